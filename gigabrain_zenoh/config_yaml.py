@@ -1,0 +1,152 @@
+"""YAML without its surprises: one document of plain values, each with its line.
+
+YAML 1.1 reads `12:30` as 750, `010` as 8, `no` as false and the last of two equal keys as the
+only one. Whoever writes a robot's limits must not be surprised, so all of this is refused.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import yaml
+
+# libyaml's loader is nine times faster than the Python one; not every platform's wheel has it.
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DEEPEST = 32  # libyaml's composer recurses in C and overruns the stack on deep nesting
+_LONGEST_NUMBER = 64  # characters
+_NUMBER = re.compile(r"[-+]?(?:(?:0|[1-9][0-9]*)(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
+
+
+class YamlFault(Exception):
+    """What is wrong with a text and on which line (from 1)."""
+
+    def __init__(self, line: int, text: str) -> None:
+        super().__init__(text)
+        self.line = line
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One `key: value` of a mapping, with the key's own line (from 1)."""
+
+    key: str
+    line: int
+    node: "Node"
+
+
+@dataclass(frozen=True)
+class Node:
+    """A value of a YAML document: a scalar, or a mapping's entries, or a sequence's items."""
+
+    line: int
+    value: Any
+    text: str = ""
+    entries: tuple[Entry, ...] | None = None
+    items: tuple["Node", ...] | None = None
+
+
+def read(text: str) -> Node:
+    """The one document in `text`. Raises YamlFault."""
+    try:
+        _refuse_indirections(text)
+        root = yaml.compose(text, Loader=_LOADER)
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise YamlFault(line, f"not YAML: {error.reason}") from None
+    except yaml.MarkedYAMLError as error:
+        line = _line(error.problem_mark or error.context_mark)
+        raise YamlFault(line, f"not YAML: {error.problem or error.context}") from None
+    if root is None:
+        raise YamlFault(1, "the file is empty; expected a mapping of fields")
+    return _node(root)
+
+
+def _refuse_indirections(text: str) -> None:
+    """Look at the events first: they need no recursion, and still show aliases and tags."""
+    depth = documents = 0
+    for event in yaml.parse(text, Loader=_LOADER):
+        line = _line(event.start_mark)
+        documents += isinstance(event, yaml.DocumentStartEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if documents > 1:
+            raise YamlFault(line, "a second document begins here; expected one")
+        if depth > _DEEPEST:
+            raise YamlFault(line, f"nested too deeply; expected at most {_DEEPEST} levels")
+        if isinstance(event, yaml.AliasEvent):
+            raise YamlFault(line, f"alias '*{event.anchor}' is not allowed; write the value out")
+        tag = getattr(event, "tag", None)
+        if tag is not None:
+            raise YamlFault(line, f"tag {tag!r} is not allowed; expected a plain value")
+
+
+def _line(mark: Any) -> int:
+    return int(mark.line) + 1 if mark else 1
+
+
+def _node(node: yaml.Node) -> Node:
+    line = _line(node.start_mark)
+    if isinstance(node, yaml.MappingNode):
+        entries = _entries(node)
+        return Node(line, {e.key: e.node.value for e in entries}, entries=entries)
+    if isinstance(node, yaml.SequenceNode):
+        items = tuple(_node(item) for item in node.value)
+        return Node(line, [item.value for item in items], items=items)
+    assert isinstance(node, yaml.ScalarNode)
+    return Node(line, _scalar(node, line), text=node.value)
+
+
+def _entries(node: yaml.MappingNode) -> tuple[Entry, ...]:
+    lines: dict[str, int] = {}
+    entries = []
+    for key, value in node.value:
+        line = _line(key.start_mark)
+        if not isinstance(key, yaml.ScalarNode):
+            raise YamlFault(line, "a key is a list or a mapping; expected a name")
+        if key.tag.endswith(":merge"):
+            raise YamlFault(line, "merge key '<<' is not allowed; write the fields out")
+        if not key.tag.endswith(":str"):
+            raise YamlFault(line, f"key {key.value!r} is not read as a name; quote it")
+        if key.value in lines:
+            raise YamlFault(
+                line,
+                f"duplicate key {key.value!r}, first on line {lines[key.value]}; expected it once",
+            )
+        lines[key.value] = line
+        entries.append(Entry(key.value, line, _node(value)))
+    return tuple(entries)
+
+
+def _scalar(node: yaml.ScalarNode, line: int) -> str | float | bool | None:
+    """The value of one scalar; its tag is the resolver's, for explicit tags are refused."""
+    kind = node.tag.rsplit(":", 1)[1]
+    text: str = node.value
+    if kind == "null":
+        return None
+    if kind == "bool":
+        if text not in ("true", "false"):
+            raise YamlFault(
+                line, f"{text!r} is read as a boolean; write true or false, or quote it"
+            )
+        return text == "true"
+    # `1e3` has no dot, so YAML 1.1 takes it for a string; everybody who writes it means a number.
+    bare = kind == "str" and not node.style and _NUMBER.fullmatch(text) is not None
+    if kind in ("int", "float") or bare:
+        return _number(text, kind == "int", line)
+    return text  # also dates and `=`, which are text here
+
+
+def _number(text: str, whole: bool, line: int) -> float:
+    if text.lower().lstrip("+-") in (".nan", ".inf"):
+        raise YamlFault(line, f"{text} is not allowed; expected a finite number")
+    if len(text) > _LONGEST_NUMBER or not _NUMBER.fullmatch(text):
+        raise YamlFault(
+            line, f"{text[:_LONGEST_NUMBER]!r}: write it as a plain decimal or quote it"
+        )
+    if whole:
+        return int(text)
+    value = float(text)
+    if not math.isfinite(value):
+        raise YamlFault(line, f"{text} is too large; expected a finite number")
+    return value
