@@ -1,0 +1,7 @@
+"""Bodies: adding one means a folder in `bodies`, and for a new kind of link a line in DRIVERS."""
+
+# name in a robot's file -> "module:class"; imported only when used, so a body's SDK stays optional
+DRIVERS = {
+    "mock": "gigabrain_drivers.mock:MockBody",
+    "mujoco": "gigabrain_drivers.sim.driver:MujocoDriver",
+}

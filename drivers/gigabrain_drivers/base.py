@@ -1,0 +1,99 @@
+"""The hardware abstraction layer: what every body offers."""
+
+import abc
+from collections.abc import AsyncIterator, Callable, Mapping
+from types import TracebackType
+from typing import Any, ClassVar, Self
+
+from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
+from gigabrain_schemas.base import TICK_NS, Message, Velocity
+from gigabrain_schemas.body import Joint, RobotState
+from gigabrain_schemas.topics import Topic
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import Unsupported
+
+Emit = Callable[[Topic[Any], Message], None]
+
+
+class Driver(abc.ABC):
+    """One body. Used as `async with driver:`; leaving the block always makes the body safe.
+
+    A body implements the primitives that it has; the others raise Unsupported. `stop` and `close`
+    work in any state, any number of times, and never raise.
+    """
+
+    Options: ClassVar[type[LinkOptions]] = LinkOptions  # the link's part of the robot's file
+    lockstep = False  # whether time waits for the brain (simulation at other speeds than 1)
+    finished = False  # whether the body's time has come to its end (simulation with a duration)
+
+    def __init__(self, robot: RobotFile, options: Any, run: Run) -> None:
+        self.robot, self.options, self.run = robot, options, run
+        self.emit: Emit = lambda topic, message: None  # the driver's process puts its own here
+
+    async def __aenter__(self) -> Self:
+        try:
+            await self.open()
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.stop()
+        await self.close()
+
+    @abc.abstractmethod
+    async def open(self) -> None:
+        """Connect. Raises BodyLost if the body does not answer."""
+
+    @abc.abstractmethod
+    async def close(self) -> None:
+        """Let go of the body."""
+
+    @abc.abstractmethod
+    async def stop(self) -> None:
+        """Bring the body to rest."""
+
+    @abc.abstractmethod
+    async def read_state(self) -> RobotState:
+        """What the body measures; header and gate are filled in later. Raises BodyLost."""
+
+    async def ticks(self, clock: Clock) -> AsyncIterator[int]:
+        """Yield whenever time has gone on, and by how many ticks of 20 ms of the body's time."""
+        start, told = clock.now_ns(), 0
+        async for now_ns in clock.every(TICK_NS):
+            passed = (now_ns - start) // TICK_NS + 1 - told
+            if passed > 0:
+                told += passed
+                yield passed
+
+    async def hold(self) -> None:
+        """Keep the present position; an arm without brakes must not go limp."""
+        await self.stop()
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        """Drive [m/s, m/s, rad/s]; returns what was really sent. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} has no base to drive")
+
+    async def set_joint_position(self, joint_name: str, position: float) -> float:
+        """Move one joint [rad or m]; returns what was really sent. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} has no joints to position")
+
+    async def get_joint_states(self) -> tuple[Joint, ...]:
+        """All joints as measured. Raises BodyLost."""
+        return (await self.read_state()).joints
+
+    async def get_sensor_data(self, sensor_name: str) -> Message | None:
+        """The newest reading of a sensor, or None before its first. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} has no sensor {sensor_name!r}")
+
+    def report(self) -> Mapping[str, float | int | str | None]:
+        """Figures for reports that only this driver knows, such as a simulation's truth."""
+        return {}

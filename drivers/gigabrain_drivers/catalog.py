@@ -1,0 +1,78 @@
+"""Finds robots and drivers by name: ours, those of installed packages, and people's own files."""
+
+import importlib
+from importlib import resources
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import cast
+
+import msgspec
+
+from gigabrain_drivers import DRIVERS
+from gigabrain_drivers.base import Driver
+from gigabrain_drivers.robot import LINKS, RobotFile, Run
+from gigabrain_zenoh import config
+from gigabrain_zenoh.errors import ConfigError, unknown
+
+
+def robot_files() -> dict[str, Path]:
+    """Every known robot and its file, by name."""
+    bodies = Path(str(resources.files("gigabrain_drivers") / "bodies"))
+    return {path.parent.name: path for path in sorted(bodies.glob("*/robot.yaml"))}
+
+
+def robot_path(name: str) -> Path:
+    """The file of a robot: a known name, or a path to somebody's own. Raises ConfigError."""
+    if name.endswith((".yaml", ".yml")):
+        return Path(name)
+    known = robot_files()
+    if name not in known:
+        raise unknown("robot", name, known)
+    return known[name]
+
+
+def load_robot(name: str) -> RobotFile:
+    """Read a robot's file. Raises ConfigError with file, line and what was expected."""
+    return config.load(robot_path(name), RobotFile)
+
+
+def driver_class(name: str) -> type[Driver]:
+    """The driver called `name`: one of ours, or one that an installed package offers.
+
+    Raises UnknownName listing the known ones, and ConfigError when what it needs is missing.
+    """
+    offered = {point.name: point for point in entry_points(group="gigabrain.drivers")}
+    if name in DRIVERS:
+        module, _, attribute = DRIVERS[name].partition(":")
+        try:
+            return cast("type[Driver]", getattr(importlib.import_module(module), attribute))
+        except ModuleNotFoundError as error:
+            raise ConfigError(
+                f"driver {name!r} needs the package {error.name!r}; "
+                "install it with: pip install 'gigabrain-zenoh[sim]'"
+            ) from None
+    if name in offered:
+        return cast("type[Driver]", offered[name].load())
+    raise unknown("driver", name, {**DRIVERS, **offered})
+
+
+def make_driver(name: str, run: Run) -> tuple[RobotFile, Driver]:
+    """The robot called `name` and the driver of its link. Raises ConfigError."""
+    path = robot_path(name)
+    robot = config.load(path, RobotFile)
+    link = getattr(robot, run.link)
+    if link is None:
+        has = ", ".join(n for n in LINKS if getattr(robot, n) is not None) or "none"
+        raise ConfigError(f"{path.parent.name} has no link {run.link!r}; it has: {has}")
+    driver = driver_class(str(link.get("driver")))
+    # read once more, now that it is known what this driver's part looks like: errors name the line
+    exact = msgspec.defstruct(
+        "RobotFile",
+        [(run.link, driver.Options)],
+        bases=(RobotFile,),
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+    )
+    options = getattr(config.load(path, exact), run.link)
+    return robot, driver(robot, options, msgspec.structs.replace(run, folder=path.parent))

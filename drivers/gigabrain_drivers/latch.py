@@ -1,0 +1,66 @@
+"""What latched the gate, on disk: it survives a restart, and is there before anybody is told."""
+
+import os
+from pathlib import Path
+
+import msgspec
+
+from gigabrain_schemas.base import Cause
+from gigabrain_zenoh.errors import ConfigError
+
+UNREADABLE = Cause(
+    code="latch_unreadable",
+    text="the file that remembers what latched the gate cannot be read; look at the robot first",
+    latching=True,
+)
+
+
+class Latched(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The content of the file."""
+
+    causes: tuple[Cause, ...] = ()
+    estop_generation: int = 0
+
+
+class LatchFile:
+    """One small file, replaced as a whole and synced."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._path = folder, folder / "latch.json"
+        self._written = Latched()
+
+    def read(self) -> Latched:
+        """What was latched when the driver ended; a file that cannot be read counts as latched.
+
+        Raises ConfigError when the folder cannot be written.
+        """
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            found = msgspec.json.decode(self._path.read_bytes(), type=Latched)
+        except FileNotFoundError:
+            found = Latched()
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            found = Latched(causes=(UNREADABLE,))
+        except OSError as error:
+            raise ConfigError(_unwritable(self._folder, error)) from None
+        self.write(found)
+        return found
+
+    def write(self, latched: Latched) -> None:
+        """On disk when this returns. Raises ConfigError when the folder cannot be written."""
+        if latched == self._written and self._path.exists():
+            return
+        fresh = self._path.with_suffix(".new")
+        try:
+            with fresh.open("wb") as file:
+                file.write(msgspec.json.encode(latched))
+                file.flush()
+                os.fsync(file.fileno())
+            fresh.replace(self._path)
+        except OSError as error:
+            raise ConfigError(_unwritable(self._folder, error)) from None
+        self._written = latched
+
+
+def _unwritable(folder: Path, error: OSError) -> str:
+    return f"cannot write {folder}: {error.strerror}; choose another --state-dir"

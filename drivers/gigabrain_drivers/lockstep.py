@@ -1,0 +1,62 @@
+"""When time may go on: a simulation that is not paced by the wall clock waits for the brain."""
+
+import asyncio
+
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_zenoh.gate import BRAIN
+
+PATIENCE_S = 0.15  # of wall time per tick
+REPEAT_S = 0.1  # how often the first tick is announced until the brain is there
+
+
+class Lockstep:
+    """Knows whether all that a tick waits for has come.
+
+    A tick waits for a command that echoes it. A tick with a scan waits for the command, and for the
+    verdict of safety, that rest on that scan. So decisions do not depend on how fast a machine is.
+    """
+
+    def __init__(self) -> None:
+        self._tick = self._basis = 0
+        self._echo = self._echo_basis = self._judged = 0
+        self._wake = asyncio.Event()
+        self.timeouts = 0  # ticks that went on without the brain
+
+    def begin(self, tick: int, basis: int) -> None:
+        """A tick has been sent out; `basis` is the tick of the newest scan, or 0."""
+        self._tick, self._basis = tick, basis
+        self._wake.clear()
+
+    def command(self, command: CmdVel) -> None:
+        """A command has come. One without a basis comes from somebody who needs no scan."""
+        self._echo = max(self._echo, command.tick)
+        basis = command.basis if command.source == BRAIN else command.tick
+        self._echo_basis = max(self._echo_basis, basis)
+        self._wake.set()
+
+    def verdict(self, verdict: SafetyState) -> None:
+        """Safety has spoken."""
+        self._judged = max(self._judged, verdict.basis)
+        self._wake.set()
+
+    @property
+    def complete(self) -> bool:
+        """Whether the tick has been answered."""
+        return self._echo >= self._tick and min(self._echo_basis, self._judged) >= self._basis
+
+    async def wait(self, timeout_s: float) -> bool:
+        """Wait for the answer; says whether it came in time."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                while not self.complete:
+                    self._wake.clear()
+                    await self._wake.wait()
+        except TimeoutError:
+            return False
+        return True
+
+    async def answered(self) -> None:
+        """Wait as long as a tick waits, and count where that was in vain."""
+        if not await self.wait(PATIENCE_S):
+            self.timeouts += 1

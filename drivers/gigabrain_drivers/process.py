@@ -1,0 +1,292 @@
+"""The driver process: joins a body to the bus, through the gate. Written once for all bodies."""
+
+import asyncio
+import dataclasses
+import logging
+import secrets
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec.structs import replace
+
+from gigabrain_drivers.base import Driver
+from gigabrain_drivers.catalog import make_driver
+from gigabrain_drivers.latch import Latched, LatchFile
+from gigabrain_drivers.lockstep import REPEAT_S, Lockstep
+from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.body import Body, RobotState
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.topics import (
+    BODY,
+    CMD_VEL,
+    ENABLE,
+    ESTOP,
+    RELEASE,
+    SAFETY,
+    SCAN,
+    STATE,
+    Topic,
+)
+from gigabrain_zenoh import causes as why
+from gigabrain_zenoh import gate
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.limits import ZERO, limits_of
+from gigabrain_zenoh.safety import scan_limit_ns
+from gigabrain_zenoh.settings import DriverConfig
+
+log = logging.getLogger(__name__)
+
+BODY_EVERY_TICKS = 50  # once a second
+STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
+LATENCIES = 20_000  # newest scan-to-command times that the figures are drawn from
+
+
+class RawSpeeds(msgspec.Struct):
+    """A command before its numbers are looked at."""
+
+    linear_x: float = 0.0
+    linear_y: float = 0.0
+    angular_z: float = 0.0
+    source: str = ""
+    boot: int = 0
+
+
+class DriverProcess:
+    """One body on the bus."""
+
+    def __init__(self, config: DriverConfig, robot: RobotFile, driver: Driver, bus: Bus) -> None:
+        self._config, self._robot, self._driver, self._bus = config, robot, driver, bus
+        self._body = Body(description=robot.description(), link=config.link)
+        self._gate_config = gate.GateConfig(
+            limits=limits_of(robot),
+            basis_ns=scan_limit_ns(robot),
+            auto_resume=config.resume == "auto",
+        )
+        self._latch = LatchFile(Path(config.state_dir))
+        latched = self._latch.read()
+        self._gate = gate.GateState(
+            boot=secrets.randbits(47) + 1,
+            causes=latched.causes or (why.BOOT,),
+            estop_generation=latched.estop_generation,
+        )
+        bus.time.boot = self._gate.boot
+        self._lockstep = Lockstep() if driver.lockstep else None
+        self._sensors: list[tuple[Topic[Any], Message]] = []  # of the present tick
+        self._scan_tick = 0  # newest tick that carried a scan
+        self._scan_sent_ns = 0
+        self._latencies: deque[float] = deque(maxlen=LATENCIES)  # [ms]
+        self._wake = asyncio.Event()
+        self._line = asyncio.Lock()  # one call at a time goes out to the body
+        driver.emit = lambda topic, message: self._sensors.append((topic, message))
+        bus.report = self.report
+
+    async def run(self, ready: Callable[[], None]) -> None:
+        """Serve the body until cancelled; it is safe when this ends, however it ends."""
+        bus = self._bus
+        async with self._driver:
+            command_topic = replace_key(CMD_VEL, self._robot.control_topic)
+            bus.subscribe(command_topic, self._on_command, self._on_bad_command)
+            bus.latest(SAFETY, self._on_safety)
+            bus.serve(ESTOP, self._on_estop)
+            bus.serve(RELEASE, self._on_release)
+            bus.serve(ENABLE, self._on_enable)
+            bus.publish(BODY, self._body)
+            ready()
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._live())
+                tasks.create_task(self._obeying())
+
+    async def _live(self) -> None:
+        async for passed in self._driver.ticks(self._bus.clock):
+            await self._tick(passed)
+        self._measure()
+        log.info("the simulation has come to its end", extra={"data": {"event": "finished"}})
+        await self._bus.failed
+
+    async def _obeying(self) -> None:
+        """Between two ticks as well: a command need not wait for anybody's period."""
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            await self._obey()
+
+    def report(self) -> Mapping[str, float | int | str | None]:
+        """What the body and this process can say of the whole run."""
+        times = sorted(self._latencies)
+        figures: dict[str, float | int | str | None] = {
+            "scan_to_cmd_p50_ms": percentile(times, 0.50),
+            "scan_to_cmd_p99_ms": percentile(times, 0.99),
+            "stale_commands_executed": self._bus.counters["stale_commands_executed"],
+            "lockstep_timeouts": self._lockstep.timeouts if self._lockstep else 0,
+            "ticks": self._gate.tick,
+        }
+        return {**self._driver.report(), **figures}
+
+    async def _tick(self, passed: int) -> None:
+        """20 ms of the body's time, or several where the process was held up."""
+        state = await self._driver.read_state()
+        faults = () if state.link.connected else (why.LINK_LOST,)
+        for _ in range(passed):
+            self._step(gate.Tick(state.velocity, self._wall_ns(), faults))
+        self._bus.time.tick = self._gate.tick
+        self._announce(state)
+        if self._lockstep:
+            await self._wait_for_brain(self._lockstep, state)
+        await self._obey()
+
+    def _announce(self, state: RobotState) -> None:
+        """State first: whoever gets the scan of a tick can expect to have seen its state."""
+        bus, tick = self._bus, self._gate.tick
+        bus.publish(STATE, replace(state, gate=gate.status(self._gate)), basis=tick)
+        for topic, message in self._sensors:
+            if topic is SCAN:
+                self._scan_tick, self._scan_sent_ns = tick, bus.clock.now_ns()
+            bus.publish(topic, message, basis=tick)
+        self._sensors.clear()
+        if tick % BODY_EVERY_TICKS == 0:
+            bus.publish(BODY, self._body)
+            self._measure()
+
+    async def _wait_for_brain(self, lockstep: Lockstep, state: RobotState) -> None:
+        """The first tick waits until the whole brain is there, so that runs can be repeated."""
+        scan = await self._newest_scan()
+        lockstep.begin(self._gate.tick, self._scan_tick)
+        if self._gate.tick > 1:
+            await lockstep.answered()
+            return
+        while not await lockstep.wait(REPEAT_S):
+            if scan:
+                self._sensors.append((SCAN, scan))
+            self._announce(state)
+            lockstep.begin(self._gate.tick, self._scan_tick)
+
+    async def _newest_scan(self) -> Message | None:
+        return await self._driver.get_sensor_data("scan") if self._robot.lidar else None
+
+    def _step(self, event: gate.Event) -> gate.Outcome:
+        """One event through the gate; what latches it is on disk before anybody is told."""
+        before = self._gate
+        self._gate, outcome = gate.step(self._gate_config, before, event)
+        if self._gate.output != before.output:
+            self._wake.set()
+        if (before.mode, before.causes) != (self._gate.mode, self._gate.causes):
+            self._changed(before)
+        return outcome
+
+    async def _obey(self) -> None:
+        """Have the body do what the gate lets through."""
+        async with self._line:
+            now = self._gate
+            if now.mode == "latched":
+                await self._driver.stop()
+                return
+            to = now.output
+            await self._driver.set_base_velocity(to.linear_x, to.linear_y, to.angular_z)
+        if now.mode == "enabled" and now.command and to != ZERO:
+            late = gate.age_ns(now, now.command.tick, self._wall_ns()) > STALE_NS
+            self._bus.counters["stale_commands_executed"] += late
+
+    def _changed(self, before: gate.GateState) -> None:
+        now = self._gate
+        latched = why.latching(now.causes)
+        self._latch.write(Latched(causes=latched, estop_generation=now.estop_generation))
+        if now.mode != before.mode:
+            reason = why.in_words(now.causes) or f"commander {now.commander or 'nobody'}"
+            data = {"event": "gate", "mode": now.mode, "tick": now.tick, "reason": reason}
+            log.info("gate %s: %s", now.mode, reason, extra={"data": data})
+
+    def _on_command(self, _key: str, command: CmdVel) -> None:
+        outcome = self._step(gate.Command(command, self._wall_ns()))
+        if outcome.refused:
+            self._bus.counters[f"refused_{outcome.refused}"] += 1
+        if command.boot == self._gate.boot:
+            if command.basis and command.basis == self._scan_tick and self._scan_sent_ns:
+                self._latencies.append((self._bus.clock.now_ns() - self._scan_sent_ns) / 1e6)
+                self._scan_sent_ns = 0
+            if self._lockstep:
+                self._lockstep.command(command)
+
+    def _on_bad_command(self, payload: bytes) -> None:
+        """Not a valid command: was it the commander, with a value that is not a number?"""
+        try:
+            raw = msgspec.msgpack.decode(payload, type=RawSpeeds)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            return
+        speeds = (raw.linear_x, raw.linear_y, raw.angular_z)
+        if all(abs(speed) < float("inf") for speed in speeds):
+            return
+        self._step(gate.NotFinite(raw.source, raw.boot))
+
+    def _on_safety(self, said: SafetyState) -> None:
+        self._step(gate.Safety(said))
+        if self._lockstep and said.boot == self._gate.boot:
+            self._lockstep.verdict(said)
+
+    async def _on_estop(self, request: EstopRequest) -> GateReply:
+        await self._driver.stop()  # before anything else, disk and log included
+        log.warning("e-stop by %s %s", request.source, request.reason)
+        return self._reply(gate.Estop(request.source))
+
+    async def _on_release(self, request: ReleaseRequest) -> GateReply:
+        log.info("%s asks for a release", request.source)
+        return self._reply(gate.Release(request.estop_generation))
+
+    async def _on_enable(self, request: EnableRequest) -> GateReply:
+        return self._reply(gate.Enable(request.source, request.take))
+
+    def _reply(self, event: gate.Event) -> GateReply:
+        outcome = self._step(event)
+        return GateReply(
+            ok=outcome.ok,
+            text=outcome.text,
+            robot_type=self._robot.robot_type,
+            gate=gate.status(self._gate),
+        )
+
+    def _wall_ns(self) -> int | None:
+        """The host's clock; none where time is lock-stepped and the wall says nothing."""
+        return None if self._lockstep else self._bus.clock.now_ns()
+
+    def _measure(self) -> None:
+        times = sorted(self._latencies)
+        for name, share in (("scan_to_cmd_p50", 0.50), ("scan_to_cmd_p99", 0.99)):
+            value = percentile(times, share)
+            if value is not None:
+                self._bus.latency_ms[name] = value
+        if self._lockstep:
+            self._bus.counters["lockstep_timeouts"] = self._lockstep.timeouts
+
+
+def percentile(ordered: list[float], share: float) -> float | None:
+    """The value that `share` of `ordered` do not exceed."""
+    return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else None
+
+
+def replace_key(topic: Topic[CmdVel], key: str) -> Topic[CmdVel]:
+    """`topic` under another key."""
+    return topic if topic.key == key else dataclasses.replace(topic, key=key)
+
+
+async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None:
+    """Drive one body until the process ends. Raises ConfigError for what cannot be driven."""
+    if config.link != "sim" and config.speed != 1.0:
+        raise ConfigError(f"link {config.link!r} runs in real time; --speed is for simulation")
+    if config.link == "real" and config.resume == "auto":
+        raise ConfigError("resume: auto is for simulation; a real body is enabled by a person")
+    where = Run(
+        folder=Path(),
+        link=config.link,
+        world=config.world,
+        seed=config.seed,
+        speed=config.speed,
+        seconds=config.seconds,
+    )
+    robot, driver = make_driver(config.body, where)
+    await DriverProcess(config, robot, driver, bus).run(ready)

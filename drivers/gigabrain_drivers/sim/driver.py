@@ -1,0 +1,282 @@
+"""A body in MuJoCo: physics and sensors in a thread of their own, results posted to the loop."""
+
+import asyncio
+import contextlib
+import math
+import threading
+import time
+from collections.abc import AsyncIterator, Mapping
+from typing import Annotated, NamedTuple
+
+from msgspec import Meta
+
+from gigabrain_drivers.base import Driver
+from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
+from gigabrain_drivers.sim.body import SimBattery, SimBody, SimLidar
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.tick import TICK_NS as STEP_NS
+from gigabrain_drivers.sim.worlds import load_world
+from gigabrain_schemas.arrays import ranges_bytes
+from gigabrain_schemas.base import (
+    TICK_NS,
+    Message,
+    NonNegative,
+    Percentage,
+    Pose,
+    Positive,
+    Velocity,
+)
+from gigabrain_schemas.body import Battery, Joint, RobotState
+from gigabrain_schemas.sensors import Imu, ImuData, LaserScan
+from gigabrain_schemas.topics import IMU, SCAN
+from gigabrain_zenoh.bridge import Bridge
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
+
+STEPS = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
+STEP_S = STEP_NS / 1e9
+DEAD_MAN_NS = 150_000_000  # of simulated time: as long as a firmware would wait
+LATE_S = 0.25  # further behind than this, time is dropped instead of raced after
+SPEEDS = (0.1, 100.0)
+
+
+class MujocoOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The simulator's part of a robot's file."""
+
+    model: str = "model.xml"  # MJCF, beside the robot's file
+    battery_capacity: Positive = 1.8  # [Ah]
+    battery_percentage: Percentage = 100.0  # [%], at the start
+    lidar_noise: NonNegative = 0.01  # [m], standard deviation
+    wheel_scale: Annotated[float, Meta(ge=0.5, le=2.0)] = 1.0  # true wheel radius / wheel_radius
+    odometry_wheel_radius: Positive | None = None  # [m], where odometry is calibrated by itself
+
+
+class Reading(NamedTuple):
+    """What the physics thread hands over after each tick."""
+
+    state: RobotState
+    imu: tuple[Imu, ...]
+    scan: LaserScan | None
+
+
+class MujocoDriver(Driver):
+    """Paced by the wall clock at speed 1; at others each tick waits until the last is answered."""
+
+    Options = MujocoOptions
+
+    def __init__(self, robot: RobotFile, options: MujocoOptions, run: Run) -> None:
+        super().__init__(robot, options, run)
+        if not SPEEDS[0] <= run.speed <= SPEEDS[1]:
+            raise ConfigError(f"speed must be {SPEEDS[0]:g} to {SPEEDS[1]:g}, got {run.speed:g}")
+        self.lockstep = run.speed != 1.0
+        world = load_world(run.world, run.seed)
+        self._simulation = Simulation(_sim_body(robot, options, run), world, run.seed)
+        period_ns = 1e9 / robot.lidar.rate_hz if robot.lidar else math.inf
+        self._scan_ticks = period_ns / TICK_NS
+        self._next_scan = self._scan_ticks
+        self._ticks = 0
+        self._last_ticks = round(run.seconds * 1e9 / TICK_NS) if run.seconds else None
+        self._commanded_ns = 0
+        self._physics_s = 0.0  # CPU time of the thread
+        self._permits = threading.Semaphore(0)
+        self._halt = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._bridge: Bridge | None = None
+        self._readings: asyncio.Queue[Reading | Exception | None] = asyncio.Queue()
+        self._reading: Reading | None = None
+
+    async def open(self) -> None:
+        """Take the first readings; time stands still until somebody asks for ticks."""
+        self._reading = self._read(with_scan=self.robot.lidar is not None)
+
+    async def close(self) -> None:
+        """End the physics thread."""
+        self._halt.set()
+        self._permits.release()
+        if self._thread:
+            await asyncio.to_thread(self._thread.join)
+        if self._bridge:
+            self._bridge.close()
+        self._thread = self._bridge = self._reading = None
+
+    async def stop(self) -> None:
+        """Brake the wheels."""
+        self._simulation.command(0.0, 0.0)
+
+    async def ticks(self, clock: Clock) -> AsyncIterator[int]:
+        """One tick per 20 ms of simulated time; ends when the run's seconds are over."""
+        self._bridge = Bridge()
+        self._thread = threading.Thread(target=self._work, name="physics", daemon=True)
+        self._thread.start()
+        while True:
+            self._permits.release()
+            reading = await self._readings.get()
+            if reading is None:
+                self.finished = True
+                return
+            if isinstance(reading, Exception):
+                raise reading
+            self._take(reading)
+            yield 1
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        """Turn the wheels; sideways is not to be had."""
+        if self._reading is None:
+            raise BodyLost("the simulation is not open")
+        self._commanded_ns = self._simulation.time_ns
+        forward, turn = self._simulation.command(linear_x, angular_z)
+        return Velocity(linear_x=forward, angular_z=turn)
+
+    async def read_state(self) -> RobotState:
+        """The state at the end of the newest tick."""
+        if self._reading is None:
+            raise BodyLost("the simulation is not open")
+        return self._reading.state
+
+    async def get_sensor_data(self, sensor_name: str) -> Message | None:
+        """The newest `scan` or `imu`."""
+        reading = self._reading
+        if sensor_name == "scan" and self.robot.lidar:
+            return reading.scan if reading else None
+        if sensor_name == "imu":
+            return reading.imu[-1] if reading else None
+        raise Unsupported(
+            f"{self.robot.robot_type} has no sensor {sensor_name!r}; it has: scan, imu"
+        )
+
+    def report(self) -> Mapping[str, float | int | str | None]:
+        """The truth of the run so far."""
+        truth = self._simulation.truth
+        return {
+            "body": self.robot.robot_type,
+            "world": self.run.world,
+            "seed": self.run.seed,
+            "sim_seconds": round(self._simulation.time_ns / 1e9, 2),
+            "distance_m": round(truth.distance_m, 3),
+            "contacts": truth.contacts,
+            "min_clearance_m": round(truth.min_clearance_m, 3),
+            "true_speed": round(truth.speed()[0], 4),
+            "physics_cpu_s": round(self._physics_s, 3),
+        }
+
+    def _take(self, reading: Reading) -> None:
+        scan = reading.scan or (self._reading.scan if self._reading else None)
+        self._reading = reading._replace(scan=scan)
+        if reading.scan:
+            self.emit(SCAN, reading.scan)
+        for sample in reading.imu:
+            self.emit(IMU, sample)
+
+    def _work(self) -> None:
+        """The physics thread."""
+        start, done = time.perf_counter(), 0
+        began = time.thread_time()
+        while not self._halt.is_set():
+            if self.lockstep:
+                self._permits.acquire()
+            if self._ticks == self._last_ticks:
+                self._post(None)
+                return
+            samples = []
+            for _ in range(STEPS):
+                done += 1
+                start = self._keep_pace(start, done)
+                if self._halt.is_set():
+                    return
+                try:
+                    self._step()
+                except BodyLost as error:
+                    self._post(error)
+                    return
+                samples.append(self._imu())
+            self._ticks += 1
+            due = self._ticks >= self._next_scan
+            if due:
+                self._next_scan += self._scan_ticks
+            self._post(self._read(with_scan=due)._replace(imu=tuple(samples)))
+            self._physics_s = time.thread_time() - began
+
+    def _keep_pace(self, start: float, done: int) -> float:
+        """Sleep until step `done` is due by absolute deadlines; returns where they count from."""
+        wait = start + done * STEP_S / self.run.speed - time.perf_counter()
+        if wait > 0:
+            time.sleep(wait)
+        elif wait < -LATE_S:
+            start -= wait
+        return start
+
+    def _step(self) -> None:
+        if self._simulation.time_ns - self._commanded_ns >= DEAD_MAN_NS:
+            self._simulation.command(0.0, 0.0)
+        self._simulation.advance()
+
+    def _post(self, reading: Reading | Exception | None) -> None:
+        bridge = self._bridge
+        if bridge:
+            with contextlib.suppress(RuntimeError):  # the loop is gone
+                bridge.post(self._readings.put_nowait, reading)
+
+    def _read(self, *, with_scan: bool) -> Reading:
+        simulation = self._simulation
+        odometry, charge = simulation.odometry(), simulation.battery()
+        imu = self._imu()
+        state = RobotState(
+            robot_type=self.robot.robot_type,
+            pose=Pose(x=odometry.x, y=odometry.y, yaw=math.remainder(odometry.yaw, math.tau)),
+            velocity=Velocity(linear_x=odometry.linear_x, angular_z=odometry.angular_z),
+            joints=tuple(Joint(**wheel._asdict()) for wheel in simulation.wheels()),
+            battery=Battery(
+                voltage=charge.voltage, percentage=charge.percentage, current=charge.current
+            ),
+            imu=ImuData(
+                orientation=imu.orientation,
+                angular_velocity=imu.angular_velocity,
+                linear_acceleration=imu.linear_acceleration,
+            ),
+            bumpers=(simulation.bumper(),),
+        )
+        return Reading(state, (imu,), self._scan() if with_scan else None)
+
+    def _imu(self) -> Imu:
+        return Imu(**self._simulation.imu()._asdict())
+
+    def _scan(self) -> LaserScan:
+        lidar = self.robot.lidar
+        assert lidar is not None
+        return LaserScan(
+            angle_min=0.0,
+            angle_increment=math.tau / lidar.beams,
+            range_min=lidar.range_min,
+            range_max=lidar.range_max,
+            ranges=ranges_bytes(self._simulation.scan()),
+        )
+
+
+def _sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimBody:
+    path = run.folder / options.model
+    try:
+        model = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; `model` names its MJCF file") from None
+    lidar = robot.lidar
+    return SimBody(
+        model=model,
+        wheel_radius=robot.wheel_radius,
+        wheel_separation=robot.wheel_separation,
+        odometry_wheel_radius=options.odometry_wheel_radius,
+        wheel_scale=options.wheel_scale,
+        lidar=SimLidar(
+            beams=lidar.beams,
+            rate_hz=lidar.rate_hz,
+            range_min=lidar.range_min,
+            range_max=lidar.range_max,
+            noise_m=options.lidar_noise,
+        )
+        if lidar
+        else None,
+        battery=SimBattery(
+            capacity_ah=options.battery_capacity, percentage=options.battery_percentage
+        ),
+    )

@@ -1,0 +1,131 @@
+"""A picture of a robot in its room, drawn without a screen."""
+
+import importlib
+import math
+import struct
+import sys
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_drivers.sim.body import SimBody
+from gigabrain_drivers.sim.geometry import Pose, clearance
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.world import World
+from gigabrain_zenoh.errors import ConfigError
+
+DISTANCE_M, HEIGHT_M = 1.0, 0.50  # of the camera, from the robot and above the floor
+AIM_HEIGHT_M = 0.22  # above the robot, so that the room is in the picture
+FIELD_OF_VIEW_DEG = 44.0
+SHADOW_REACH_M = 3.5  # shadows are drawn this far round the robot: fewer metres, finer edges
+SUN_M = 4.0  # from the robot to the sun: far enough for the tallest thing near it
+FINER = 2  # drawn this many times as large, then averaged
+
+
+def render(
+    body: SimBody, world: World, seed: int, path: Path, width: int = 1280, height: int = 720
+) -> None:
+    """Write a PNG of the robot at its start. Raises ConfigError where nothing can be drawn."""
+    simulation = Simulation(body, world, seed)
+    model, data = simulation.model, simulation.data
+    model.vis.global_.offwidth, model.vis.global_.offheight = width * FINER, height * FINER
+    model.vis.global_.fovy, model.vis.map.zfar = FIELD_OF_VIEW_DEG, 3.0
+    robot = simulation.truth.pose()
+    _light(model, robot)
+    mujoco.mj_forward(model, data)
+    with _graphics(width * FINER, height * FINER):
+        fine = _draw(model, data, _camera(world, robot))
+    pixels = fine.reshape(height, FINER, width, FINER, 3).mean(axis=(1, 3)).round()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(png(pixels.astype(np.uint8)))
+
+
+def _light(model: mujoco.MjModel, robot: Pose) -> None:
+    """Put the sun over the robot and spend the whole shadow map there."""
+    model.vis.quality.shadowsize = 8192
+    model.vis.map.shadowclip = SHADOW_REACH_M / model.stat.extent
+    model.light_pos[:] = np.array([robot.x, robot.y, 0]) - SUN_M * model.light_dir
+
+
+def png(pixels: NDArray[np.uint8]) -> bytes:
+    """An image (height, width, 3) as a PNG file, each row stored as what differs from the last."""
+    height, width, _ = pixels.shape
+    rows = pixels.reshape(height, width * 3)
+    above = np.vstack([np.zeros_like(rows[:1]), rows[:-1]])
+    filtered = np.hstack([np.full((height, 1), 2, np.uint8), rows - above])  # 2: the filter "up"
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits of red, green, blue
+    chunks = (
+        (b"IHDR", header),
+        (b"IDAT", zlib.compress(filtered.tobytes(), 9)),
+        (b"IEND", b""),
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(kind, content) for kind, content in chunks)
+
+
+def _chunk(kind: bytes, content: bytes) -> bytes:
+    check = struct.pack(">I", zlib.crc32(kind + content))
+    return struct.pack(">I", len(content)) + kind + content + check
+
+
+@contextmanager
+def _graphics(width: int, height: int) -> Iterator[None]:
+    """An off-screen OpenGL context. Raises ConfigError naming the packages that are missing."""
+    try:
+        backend = importlib.import_module(
+            "mujoco.cgl" if sys.platform == "darwin" else "mujoco.egl"
+        )
+        context = backend.GLContext(width, height)
+    except (ImportError, AttributeError, RuntimeError) as error:
+        raise ConfigError(
+            f"no picture without OpenGL ({error}): pip install 'gigabrain-zenoh[view]' and, on "
+            "Debian, apt-get install libegl1 libgl1-mesa-dri"
+        ) from error
+    try:
+        context.make_current()
+        yield
+    finally:
+        context.free()
+
+
+def _draw(
+    model: mujoco.MjModel, data: mujoco.MjData, camera: mujoco.MjvCamera
+) -> NDArray[np.uint8]:
+    width, height = model.vis.global_.offwidth, model.vis.global_.offheight
+    scene = mujoco.MjvScene(model, maxgeom=1000)
+    scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 1
+    everything = mujoco.mjtCatBit.mjCAT_ALL.value
+    mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, camera, everything, scene)
+    pixels, whole = np.empty((height, width, 3), np.uint8), mujoco.MjrRect(0, 0, width, height)
+    context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+    try:
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, context)
+        mujoco.mjr_render(whole, scene, context)
+        mujoco.mjr_readPixels(pixels, None, whole, context)
+    finally:
+        context.free()
+    return pixels[::-1]  # OpenGL counts rows from below
+
+
+def _camera(world: World, robot: Pose) -> mujoco.MjvCamera:
+    """Three-quarter from the front, on the side where the view is free and the room is deep."""
+    shapes = world.everything()
+
+    def room(angle: float) -> float:
+        """The least clearance on the line from the robot to the camera, and a bit behind it."""
+        cos, sin = math.cos(robot.yaw + angle), math.sin(robot.yaw + angle)
+        reaches = (0.4, 0.7, 1.0, DISTANCE_M, DISTANCE_M + 0.2)
+        return min(clearance(shapes, robot.x + cos * r, robot.y + sin * r) for r in reaches)
+
+    side = max(math.radians(35), math.radians(-35), math.radians(55), math.radians(-55), key=room)
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.lookat = (robot.x, robot.y, AIM_HEIGHT_M)
+    camera.distance = math.hypot(DISTANCE_M, HEIGHT_M - AIM_HEIGHT_M)
+    camera.azimuth = math.degrees(robot.yaw + side) + 180
+    camera.elevation = -math.degrees(math.atan2(HEIGHT_M - AIM_HEIGHT_M, DISTANCE_M))
+    return camera

@@ -1,0 +1,121 @@
+"""What really happened, by the physics: for reports and tests, never for the robot."""
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_drivers.sim.geometry import Footprint, Pose
+from gigabrain_drivers.sim.scene import FLOOR, ROBOT
+from gigabrain_drivers.sim.tick import TICK_NS
+
+APART_TICKS = 500_000_000 // TICK_NS  # contact again after half a second is a new contact
+CLEARANCE_TICKS = 100_000_000 // TICK_NS
+FAR_M = 10.0  # clearances beyond this are not told apart
+
+
+class Truth:
+    """Contacts, clearance and path of the robot. `update` once a tick.
+
+    contacts: how often the robot touched something else than the floor; sliding along one thing
+    is one contact, touching it again half a second later another. touching: right now.
+    min_clearance_m: the least distance from the robot's outline to anything, sampled at 10 Hz,
+    0 in contact. distance_m: the length of the path of the base's origin.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._model, self._data = model, data
+        self._base = model.body(f"{ROBOT}base").id
+        self._velocity = model.joint(f"{ROBOT}free").dofadr[0]
+        self._is_robot = model.body_rootid[model.geom_bodyid] == self._base
+        floor = model.geom(FLOOR).id
+        self._is_obstacle = ~self._is_robot & (model.geom_contype != 0)
+        self._is_obstacle[floor] = False
+        self._obstacles = np.flatnonzero(self._is_obstacle)
+        self._hull = [
+            geom for geom in range(model.ngeom) if model.geom(geom).name.startswith(f"{ROBOT}hull_")
+        ]
+        self._half_sizes = _half_sizes(model, self._obstacles)
+        self._last_touch: dict[int, int] = {}
+        self._ticks = 0
+        self.contacts, self.touching = 0, False
+        self.min_clearance_m, self.distance_m = FAR_M, 0.0
+        mujoco.mj_forward(model, data)
+        self.footprint = self._measure_footprint()
+        self._reach = math.hypot(
+            max(self.footprint.front, -self.footprint.rear), self.footprint.half_width
+        )
+        self._position = self.pose()
+        self._touch()
+        self._clear()
+
+    def pose(self) -> Pose:
+        """Where the base is in the world."""
+        x, y, _ = self._data.xpos[self._base].tolist()
+        forward = self._data.xmat[self._base]
+        return Pose(x, y, math.atan2(forward[3], forward[0]))
+
+    def speed(self) -> tuple[float, float]:
+        """(forward [m/s], turning [rad/s]) of the base."""
+        x, y, _, _, _, turning = self._data.qvel[self._velocity : self._velocity + 6].tolist()
+        yaw = self.pose().yaw
+        return math.cos(yaw) * x + math.sin(yaw) * y, turning
+
+    def update(self) -> None:
+        """Take in the tick that was just simulated."""
+        self._ticks += 1
+        pose = self.pose()
+        self.distance_m += math.hypot(pose.x - self._position.x, pose.y - self._position.y)
+        self._position = pose
+        self._touch()
+        if self._ticks % CLEARANCE_TICKS == 0:
+            self._clear()
+
+    def _touch(self) -> None:
+        """Count contacts between the robot and obstacles that begin in this tick."""
+        pairs = self._data.contact.geom
+        with_obstacle = self._is_obstacle[pairs].any(axis=1)
+        self.touching = bool(with_obstacle.any())
+        if not self.touching:
+            return
+        self.min_clearance_m = 0.0
+        for pair in pairs[with_obstacle]:
+            thing = int(pair[self._is_obstacle[pair]][0])
+            if self._ticks - self._last_touch.get(thing, -APART_TICKS) >= APART_TICKS:
+                self.contacts += 1
+            self._last_touch[thing] = self._ticks
+
+    def _clear(self) -> None:
+        """Measure what may be nearer than the nearest so far, exactly."""
+        for thing in self._obstacles[self._lower_bounds() < self.min_clearance_m]:
+            for hull in self._hull:
+                limit = self.min_clearance_m
+                gap = mujoco.mj_geomDistance(self._model, self._data, hull, thing, limit, None)
+                self.min_clearance_m = max(min(gap, limit), 0.0)
+
+    def _lower_bounds(self) -> NDArray[np.float64]:
+        """At least this far is each obstacle from the robot [m], by boxes and a circle round it."""
+        things = self._obstacles
+        offset = self._data.xpos[self._base, :2] - self._data.geom_xpos[things, :2]
+        axes = self._data.geom_xmat[things].reshape(-1, 3, 3)[:, :2, :2]
+        beside = np.abs(np.einsum("nij,ni->nj", axes, offset)) - self._half_sizes
+        beside = np.maximum(beside, 0.0)
+        return np.asarray(np.hypot(beside[:, 0], beside[:, 1]) - self._reach)
+
+    def _measure_footprint(self) -> Footprint:
+        """The rectangle round the hull in the base's frame."""
+        model, boxes = self._model, [_half_sizes(self._model, [geom])[0] for geom in self._hull]
+        middles = [model.geom_pos[geom] for geom in self._hull]
+        pairs = list(zip(middles, boxes, strict=True))
+        front = max(float(middle[0] + half[0]) for middle, half in pairs)
+        rear = min(float(middle[0] - half[0]) for middle, half in pairs)
+        return Footprint(front, rear, max(float(abs(m[1]) + half[1]) for m, half in pairs))
+
+
+def _half_sizes(model: mujoco.MjModel, geoms: NDArray[np.int64] | list[int]) -> NDArray[np.float64]:
+    """Half the size of each upright geom along its own x and y (n, 2) [m]."""
+    size = model.geom_size[geoms][:, :2].copy()
+    round_ones = model.geom_type[geoms] != mujoco.mjtGeom.mjGEOM_BOX
+    size[round_ones, 1] = size[round_ones, 0]
+    return np.asarray(size, np.float64)

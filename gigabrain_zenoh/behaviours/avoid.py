@@ -1,0 +1,94 @@
+"""Drive straight on; turn on the spot while something is ahead; wait while nothing is known."""
+
+import math
+
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.brain import Intent, TrajectoryPoint, WorldModel
+from gigabrain_zenoh.behaviours import Situation
+from gigabrain_zenoh.settings import DecisionConfig
+
+HORIZON_S, STEP_S = 2.0, 0.25  # how far ahead the expected trajectory reaches, and how finely
+OPEN_M = 2.5  # how far a straight leg is expected to go where nothing is in sight [m]
+TURN_RAD = math.pi / 2  # how far a turn is expected to go
+
+
+class Avoid:
+    """The simplest behaviour that keeps a robot moving and whole."""
+
+    def __init__(self, config: DecisionConfig) -> None:
+        self._config = config
+        self._doing = "waiting"
+        self._began = Pose(x=0.0, y=0.0, yaw=0.0)
+        self._expected = 1.0  # [m] straight on, [rad] turning
+
+    def step(self, situation: Situation) -> Intent:
+        """What to do now, with the reason in words."""
+        world = situation.world
+        if world is None:
+            return self._wait("waiting: perception is silent")
+        if not world.scan_ok:
+            return self._wait(f"waiting: {world.scan_problem}")
+        if world.obstacle_ahead:
+            return self._turn(world, situation.pose)
+        return self._straight(world, situation.pose)
+
+    def _wait(self, reason: str) -> Intent:
+        self._doing = "waiting"
+        return Intent(twist=Velocity(), behaviour="avoid", reason=reason)
+
+    def _straight(self, world: WorldModel, pose: Pose) -> Intent:
+        if self._doing != "forward":
+            free = world.sectors[0] if world.sectors else None
+            self._begin("forward", pose, free or OPEN_M)
+        done = math.hypot(pose.x - self._began.x, pose.y - self._began.y)
+        speed = self._config.linear_speed
+        return self._intent(Velocity(linear_x=speed), done, f"forward {speed:.2f} m/s")
+
+    def _turn(self, world: WorldModel, pose: Pose) -> Intent:
+        if not self._doing.startswith("turning"):
+            self._begin(f"turning {self._side(world)}", pose, TURN_RAD)
+        done = abs(math.remainder(pose.yaw - self._began.yaw, 2 * math.pi))
+        sign = 1.0 if self._doing == "turning left" else -1.0
+        what = "obstacle"
+        if world.distance_ahead is not None:
+            what = f"obstacle {world.distance_ahead:.2f} m ahead"
+        twist = Velocity(angular_z=sign * self._config.angular_speed)
+        return self._intent(twist, done, f"{self._doing}: {what}")
+
+    def _side(self, world: WorldModel) -> str:
+        if self._config.turn != "clearer":
+            return self._config.turn
+        half = len(world.sectors) // 2
+        free = [math.inf if d is None else d for d in world.sectors]
+        left, right = free[1:half], free[half + 1 :]
+        return "left" if sum(_nearer(left)) > sum(_nearer(right)) else "right"
+
+    def _begin(self, doing: str, pose: Pose, expected: float) -> None:
+        self._doing, self._began, self._expected = doing, pose, max(expected, 0.1)
+
+    def _intent(self, twist: Velocity, done: float, reason: str) -> Intent:
+        return Intent(
+            twist=twist,
+            trajectory=expected_trajectory(twist),
+            progress=min(1.0, done / self._expected),
+            behaviour="avoid",
+            reason=reason,
+        )
+
+
+def expected_trajectory(twist: Velocity) -> tuple[TrajectoryPoint, ...]:
+    """Where a constant twist leads from the present pose, as an arc in the body's frame."""
+    v, w = twist.linear_x, twist.angular_z
+    points = []
+    for i in range(1, round(HORIZON_S / STEP_S) + 1):
+        t = i * STEP_S
+        yaw = w * t
+        x = v * t if abs(w) < 1e-6 else v / w * math.sin(yaw)
+        y = 0.0 if abs(w) < 1e-6 else v / w * (1 - math.cos(yaw))
+        points.append(TrajectoryPoint(t=t, x=x, y=y, yaw=yaw))
+    return tuple(points)
+
+
+def _nearer(distances: list[float]) -> list[float]:
+    """Free distances, none counting for more than a room's width."""
+    return [min(d, OPEN_M) for d in distances]

@@ -1,0 +1,28 @@
+"""Why a robot is held back: codes for programs, sentences for people."""
+
+from gigabrain_schemas.base import Cause
+
+BOOT = Cause(code="boot", text="just started; nobody has released it yet")
+SILENCE = Cause(code="silence", text="no good command for 100 ms")
+STALE = Cause(code="stale", text="commands rest on sensor data that is too old")
+SAFETY_SILENT = Cause(code="safety_silent", text="the safety process is silent")
+NOT_FINITE = Cause(code="nan", text="the commander sent a value that is not a number")
+NAN_STORM = Cause(
+    code="nan_storm", text="the commander kept sending values that are not numbers", latching=True
+)
+LINK_LOST = Cause(code="link_lost", text="the body does not answer")
+
+
+def estop(source: str) -> Cause:
+    """An e-stop, by whom."""
+    return Cause(code="estop", text=f"e-stop pressed by {source}"[:500], latching=True)
+
+
+def latching(causes: tuple[Cause, ...]) -> tuple[Cause, ...]:
+    """Those of `causes` that only a person releases."""
+    return tuple(cause for cause in causes if cause.latching)
+
+
+def in_words(causes: tuple[Cause, ...]) -> str:
+    """`causes` as one phrase."""
+    return "; ".join(cause.text for cause in causes)

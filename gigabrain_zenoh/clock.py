@@ -1,0 +1,70 @@
+"""Time. Everything that waits or measures takes a Clock, so tests can run without waiting."""
+
+import asyncio
+import heapq
+import itertools
+import time
+from collections.abc import AsyncIterator
+
+
+class Clock:
+    """The host's clocks."""
+
+    def now_ns(self) -> int:
+        """Nanoseconds since an arbitrary start; never goes backwards."""
+        return time.monotonic_ns()
+
+    def unix_ns(self) -> int:
+        """Nanoseconds since 1970, for people and recordings; jumps whenever the clock is set."""
+        return time.time_ns()
+
+    async def sleep_ns(self, duration_ns: int) -> None:
+        """Let other tasks run for `duration_ns`."""
+        await asyncio.sleep(duration_ns / 1e9)
+
+    async def every(self, period_ns: int) -> AsyncIterator[int]:
+        """Yield the current time [ns] each period. Missed periods are skipped, not caught up."""
+        due = self.now_ns()
+        while True:
+            yield self.now_ns()
+            due = max(due + period_ns, self.now_ns())
+            await self.sleep_ns(due - self.now_ns())
+
+
+class FakeClock(Clock):
+    """A clock the test moves. Sleepers wake in order of their due time, so runs repeat exactly."""
+
+    def __init__(self) -> None:
+        self._now = 0
+        self._sleepers: list[tuple[int, int, asyncio.Future[None]]] = []
+        self._count = itertools.count()
+
+    def now_ns(self) -> int:
+        """Current fake time [ns]."""
+        return self._now
+
+    def unix_ns(self) -> int:
+        """Current fake time after 2001-09-09 [ns]."""
+        return 1_000_000_000_000_000_000 + self._now
+
+    async def sleep_ns(self, duration_ns: int) -> None:
+        """Wait until the test has moved the clock far enough."""
+        wake: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        heapq.heappush(self._sleepers, (self._now + duration_ns, next(self._count), wake))
+        await wake
+
+    async def advance(self, duration_ns: int) -> None:
+        """Move time forward, waking sleepers on the way."""
+        end = self._now + duration_ns
+        await self._settle()
+        while self._sleepers and self._sleepers[0][0] <= end:
+            due, _, wake = heapq.heappop(self._sleepers)
+            self._now = max(self._now, due)
+            if not wake.done():
+                wake.set_result(None)
+            await self._settle()
+        self._now = end
+
+    async def _settle(self) -> None:
+        for _ in range(10):  # more hand-overs than any node needs between two sleeps
+            await asyncio.sleep(0)

@@ -1,0 +1,43 @@
+"""Messages to bytes and back. Whatever a decoder lets through here is valid."""
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+import msgspec
+
+from gigabrain_schemas.base import Message
+
+M = TypeVar("M", bound=Message)
+
+# everything that msgspec raises on hostile input (facts: it is four exceptions, not one)
+DECODE_ERRORS = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+
+encode = msgspec.msgpack.Encoder().encode
+
+
+def encoding_of(message: type[Message]) -> str:
+    """The Zenoh encoding of a message type."""
+    return f"application/msgpack;gigabrain.{message.__name__}"
+
+
+class Codec(Generic[M]):
+    """Decodes one message type, from MessagePack or from JSON."""
+
+    def __init__(self, message: type[M], max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._msgpack: Callable[[bytes], M] = msgspec.msgpack.Decoder(message).decode
+        self._json: Callable[[bytes], M] = msgspec.json.Decoder(message).decode
+
+    def decode(self, payload: bytes, encoding: str) -> M:
+        """The message in `payload`. Raises ValueError with a sentence when it is not a valid one.
+
+        A payload that begins with a brace is JSON whatever its encoding says, since foreign
+        clients rarely set one; no MessagePack map begins with that byte.
+        """
+        if len(payload) > self._max_bytes:
+            raise ValueError(f"{len(payload)} bytes, at most {self._max_bytes} are read")
+        is_json = payload[:1] == b"{" or encoding.startswith(("application/json", "text/json"))
+        try:
+            return self._json(payload) if is_json else self._msgpack(payload)
+        except DECODE_ERRORS as error:
+            raise ValueError(str(error)) from None

@@ -1,0 +1,53 @@
+"""The tree of errors that a user may see. Each says in one line what would have been right.
+
+GigabrainError
+├── ConfigError       a file or an option is wrong (exit code 2)
+│   └── UnknownName   no such robot, world, driver, process or behaviour
+├── BusError          the router is missing, or its port is taken
+├── Refused           the robot said no, and why
+├── Unsupported       the body has no such primitive
+└── BodyLost          the body no longer answers
+"""
+
+import difflib
+from collections.abc import Iterable
+
+
+class GigabrainError(Exception):
+    """Anything that this project raises on purpose. `str()` is one line for people."""
+
+    exit_code = 1
+
+
+class ConfigError(GigabrainError):
+    """A configuration that cannot be used; names the file, the line and what was expected."""
+
+    exit_code = 2
+
+
+class UnknownName(ConfigError):
+    """A name that nothing here answers to."""
+
+
+class BusError(GigabrainError):
+    """The bus cannot be reached or cannot be opened."""
+
+
+class Refused(GigabrainError):
+    """The robot was asked for something and said no."""
+
+
+class Unsupported(GigabrainError):
+    """This body does not have the primitive that was called."""
+
+
+class BodyLost(GigabrainError):
+    """The body no longer answers. The process ends; its supervisor starts it again."""
+
+
+def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownName:
+    """The error for a name that is not among `known`, with the nearest one as a suggestion."""
+    names = sorted(known)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    hint = f"; did you mean {close[0]!r}?" if close else ";"
+    return UnknownName(f"no {kind} {name!r}{hint} known: {', '.join(names)}")

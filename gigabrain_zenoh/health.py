@@ -1,0 +1,82 @@
+"""How a process is doing: once a second on `robot/health/<process>`, and whenever it is asked."""
+
+import os
+import resource
+import socket
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+from gigabrain_schemas.requests import DescribeRequest, Description
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import DESCRIBE, HEALTH
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.version import __version__
+
+PERIOD_NS = 1_000_000_000
+ASK_S = 0.3  # how long another process of the same name may take to answer
+
+
+def rss_bytes() -> int:
+    """Memory that this process holds now; where /proc is missing, the most it ever held."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return peak if sys.platform == "darwin" else peak * 1024
+    return pages * resource.getpagesize()
+
+
+async def answer_to_name(bus: Bus) -> None:
+    """Answer `robot/describe/<process>`. Raises ConfigError where another one does already."""
+    others = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=ASK_S, name=bus.process)
+    if others:
+        other = others[0]
+        raise ConfigError(
+            f"a {bus.process} is already running here (pid {other.pid} on {other.host}); "
+            "stop it, or give this robot a namespace of its own"
+        )
+
+    async def describe(_: DescribeRequest) -> Description:
+        return Description(
+            process=bus.process,
+            pid=os.getpid(),
+            host=socket.gethostname(),
+            version=__version__,
+            publishes=tuple(sorted(bus.sent)),
+            subscribes=tuple(sorted(bus.listens)),
+            report=dict(bus.report()),
+        )
+
+    bus.serve(DESCRIBE, describe, name=bus.process)
+
+
+async def publish_health(bus: Bus) -> None:
+    """Until cancelled."""
+    host, pid, began = socket.gethostname(), os.getpid(), bus.clock.now_ns()
+    then, cpu = began, time.process_time()
+    received, sent = Counter[str](), Counter[str]()
+    async for now in bus.clock.every(PERIOD_NS):
+        seconds = max((now - then) / 1e9, 1e-3)
+        used = time.process_time()
+        message = Health(
+            process=bus.process,
+            pid=pid,
+            host=host,
+            uptime_s=(now - began) / 1e9,
+            cpu=(used - cpu) / seconds,
+            rss_bytes=rss_bytes(),
+            received_hz=_rates(bus.received, received, seconds),
+            sent_hz=_rates(bus.sent, sent, seconds),
+            rejected=dict(bus.rejected),
+            latency_ms=dict(bus.latency_ms),
+            counters=dict(bus.counters),
+        )
+        then, cpu, received, sent = now, used, bus.received.copy(), bus.sent.copy()
+        bus.publish(HEALTH, message, name=bus.process)
+
+
+def _rates(now: Counter[str], before: Counter[str], seconds: float) -> dict[str, float]:
+    return {key: round((count - before[key]) / seconds, 2) for key, count in now.items()}

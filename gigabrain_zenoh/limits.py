@@ -1,0 +1,67 @@
+"""How fast a body may go, and how fast it may change that. Pure functions."""
+
+import msgspec
+
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.safety import SpeedCaps
+
+ZERO = Velocity()
+NO_CAPS = SpeedCaps()
+
+
+class Limits(msgspec.Struct, frozen=True, kw_only=True):
+    """The limits of one body."""
+
+    linear_speed: float  # [m/s]
+    lateral_speed: float  # [m/s]
+    angular_speed: float  # [rad/s]
+    linear_acceleration: float  # [m/s2]
+    linear_deceleration: float  # [m/s2]
+    angular_acceleration: float  # [rad/s2], both ways
+
+
+def limits_of(body: BodyDescription) -> Limits:
+    """The limits that a body's file states."""
+    return Limits(
+        linear_speed=body.max_linear_speed,
+        lateral_speed=body.max_lateral_speed,
+        angular_speed=body.max_angular_speed,
+        linear_acceleration=body.max_linear_acceleration,
+        linear_deceleration=body.max_linear_deceleration,
+        angular_acceleration=body.max_angular_acceleration,
+    )
+
+
+def clamp(velocity: Velocity, limits: Limits, caps: SpeedCaps = NO_CAPS) -> Velocity:
+    """`velocity` within the body's speeds and the caps of the moment, axis by axis."""
+    return Velocity(
+        linear_x=_within(velocity.linear_x, limits.linear_speed, caps.backward, caps.forward),
+        linear_y=_within(velocity.linear_y, limits.lateral_speed, caps.right, caps.left),
+        angular_z=_within(velocity.angular_z, limits.angular_speed, caps.rotation, caps.rotation),
+    )
+
+
+def ramp(current: Velocity, target: Velocity, limits: Limits, dt: float) -> Velocity:
+    """What `current` can become within `dt` [s] on the way to `target`."""
+    up, down = limits.linear_acceleration * dt, limits.linear_deceleration * dt
+    turn = limits.angular_acceleration * dt
+    return Velocity(
+        linear_x=_approach(current.linear_x, target.linear_x, up, down),
+        linear_y=_approach(current.linear_y, target.linear_y, up, down),
+        angular_z=_approach(current.angular_z, target.angular_z, turn, turn),
+    )
+
+
+def _within(value: float, limit: float, below: float | None, above: float | None) -> float:
+    lowest = -limit if below is None else -min(limit, below)
+    highest = limit if above is None else min(limit, above)
+    return max(lowest, min(highest, value))
+
+
+def _approach(current: float, target: float, up: float, down: float) -> float:
+    """One step. It ends at zero on the way to the other side: braking comes first."""
+    if current * target < 0:
+        target = 0.0
+    step = up if abs(target) > abs(current) else down
+    return max(current - step, min(current + step, target))

@@ -1,0 +1,175 @@
+"""What every process is made of: logs, a session, health, and a node that runs until it is told.
+
+Started as `python -m gigabrain_zenoh.process CONFIG`, with a ProcessConfig in JSON.
+"""
+
+import asyncio
+import contextlib
+import functools
+import gc
+import importlib
+import logging
+import os
+import signal
+import sys
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gigabrain_schemas.topics import LOG
+from gigabrain_zenoh import lifeline, logs
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import GigabrainError, unknown
+from gigabrain_zenoh.health import answer_to_name, publish_health
+from gigabrain_zenoh.zenoh_transport import Endpoint, ZenohTransport
+
+log = logging.getLogger("gigabrain")
+
+Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
+PATIENCE_S = 1.0  # how long the router may be missing before somebody is told
+
+
+@dataclass(frozen=True)
+class Program:
+    """Where a process's node is, and the settings it takes, if any; imported only when used."""
+
+    run: str
+    settings: str = ""
+
+
+PROGRAMS = {
+    "router": Program("gigabrain_zenoh.router:run"),
+    "driver": Program("gigabrain_drivers.process:run", "gigabrain_zenoh.settings:DriverConfig"),
+    "perception": Program(
+        "gigabrain_zenoh.perception:run", "gigabrain_zenoh.settings:PerceptionConfig"
+    ),
+    "decision": Program("gigabrain_zenoh.decision:run", "gigabrain_zenoh.settings:DecisionConfig"),
+    "control": Program("gigabrain_zenoh.control:run"),
+    "safety": Program("gigabrain_zenoh.safety:run"),
+}
+
+
+class ProcessConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Everything that one process has to know."""
+
+    name: str
+    endpoint: Endpoint
+    settings: dict[str, Any] = msgspec.field(default_factory=dict)
+    run_dir: str | None = None  # where its log file goes; none without
+    json_console: bool = False  # for a supervisor to read
+    level: str = "info"
+
+
+def find(path: str) -> Any:
+    """The object at "module:name"."""
+    module, _, name = path.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def node_of(config: ProcessConfig) -> Node:
+    """The node with its settings filled in. Raises ConfigError, and UnknownName."""
+    if config.name not in PROGRAMS:
+        raise unknown("process", config.name, PROGRAMS)
+    program = PROGRAMS[config.name]
+    run = find(program.run)
+    if not program.settings:
+        return run  # type: ignore[no-any-return]
+    return functools.partial(run, msgspec.convert(config.settings, find(program.settings)))
+
+
+def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
+    """uvloop's event loop where it is installed, else asyncio's own."""
+    try:
+        return find("uvloop:new_event_loop")  # type: ignore[no-any-return]
+    except ModuleNotFoundError:
+        return None
+
+
+def run(config: ProcessConfig) -> int:
+    """Run one process to its end; the exit code."""
+    try:
+        run_dir = Path(config.run_dir) if config.run_dir else None
+        logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
+        node = node_of(config)
+        with asyncio.Runner(loop_factory=loop_factory()) as runner:
+            runner.run(_run(config, node))
+    except GigabrainError as error:
+        log.error("%s", error, extra={"data": {"event": "failed"}})
+        return error.exit_code
+    except Exception:
+        log.critical("died of an error in the program", exc_info=True)
+        return 1
+    return 0
+
+
+async def _run(config: ProcessConfig, node: Node) -> None:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    work = asyncio.ensure_future(_work(config, node))
+    stopped = asyncio.ensure_future(stop.wait())
+    await asyncio.wait((work, stopped), return_when=asyncio.FIRST_COMPLETED)
+    work.cancel()
+    stopped.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await work
+
+
+async def _work(config: ProcessConfig, node: Node) -> None:
+    bus = Bus(await _connect(config.endpoint), Clock(), config.name)
+    handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
+    logging.getLogger().addHandler(handler)
+    try:
+        await answer_to_name(bus)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(publish_health(bus))
+            tasks.create_task(_node(bus, node))
+    except* GigabrainError as group:
+        raise group.exceptions[0] from None
+    finally:
+        logging.getLogger().removeHandler(handler)
+        await bus.close()
+
+
+async def _node(bus: Bus, node: Node) -> None:
+    await node(bus, _ready)
+
+
+def _ready() -> None:
+    gc.collect()
+    gc.freeze()  # what set-up made stays: collections look at new objects only
+    log.info("ready", extra={"data": {"event": "ready", "pid": os.getpid()}})
+
+
+async def _connect(endpoint: Endpoint) -> ZenohTransport:
+    """Open the session, and say so once when that takes longer than a person would wait."""
+    opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
+    done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
+    if not done:
+        where = ", ".join(endpoint.connect) or ", ".join(endpoint.listen)
+        log.warning(
+            "no router at %s yet; waiting for it (start one with: gigabrain router)",
+            where,
+            extra={"data": {"event": "waiting"}},
+        )
+    try:
+        return await opening
+    finally:
+        opening.cancel()
+
+
+def main() -> None:
+    """Entry of a supervised process."""
+    lifeline.die_with_supervisor()
+    code = run(msgspec.json.decode(sys.argv[1], type=ProcessConfig))
+    logging.shutdown()
+    sys.stdout.flush()
+    os._exit(code)  # Zenoh's threads must not keep a finished process alive
+
+
+if __name__ == "__main__":
+    main()

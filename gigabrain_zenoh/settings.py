@@ -1,0 +1,43 @@
+"""The settings of the processes. Kept apart, so that reading a deployment file needs no numpy."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
+
+from gigabrain_schemas.base import NonNegative, Positive
+
+LinkName = Literal["sim", "emulated", "real"]
+Resume = Literal["auto", "manual"]
+
+
+class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The `perception` part of a deployment file."""
+
+    sector_deg: Annotated[float, Meta(gt=0, le=360)] = 30.0  # [deg], the cone that counts as ahead
+    ahead: Positive = 1.0  # [m], how far it reaches
+    ignore_below: NonNegative = 0.1  # [m], nearer hits are the lidar's own housing
+    corridor: NonNegative = 0.45  # [m], length of the strip ahead that must be free to turn in
+    turning_room: NonNegative = 0.04  # [m], kept free round the circle that a turning body sweeps
+    sectors: Annotated[int, Meta(ge=4, le=360)] = 12  # all round, the first centred ahead
+
+
+class DecisionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The `decision` part of a deployment file."""
+
+    behaviour: str = "avoid"
+    turn: Literal["right", "left", "clearer"] = "right"
+    linear_speed: Annotated[float, Meta(gt=0, le=10)] = 0.2  # [m/s]
+    angular_speed: Annotated[float, Meta(gt=0, le=10)] = 0.5  # [rad/s]
+
+
+class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The settings of the driver process."""
+
+    body: str
+    link: LinkName = "sim"
+    world: str = "arena"
+    seed: Annotated[int, Meta(ge=0, le=2**32)] = 0
+    speed: Positive = 1.0  # of real time; other than 1 means lock-step
+    seconds: Positive | None = None  # of simulated time, then the body holds still
+    resume: Resume = "manual"
+    state_dir: str  # where it remembers what latched it

@@ -1,0 +1,123 @@
+"""Runs the processes of one host: starts them in readiness order, and ends them all."""
+
+import asyncio
+import graphlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Self
+
+from gigabrain_zenoh import errors
+from gigabrain_zenoh.backoff import Backoff
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.keeper import Keeper, OnRecord, ProcessSpec, ProcessStatus, Shared, State
+
+__all__ = ["Backoff", "OnRecord", "ProcessSpec", "ProcessStatus", "State", "Supervisor"]
+
+# Shares of the time that a stop may take, after which the processes are killed, and then left to
+# the kernel. The router goes last, so the others are hurried when there is one.
+_FIRST, _REAPED, _LAST = 0.55, 0.65, 0.85
+
+
+class Supervisor:
+    """Runs processes until told to stop; used once. Leaves none behind, however it ends."""
+
+    def __init__(
+        self, specs: Sequence[ProcessSpec], on_record: OnRecord, backoff: Backoff | None = None
+    ) -> None:
+        _check(specs)
+        self._shared = Shared(on_record, backoff or Backoff())
+        self._keepers = {spec.name: Keeper(spec, self._shared) for spec in specs}
+        self.statuses: Mapping[str, ProcessStatus] = {
+            name: keeper.status for name, keeper in self._keepers.items()
+        }
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._stopping: asyncio.Task[None] | None = None
+
+    @property
+    def deaths(self) -> int:
+        """How often a process has ended that nobody had asked to."""
+        return sum(keeper.deaths for keeper in self._keepers.values())
+
+    @property
+    def given_up(self) -> tuple[str, ...]:
+        """Names of the processes that are not started any more."""
+        return tuple(name for name, status in self.statuses.items() if status.state == "given up")
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.stop()
+
+    async def run(self) -> None:
+        """Keep all processes running until `stop()` or cancellation, both of which end them."""
+        self._tasks = {
+            name: asyncio.create_task(keeper.run([self._keepers[n] for n in keeper.spec.after]))
+            for name, keeper in self._keepers.items()
+        }
+        halted = asyncio.create_task(self._shared.halt.wait())
+        try:
+            # a keeper ends when all are told to; before that it can only fail
+            await asyncio.wait([halted, *self._tasks.values()], return_when="FIRST_EXCEPTION")
+        finally:
+            await self.stop()
+            await halted
+
+    async def stop(self, within_s: float = 1.5) -> None:
+        """End all processes within `within_s`, politely at first, also those that hang."""
+        if self._stopping is None:
+            self._stopping = asyncio.create_task(self._stop(within_s))
+        await asyncio.shield(self._stopping)
+
+    async def _stop(self, within_s: float) -> None:
+        begin_s, keepers = asyncio.get_running_loop().time(), self._keepers.values()
+        self._shared.halt.set()
+        for keeper in keepers:
+            keeper.settled.set()
+        try:
+            async with self._shared.starting:  # whatever is being started now has a pid after this
+                running = [keeper for keeper in keepers if keeper.child]
+            last = [keeper for keeper in running if keeper.spec.stop_last]
+            first = [keeper for keeper in running if not keeper.spec.stop_last]
+            if last:
+                await self._end(first, begin_s + _FIRST * within_s, begin_s + _REAPED * within_s)
+            await self._end(last or first, begin_s + _LAST * within_s, begin_s + within_s)
+            for task in self._tasks.values():
+                if task.done():
+                    task.result()
+        finally:
+            for keeper in keepers:
+                if keeper.child:
+                    keeper.child.abandon()
+
+    async def _end(self, keepers: Sequence[Keeper], kill_s: float, leave_s: float) -> None:
+        """Ask, kill at `kill_s` what has not ended, go on at `leave_s` regardless (loop times)."""
+        for keeper in keepers:
+            keeper.ask_to_end()
+        await self._wait_for(keepers, kill_s)
+        for keeper in keepers:
+            keeper.force_to_end()
+        await self._wait_for(keepers, leave_s)
+
+    async def _wait_for(self, keepers: Sequence[Keeper], until_s: float) -> None:
+        tasks = [self._tasks[keeper.spec.name] for keeper in keepers]
+        if tasks:
+            left_s = until_s - asyncio.get_running_loop().time()
+            await asyncio.wait(tasks, timeout=max(left_s, 0.0))
+
+
+def _check(specs: Sequence[ProcessSpec]) -> None:
+    """Refuse names that are used twice, that nobody has, or that wait for each other."""
+    after = {spec.name: spec.after for spec in specs}
+    for name, times in Counter(spec.name for spec in specs).items():
+        if times > 1:
+            raise ConfigError(f"{times} processes are called {name!r}; expected one")
+    for others in after.values():
+        for other in others:
+            if other not in after:
+                raise errors.unknown("process", other, after)
+    try:
+        graphlib.TopologicalSorter(after).prepare()
+    except graphlib.CycleError as error:
+        circle = " after ".join(reversed(error.args[1]))
+        raise ConfigError(f"no process can be first: {circle}; expected an order") from None

@@ -1,0 +1,129 @@
+"""What perception, decision and control tell one another."""
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from gigabrain_schemas.base import (
+    Count,
+    Finite,
+    Fraction,
+    Message,
+    Name,
+    NonNegative,
+    Positive,
+    Record,
+    Text,
+    Velocity,
+)
+
+
+class Obstacle(Record, frozen=True, kw_only=True):
+    """Something that perception follows from scan to scan."""
+
+    id: Count
+    x: Finite  # [m], in the frame of the odometry
+    y: Finite  # [m]
+    velocity_x: Finite = 0.0  # [m/s]
+    velocity_y: Finite = 0.0  # [m/s]
+    radius: NonNegative  # [m]
+    covariance: tuple[Finite, ...] = ()  # of (x, y, velocity_x, velocity_y), 16 values by row
+
+
+class WorldModel(Message, frozen=True, kw_only=True):
+    """What is round the robot now, in the body's frame."""
+
+    scan_ok: bool
+    scan_problem: Text = ""  # why the scan cannot be believed
+    obstacle_ahead: bool  # true as well while that is unknown
+    distance_ahead: NonNegative | None = None  # [m] to the nearest hit ahead; None: none or unknown
+    sectors: tuple[NonNegative | None, ...] = ()
+    # [m], nearest hit per equal sector, counter-clockwise, the first centred ahead; None for none
+    obstacles: tuple[Obstacle, ...] = ()
+
+
+class PoseInMap(Message, frozen=True, kw_only=True):
+    """Where the robot is in the map."""
+
+    x: Finite  # [m]
+    y: Finite  # [m]
+    yaw: Finite  # [rad]
+    covariance: Annotated[tuple[Finite, ...], Meta(min_length=9, max_length=9)]  # of x, y, yaw
+    localized: bool = True
+
+
+class OccupancyGrid(Message, frozen=True, kw_only=True):
+    """A map. The last value is kept for those who join late."""
+
+    resolution: Positive  # [m] per cell
+    width: Count  # cells
+    height: Count  # cells
+    origin_x: Finite  # [m], of the corner of cell (0, 0)
+    origin_y: Finite  # [m]
+    cells: bytes  # int8, (height, width) by row: 0 free to 100 occupied, -1 unknown
+
+    def __post_init__(self) -> None:
+        if len(self.cells) != self.width * self.height:
+            raise ValueError(f"{self.width} x {self.height} cells but {len(self.cells)} bytes")
+
+
+class TrajectoryPoint(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+    """A pose that decision expects the body to have, in the body's frame of now."""
+
+    t: NonNegative  # [s] from now
+    x: Finite  # [m]
+    y: Finite  # [m]
+    yaw: Finite  # [rad]
+
+
+class JointTarget(Record, frozen=True, kw_only=True):
+    """Where one joint should go."""
+
+    name: Name
+    position: Finite  # [rad] or [m]
+
+
+class Intent(Message, frozen=True, kw_only=True):
+    """What decision wants, what it expects to come of it, and why."""
+
+    twist: Velocity | None = None
+    joints: tuple[JointTarget, ...] = ()
+    trajectory: Annotated[tuple[TrajectoryPoint, ...], Meta(max_length=256)] = ()
+    progress: Fraction = 0.0  # how far the present step has come, as expected against as measured
+    behaviour: Name
+    reason: Text  # in words, for people
+
+
+class Twist(Message, frozen=True, kw_only=True):
+    """A velocity that an operator asks for."""
+
+    linear_x: Finite  # [m/s]
+    linear_y: Finite = 0.0  # [m/s]
+    angular_z: Finite = 0.0  # [rad/s]
+
+
+class CmdVel(Message, frozen=True, kw_only=True):
+    """A velocity that the gate is asked to let through to the body."""
+
+    linear_x: Finite  # [m/s]
+    linear_y: Finite = 0.0  # [m/s]
+    angular_z: Finite = 0.0  # [rad/s]
+    source: Name = ""  # who commands
+
+
+class JointCommand(Message, frozen=True, kw_only=True):
+    """Where, or how fast, the joints should move; one of position and velocity per name."""
+
+    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=128)]
+    position: tuple[Finite, ...] = ()  # [rad] or [m]
+    velocity: tuple[Finite, ...] = ()  # [rad/s] or [m/s]
+    source: Name = ""
+
+    def __post_init__(self) -> None:
+        lengths = sorted((len(self.position), len(self.velocity)))
+        if lengths != [0, len(self.name)]:
+            raise ValueError(
+                f"{len(self.name)} names need as many positions or velocities, "
+                f"got {len(self.position)} and {len(self.velocity)}"
+            )

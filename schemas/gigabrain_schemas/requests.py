@@ -1,0 +1,83 @@
+"""What may be asked of a robot, and what it answers."""
+
+from msgspec import field
+
+from gigabrain_schemas.base import Count, Finite, Message, Name, Text
+from gigabrain_schemas.body import GateStatus
+
+
+class EstopRequest(Message, frozen=True, kw_only=True):
+    """Stop at once, and stay stopped until a person releases it. An empty request will do."""
+
+    source: Name = "anonymous"
+    reason: Text = ""
+
+
+class ReleaseRequest(Message, frozen=True, kw_only=True):
+    """Let go of a latched gate. It does not move the robot: that takes an enable as well."""
+
+    estop_generation: Count  # as seen in robot/state, so that nobody releases a stop unseen
+    source: Name = "anonymous"
+
+
+class EnableRequest(Message, frozen=True, kw_only=True):
+    """Open the gate for the commands of one source."""
+
+    source: Name  # "control" for the robot's own brain
+    take: bool = False  # even when somebody else holds the body
+
+
+class GateReply(Message, frozen=True, kw_only=True):
+    """What the gate made of a request."""
+
+    ok: bool
+    text: Text  # a sentence for people
+    robot_type: Name
+    gate: GateStatus
+
+
+class GoalRequest(Message, frozen=True, kw_only=True):
+    """Go there."""
+
+    x: Finite  # [m], in the map
+    y: Finite  # [m]
+    yaw: Finite | None = None  # [rad]; None for any
+
+
+class GoalReply(Message, frozen=True, kw_only=True):
+    """Whether the robot will go there."""
+
+    ok: bool
+    text: Text
+    goal: Name = ""  # the goal's name, to cancel it by
+
+
+class MissionRequest(Message, frozen=True, kw_only=True):
+    """Carry out a mission."""
+
+    mission: str  # the YAML text
+    source: Name = "anonymous"
+
+
+class MissionReply(Message, frozen=True, kw_only=True):
+    """Whether the robot will carry it out."""
+
+    ok: bool
+    text: Text
+
+
+class DescribeRequest(Message, frozen=True, kw_only=True):
+    """Who are you? An empty request will do."""
+
+
+class Description(Message, frozen=True, kw_only=True):
+    """What a process is, and figures that only it knows."""
+
+    process: Name
+    pid: Count
+    host: Name
+    version: Name
+    publishes: tuple[str, ...] = ()
+    subscribes: tuple[str, ...] = ()
+    report: dict[str, float | int | str | None] = field(default_factory=dict)
+    # of a simulation: its truth, for reports only

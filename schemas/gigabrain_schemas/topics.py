@@ -1,0 +1,97 @@
+"""The one table of topics. Adding a topic means adding a line here, and nowhere else."""
+
+from dataclasses import dataclass
+from typing import Any, Generic, Literal, TypeVar
+
+from gigabrain_schemas import body, brain, requests, safety, sensors
+from gigabrain_schemas.base import Message
+
+M = TypeVar("M", bound=Message)
+Q = TypeVar("Q", bound=Message)
+R = TypeVar("R", bound=Message)
+
+KB = 1024
+Priority = Literal["real_time", "interactive_high", "data_high", "data", "background"]
+
+
+@dataclass(frozen=True, slots=True)
+class Topic(Generic[M]):
+    """A named stream of one message type at a promised rate."""
+
+    key: str  # Zenoh key expression, below the robot's namespace
+    type: type[M]
+    hz: float  # promised rate, which decides how long a value counts
+    missed: float = 5.0  # periods without a message after which the last one no longer counts
+    priority: Priority = "data"
+    congestion: Literal["drop", "block"] = "drop"
+    express: bool = False  # not batched: for small messages that must not wait
+    keep: bool = False  # the last value is kept for those who join late
+    depth: int = 1  # messages that wait for a busy reader; the oldest give way
+    max_bytes: int = 4 * KB  # larger ones are not even decoded
+    many: bool = False  # one key per camera or process below this one
+
+    @property
+    def stale_after_ns(self) -> int:
+        """Age from which the newest message no longer counts [ns]."""
+        return round(self.missed / self.hz * 1e9)
+
+    def at(self, name: str = "") -> str:
+        """The key of this topic; of the camera or process `name` where there are many."""
+        return f"{self.key}/{name}" if self.many else self.key
+
+
+@dataclass(frozen=True, slots=True)
+class Service(Generic[Q, R]):
+    """A named question and its answer."""
+
+    key: str
+    request: type[Q]
+    reply: type[R]
+    many: bool = False
+
+    def at(self, name: str = "") -> str:
+        """The key of this service; at the process `name` where there are many."""
+        return f"{self.key}/{name}" if self.many else self.key
+
+
+SCAN = Topic("robot/scan", sensors.LaserScan, 10, missed=2.5, max_bytes=64 * KB)
+IMU = Topic("robot/imu", sensors.Imu, 100)
+STATE = Topic(
+    "robot/state", body.RobotState, 50, missed=12.5, keep=True,
+    max_bytes=32 * KB,
+)  # fmt: skip
+BODY = Topic("robot/body", body.Body, 1, keep=True, max_bytes=16 * KB)
+IMAGE = Topic("robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True)
+WORLD = Topic("robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB)
+POSE = Topic("robot/pose", brain.PoseInMap, 10)
+MAP = Topic("robot/map", brain.OccupancyGrid, 1, keep=True, max_bytes=1024 * KB)
+INTENT = Topic("robot/intent", brain.Intent, 50, max_bytes=16 * KB)
+TELEOP = Topic("robot/teleop", brain.Twist, 20, priority="interactive_high", max_bytes=KB)
+CMD_VEL = Topic(
+    "robot/cmd_vel", brain.CmdVel, 50, priority="real_time", express=True, depth=16, max_bytes=KB
+)
+JOINT_CMD = Topic(
+    "robot/joint_cmd", brain.JointCommand, 50, priority="real_time", express=True, depth=16
+)
+SAFETY = Topic(
+    "robot/safety", safety.SafetyState, 20, missed=3, priority="real_time", express=True,
+    max_bytes=16 * KB,
+)  # fmt: skip
+HEALTH = Topic(
+    "robot/health", safety.Health, 1, priority="background", many=True, depth=32, max_bytes=16 * KB
+)
+LOG = Topic("robot/log", safety.LogRecord, 10, priority="background", depth=256, max_bytes=16 * KB)
+
+TOPICS: tuple[Topic[Any], ...] = (
+    SCAN, IMU, STATE, BODY, IMAGE, WORLD, POSE, MAP, INTENT, TELEOP, CMD_VEL, JOINT_CMD, SAFETY,
+    HEALTH, LOG,
+)  # fmt: skip
+
+ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply)
+RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply)
+ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply)
+GOAL = Service("robot/goal", requests.GoalRequest, requests.GoalReply)
+MISSION = Service("robot/mission", requests.MissionRequest, requests.MissionReply)
+DESCRIBE = Service("robot/describe", requests.DescribeRequest, requests.Description, many=True)
+
+SERVICES: tuple[Service[Any, Any], ...] = (ESTOP, RELEASE, ENABLE, GOAL, MISSION, DESCRIBE)
