@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_drivers.sim.geometry import Footprint, Pose
-from gigabrain_drivers.sim.scene import FLOOR, ROBOT
+from gigabrain_drivers.sim.looks import FLOOR
+from gigabrain_drivers.sim.scene import ROBOT
 from gigabrain_drivers.sim.tick import TICK_NS
 
 APART_TICKS = 500_000_000 // TICK_NS  # contact again after half a second is a new contact
@@ -27,11 +28,11 @@ class Truth:
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._model, self._data = model, data
         self._base = model.body(f"{ROBOT}base").id
+        self._place = model.joint(f"{ROBOT}free").qposadr[0]
         self._velocity = model.joint(f"{ROBOT}free").dofadr[0]
-        self._is_robot = model.body_rootid[model.geom_bodyid] == self._base
-        floor = model.geom(FLOOR).id
-        self._is_obstacle = ~self._is_robot & (model.geom_contype != 0)
-        self._is_obstacle[floor] = False
+        is_robot = model.body_rootid[model.geom_bodyid] == self._base
+        self._is_obstacle = ~is_robot & (model.geom_contype != 0)
+        self._is_obstacle[model.geom(FLOOR).id] = False
         self._obstacles = np.flatnonzero(self._is_obstacle)
         self._hull = [
             geom for geom in range(model.ngeom) if model.geom(geom).name.startswith(f"{ROBOT}hull_")
@@ -52,9 +53,9 @@ class Truth:
 
     def pose(self) -> Pose:
         """Where the base is in the world."""
-        x, y, _ = self._data.xpos[self._base].tolist()
-        forward = self._data.xmat[self._base]
-        return Pose(x, y, math.atan2(forward[3], forward[0]))
+        x, y, _, *quaternion = self._data.qpos[self._place : self._place + 7].tolist()
+        a, b, c, d = quaternion
+        return Pose(x, y, math.atan2(2 * (a * d + b * c), 1 - 2 * (c * c + d * d)))
 
     def speed(self) -> tuple[float, float]:
         """(forward [m/s], turning [rad/s]) of the base."""
