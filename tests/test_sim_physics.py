@@ -1,4 +1,4 @@
-"""The simulated bodies: driving, odometry, wear, truth, and the same numbers from the same seed."""
+"""The simulated bodies: driving, odometry, wear, and the same numbers from the same seed."""
 
 import logging
 import math
@@ -201,46 +201,6 @@ def test_a_stalled_motor_gets_warmer_than_a_free_one() -> None:
     assert free.wheels()[0].temperature == pytest.approx(25.6, abs=0.5)
     assert stalled.wheels()[0].temperature > free.wheels()[0].temperature + 0.5
     assert abs(stalled.wheels()[0].effort) > 0.2
-
-
-def test_a_push_against_a_wall_is_one_contact_and_the_bumper_feels_it() -> None:
-    simulation = Simulation(waffle(), room(Box(0.6, 0, 0.1, 1, 0.5)), 0)
-    assert simulation.truth.min_clearance_m == pytest.approx(0.5 - 0.069, abs=1e-3)
-    simulation.command(0.2, 0.0)
-    run(simulation, 1)
-    assert (simulation.truth.contacts, simulation.bumper()) == (0, False)
-    run(simulation, 4)
-    assert (simulation.truth.contacts, simulation.bumper()) == (1, True)
-    assert simulation.truth.min_clearance_m == 0.0
-    assert simulation.odometry().x > simulation.truth.pose().x + 0.05
-
-
-def test_backing_off_and_touching_again_is_a_second_contact() -> None:
-    simulation = Simulation(waffle(), room(Box(0.3, 0, 0.1, 1, 0.5)), 0)
-    for speed in (0.2, -0.2, 0.2, 0.2):
-        simulation.command(speed, 0.0)
-        run(simulation, 1.5)
-    assert simulation.truth.contacts == 2
-
-
-def test_passing_close_is_measured_to_a_millimetre_and_is_no_contact() -> None:
-    simulation = Simulation(waffle(), room(Box(1.0, 0.3035, 0.1, 0.1, 0.5)), 0)
-    simulation.command(0.26, 0.0)
-    run(simulation, 6)
-    assert simulation.truth.contacts == 0
-    assert simulation.truth.min_clearance_m == pytest.approx(0.05, abs=2e-3)
-
-
-def test_the_person_counts_as_a_contact_and_never_comes_nearer_by_himself() -> None:
-    path = ((3.0, 0.0), (-3.0, 0.0), (-3.0, 3.0), (3.0, 3.0))
-    world = replace(room(), path=path)
-    standing = Simulation(waffle(), world, 0)
-    run(standing, 5)
-    assert standing.truth.contacts == 0
-    assert standing.truth.min_clearance_m == pytest.approx(0.5, abs=0.01)
-    standing.command(0.2, 0.0)
-    run(standing, 4)
-    assert standing.truth.contacts == 1
 
 
 def test_the_same_seed_and_commands_give_the_same_bits() -> None:
