@@ -47,7 +47,7 @@ async def answer_to_name(bus: Bus) -> None:
             version=__version__,
             publishes=tuple(sorted(bus.sent)),
             subscribes=tuple(sorted(bus.listens)),
-            report=dict(bus.report()),
+            report={"rejected_messages": bus.rejected.total(), **bus.report()},
         )
 
     bus.serve(DESCRIBE, describe, name=bus.process)

@@ -181,7 +181,7 @@ def new_run_dir(base: Path | None, label: str) -> Path:
 
     Raises ConfigError when it cannot be created.
     """
-    base = base or _state_dir() / "gigabrain" / "runs"
+    base = base or state_dir() / "runs"
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     name = f"{stamp}-{re.sub(r'[^A-Za-z0-9._-]+', '-', label)}-{os.getpid()}"
     path, n = base / name, 1
@@ -196,12 +196,13 @@ def new_run_dir(base: Path | None, label: str) -> Path:
             raise _unwritable(base, error) from None
 
 
-def _state_dir() -> Path:
+def state_dir() -> Path:
+    """Where runs and robots leave what they have to remember (XDG). Raises ConfigError."""
     given = os.environ.get("XDG_STATE_HOME", "")
     if os.path.isabs(given):  # the XDG base directory specification ignores relative paths
-        return Path(given)
+        return Path(given) / "gigabrain"
     try:
-        return Path.home() / ".local" / "state"
+        return Path.home() / ".local" / "state" / "gigabrain"
     except RuntimeError:
         raise ConfigError("there is no home folder; set XDG_STATE_HOME to a folder") from None
 

@@ -25,7 +25,9 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, unknown
 from gigabrain_zenoh.health import answer_to_name, publish_health
-from gigabrain_zenoh.zenoh_transport import Endpoint, ZenohTransport
+from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 log = logging.getLogger("gigabrain")
 
@@ -51,17 +53,6 @@ PROGRAMS = {
     "control": Program("gigabrain_zenoh.control:run"),
     "safety": Program("gigabrain_zenoh.safety:run"),
 }
-
-
-class ProcessConfig(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Everything that one process has to know."""
-
-    name: str
-    endpoint: Endpoint
-    settings: dict[str, Any] = msgspec.field(default_factory=dict)
-    run_dir: str | None = None  # where its log file goes; none without
-    json_console: bool = False  # for a supervisor to read
-    level: str = "info"
 
 
 def find(path: str) -> Any:

@@ -8,6 +8,16 @@ from gigabrain_schemas.base import NonNegative, Positive
 
 LinkName = Literal["sim", "emulated", "real"]
 Resume = Literal["auto", "manual"]
+Seed = Annotated[int, Meta(ge=0, le=2**32)]
+Speed = Annotated[float, Meta(ge=0.1, le=100)]  # of real time; other than 1 means lock-step
+
+
+class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Where a process finds the others."""
+
+    connect: tuple[str, ...] = ()  # Zenoh endpoints, such as tcp/127.0.0.1:7447
+    listen: tuple[str, ...] = ()  # of a router
+    namespace: str = ""  # the robot's own part of the key space
 
 
 class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -36,8 +46,8 @@ class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     body: str
     link: LinkName = "sim"
     world: str = "arena"
-    seed: Annotated[int, Meta(ge=0, le=2**32)] = 0
-    speed: Positive = 1.0  # of real time; other than 1 means lock-step
+    seed: Seed = 0
+    speed: Speed = 1.0
     seconds: Positive | None = None  # of simulated time, then the body holds still
     resume: Resume = "manual"
     state_dir: str  # where it remembers what latched it

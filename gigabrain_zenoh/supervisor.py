@@ -43,6 +43,12 @@ class Supervisor:
         """Names of the processes that are not started any more."""
         return tuple(name for name, status in self.statuses.items() if status.state == "given up")
 
+    @property
+    def misconfigured(self) -> tuple[str, ...]:
+        """Names of those given up because what they were given is wrong (exit code 2)."""
+        given_up = (self.statuses[name] for name in self.given_up)
+        return tuple(s.name for s in given_up if s.last_exit == ConfigError.exit_code)
+
     async def __aenter__(self) -> Self:
         return self
 

@@ -13,6 +13,7 @@ from gigabrain_drivers.base import Driver
 from gigabrain_drivers.robot import LINKS, RobotFile, Run
 from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.settings import LinkName
 
 
 def robot_files() -> dict[str, Path]:
@@ -34,6 +35,11 @@ def robot_path(name: str) -> Path:
 def load_robot(name: str) -> RobotFile:
     """Read a robot's file. Raises ConfigError with file, line and what was expected."""
     return config.load(robot_path(name), RobotFile)
+
+
+def links_of(robot: RobotFile) -> list[LinkName]:
+    """By which links a robot can be reached."""
+    return [name for name in LINKS if getattr(robot, name) is not None]
 
 
 def driver_class(name: str) -> type[Driver]:
@@ -62,7 +68,7 @@ def make_driver(name: str, run: Run) -> tuple[RobotFile, Driver]:
     robot = config.load(path, RobotFile)
     link = getattr(robot, run.link)
     if link is None:
-        has = ", ".join(n for n in LINKS if getattr(robot, n) is not None) or "none"
+        has = ", ".join(links_of(robot)) or "none"
         raise ConfigError(f"{path.parent.name} has no link {run.link!r}; it has: {has}")
     driver = driver_class(str(link.get("driver")))
     # read once more, now that it is known what this driver's part looks like: errors name the line

@@ -70,7 +70,7 @@ class MujocoDriver(Driver):
             raise ConfigError(f"speed must be {SPEEDS[0]:g} to {SPEEDS[1]:g}, got {run.speed:g}")
         self.lockstep = run.speed != 1.0
         world = load_world(run.world, run.seed)
-        self._simulation = Simulation(_sim_body(robot, options, run), world, run.seed)
+        self._simulation = Simulation(sim_body(robot, options, run), world, run.seed)
         period_ns = 1e9 / robot.lidar.rate_hz if robot.lidar else math.inf
         self._scan_ticks = period_ns / TICK_NS
         self._next_scan = self._scan_ticks
@@ -254,7 +254,8 @@ class MujocoDriver(Driver):
         )
 
 
-def _sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimBody:
+def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimBody:
+    """The body as the simulation wants it. Raises ConfigError when there is no model."""
     path = run.folder / options.model
     try:
         model = path.read_text(encoding="utf-8")

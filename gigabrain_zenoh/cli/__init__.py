@@ -1,0 +1,1 @@
+"""The `gigabrain` command. Each group of commands is a module that is imported when it is used."""

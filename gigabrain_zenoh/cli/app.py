@@ -1,0 +1,65 @@
+"""The table of commands. Importing it is what `gigabrain --help` costs: keep it light."""
+
+import os
+import sys
+
+from cyclopts import App
+
+from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.version import __version__
+
+COMMANDS = "gigabrain_zenoh.cli"
+
+
+def make_app() -> App:
+    """All commands, by name, with the module that holds each."""
+    app = App(
+        name="gigabrain",
+        help="A robot brain of three systems that any body can wear.",
+        version=__version__,
+    )
+    lazy = (
+        ("demo", "run:demo", "Drive a simulated robot round a room, until Ctrl-C."),
+        ("up", "run:up", "Start what a deployment file puts on this host, and keep it running."),
+        ("router", "process:router", "Start the router that joins the other processes."),
+        ("perception", "process:perception", "Start perception."),
+        ("decision", "process:decision", "Start decision."),
+        ("control", "process:control", "Start control."),
+        ("safety", "process:safety", "Start safety."),
+        ("estop", "operate:estop", "Stop the robot at once, and latch it."),
+        ("release", "operate:release", "Let go of a latched gate."),
+        ("enable", "operate:enable", "Let the robot's brain drive."),
+        ("robots", "names:robots", "List the robots that there are."),
+        ("worlds", "names:worlds", "List the simulated worlds that there are."),
+        ("view", "view:view", "Draw a robot in its world into a PNG file."),
+    )
+    for name, where, summary in lazy:
+        app.command(f"{COMMANDS}.{where}", name=name, help=summary)
+    groups = (
+        ("driver", "run", "process:driver", "Drivers of bodies.", "Start the driver of a body."),
+        ("schema", "export", "schema:export", "Messages.", "Write JSON Schema of every message."),
+    )
+    for group, name, where, about, summary in groups:
+        sub = App(name=group, help=about)
+        sub.command(f"{COMMANDS}.{where}", name=name, help=summary)
+        app.command(sub)
+    bench = App(name="bench", help="Measure this machine.")
+    bench.command(f"{COMMANDS}.bench:chain", name="chain", help="From scan to command, timed.")
+    bench.command(f"{COMMANDS}.bench:stack", name="stack", help="CPU, memory and time to start.")
+    app.command(bench)
+    app.command(f"{COMMANDS}.completion:completion", name="completion", help="Shell completion.")
+    return app
+
+
+def main() -> None:
+    """Entry of the `gigabrain` command."""
+    try:
+        code = make_app()(sys.argv[1:], result_action="return_value")
+    except GigabrainError as error:
+        print(f"gigabrain: {error}", file=sys.stderr)
+        code = error.exit_code
+    except KeyboardInterrupt:
+        code = 130
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code if isinstance(code, int) else 0)  # Zenoh's threads must not hold it back

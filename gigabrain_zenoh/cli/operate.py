@@ -1,0 +1,78 @@
+"""`gigabrain estop`, `release` and `enable`: what a person asks of the gate."""
+
+import asyncio
+import getpass
+import time
+from collections.abc import Awaitable, Callable
+
+from gigabrain_schemas.requests import GateReply
+from gigabrain_zenoh.client import Robot
+from gigabrain_zenoh.client import connect as connect_robot
+from gigabrain_zenoh.gate import BRAIN
+
+
+def estop(*, connect: str | None = None, namespace: str = "", reason: str = "") -> int:
+    """Stop the robot at once, and latch it.
+
+    Example: gigabrain estop --reason "somebody is in the way"
+
+    Parameters
+    ----------
+    connect
+        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
+    namespace
+        The robot's own part of the key space.
+    reason
+        For the log.
+    """
+    return _ask(connect, namespace, lambda robot: robot.estop(reason), "CONFIRMED by ")
+
+
+def release(*, connect: str | None = None, namespace: str = "") -> int:
+    """Let go of a latched gate. It takes an enable as well to move.
+
+    Example: gigabrain release
+
+    Parameters
+    ----------
+    connect
+        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
+    namespace
+        The robot's own part of the key space.
+    """
+    return _ask(connect, namespace, lambda robot: robot.release())
+
+
+def enable(*, connect: str | None = None, namespace: str = "", take: bool = False) -> int:
+    """Let the robot's brain drive.
+
+    Example: gigabrain enable
+
+    Parameters
+    ----------
+    connect
+        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
+    namespace
+        The robot's own part of the key space.
+    take
+        Even when somebody else drives.
+    """
+    return _ask(connect, namespace, lambda robot: robot.enable(BRAIN, take=take))
+
+
+def _ask(
+    connect: str | None,
+    namespace: str,
+    ask: Callable[[Robot], Awaitable[GateReply]],
+    prefix: str = "",
+) -> int:
+    async def run() -> None:
+        source = f"{getpass.getuser()}-cli"
+        async with connect_robot(connect, namespace=namespace, source=source) as robot:
+            began = time.perf_counter()
+            reply = await ask(robot)
+            took_ms = (time.perf_counter() - began) * 1e3
+            print(f"{prefix}{reply.robot_type}: {reply.text} ({took_ms:.0f} ms)")
+
+    asyncio.run(run())
+    return 0

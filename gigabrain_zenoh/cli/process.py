@@ -1,0 +1,150 @@
+"""One command per process, for whoever starts them one by one, or on several hosts."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from cyclopts import Parameter
+
+from gigabrain_zenoh.logs import state_dir
+from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.settings import DriverConfig, Endpoint, LinkName, Resume
+
+ROUTER = "tcp/127.0.0.1:7447"
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Place:
+    """Where a process meets the others, and where it logs."""
+
+    connect: str = ROUTER
+    "The router's Zenoh endpoint."
+    namespace: str = ""
+    "The robot's own part of the key space, where one router serves several robots."
+    run_dir: Path | None = None
+    "Write a log file into this folder."
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    "The least level of what is logged."
+
+
+HERE = Place()
+
+
+def router(*, listen: str = ROUTER, place: Annotated[Place, Parameter(show=False)] = HERE) -> int:
+    """Start the router that joins the other processes.
+
+    Example: gigabrain router --listen tcp/127.0.0.1:7447
+
+    Parameters
+    ----------
+    listen
+        The Zenoh endpoint to listen on.
+    """
+    return _run("router", place, {}, Endpoint(listen=(listen,), namespace=place.namespace))
+
+
+def perception(*, place: Place = HERE) -> int:
+    """Start perception: scans become what is round the robot.
+
+    Example: gigabrain perception --connect tcp/192.168.1.10:7447
+    """
+    return _run("perception", place, {})
+
+
+def decision(
+    *,
+    behaviour: str = "avoid",
+    turn: Literal["right", "left", "clearer"] = "right",
+    place: Place = HERE,
+) -> int:
+    """Start decision: what is round the robot becomes what to do.
+
+    Example: gigabrain decision --turn clearer
+
+    Parameters
+    ----------
+    behaviour
+        What it does.
+    turn
+        Which way it turns from an obstacle.
+    """
+    return _run("decision", place, {"behaviour": behaviour, "turn": turn})
+
+
+def control(*, place: Place = HERE) -> int:
+    """Start control: what to do becomes smooth commands.
+
+    Example: gigabrain control
+    """
+    return _run("control", place, {})
+
+
+def safety(*, place: Place = HERE) -> int:
+    """Start safety: it listens to all and says how fast the body may move.
+
+    Example: gigabrain safety
+    """
+    return _run("safety", place, {})
+
+
+def driver(
+    name: str,
+    *,
+    link: LinkName = "sim",
+    world: str = "arena",
+    seed: int = 0,
+    speed: float = 1.0,
+    resume: Resume = "manual",
+    remember: Path | None = None,
+    place: Place = HERE,
+) -> int:
+    """Start the driver of a body.
+
+    Example: gigabrain driver run turtlebot3_waffle --world house --resume auto
+
+    Parameters
+    ----------
+    name
+        A known robot, or the path of a robot's YAML file.
+    link
+        How to reach it.
+    world
+        Where a simulated one drives.
+    seed
+        For the start pose and the noise of a simulated one.
+    speed
+        Simulated over real time; other than 1, time waits for the brain.
+    resume
+        Whether it goes on by itself after a stop that has passed.
+    remember
+        The folder for what must survive a restart: what latched it.
+    """
+    label = place.namespace or Path(name).stem
+    settings = DriverConfig(
+        body=name,
+        link=link,
+        world=world,
+        seed=seed,
+        speed=speed,
+        resume=resume,
+        state_dir=str(remember or state_dir() / "robots" / label),
+    )
+    return _run("driver", place, msgspec.to_builtins(settings))
+
+
+def _run(
+    name: str, place: Place, settings: dict[str, Any], endpoint: Endpoint | None = None
+) -> int:
+    from gigabrain_zenoh.process import run
+
+    return run(
+        ProcessConfig(
+            name=name,
+            endpoint=endpoint or Endpoint(connect=(place.connect,), namespace=place.namespace),
+            settings=settings,
+            run_dir=str(place.run_dir) if place.run_dir else None,
+            level=place.level,
+        )
+    )

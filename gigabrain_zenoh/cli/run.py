@@ -1,0 +1,105 @@
+"""`gigabrain demo` and `gigabrain up`: a whole robot."""
+
+import asyncio
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from gigabrain_zenoh.deployment import Deployment, host_of, load_deployment
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.settings import LinkName, Resume
+
+
+def demo(
+    *,
+    body: str = "turtlebot3_waffle",
+    link: LinkName = "sim",
+    world: str = "arena",
+    seconds: float | None = None,
+    seed: int = 0,
+    speed: float = 1.0,
+    turn: Literal["right", "left", "clearer"] = "right",
+    resume: Resume = "auto",
+    headless: bool = False,
+    report: Path | None = None,
+) -> int:
+    """Drive a simulated robot round a room, until Ctrl-C.
+
+    Example: gigabrain demo --world house --seconds 60 --speed 5 --headless --report run.json
+
+    Ends with 1 after any contact, without motion, or when a process has died.
+
+    Parameters
+    ----------
+    body
+        Which robot; see `gigabrain robots`.
+    link
+        How to reach it.
+    world
+        Where it drives; see `gigabrain worlds`.
+    seconds
+        End after this much simulated time [s].
+    seed
+        For the start pose and the noise of the sensors.
+    speed
+        Simulated over real time; other than 1, time waits for the brain.
+    turn
+        Which way it turns from an obstacle.
+    resume
+        Whether it goes on by itself after a stop that has passed.
+    headless
+        Progress in a line instead of the live view.
+    report
+        Write what the run came to, as JSON, into this file.
+    """
+    from gigabrain_zenoh.demo import Demo, DemoOptions
+
+    if seconds is not None and not 0 < seconds < 1e7:
+        raise ConfigError(f"--seconds: expected a number above 0, got {seconds:g}")
+    values = {
+        "body": body,
+        "link": link,
+        "world": world,
+        "seed": seed,
+        "speed": speed,
+        "resume": resume,
+        "router": "tcp/127.0.0.1:0",
+        "decision": {"turn": turn},
+    }
+    deployment = _checked(values)
+    options = DemoOptions(seconds=seconds, headless=headless, report=report)
+    return asyncio.run(Demo(deployment, options).run())
+
+
+def up(deployment: str, *, host: str | None = None, level: str = "info") -> int:
+    """Start what a deployment file puts on this host, and keep it running until Ctrl-C.
+
+    Example: gigabrain up deploy/demo.yaml
+
+    Parameters
+    ----------
+    deployment
+        A deployment file.
+    host
+        Which of the file's hosts this is; needed where it has several.
+    level
+        The least level of what is logged: debug, info, warning or error.
+    """
+    from gigabrain_zenoh.launch import up as run
+
+    loaded = load_deployment(deployment)
+    return asyncio.run(run(loaded, host_of(loaded, host), _say, level))
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
+
+
+def _checked(values: dict[str, object]) -> Deployment:
+    try:
+        return msgspec.convert(values, Deployment)
+    except msgspec.ValidationError as error:
+        text, _, path = str(error).partition(" - at `$.")
+        name = path.rstrip("`")
+        raise ConfigError(f"--{name}: {text}" if name else text) from None

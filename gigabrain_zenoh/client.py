@@ -1,0 +1,231 @@
+"""The robot from a script or a notebook: the primitives of the HAL, over Zenoh."""
+
+import asyncio
+import os
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import TypeVar
+
+from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.body import Joint, RobotState
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.topics import (
+    BODY,
+    CMD_VEL,
+    ENABLE,
+    ESTOP,
+    RELEASE,
+    STATE,
+    TOPICS,
+    Service,
+    Topic,
+)
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import BodyLost, BusError, Refused, Unsupported, unknown
+from gigabrain_zenoh.limits import ZERO, clamp, limits_of
+from gigabrain_zenoh.running import find_endpoint
+
+M = TypeVar("M", bound=Message)
+Q = TypeVar("Q", bound=Message)
+
+HOLD_TICKS = 50  # a velocity lasts one second of the robot's time unless it is asked for again
+ROUTER_S, ANSWER_S = 3.0, 1.0  # how long a router, and a robot, may take to answer
+ROOM = 64  # messages that wait for a slow `async for`; the oldest give way
+
+
+@asynccontextmanager
+async def connect(
+    connect: str | None = None, *, namespace: str = "", source: str = "", take: bool = False
+) -> AsyncIterator["Robot"]:
+    """A robot to drive and to listen to.
+
+    `connect` is its router's Zenoh endpoint; without it, the only robot that runs on this machine.
+    `source` is the name under which the gate knows this script; with `take` it takes the body over
+    from whoever drives. Raises BusError when there is no router, BodyLost when there is no driver.
+    """
+    from gigabrain_zenoh.zenoh_transport import ZenohTransport  # takes a while: only when used
+
+    endpoint = find_endpoint(connect, namespace)
+    try:
+        transport = await asyncio.wait_for(ZenohTransport.open(endpoint), ROUTER_S)
+    except TimeoutError:
+        where = endpoint.connect[0]
+        raise BusError(f"no router answers at {where}; is the robot running?") from None
+    bus = Bus(transport, Clock(), source or f"script-{os.getpid()}")
+    try:
+        robot = Robot(bus, take=take)
+        await robot.read_state()
+        yield robot
+        await robot.stop()
+    finally:
+        await bus.close()
+
+
+class Robot:
+    """One robot. Commands go out at 50 Hz with the echo that the gate asks for."""
+
+    def __init__(self, bus: Bus, *, take: bool = False) -> None:
+        self._bus, self._take = bus, take
+        self._states = bus.latest(STATE, self._repeat)
+        self._bodies = bus.latest(BODY)
+        self._target: Velocity | None = None
+        self._until_tick = 0
+        self._arrived = asyncio.Event()
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float = 0.0, angular_z: float = 0.0
+    ) -> Velocity:
+        """Drive [m/s, m/s, rad/s] for one second, or until the next call; returns what was asked.
+
+        What was asked is what the body's limits leave of it. The first call asks the gate for the
+        body. Raises Refused, with the gate's reason, when it does not let this script drive.
+        """
+        state, body = await self.read_state(), self._bodies.current
+        wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
+        if body:
+            wanted = clamp(wanted, limits_of(body.description))
+        if state.gate.commander != self._bus.process or state.gate.mode != "enabled":
+            await self.enable(take=self._take)
+        self._target, self._until_tick = wanted, self._bus.time.tick + HOLD_TICKS
+        self._send()
+        return wanted
+
+    async def drive(self, linear_x: float = 0.0, angular_z: float = 0.0, *, seconds: float) -> None:
+        """Drive for `seconds` of the robot's time, then stop. Raises Refused, and BodyLost."""
+        start = (await self.read_state()).tick
+        last = start + round(seconds * 50)
+        while (left := last - self._bus.time.tick) > 0:
+            await self.set_base_velocity(linear_x, 0.0, angular_z)
+            await self._ticks(min(left, HOLD_TICKS // 2))
+        await self.stop()
+
+    async def stop(self) -> None:
+        """Come to rest, if this script drives."""
+        if self._target is None:
+            return
+        self._target, self._until_tick = ZERO, self._bus.time.tick + HOLD_TICKS
+        for _ in range(HOLD_TICKS):
+            state = self._states.fresh()
+            at_rest = state and abs(state.velocity.linear_x) + abs(state.velocity.angular_z) < 0.02
+            if state is None or at_rest:
+                break
+            await self._ticks(1)
+        self._target = None
+
+    async def enable(self, source: str = "", *, take: bool = False) -> GateReply:
+        """Ask the gate for the body, for this script or for `source`. Raises Refused, and why."""
+        request = EnableRequest(source=source or self._bus.process, take=take)
+        return self._granted(await self._ask(ENABLE, request))
+
+    async def release(self) -> GateReply:
+        """Let go of a latched gate; it takes an enable as well to move. Raises Refused."""
+        generation = (await self.read_state()).gate.estop_generation
+        request = ReleaseRequest(estop_generation=generation, source=self._bus.process)
+        return self._granted(await self._ask(RELEASE, request))
+
+    async def estop(self, reason: str = "") -> GateReply:
+        """Stop at once and latch. Raises BodyLost when no body has confirmed it."""
+        request = EstopRequest(source=self._bus.process, reason=reason)
+        return await self._ask(ESTOP, request)
+
+    async def read_state(self) -> RobotState:
+        """What the body measures. Raises BodyLost when it is silent for a second."""
+        if self._states.fresh() is None:
+            await self._ticks(1)
+        state = self._states.fresh()
+        if state is None:
+            raise BodyLost("no robot/state; is the driver running?")
+        return state
+
+    async def get_joint_states(self) -> tuple[Joint, ...]:
+        """All joints as measured. Raises BodyLost."""
+        return (await self.read_state()).joints
+
+    async def set_joint_position(self, joint_name: str, position: float) -> float:
+        """No driver obeys joint commands yet: raises Unsupported."""
+        state = await self.read_state()
+        raise Unsupported(f"{state.robot_type} has no joint that can be positioned")
+
+    async def get_sensor_data(self, sensor_name: str) -> Message:
+        """The next reading of `scan`, `imu` or any other topic. Raises BodyLost after a second."""
+        readings: AsyncIterator[Message] = self.topic(sensor_name)
+        try:
+            return await asyncio.wait_for(anext(readings), ANSWER_S)
+        except TimeoutError:
+            raise BodyLost(f"nobody sends robot/{sensor_name}") from None
+
+    def topic(self, topic: Topic[M] | str) -> AsyncIterator[M]:
+        """Every message on a topic from now on: `async for scan in robot.topic("scan")`.
+
+        Raises UnknownName for a topic that is not in the table.
+        """
+        return self._listen(_topic(topic))
+
+    async def _listen(self, topic: Topic[M]) -> AsyncIterator[M]:
+        waiting: deque[M] = deque(maxlen=ROOM)
+        arrived = asyncio.Event()
+
+        def take(_key: str, message: M) -> None:
+            waiting.append(message)
+            arrived.set()
+
+        close = self._bus.subscribe(topic, take)
+        try:
+            while True:
+                while waiting:
+                    yield waiting.popleft()
+                arrived.clear()
+                await arrived.wait()
+        finally:
+            close()
+
+    def _repeat(self, _: RobotState) -> None:
+        self._arrived.set()
+        self._send()
+
+    def _send(self) -> None:
+        target = self._target
+        if target is None:
+            return
+        if self._bus.time.tick > self._until_tick:
+            target = ZERO
+        command = CmdVel(
+            linear_x=target.linear_x,
+            linear_y=target.linear_y,
+            angular_z=target.angular_z,
+            source=self._bus.process,
+        )
+        self._bus.publish(CMD_VEL, command)
+
+    async def _ticks(self, count: int) -> None:
+        """Let the robot's time go on by `count` states, or a second of ours."""
+        for _ in range(count):
+            self._arrived.clear()
+            try:
+                await asyncio.wait_for(self._arrived.wait(), ANSWER_S)
+            except TimeoutError:
+                raise BodyLost("robot/state has stopped; is the driver running?") from None
+
+    async def _ask(self, service: Service[Q, GateReply], request: Q) -> GateReply:
+        replies = await self._bus.ask(service, request, timeout_s=ANSWER_S)
+        if not replies:
+            raise BodyLost(f"NOT CONFIRMED: no driver answers {service.key}")
+        return replies[0]
+
+    @staticmethod
+    def _granted(reply: GateReply) -> GateReply:
+        if not reply.ok:
+            raise Refused(f"{reply.robot_type}: {reply.text}")
+        return reply
+
+
+def _topic(topic: Topic[M] | str) -> Topic[M]:
+    if isinstance(topic, Topic):
+        return topic
+    known: dict[str, Topic[M]] = {t.key.removeprefix("robot/"): t for t in TOPICS}
+    if topic.removeprefix("robot/") not in known:
+        raise unknown("topic", topic, known)
+    return known[topic.removeprefix("robot/")]

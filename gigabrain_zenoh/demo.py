@@ -1,0 +1,158 @@
+"""The demo: a whole robot on this machine, watched until it is stopped or its time is over."""
+
+import asyncio
+import contextlib
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from msgspec import Struct
+
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.deployment import Deployment, client_endpoint, process_specs, with_free_port
+from gigabrain_zenoh.errors import BodyLost, ConfigError
+from gigabrain_zenoh.launch import STOP_S, stop_signals
+from gigabrain_zenoh.live_view import HeadlessView, LiveView, View
+from gigabrain_zenoh.logs import new_run_dir
+from gigabrain_zenoh.report import Report, make_report, summary, write_report
+from gigabrain_zenoh.running import announced
+from gigabrain_zenoh.supervisor import Supervisor
+from gigabrain_zenoh.watch import Watch
+from gigabrain_zenoh.zenoh_transport import ZenohTransport
+
+LOOK_S = 0.1  # how often the run is looked at
+STALLED_S = 60.0  # without a tick of the robot's clock
+
+
+class DemoOptions(Struct, frozen=True, kw_only=True):
+    """How the demo is run."""
+
+    seconds: float | None = None  # of the robot's time; None for until Ctrl-C
+    headless: bool = False
+    report: Path | None = None
+
+
+class Demo:
+    """One run."""
+
+    def __init__(self, deployment: Deployment, options: DemoOptions) -> None:
+        self._deployment, self._options = with_free_port(deployment), options
+        self._run_dir = new_run_dir(None, "demo")
+        specs = process_specs(
+            self._deployment,
+            "robot",
+            self._run_dir,
+            self._run_dir / "state",
+            seconds=options.seconds,
+        )
+        self._supervisor = Supervisor(specs, self._record)
+        self._decisions: list[tuple[float, str]] = []
+        self._failures: list[str] = []
+        self._refusal = ""  # what a process said before it ended
+        self._faults: list[str] = []
+
+    async def run(self) -> int:
+        """The exit code: 0 for a run without contact, with motion, with all processes alive.
+
+        A run that a person ends is not judged. Raises GigabrainError when it cannot be started.
+        """
+        label = f"{self._deployment.body} in {self._deployment.world}"
+        endpoint = client_endpoint(self._deployment)
+        with stop_signals() as stop, announced(label, endpoint):
+            async with self._supervisor:
+                running = asyncio.ensure_future(self._supervisor.run())
+                bus = await self._join(stop)
+                try:
+                    report = await self._watch(Watch(bus), stop) if bus else None
+                finally:
+                    closing = asyncio.ensure_future(bus.close()) if bus else None
+                    await self._supervisor.stop(STOP_S)
+                    await running
+                    if closing:
+                        await closing
+        return self._finish(report, stopped=stop.is_set())
+
+    async def _join(self, stop: asyncio.Event) -> Bus | None:
+        """A session of our own, or None when the run ended before there was a router."""
+        opening = asyncio.ensure_future(ZenohTransport.open(client_endpoint(self._deployment)))
+        while not opening.done() and not stop.is_set() and not self._supervisor.given_up:
+            await asyncio.wait((opening,), timeout=LOOK_S)
+        if not opening.done():
+            opening.cancel()
+            return None
+        return Bus(opening.result(), Clock(), "demo")
+
+    async def _watch(self, watch: Watch, stop: asyncio.Event) -> Report | None:
+        """Look on until the end, then ask the driver for the truth."""
+        view = self._view(watch)
+        loop = asyncio.get_running_loop()
+        moved_s, seconds = loop.time(), watch.seconds
+        with view:
+            while not (stop.is_set() or self._supervisor.given_up or self._over(watch)):
+                view.show()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(stop.wait(), LOOK_S)
+                if watch.seconds != seconds:
+                    moved_s, seconds = loop.time(), watch.seconds
+                elif loop.time() - moved_s > STALLED_S:
+                    self._failures.append(f"the robot's clock stood still for {STALLED_S:.0f} s")
+                    break
+            view.show()
+        return await self._ask_for_truth(watch)
+
+    def _over(self, watch: Watch) -> bool:
+        seconds = self._options.seconds
+        return seconds is not None and watch.seconds >= seconds - 1e-6
+
+    def _view(self, watch: Watch) -> View:
+        if self._options.headless or not sys.stdout.isatty():
+            return HeadlessView(watch, self._options.seconds)
+        return LiveView(watch, self._supervisor, self._deployment, self._faults)
+
+    async def _ask_for_truth(self, watch: Watch) -> Report | None:
+        names = [n for n, status in self._supervisor.statuses.items() if status.state == "ready"]
+        told = await asyncio.gather(*(watch.describe(name) for name in names))
+        answers = {answer.process: answer for answer in told if answer}
+        driver = answers.get("driver")
+        if driver is None or "contacts" not in driver.report:
+            return None
+        return make_report(
+            driver.report,
+            self._decisions,
+            speed=self._deployment.speed,
+            deaths=self._supervisor.deaths,
+            restarts=sum(status.restarts for status in self._supervisor.statuses.values()),
+            rejected=sum(int(a.report.get("rejected_messages") or 0) for a in answers.values()),
+        )
+
+    def _record(self, name: str, record: Mapping[str, Any]) -> None:
+        """A line of somebody's log."""
+        event, level = record.get("event"), record.get("level")
+        if event == "decision":
+            self._decisions.append((round(record["tick"] * 0.02, 2), str(record["reason"])))
+        if event == "failed":
+            self._refusal = str(record.get("text", ""))
+        if event in ("given up", "died"):
+            self._failures.append(str(record.get("text", "")))
+        if level in ("warning", "error", "critical"):
+            self._faults.append(f"{name}: {record.get('text', '')}")
+            del self._faults[:-4]
+
+    def _finish(self, report: Report | None, *, stopped: bool) -> int:
+        if report and self._options.report:
+            write_report(report, self._options.report)
+        if report:
+            print(summary(report))
+        if stopped:
+            return 0
+        if report and report.ok:
+            return 0
+        if self._supervisor.misconfigured:
+            raise ConfigError(self._refusal)
+        if report is None:
+            reason = self._failures[-1] if self._failures else "the driver did not answer"
+            raise BodyLost(f"no report: {reason}; logs in {self._run_dir}")
+        print(f"logs in {self._run_dir}", file=sys.stderr)
+        return 1

@@ -1,0 +1,177 @@
+"""A deployment file: which body on which link, and which process runs on which host."""
+
+import socket
+import sys
+from collections.abc import Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+from msgspec import Struct
+
+from gigabrain_zenoh import config
+from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.keeper import ProcessSpec
+from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.settings import (
+    DecisionConfig,
+    DriverConfig,
+    Endpoint,
+    LinkName,
+    PerceptionConfig,
+    Resume,
+    Seed,
+    Speed,
+)
+
+ProcessName = Literal["router", "driver", "perception", "decision", "control", "safety"]
+ALL: tuple[ProcessName, ...] = (
+    "router", "driver", "perception", "decision", "control", "safety",
+)  # fmt: skip
+LOOPBACK = ("127.", "localhost", "[::1]")
+
+
+class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole deployment file."""
+
+    body: str = "turtlebot3_waffle"
+    link: LinkName = "sim"
+    world: str = "arena"
+    seed: Seed = 0
+    speed: Speed = 1.0
+    resume: Resume = "manual"
+    namespace: str = ""  # the robot's own part of the key space, where one router serves several
+    router: str = "tcp/127.0.0.1:7447"  # where the router listens; port 0 for any free one
+    insecure: bool = False  # allow a router that other machines can reach
+    hosts: dict[str, tuple[ProcessName, ...]] = msgspec.field(
+        default_factory=lambda: {"robot": ALL}
+    )
+    perception: PerceptionConfig = PerceptionConfig()
+    decision: DecisionConfig = DecisionConfig()
+
+    def __post_init__(self) -> None:
+        placed = [name for names in self.hosts.values() for name in names]
+        twice = sorted({name for name in placed if placed.count(name) > 1})
+        if twice:
+            raise ValueError(f"{', '.join(twice)} must run once, on one host")
+        address = self.router.partition("/")[2]
+        if not self.insecure and not address.startswith(LOOPBACK):
+            raise ValueError(
+                f"router {self.router} can be reached by anybody on the network; "
+                "use a loopback address, or write `insecure: true`"
+            )
+        if self.resume == "auto" and self.link == "real":
+            raise ValueError("resume: auto is for simulation; a real body is enabled by a person")
+        if self.speed != 1.0 and self.link != "sim":
+            raise ValueError("speed is for the simulation; other links run in real time")
+
+
+def deployment_folder() -> Path:
+    """The deployment files that come with the package, in a wheel as in a checkout."""
+    package = Path(str(resources.files("gigabrain_zenoh")))
+    installed = package / "deploy"
+    return installed if installed.is_dir() else package.parent / "deploy"
+
+
+def load_deployment(name: str) -> Deployment:
+    """Read a deployment file: a path, or the name of one of ours. Raises ConfigError."""
+    path = Path(name)
+    ours = {file.stem: file for file in sorted(deployment_folder().glob("*.yaml"))}
+    if not path.exists() and not name.endswith((".yaml", ".yml")):
+        if name not in ours:
+            raise unknown("deployment", name, ours)
+        path = ours[name]
+    elif not path.exists() and path.stem in ours and path.parent in (Path(), Path("deploy")):
+        path = ours[path.stem]
+    return config.load(path, Deployment)
+
+
+def host_of(deployment: Deployment, name: str | None) -> str:
+    """The host to start: `name`, or the only one there is. Raises ConfigError."""
+    hosts = deployment.hosts
+    if name is None:
+        if len(hosts) > 1:
+            raise ConfigError(f"which host is this? choose one with --host: {', '.join(hosts)}")
+        return next(iter(hosts), "")
+    if name not in hosts:
+        raise unknown("host", name, hosts)
+    return name
+
+
+def with_free_port(deployment: Deployment) -> Deployment:
+    """The deployment with a free port in place of port 0."""
+    protocol, _, address = deployment.router.partition("/")
+    host, _, port = address.rpartition(":")
+    if port != "0":
+        return deployment
+    with socket.socket() as probe:
+        probe.bind((host, 0))
+        free = probe.getsockname()[1]
+    return msgspec.structs.replace(deployment, router=f"{protocol}/{host}:{free}")
+
+
+def client_endpoint(deployment: Deployment) -> Endpoint:
+    """Where anybody meets this deployment."""
+    return Endpoint(connect=(deployment.router,), namespace=deployment.namespace)
+
+
+def process_specs(
+    deployment: Deployment,
+    host: str,
+    run_dir: Path,
+    state_dir: Path,
+    *,
+    seconds: float | None = None,
+    level: str = "info",
+) -> list[ProcessSpec]:
+    """What the supervisor of `host` has to run, in readiness order: the router first."""
+    names = deployment.hosts[host]
+    settings = _settings(deployment, state_dir, seconds)
+    specs = []
+    for name in sorted(names, key=ALL.index):
+        endpoint = client_endpoint(deployment)
+        if name == "router":
+            endpoint = Endpoint(listen=(deployment.router,), namespace=deployment.namespace)
+        process = ProcessConfig(
+            name=name,
+            endpoint=endpoint,
+            settings=settings.get(name, {}),
+            run_dir=str(run_dir),
+            json_console=True,
+            level=level,
+        )
+        after = ("router",) if "router" in names and name != "router" else ()
+        specs.append(
+            ProcessSpec(
+                name=name,
+                argv=(*COMMAND, msgspec.json.encode(process).decode()),
+                after=after,
+                stop_last=name == "router",
+                ready_timeout_s=30.0 if after else 3600.0,  # elsewhere, the router may come later
+            )
+        )
+    return specs
+
+
+COMMAND = (sys.executable, "-m", "gigabrain_zenoh.process")
+
+
+def _settings(
+    deployment: Deployment, state_dir: Path, seconds: float | None
+) -> Mapping[str, dict[str, Any]]:
+    driver = DriverConfig(
+        body=deployment.body,
+        link=deployment.link,
+        world=deployment.world,
+        seed=deployment.seed,
+        speed=deployment.speed,
+        seconds=seconds,
+        resume=deployment.resume,
+        state_dir=str(state_dir),
+    )
+    return {
+        "driver": msgspec.to_builtins(driver),
+        "perception": msgspec.to_builtins(deployment.perception),
+        "decision": msgspec.to_builtins(deployment.decision),
+    }

@@ -1,0 +1,65 @@
+"""Runs a deployment's processes on this host, logging to a run folder and to the console."""
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from gigabrain_zenoh import log_text
+from gigabrain_zenoh.deployment import Deployment, client_endpoint, process_specs
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.logs import new_run_dir, state_dir
+from gigabrain_zenoh.running import announced
+from gigabrain_zenoh.supervisor import Supervisor
+
+STOP_S = 1.5
+LOOK_S = 0.1
+
+
+@contextmanager
+def stop_signals() -> Iterator[asyncio.Event]:
+    """An event that Ctrl-C and SIGTERM set."""
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    try:
+        yield stop
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.remove_signal_handler(number)
+
+
+async def up(
+    deployment: Deployment, host: str, say: Callable[[str], None], level: str = "info"
+) -> int:
+    """Keep a host's processes running until Ctrl-C; the exit code.
+
+    Raises ConfigError when the run folder or the state folder cannot be written.
+    """
+    label = deployment.namespace or deployment.body.replace("/", "-")
+    run_dir = new_run_dir(None, label)
+    remembers = state_dir() / "robots" / label
+    specs = process_specs(deployment, host, run_dir, remembers, level=level)
+
+    refusal = ""
+
+    def show(_name: str, record: Mapping[str, Any]) -> None:
+        nonlocal refusal
+        if record.get("event") == "failed":
+            refusal = str(record.get("text", ""))
+        say(log_text.readable(record, colour=False))
+
+    say(f"{deployment.body} on {host}: {', '.join(spec.name for spec in specs)}; logs in {run_dir}")
+    with stop_signals() as stop, announced(label, client_endpoint(deployment)):
+        async with Supervisor(specs, show) as supervisor:
+            running = asyncio.ensure_future(supervisor.run())
+            while not stop.is_set() and not running.done() and not supervisor.misconfigured:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(stop.wait(), LOOK_S)
+            await supervisor.stop(STOP_S)
+            await running
+            if supervisor.misconfigured:
+                raise ConfigError(refusal)
+            return 1 if supervisor.given_up else 0

@@ -1,0 +1,194 @@
+"""What a person sees of a running demo: one calm page in the terminal, or a line now and then."""
+
+import sys
+from types import TracebackType
+from typing import Protocol, Self
+
+from rich.console import Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from gigabrain_zenoh.causes import in_words
+from gigabrain_zenoh.deployment import Deployment
+from gigabrain_zenoh.supervisor import Supervisor
+from gigabrain_zenoh.watch import Watch
+
+FRAMES_HZ = 4
+LINE_S = 10.0  # of the robot's time between two lines without a terminal
+GATE_COLOURS = {"enabled": "green", "idle": "yellow", "stopping": "yellow", "latched": "red"}
+
+
+class View(Protocol):
+    """Shows a run for as long as its `with` block lasts."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None: ...
+
+    def show(self) -> None:
+        """Bring it up to date."""
+
+
+class HeadlessView:
+    """A progress line on stderr: redrawn in place on a terminal, every ten seconds elsewhere."""
+
+    def __init__(self, watch: Watch, seconds: float | None) -> None:
+        self._watch, self._seconds = watch, seconds
+        self._next = LINE_S
+        self._in_place = sys.stderr.isatty()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._in_place:
+            print(file=sys.stderr)
+
+    def show(self) -> None:
+        """Bring it up to date."""
+        watch = self._watch
+        if not self._in_place and watch.seconds < self._next:
+            return
+        self._next = watch.seconds + LINE_S
+        of = f"/{self._seconds:.0f}" if self._seconds else ""
+        line = f"{watch.seconds:6.1f}{of} s  {watch.distance_m:6.2f} m  {doing(watch)}"
+        if self._in_place:
+            print(f"\r{line[:100]:<100}", end="", file=sys.stderr, flush=True)
+        else:
+            print(line, file=sys.stderr, flush=True)
+
+
+class LiveView:
+    """The whole robot on one page."""
+
+    def __init__(
+        self, watch: Watch, supervisor: Supervisor, deployment: Deployment, faults: list[str]
+    ) -> None:
+        self._watch, self._supervisor, self._deployment = watch, supervisor, deployment
+        self._faults = faults
+        self._live = Live(refresh_per_second=FRAMES_HZ, get_renderable=self._page)
+
+    def __enter__(self) -> Self:
+        self._live.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._live.stop()
+
+    def show(self) -> None:
+        """Rich redraws the page by itself."""
+
+    def _page(self) -> Panel:
+        deployment = self._deployment
+        speed = "" if deployment.speed == 1.0 else f" · ×{deployment.speed:g}"
+        title = f"{deployment.body} · {deployment.world} · seed {deployment.seed}{speed}"
+        parts: list[Text | Table] = [
+            Text(doing(self._watch), style="bold cyan", justify="center"),
+            Text(),
+            self._figures(),
+            Text(),
+            self._processes(),
+        ]
+        parts += [Text(fault, style="yellow", overflow="ellipsis") for fault in self._faults]
+        return Panel(Group(*parts), title=title, subtitle="Ctrl-C ends it", padding=(1, 2))
+
+    def _figures(self) -> Table:
+        watch, state = self._watch, self._watch.state.newest
+        table = Table.grid(expand=True)
+        for _ in range(4):
+            table.add_column(justify="center")
+        gate = Text("-", style="dim")
+        battery = "-"
+        if state:
+            gate = Text(state.gate.mode, style=GATE_COLOURS[state.gate.mode])
+            if state.battery:
+                battery = f"{state.battery.percentage:.0f} %  {state.battery.voltage:.1f} V"
+        driver = watch.health.get("driver")
+        latency = driver.latency_ms if driver else {}
+        p50, p99 = latency.get("scan_to_cmd_p50"), latency.get("scan_to_cmd_p99")
+        chain = f"{p50:.1f} ms (p99 {p99:.1f})" if p50 and p99 else "-"
+        names = ("driven", "scan → command", "gate", "battery")
+        table.add_row(*(Text(name, style="dim") for name in names))
+        driven = f"{watch.distance_m:.2f} m in {watch.seconds:.0f} s"
+        table.add_row(driven, chain, gate, battery)
+        return table
+
+    def _processes(self) -> Table:
+        table = Table(box=None, expand=True, pad_edge=False, header_style="dim")
+        table.add_column("process", style="bold", width=11)
+        table.add_column("state", width=11)
+        table.add_column("pid", justify="right", width=7)
+        table.add_column("CPU", justify="right", width=6)
+        table.add_column("memory", justify="right", width=7)
+        table.add_column("what it does", ratio=1, no_wrap=True, overflow="ellipsis")
+        for name, status in self._supervisor.statuses.items():
+            health = self._watch.health.get(name)
+            style = "green" if status.state == "ready" else "yellow"
+            again = f" ↻{status.restarts}" if status.restarts else ""
+            table.add_row(
+                name,
+                Text(f"{status.state}{again}", style=style),
+                str(status.pid or ""),
+                f"{health.cpu * 100:.1f} %" if health else "",
+                f"{health.rss_bytes / 1e6:.0f} MB" if health else "",
+                _activity(name, self._watch),
+            )
+        return table
+
+
+def doing(watch: Watch) -> str:
+    """What the robot is doing, in words."""
+    state, intent = watch.state.fresh(), watch.intent.fresh()
+    if state is None:
+        return "starting" if watch.state.newest is None else "the driver is silent"
+    gate = state.gate
+    if gate.mode == "enabled" and gate.commander != "control":
+        return f"{gate.commander} drives"
+    if gate.mode != "enabled" and gate.causes:
+        return f"{gate.mode}: {in_words(gate.causes)}"
+    if gate.mode != "enabled":
+        return f"{gate.mode}: waiting to be enabled"
+    return intent.reason if intent else "decision is silent"
+
+
+def _activity(name: str, watch: Watch) -> str:
+    """One process's work, as its messages show it."""
+    health = watch.health.get(name)
+    sent = health.sent_hz if health else {}
+    if name == "router":
+        return "joins the others"
+    if name == "driver":
+        return f"state {sent.get('robot/state', 0):.0f} Hz, scan {sent.get('robot/scan', 0):.0f} Hz"
+    if name == "perception":
+        return _seen(watch)
+    if name == "decision":
+        intent = watch.intent.fresh()
+        return intent.reason if intent else "silent"
+    if name == "control":
+        command = watch.command.fresh()
+        if command is None:
+            return "silent"
+        return f"{command.linear_x:+.2f} m/s  {command.angular_z:+.2f} rad/s"
+    verdict = watch.safety.fresh()
+    if verdict is None:
+        return "silent"
+    causes = in_words((*verdict.causes, *verdict.warnings))
+    return f"{verdict.verdict}: {causes}" if causes else verdict.verdict
+
+
+def _seen(watch: Watch) -> str:
+    world = watch.world.fresh()
+    if world is None:
+        return "silent"
+    if not world.scan_ok:
+        return f"blind: {world.scan_problem}"
+    if world.distance_ahead is not None:
+        return f"obstacle {world.distance_ahead:.2f} m ahead"
+    return "free ahead"

@@ -1,0 +1,44 @@
+"""Watches a robot from outside: the newest of everything that people want to see."""
+
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.requests import DescribeRequest, Description
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import CMD_VEL, DESCRIBE, HEALTH, INTENT, SAFETY, STATE, WORLD
+from gigabrain_zenoh.bus import Bus
+
+
+class Watch:
+    """What the robot is doing, as far as it can be heard."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self.state = bus.latest(STATE, self._moved)
+        self.world = bus.latest(WORLD)
+        self.intent = bus.latest(INTENT)
+        self.command = bus.latest(CMD_VEL)
+        self.safety = bus.latest(SAFETY)
+        self.health: dict[str, Health] = {}
+        self.distance_m = 0.0  # by odometry
+        self._last: RobotState | None = None
+        bus.subscribe(HEALTH, self._healthy)
+
+    @property
+    def seconds(self) -> float:
+        """Time of the robot since its driver's start [s]."""
+        return self._bus.time.tick * 0.02
+
+    async def describe(self, process: str, timeout_s: float = 0.3) -> Description | None:
+        """What a process says of itself, or None when it does not answer."""
+        replies = await self._bus.ask(
+            DESCRIBE, DescribeRequest(), timeout_s=timeout_s, name=process
+        )
+        return replies[0] if replies else None
+
+    def _healthy(self, _key: str, health: Health) -> None:
+        self.health[health.process] = health
+
+    def _moved(self, state: RobotState) -> None:
+        last, self._last = self._last, state
+        if last and last.boot == state.boot:
+            dx, dy = state.pose.x - last.pose.x, state.pose.y - last.pose.y
+            self.distance_m += (dx * dx + dy * dy) ** 0.5
