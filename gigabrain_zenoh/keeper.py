@@ -179,10 +179,5 @@ class Keeper:
 
 
 def _in_words(code: int) -> str:
-    """`exit code 1`, `SIGKILL`."""
-    if code >= 0:
-        return f"exit code {code}"
-    try:
-        return signal.Signals(-code).name
-    except ValueError:  # a real-time signal
-        return f"signal {-code}"
+    """`exit code 1`, `signal 9 (Killed)`."""
+    return f"exit code {code}" if code >= 0 else f"signal {-code} ({signal.strsignal(-code)})"

@@ -50,7 +50,7 @@ def watch_parent(parent_pid: int, period_s: float = 0.2) -> threading.Thread:
 
 
 def _kill_on_parent_death() -> bool:
-    import ctypes  # 3 ms that only a supervised process pays
+    import ctypes  # costs 3 ms, which only a supervised process pays
 
     libc = ctypes.CDLL(None)
     zero = ctypes.c_ulong(0)
