@@ -146,7 +146,7 @@ async def test_five_deaths_are_enough_and_a_sentence_says_so() -> None:
         status = supervisor.statuses["control"]
         await until(lambda: status.state == "given up")
         assert (supervisor.deaths, status.restarts, status.last_exit) == (5, 4, 7)
-        assert supervisor.given_up == ("control",)
+        assert (supervisor.given_up, supervisor.misconfigured) == (("control",), ())
         assert records.texts("given up") == [
             "control ended with exit code 7 and is given up: 5 deaths within 60 s"
         ]
@@ -161,7 +161,7 @@ async def test_five_deaths_are_enough_and_a_sentence_says_so() -> None:
 async def test_a_bad_configuration_is_not_tried_twice() -> None:
     async with running(spec("driver", "sys.exit(2)")) as (supervisor, records):
         await until(lambda: supervisor.given_up)
-        assert supervisor.deaths == 1
+        assert (supervisor.misconfigured, supervisor.deaths) == (("driver",), 1)
         (name, record) = records.all[-1]
         assert (name, record["event"], record["level"], record["exit_code"]) == (
             "driver",
