@@ -154,7 +154,8 @@ def process_specs(
     return specs
 
 
-COMMAND = (sys.executable, "-m", "gigabrain_zenoh.process")
+# -P: a folder that happens to be the current one must not stand in for an installed package
+COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.process")
 
 
 def _settings(
