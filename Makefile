@@ -1,0 +1,53 @@
+# make demo   set up, and drive a robot round a room        make test   set up, and run all checks
+# make setup  the set-up alone                              make bench  measure this machine
+
+VENV := .venv
+BIN := $(VENV)/bin
+PYTHON ?= python3
+DONE := $(VENV)/.done
+
+.PHONY: setup demo test lint unit bench mutation golden pictures clean
+
+setup: $(DONE)
+
+# uv where it is installed, pip otherwise
+$(DONE): pyproject.toml
+	@if command -v uv >/dev/null; then \
+	  uv venv --quiet --allow-existing --python '>=3.11' $(VENV) && \
+	  uv pip install --quiet --python $(BIN)/python -e '.[all,dev]'; \
+	else \
+	  $(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	    { echo 'Python 3.11 or newer is needed; name it: make PYTHON=python3.12 $(MAKECMDGOALS)'; exit 1; }; \
+	  $(PYTHON) -m venv $(VENV) && \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[all,dev]'; \
+	fi
+	@touch $@
+
+demo: setup
+	@$(BIN)/gigabrain demo $(ARGS)
+
+test: setup lint unit
+
+lint: setup
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+unit: setup
+	$(BIN)/pytest $(ARGS)
+
+bench: setup
+	$(BIN)/gigabrain bench chain
+	$(BIN)/gigabrain bench stack
+
+mutation: setup
+	$(BIN)/mutmut run
+
+golden: setup
+	$(BIN)/python -m gigabrain_schemas.golden
+
+pictures: setup
+	$(BIN)/gigabrain view --png docs/pictures/waffle_in_house.png --world house --seed 1
+
+clean:
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis mutants
