@@ -1,0 +1,42 @@
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.latch import Latched, LatchFile
+from gigabrain_zenoh.causes import NAN_STORM, estop
+from gigabrain_zenoh.errors import ConfigError
+
+
+def test_nothing_is_latched_before_anything_was(tmp_path: Path) -> None:
+    assert LatchFile(tmp_path / "new").read() == Latched()
+
+
+def test_what_was_latched_is_there_after_a_restart(tmp_path: Path) -> None:
+    file = LatchFile(tmp_path)
+    file.read()
+    file.write(Latched(causes=(estop("ann"), NAN_STORM), estop_generation=3))
+
+    again = LatchFile(tmp_path).read()
+    assert [cause.code for cause in again.causes] == ["estop", "nan_storm"]
+    assert again.estop_generation == 3
+
+
+def test_a_release_is_remembered_too(tmp_path: Path) -> None:
+    file = LatchFile(tmp_path)
+    file.read()
+    file.write(Latched(causes=(estop("ann"),), estop_generation=1))
+    file.write(Latched(estop_generation=1))
+    assert LatchFile(tmp_path).read() == Latched(causes=(), estop_generation=1)
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b'{"causes": 3}', b"\xff\xfe", b"[" * 100_000])
+def test_a_file_that_cannot_be_read_counts_as_latched(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "latch.json").write_bytes(content)
+    causes = LatchFile(tmp_path).read().causes
+    assert [(cause.code, cause.latching) for cause in causes] == [("latch_unreadable", True)]
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"cannot write .*file/state: Not a directory"):
+        LatchFile(tmp_path / "file" / "state").read()

@@ -1,0 +1,56 @@
+import asyncio
+
+from gigabrain_drivers.lockstep import Lockstep
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.safety import SafetyState
+
+
+def command(tick: int, basis: int, source: str = "control") -> CmdVel:
+    return CmdVel(linear_x=0.0, tick=tick, basis=basis, source=source)
+
+
+def test_a_tick_without_a_scan_waits_for_the_command_that_echoes_it() -> None:
+    steps = Lockstep()
+    steps.begin(7, 5)
+    steps.verdict(SafetyState(verdict="ok", basis=5))
+    steps.command(command(6, 5))
+    assert not steps.complete
+    steps.command(command(7, 5))
+    assert steps.complete
+
+
+def test_a_tick_with_a_scan_waits_for_the_command_and_the_verdict_that_rest_on_it() -> None:
+    steps = Lockstep()
+    steps.begin(10, 10)
+    steps.command(command(10, 5))
+    steps.verdict(SafetyState(verdict="ok", basis=5))
+    assert not steps.complete
+    steps.command(command(10, 10))
+    assert not steps.complete
+    steps.verdict(SafetyState(verdict="ok", basis=10))
+    assert steps.complete
+
+
+def test_a_commander_that_looks_itself_needs_no_basis() -> None:
+    steps = Lockstep()
+    steps.begin(10, 10)
+    steps.verdict(SafetyState(verdict="ok", basis=10))
+    steps.command(command(10, 0, "script"))
+    assert steps.complete
+
+
+async def test_the_answer_wakes_the_one_who_waits() -> None:
+    steps = Lockstep()
+    steps.begin(1, 0)
+    waiting = asyncio.ensure_future(steps.wait(10.0))
+    await asyncio.sleep(0)
+    steps.command(command(1, 0))
+    assert await waiting
+    assert steps.timeouts == 0
+
+
+async def test_a_tick_that_nobody_answers_goes_on_and_is_counted() -> None:
+    steps = Lockstep()
+    steps.begin(1, 0)
+    await steps.answered()
+    assert steps.timeouts == 1
