@@ -4,9 +4,11 @@ import logging
 from collections.abc import Callable
 
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.brain import Intent
-from gigabrain_schemas.topics import INTENT, STATE, WORLD
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import Intent, WorldModel
+from gigabrain_schemas.topics import BODY, INTENT, STATE, WORLD
 from gigabrain_zenoh import behaviours
+from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.behaviours import Situation
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.settings import DecisionConfig
@@ -14,31 +16,55 @@ from gigabrain_zenoh.settings import DecisionConfig
 log = logging.getLogger(__name__)
 
 
+class Thinker:
+    """Thinks once per world, and stands by its word in between.
+
+    A world of a tick whose state is still on its way waits for that state: no outcome may depend on
+    which of two messages was quicker.
+    """
+
+    def __init__(self, config: DecisionConfig) -> None:
+        self._load, self._config = behaviours.load(config.behaviour), config
+        self._behaviour, self._boot = self._load(config), 0
+        self.intent = Intent(behaviour=config.behaviour, reason="starting")
+        self.basis = 0
+
+    def think(self, state: RobotState, world: WorldModel | None) -> None:
+        """Form a new intent if there is anything new to go by."""
+        if state.boot != self._boot:  # the driver has started anew, and with it the odometry
+            self._behaviour, self._boot, self.basis = self._load(self._config), state.boot, 0
+        if world is None:
+            self.intent = self._behaviour.step(Situation(None, state.pose))
+        elif world.basis != self.basis and world.basis <= state.tick:
+            self.intent = self._behaviour.step(Situation(world, state.pose))
+            self.basis = world.basis
+
+
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """An intent per world, as soon as it comes; repeated with the newest tick at each state."""
-    behaviour = behaviours.load(config.behaviour)(config)
-    intent, basis, said = Intent(behaviour=config.behaviour, reason="starting"), 0, ""
+    thinker, said = Thinker(config), ""
 
     def decide(_: Message) -> None:
-        nonlocal intent, basis, said
+        nonlocal said
         state = states.fresh()
         if state is None:
             return
-        world = worlds.fresh()
-        # a world of a tick whose state is still on its way waits for it: no outcome may depend on
-        # which of two messages was quicker
-        if world is None:
-            intent = behaviour.step(Situation(None, state.pose))
-        elif basis != world.basis and world.basis <= state.tick:
-            intent, basis = behaviour.step(Situation(world, state.pose)), world.basis
-        bus.publish(INTENT, intent, basis=basis)
+        body = bodies.current
+        thinker.think(state, worlds.fresh(scan_limit_ns(body.description) if body else None))
+        intent = thinker.intent
+        bus.publish(INTENT, intent, basis=thinker.basis)
         phrase = intent.reason.partition(":")[0]
         if phrase != said:
             said = phrase
             data = {"event": "decision", "tick": state.tick, "reason": intent.reason}
-            log.info(intent.reason, extra={"data": data})
+            log.info("%s", intent.reason, extra={"data": data})
 
+    def see(world: WorldModel) -> None:
+        if world.basis <= bus.time.tick:
+            decide(world)
+
+    bodies = bus.latest(BODY)
     states = bus.latest(STATE, decide)
-    worlds = bus.latest(WORLD, decide)
+    worlds = bus.latest(WORLD, see)
     ready()
     await bus.failed

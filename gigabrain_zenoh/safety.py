@@ -1,7 +1,6 @@
 """Safety: listens to all, trusts none, and says whether and how fast the body may move."""
 
 import logging
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -9,24 +8,28 @@ import msgspec
 from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import ranges
-from gigabrain_schemas.base import TICK_NS, Cause, Message
+from gigabrain_schemas.base import Cause, Message
 from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, SCAN, STATE, WORLD
+from gigabrain_zenoh.ages import scan_limit_ns as scan_limit_ns
 from gigabrain_zenoh.bus import Bus, Latest
+from gigabrain_zenoh.causes import in_words
 from gigabrain_zenoh.gate import BRAIN
-from gigabrain_zenoh.perception import beams, scan_problem
+from gigabrain_zenoh.perception import blind_ahead, scan_problem
+from gigabrain_zenoh.stop_zone import NEAREST, cap, free_distances, in_zone
 
 log = logging.getLogger(__name__)
 
-TICK_S = TICK_NS / 1e9
-SIDE_MARGIN = 0.03  # [m], kept free beside the body as it moves on
-RESUME_MARGIN = 0.10  # [m], more than the stop zone before the body may go on
+SYSTEMS = ("perception", "decision", "control")
 SUSTAIN_TICKS = 25  # how long a battery or motor must be out of bounds (0.5 s)
+LONGEST_STEP_TICKS = 5  # a sample after a longer gap speaks for no more than this
 REPEAT_TICKS = 2  # the verdict is repeated every 40 ms, and at once when it changes
 HEARTBEAT_NS = 150_000_000  # how long decision and control may be silent
-NEAREST = 0.1  # [m], nearer hits are the lidar's own housing
+WORLD_MARGIN_NS = 50_000_000  # how much later than a scan its world may come
+CONE_DEG = 30.0  # [deg], the cone ahead of which something must be known
 
 
 class Inputs(msgspec.Struct, frozen=True, kw_only=True):
@@ -41,6 +44,7 @@ class Inputs(msgspec.Struct, frozen=True, kw_only=True):
 class Memory(msgspec.Struct, frozen=True, kw_only=True):
     """What safety remembers from tick to tick."""
 
+    boot: int = 0
     tick: int = 0
     basis: int = 0  # the scan that `free` was read from
     problem: str = ""  # why that scan cannot be believed
@@ -53,55 +57,40 @@ class Memory(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def step(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Memory, SafetyState]:
-    """One verdict."""
+    """One verdict. Asked again within a tick, it has changed only by what has come since."""
     state = inputs.state
-    elapsed = max(0, state.tick - memory.tick)
-    memory = replace(memory, tick=state.tick)
-    memory = _look(body, memory, inputs)
-    memory = _count(body, memory, state, elapsed)
-    causes = (*_blind(body, memory, inputs), *_silent(inputs), *_worn(body, memory))
+    if state.boot != memory.boot:  # the driver has started anew
+        memory = Memory(boot=state.boot, tick=state.tick)
+    memory = _look(body, _count(body, memory, state), inputs)
+    stop = (*_blind(body, memory, inputs), *_silent(inputs), *_worn(body, memory))
     zones = _zone_causes(memory)
-    caps = _caps(body, memory)
+    caps = SpeedCaps(
+        forward=cap(body, memory.free_ahead, memory.stopped_ahead),
+        backward=cap(body, memory.free_behind, memory.stopped_behind),
+    )
     verdict = SafetyState(
-        verdict="stop" if causes else "slow" if zones or caps != SpeedCaps() else "ok",
+        verdict="stop" if stop else "slow" if caps != SpeedCaps() else "ok",
         caps=caps,
-        causes=(*causes, *zones),
+        causes=(*stop, *zones),
         warnings=_warnings(body, state),
     )
     return memory, verdict
 
 
-def stopping_distance(body: BodyDescription, speed: float) -> float:
-    """L(v) = v T + v² / 2a + margin [m]: how far ahead must be free at `speed` [m/s]."""
-    t, a = body.thresholds.reaction_time, body.max_linear_deceleration
-    return speed * t + speed * speed / (2 * a) + body.thresholds.stop_margin
-
-
-def speed_within(body: BodyDescription, free: float) -> float:
-    """The speed [m/s] from which the body stops within `free` [m]: L(v) solved for v."""
-    t, a = body.thresholds.reaction_time, body.max_linear_deceleration
-    room = max(0.0, free - body.thresholds.stop_margin)
-    return -a * t + math.sqrt((a * t) ** 2 + 2 * a * room)
-
-
-def free_distances(body: BodyDescription, scan: LaserScan) -> tuple[float | None, float | None]:
-    """How far the footprint can go forwards and backwards until it touches a hit of `scan` [m]."""
-    lidar = body.lidar
-    if lidar is None:
-        return None, None
-    values = ranges(scan)
-    directions = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
-    hits = (values >= NEAREST) & (values <= scan.range_max)  # nan and inf are neither
-    x = lidar.x + values[hits] * directions[hits, 0]
-    y = lidar.y + values[hits] * directions[hits, 1]
-    half_width = max(abs(corner[1]) for corner in body.footprint) + SIDE_MARGIN
-    front = max(corner[0] for corner in body.footprint)
-    rear = min(corner[0] for corner in body.footprint)
-    x = x[abs(y) <= half_width]
-    ahead, behind = x[x > 0], x[x < 0]
-    return (
-        max(0.0, float(ahead.min()) - front) if ahead.size else None,
-        max(0.0, rear - float(behind.max())) if behind.size else None,
+def _count(body: BodyDescription, memory: Memory, state: RobotState) -> Memory:
+    """How long the battery and the motors have been out of bounds."""
+    limits = body.thresholds
+    low = state.battery is not None and state.battery.percentage <= limits.battery_stop
+    hot = any(
+        joint.temperature is not None and joint.temperature >= limits.motor_stop
+        for joint in state.joints
+    )
+    elapsed = min(max(0, state.tick - memory.tick), LONGEST_STEP_TICKS)
+    return replace(
+        memory,
+        tick=state.tick,
+        low_ticks=memory.low_ticks + elapsed if low else 0,
+        hot_ticks=memory.hot_ticks + elapsed if hot else 0,
     )
 
 
@@ -117,6 +106,7 @@ def _look(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
     if scan.basis > inputs.state.tick:
         return memory
     problem = scan_problem(body.lidar, ranges(scan), NEAREST)
+    problem = problem or blind_ahead(body.lidar, scan, NEAREST, CONE_DEG)
     ahead, behind = (None, None) if problem else free_distances(body, scan)
     speed = inputs.state.velocity.linear_x
     return replace(
@@ -125,33 +115,9 @@ def _look(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
         problem=problem,
         free_ahead=ahead,
         free_behind=behind,
-        stopped_ahead=_in_zone(body, ahead, max(0.0, speed), memory.stopped_ahead),
-        stopped_behind=_in_zone(body, behind, max(0.0, -speed), memory.stopped_behind),
+        stopped_ahead=in_zone(body, ahead, speed, memory.stopped_ahead),
+        stopped_behind=in_zone(body, behind, -speed, memory.stopped_behind),
     )
-
-
-def _in_zone(body: BodyDescription, free: float | None, speed: float, stopped: bool) -> bool:
-    """Once stopped, only a clear margin opens the zone again."""
-    if free is None:
-        return False
-    margin = RESUME_MARGIN if stopped else 0.0
-    return free < stopping_distance(body, speed) + margin
-
-
-def _caps(body: BodyDescription, memory: Memory) -> SpeedCaps:
-    return SpeedCaps(
-        forward=_cap(body, memory.free_ahead, memory.stopped_ahead),
-        backward=_cap(body, memory.free_behind, memory.stopped_behind),
-    )
-
-
-def _cap(body: BodyDescription, free: float | None, stopped: bool) -> float | None:
-    if stopped:
-        return 0.0
-    if free is None:
-        return None
-    allowed = speed_within(body, free)
-    return allowed if allowed < body.max_linear_speed else None
 
 
 def _zone_causes(memory: Memory) -> tuple[Cause, ...]:
@@ -179,31 +145,16 @@ def _blind(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause
     return ()
 
 
-def scan_limit_ns(body: BodyDescription) -> int:
-    """How old sensor data may be that moves the body: 250 ms, or 1.5 scans where that is more."""
-    period_ns = 1e9 / body.lidar.rate_hz if body.lidar else 0.0
-    return round(max(250e6, 1.5 * period_ns))
-
-
 def _silent(inputs: Inputs) -> tuple[Cause, ...]:
-    """The brain's processes matter while the brain drives; a person or a script looks itself."""
-    if inputs.state.gate.commander not in ("", BRAIN):
+    """The brain's processes matter while the brain drives; a person or a script looks itself.
+
+    While nobody drives they matter too, since the brain would be next; but where all three are
+    silent there is no brain, and a script need not wait for one.
+    """
+    commander = inputs.state.gate.commander
+    if commander not in ("", BRAIN) or (not commander and len(inputs.silent) == len(SYSTEMS)):
         return ()
     return tuple(Cause(code=f"{name}_silent", text=f"{name} is silent") for name in inputs.silent)
-
-
-def _count(body: BodyDescription, memory: Memory, state: RobotState, elapsed: int) -> Memory:
-    limits = body.thresholds
-    low = state.battery is not None and state.battery.percentage <= limits.battery_stop
-    hot = any(
-        joint.temperature is not None and joint.temperature >= limits.motor_stop
-        for joint in state.joints
-    )
-    return replace(
-        memory,
-        low_ticks=memory.low_ticks + elapsed if low else 0,
-        hot_ticks=memory.hot_ticks + elapsed if hot else 0,
-    )
 
 
 def _worn(body: BodyDescription, memory: Memory) -> tuple[Cause, ...]:
@@ -231,16 +182,14 @@ def _warnings(body: BodyDescription, state: RobotState) -> tuple[Cause, ...]:
 
 async def run(bus: Bus, ready: Callable[[], None]) -> None:
     """A verdict per scan and per second state, and at once when it changes."""
-    memory, said, said_tick = Memory(), SafetyState(verdict="stop"), -REPEAT_TICKS
+    memory, said, said_tick = Memory(), SafetyState(verdict="stop"), 0
 
     def judge(_: Message) -> None:
         nonlocal memory, said, said_tick
         state, body = states.fresh(), bodies.current
-        if state is None or body is None:
-            return
-        if state.tick < memory.tick or state.boot != said.boot:
-            memory, said_tick = Memory(), -REPEAT_TICKS  # the driver has started anew
-        before = memory.basis
+        if state is None or body is None or state.tick < bus.time.tick:
+            return  # a scan of a tick whose state is still on its way waits for that state
+        before = memory
         inputs = Inputs(
             state=state,
             scan=scans.current,
@@ -248,25 +197,44 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
             silent=_silent_systems(body.description),
         )
         memory, verdict = step(body.description, memory, inputs)
-        due = state.tick - said_tick >= REPEAT_TICKS or memory.basis != before
-        if due or (verdict.causes, verdict.caps) != (said.causes, said.caps):
+        due = state.tick - said_tick >= REPEAT_TICKS or state.boot != before.boot
+        new = memory.basis != before.basis
+        if due or new or (verdict.causes, verdict.caps) != (said.causes, said.caps):
+            _tell(state, said, verdict)
             said, said_tick = bus.publish(SAFETY, verdict, basis=memory.basis), state.tick
 
     def _silent_systems(body: BodyDescription) -> tuple[str, ...]:
-        limit_ns = {"perception": scan_limit_ns(body) + 50_000_000}
+        limits_ns = {"perception": scan_limit_ns(body) + WORLD_MARGIN_NS}
         return tuple(
-            name
-            for name, heard in systems.items()
-            if not heard.fresh(limit_ns.get(name, HEARTBEAT_NS))
+            name for name in SYSTEMS if not systems[name].fresh(limits_ns.get(name, HEARTBEAT_NS))
         )
+
+    def hear_command(_key: str, command: CmdVel) -> None:
+        if command.source == BRAIN:
+            commands.take(command)
 
     bodies = bus.latest(BODY)
     states = bus.latest(STATE, judge)
     scans = bus.latest(SCAN, judge)
+    commands = Latest(CMD_VEL, bus.clock, bus.time)
+    bus.subscribe(CMD_VEL, hear_command)
     systems: dict[str, Latest[Any]] = {
         "perception": bus.latest(WORLD),
         "decision": bus.latest(INTENT),
-        "control": bus.latest(CMD_VEL),
+        "control": commands,
     }
     ready()
     await bus.failed
+
+
+def _tell(state: RobotState, before: SafetyState, now: SafetyState) -> None:
+    """Log a cause once when it begins, and once when all have ended; not while all is starting."""
+    if not state.gate.enables:
+        return
+    known = {cause.code for cause in before.causes}
+    fresh = tuple(cause for cause in now.causes if cause.code not in known)
+    if fresh:
+        data = {"event": "held back", "causes": ",".join(cause.code for cause in fresh)}
+        log.warning("%s: %s", now.verdict, in_words(fresh), extra={"data": data})
+    elif before.causes and not now.causes:
+        log.info("nothing holds the body back", extra={"data": {"event": "free"}})

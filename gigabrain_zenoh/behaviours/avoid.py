@@ -8,7 +8,7 @@ from gigabrain_zenoh.behaviours import Situation
 from gigabrain_zenoh.settings import DecisionConfig
 
 HORIZON_S, STEP_S = 2.0, 0.25  # how far ahead the expected trajectory reaches, and how finely
-OPEN_M = 2.5  # how far a straight leg is expected to go where nothing is in sight [m]
+OPEN_M = 2.5  # [m], farther counts as open; a leg with nothing in sight is expected to be so long
 TURN_RAD = math.pi / 2  # how far a turn is expected to go
 
 
@@ -20,6 +20,7 @@ class Avoid:
         self._doing = "waiting"
         self._began = Pose(x=0.0, y=0.0, yaw=0.0)
         self._expected = 1.0  # [m] straight on, [rad] turning
+        self._progress = 0.0
 
     def step(self, situation: Situation) -> Intent:
         """What to do now, with the reason in words."""
@@ -39,7 +40,7 @@ class Avoid:
     def _straight(self, world: WorldModel, pose: Pose) -> Intent:
         if self._doing != "forward":
             free = world.sectors[0] if world.sectors else None
-            self._begin("forward", pose, free or OPEN_M)
+            self._begin("forward", pose, OPEN_M if free is None else free)
         done = math.hypot(pose.x - self._began.x, pose.y - self._began.y)
         speed = self._config.linear_speed
         return self._intent(Velocity(linear_x=speed), done, f"forward {speed:.2f} m/s")
@@ -58,19 +59,20 @@ class Avoid:
     def _side(self, world: WorldModel) -> str:
         if self._config.turn != "clearer":
             return self._config.turn
-        half = len(world.sectors) // 2
-        free = [math.inf if d is None else d for d in world.sectors]
-        left, right = free[1:half], free[half + 1 :]
-        return "left" if sum(_nearer(left)) > sum(_nearer(right)) else "right"
+        free = [OPEN_M if d is None else min(d, OPEN_M) for d in world.sectors]
+        left, right = free[1 : (len(free) + 1) // 2], free[len(free) // 2 + 1 :]
+        return "left" if sum(left) > sum(right) else "right"
 
     def _begin(self, doing: str, pose: Pose, expected: float) -> None:
-        self._doing, self._began, self._expected = doing, pose, max(expected, 0.1)
+        self._doing, self._began, self._progress = doing, pose, 0.0
+        self._expected = max(expected, 0.1)
 
     def _intent(self, twist: Velocity, done: float, reason: str) -> Intent:
+        self._progress = min(1.0, max(self._progress, done / self._expected))
         return Intent(
             twist=twist,
             trajectory=expected_trajectory(twist),
-            progress=min(1.0, done / self._expected),
+            progress=self._progress,
             behaviour="avoid",
             reason=reason,
         )
@@ -87,8 +89,3 @@ def expected_trajectory(twist: Velocity) -> tuple[TrajectoryPoint, ...]:
         y = 0.0 if abs(w) < 1e-6 else v / w * (1 - math.cos(yaw))
         points.append(TrajectoryPoint(t=t, x=x, y=y, yaw=yaw))
     return tuple(points)
-
-
-def _nearer(distances: list[float]) -> list[float]:
-    """Free distances, none counting for more than a room's width."""
-    return [min(d, OPEN_M) for d in distances]

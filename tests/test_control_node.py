@@ -1,0 +1,260 @@
+"""Control on the bus: whom it listens to, for how long, and that no message's speed matters."""
+
+import itertools
+
+import pytest
+
+from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.body import GateStatus
+from gigabrain_schemas.brain import Intent, Twist
+from gigabrain_schemas.safety import SafetyState, SpeedCaps
+from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, STATE, TELEOP, Topic
+from gigabrain_zenoh import control
+from gigabrain_zenoh.control import EarlierCaps
+from gigabrain_zenoh.limits import NO_CAPS
+from gigabrain_zenoh.teleop import Teleop
+from tests.brain_rig import BOOT, DRIVING, TICK_NS, Bench, body, state
+
+MS = 1_000_000
+
+
+def intent(tick: int, v: float = 0.2, *, basis: int | None = None, boot: int = BOOT) -> Intent:
+    return Intent(
+        twist=Velocity(linear_x=v),
+        behaviour="avoid",
+        reason="because",
+        boot=boot,
+        tick=tick,
+        basis=tick if basis is None else basis,
+    )
+
+
+def verdict(tick: int, forward: float | None = None, *, boot: int = BOOT) -> SafetyState:
+    return SafetyState(verdict="ok", caps=SpeedCaps(forward=forward), boot=boot, tick=tick)
+
+
+class Chain(Bench):
+    """Control, with the messages that drive it, and a body that follows at once."""
+
+    def __init__(self) -> None:
+        super().__init__(control.run)
+        self.tick, self._speeds = 0, [0.0]
+
+    async def go(
+        self,
+        ticks: int = 1,
+        *,
+        v: float | None = None,
+        teleop: Twist | None = None,
+        gate: GateStatus = DRIVING,
+    ) -> list[float]:
+        """So many ticks of a decision that wants `v`; the speeds that came of it."""
+        self._speeds = self._speeds[-1:]
+        for _ in range(ticks):
+            self.tick += 1
+            if teleop and self.tick % 2 == 0:
+                self.send(TELEOP, teleop)
+            self.send(STATE, state(self.tick, v=self._speeds[-1], gate=gate))
+            self._speeds += [command.linear_x for command in self.sent(CMD_VEL)]
+            if v is not None:
+                self.send(INTENT, intent(self.tick, v, basis=1))
+            await self.clock.advance(TICK_NS)
+        return self._speeds[1:]
+
+
+async def test_it_commands_once_per_state_and_at_once_when_decision_has_thought_again() -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        chain.send(STATE, state(9))
+        chain.send(STATE, state(10))
+        assert [(c.tick, c.basis) for c in chain.sent(CMD_VEL)] == [(9, 0), (10, 0)]
+        chain.send(INTENT, intent(10))
+        (command,) = chain.sent(CMD_VEL)
+        assert (command.tick, command.basis, command.source) == (10, 10, "control")
+        assert command.linear_x == pytest.approx(0.02)
+        chain.send(INTENT, intent(10))  # only repeated
+        assert chain.sent(CMD_VEL) == []
+
+
+async def test_an_intent_of_a_tick_whose_state_is_still_on_its_way_waits_for_it() -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        chain.send(STATE, state(9))
+        chain.sent(CMD_VEL)
+        chain.send(INTENT, intent(10))
+        assert chain.sent(CMD_VEL) == []
+        chain.send(STATE, state(10))
+        assert [(c.tick, c.basis) for c in chain.sent(CMD_VEL)] == [(10, 10)]
+
+
+async def test_a_silent_decision_is_given_up_after_100_ms() -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        await chain.go(30, v=0.2)
+        speeds = await chain.go(20)
+    assert speeds[:6] == pytest.approx([0.2, 0.2, 0.2, 0.2, 0.2, 0.18])
+    assert speeds[13:] == pytest.approx([0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], abs=1e-9)
+
+
+async def test_an_intent_of_an_earlier_start_of_the_driver_is_not_obeyed() -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        chain.send(STATE, state(1))
+        for tick in range(2, 6):
+            chain.send(INTENT, intent(tick, boot=8))
+            chain.send(STATE, state(tick))
+        assert {command.linear_x for command in chain.sent(CMD_VEL)} == {0.0}
+
+
+async def test_without_body_or_state_it_says_nothing() -> None:
+    async with Chain() as chain:
+        chain.send(STATE, state(1))
+        chain.send(INTENT, intent(1))
+        assert chain.sent(CMD_VEL) == []
+        chain.send(BODY, body())
+        await chain.clock.advance(260 * MS)  # the driver has stopped
+        chain.send(INTENT, intent(1, basis=1))
+        assert chain.sent(CMD_VEL) == []
+
+
+def tick_in_any_order() -> list[tuple[tuple[Topic[Message], Message], ...]]:
+    """The messages of a tick in which all has changed, in all the orders in which they may come."""
+    news = ((STATE, state(12)), (INTENT, intent(12)), (SAFETY, verdict(12, forward=0.01)))
+    return list(itertools.permutations(news))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("order", tick_in_any_order())
+async def test_no_command_depends_on_which_message_of_a_tick_was_quicker(
+    order: tuple[tuple[Topic[Message], Message], ...],
+) -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        for tick in (9, 10, 11):
+            chain.send(STATE, state(tick))
+            chain.send(INTENT, intent(tick, 0.05))
+            chain.send(SAFETY, verdict(tick, forward=0.05))
+        for topic, message in order:
+            chain.send(topic, message)
+        last = chain.sent(CMD_VEL)[-1]
+        assert (last.tick, last.basis) == (12, 12)
+        assert last.linear_x == pytest.approx(0.05)
+        chain.send(STATE, state(13))  # the verdict of tick 12 holds from here
+        assert chain.sent(CMD_VEL)[-1].linear_x == pytest.approx(0.03)
+
+
+def test_caps_hold_from_the_tick_after_their_verdict_for_150_ms() -> None:
+    caps = EarlierCaps()
+    assert caps.at(state(9)) == NO_CAPS
+    caps.receive(verdict(10, 0.1))
+    caps.receive(verdict(12, 0.3))
+    caps.receive(verdict(12, 0.2))  # with the scan of that tick
+    found = [caps.at(state(tick)).forward for tick in (10, 11, 12, 13, 19, 20)]
+    assert found == [None, 0.1, 0.1, 0.2, 0.2, None]
+    assert caps.at(state(13, boot=8)) == NO_CAPS
+    caps.receive(verdict(1, 0.05, boot=8))
+    assert caps.at(state(2, boot=8)).forward == 0.05
+
+
+FORWARD = Twist(linear_x=0.1)  # what a person types: no boot, no tick
+
+
+async def test_teleop_is_deaf_for_half_a_second_and_then_drives() -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        speeds = await chain.go(40, teleop=FORWARD)
+    assert set(speeds[:26]) == {0.0}  # the first message came with the second tick
+    assert speeds[26:30] == pytest.approx([0.02, 0.04, 0.06, 0.08])
+
+
+async def test_teleop_that_ends_holds_zero_and_does_not_hand_back_by_itself() -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        await chain.go(40, v=0.2, teleop=FORWARD)
+        after = await chain.go(60, v=0.2)
+        assert after[:10] == pytest.approx([0.1] * 10)  # 200 ms after its last message
+        assert after[10:16] == pytest.approx([0.08, 0.06, 0.04, 0.02, 0.0, 0.0])
+        assert set(after[15:]) == {0.0}
+        handed_back = GateStatus(mode="enabled", commander="control", enables=2)
+        back = await chain.go(4, v=0.2, gate=handed_back)
+        assert back == pytest.approx([0.02, 0.04, 0.06, 0.08])
+
+
+class Stick:
+    """An operator's joystick, on a clock of its own."""
+
+    def __init__(self) -> None:
+        self.now_ms = 1000
+        self.teleop = Teleop(lambda: self.now_ms * MS)
+
+    def push(self, every_ms: int, times: int, twist: Twist = FORWARD) -> None:
+        for _ in range(times):
+            self.now_ms += every_ms
+            self.teleop.receive(twist)
+
+    def moves(self, tick: int = 100, *, echo_wanted: bool = False) -> bool:
+        return self.teleop.velocity(state(tick), echo_wanted) is not None
+
+
+def test_a_stream_is_believed_from_half_a_second_on() -> None:
+    stick = Stick()
+    assert not stick.moves()
+    stick.push(50, 10)  # 450 ms after the first
+    assert not stick.moves()
+    stick.push(50, 1)
+    assert stick.moves()
+
+
+@pytest.mark.parametrize(("gap_ms", "believed"), [(200, True), (201, False)])
+def test_after_a_gap_of_more_than_200_ms_it_is_deaf_again(gap_ms: int, believed: bool) -> None:
+    stick = Stick()
+    stick.push(50, 11)
+    stick.push(gap_ms, 1)
+    assert stick.moves() is believed
+    stick.push(0, 100)  # all that the network had stored, at once
+    assert stick.moves() is believed
+    stick.push(50, 10)
+    assert stick.moves()
+
+
+@pytest.mark.parametrize(("age_ms", "moves"), [(200, True), (201, False)])
+def test_a_stream_ends_200_ms_after_its_last_message(age_ms: int, moves: bool) -> None:
+    stick = Stick()
+    stick.push(50, 11)
+    stick.now_ms += age_ms
+    assert stick.moves() is moves
+
+
+@pytest.mark.parametrize(
+    ("tick", "boot", "on_a_real_body", "in_simulation"),
+    [
+        (100, BOOT, True, True),
+        (90, BOOT, True, True),  # 200 ms ago
+        (89, BOOT, False, False),
+        (110, BOOT, True, True),  # the operator may have seen a tick that is still on its way here
+        (111, BOOT, False, False),
+        (100, 8, False, False),
+        (0, 0, False, True),  # no echo at all
+    ],
+)
+def test_a_real_body_wants_the_newest_tick_echoed(
+    tick: int, boot: int, on_a_real_body: bool, in_simulation: bool
+) -> None:
+    stick = Stick()
+    stick.push(50, 11, Twist(linear_x=0.1, boot=boot, tick=tick))
+    assert stick.moves(echo_wanted=True) is on_a_real_body
+    assert stick.moves(echo_wanted=False) is in_simulation
+
+
+@pytest.mark.parametrize("real", [True, False])
+async def test_the_kind_of_link_decides_whether_the_echo_is_wanted(real: bool) -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body(real=real))
+        speeds = await chain.go(40, teleop=FORWARD)
+    assert (speeds[-1] == 0.0) is real
+
+
+def test_what_the_operator_asks_for_is_passed_on_whole() -> None:
+    stick = Stick()
+    stick.push(50, 11, Twist(linear_x=0.1, linear_y=-0.2, angular_z=0.3))
+    found = stick.teleop.velocity(state(1), echo_wanted=False)
+    assert found == Velocity(linear_x=0.1, linear_y=-0.2, angular_z=0.3)

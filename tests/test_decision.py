@@ -1,0 +1,293 @@
+"""Decision: what it wants, in words and in numbers, and when it says so."""
+
+import functools
+import logging
+import math
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.brain import Intent, WorldModel
+from gigabrain_schemas.topics import BODY, INTENT, STATE, WORLD
+from gigabrain_zenoh import behaviours, decision
+from gigabrain_zenoh.behaviours import Situation
+from gigabrain_zenoh.behaviours.avoid import Avoid, expected_trajectory
+from gigabrain_zenoh.errors import UnknownName
+from gigabrain_zenoh.settings import DecisionConfig
+from tests.brain_rig import LIDAR, WAFFLE, Bench, body, state
+
+CONFIG = DecisionConfig()
+
+
+def free(*sectors: float | None) -> WorldModel:
+    return WorldModel(scan_ok=True, obstacle_ahead=False, sectors=sectors)
+
+
+def blocked(distance: float | None, *sectors: float | None) -> WorldModel:
+    return WorldModel(scan_ok=True, obstacle_ahead=True, distance_ahead=distance, sectors=sectors)
+
+
+def at(world: WorldModel | None, x: float = 0.0, y: float = 0.0, yaw: float = 0.0) -> Situation:
+    return Situation(world, Pose(x=x, y=y, yaw=yaw))
+
+
+def test_it_drives_straight_on_where_nothing_is_ahead() -> None:
+    intent = Avoid(CONFIG).step(at(free()))
+    assert intent.twist == Velocity(linear_x=0.2)
+    assert (intent.behaviour, intent.reason) == ("avoid", "forward 0.20 m/s")
+
+
+def test_it_turns_right_on_the_spot_while_something_is_ahead() -> None:
+    avoid = Avoid(CONFIG)
+    intent = avoid.step(at(blocked(0.83)))
+    assert intent.twist == Velocity(angular_z=-0.5)
+    assert intent.reason == "turning right: obstacle 0.83 m ahead"
+    assert avoid.step(at(free())).twist == Velocity(linear_x=0.2)
+
+
+def test_an_obstacle_at_an_unknown_distance_is_named_without_one() -> None:
+    assert Avoid(CONFIG).step(at(blocked(None))).reason == "turning right: obstacle"
+
+
+def test_speeds_come_from_the_deployment_file() -> None:
+    slow = Avoid(DecisionConfig(linear_speed=0.15, angular_speed=0.3, turn="left"))
+    assert slow.step(at(free())).twist == Velocity(linear_x=0.15)
+    intent = slow.step(at(blocked(0.5)))
+    assert intent.twist == Velocity(angular_z=0.3)
+    assert intent.reason == "turning left: obstacle 0.50 m ahead"
+
+
+LEFT_CLEAR = (0.8, 3.0, 3.0, 1.0, 1.0, 1.0)  # counter-clockwise: ahead, two left, behind, two right
+
+
+@pytest.mark.parametrize(
+    ("sectors", "reason"),
+    [
+        (LEFT_CLEAR, "turning left"),
+        ((0.8, 1.0, 1.0, 1.0, 3.0, 3.0), "turning right"),
+        ((0.8, 1.0, 1.0, 3.0, 1.0, 1.0), "turning right"),  # no difference: as usual
+        ((0.8, None, 1.0, 1.0, 2.0, 1.0), "turning left"),  # nothing in sight is clearer
+        ((0.8, None, None, 1.0, 2.5, 3.4), "turning right"),  # beyond 2.5 m all is open
+        ((0.8, 1.0, 2.0, 1.0, 1.0), "turning left"),  # an odd number has no sector behind
+        ((), "turning right"),
+    ],
+)
+def test_turning_to_the_clearer_side(sectors: tuple[float | None, ...], reason: str) -> None:
+    intent = Avoid(DecisionConfig(turn="clearer")).step(at(blocked(0.8, *sectors)))
+    assert intent.reason.startswith(reason)
+
+
+def test_a_turn_once_begun_keeps_its_side() -> None:
+    avoid = Avoid(DecisionConfig(turn="clearer"))
+    avoid.step(at(blocked(0.8, *LEFT_CLEAR)))
+    later = avoid.step(at(blocked(0.9, 0.9, 1.0, 1.0, 1.0, 3.0, 3.0), yaw=0.4))
+    assert later.reason == "turning left: obstacle 0.90 m ahead"
+
+
+def test_it_waits_while_perception_is_silent_or_blind() -> None:
+    avoid = Avoid(CONFIG)
+    avoid.step(at(free()))
+    silent = avoid.step(at(None))
+    unsure = WorldModel(
+        scan_ok=False, scan_problem="the lidar sees nothing at all", obstacle_ahead=True
+    )
+    blind = avoid.step(at(unsure))
+    for intent, reason in (
+        (silent, "waiting: perception is silent"),
+        (blind, "waiting: the lidar sees nothing at all"),
+    ):
+        assert intent == Intent(twist=Velocity(), behaviour="avoid", reason=reason)
+
+
+def test_the_expected_trajectory_of_a_straight_leg_is_a_line() -> None:
+    points = Avoid(CONFIG).step(at(free())).trajectory
+    assert [point.t for point in points] == [0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0]
+    assert [point.x for point in points] == pytest.approx(
+        [0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4]
+    )
+    assert {(point.y, point.yaw) for point in points} == {(0.0, 0.0)}
+
+
+def test_the_expected_trajectory_of_a_turn_stays_on_the_spot() -> None:
+    points = Avoid(CONFIG).step(at(blocked(0.8))).trajectory
+    assert {(point.x, point.y) for point in points} == {(0.0, 0.0)}
+    assert points[-1].yaw == pytest.approx(-1.0)
+
+
+def test_the_expected_trajectory_of_a_bend_is_an_arc_of_radius_v_over_w() -> None:
+    points = expected_trajectory(Velocity(linear_x=0.2, angular_z=0.5))
+    for point in points:
+        from_centre = (point.x, point.y - 0.4)  # 0.2 / 0.5 = 0.4 m to the left
+        assert math.hypot(*from_centre) == pytest.approx(0.4)
+        assert math.atan2(from_centre[0], -from_centre[1]) == pytest.approx(point.yaw)
+    assert points[-1].yaw == pytest.approx(1.0)
+    nearly_straight = expected_trajectory(Velocity(linear_x=0.2, angular_z=1e-7))[-1]
+    assert nearly_straight.x == pytest.approx(0.4)
+    assert nearly_straight.y == 0.0
+
+
+def test_progress_of_a_leg_is_what_is_driven_of_what_was_free() -> None:
+    avoid = Avoid(CONFIG)
+    at_x = [avoid.step(at(free(2.0), x=x)).progress for x in (0.0, 0.5, 1.0, 2.0, 3.0)]
+    assert at_x == [0.0, 0.25, 0.5, 1.0, 1.0]
+
+
+def test_a_leg_with_nothing_in_sight_is_expected_to_go_two_and_a_half_metres() -> None:
+    for world in (free(), free(None, 1.0, 1.0, 1.0)):
+        avoid = Avoid(CONFIG)
+        avoid.step(at(world))
+        assert avoid.step(at(world, y=1.25)).progress == pytest.approx(0.5)
+
+
+def test_progress_of_a_turn_is_what_is_turned_of_a_right_angle() -> None:
+    avoid = Avoid(CONFIG)
+    yaws = [0.0, -math.pi / 4, -math.pi / 2, -3.0, 3.0, 0.0]  # once round, through the seam
+    found = [avoid.step(at(blocked(0.8), yaw=yaw)).progress for yaw in yaws]
+    assert found == [0.0, pytest.approx(0.5), 1.0, 1.0, 1.0, 1.0]
+
+
+def test_progress_never_goes_back_within_a_step_and_begins_anew_with_the_next() -> None:
+    avoid = Avoid(CONFIG)
+    pushed = [avoid.step(at(free(1.0), x=x)).progress for x in (0.0, 0.5, 0.4, 0.6)]
+    assert pushed == [0.0, 0.5, 0.5, pytest.approx(0.6)]
+    assert avoid.step(at(blocked(0.8), x=0.6)).progress == 0.0
+    assert avoid.step(at(free(1.0), x=0.6)).progress == 0.0
+
+
+def test_an_unknown_behaviour_suggests_the_nearest() -> None:
+    with pytest.raises(UnknownName, match=r"no behaviour 'aviod'; did you mean 'avoid'\? known"):
+        behaviours.load("aviod")
+    assert behaviours.load("avoid") is Avoid
+
+
+def world(tick: int, *, ahead: bool = False, boot: int = 7) -> WorldModel:
+    return WorldModel(
+        scan_ok=True,
+        obstacle_ahead=ahead,
+        distance_ahead=0.83 if ahead else None,
+        boot=boot,
+        tick=tick,
+        basis=tick,
+    )
+
+
+def bench(config: DecisionConfig = CONFIG) -> Bench:
+    return Bench(functools.partial(decision.run, config))
+
+
+def heads(intents: list[Intent]) -> list[tuple[int, int, str]]:
+    return [(i.tick, i.basis, i.reason.partition(" ")[0]) for i in intents]
+
+
+async def test_a_world_becomes_an_intent_at_once() -> None:
+    async with bench() as node:
+        node.send(STATE, state(10))
+        assert heads(node.sent(INTENT)) == [(10, 0, "waiting:")]
+        node.send(WORLD, world(10))
+        assert heads(node.sent(INTENT)) == [(10, 10, "forward")]
+
+
+async def test_an_intent_is_repeated_with_the_newest_tick_and_its_own_basis() -> None:
+    async with bench() as node:
+        node.send(STATE, state(10))
+        node.send(WORLD, world(10))
+        node.sent(INTENT)
+        for tick in (11, 12, 13):
+            node.send(STATE, state(tick))
+        assert heads(node.sent(INTENT)) == [
+            (11, 10, "forward"),
+            (12, 10, "forward"),
+            (13, 10, "forward"),
+        ]
+        node.send(STATE, state(15))
+        node.send(WORLD, world(15, ahead=True))
+        assert heads(node.sent(INTENT)) == [(15, 10, "forward"), (15, 15, "turning")]
+
+
+async def test_a_world_that_comes_before_the_state_of_its_tick_waits_for_it() -> None:
+    async with bench() as node:
+        node.send(STATE, state(9))
+        node.sent(INTENT)
+        node.send(WORLD, world(10))
+        assert node.sent(INTENT) == []
+        node.send(STATE, state(10))
+        assert heads(node.sent(INTENT)) == [(10, 10, "forward")]
+
+
+async def test_a_state_that_was_overtaken_by_a_later_world_does_not_use_it() -> None:
+    async with bench() as node:
+        node.send(STATE, state(8))
+        node.send(WORLD, world(10))
+        node.sent(INTENT)
+        node.send(STATE, state(9))
+        assert heads(node.sent(INTENT)) == [(9, 0, "waiting:")]
+
+
+async def test_it_thinks_once_per_world_however_often_it_repeats_itself() -> None:
+    async with bench() as node:
+        node.send(STATE, state(10))
+        node.send(WORLD, world(10))
+        node.send(STATE, state(11, pose=(1.0, 0.0, 0.0)))
+        node.send(WORLD, world(10))  # the same once more
+        intents = node.sent(INTENT)
+    assert [intent.progress for intent in intents] == [0.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("rate_hz", "last"), [(10.0, 22), (5.0, 25)])
+async def test_it_waits_once_the_world_is_older_than_250_ms_or_one_and_a_half_scans(
+    rate_hz: float, last: int
+) -> None:
+    async with bench() as node:
+        node.send(BODY, body(replace(WAFFLE, lidar=replace(LIDAR, rate_hz=rate_hz))))
+        node.send(STATE, state(10))
+        node.send(WORLD, world(10))
+        for tick in range(11, 30):
+            node.send(STATE, state(tick))
+        intents = node.sent(INTENT)
+    forward = [intent.tick for intent in intents if intent.reason.startswith("forward")]
+    assert forward[-1] == last
+    assert intents[-1].reason == "waiting: perception is silent"
+    assert intents[-1].basis == 10
+
+
+async def test_a_driver_that_starts_anew_is_met_with_an_open_mind() -> None:
+    async with bench() as node:
+        node.send(STATE, state(5000))
+        node.send(WORLD, world(5000))
+        node.send(STATE, state(3, boot=8))
+        node.send(STATE, state(5, boot=8, pose=(9.0, 9.0, 0.0)))
+        node.send(WORLD, world(5, boot=8))
+        intents = node.sent(INTENT)
+    assert heads(intents)[2:] == [(3, 0, "waiting:"), (5, 0, "waiting:"), (5, 5, "forward")]
+    assert intents[-1].boot == 8
+    assert intents[-1].progress == 0.0
+
+
+async def test_a_change_of_mind_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gigabrain_zenoh.decision")
+    async with bench() as node:
+        for tick in range(10, 30, 5):
+            node.send(STATE, state(tick))
+            node.send(WORLD, world(tick, ahead=tick >= 20))
+    assert [record.getMessage() for record in caplog.records] == [
+        "waiting: perception is silent",
+        "forward 0.20 m/s",
+        "turning right: obstacle 0.83 m ahead",
+    ]
+
+
+async def test_without_a_state_it_says_nothing() -> None:
+    async with bench() as node:
+        node.send(WORLD, world(10))
+        assert node.sent(INTENT) == []
+        node.send(STATE, state(10))
+        node.sent(INTENT)
+        await node.clock.advance(260_000_000)  # the driver has stopped
+        node.send(WORLD, world(11))
+        assert node.sent(INTENT) == []
+
+
+async def test_an_unknown_behaviour_ends_the_process_before_it_begins() -> None:
+    with pytest.raises(UnknownName, match="no behaviour 'fly'"):
+        await decision.run(DecisionConfig(behaviour="fly"), None, lambda: None)  # type: ignore[arg-type]

@@ -1,0 +1,308 @@
+"""Safety's step: what stops the body, what slows it down, and after how long."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Cause
+from gigabrain_schemas.body import BodyDescription, GateStatus, RobotState, Thresholds
+from gigabrain_schemas.safety import SafetyState, SpeedCaps
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.ages import scan_limit_ns
+from gigabrain_zenoh.safety import Inputs, Memory, step
+from tests.brain_rig import DRIVING, LIDAR, WAFFLE, open_space, scan, state
+
+MS = 1_000_000
+BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.32, stop_margin=0.08))
+ALL = ("perception", "decision", "control")
+
+
+def judge(
+    *,
+    at: RobotState | None = None,
+    seen: LaserScan | None = None,
+    age_ms: float | None = 0,
+    silent: tuple[str, ...] = (),
+    memory: Memory | None = None,
+    body: BodyDescription = BODY,
+) -> SafetyState:
+    """The verdict on one moment."""
+    now = at or state(1)
+    inputs = Inputs(
+        state=now,
+        scan=seen or scan(open_space()),
+        scan_age_ns=None if age_ms is None else round(age_ms * MS),
+        silent=silent,
+    )
+    return step(body, memory or Memory(boot=now.boot), inputs)[1]
+
+
+def codes(verdict: SafetyState) -> list[str]:
+    return [cause.code for cause in verdict.causes]
+
+
+class Watch:
+    """Safety over time: a tick and a fresh scan at each call, free space unless it is said."""
+
+    def __init__(self) -> None:
+        self.memory, self.tick = Memory(), 0
+
+    def sees(
+        self, ahead: float | None = None, behind: float | None = None, v: float = 0.0
+    ) -> SafetyState:
+        """The verdict with so much room, at a speed of `v`."""
+        self.tick += 1
+        values = open_space()
+        if ahead is not None:
+            values[0] = 0.075 + ahead
+        if behind is not None:
+            values[180] = 0.200 + behind
+        return self._judge(
+            Inputs(state=state(self.tick, v=v), scan=scan(values, self.tick), scan_age_ns=0)
+        )
+
+    def feels(
+        self, *, ticks: int = 1, battery: float = 100.0, motor: float | None = 30.0
+    ) -> SafetyState:
+        """The verdict after so many ticks with a battery and a motor like this."""
+        for _ in range(ticks):
+            self.tick += 1
+            now = state(self.tick, battery=battery, motor=motor)
+            verdict = self._judge(
+                Inputs(state=now, scan=scan(open_space(), self.tick), scan_age_ns=0)
+            )
+        return verdict
+
+    def _judge(self, inputs: Inputs) -> SafetyState:
+        self.memory, verdict = step(BODY, self.memory, inputs)
+        return verdict
+
+
+def test_all_is_well() -> None:
+    assert judge() == SafetyState(verdict="ok")
+
+
+def test_a_lost_scan_stops_the_body_after_250_ms() -> None:
+    assert judge(age_ms=250).verdict == "ok"
+    lost = judge(age_ms=250.001)
+    assert lost.verdict == "stop"
+    assert lost.causes == (Cause(code="scan_lost", text="no scan for more than 250 ms"),)
+    assert codes(judge(age_ms=None)) == ["scan_lost"]
+
+
+def test_a_slow_lidar_may_take_one_and_a_half_periods() -> None:
+    slow = replace(BODY, lidar=replace(LIDAR, rate_hz=5.0))
+    assert judge(age_ms=300, body=slow).verdict == "ok"
+    assert judge(age_ms=300.001, body=slow).causes[0].text == "no scan for more than 300 ms"
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "limit_ms"), [(50.0, 250), (10.0, 250), (6.0, 250), (5.0, 300), (2.0, 750)]
+)
+def test_sensor_data_that_moves_the_body_is_at_most_so_old(rate_hz: float, limit_ms: int) -> None:
+    assert scan_limit_ns(replace(BODY, lidar=replace(LIDAR, rate_hz=rate_hz))) == limit_ms * MS
+    assert scan_limit_ns(replace(BODY, lidar=None)) == 250 * MS
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        (np.full(360, np.nan), "the lidar sees nothing at all"),
+        (np.full(360, 2.0), "all beams report the same distance"),
+        (np.linspace(1, 2, 359), "the scan has 359 beams, the body's lidar 360"),
+    ],
+)
+def test_a_blind_lidar_stops_the_body(values: np.ndarray, text: str) -> None:
+    verdict = judge(seen=scan(values))
+    assert verdict.verdict == "stop"
+    assert verdict.causes == (Cause(code="scan_blind", text=text),)
+
+
+def test_a_lidar_that_sees_nothing_of_what_is_ahead_stops_the_body() -> None:
+    values = np.linspace(1.0, 2.0, 360)
+    values[:16] = values[-15:] = np.nan
+    assert codes(judge(seen=scan(values))) == ["scan_blind"]
+
+
+def test_a_body_without_a_lidar_is_not_stopped_for_it() -> None:
+    assert judge(body=replace(BODY, lidar=None), age_ms=None).verdict == "ok"
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_silent_system_stops_the_body_while_the_brain_drives(name: str) -> None:
+    verdict = judge(silent=(name,))
+    assert verdict.verdict == "stop"
+    assert verdict.causes == (Cause(code=f"{name}_silent", text=f"{name} is silent"),)
+
+
+@pytest.mark.parametrize(
+    ("commander", "silent", "expected"),
+    [
+        ("control", ALL, "stop"),
+        ("script", ALL, "ok"),  # a person or a script looks itself
+        ("", ("decision",), "stop"),  # the brain would be next
+        ("", ("perception", "decision"), "stop"),
+        ("", ALL, "ok"),  # there is no brain, and a script need not wait for one
+    ],
+)
+def test_the_systems_matter_only_where_the_brain_does(
+    commander: str, silent: tuple[str, ...], expected: str
+) -> None:
+    gate = GateStatus(mode="enabled" if commander else "idle", commander=commander)
+    assert judge(at=state(1, gate=gate), silent=silent).verdict == expected
+
+
+def test_within_the_stopping_distance_the_way_ahead_is_closed_but_no_other() -> None:
+    verdict = Watch().sees(ahead=0.16, v=0.2)  # L(0.2) = 0.164 m
+    assert verdict.verdict == "slow"
+    assert verdict.caps == SpeedCaps(forward=0.0)
+    assert verdict.causes == (Cause(code="zone_ahead", text="obstacle 0.16 m ahead of the body"),)
+    verdict = Watch().sees(behind=0.16, v=-0.2)
+    assert verdict.caps == SpeedCaps(backward=0.0)
+    assert codes(verdict) == ["zone_behind"]
+
+
+def test_beyond_the_stopping_distance_only_the_speed_is_bounded() -> None:
+    verdict = Watch().sees(ahead=0.17, v=0.2)
+    assert (verdict.verdict, verdict.causes) == ("slow", ())
+    assert verdict.caps.forward == pytest.approx(0.211, abs=0.001)
+    assert Watch().sees(ahead=0.5, v=0.26) == SafetyState(verdict="ok")
+
+
+def test_a_closed_zone_opens_again_with_ten_centimetres_to_spare() -> None:
+    watch = Watch()
+    assert codes(watch.sees(ahead=0.16, v=0.2)) == ["zone_ahead"]
+    assert codes(watch.sees(ahead=0.17)) == ["zone_ahead"]  # at rest, L(0) = 0.08 m
+    opened = watch.sees(ahead=0.19)
+    assert opened.causes == ()
+    assert opened.caps.forward is not None
+    assert opened.caps.forward > 0.2
+    assert codes(watch.sees(ahead=0.17)) == []
+
+
+def test_a_zone_goes_by_the_speed_towards_it() -> None:
+    assert codes(Watch().sees(ahead=0.1, v=-0.26)) == []
+    assert codes(Watch().sees(behind=0.1, v=0.26)) == []
+
+
+def test_a_scan_waits_for_the_state_of_its_tick() -> None:
+    near = open_space(deg_0=0.2)
+    memory, verdict = step(
+        BODY, Memory(boot=7), Inputs(state=state(4), scan=scan(near, 5), scan_age_ns=0)
+    )
+    assert (memory.basis, verdict.causes) == (0, ())
+    memory, verdict = step(
+        BODY, memory, Inputs(state=state(5, v=0.2), scan=scan(near, 5), scan_age_ns=0)
+    )
+    assert memory.basis == 5
+    assert codes(verdict) == ["zone_ahead"]
+
+
+def test_a_scan_is_judged_once_by_the_speed_of_its_own_time() -> None:
+    seen = scan(open_space(deg_0=0.255), 1)  # 0.18 m free
+    memory, first = step(
+        BODY, Memory(boot=7), Inputs(state=state(1, v=0.2), scan=seen, scan_age_ns=0)
+    )
+    _, later = step(BODY, memory, Inputs(state=state(3, v=0.26), scan=seen, scan_age_ns=0))
+    assert codes(first) == codes(later) == []
+    assert first.caps == later.caps  # which keep it from becoming faster than the zone allows
+
+
+def test_a_blind_scan_says_nothing_of_the_room_ahead() -> None:
+    watch = Watch()
+    watch.sees(ahead=0.1, v=0.2)
+    watch.tick += 1
+    inputs = Inputs(
+        state=state(watch.tick), scan=scan(np.full(360, np.nan), watch.tick), scan_age_ns=0
+    )
+    memory, verdict = step(BODY, watch.memory, inputs)
+    assert (memory.free_ahead, memory.stopped_ahead) == (None, False)
+    assert codes(verdict) == ["scan_blind"]
+
+
+@pytest.mark.parametrize(("percentage", "warned"), [(15.1, []), (15.0, ["battery_low"])])
+def test_a_low_battery_is_a_warning(percentage: float, warned: list[str]) -> None:
+    verdict = Watch().feels(battery=percentage, ticks=100)
+    assert [warning.code for warning in verdict.warnings] == warned
+    assert verdict.verdict == "ok"
+
+
+def test_an_empty_battery_stops_the_body_for_good_after_half_a_second() -> None:
+    watch = Watch()
+    watch.feels(ticks=10)
+    assert watch.feels(battery=5.0, ticks=24).verdict == "ok"
+    verdict = watch.feels(battery=5.0)
+    text = "battery at or below 5 %; charge it"
+    assert verdict.verdict == "stop"
+    assert verdict.causes == (Cause(code="battery_empty", text=text, latching=True),)
+    assert watch.feels(battery=5.1).verdict == "ok"  # whether it stays stopped is the gate's affair
+
+
+@pytest.mark.parametrize(("degrees", "warned"), [(59.9, []), (60.0, ["motor_warm"])])
+def test_a_warm_motor_is_a_warning(degrees: float, warned: list[str]) -> None:
+    verdict = Watch().feels(motor=degrees, ticks=100)
+    assert [warning.code for warning in verdict.warnings] == warned
+    assert verdict.verdict == "ok"
+
+
+def test_a_hot_motor_stops_the_body_for_good_after_half_a_second() -> None:
+    watch = Watch()
+    watch.feels(ticks=10)
+    assert watch.feels(motor=70.0, ticks=24).verdict == "ok"
+    verdict = watch.feels(motor=70.0)
+    text = "a motor has 70 °C or more; let it cool"
+    assert verdict.causes == (Cause(code="motor_hot", text=text, latching=True),)
+    assert verdict.warnings == (Cause(code="motor_warm", text="left_wheel has 70 °C"),)
+
+
+def test_a_sag_or_a_spike_does_not_add_up_with_the_next() -> None:
+    watch = Watch()
+    for _ in range(20):
+        assert watch.feels(battery=1.0, motor=90.0, ticks=20).verdict == "ok"
+        watch.feels()
+
+
+def test_one_sample_after_a_long_gap_does_not_count_as_half_a_second() -> None:
+    watch = Watch()
+    watch.feels()
+    watch.tick += 1000  # this process, or the network, was frozen
+    assert watch.feels(battery=1.0).verdict == "ok"
+    fresh = Watch()
+    fresh.tick = 100_000  # this process has just been started
+    assert fresh.feels(battery=1.0).verdict == "ok"
+
+
+def test_asked_again_within_a_tick_nothing_counts_twice() -> None:
+    memory = Memory(boot=7)
+    low = Inputs(state=state(1, battery=1.0), scan=scan(open_space()), scan_age_ns=0)
+    for _ in range(100):
+        memory, verdict = step(BODY, memory, low)
+    assert verdict.verdict == "ok"
+    assert memory.low_ticks == 1
+
+
+def test_a_body_that_measures_neither_battery_nor_motors_is_not_stopped_for_it() -> None:
+    bare = replace(state(1), battery=None, joints=())
+    assert judge(at=bare) == SafetyState(verdict="ok")
+    assert judge(at=state(1, motor=None)) == SafetyState(verdict="ok")
+
+
+def test_a_new_start_of_the_driver_is_judged_afresh() -> None:
+    watch = Watch()
+    watch.feels(battery=1.0, ticks=24)
+    watch.sees(ahead=0.1, v=0.2)
+    now = state(1, boot=8, battery=1.0)
+    memory, verdict = step(BODY, watch.memory, Inputs(state=now, scan_age_ns=None))
+    assert memory == Memory(boot=8, tick=1)
+    assert codes(verdict) == ["scan_lost"]
+
+
+def test_several_causes_stand_side_by_side() -> None:
+    watch = Watch()
+    watch.sees(ahead=0.05)
+    inputs = Inputs(
+        state=state(watch.tick + 1, gate=DRIVING), scan_age_ns=300 * MS, silent=("control",)
+    )
+    _, verdict = step(BODY, watch.memory, inputs)
+    assert codes(verdict) == ["scan_lost", "control_silent", "zone_ahead"]
+    assert verdict.verdict == "stop"

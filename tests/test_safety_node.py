@@ -1,0 +1,172 @@
+"""Safety on the bus: how often it speaks, whom it waits for, and after how long it misses them."""
+
+import logging
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import GateStatus
+from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
+from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, SCAN, STATE, WORLD
+from gigabrain_zenoh import safety
+from tests.brain_rig import BOOT, DRIVING, TICK_NS, Bench, body, open_space, scan, state
+
+ALL = ("perception", "decision", "control")
+SCRIPT = GateStatus(mode="enabled", commander="script", enables=1)
+NOBODY = GateStatus(mode="idle")
+WORLD_NOW = WorldModel(scan_ok=True, obstacle_ahead=False)
+INTENT_NOW = Intent(twist=Velocity(), behaviour="avoid", reason="because")
+
+
+class Chain(Bench):
+    """Safety, with all that it listens to."""
+
+    def __init__(self) -> None:
+        super().__init__(safety.run)
+        self.tick = 0
+
+    async def go(
+        self,
+        ticks: int,
+        *,
+        alive: tuple[str, ...] = ALL,
+        scans: bool = True,
+        gate: GateStatus = DRIVING,
+        source: str = "control",
+        battery: float = 100.0,
+    ) -> list[tuple[int, tuple[str, ...]]]:
+        """So many ticks with these systems alive; tick and causes of every verdict."""
+        for _ in range(ticks):
+            self.tick += 1
+            self.send(STATE, state(self.tick, gate=gate, battery=battery))
+            if self.tick % 5 == 0 and scans:
+                self.send(SCAN, scan(open_space(), self.tick))
+            if self.tick % 5 == 0 and "perception" in alive:
+                self.send(WORLD, replace(WORLD_NOW, boot=BOOT, tick=self.tick))
+            if "decision" in alive:
+                self.send(INTENT, replace(INTENT_NOW, boot=BOOT, tick=self.tick))
+            if "control" in alive:
+                command = CmdVel(linear_x=0.0, source=source, boot=BOOT, tick=self.tick)
+                self.send(CMD_VEL, command)
+            await self.clock.advance(TICK_NS)
+        return [(v.tick, tuple(c.code for c in v.causes)) for v in self.sent(SAFETY)]
+
+
+async def started(chain: Chain) -> None:
+    chain.send(BODY, body())
+    await chain.go(20)
+
+
+async def test_it_speaks_every_second_tick_and_with_every_scan() -> None:
+    async with Chain() as chain:
+        await started(chain)
+        ticks = [tick for tick, causes in await chain.go(20) if causes == ()]
+    assert ticks == [22, 24, 25, 27, 29, 30, 32, 34, 35, 37, 39, 40]
+
+
+async def test_a_verdict_rests_on_the_newest_scan_and_carries_the_newest_tick() -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        chain.send(STATE, state(5))
+        chain.send(SCAN, scan(open_space(), 5))
+        verdicts = chain.sent(SAFETY)
+    assert [(v.boot, v.tick, v.basis) for v in verdicts] == [(BOOT, 5, 0), (BOOT, 5, 5)]
+
+
+async def test_a_scan_that_overtakes_the_state_of_its_tick_waits_for_it() -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        chain.send(STATE, state(4))
+        chain.sent(SAFETY)
+        chain.send(SCAN, scan(open_space(), 5))
+        assert chain.sent(SAFETY) == []
+        chain.send(STATE, state(5))
+        assert [(v.tick, v.basis) for v in chain.sent(SAFETY)] == [(5, 5)]
+
+
+async def test_a_change_is_told_at_once() -> None:
+    async with Chain() as chain:
+        await started(chain)
+        await chain.go(1)
+        await chain.go(24, battery=1.0)
+        found = await chain.go(1, battery=1.0)  # an odd tick
+    assert found == [(46, ("battery_empty",))]
+
+
+@pytest.mark.parametrize(
+    ("name", "missed_ms"),
+    [("decision", 160), ("control", 160), ("perception", 320)],
+)
+async def test_a_silent_system_is_missed_in_time(name: str, missed_ms: int) -> None:
+    async with Chain() as chain:
+        await started(chain)
+        alive = tuple(other for other in ALL if other != name)
+        found = await chain.go(30, alive=alive)
+    first = next(tick for tick, causes in found if causes)
+    assert (first - 20) * 20 == missed_ms  # all were heard last in tick 20
+    assert found[-1] == (50, (f"{name}_silent",))
+
+
+async def test_a_lost_scan_is_missed_in_time() -> None:
+    async with Chain() as chain:
+        await started(chain)
+        found = await chain.go(30, scans=False)
+    first = next(tick for tick, causes in found if causes)
+    assert (first - 20) * 20 == 260
+    assert found[-1][1] == ("scan_lost",)
+
+
+async def test_what_a_script_sends_is_no_sign_of_life_from_control() -> None:
+    async with Chain() as chain:
+        await started(chain)
+        found = await chain.go(30, source="script")
+    assert found[-1] == (50, ("control_silent",))
+
+
+async def test_without_a_brain_a_script_may_drive() -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        idle = await chain.go(30, alive=(), gate=NOBODY)
+        driven = await chain.go(30, alive=("control",), source="script", gate=SCRIPT)
+    assert idle[-1] == (30, ())
+    assert {causes for _, causes in driven} == {()}
+
+
+async def test_silence_is_judged_by_the_robots_clock_and_the_scan_by_arrival_as_well() -> None:
+    async with Chain() as chain:
+        await started(chain)
+        await chain.clock.advance(200_000_000)  # the driver was held up; its time stood still
+        found = await chain.go(3, scans=False)
+    assert found[-1] == (23, ("scan_lost",))  # 260 ms after it came, only 60 ms by the tick
+    assert {causes for _, causes in found[:-1]} <= {()}
+
+
+async def test_a_driver_that_starts_anew_is_judged_afresh() -> None:
+    async with Chain() as chain:
+        await started(chain)
+        chain.send(STATE, state(1, boot=8))
+        assert chain.sent(SAFETY) == []  # whose body?
+        chain.send(BODY, body(boot=8))
+        chain.send(STATE, state(2, boot=8))
+        (verdict,) = chain.sent(SAFETY)
+    assert (verdict.boot, verdict.tick, verdict.basis) == (8, 2, 0)
+    assert {cause.code for cause in verdict.causes} >= {"scan_lost", "decision_silent"}
+
+
+async def test_a_cause_is_logged_once_when_it_begins_and_once_when_it_ends(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "gigabrain_zenoh.safety")
+    async with Chain() as chain:
+        chain.send(BODY, body())
+        await chain.go(20, alive=("decision",), gate=NOBODY)  # while all is starting: not a word
+        await chain.go(20, gate=NOBODY)
+        assert caplog.messages == []
+        await chain.go(20)
+        await chain.go(50, alive=("perception", "control"))
+        await chain.go(20)
+    assert caplog.messages == [
+        "stop: decision is silent",
+        "nothing holds the body back",
+    ]
