@@ -6,6 +6,7 @@ BOOT = Cause(code="boot", text="just started; nobody has released it yet")
 SILENCE = Cause(code="silence", text="no good command for 100 ms")
 STALE = Cause(code="stale", text="commands rest on sensor data that is too old")
 SAFETY_SILENT = Cause(code="safety_silent", text="the safety process is silent")
+SAFETY_STOP = Cause(code="safety_stop", text="the safety process says stop")
 NOT_FINITE = Cause(code="nan", text="the commander sent a value that is not a number")
 NAN_STORM = Cause(
     code="nan_storm", text="the commander kept sending values that are not numbers", latching=True
@@ -23,6 +24,12 @@ def latching(causes: tuple[Cause, ...]) -> tuple[Cause, ...]:
     return tuple(cause for cause in causes if cause.latching)
 
 
+def merge(known: tuple[Cause, ...], more: tuple[Cause, ...]) -> tuple[Cause, ...]:
+    """`known`, and those of `more` that are new; one that has come to latch counts as new."""
+    held = {(cause.code, cause.latching) for cause in known}
+    return known + tuple(cause for cause in more if (cause.code, cause.latching) not in held)
+
+
 def in_words(causes: tuple[Cause, ...]) -> str:
-    """`causes` as one phrase."""
-    return "; ".join(cause.text for cause in causes)
+    """`causes` as one phrase, short enough to stand in a reply with words around it."""
+    return "; ".join(cause.text for cause in causes)[:400]

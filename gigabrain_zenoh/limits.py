@@ -63,5 +63,6 @@ def _approach(current: float, target: float, up: float, down: float) -> float:
     """One step. It ends at zero on the way to the other side: braking comes first."""
     if current * target < 0:
         target = 0.0
-    step = up if abs(target) > abs(current) else down
-    return max(current - step, min(current + step, target))
+    highest = current + (up if current >= 0 else down)
+    lowest = current - (up if current <= 0 else down)
+    return max(lowest, min(highest, target))
