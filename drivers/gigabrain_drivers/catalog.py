@@ -4,13 +4,14 @@ import importlib
 from importlib import resources
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import msgspec
 
 from gigabrain_drivers import DRIVERS
 from gigabrain_drivers.base import Driver
-from gigabrain_drivers.robot import LINKS, RobotFile, Run
+from gigabrain_drivers.lidars.base import source_class
+from gigabrain_drivers.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.settings import LinkName
@@ -74,7 +75,7 @@ def make_driver(name: str, run: Run) -> tuple[RobotFile, Driver]:
     # read once more, now that it is known what this driver's part looks like: errors name the line
     exact = msgspec.defstruct(
         "RobotFile",
-        [(run.link, driver.Options)],
+        [(run.link, link_options(driver, link))],
         bases=(RobotFile,),
         frozen=True,
         kw_only=True,
@@ -82,3 +83,20 @@ def make_driver(name: str, run: Run) -> tuple[RobotFile, Driver]:
     )
     options = getattr(config.load(path, exact), run.link)
     return robot, driver(robot, options, msgspec.structs.replace(run, folder=path.parent))
+
+
+def link_options(driver: type[Driver], link: dict[str, Any]) -> type[LinkOptions]:
+    """What a link of `driver` may hold, down to the options of the lidar that it carries."""
+    scan = link.get("scan")
+    name = scan.get("driver") if isinstance(scan, dict) else None
+    if not isinstance(name, str):
+        return driver.Options  # which refuses it, with the line
+    exact = msgspec.defstruct(
+        driver.Options.__name__,
+        [("scan", source_class(name).Options)],
+        bases=(driver.Options,),
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+    )
+    return cast("type[LinkOptions]", exact)

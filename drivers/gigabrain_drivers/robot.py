@@ -39,10 +39,18 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
         return BodyDescription(**{name: getattr(self, name) for name in names})
 
 
+class ScanOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A lidar on a line of its own; scan sources add their own fields."""
+
+    driver: str  # one of gigabrain_drivers.lidars.SCAN_SOURCES
+    port: str = "auto"  # a path, usb:VID:PID[:SERIAL], or auto
+
+
 class LinkOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What every link has; drivers add their own fields."""
 
     driver: str
+    scan: ScanOptions | None = None  # a lidar that the driver carries, see lidars.base.carry
 
 
 class Run(Struct, frozen=True, kw_only=True):
