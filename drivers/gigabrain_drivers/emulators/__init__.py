@@ -1,0 +1,6 @@
+"""Bodies that are not there: real bytes on a pty or a TCP port, with physics behind them."""
+
+# driver of a link, or of its scan source -> the device that answers it, imported only when used
+DEVICES = {
+    "line": "gigabrain_drivers.emulators.line_base:LineBase",
+}

@@ -1,0 +1,155 @@
+"""A body in MuJoCo that runs in real time, for devices to be the electronics of."""
+
+import abc
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.sim.physics import Charge, ImuSample, Odometry, Simulation, Wheel
+from gigabrain_drivers.sim.tick import TICK_S
+from gigabrain_zenoh.errors import BodyLost
+
+LATE_S = 0.25  # further behind than this, time is dropped instead of raced after
+
+
+class Snapshot(NamedTuple):
+    """What the body's parts measured at the end of a step of 10 ms."""
+
+    time_ns: int  # simulated
+    odometry: Odometry
+    wheels: tuple[Wheel, ...]  # left, right
+    imu: ImuSample
+    battery: Charge
+    bumper: bool
+    ranges: NDArray[np.float32] | None  # (beams,) [m], ahead first, counter-clockwise; inf: no hit
+
+
+class EmulatedBody:
+    """Physics in a thread of its own, 10 ms a step; everything else may be called on the loop.
+
+    `command` is what the motors are told; stopping when nobody tells them is the devices' part.
+    """
+
+    def __init__(self, robot: RobotFile, simulation: Simulation, run: Run) -> None:
+        self.robot, self.run = robot, run
+        self.lost = ""  # why the physics has ended, if it has
+        self.scanning = False  # set by a lidar: a fresh scan is then cast in every step
+        self.on_step: list[Callable[[Snapshot], None]] = []  # called in the physics thread
+        self._simulation = simulation
+        self._halt = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._commanded = (0.0, 0.0, 0.0)
+        self._cpu_s = 0.0
+        self.snapshot = self._look()
+
+    def start(self) -> None:
+        """Let time begin."""
+        self._thread = threading.Thread(target=self._work, name="physics", daemon=True)
+        self._thread.start()
+
+    async def close(self) -> None:
+        """End the physics. Any number of times."""
+        self._halt.set()
+        thread, self._thread = self._thread, None
+        if thread:
+            await asyncio.to_thread(thread.join)
+
+    def command(self, linear_x: float, linear_y: float, angular_z: float) -> None:
+        """What the motors aim for from the next step on [m/s, m/s, rad/s]."""
+        self._commanded = (linear_x, linear_y, angular_z)
+
+    @property
+    def commanded(self) -> tuple[float, float, float]:
+        """What the motors aim for."""
+        return self._commanded
+
+    def report(self) -> Mapping[str, float | int | str | None]:
+        """The truth of the run so far."""
+        truth = self._simulation.truth
+        return {
+            "body": self.robot.robot_type,
+            "world": self.run.world,
+            "seed": self.run.seed,
+            "sim_seconds": round(self._simulation.time_ns / 1e9, 2),
+            "distance_m": round(truth.distance_m, 3),
+            "contacts": truth.contacts,
+            "min_clearance_m": round(truth.min_clearance_m, 3),
+            "true_speed": round(truth.speed()[0], 4),
+            "physics_cpu_s": round(self._cpu_s, 3),
+        }
+
+    def _work(self) -> None:
+        start, done, began = time.perf_counter(), 0, time.thread_time()
+        while not self._halt.is_set():
+            done += 1
+            wait = start + done * TICK_S - time.perf_counter()
+            if wait > 0:
+                time.sleep(wait)
+            elif wait < -LATE_S:
+                start -= wait
+            try:
+                self._step()
+            except BodyLost as error:
+                self.lost = str(error)
+                return
+            self._cpu_s = time.thread_time() - began
+
+    def _step(self) -> None:
+        linear_x, _, angular_z = self._commanded
+        self._simulation.command(linear_x, angular_z)
+        self._simulation.advance()
+        self.snapshot = snapshot = self._look()
+        for tell in self.on_step:
+            tell(snapshot)
+
+    def _look(self) -> Snapshot:
+        simulation = self._simulation
+        return Snapshot(
+            time_ns=simulation.time_ns,
+            odometry=simulation.odometry(),
+            wheels=simulation.wheels(),
+            imu=simulation.imu(),
+            battery=simulation.battery(),
+            bumper=simulation.bumper(),
+            ranges=simulation.scan() if self.scanning else None,
+        )
+
+
+class Wire(Protocol):
+    """The device's end of a link."""
+
+    def write(self, data: bytes) -> bool:
+        """To the host; False when nobody takes it."""
+
+
+class Device(abc.ABC):
+    """The electronics on one link: answers bytes, moves the body, reports what it measures.
+
+    Everything is called on the loop. There is no clock inside: `step` says what time it is.
+    """
+
+    Options: ClassVar[type[Struct]]  # those of the driver or scan source that it answers
+    period_s: ClassVar[float] = 0.01  # between two steps
+
+    def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
+        self.body, self.options, self.wire = body, options, wire
+        self.sag_volts = 0.0  # brown-out: by how much the supply has fallen [V]
+
+    @abc.abstractmethod
+    def feed(self, data: bytes) -> None:
+        """Bytes have come from the host, in pieces of any size."""
+
+    @abc.abstractmethod
+    def step(self, now_ns: int) -> None:
+        """What the firmware does by itself every `period_s`: telemetry, and its watchdog."""
+
+    @abc.abstractmethod
+    def reset(self) -> None:
+        """Power has come: all as at the start, motors at rest, the banner where it has one."""

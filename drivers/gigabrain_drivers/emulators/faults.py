@@ -1,0 +1,75 @@
+"""Faults on demand, between a device and its wire."""
+
+import random
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+from gigabrain_drivers.emulators.base import Wire
+from gigabrain_schemas.base import NonNegative
+
+Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+LONGEST_GARBAGE = 64  # bytes
+
+
+class Faults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What is wrong with a device at present. Written as JSON, or as words such as `silence`."""
+
+    silence: bool = False  # nothing that it sends arrives; it still hears
+    deaf: bool = False  # nothing that is sent to it arrives; it still talks
+    frozen: bool = False  # its line hangs: no answer, bytes pile up; the motors' watchdog goes on
+    garbage: Chance = 0.0  # of each piece that it sends to be preceded by random bytes
+    bit_errors: Chance = 0.0  # of each byte, both ways, to arrive with one bit flipped
+    half_frames: Chance = 0.0  # of each piece that it sends to be cut in two and lose the rest
+    unplugged: bool = False  # the port is gone
+    reboot: bool = False  # held in reset, motors off; afterwards it boots and says its banner
+    brown_out: NonNegative = 0.0  # [V], by which its supply has fallen
+
+
+NONE = Faults()
+
+
+class FaultyWire:
+    """Between a device and its wire: hands bytes on, or does with them what the faults say."""
+
+    def __init__(self, wire: Wire, seed: int = 0) -> None:
+        self.faults = NONE
+        self._wire = wire
+        self._random = random.Random(seed)
+        self._waiting = bytearray()  # what came while the device stood still
+
+    def write(self, data: bytes) -> bool:
+        """From the device to the host."""
+        faults = self.faults
+        if faults.silence or faults.frozen or faults.reboot:
+            return True
+        if self._happens(faults.garbage):
+            data = self._random.randbytes(self._random.randint(1, LONGEST_GARBAGE)) + data
+        if self._happens(faults.half_frames):
+            data = data[: len(data) // 2]
+        return self._wire.write(self._flipped(data))
+
+    def incoming(self, data: bytes) -> bytes:
+        """What reaches the device of what the host sent, and of what had to wait."""
+        faults = self.faults
+        if faults.deaf or faults.reboot:
+            return b""
+        if faults.frozen:
+            self._waiting += data
+            return b""
+        waited, self._waiting = bytes(self._waiting), bytearray()
+        return self._flipped(waited + data)
+
+    def _happens(self, chance: float) -> bool:
+        return chance > 0 and self._random.random() < chance
+
+    def _flipped(self, data: bytes) -> bytes:
+        chance = self.faults.bit_errors
+        if not chance:
+            return data
+        noisy = bytearray(data)
+        for place in range(len(noisy)):
+            if self._happens(chance):
+                noisy[place] ^= 1 << self._random.randrange(8)
+        return bytes(noisy)

@@ -1,0 +1,100 @@
+"""A serial port that is not there: a pty behind a symlink, which can be unplugged."""
+
+import asyncio
+import contextlib
+import os
+import tty
+from collections.abc import Callable
+from pathlib import Path
+
+READ_BYTES = 4096
+BITS_PER_BYTE = 10  # 8N1: start, eight, stop
+
+
+class Pty:
+    """The device's end. Both ways take the time that a wire of `baud` takes, or none without."""
+
+    def __init__(self, path: Path, baud: int | None = None) -> None:
+        self.path = path  # what the host opens
+        self.on_bytes: Callable[[bytes], None] = lambda data: None
+        self.lost_bytes = 0  # that the host did not read in time; a UART loses them as well
+        self._byte_s = BITS_PER_BYTE / baud if baud else 0.0
+        self._out_free = self._in_free = 0.0  # when the wire will be free again [loop time]
+        self._master: int | None = None
+        self._slave: int | None = None
+
+    @property
+    def plugged(self) -> bool:
+        """Whether the port exists."""
+        return self._master is not None
+
+    def plug(self) -> None:
+        """Make the port appear, with nothing old in it. Nothing if it is there."""
+        if self._master is not None:
+            return
+        self._master, self._slave = os.openpty()  # the slave stays open: no EIO between clients
+        for end in (self._master, self._slave):
+            tty.setraw(end)
+        os.set_blocking(self._master, False)
+        asyncio.get_running_loop().add_reader(self._master, self._readable)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = self.path.with_name(f".{self.path.name}.new")
+        fresh.unlink(missing_ok=True)
+        fresh.symlink_to(os.ttyname(self._slave))
+        os.replace(fresh, self.path)
+
+    def unplug(self) -> None:
+        """Make the port disappear under whoever has it open. Nothing if it is gone."""
+        if self._master is None or self._slave is None:
+            return
+        asyncio.get_running_loop().remove_reader(self._master)
+        self.path.unlink(missing_ok=True)
+        os.close(self._master)
+        os.close(self._slave)
+        self._master = self._slave = None
+        self._out_free = self._in_free = 0.0
+
+    def write(self, data: bytes) -> bool:
+        """To the host; False when the port is unplugged."""
+        if self._master is None:
+            return False
+        self._out_free = self._after(self._out_free, len(data), self._send, self._master, data)
+        return True
+
+    def _after(
+        self,
+        free: float,
+        size: int,
+        act: Callable[[int, bytes], None],
+        master: int,
+        data: bytes,
+    ) -> float:
+        """Act once the bytes have been on the wire; returns when it is free again."""
+        if not self._byte_s:
+            act(master, data)
+            return free
+        loop = asyncio.get_running_loop()
+        free = max(free, loop.time()) + size * self._byte_s
+        loop.call_at(free, act, master, data)
+        return free
+
+    def _send(self, master: int, data: bytes) -> None:
+        if master != self._master:  # unplugged meanwhile
+            return
+        sent = 0
+        with contextlib.suppress(BlockingIOError, OSError):
+            sent = os.write(master, data)
+        self.lost_bytes += len(data) - sent
+
+    def _readable(self) -> None:
+        if self._master is None:
+            return
+        try:
+            data = os.read(self._master, READ_BYTES)
+        except (BlockingIOError, OSError):
+            return
+        self._in_free = self._after(self._in_free, len(data), self._take, self._master, data)
+
+    def _take(self, master: int, data: bytes) -> None:
+        if master == self._master:
+            self.on_bytes(data)

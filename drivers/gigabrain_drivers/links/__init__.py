@@ -1,0 +1,1 @@
+"""Bytes to and from bodies: serial lines and TCP connections that keep themselves open."""

@@ -1,0 +1,186 @@
+"""What every link is: bytes out, bytes in, and a port that is opened again for ever."""
+
+import abc
+import asyncio
+import contextlib
+import os
+from collections.abc import Callable
+
+from gigabrain_schemas.body import LinkHealth
+from gigabrain_zenoh.clock import Clock
+
+Trace = Callable[[str, bytes], None]
+
+FIRST_RETRY_NS = 100_000_000
+LONGEST_RETRY_NS = 1_000_000_000
+LOOK_S = 0.02  # how often the age of the newest bytes is looked at, where silence has a limit
+READ_BYTES = 65536
+
+
+class LinkProblem(Exception):
+    """Why a port cannot be opened, in one line for people."""
+
+
+class Link(abc.ABC):
+    """Bytes to and from a body. Once opened it keeps itself open until it is closed.
+
+    A subclass knows how to connect; everything else is here. All callbacks run on the loop.
+    """
+
+    quiet_ns: int | None = None  # after so long without a byte, the peer counts as lost
+
+    def __init__(self, clock: Clock) -> None:
+        self.on_bytes: Callable[[bytes], None] = _ignore
+        self.on_open: Callable[[], None] = _nothing
+        self.on_lost: Callable[[str], None] = _ignore
+        self.trace: Trace | None = None  # ("tx" or "rx", bytes)
+        self.problem = "not opened"
+        self.errors = 0  # frames that the owner threw away
+        self.reconnects = 0
+        self._clock = clock
+        self._heard_ns = clock.now_ns()
+        self._fd: int | None = None
+        self._opened_once = False
+        self._ended = asyncio.Event()
+        self._keeper: asyncio.Task[None] | None = None
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is open. What it means for the body, only its bytes can tell."""
+        return self._fd is not None
+
+    @property
+    def age_ns(self) -> int:
+        """Since the newest bytes came, or since the link was opened where none came yet."""
+        return self._clock.now_ns() - self._heard_ns
+
+    @property
+    def health(self) -> LinkHealth:
+        """For `robot/state`."""
+        return LinkHealth(
+            connected=self.connected,
+            age_ms=self.age_ns / 1e6,
+            errors=self.errors,
+            reconnects=self.reconnects,
+        )
+
+    def open(self) -> None:
+        """Connect in the background, and again after every loss. Returns at once."""
+        if self._keeper is None:
+            self.problem, self._heard_ns = "connecting", self._clock.now_ns()
+            self._keeper = asyncio.create_task(self._keep_open(), name=f"link {self}")
+
+    def write(self, data: bytes) -> bool:
+        """Send now, or not at all: False when not all of it could be. Never blocks or raises."""
+        if self._fd is None:
+            return False
+        try:
+            sent = os.write(self._fd, data)
+        except BlockingIOError:
+            sent = 0
+        except OSError as error:
+            self.drop(_why(error))
+            return False
+        if sent < len(data):
+            self._cut_short()
+            return False
+        if self.trace:
+            self.trace("tx", data)
+        return True
+
+    def drop(self, why: str) -> None:
+        """Give the present connection up, with all that is queued in it, and connect anew."""
+        if self._fd is None:
+            return
+        fd, self._fd, self.problem = self._fd, None, why
+        asyncio.get_running_loop().remove_reader(fd)
+        self._shut()
+        self._ended.set()
+        self.on_lost(why)
+
+    async def close(self) -> None:
+        """Let go of the port. Any number of times."""
+        keeper, self._keeper = self._keeper, None
+        if keeper:
+            keeper.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await keeper
+        self.drop("closed")
+        self.problem = "closed"
+
+    @abc.abstractmethod
+    async def _connect(self) -> int:
+        """Open the port: a descriptor that does not block. Raises LinkProblem and OSError."""
+
+    @abc.abstractmethod
+    def _shut(self) -> None:
+        """Close what `_connect` opened, discarding what is still to be sent. Never raises."""
+
+    @abc.abstractmethod
+    def _cut_short(self) -> None:
+        """A write went out in part; see to it that the rest never goes out later."""
+
+    async def _keep_open(self) -> None:
+        retry_ns = FIRST_RETRY_NS
+        while True:
+            try:
+                fd = await self._connect()
+            except (LinkProblem, OSError) as error:
+                self.problem = _why(error)
+                await self._clock.sleep_ns(retry_ns)
+                retry_ns = min(2 * retry_ns, LONGEST_RETRY_NS)
+                continue
+            retry_ns = FIRST_RETRY_NS
+            self._attach(fd)
+            await self._until_ended()
+            await self._clock.sleep_ns(retry_ns)
+
+    def _attach(self, fd: int) -> None:
+        self._fd, self.problem, self._heard_ns = fd, "", self._clock.now_ns()
+        self._ended.clear()
+        self.reconnects += self._opened_once
+        self._opened_once = True
+        asyncio.get_running_loop().add_reader(fd, self._readable)
+        self.on_open()
+
+    async def _until_ended(self) -> None:
+        if self.quiet_ns is None:
+            await self._ended.wait()
+        while not self._ended.is_set():
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(LOOK_S):
+                    await self._ended.wait()
+            if self.quiet_ns is not None and self.age_ns > self.quiet_ns:
+                self.drop(f"nothing heard for {self.age_ns / 1e6:.0f} ms")
+
+    def _readable(self) -> None:
+        if self._fd is None:
+            return
+        try:
+            data = os.read(self._fd, READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            self.drop(_why(error))
+            return
+        if not data:  # the other end is gone; left in the loop, this would spin
+            self.drop("the other end is gone: unplugged?")
+            return
+        self._heard_ns = self._clock.now_ns()
+        if self.trace:
+            self.trace("rx", data)
+        self.on_bytes(data)
+
+
+def _why(error: Exception) -> str:
+    if isinstance(error, OSError):
+        return str(error.strerror or error)
+    return str(error)
+
+
+def _ignore(_: object) -> None:
+    pass
+
+
+def _nothing() -> None:
+    pass

@@ -1,0 +1,69 @@
+"""Which serial port is meant, and what to say when it cannot be had."""
+
+import errno
+import os
+from pathlib import Path
+
+from serial.tools import list_ports
+
+AUTO = "auto"
+USB = "usb:"
+
+
+def candidates(port: str) -> list[str]:
+    """The paths that `port` (a path, `usb:VID:PID[:SERIAL]` or `auto`) may stand for."""
+    if port == AUTO:
+        return sorted(p.device for p in list_ports.comports() if p.vid is not None)
+    if not port.startswith(USB):
+        return [port]
+    vendor, product, serial_number = usb_id(port)
+    return sorted(
+        p.device
+        for p in list_ports.comports()
+        if (p.vid, p.pid) == (vendor, product) and serial_number in ("", p.serial_number)
+    )
+
+
+def usb_id(port: str) -> tuple[int, int, str]:
+    """(vendor, product, serial number or "") of `usb:VID:PID[:SERIAL]`. Raises ValueError."""
+    parts = port.removeprefix(USB).split(":", 2)
+    if len(parts) < 2:
+        raise ValueError(f"expected usb:VID:PID or usb:VID:PID:SERIAL, got {port!r}")
+    try:
+        vendor, product = int(parts[0], 16), int(parts[1], 16)
+    except ValueError:
+        raise ValueError(f"expected hexadecimal VID and PID, got {port!r}") from None
+    return vendor, product, parts[2] if len(parts) > 2 else ""
+
+
+def missing(port: str) -> str:
+    """What to say when there is no such device."""
+    if port == AUTO:
+        return "no serial port at all: is it plugged in?"
+    what = f"USB device {port.removeprefix(USB)}" if port.startswith(USB) else port
+    return f"no {what}: is it plugged in?"
+
+
+def refused(path: str, error: OSError) -> str:
+    """What to say when the device is there but cannot be opened."""
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return (
+            f"no permission to open {path}; add yourself to its group (dialout on Debian), or "
+            f'this udev rule: KERNEL=="{Path(path).resolve().name}", MODE="0666"'
+        )
+    if error.errno in (errno.EAGAIN, errno.EBUSY):
+        holders = ", ".join(map(str, _holders(path)))
+        return f"{path} is in use{f' by pid {holders}' if holders else ''}"
+    return f"{path}: {error.strerror or error}"
+
+
+def _holders(path: str) -> list[int]:
+    """Who has the device open, as far as we may look (Linux)."""
+    device, found = os.path.realpath(path), []
+    for entry in Path("/proc").glob("[0-9]*/fd/*"):
+        try:
+            if os.readlink(entry) == device:
+                found.append(int(entry.parts[2]))
+        except OSError:
+            continue  # not ours to look at, or gone meanwhile
+    return sorted(set(found))
