@@ -1,0 +1,133 @@
+"""LDROBOT's measurement frame: LD06, LD19, STL-19P, LD14P and LDS-02 (LD08) all send it.
+
+47 bytes, little-endian: `54 2C`, speed u16 [deg/s], start u16 [0.01 deg], 12 x {distance u16 [mm],
+confidence u8}, end u16 [0.01 deg], time u16 [ms, wraps at 30000], CRC-8 (poly 0x4D) of all before.
+Angles run clockwise. Source: LDROBOT's LD06 and LD19 development manuals.
+"""
+
+import struct
+from typing import NamedTuple
+
+POINTS = 12  # per frame
+SIZE = 47  # bytes
+HEADER, VERSIONS = 0x54, (0x2C, 0xEC)  # low five bits of the second byte: 12 points
+TURN = 36_000  # [0.01 deg]
+LEAST_SAMPLES_HZ = 2300  # of the slowest of these lidars; none spreads its points wider
+SLACK = 1.5  # on the width of a frame, as the vendor's driver allows
+_LAYOUT = struct.Struct("<BBHH" + "HB" * POINTS + "HHB")
+
+
+def _table() -> bytes:
+    values = []
+    for value in range(256):
+        for _ in range(8):
+            value = (value << 1) ^ (0x4D if value & 0x80 else 0)
+        values.append(value & 0xFF)
+    return bytes(values)
+
+
+_CRC = _table()
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8 of `data`: polynomial 0x4D, initially 0, not reflected."""
+    crc = 0
+    for byte in data:
+        crc = _CRC[crc ^ byte]
+    return crc
+
+
+class Frame(NamedTuple):
+    """Twelve measurements in the units of the wire."""
+
+    speed: int  # [deg/s]
+    start: int  # [0.01 deg], clockwise
+    end: int  # [0.01 deg], of the last point
+    distances: tuple[int, ...]  # (12,) [mm], 0 where there was no return
+    confidences: tuple[int, ...]  # (12,), 0-255
+    time_ms: int  # wraps at 30000
+
+    def angles(self) -> tuple[float, ...]:
+        """The points' angles (12,) [deg], clockwise, from `start` on and so up to 720."""
+        step = (self.end - self.start) % TURN / (POINTS - 1)
+        return tuple((self.start + n * step) / 100 for n in range(POINTS))
+
+
+def encode(frame: Frame) -> bytes:
+    """The 47 bytes of `frame`."""
+    points = [
+        part for pair in zip(frame.distances, frame.confidences, strict=True) for part in pair
+    ]
+    fields = (HEADER, VERSIONS[0], frame.speed, frame.start, *points, frame.end, frame.time_ms)
+    head = _LAYOUT.pack(*fields, 0)[:-1]
+    return head + bytes([crc8(head)])
+
+
+def decode(data: bytes) -> Frame | None:
+    """The frame in exactly 47 bytes, or None when they cannot be one.
+
+    CRC-8 lets one in 256 heavily damaged frames through, so what a turning lidar cannot say is
+    refused as well: angles beyond a turn, and points further apart than its speed allows.
+    """
+    if crc8(data[:-1]) != data[-1]:
+        return None
+    fields = _LAYOUT.unpack(data)
+    _, version, speed, start = fields[:4]
+    end, time_ms = fields[-3:-1]
+    widest = SLACK * speed * 100 * POINTS / LEAST_SAMPLES_HZ
+    if version not in VERSIONS or max(start, end) >= TURN or (end - start) % TURN > widest:
+        return None
+    return Frame(speed, start, end, fields[4:-3:2], fields[5:-3:2], time_ms)
+
+
+class Decoder:
+    """Finds the frames in a stream of bytes, whatever else is in it."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._in_step = False  # whether the last bytes were a frame; joining half way is no error
+        self.errors = 0  # how often a frame was thrown away
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that `data` completes. Fewer than 47 bytes are kept for the next call."""
+        buffer, frames, at = self._buffer, list[Frame](), 0
+        buffer += data
+        while (found := self._find(at)) >= 0:
+            if found > at:
+                self._lose_step()
+            at = found
+            if len(buffer) - at < SIZE:
+                break
+            frame = decode(bytes(buffer[at : at + SIZE]))
+            if frame:
+                frames.append(frame)
+                self._in_step = True
+                at += SIZE
+            else:
+                self.errors += 1
+                self._in_step = False
+                at += 2  # the header alone: a whole frame may begin within these 47 bytes
+        if found < 0:
+            if at < len(buffer):
+                self._lose_step()
+            at = len(buffer)
+        del buffer[:at]
+        return frames
+
+    def clear(self) -> None:
+        """Forget what came so far: what comes next is another connection's."""
+        self._buffer.clear()
+        self._in_step = False
+
+    def _find(self, at: int) -> int:
+        """Where the next frame may begin, from `at` on; -1 for nowhere in what has come."""
+        buffer = self._buffer
+        while (at := buffer.find(HEADER, at)) >= 0:
+            if at + 1 == len(buffer) or buffer[at + 1] in VERSIONS:
+                return at
+            at += 1
+        return -1
+
+    def _lose_step(self) -> None:
+        self.errors += self._in_step
+        self._in_step = False

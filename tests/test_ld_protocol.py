@@ -1,0 +1,179 @@
+import random
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gigabrain_drivers.protocols import ld
+
+MANUAL = bytes.fromhex(  # LD19 development manual
+    "54 2C 68 08 AB 7E E0 00 E4 DC 00 E2 D9 00 E5 D5 00 E3 D3 00 E4 D0 00 E9 CD 00 E4 CA 00 E2"
+    "C7 00 E9 C5 00 E5 C2 00 E5 C0 00 E5 BE 82 3A 1A 50"
+)
+CAPTURED = bytes.fromhex(  # from a real D200 kit
+    "54 2C 74 08 B0 86 00 00 D4 00 00 D4 00 00 D4 00 00 D4 00 00 D4 00 00 D5 00 00 D5 00 00 49"
+    "00 00 5F 00 00 B0 00 00 D2 00 00 D4 02 89 1E 09 1F"
+)
+
+
+def frames(draw: st.DrawFn) -> ld.Frame:
+    speed = draw(st.integers(360, 0xFFFF))
+    start = draw(st.integers(0, 35_999))
+    width = draw(st.integers(0, min(35_999, speed * 12 * 100 // 2300)))
+    points = draw(st.binary(min_size=36, max_size=36))
+    return ld.Frame(
+        speed,
+        start,
+        (start + width) % 36_000,
+        struct.unpack("<12H", points[:24]),
+        tuple(points[24:]),
+        draw(st.integers(0, 29_999)),
+    )
+
+
+any_frame = st.composite(frames)()
+
+
+def test_crc8_of_the_bytes_1_2_and_3_is_as_in_the_vendors_table() -> None:
+    assert [ld.crc8(bytes([n])) for n in (1, 2, 3)] == [0x4D, 0x9A, 0xD7]
+
+
+def test_the_manuals_frame_decodes_to_the_manuals_numbers() -> None:
+    frame = ld.decode(MANUAL)
+
+    assert frame is not None
+    assert frame.speed == 2152
+    assert (frame.start, frame.end) == (32427, 33470)
+    assert frame.distances == (224, 220, 217, 213, 211, 208, 205, 202, 199, 197, 194, 192)
+    assert frame.confidences == (228, 226, 229, 227, 228, 233, 228, 226, 233, 229, 229, 229)
+    assert frame.time_ms == 6714
+    assert frame.angles()[0] == 324.27
+    assert frame.angles()[11] == pytest.approx(334.70, abs=1e-9)
+    assert ld.encode(frame) == MANUAL
+
+
+def test_a_frame_of_a_real_lidar_that_saw_nothing_decodes() -> None:
+    frame = ld.decode(CAPTURED)
+
+    assert frame is not None
+    assert (frame.speed, frame.start, frame.end, frame.time_ms) == (2164, 34480, 35074, 2334)
+    assert frame.distances == (0,) * 12
+    assert frame.confidences == (212, 212, 212, 212, 212, 213, 213, 73, 95, 176, 210, 212)
+
+
+def test_angles_go_on_through_a_full_turn() -> None:
+    frame = ld.Frame(3600, 35_800, 13, (0,) * 12, (0,) * 12, 0)
+
+    assert frame.angles()[0] == 358.0
+    assert frame.angles()[11] == pytest.approx(360.13, abs=1e-9)
+
+
+@given(any_frame)
+def test_every_frame_comes_back_as_it_was(frame: ld.Frame) -> None:
+    assert ld.Decoder().feed(ld.encode(frame)) == [frame]
+
+
+@pytest.mark.parametrize("good", [MANUAL, CAPTURED])
+def test_no_flip_of_one_bit_and_no_burst_within_a_byte_is_accepted(good: bytes) -> None:
+    for at in range(47):
+        for pattern in range(1, 256):
+            damaged = bytearray(good)
+            damaged[at] ^= pattern
+            assert ld.decode(bytes(damaged)) is None, (at, pattern)
+
+
+@given(any_frame, st.integers(0, 47 * 8 - 1))
+def test_no_flip_of_one_bit_in_any_frame_is_accepted(frame: ld.Frame, bit: int) -> None:
+    damaged = bytearray(ld.encode(frame))
+    damaged[bit // 8] ^= 1 << bit % 8
+
+    assert ld.decode(bytes(damaged)) is None
+
+
+@given(any_frame, st.sets(st.integers(0, 47 * 8 - 1), min_size=2, max_size=2))
+def test_two_flipped_bits_pass_only_where_the_crc_repeats_255_bits_apart(
+    frame: ld.Frame, bits: set[int]
+) -> None:
+    damaged = bytearray(ld.encode(frame))
+    for bit in bits:
+        damaged[bit // 8] ^= 0x80 >> bit % 8
+
+    assert ld.decode(bytes(damaged)) is None or max(bits) - min(bits) == 255
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("start", 36_000),  # beyond a turn
+        ("end", 36_000),
+        ("end", 32_427 - 1),  # the whole turn but a hundredth within one frame
+        ("speed", 0),  # points spread by a lidar that does not turn
+    ],
+)
+def test_a_frame_that_no_lidar_can_mean_is_refused_though_its_crc_is_right(
+    field: str, value: int
+) -> None:
+    frame = ld.decode(MANUAL)
+    assert frame is not None
+
+    assert ld.decode(ld.encode(frame._replace(**{field: value}))) is None
+
+
+@given(st.lists(st.sampled_from([MANUAL, CAPTURED]), max_size=6), st.data())
+def test_it_does_not_matter_how_the_bytes_are_cut(parts: list[bytes], data: st.DataObject) -> None:
+    stream, decoder, found = b"".join(parts), ld.Decoder(), []
+    while stream:
+        size = data.draw(st.integers(1, len(stream)))
+        found += decoder.feed(stream[:size])
+        stream = stream[size:]
+
+    assert found == [ld.decode(part) for part in parts]
+    assert decoder.errors == 0
+
+
+@given(st.binary(max_size=300))
+def test_a_frame_after_any_garbage_is_found_by_the_second_time_it_is_sent(garbage: bytes) -> None:
+    decoder = ld.Decoder()
+    decoder.feed(garbage)
+
+    assert ld.decode(MANUAL) in decoder.feed(MANUAL + MANUAL)
+
+
+@given(st.lists(st.binary(max_size=100), max_size=50))
+def test_what_is_kept_between_calls_stays_below_one_frame(pieces: list[bytes]) -> None:
+    decoder = ld.Decoder()
+    for piece in pieces:
+        decoder.feed(piece)
+        assert len(decoder._buffer) < 47
+
+
+def test_joining_a_stream_half_way_is_no_error_but_losing_step_is() -> None:
+    decoder = ld.Decoder()
+
+    assert len(decoder.feed(MANUAL[20:] + MANUAL)) == 1
+    assert decoder.errors == 0
+    assert len(decoder.feed(b"\x00" + MANUAL[:30] + MANUAL)) == 1
+    assert decoder.errors == 2  # the stray byte, and the half frame
+
+
+def test_a_lidar_that_sends_ec_in_place_of_2c_is_understood() -> None:
+    other = bytes([0x54, 0xEC]) + MANUAL[2:46]
+
+    assert ld.decode(other + bytes([ld.crc8(other)])) == ld.decode(MANUAL)
+
+
+def test_of_frames_with_a_tenth_of_a_percent_of_bytes_wrong_next_to_none_pass_as_others() -> None:
+    chance = random.Random(3)
+    decoder, sent, wrong, whole = ld.Decoder(), ld.decode(MANUAL), 0, 0
+    for _ in range(50):
+        stream = bytearray(MANUAL * 400)
+        for at in range(len(stream)):
+            if chance.random() < 0.001:
+                stream[at] ^= chance.randrange(1, 256)
+        for frame in decoder.feed(bytes(stream)):
+            whole += frame == sent
+            wrong += frame != sent
+
+    assert wrong <= 3  # 7e-6 of all pass: 0.14 of these 20 000
+    assert 18_900 <= whole <= 19_250  # of 20 000; (1 - 0.001)^47 = 95.4 %
