@@ -4,9 +4,10 @@ import importlib
 from importlib import resources
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import msgspec
+from msgspec import Struct
 
 from gigabrain_drivers import DRIVERS
 from gigabrain_drivers.base import Driver
@@ -15,6 +16,9 @@ from gigabrain_drivers.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.settings import LinkName
+
+EMULATOR = "{emulator}"  # in a robot's file: the folder of the emulator's ports
+Options = TypeVar("Options", bound=Struct)
 
 
 def robot_files() -> dict[str, Path]:
@@ -39,8 +43,11 @@ def load_robot(name: str) -> RobotFile:
 
 
 def links_of(robot: RobotFile) -> list[LinkName]:
-    """By which links a robot can be reached."""
-    return [name for name in LINKS if getattr(robot, name) is not None]
+    """By which links a robot can be reached; what is real and simulated can be emulated."""
+    known = {name for name in LINKS if getattr(robot, name) is not None}
+    if {"sim", "real"} <= known:
+        known.add("emulated")
+    return [name for name in LINKS if name in known]
 
 
 def driver_class(name: str) -> type[Driver]:
@@ -65,24 +72,60 @@ def driver_class(name: str) -> type[Driver]:
 
 def make_driver(name: str, run: Run) -> tuple[RobotFile, Driver]:
     """The robot called `name` and the driver of its link. Raises ConfigError."""
+    robot, driver, options, folder = load_link(name, run)
+    return robot, driver(robot, options, msgspec.structs.replace(run, folder=folder))
+
+
+def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions, Path]:
+    """A robot, the driver of the link of `run`, its options and the file's folder.
+
+    A link `emulated` that the file does not have is its `real` one with the emulator's ports.
+    Raises ConfigError.
+    """
     path = robot_path(name)
     robot = config.load(path, RobotFile)
-    link = getattr(robot, run.link)
-    if link is None:
+    if run.link not in links_of(robot):
         has = ", ".join(links_of(robot)) or "none"
         raise ConfigError(f"{path.parent.name} has no link {run.link!r}; it has: {has}")
+    borrowed = run.link == "emulated" and robot.emulated is None
+    section: LinkName = "real" if borrowed else run.link
+    link = getattr(robot, section)
     driver = driver_class(str(link.get("driver")))
     # read once more, now that it is known what this driver's part looks like: errors name the line
     exact = msgspec.defstruct(
         "RobotFile",
-        [(run.link, link_options(driver, link))],
+        [(section, link_options(driver, link))],
         bases=(RobotFile,),
         frozen=True,
         kw_only=True,
         forbid_unknown_fields=True,
     )
-    options = getattr(config.load(path, exact), run.link)
-    return robot, driver(robot, options, msgspec.structs.replace(run, folder=path.parent))
+    options = getattr(config.load(path, exact), section)
+    if borrowed:
+        options = with_ports(options)
+    return robot, driver, at_emulator(options, run.emulator), path.parent
+
+
+def with_ports(options: LinkOptions) -> LinkOptions:
+    """The options of a real link with the emulator's ports in place of the real ones."""
+    if hasattr(options, "port"):
+        options = msgspec.structs.replace(options, port=f"{EMULATOR}/base")
+    if options.scan:
+        scan = msgspec.structs.replace(options.scan, port=f"{EMULATOR}/scan")
+        options = msgspec.structs.replace(options, scan=scan)
+    return options
+
+
+def at_emulator(options: Options, folder: str) -> Options:
+    """The options with the folder of the emulator's ports wherever they say `{emulator}`."""
+    changes: dict[str, Any] = {}
+    for field in options.__struct_fields__:
+        value = getattr(options, field)
+        if isinstance(value, Struct):
+            changes[field] = at_emulator(value, folder)
+        elif isinstance(value, str) and EMULATOR in value:
+            changes[field] = value.replace(EMULATOR, folder)
+    return msgspec.structs.replace(options, **changes)
 
 
 def link_options(driver: type[Driver], link: dict[str, Any]) -> type[LinkOptions]:

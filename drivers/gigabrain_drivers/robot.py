@@ -62,3 +62,4 @@ class Run(Struct, frozen=True, kw_only=True):
     seed: int = 0
     speed: float = 1.0  # of real time; other than 1 means lock-step
     seconds: float | None = None  # of simulated time, then it holds still
+    emulator: str = ""  # the folder of the emulator's ports, where the link is `emulated`
