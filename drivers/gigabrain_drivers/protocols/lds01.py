@@ -1,0 +1,70 @@
+"""LDS-01 (Hitachi-LG HLS-LFCD2), the lidar of early TurtleBot3: 60 packets of 42 bytes a turn.
+
+Source: the vendor's driver hls_lfcd_lds_driver. It does not look at the checksum, whose rule is not
+published; so a packet is known by its structure, and counts when the next one follows it at once.
+"""
+
+import struct
+from typing import NamedTuple
+
+BAUD = 230_400
+START, STOP = b"b", b"e"
+PACKETS, SAMPLES = 60, 6  # per turn, per packet
+SIZE = 42
+NO_RETURN = 0  # [mm]
+
+_SYNC, _FIRST = 0xFA, 0xA0
+
+
+class Packet(NamedTuple):
+    """Six of a turn's 360 samples; sample `6 * number + i` looks that many degrees clockwise."""
+
+    number: int  # 0-59
+    rpm: float
+    intensities: tuple[int, ...]
+    ranges: tuple[int, ...]  # [mm], 0 where there was no return
+
+
+def encode(packet: Packet) -> bytes:
+    """The bytes of a packet; the checksum is the one that other drivers report, unverified."""
+    frame = struct.pack("<BBH", _SYNC, _FIRST + packet.number, round(packet.rpm * 10))
+    for intensity, distance in zip(packet.intensities, packet.ranges, strict=True):
+        frame += struct.pack("<HHH", intensity, distance, 0)
+    return frame + bytes([0xFF - sum(frame) & 0xFF]) * 2
+
+
+class Decoder:
+    """Finds packets in whatever comes in. `errors` counts stretches of other bytes."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._lost = False
+        self.errors = 0
+
+    def clear(self) -> None:
+        """Forget what has begun to come in."""
+        self._buffer.clear()
+        self._lost = False
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """The packets that `data` completes, in order; each waits for the header of the next."""
+        buffer, packets = self._buffer, []
+        buffer += data
+        while len(buffer) >= SIZE + 2:
+            number = buffer[1] - _FIRST
+            follows = buffer[SIZE] == _SYNC and buffer[SIZE + 1] == _FIRST + (number + 1) % PACKETS
+            if buffer[0] == _SYNC and 0 <= number < PACKETS and follows:
+                packets.append(_packet(bytes(buffer[:SIZE])))
+                del buffer[:SIZE]
+                self._lost = False
+            else:
+                at = buffer.find(_SYNC, 1)
+                del buffer[: at if at > 0 else len(buffer)]
+                self.errors += not self._lost
+                self._lost = True
+        return packets
+
+
+def _packet(frame: bytes) -> Packet:
+    values = struct.unpack("<BBH" + "HHH" * SAMPLES + "H", frame)
+    return Packet(values[1] - _FIRST, values[2] / 10, values[3:-1:3], values[4:-1:3])
