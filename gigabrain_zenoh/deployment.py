@@ -17,6 +17,7 @@ from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.settings import (
     DecisionConfig,
     DriverConfig,
+    EmulatorConfig,
     Endpoint,
     LinkName,
     PerceptionConfig,
@@ -25,6 +26,7 @@ from gigabrain_zenoh.settings import (
     Speed,
 )
 
+EMULATOR = "emulator"  # runs beside the driver where the link is `emulated`; not in `hosts`
 ProcessName = Literal["router", "driver", "perception", "decision", "control", "safety"]
 ALL: tuple[ProcessName, ...] = (
     "router", "driver", "perception", "decision", "control", "safety",
@@ -126,10 +128,12 @@ def process_specs(
     level: str = "info",
 ) -> list[ProcessSpec]:
     """What the supervisor of `host` has to run, in readiness order: the router first."""
-    names = deployment.hosts[host]
-    settings = _settings(deployment, state_dir, seconds)
+    names: list[str] = sorted(deployment.hosts[host], key=ALL.index)
+    if deployment.link == "emulated" and "driver" in names:
+        names.insert(names.index("driver"), EMULATOR)
+    settings = _settings(deployment, run_dir, state_dir, seconds)
     specs = []
-    for name in sorted(names, key=ALL.index):
+    for name in names:
         endpoint = client_endpoint(deployment)
         if name == "router":
             endpoint = Endpoint(listen=(deployment.router,), namespace=deployment.namespace)
@@ -141,7 +145,8 @@ def process_specs(
             json_console=True,
             level=level,
         )
-        after = ("router",) if "router" in names and name != "router" else ()
+        first = ("router", EMULATOR) if name == "driver" else ("router",)
+        after = tuple(other for other in first if other in names and other != name)
         specs.append(
             ProcessSpec(
                 name=name,
@@ -159,8 +164,9 @@ COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.process")
 
 
 def _settings(
-    deployment: Deployment, state_dir: Path, seconds: float | None
+    deployment: Deployment, run_dir: Path, state_dir: Path, seconds: float | None
 ) -> Mapping[str, dict[str, Any]]:
+    ports = str(run_dir / "ports") if deployment.link == "emulated" else ""
     driver = DriverConfig(
         body=deployment.body,
         link=deployment.link,
@@ -170,9 +176,14 @@ def _settings(
         seconds=seconds,
         resume=deployment.resume,
         state_dir=str(state_dir),
+        emulator=ports,
+    )
+    emulator = EmulatorConfig(
+        body=deployment.body, world=deployment.world, seed=deployment.seed, folder=ports
     )
     return {
         "driver": msgspec.to_builtins(driver),
+        EMULATOR: msgspec.to_builtins(emulator),
         "perception": msgspec.to_builtins(deployment.perception),
         "decision": msgspec.to_builtins(deployment.decision),
     }

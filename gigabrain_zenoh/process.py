@@ -46,6 +46,9 @@ class Program:
 PROGRAMS = {
     "router": Program("gigabrain_zenoh.router:run"),
     "driver": Program("gigabrain_drivers.process:run", "gigabrain_zenoh.settings:DriverConfig"),
+    "emulator": Program(
+        "gigabrain_drivers.emulators.process:run", "gigabrain_zenoh.settings:EmulatorConfig"
+    ),
     "perception": Program(
         "gigabrain_zenoh.perception:run", "gigabrain_zenoh.settings:PerceptionConfig"
     ),

@@ -51,3 +51,13 @@ class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     seconds: Positive | None = None  # of simulated time, then the body holds still
     resume: Resume = "manual"
     state_dir: str  # where it remembers what latched it
+    emulator: str = ""  # the folder of the emulator's ports, where the link is `emulated`
+
+
+class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The settings of the emulator process."""
+
+    body: str
+    world: str = "arena"
+    seed: Seed = 0
+    folder: str  # where its ports appear

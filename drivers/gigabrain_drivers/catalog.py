@@ -15,6 +15,7 @@ from gigabrain_drivers.lidars.base import source_class
 from gigabrain_drivers.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.settings import LinkName
 
 EMULATOR = "{emulator}"  # in a robot's file: the folder of the emulator's ports
@@ -40,6 +41,11 @@ def robot_path(name: str) -> Path:
 def load_robot(name: str) -> RobotFile:
     """Read a robot's file. Raises ConfigError with file, line and what was expected."""
     return config.load(robot_path(name), RobotFile)
+
+
+def ports_folder(name: str) -> Path:
+    """Where the emulator of a robot (name or file) puts its ports, and its driver looks."""
+    return state_dir() / "ports" / robot_path(name).absolute().parent.name
 
 
 def links_of(robot: RobotFile) -> list[LinkName]:

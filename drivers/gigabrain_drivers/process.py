@@ -13,7 +13,7 @@ import msgspec
 from msgspec.structs import replace
 
 from gigabrain_drivers.base import Driver
-from gigabrain_drivers.catalog import make_driver
+from gigabrain_drivers.catalog import make_driver, ports_folder
 from gigabrain_drivers.latch import Latched, LatchFile
 from gigabrain_drivers.lockstep import REPEAT_S, Lockstep
 from gigabrain_drivers.robot import RobotFile, Run
@@ -287,6 +287,7 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
         seed=config.seed,
         speed=config.speed,
         seconds=config.seconds,
+        emulator=config.emulator or str(ports_folder(config.body)),
     )
     robot, driver = make_driver(config.body, where)
     await DriverProcess(config, robot, driver, bus).run(ready)

@@ -29,6 +29,11 @@ def make_app() -> App:
         ("estop", "operate:estop", "Stop the robot at once, and latch it."),
         ("release", "operate:release", "Let go of a latched gate."),
         ("enable", "operate:enable", "Let the robot's brain drive."),
+        (
+            "emulate",
+            "emulate:emulate",
+            "Be a robot's body on real ports, in MuJoCo.",
+        ),
         ("robots", "names:robots", "List the robots that there are."),
         ("worlds", "names:worlds", "List the simulated worlds that there are."),
         ("view", "view:view", "Draw a robot in its world into a PNG file."),

@@ -97,6 +97,7 @@ def driver(
     seed: int = 0,
     speed: float = 1.0,
     resume: Resume = "manual",
+    ports: Path | None = None,
     remember: Path | None = None,
     place: Place = HERE,
 ) -> int:
@@ -118,6 +119,8 @@ def driver(
         Simulated over real time; other than 1, time waits for the brain.
     resume
         Whether it goes on by itself after a stop that has passed.
+    ports
+        The folder of the emulator's ports, where the link is `emulated`.
     remember
         The folder for what must survive a restart: what latched it.
     """
@@ -129,6 +132,7 @@ def driver(
         seed=seed,
         speed=speed,
         resume=resume,
+        emulator=str(ports.absolute()) if ports else "",
         state_dir=str(remember or state_dir() / "robots" / label),
     )
     return _run("driver", place, msgspec.to_builtins(settings))

@@ -20,7 +20,7 @@ def demo(
     seed: int = 0,
     speed: float = 1.0,
     turn: Literal["right", "left", "clearer"] = "right",
-    resume: Resume = "auto",
+    resume: Resume | None = None,
     headless: bool = False,
     report: Path | None = None,
 ) -> int:
@@ -47,7 +47,7 @@ def demo(
     turn
         Which way it turns from an obstacle.
     resume
-        Whether it goes on by itself after a stop that has passed.
+        Whether it goes on by itself after a stop that has passed; a real body never does.
     headless
         Progress in a line instead of the live view.
     report
@@ -63,7 +63,7 @@ def demo(
         "world": world,
         "seed": seed,
         "speed": speed,
-        "resume": resume,
+        "resume": resume or ("manual" if link == "real" else "auto"),
         "router": "tcp/127.0.0.1:0",
         "decision": {"turn": turn},
     }

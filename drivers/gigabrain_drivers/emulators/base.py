@@ -5,12 +5,14 @@ import asyncio
 import threading
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Odometry, Simulation, Wheel
 from gigabrain_drivers.sim.tick import TICK_S
@@ -123,10 +125,22 @@ class EmulatedBody:
 
 
 class Wire(Protocol):
-    """The device's end of a link."""
+    """Where a device's bytes go."""
 
     def write(self, data: bytes) -> bool:
         """To the host; False when nobody takes it."""
+
+
+class Port(Wire, Protocol):
+    """The device's end of a link, which may be there or not."""
+
+    on_bytes: Callable[[bytes], None]  # set by the owner
+
+    def plug(self) -> None:
+        """Make it appear. Nothing if it is there."""
+
+    def unplug(self) -> None:
+        """Make it disappear under whoever uses it. Nothing if it is gone."""
 
 
 class Device(abc.ABC):
@@ -141,6 +155,11 @@ class Device(abc.ABC):
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         self.body, self.options, self.wire = body, options, wire
         self.sag_volts = 0.0  # brown-out: by how much the supply has fallen [V]
+
+    @classmethod
+    def port(cls, options: Any) -> Port:
+        """What it is plugged into: the pty that the options of its driver name."""
+        return Pty(Path(options.port))
 
     @abc.abstractmethod
     def feed(self, data: bytes) -> None:

@@ -3,16 +3,15 @@
 import asyncio
 from collections.abc import Callable
 
-from gigabrain_drivers.emulators.base import Device, Wire
+from gigabrain_drivers.emulators.base import Device, Port, Wire
 from gigabrain_drivers.emulators.faults import NONE, Faults, FaultyWire
-from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_zenoh.clock import Clock
 
 
 class Station:
     """Plugs a device in and runs it. `device` may be looked at, `faults` set at any time."""
 
-    def __init__(self, make: Callable[[Wire], Device], port: Pty, clock: Clock) -> None:
+    def __init__(self, make: Callable[[Wire], Device], port: Port, clock: Clock) -> None:
         self._port, self._clock = port, clock
         self._wire = FaultyWire(port)
         self.device = make(self._wire)

@@ -1,0 +1,101 @@
+"""A whole emulated robot: one body in MuJoCo, a station for each of its links."""
+
+import functools
+import importlib
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from gigabrain_drivers import catalog
+from gigabrain_drivers.emulators import DEVICES
+from gigabrain_drivers.emulators.base import Device, EmulatedBody
+from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.physics import emulated_body
+from gigabrain_drivers.emulators.station import Station
+from gigabrain_drivers.robot import LinkOptions, Run
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import ConfigError, unknown
+
+BASE, SCAN = "base", "scan"
+
+
+class Emulator:
+    """The robot called `name`. Used as `async with`; its ports are there inside.
+
+    `run` says in which world, with which seed, and in which folder its ports appear.
+    """
+
+    def __init__(self, name: str, run: Run) -> None:
+        _, _, options, _ = catalog.load_link(name, msgspec.structs.replace(run, link="emulated"))
+        self.body: EmulatedBody = emulated_body(name, run)
+        self.ports = _ports(options)
+        clock = Clock()
+        self.stations: dict[str, Station] = {}
+        for station, its in _parts(options).items():
+            device = device_class(its.driver)
+            make = functools.partial(device, self.body, its)
+            self.stations[station] = Station(make, device.port(its), clock)
+
+    async def __aenter__(self) -> Self:
+        self.body.start()
+        for station in self.stations.values():
+            station.start()
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        for station in self.stations.values():
+            await station.close()
+        await self.body.close()
+
+    def set(self, faults: Mapping[str, Faults]) -> None:
+        """Have these faults, by station, and no others."""
+        for name, station in self.stations.items():
+            wanted = faults.get(name, NONE)
+            if wanted != station.faults:
+                station.set(wanted)
+
+    def faults_of(self, words: str) -> dict[str, Faults]:
+        """The faults in `[STATION] FAULT[=VALUE] ...`; for all stations where none is named.
+
+        Nothing, or `off`, is no fault. Raises ConfigError naming what there is.
+        """
+        named = words.split()
+        wanted = list(self.stations)
+        if named and named[0] in self.stations:
+            wanted = [named.pop(0)]
+        values = dict(word.partition("=")[::2] for word in named if word != "off")
+        given = {name: value or "true" for name, value in values.items()}
+        for name in given:
+            if name not in Faults.__struct_fields__:
+                raise unknown("fault", name, [*Faults.__struct_fields__, *self.stations, "off"])
+        try:
+            faults = msgspec.convert(given, Faults, strict=False)
+        except msgspec.ValidationError as error:
+            raise ConfigError(f"{words!r}: {error}") from None
+        now = {name: station.faults for name, station in self.stations.items()}
+        return {**now, **dict.fromkeys(wanted, faults)}
+
+
+def device_class(driver: str) -> type[Device]:
+    """The device that answers a driver or a scan source. Raises UnknownName."""
+    if driver not in DEVICES:
+        raise unknown("emulator for driver", driver, DEVICES)
+    module, _, attribute = DEVICES[driver].partition(":")
+    return getattr(importlib.import_module(module), attribute)  # type: ignore[no-any-return]
+
+
+def _parts(options: LinkOptions) -> dict[str, Any]:
+    """Each station's options."""
+    return {BASE: options, **({SCAN: options.scan} if options.scan else {})}
+
+
+def _ports(options: LinkOptions) -> dict[str, str]:
+    """Where each station is to be found."""
+    return {name: str(getattr(its, "port", "")) for name, its in _parts(options).items()}

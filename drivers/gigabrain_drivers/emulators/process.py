@@ -1,0 +1,113 @@
+"""The emulator's process: beside a driver under a supervisor, or by itself for whoever likes."""
+
+import asyncio
+import contextlib
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+
+from gigabrain_drivers.emulators.emulator import Emulator
+from gigabrain_drivers.emulators.faults import Faults
+from gigabrain_drivers.robot import Run
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.errors import BodyLost, ConfigError
+from gigabrain_zenoh.settings import EmulatorConfig
+
+log = logging.getLogger(__name__)
+
+LOOK_S = 0.05  # how often the file with the faults is looked at
+FAULTS_FILE = "faults.json"  # {STATION: {FAULT: VALUE}}, in the folder of the ports
+
+
+async def run(config: EmulatorConfig, bus: Bus, ready: Callable[[], None]) -> None:
+    """Be the body until the process ends; its truth is in `describe`."""
+    async with emulator_of(config) as emulator:
+        bus.report = emulator.body.report
+        ready()
+        await watch(emulator, Path(config.folder) / FAULTS_FILE)
+
+
+async def emulate(config: EmulatorConfig, say: Callable[[str], None]) -> None:
+    """Be the body until cancelled; faults are read from standard input, line by line."""
+    async with emulator_of(config) as emulator:
+        for name, port in emulator.ports.items():
+            say(f"{config.body} in {config.world}: {name} at {port}")
+        say(f"faults, one line each: [{'|'.join(emulator.stations)}] "
+            f"{' '.join(Faults.__struct_fields__)}; off ends them")  # fmt: skip
+        with _lines(lambda line: _told(emulator, line, say)):
+            await watch(emulator, Path(config.folder) / FAULTS_FILE)
+
+
+def emulator_of(config: EmulatorConfig) -> Emulator:
+    """The emulated robot of the settings. Raises ConfigError."""
+    return Emulator(
+        config.body,
+        Run(
+            folder=Path(),
+            link="emulated",
+            world=config.world,
+            seed=config.seed,
+            emulator=config.folder,
+        ),
+    )
+
+
+async def watch(emulator: Emulator, path: Path) -> None:
+    """Have the faults that the file asks for, for ever. Raises BodyLost with the physics."""
+    seen = None
+    while not emulator.body.lost:
+        stamp = _changed_ns(path)
+        if stamp != seen:
+            seen = stamp
+            _from_file(emulator, path)
+        await asyncio.sleep(LOOK_S)
+    raise BodyLost(emulator.body.lost)
+
+
+def _changed_ns(path: Path) -> int | None:
+    return path.stat().st_mtime_ns if path.exists() else None
+
+
+def _from_file(emulator: Emulator, path: Path) -> None:
+    try:
+        faults = msgspec.json.decode(path.read_bytes(), type=dict[str, Faults])
+    except FileNotFoundError:
+        faults = {}
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        log.warning("%s: %s", path.name, error)
+        return
+    emulator.set(faults)
+    log.info("faults: %s", faults or "none")
+
+
+def _told(emulator: Emulator, line: str, say: Callable[[str], None]) -> None:
+    try:
+        emulator.set(emulator.faults_of(line))
+    except ConfigError as error:
+        say(str(error))
+
+
+@contextlib.contextmanager
+def _lines(take: Callable[[str], None]) -> Iterator[None]:
+    """Call `take` with each line of standard input, where that can be waited for."""
+    loop = asyncio.get_running_loop()
+
+    def readable() -> None:
+        line = sys.stdin.readline()
+        if line:
+            take(line)
+        else:
+            loop.remove_reader(sys.stdin)
+
+    try:
+        loop.add_reader(sys.stdin, readable)
+    except (OSError, ValueError):  # a file, or nothing at all
+        yield
+        return
+    try:
+        yield
+    finally:
+        loop.remove_reader(sys.stdin)

@@ -1,0 +1,37 @@
+"""`gigabrain emulate`: a body that is not there, on real ports."""
+
+import asyncio
+from pathlib import Path
+
+from gigabrain_zenoh.process import find
+from gigabrain_zenoh.settings import EmulatorConfig
+
+
+def emulate(name: str, *, world: str = "arena", seed: int = 0, ports: Path | None = None) -> int:
+    """Be a robot's body: its serial ports or its TCP port, with MuJoCo behind them, until Ctrl-C.
+
+    Example: gigabrain emulate mycustombot --world house
+
+    In another terminal: gigabrain driver run mycustombot --link emulated
+
+    Faults are typed in, one line each: `silence`, `bit_errors=0.001`, `scan unplugged`, `off`.
+
+    Parameters
+    ----------
+    name
+        A known robot, or the path of a robot's YAML file.
+    world
+        Where it stands; see `gigabrain worlds`.
+    seed
+        For the start pose and the noise of the sensors.
+    ports
+        The folder in which its ports appear.
+    """
+    folder = ports or find("gigabrain_drivers.catalog:ports_folder")(name)
+    config = EmulatorConfig(body=name, world=world, seed=seed, folder=str(folder.absolute()))
+    asyncio.run(find("gigabrain_drivers.emulators.process:emulate")(config, _say))
+    return 0
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
