@@ -1,0 +1,207 @@
+"""How Slamtec RPLIDARs pack their samples: standard nodes, express and dense capsules.
+
+Little-endian; angles run clockwise, in 1/64 degree (q6). Sources: Slamtec's interface protocol
+document and the public rplidar_sdk. Both ways, so that an emulator speaks what the driver reads.
+"""
+
+import abc
+import functools
+import operator
+import struct
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
+
+TURN_Q6 = 360 << 6
+MOST_JUMP_DEG = 25.0  # between two nodes in step; their triangulation shifts them by up to 8
+FULL_TURN_DEG = 400.0  # no start of a turn for so long: its node was lost
+WIDER = 1.5  # a capsule this much wider than the last: one between them was lost
+
+
+class Samples(NamedTuple):
+    """Measurements in the order they were made."""
+
+    angles: tuple[float, ...]  # (n,) [deg], clockwise, 0 to 720
+    distances: tuple[float, ...]  # (n,) [mm], 0 where there was no return
+    turn_at: int | None  # index of the first of them that belongs to a new turn
+
+
+class ScanFormat(abc.ABC):
+    """Samples out of blocks of `size` bytes. Which bytes are a block is the caller's search."""
+
+    size: ClassVar[int]
+    kind: ClassVar[int]  # its answer type
+    confirm: ClassVar[int] = 1  # so many blocks in a row make sure that the stream is in step
+
+    @abc.abstractmethod
+    def is_block(self, block: bytes) -> bool:
+        """Whether these bytes can be a block that follows the last."""
+
+    @abc.abstractmethod
+    def take(self, block: bytes) -> Samples | None:
+        """The samples that this block completes."""
+
+    @abc.abstractmethod
+    def lose(self) -> None:
+        """Bytes were lost: the next block does not follow the last."""
+
+
+class Standard(ScanFormat):
+    """A node of 5 bytes per sample. It has no checksum, so angles must go on from one another."""
+
+    size, kind, confirm = 5, 0x81, 4
+
+    def __init__(self) -> None:
+        self._last: float | None = None  # [deg]
+        self._travelled = 0.0  # [deg], since the turn began
+
+    def is_block(self, block: bytes) -> bool:
+        """By its sync bits, and by how far the angle has gone on."""
+        first, raw, _ = _NODE.unpack(block)
+        if not (first ^ first >> 1) & 1 or not raw & 1 or raw >> 1 >= TURN_Q6:
+            return False
+        return self._last is None or abs(_advance(self._last, (raw >> 1) / 64)) < MOST_JUMP_DEG
+
+    def take(self, block: bytes) -> Samples:
+        """One sample. A turn begins with the node that says so."""
+        first, raw, distance = _NODE.unpack(block)
+        angle = (raw >> 1) / 64
+        if self._last is not None:
+            self._travelled += _advance(self._last, angle)
+        self._last = angle
+        begins = bool(first & 1) or self._travelled > FULL_TURN_DEG
+        if begins:
+            self._travelled = 0.0
+        return Samples((angle,), (distance / 4,), 0 if begins else None)
+
+    def lose(self) -> None:
+        """Any angle may come next."""
+        self._last = None
+
+
+class Capsule(ScanFormat):
+    """Blocks of many samples; their angles lie between its start and the start of the next."""
+
+    size = 84
+
+    def __init__(self) -> None:
+        self._held: bytes | None = None
+        self._width: float | None = None  # [deg], of the last capsule
+
+    def is_block(self, block: bytes) -> bool:
+        """By its two sync nibbles and its checksum, the XOR of all after them."""
+        if block[0] >> 4 != 0xA or block[1] >> 4 != 0x5 or _start(block) >= 360:
+            return False
+        return capsule_checksum(block) == (block[0] & 0xF | (block[1] & 0xF) << 4)
+
+    def take(self, block: bytes) -> Samples | None:
+        """The samples of the capsule before this one, where nothing is missing between them."""
+        held, self._held = self._held, block
+        if held is None or block[3] & 0x80:  # this one begins a new stream
+            self._width = None
+            return None
+        start = _start(held)
+        width = (_start(block) - start) % 360
+        usual, self._width = self._width, width
+        if usual is not None and width > usual * WIDER + 1:
+            return None
+        passed = start + width >= 360
+        angles = self._angles(held, start, width)
+        count = len(angles)
+        turn_at = min(count - 1, -int((start - 360) * count // width)) if passed else None
+        return Samples(angles, self._distances(held), turn_at)
+
+    def lose(self) -> None:
+        """The capsule that waits for the next one waits in vain."""
+        self._held = self._width = None
+
+    @abc.abstractmethod
+    def _angles(self, block: bytes, start: float, width: float) -> tuple[float, ...]: ...
+
+    @abc.abstractmethod
+    def _distances(self, block: bytes) -> tuple[float, ...]: ...
+
+
+class Express(Capsule):
+    """32 samples in 16 cabins of {u16, u16, u8}: distances [mm], and how far angles deviate."""
+
+    kind = 0x82
+
+    def _angles(self, block: bytes, start: float, width: float) -> tuple[float, ...]:
+        cabins, angles, n = _CABINS.unpack_from(block, 4), list[float](), 0
+        for first, second, low in zip(cabins[::3], cabins[1::3], cabins[2::3], strict=True):
+            for shift_q3 in (low & 0xF | (first & 3) << 4, low >> 4 | (second & 3) << 4):
+                angles.append((start + width * n / 32 - shift_q3 / 8) % 720)
+                n += 1
+        return tuple(angles)
+
+    def _distances(self, block: bytes) -> tuple[float, ...]:
+        cabins = _CABINS.unpack_from(block, 4)
+        pairs = zip(cabins[::3], cabins[1::3], strict=True)
+        return tuple(float(value >> 2) for pair in pairs for value in pair)
+
+
+class Dense(Capsule):
+    """40 distances u16 in mm, evenly spread."""
+
+    kind = 0x85
+
+    def _angles(self, block: bytes, start: float, width: float) -> tuple[float, ...]:
+        return tuple([start + width * n / 40 for n in range(40)])
+
+    def _distances(self, block: bytes) -> tuple[float, ...]:
+        return tuple(map(float, _DENSE.unpack_from(block, 4)))
+
+
+FORMATS: dict[int, type[ScanFormat]] = {f.kind: f for f in (Standard, Express, Dense)}
+
+_NODE = struct.Struct("<BHH")
+_CABINS = struct.Struct("<" + "HHB" * 16)
+_DENSE = struct.Struct("<40H")
+
+
+def capsule_checksum(block: bytes) -> int:
+    """The XOR of all bytes but the first two."""
+    return functools.reduce(operator.xor, block[2:])
+
+
+def node(angle_deg: float, distance_mm: float, *, quality: int, begins: bool) -> bytes:
+    """A standard node; `quality` 0-63."""
+    first = quality << 2 | (not begins) << 1 | begins
+    angle_q6 = round(angle_deg * 64) % TURN_Q6
+    return _NODE.pack(first, angle_q6 << 1 | 1, min(0xFFFF, round(distance_mm * 4)))
+
+
+def express_capsule(
+    start_deg: float,
+    distances_mm: Sequence[float],
+    shifts_q3: Sequence[int] = (0,) * 32,
+    *,
+    begins: bool,
+) -> bytes:
+    """An express capsule of 32 samples, the angle of each less by its shift [deg/8], 0-63."""
+    words = [
+        min(0x3FFF, round(d)) << 2 | s >> 4 for d, s in zip(distances_mm, shifts_q3, strict=True)
+    ]
+    lows = [a & 0xF | (b & 0xF) << 4 for a, b in zip(shifts_q3[::2], shifts_q3[1::2], strict=True)]
+    cabins = zip(words[::2], words[1::2], lows, strict=True)
+    return _capsule(start_deg, _CABINS.pack(*(part for cabin in cabins for part in cabin)), begins)
+
+
+def dense_capsule(start_deg: float, distances_mm: Sequence[float], *, begins: bool) -> bytes:
+    """A dense capsule of 40 samples."""
+    return _capsule(start_deg, _DENSE.pack(*(min(0xFFFF, round(d)) for d in distances_mm)), begins)
+
+
+def _capsule(start_deg: float, payload: bytes, begins: bool) -> bytes:
+    body = struct.pack("<H", round(start_deg * 64) % TURN_Q6 | begins << 15) + payload
+    checksum = capsule_checksum(b"\0\0" + body)
+    return bytes([0xA0 | checksum & 0xF, 0x50 | checksum >> 4]) + body
+
+
+def _start(block: bytes) -> float:
+    return ((block[2] | block[3] << 8) & 0x7FFF) / 64
+
+
+def _advance(before: float, after: float) -> float:
+    """From one angle to the next [deg], -180 to 180."""
+    return (after - before + 180) % 360 - 180
