@@ -26,7 +26,8 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
 
     summary: str  # one line, for `gigabrain robots`
     control_topic: str = "robot/cmd_vel"  # the key that its driver obeys
-    wheel_separation: NonNegative = 0.0  # [m], of a differential base
+    wheel_separation: NonNegative = 0.0  # [m], left to right; of omni wheels, to the next one
+    wheel_base: NonNegative = 0.0  # [m], front to rear, of mecanum and Ackermann bases
     wheel_radius: NonNegative = 0.0  # [m]
     joints: tuple[JointLimits, ...] = ()
     sim: dict[str, Any] | None = None

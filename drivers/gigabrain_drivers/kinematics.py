@@ -1,0 +1,213 @@
+"""From a body's velocity to its wheels or its gait, and back. Pure; SI units; x forward, y left.
+
+What holds for speeds holds for small distances: `to_body` of wheel angles [rad] is how far the
+body has moved [m, m, rad].
+"""
+
+import abc
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from gigabrain_drivers.robot import RobotFile
+
+
+class Twist(NamedTuple):
+    """A body's velocity, or how far it has moved in a moment."""
+
+    linear_x: float  # [m/s] or [m]
+    linear_y: float
+    angular_z: float  # [rad/s] or [rad]
+
+
+class Base(abc.ABC):
+    """A base on wheels. Wheel speeds [rad/s] are positive where the wheel rolls forward."""
+
+    wheels: tuple[str, ...]  # their names, in the order of all tuples here
+
+    @abc.abstractmethod
+    def to_wheels(self, twist: Twist) -> tuple[float, ...]:
+        """What each wheel has to do; what the base cannot do is left out."""
+
+    @abc.abstractmethod
+    def to_body(self, wheels: tuple[float, ...]) -> Twist:
+        """What the body does when its wheels do this without slipping."""
+
+
+@dataclass(frozen=True)
+class Differential(Base):
+    """Two driven wheels on one axle; it cannot go sideways."""
+
+    radius: float  # [m]
+    separation: float  # [m], between the wheels
+
+    wheels = ("left", "right")
+
+    def to_wheels(self, twist: Twist) -> tuple[float, ...]:
+        """(left, right) [rad/s]."""
+        turn = twist.angular_z * self.separation / 2
+        return (twist.linear_x - turn) / self.radius, (twist.linear_x + turn) / self.radius
+
+    def to_body(self, wheels: tuple[float, ...]) -> Twist:
+        """Linear along x and turning about z."""
+        left, right = wheels
+        forward, turn = (left + right) / 2 * self.radius, (right - left) * self.radius
+        return Twist(forward, 0.0, turn / self.separation)
+
+
+@dataclass(frozen=True)
+class Mecanum(Base):
+    """Four wheels with rollers at 45 degrees, in an X seen from above."""
+
+    radius: float  # [m]
+    separation: float  # [m], left to right
+    wheel_base: float  # [m], front to rear
+
+    wheels = ("front_left", "front_right", "rear_left", "rear_right")
+
+    def to_wheels(self, twist: Twist) -> tuple[float, ...]:
+        """(front left, front right, rear left, rear right) [rad/s]."""
+        x, y, turn = twist.linear_x, twist.linear_y, twist.angular_z * self._arm
+        speeds = (x - y - turn, x + y + turn, x + y - turn, x - y + turn)
+        return tuple(speed / self.radius for speed in speeds)
+
+    def to_body(self, wheels: tuple[float, ...]) -> Twist:
+        """The velocity that fits all four best (least squares)."""
+        front_left, front_right, rear_left, rear_right = (w * self.radius / 4 for w in wheels)
+        return Twist(
+            front_left + front_right + rear_left + rear_right,
+            -front_left + front_right + rear_left - rear_right,
+            (-front_left + front_right - rear_left + rear_right) / self._arm,
+        )
+
+    @property
+    def _arm(self) -> float:
+        return (self.separation + self.wheel_base) / 2
+
+
+@dataclass(frozen=True)
+class Omni(Base):
+    """Three omnidirectional wheels on a circle, 120 degrees apart, one of them at the back."""
+
+    radius: float  # [m]
+    circle: float  # [m], radius of the circle on which they stand
+
+    wheels = ("left", "back", "right")
+
+    def to_wheels(self, twist: Twist) -> tuple[float, ...]:
+        """(left, back, right) [rad/s]; all turn the body counter-clockwise."""
+        wheels = self._matrix @ twist / self.radius
+        return tuple(wheels.tolist())
+
+    def to_body(self, wheels: tuple[float, ...]) -> Twist:
+        """The only velocity that turns the wheels like this."""
+        return Twist(*np.linalg.solve(self._matrix, np.array(wheels) * self.radius).tolist())
+
+    @property
+    def _matrix(self) -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
+        directions = np.radians((150.0, -90.0, 30.0))  # in which each wheel rolls
+        return np.stack([np.cos(directions), np.sin(directions), np.full(3, self.circle)], axis=1)
+
+
+@dataclass(frozen=True)
+class Ackermann(Base):
+    """A car, as the bicycle in its middle: rear wheels drive, front wheels steer.
+
+    It cannot turn on the spot: at a standstill the steering is straight.
+    """
+
+    radius: float  # [m], of the rear wheels
+    wheel_base: float  # [m], front to rear axle
+    max_steering: float = math.radians(45.0)  # [rad], to either side
+
+    wheels = ("drive", "steering")
+
+    def to_wheels(self, twist: Twist) -> tuple[float, ...]:
+        """(rear wheels [rad/s], steering angle [rad], positive to the left)."""
+        drive = twist.linear_x / self.radius
+        if twist.linear_x == 0:
+            return drive, 0.0
+        steering = math.atan(self.wheel_base * twist.angular_z / twist.linear_x)
+        return drive, min(max(steering, -self.max_steering), self.max_steering)
+
+    def to_body(self, wheels: tuple[float, ...]) -> Twist:
+        """The velocity of the middle of the rear axle."""
+        drive, steering = wheels
+        forward = drive * self.radius
+        return Twist(forward, 0.0, forward * math.tan(steering) / self.wheel_base)
+
+    def front_wheels(self, steering: float, separation: float) -> tuple[float, float]:
+        """(left, right) angle [rad] of front wheels `separation` [m] apart, none of them scrubbing.
+
+        The bicycle's front wheel stands between them.
+        """
+        if steering == 0:
+            return 0.0, 0.0
+        turning = self.wheel_base / math.tan(steering)  # radius, positive to the left
+        left = math.atan(self.wheel_base / (turning - separation / 2))
+        return left, math.atan(self.wheel_base / (turning + separation / 2))
+
+
+class Gait(NamedTuple):
+    """How a quadruped walks: each foot is on the ground for `duty` of a cycle."""
+
+    stride_x: float  # [m], by which the body moves in one cycle
+    stride_y: float  # [m]
+    turn: float  # [rad], by which it turns in one cycle
+    frequency: float  # [Hz], cycles
+    duty: float  # 0-1
+    phases: tuple[float, float, float, float]  # 0-1, of front left, front right, rear left, right
+    height: float  # [m], of the hips
+
+
+@dataclass(frozen=True)
+class Walker:
+    """A quadruped's way to walk: a trot whose steps grow with the speed, then come faster."""
+
+    frequency: float = 2.5  # [Hz], as long as the stride allows it
+    max_frequency: float = 4.0  # [Hz]
+    max_stride: float = 0.2  # [m] in one cycle
+    duty: float = 0.55
+    height: float = 0.29  # [m]
+    phases: tuple[float, float, float, float] = (0.0, 0.5, 0.5, 0.0)
+
+    def to_gait(self, twist: Twist) -> Gait:
+        """The gait for a velocity; faster than it can step, all parts slow down alike."""
+        speed = math.hypot(twist.linear_x, twist.linear_y)
+        fastest = self.max_frequency * self.max_stride
+        scale = min(1.0, fastest / speed) if speed else 1.0
+        x, y, turn = (part * scale for part in twist)
+        frequency = max(self.frequency, speed * scale / self.max_stride)
+        return Gait(
+            stride_x=x / frequency,
+            stride_y=y / frequency,
+            turn=turn / frequency,
+            frequency=frequency,
+            duty=self.duty,
+            phases=self.phases,
+            height=self.height,
+        )
+
+    @staticmethod
+    def to_body(gait: Gait) -> Twist:
+        """The velocity of a body whose feet do not slip."""
+        strides = (gait.stride_x, gait.stride_y, gait.turn)
+        return Twist(*(stride * gait.frequency for stride in strides))
+
+
+def base_of(robot: RobotFile) -> Base | None:
+    """The wheels of a robot's file, or None where it has none or does not give their measures."""
+    radius, across, along = robot.wheel_radius, robot.wheel_separation, robot.wheel_base
+    if not radius:
+        return None
+    if robot.drive_type == "differential" and across:
+        return Differential(radius, across)
+    if robot.drive_type == "mecanum" and across and along:
+        return Mecanum(radius, across, along)
+    if robot.drive_type == "omni" and across:
+        return Omni(radius, across / math.sqrt(3.0))
+    if robot.drive_type == "ackermann" and along:
+        return Ackermann(radius, along)
+    return None
