@@ -1,0 +1,47 @@
+"""Dead reckoning: where a body has got to, by how its wheels turned."""
+
+import math
+
+from gigabrain_drivers.kinematics import Base
+from gigabrain_schemas.base import Pose
+
+
+class Odometry:
+    """The pose since the start (REP-103), integrated at the mid heading."""
+
+    def __init__(self, base: Base) -> None:
+        self._base = base
+        self.pose = Pose(x=0.0, y=0.0, yaw=0.0)
+
+    def add(self, wheels: tuple[float, ...]) -> None:
+        """The wheels have turned by so much [rad], in the order of `base.wheels`."""
+        moved, pose = self._base.to_body(wheels), self.pose
+        middle = pose.yaw + moved.angular_z / 2
+        cos, sin = math.cos(middle), math.sin(middle)
+        self.pose = Pose(
+            x=pose.x + moved.linear_x * cos - moved.linear_y * sin,
+            y=pose.y + moved.linear_x * sin + moved.linear_y * cos,
+            yaw=math.remainder(pose.yaw + moved.angular_z, math.tau),
+        )
+
+
+class Encoders:
+    """Counters that wrap, read as the angles by which wheels turned between two looks."""
+
+    def __init__(self, per_turn: float, bits: int) -> None:
+        self._radians, self._range = math.tau / per_turn, 1 << bits
+        self._last: tuple[int, ...] | None = None
+
+    def turned(self, counts: tuple[int, ...]) -> tuple[float, ...]:
+        """By how much [rad] since the last look; nothing at the first."""
+        last, self._last = self._last or counts, counts
+        pairs = zip(counts, last, strict=True)
+        return tuple(self._radians * self._wrapped(now - before) for now, before in pairs)
+
+    def restart(self) -> None:
+        """The counters may have been set anew: what comes next counts from there."""
+        self._last = None
+
+    def _wrapped(self, difference: int) -> int:
+        half = self._range // 2
+        return (difference + half) % self._range - half
