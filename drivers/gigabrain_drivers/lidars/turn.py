@@ -10,6 +10,7 @@ from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 
 MOST_SAMPLES = 20_000  # per turn; the fastest lidar here measures 3200
+CLOCKWISE = -math.pi / 180  # from degrees clockwise to radians counter-clockwise
 SHORTEST, LONGEST = 0.25, 3.0  # of the nominal period; less is a backlog, more is two turns mixed
 
 
@@ -25,30 +26,60 @@ class Turn:
         """Forget what was gathered."""
         self._angles: list[float] = []
         self._ranges: list[float] = []
-        self._began_ns = 0
+        self._began_ns = self._last_ns = 0
+        self._whole = False  # whether it was seen from its start
 
     def add(self, angles: Sequence[float], ranges: Sequence[float], now_ns: int) -> None:
         """Samples (n,) at `angles` [rad] counter-clockwise from ahead, with `ranges` [m].
 
-        inf is a sample without a return, nan one that cannot be trusted.
+        inf is a sample without a return, nan one that cannot be trusted. After a whole turn of
+        silence what was gathered before it is forgotten.
         """
-        if len(self._angles) + len(angles) > MOST_SAMPLES:
+        if (
+            len(self._angles) + len(angles) > MOST_SAMPLES
+            or now_ns - self._last_ns > self._period_ns
+        ):
             self.clear()
         if not self._angles:
             self._began_ns = now_ns
+        self._last_ns = now_ns
         self._angles += angles
         self._ranges += ranges
+
+    def clockwise(
+        self,
+        angles_deg: Sequence[float],
+        distances_mm: Sequence[float],
+        turn_at: int | None,
+        now_ns: int,
+    ) -> LaserScan | None:
+        """Samples (n,) of a lidar that turns clockwise and says 0 mm where there was no return.
+
+        `turn_at` is the index of the first that belongs to a new turn; the scan of the turn that
+        ends there is returned.
+        """
+        angles = [a * CLOCKWISE for a in angles_deg]
+        ranges = [d / 1000 if d else math.inf for d in distances_mm]
+        if turn_at is None:
+            self.add(angles, ranges, now_ns)
+            return None
+        if turn_at:
+            self.add(angles[:turn_at], ranges[:turn_at], now_ns)
+        scan = self.finish(now_ns)
+        self.add(angles[turn_at:], ranges[turn_at:], now_ns)
+        return scan
 
     def finish(self, now_ns: int) -> LaserScan | None:
         """The scan of the turn that ends here; a new one begins.
 
-        None when there is nothing, and when its bytes came faster or slower than a lidar turns: a
-        process that was held up gets what waited in the port all at once, and that is old.
+        None when its start was not seen, and when its bytes came faster or slower than a lidar
+        turns: a process that was held up gets what waited in the port at once, and that is old.
         """
-        angles, ranges, began_ns = self._angles, self._ranges, self._began_ns
+        angles, ranges, whole = self._angles, self._ranges, self._whole
+        took = (now_ns - self._began_ns) / self._period_ns
         self.clear()
-        took = (now_ns - began_ns) / self._period_ns
-        if not angles or not SHORTEST <= took <= LONGEST:
+        self._whole = True
+        if not angles or not whole or not SHORTEST <= took <= LONGEST:
             return None
         return scan_of(self._lidar, angles, ranges)
 

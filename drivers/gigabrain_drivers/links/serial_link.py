@@ -28,7 +28,8 @@ class SerialLink(Link):
 
     def __init__(self, port: str, baud: int, clock: Clock, *, probe: Probe | None = None) -> None:
         super().__init__(clock)
-        self._port, self._baud, self._probe = port, baud, probe
+        self.baud = baud  # holds from the next connection on
+        self._port, self._probe = port, probe
         self._serial: serial.Serial | None = None
         self.path = ""  # of the device that was opened last
 
@@ -68,7 +69,7 @@ class SerialLink(Link):
             raise LinkProblem(ports.missing(self._port))
         if self._port != ports.AUTO:
             self.path = paths[0]
-            return ready(open_port(self.path, self._baud))
+            return ready(open_port(self.path, self.baud))
         for self.path in paths:
             if port := self._probed(self.path):
                 return ready(port)
@@ -77,7 +78,7 @@ class SerialLink(Link):
     def _probed(self, path: str) -> serial.Serial | None:
         """The port, if it is the right one; others are left as they were."""
         try:
-            port = open_port(path, self._baud)
+            port = open_port(path, self.baud)
         except LinkProblem:
             return None
         try:

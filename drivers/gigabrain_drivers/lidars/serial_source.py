@@ -1,0 +1,148 @@
+"""A lidar on a serial port: what all of them share, whatever they say on it."""
+
+import abc
+import asyncio
+import contextlib
+import logging
+from typing import Any, ClassVar
+
+import serial
+
+from gigabrain_drivers.lidars.base import ScanSource
+from gigabrain_drivers.lidars.strangers import who_sends
+from gigabrain_drivers.lidars.turn import Turn
+from gigabrain_drivers.links.serial_link import SerialLink
+from gigabrain_schemas.body import Lidar, LinkHealth
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.clock import Clock
+
+log = logging.getLogger(__name__)
+
+LOOK_NS = 100_000_000  # how often it is looked at whether scans come
+PATIENCE_NS = 2_000_000_000  # without a scan, until something is said
+REOPEN_NS = 5_000_000_000  # without a scan, until the port is opened anew
+LAST_WORDS_S = 0.02
+NEWEST = 256  # bytes, kept to say what else may be sending there
+
+
+class SerialSource(ScanSource):
+    """Keeps its port open, and says in one line why there are no scans: once, and when it ends."""
+
+    name: ClassVar[str]  # as people call it
+
+    def __init__(self, options: Any, lidar: Lidar, clock: Clock, baud: int) -> None:
+        super().__init__(options, lidar, clock)
+        self.baud = baud
+        self.link = SerialLink(options.port, baud, clock, probe=self.probe)
+        self.link.on_bytes, self.link.on_open = self._on_bytes, self._on_open
+        self.turn = Turn(lidar)
+        self._newest = b""
+        self._scan_ns = self._opened_ns = 0
+        self._problem = ""
+        self._task: asyncio.Task[None] | None = None
+
+    @abc.abstractmethod
+    def received(self, data: bytes) -> None:
+        """Bytes have come."""
+
+    @abc.abstractmethod
+    def connected(self) -> None:
+        """The port was opened, for the first time or again: nothing from before counts."""
+
+    @abc.abstractmethod
+    def understands(self) -> bool:
+        """Whether anything that came since the port was opened made sense."""
+
+    @abc.abstractmethod
+    def probe(self, port: serial.Serial) -> bool:
+        """Whether the right lidar is on this port. Runs in a thread; may raise OSError."""
+
+    def open(self) -> None:
+        """Connect in the background, for ever."""
+        if self._task is None:
+            self._scan_ns = self._opened_ns = self.clock.now_ns()
+            self._problem = ""
+            self.link.open()
+            self._task = asyncio.create_task(self.run(), name=self.name)
+
+    async def close(self) -> None:
+        """Free the port."""
+        task, self._task = self._task, None
+        if task:
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+        if self.link.connected and self.farewell():
+            await asyncio.sleep(LAST_WORDS_S)  # closing throws away what is not sent by then
+        await self.link.close()
+
+    @property
+    def health(self) -> LinkHealth:
+        """The line's; connected means that scans come."""
+        line = self.link.health
+        return LinkHealth(
+            connected=line.connected and not self.problem,
+            age_ms=line.age_ms,
+            errors=line.errors,
+            reconnects=line.reconnects,
+        )
+
+    @property
+    def problem(self) -> str:
+        """Why there are no scans; empty while they come, and for two seconds without."""
+        return self._problem
+
+    async def run(self) -> None:
+        """Look after it until cancelled."""
+        async for now_ns in self.clock.every(LOOK_NS):
+            self.look(now_ns)
+            if self.link.connected and now_ns - max(self._scan_ns, self._opened_ns) > REOPEN_NS:
+                self._opened_ns = now_ns
+                self.link.drop(self._problem)
+
+    def look(self, now_ns: int) -> None:
+        """Judge whether all is well, and say so when that has changed."""
+        before = self._problem
+        self._problem = ""
+        if now_ns - self._scan_ns > PATIENCE_NS:
+            self._problem = self.trouble() if self.link.connected else self.link.problem
+        if self._problem and self._problem != before:
+            log.warning("%s: %s", self.name, self._problem)
+        elif before and not self._problem:
+            log.info("%s: scans come again", self.name)
+
+    def trouble(self) -> str:
+        """Why there are no scans though the port is open."""
+        if not self.understands():
+            return self.no_answer()
+        return f"the {self.name} on {self.link} answers, but does not turn"
+
+    def farewell(self) -> bool:
+        """Let the lidar come to rest before its port is closed; whether anything was sent."""
+        return False
+
+    def no_answer(self) -> str:
+        """What may be wrong where bytes come that make no sense, or none at all."""
+        if not self._newest:
+            return (
+                f"nothing comes from {self.link}: is the {self.name} powered, and wired both ways?"
+            )
+        other = who_sends(self._newest)
+        guess = f"it looks like {other}" if other else "another lidar, or another baud rate?"
+        return f"what comes from {self.link} is no {self.name} at {self.baud} baud: {guess}"
+
+    def finished(self, scan: LaserScan | None) -> None:
+        """A turn has ended; hands its scan on, if it is one."""
+        if scan:
+            self._scan_ns = self.clock.now_ns()
+            self.emit(scan)
+
+    def _on_open(self) -> None:
+        self._opened_ns = self.clock.now_ns()
+        self._newest = b""
+        self.turn.clear()
+        self.connected()
+
+    def _on_bytes(self, data: bytes) -> None:
+        self._newest = (self._newest + data)[-NEWEST:]
+        self.received(data)
