@@ -2,8 +2,27 @@
 
 import math
 
-from gigabrain_drivers.kinematics import Base
+from gigabrain_drivers.kinematics import Base, Twist
 from gigabrain_schemas.base import Pose
+
+
+def advanced(pose: Pose, moved: Twist) -> Pose:
+    """Where a body is after a small step in its own frame, taken at the mid heading."""
+    middle = pose.yaw + moved.angular_z / 2
+    cos, sin = math.cos(middle), math.sin(middle)
+    return Pose(
+        x=pose.x + moved.linear_x * cos - moved.linear_y * sin,
+        y=pose.y + moved.linear_x * sin + moved.linear_y * cos,
+        yaw=math.remainder(pose.yaw + moved.angular_z, math.tau),
+    )
+
+
+def between(start: Pose, end: Pose) -> Twist:
+    """The small step, in the body's own frame, that leads from one pose to another."""
+    turn = math.remainder(end.yaw - start.yaw, math.tau)
+    middle, x, y = start.yaw + turn / 2, end.x - start.x, end.y - start.y
+    cos, sin = math.cos(middle), math.sin(middle)
+    return Twist(cos * x + sin * y, cos * y - sin * x, turn)
 
 
 class Odometry:
@@ -15,14 +34,7 @@ class Odometry:
 
     def add(self, wheels: tuple[float, ...]) -> None:
         """The wheels have turned by so much [rad], in the order of `base.wheels`."""
-        moved, pose = self._base.to_body(wheels), self.pose
-        middle = pose.yaw + moved.angular_z / 2
-        cos, sin = math.cos(middle), math.sin(middle)
-        self.pose = Pose(
-            x=pose.x + moved.linear_x * cos - moved.linear_y * sin,
-            y=pose.y + moved.linear_x * sin + moved.linear_y * cos,
-            yaw=math.remainder(pose.yaw + moved.angular_z, math.tau),
-        )
+        self.pose = advanced(self.pose, self._base.to_body(wheels))
 
 
 class Encoders:
