@@ -3,4 +3,8 @@
 # driver of a link, or of its scan source -> the device that answers it, imported only when used
 DEVICES = {
     "line": "gigabrain_drivers.emulators.line_base:LineBase",
+    "ld06": "gigabrain_drivers.emulators.ld:LdDevice",
+    "ld19": "gigabrain_drivers.emulators.ld:LdDevice",
+    "rplidar": "gigabrain_drivers.emulators.rplidar:RplidarDevice",
+    "opencr": "gigabrain_drivers.emulators.opencr:OpenCr",
 }

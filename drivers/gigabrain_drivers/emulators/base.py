@@ -72,6 +72,11 @@ class EmulatedBody:
         """What the motors aim for."""
         return self._commanded
 
+    @property
+    def simulation(self) -> Simulation:
+        """The physics; to be touched in `on_step` only."""
+        return self._simulation
+
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far."""
         truth = self._simulation.truth

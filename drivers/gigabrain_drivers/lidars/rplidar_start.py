@@ -10,7 +10,8 @@ from gigabrain_drivers.protocols.rplidar_scans import FORMATS
 STOP_S = 0.1  # the vendor waits so long after a stop
 RESET_S = 2.0
 PWM_FAMILIES = range(2, 6)  # which may sit on a board that powers the motor
-CONF_FIRMWARE = (1, 24)  # from here on it can be asked for its scan modes
+CONF_FIRMWARE = (1, 24)  # from here on it can be asked for its scan modes; C1 and later always
+CONF_FAMILY = 4
 EXPRESS_FIRMWARE = (1, 17)  # from here on it has the express mode
 
 
@@ -76,7 +77,7 @@ async def choose(line: Line, info: Info, scan_mode: str) -> tuple[int, int]:
 
     `auto` is the lidar's typical mode, or the fastest of those that are understood here.
     """
-    if info.firmware < CONF_FIRMWARE:
+    if info.firmware < CONF_FIRMWARE and info.model >> 4 < CONF_FAMILY:
         return _old_mode(info, scan_mode), 0
     wanted = set(FORMATS) if scan_mode == "auto" else {KINDS[scan_mode]}
     typical = _number(await _conf(line, rplidar.MODE_TYPICAL))
@@ -112,7 +113,10 @@ async def _stop(line: Line) -> None:
 async def _on_board(line: Line, info: Info) -> bool:
     if info.model >> 4 not in PWM_FAMILIES:
         return False
-    flags = await line.ask(rplidar.request(rplidar.GET_BOARD, bytes(4)), rplidar.BOARD)
+    try:
+        flags = await line.ask(rplidar.request(rplidar.GET_BOARD, bytes(4)), rplidar.BOARD)
+    except Trouble:  # there is nobody to answer where there is no board
+        return False
     return bool(flags[0] & 1)
 
 

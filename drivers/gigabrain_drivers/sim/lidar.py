@@ -22,37 +22,37 @@ class Lidar:
         self._body = int(model.site_bodyid[self._site])
         angle = np.arange(config.beams) * (math.tau / config.beams)
         self._directions = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-        self._rays = np.empty((config.beams, 3))
-        self._hit = np.empty(config.beams, np.int32)
-        self._range = np.empty(config.beams)
 
     def scan(self, data: mujoco.MjData) -> NDArray[np.float32]:
         """Ranges (beams,) [m], counter-clockwise from straight ahead; inf: nothing in range.
 
         What is nearer than the sensor can measure is reported at its least range, not as free.
         """
-        config, ranges = self._config, self._range
+        return self.cast(data, self._directions)
+
+    def cast(self, data: mujoco.MjData, directions: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Ranges (n,) [m] along `directions` (n, 3) in the sensor's frame, as in `scan`."""
+        config, count = self._config, len(directions)
         mujoco.mj_kinematics(self._model, data)  # sites lag one step behind, mocap bodies too
-        site = data.site_xmat[self._site].reshape(3, 3)
-        np.dot(self._directions, site.T, out=self._rays)
-        origin, rays = data.site_xpos[self._site], self._rays.reshape(-1)
+        rays = directions @ data.site_xmat[self._site].reshape(3, 3).T
+        hit, ranges = np.empty(count, np.int32), np.empty(count)
         mujoco.mj_multiRay(
             self._model,
             data,
-            origin,
-            rays,
+            data.site_xpos[self._site],
+            rays.reshape(-1),
             SEES_GROUPS,
             True,
             self._body,
-            self._hit,
+            hit,
             ranges,
             None,
-            config.beams,
+            count,
             config.range_max,
         )
         # A hit beyond the cutoff may be any number, a miss is -1: neither is a return.
         missed = (ranges < 0) | (ranges > config.range_max)
-        ranges += self._noise.normal(0.0, config.noise_m, config.beams)
+        ranges += self._noise.normal(0.0, config.noise_m, count)
         np.maximum(ranges, config.range_min, out=ranges)
         ranges[missed | (ranges > config.range_max)] = np.inf
         return ranges.astype(np.float32)
