@@ -41,10 +41,22 @@ def _find(node: Node, type_: Any, path: str, key_line: int) -> Fault | None:
     except msgspec.ValidationError as error:
         line = key_line if node.entries or node.items else node.line
         if structs:  # its fields are right, so its own __post_init__ said no
-            return Fault(line, _at(path, re.sub(r" - at `[^`]*`$", "", str(error))))
+            return _own_fault(node, path, line, re.sub(r" - at `[^`]*`$", "", str(error)))
         hint = nearest(node.value, choices(type_))
         return Fault(line, _at(path, f"expected {expected(type_)}, got {got(node)}{hint}"))
     return None
+
+
+def _own_fault(node: Node, path: str, line: int, text: str) -> Fault:
+    """What a Struct says of itself; `FIELD: ...` or `FIELD[2]: ...` is about that very line."""
+    match = re.match(r"(\w+)(?:\[(\d+)\])?: ", text)
+    for entry in node.entries or ():
+        if match and entry.key == match[1]:
+            items = entry.node.items or ()
+            number = int(match[2]) if match[2] else len(items)
+            at = items[number].line if number < len(items) else entry.line
+            return Fault(at, _join(path, text))
+    return Fault(line, _at(path, text))
 
 
 def _wrong_tag(node: Node, structs: list[Any], path: str, key_line: int) -> Fault | None:

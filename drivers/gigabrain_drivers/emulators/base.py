@@ -8,9 +8,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
 
-import numpy as np
 from msgspec import Struct
-from numpy.typing import NDArray
 
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.robot import RobotFile, Run
@@ -30,7 +28,6 @@ class Snapshot(NamedTuple):
     imu: ImuSample
     battery: Charge
     bumper: bool
-    ranges: NDArray[np.float32] | None  # (beams,) [m], ahead first, counter-clockwise; inf: no hit
 
 
 class EmulatedBody:
@@ -42,7 +39,6 @@ class EmulatedBody:
     def __init__(self, robot: RobotFile, simulation: Simulation, run: Run) -> None:
         self.robot, self.run = robot, run
         self.lost = ""  # why the physics has ended, if it has
-        self.scanning = False  # set by a lidar: a fresh scan is then cast in every step
         self.on_step: list[Callable[[Snapshot], None]] = []  # called in the physics thread
         self._simulation = simulation
         self._halt = threading.Event()
@@ -125,7 +121,6 @@ class EmulatedBody:
             imu=simulation.imu(),
             battery=simulation.battery(),
             bumper=simulation.bumper(),
-            ranges=simulation.scan() if self.scanning else None,
         )
 
 

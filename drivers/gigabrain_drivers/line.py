@@ -1,0 +1,246 @@
+"""A body without code: one text line out, text lines in, all described in the robot's file.
+
+The driver never speaks by itself: when nobody commands, the line falls silent, and the firmware
+stops the body (docs/firmware_line.md).
+"""
+
+import logging
+import math
+import time
+
+import serial
+from msgspec.structs import replace
+
+from gigabrain_drivers.base import Driver
+from gigabrain_drivers.kinematics import Twist, base_of
+from gigabrain_drivers.lidars.base import ScanSource, carry
+from gigabrain_drivers.line_options import BITS_PER_BYTE, LineOptions
+from gigabrain_drivers.line_report import LineReport
+from gigabrain_drivers.links.serial_link import SerialLink
+from gigabrain_drivers.protocols.line import Decoder
+from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.body import LinkHealth, RobotState
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import SCAN
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
+from gigabrain_zenoh.limits import ZERO, clamp, limits_of
+from gigabrain_zenoh.logs import Fault
+
+log = logging.getLogger(__name__)
+
+MISSED = 3  # state lines in a row, and the body counts as lost
+LEAST_SILENT_NS = 100_000_000
+REPEAT_SHARE = 0.9  # of the repetition's period: ticks are not that even
+PATIENCE_NS = 500_000_000  # without a good line, before something is said
+BUMPER = "bumper"  # flags of such names are bumpers
+WHEEL_PARTS = ("_position", "_velocity", "_effort", "_temperature")
+PROBE_S = 2.5  # an Arduino that opening has reset takes two seconds to say anything
+LAST_WORD_NS = 10_000_000  # and the time of one line, before a port is closed
+SEQUENCES = 1 << 16
+
+
+class LineDriver(Driver):
+    """Silent until the body has been heard; the first command then is zero, as after a loss."""
+
+    Options = LineOptions
+
+    def __init__(self, robot: RobotFile, options: LineOptions, run: Run) -> None:
+        super().__init__(robot, options, run)
+        self._base = base_of(robot)
+        self._command = options.command_template()
+        self._decoder = Decoder(options.state_templates())
+        self._check_wheels()
+        self._clock = Clock()
+        self.link = SerialLink(options.port, options.baud, self._clock, probe=self._is_ours)
+        self.link.on_bytes, self.link.on_open = self._received, self._opened
+        self.link.on_lost = self._lost
+        self._report = LineReport(options, robot, self._base)
+        self._limits = limits_of(robot)
+        self._silent_ns = max(round(MISSED / options.state_hz * 1e9), LEAST_SILENT_NS)
+        self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
+        self._heard_ns: int | None = None  # when the newest good line came; none since it opened
+        self._hoping_ns = self._clock.now_ns()  # since when there is none
+        self._started = False  # whether the firmware has had its start string
+        self._sent = ZERO
+        self._sent_ns = self._seq = 0
+        self._open = False
+        self._silence = Fault(log)
+        self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
+        self._lidar: ScanSource | None = None
+        self._scan: LaserScan | None = None
+
+    async def open(self) -> None:
+        """Begin to look for the body and its lidar; neither has to be there yet."""
+        self._open = True
+        self.link.open()
+        self._lidar = carry(self, self._clock)
+        if self._lidar:
+            self._lidar.emit = self._scanned
+
+    async def close(self) -> None:
+        """Stop, and let go of the ports."""
+        if self._open:
+            await self.stop()
+            if self.link.connected:  # what is still in the port when it is closed is lost
+                line_ns = round(self._command.longest() * BITS_PER_BYTE / self.options.baud * 1e9)
+                await self._clock.sleep_ns(LAST_WORD_NS + line_ns)
+        self._open = False
+        await self.link.close()
+        if self._lidar:
+            await self._lidar.close()
+
+    async def stop(self) -> None:
+        """A command of zero, and the stop string where the body has one."""
+        self._send(ZERO)
+        if self._started and self.options.stop:
+            self._started = not self.link.write(self.options.stop.encode())
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        """Drive; a value that is not a number is zero for all, and so is all while it is lost."""
+        if not self._open:
+            raise BodyLost("the line is not open")
+        wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
+        if not all(map(math.isfinite, (linear_x, linear_y, angular_z))):
+            wanted = ZERO
+        self._send(clamp(wanted, self._limits))
+        return self._sent
+
+    async def read_state(self) -> RobotState:
+        """What the lines said last; `link` says whether that is still so."""
+        report = self._report
+        return RobotState(
+            robot_type=self.robot.robot_type,
+            pose=report.pose,
+            velocity=report.velocity(),
+            joints=report.joints(),
+            battery=report.battery(),
+            bumpers=self._bumpers(),
+            link=self._health(),
+        )
+
+    async def get_sensor_data(self, sensor_name: str) -> Message | None:
+        """The newest `scan`."""
+        if sensor_name != "scan" or self.robot.lidar is None:
+            raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}")
+        return self._scan
+
+    def _send(self, wanted: Velocity) -> None:
+        """Write a command that is new, or due again; `_sent` is what the body then goes by."""
+        if self._heard_ns is None:  # it may still be booting: nothing that could disturb it
+            self._sent = ZERO
+            return
+        now_ns = self._clock.now_ns()
+        sent = self._rounded(wanted)
+        if sent == self._sent and now_ns - self._sent_ns < self._repeat_ns:
+            return
+        if sent != ZERO and not self._started:
+            self._start()
+        line = self._command.encode(self._values(sent))
+        self._sent, self._sent_ns = (sent if self.link.write(line) else ZERO), now_ns
+
+    def _values(self, velocity: Velocity) -> dict[str, float]:
+        """All that a command line may hold."""
+        self._seq = (self._seq + 1) % SEQUENCES
+        twist = Twist(velocity.linear_x, velocity.linear_y, velocity.angular_z)
+        values = {**twist._asdict(), "seq": float(self._seq)}
+        if self._base:
+            speeds = zip(self._base.wheels, self._base.to_wheels(twist), strict=True)
+            values.update({f"wheel_{name}": speed for name, speed in speeds})
+        return values
+
+    def _rounded(self, velocity: Velocity) -> Velocity:
+        """What is left of a velocity after it was written with the line's digits."""
+        sent = self._command.sent
+        return Velocity(
+            linear_x=sent("linear_x", velocity.linear_x),
+            linear_y=sent("linear_y", velocity.linear_y),
+            angular_z=sent("angular_z", velocity.angular_z),
+        )
+
+    def _start(self) -> None:
+        start = self.options.start.encode()
+        self._started = not start or self.link.write(start)
+
+    def _opened(self) -> None:
+        """A new line: nothing from before counts. Some firmware speaks only when it is asked to."""
+        self._decoder.clear()
+        self._report.restart()
+        self._heard_ns, self._started = None, False
+        if self.options.start:
+            self._start()
+
+    def _lost(self, why: str) -> None:
+        self._heard_ns, self._hoping_ns, self._sent = None, self._clock.now_ns(), ZERO
+
+    def _received(self, data: bytes) -> None:
+        now_ns = self._clock.now_ns()
+        for values in self._decoder.feed(data):
+            self._report.take(values, now_ns)
+            first, self._heard_ns = self._heard_ns is None, now_ns
+            if first:
+                self._sent_ns = 0
+                self._send(ZERO)
+            self._tell_flags()
+        self.link.errors = self._decoder.errors
+
+    def _health(self) -> LinkHealth:
+        """The line's; connected means that the body has been heard lately. Says so when it has not.
+
+        What is wrong for a moment only, the gate says.
+        """
+        now_ns = self._clock.now_ns()
+        silent_ns = now_ns - (self._heard_ns or self._hoping_ns)
+        alive = self._heard_ns is not None and silent_ns <= self._silent_ns
+        if alive:
+            self._silence.end(f"{self.link}: heard again")
+        elif silent_ns > PATIENCE_NS:
+            senseless = "no line that makes sense comes: firmware, baud rate, wiring?"
+            self._silence.begin(f"{self.link}: {self.link.problem or senseless}")
+        return replace(self.link.health, connected=alive)
+
+    def _bumpers(self) -> tuple[bool, ...]:
+        """The flags whose names begin with `bumper`."""
+        names = enumerate(self.options.flags)
+        return tuple(bool(self._report.flags >> bit & 1) for bit, name in names if BUMPER in name)
+
+    def _tell_flags(self) -> None:
+        """Say once when a flag is raised and once when it falls."""
+        for bit, name in enumerate(self.options.flags):
+            if BUMPER in name:
+                continue
+            if self._report.flags >> bit & 1:
+                self._flags[bit].begin(f"the firmware reports: {name}")
+            else:
+                self._flags[bit].end(f"the firmware no longer reports: {name}")
+
+    def _scanned(self, scan: LaserScan) -> None:
+        self._scan = scan
+        self.emit(SCAN, scan)
+
+    def _is_ours(self, port: serial.Serial) -> bool:
+        """Whether a good line comes from this port. Runs in a thread."""
+        decoder, until = Decoder(self.options.state_templates()), time.monotonic() + PROBE_S
+        while time.monotonic() < until:
+            if decoder.feed(port.read(max(1, port.in_waiting))):
+                return True
+        return False
+
+    def _check_wheels(self) -> None:
+        """Raises ConfigError for a wheel that the base does not have."""
+        kind, has = self.robot.drive_type, self._base.wheels if self._base else ()
+        known = {f"wheel_{name}{part}" for name in has for part in ("", *WHEEL_PARTS)}
+        templates = {"command": self._command}
+        templates |= {f"state[{i}]": t for i, t in enumerate(self.options.state_templates())}
+        for field, template in templates.items():
+            for name in sorted(template.names):
+                if not name.startswith("wheel_") or name in known:
+                    continue
+                wheels = ", ".join(has) or "none without wheel_radius and wheel_separation"
+                raise ConfigError(
+                    f"{self.robot.robot_type}: {self.run.link}.{field}: no {name} on a {kind} "
+                    f"base; its wheels: {wheels}"
+                )

@@ -1,0 +1,214 @@
+"""Lines of text with numbers in them, written and read by the same template.
+
+A template is the line as it is on the wire, with `{FIELD}`, `{FIELD|UNIT}` or
+`{FIELD|UNIT:FORMAT}` where the numbers are: `V,{linear_x:.3f},{angular_z:.3f}` and a newline. A
+checksum (`{crc16}`, see checks.py) stands last and covers the text before it, as in NMEA 0183:
+without a `$` at the beginning and without a `*` right before the checksum.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from gigabrain_drivers.protocols.checks import CHECKS
+from gigabrain_drivers.protocols.line_fields import DEFAULT_FORMATS, IGNORED, factor
+from gigabrain_zenoh.errors import unknown
+
+LONGEST = 256  # bytes of a line
+_FIELD = re.compile(r"\{([^{}|:]*)(?:\|([^{}|:]*))?(?::([^{}]*))?\}")
+_FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.([0-9]))?f|d|[xX])")
+_ANY_NUMBER = r" *[-+]?[0-9]{1,12}(?:\.[0-9]{0,9})?"
+
+
+@dataclass(frozen=True)
+class Field:
+    """One number of a line."""
+
+    name: str
+    unit: str
+    factor: float  # wire * factor is in SI units
+    format: str  # of Python's format(); whole numbers and hexadecimals are rounded first
+    pattern: str  # of a regular expression
+
+    def write(self, value: float) -> str:
+        """The text for a value in SI units; zero has no sign."""
+        wire = value / self.factor
+        if self.format[-1] != "f":
+            return format(round(wire), self.format)
+        text = format(wire, self.format)
+        return format(0.0, self.format) if float(text) == 0 else text
+
+    def read(self, text: str) -> float:
+        """The value in SI units of a text that fits the pattern."""
+        return (int(text, 16) if self.format[-1] in "xX" else float(text)) * self.factor
+
+
+class Template:
+    """One kind of line. Raises ValueError for a text that cannot be one.
+
+    `known` are the fields that it may have and their quantities.
+    """
+
+    def __init__(
+        self, text: str, known: Mapping[str, str], ticks_per_turn: float | None = None
+    ) -> None:
+        _check_text(text)
+        self.end = text[-1].encode()
+        parts = _FIELD.split(text.rstrip("\r\n"))  # text, name, unit, format, text, ...
+        self._tail = text[len(text.rstrip("\r\n")) :]
+        self._texts = parts[0::4]
+        triples = list(zip(parts[1::4], parts[2::4], parts[3::4], strict=True))
+        self.check = triples.pop()[0] if triples and triples[-1][0] in CHECKS else ""
+        if self.check and self._texts[-1]:
+            raise ValueError(f"the checksum {{{self.check}}} must stand last in the line")
+        if any("{" in part or "}" in part for part in self._texts):
+            raise ValueError("a brace without its partner; expected {FIELD|UNIT:FORMAT}")
+        self.fields = tuple(_field(*triple, known, ticks_per_turn) for triple in triples)
+        if not self.fields:
+            raise ValueError(f"there is no field in it; known: {', '.join(known)}")
+        names = [field.name for field in self.fields if field.name != IGNORED]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"{', '.join(twice)} stands in it twice")
+        self.names = frozenset(names)
+        self._expression = re.compile(self._regular())
+
+    def encode(self, values: Mapping[str, float]) -> bytes:
+        """The line for values in SI units; a field without a value is 0."""
+        text = self._texts[0]
+        for field, after in zip(self.fields, self._texts[1:], strict=False):
+            text += field.write(values.get(field.name, 0.0)) + after
+        if self.check:
+            text += self._sum(text)
+        return (text + self._tail).encode("ascii")
+
+    def decode(self, line: bytes) -> dict[str, float] | None:
+        """The values of a line without its end, in SI units; None when it is no such line."""
+        if len(line) > LONGEST or not line.isascii():
+            return None
+        text = line.decode("ascii")
+        match = self._expression.fullmatch(text)
+        if match is None:
+            return None
+        if self.check:
+            digits = CHECKS[self.check].digits
+            if text[-digits:].upper() != self._sum(text[:-digits]):
+                return None
+        pairs = zip(self.fields, match.groups(), strict=True)
+        return {f.name: f.read(number) for f, number in pairs if f.name != IGNORED}
+
+    def sent(self, name: str, value: float) -> float:
+        """What is left of a value [SI] after it was rounded to the line's digits."""
+        for field in self.fields:
+            if field.name == name:
+                return field.read(field.write(value))
+        return value
+
+    def longest(self) -> int:
+        """About how many bytes a line has."""
+        return len(self.encode({field.name: -5.0 * field.factor for field in self.fields}))
+
+    def _sum(self, text: str) -> str:
+        check = CHECKS[self.check]
+        covered = text.removeprefix("$").removesuffix("*").encode("ascii")
+        return format(check.of(covered), f"0{check.digits}X")
+
+    def _regular(self) -> str:
+        """The expression of a whole line; its groups are the numbers."""
+        pattern = re.escape(self._texts[0])
+        for field, after in zip(self.fields, self._texts[1:], strict=False):
+            pattern += f"({field.pattern})" + re.escape(after)
+        if self.check:
+            pattern += f"[0-9A-Fa-f]{{{CHECKS[self.check].digits}}}"
+        return pattern
+
+
+def _check_text(text: str) -> None:
+    if not text.endswith(("\n", "\r")):
+        quotes = "; in YAML, write it in double quotes" if text.endswith((r"\n", r"\r")) else ""
+        raise ValueError(f"expected a newline (\\n) at its end{quotes}")
+    if not text.isascii() or any(ord(c) < 32 for c in text.rstrip("\r\n")):
+        raise ValueError("expected printable ASCII")
+    if len(text) > LONGEST:
+        raise ValueError(f"expected at most {LONGEST} characters, got {len(text)}")
+
+
+def _field(
+    name: str, unit: str | None, form: str | None, known: Mapping[str, str], turn: float | None
+) -> Field:
+    if name in CHECKS:
+        raise ValueError(f"the checksum {{{name}}} must stand last in the line")
+    if name not in known:
+        raise ValueError(str(unknown("field", name, [*known, *CHECKS])))
+    quantity, unit = known[name], (unit or "").strip()
+    try:
+        scale = factor(quantity, unit, turn)
+    except ValueError as error:
+        raise ValueError(f"{{{name}}}: {error}") from None
+    if form is None:
+        pattern = "[0-9A-Fa-f]{1,8}" if quantity == "flags" else _ANY_NUMBER
+        plain = "d" if unit.lstrip("-") in ("tick", "tick/s") else ".3f"
+        return Field(name, unit, scale, DEFAULT_FORMATS.get(quantity, plain), pattern)
+    given = _FORMAT.fullmatch(form)
+    if given is None:
+        raise ValueError(f"{{{name}}}: expected a format such as .3f, d or 02x, got {form!r}")
+    if form[-1] in "xX" and quantity not in DEFAULT_FORMATS:
+        raise ValueError(f"{{{name}}}: a {quantity} has a sign; expected .3f or d, got {form!r}")
+    return Field(name, unit, scale, form, _pattern(form, given[1]))
+
+
+def _pattern(form: str, decimals: str | None) -> str:
+    """What a number of this format looks like, and nothing else."""
+    sign = "[-+]" if form.startswith("+") else "-?"
+    padding = " *" if len(form.rstrip("fdxX").partition(".")[0].lstrip("+0")) else ""
+    if form[-1] in "xX":
+        return f"{padding}[0-9A-Fa-f]{{1,8}}"
+    if form[-1] == "d":
+        return f"{padding}{sign}[0-9]{{1,12}}"
+    places = int(decimals) if decimals else 6 if "." not in form else 0
+    return rf"{padding}{sign}[0-9]{{1,12}}" + (rf"\.[0-9]{{{places}}}" if places else "")
+
+
+class Decoder:
+    """Cuts bytes into lines and reads those that fit one of the templates.
+
+    `errors` counts the others, from the first good line on: what comes before is a boot banner.
+    At most LONGEST bytes are ever kept.
+    """
+
+    def __init__(self, templates: Sequence[Template]) -> None:
+        self.errors = 0
+        self._templates = templates
+        self._end = templates[0].end
+        self._rest = b""
+        self._skipping = False  # to the end of a line that is too long
+        self._begun = False
+
+    def feed(self, data: bytes) -> list[dict[str, float]]:
+        """The values of each good line that `data` completes."""
+        *lines, rest = (self._rest + data).split(self._end)
+        found = []
+        for line in lines:
+            if self._skipping:
+                self._skipping = False
+            elif (values := self._read(line)) is not None:
+                found.append(values)
+        if len(rest) > LONGEST:
+            self.errors += self._begun and not self._skipping
+            self._skipping, rest = True, b""
+        self._rest = rest
+        return found
+
+    def clear(self) -> None:
+        """Forget the beginning of a line; what comes next may be a banner."""
+        self._rest, self._skipping, self._begun = b"", False, False
+
+    def _read(self, line: bytes) -> dict[str, float] | None:
+        line = line.strip(b"\r\n")
+        for template in self._templates:
+            values = template.decode(line)
+            if values is not None:
+                self._begun = True
+                return values
+        self.errors += bool(line) and self._begun
+        return None
