@@ -77,7 +77,7 @@ def test_items_are_where_the_firmware_has_them() -> None:
     found = opencr.readings(
         table(
             a10=(123456).to_bytes(4, "little"),
-            a18=b"\xff",
+            a18=b"\xff\x2a",
             a26=b"\x01\x00\x00\x01",
             a42=struct.pack("<II", 1184, 7444),
             a60=struct.pack("<3f", 0.25, -0.5, 1.5),
@@ -91,6 +91,7 @@ def test_items_are_where_the_firmware_has_them() -> None:
     )
     assert found.milliseconds == 123456
     assert found.device_status == -1
+    assert found.heartbeat == 42
     assert found.buttons == (True, False)
     assert found.bumpers == (False, True)
     assert found.voltage == pytest.approx(11.84)

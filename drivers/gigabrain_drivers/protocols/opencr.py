@@ -23,6 +23,7 @@ RUNNING, MOTORS_SILENT = 0, -1  # device status; silent mostly means that their 
 TICKS = 4096  # of a wheel's encoder per turn
 RADIANS_PER_TICK = math.tau / TICKS
 VELOCITY_UNIT = 0.229 * math.tau / 60  # [rad/s]
+FASTEST_WHEEL = 337 * VELOCITY_UNIT  # [rad/s], beyond which the firmware cuts off
 CURRENT_UNIT = 0.00269  # [A]
 SPEED_UNIT = 0.01  # [m/s] and [rad/s], of a command
 EMPTY_VOLTAGE = 10.5  # [V], below which the percentage stands still
@@ -49,6 +50,7 @@ class Readings(NamedTuple):
     milliseconds: int  # since the board's start, renewed every 20 ms
     watchdog_off: bool  # debug mode: the firmware would not stop by itself
     device_status: int
+    heartbeat: int  # as last written: an answer that holds the newest is none of an older question
     buttons: tuple[bool, bool]
     bumpers: tuple[bool, bool]
     voltage: float  # [V]
@@ -67,6 +69,11 @@ def ask() -> bytes:
     return dynamixel.read(ID, FIRST, LENGTH)
 
 
+def model_of(answer: bytes) -> tuple[int, int] | None:
+    """(model number, firmware version) in the answer to a ping; None: it is another answer."""
+    return (answer[0] | answer[1] << 8, answer[2]) if len(answer) == 3 else None
+
+
 def readings(data: bytes) -> Readings:
     """What the answer's `data` (172 bytes) says. Raises ValueError when it is not that long."""
     if len(data) != LENGTH:
@@ -77,6 +84,7 @@ def readings(data: bytes) -> Readings:
         milliseconds=v[0],
         watchdog_off=v[1],
         device_status=v[4],
+        heartbeat=v[5],
         buttons=(v[10], v[11]),
         bumpers=(v[12], v[13]),
         voltage=voltage,

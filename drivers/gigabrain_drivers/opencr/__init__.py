@@ -1,0 +1,1 @@
+"""TurtleBot3's OpenCR: the board on its line, and the driver of the body that it moves."""

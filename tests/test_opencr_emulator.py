@@ -1,0 +1,274 @@
+"""The emulated OpenCR: the vendor's firmware, as the vendor's own SDK and the facts see it."""
+
+import asyncio
+import itertools
+import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import dynamixel_sdk
+import pytest
+
+from gigabrain_drivers.catalog import load_robot
+from gigabrain_drivers.emulators.base import EmulatedBody
+from gigabrain_drivers.emulators.opencr import OpenCr
+from gigabrain_drivers.emulators.physics import emulated_body
+from gigabrain_drivers.emulators.pty import Pty
+from gigabrain_drivers.emulators.station import Station
+from gigabrain_drivers.opencr.driver import OpenCrOptions
+from gigabrain_drivers.protocols import dynamixel, opencr
+from gigabrain_drivers.protocols.dynamixel import Decoder, Packet
+from gigabrain_drivers.robot import Run
+from gigabrain_zenoh.clock import Clock
+
+MS = 1_000_000
+
+
+class Wire:
+    """What the board answers."""
+
+    def __init__(self) -> None:
+        self._decoder = Decoder()
+        self.answers: list[Packet] = []
+
+    def write(self, data: bytes) -> bool:
+        self.answers += self._decoder.feed(data)
+        return True
+
+
+class Bench:
+    """A board in the hand: time passes when the test says so."""
+
+    def __init__(self, robot: str) -> None:
+        assert load_robot(robot)
+        self.body = emulated_body(robot, Run(folder=Path()))
+        self.wire = Wire()
+        self.board = OpenCr(self.body, OpenCrOptions(driver="opencr"), self.wire)
+        self.now_ns = 10**15
+        self.wait(20)
+
+    def wait(self, milliseconds: int) -> None:
+        for _ in range(milliseconds // 20):
+            self.board.step(self.now_ns)
+            self.now_ns += 20 * MS
+
+    def ask(self, frame: bytes) -> Packet | None:
+        self.wire.answers.clear()
+        self.board.feed(frame)
+        return self.wire.answers[0] if self.wire.answers else None
+
+    def read(self, address: int, length: int) -> bytes:
+        answer = self.ask(dynamixel.read(opencr.ID, address, length))
+        assert answer
+        return answer.params[1:]
+
+    def drive(self, forward: float, turn: float, beat: int) -> None:
+        self.ask(opencr.heartbeat(beat))
+        self.wait(20)
+        self.ask(opencr.velocity(forward, turn).frame)
+        self.wait(20)
+
+
+@pytest.fixture(name="bench")
+def make_bench() -> Bench:
+    return Bench("turtlebot3_waffle")
+
+
+def test_it_says_who_it_is(bench: Bench) -> None:
+    answer = bench.ask(dynamixel.ping(200))
+    assert answer == Packet(200, dynamixel.STATUS, bytes([0, 0x00, 0x50, 5]))
+    assert bench.read(0, 10).hex(" ") == "00 50 02 00 00 00 05 c8 03 02"
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        dynamixel.ping(1),
+        dynamixel.ping(254),
+        dynamixel.encode(Packet(200, 0x82, bytes(6))),
+        dynamixel.read(200, 0, 1014),
+        dynamixel.encode(Packet(200, dynamixel.READ, bytes(3))),
+        dynamixel.encode(Packet(200, dynamixel.WRITE, bytes(2))),
+        dynamixel.status(200),
+    ],
+    ids=["other id", "broadcast", "sync read", "too long", "short read", "empty write", "status"],
+)
+def test_other_things_are_ignored_in_silence(bench: Bench, frame: bytes) -> None:
+    assert bench.ask(frame) is None
+
+
+def test_only_whole_items_are_read_and_gaps_are_zero(bench: Bench) -> None:
+    assert bench.read(1, 1) == b"\0"
+    assert bench.read(0, 2) == b"\x00\x50"
+    assert bench.read(51, 8) == bytes(8)
+    assert len(bench.read(10, 172)) == 172
+
+
+def test_only_whole_items_are_written(bench: Bench) -> None:
+    bench.ask(dynamixel.write(200, 150, b"\x01\x02\x03"))
+    assert bench.read(150, 4) == bytes(4)
+    bench.ask(dynamixel.write(200, 149, b"\x00" + struct.pack("<i", 7) + b"\xff"))
+    assert bench.read(149, 6) == b"\x00\x07\x00\x00\x00\x00"
+
+
+def test_without_a_heartbeat_nothing_moves(bench: Bench) -> None:
+    bench.ask(opencr.velocity(0.2, 0.0).frame)
+    bench.wait(40)
+    assert bench.body.commanded == (0.0, 0.0, 0.0)
+    assert bench.read(15, 1) == b"\0"
+
+
+def test_a_velocity_is_obeyed_in_the_motors_own_units(bench: Bench) -> None:
+    bench.drive(0.15, 0.3, beat=1)
+    forward, _, turn = bench.body.commanded
+    assert forward == pytest.approx((135 + 243) / 2 / 1263.632956882)
+    assert turn == pytest.approx((243 - 135) / 1263.632956882 / 0.287)
+
+
+def test_a_wheel_that_would_be_too_fast_is_slowed_down_by_itself(bench: Bench) -> None:
+    bench.drive(0.26, 1.0, beat=1)
+    forward, _, turn = bench.body.commanded
+    assert forward == pytest.approx((147 + 337) / 2 / 1263.632956882)
+    assert turn == pytest.approx((337 - 147) / 1263.632956882 / 0.287)
+
+
+@pytest.mark.parametrize(
+    ("robot", "forward", "turn"),
+    [("turtlebot3_burger", 0.2108, 2.635), ("turtlebot3_waffle", 0.2661, 1.854)],
+)
+def test_speeds_are_cut_off_as_the_firmware_does(robot: str, forward: float, turn: float) -> None:
+    bench = Bench(robot)
+    bench.drive(1.0, 0.0, beat=1)
+    assert bench.body.commanded[0] == pytest.approx(forward, abs=1e-3)
+    bench.drive(0.0, -9.0, beat=2)
+    assert bench.body.commanded[2] == pytest.approx(-turn, abs=0.01)
+
+
+def test_the_wheels_stop_half_a_second_after_the_heartbeat_last_changed(bench: Bench) -> None:
+    bench.drive(0.2, 0.0, beat=1)
+    for _ in range(22):
+        bench.ask(opencr.heartbeat(1))
+        bench.wait(20)
+    assert bench.body.commanded[0] > 0.19
+    bench.wait(60)
+    assert bench.body.commanded == (0.0, 0.0, 0.0)
+    assert bench.read(15, 1) == b"\0"
+
+
+def test_a_heartbeat_alone_does_not_bring_the_old_speed_back(bench: Bench) -> None:
+    bench.drive(0.2, 0.0, beat=1)
+    bench.wait(600)
+    bench.ask(opencr.heartbeat(2))
+    bench.wait(100)
+    assert bench.body.commanded == (0.0, 0.0, 0.0)
+
+
+def test_in_debug_mode_it_would_drive_on(bench: Bench) -> None:
+    bench.ask(dynamixel.write(200, 14, b"\x01"))
+    bench.drive(0.2, 0.0, beat=1)
+    bench.wait(2000)
+    assert bench.body.commanded[0] > 0.19
+
+
+def test_without_torque_it_stands(bench: Bench) -> None:
+    bench.ask(opencr.torque(on=False))
+    bench.drive(0.2, 0.0, beat=1)
+    assert bench.body.commanded == (0.0, 0.0, 0.0)
+
+
+def test_calibration_makes_it_deaf_for_five_seconds(bench: Bench) -> None:
+    assert bench.ask(dynamixel.write(200, 59, b"\x01")) is None
+    assert bench.ask(dynamixel.ping(200)) is None
+    bench.wait(4980)
+    assert bench.wire.answers == []
+    bench.wait(60)
+    assert [len(answer.params) for answer in bench.wire.answers] == [1, 4]
+
+
+def test_the_charge_stands_still_below_ten_and_a_half_volts(bench: Bench) -> None:
+    def charge() -> tuple[int, int]:
+        voltage, percentage = struct.unpack("<II", bench.read(42, 8))
+        return voltage, percentage
+
+    voltage, percentage = charge()
+    assert 1230 < voltage < 1270
+    assert percentage == pytest.approx((voltage - 1050) / 180 * 10_000, abs=60)
+    bench.board.sag_volts = 3.0
+    bench.wait(20)
+    assert charge() == pytest.approx((voltage - 300, percentage), abs=1)
+    assert charge()[1] == percentage
+
+
+def test_with_too_little_voltage_it_is_off_and_starts_anew_with_enough(bench: Bench) -> None:
+    bench.drive(0.2, 0.0, beat=1)
+    bench.board.sag_volts = 9.0
+    bench.wait(20)
+    assert bench.ask(dynamixel.ping(200)) is None
+    assert bench.body.commanded == (0.0, 0.0, 0.0)
+    bench.board.sag_volts = 0.0
+    bench.wait(40)
+    assert struct.unpack("<I", bench.read(10, 4))[0] < 100
+    assert bench.read(150, 4) == bytes(4)
+
+
+async def test_the_vendors_sdk_reads_and_drives_it(tmp_path: Path) -> None:
+    body = emulated_body("turtlebot3_waffle", Run(folder=Path()))
+    port = Pty(tmp_path / "base")
+    station = Station(lambda wire: OpenCr(body, None, wire), port, Clock())
+    body.start()
+    station.start()
+    try:
+        await asyncio.to_thread(_by_the_sdk, str(port.path), body)
+    finally:
+        await station.close()
+        await body.close()
+
+
+def _by_the_sdk(path: str, body: EmulatedBody) -> None:
+    line = dynamixel_sdk.PortHandler(path)
+    sdk = dynamixel_sdk.PacketHandler(2.0)
+    assert line.openPort()
+    assert line.setBaudRate(1_000_000)
+
+    def readings() -> opencr.Readings:
+        (data,) = _told(sdk.readTxRx(line, 200, 10, 172))
+        return opencr.readings(bytes(data))
+
+    try:
+        assert _told(sdk.ping(line, 200)) == [0x5000]
+        assert _told(sdk.read4ByteTxRx(line, 200, 2)) == [2]
+        _until(lambda: readings().linear_acceleration[2] == pytest.approx(9.81, abs=0.2))
+        found = readings()
+        assert 12.3 < found.voltage < 12.7
+        assert found.orientation == pytest.approx((0, 0, 0, 1), abs=0.02)
+        assert found.ticks == pytest.approx((1234, 3210), abs=3)
+        beats = itertools.cycle(range(256))
+
+        def driven() -> bool:
+            _told(sdk.write1ByteTxRx(line, 200, 19, next(beats)))
+            _told(sdk.writeTxRx(line, 200, 150, 24, struct.pack("<6i", 20, 0, 0, 0, 0, 0)))
+            return readings().ticks[0] > 1234 + 500
+
+        _until(driven)
+        assert body.commanded[0] == pytest.approx(0.2, abs=1e-3)
+        assert readings().velocities == pytest.approx((6.06, 6.06), abs=0.2)
+        assert sdk.ping(line, 1)[1] == dynamixel_sdk.COMM_RX_TIMEOUT
+        _until(lambda: body.commanded == (0.0, 0.0, 0.0))
+    finally:
+        line.closePort()
+
+
+def _until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10
+    while not true():
+        assert time.monotonic() < deadline, "it never happened"
+        time.sleep(0.005)
+
+
+def _told(answer: tuple[Any, ...]) -> list[Any]:
+    """What the SDK read, once it says that all went well."""
+    *values, result, error = answer
+    assert (result, error) == (dynamixel_sdk.COMM_SUCCESS, 0)
+    return values[:1]
