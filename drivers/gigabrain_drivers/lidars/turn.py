@@ -35,10 +35,8 @@ class Turn:
         inf is a sample without a return, nan one that cannot be trusted. After a whole turn of
         silence what was gathered before it is forgotten.
         """
-        if (
-            len(self._angles) + len(angles) > MOST_SAMPLES
-            or now_ns - self._last_ns > self._period_ns
-        ):
+        silent = self._angles and now_ns - self._last_ns > self._period_ns
+        if silent or len(self._angles) + len(angles) > MOST_SAMPLES:
             self.clear()
         if not self._angles:
             self._began_ns = now_ns

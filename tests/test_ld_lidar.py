@@ -1,0 +1,163 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.ld import LdDevice
+from gigabrain_drivers.lidars.ld import Ld19
+from gigabrain_drivers.lidars.turn import Turn, scan_of
+from gigabrain_drivers.protocols import ld
+from gigabrain_drivers.robot import ScanOptions
+from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.body import Lidar
+from gigabrain_zenoh.clock import Clock, FakeClock
+from tests.lidar_rig import LIDAR, Listener, Wire, agree, emulated, run_for, truth, until, waffle
+
+SMALL = Lidar(beams=8, rate_hz=10, range_min=0.1, range_max=3.0)
+MS = 1_000_000
+
+
+def options(folder: Path) -> ScanOptions:
+    return ScanOptions(driver="ld19", port=str(folder / "scan"))
+
+
+def test_a_bin_holds_its_nearest_sample_inf_without_a_return_and_nan_without_a_sample() -> None:
+    eighth = math.tau / 8
+    angles = [0.1, -0.1, eighth, 2 * eighth, 3 * eighth, 4 * eighth, 5 * eighth]
+    scan = scan_of(SMALL, angles, [1.0, 0.9, math.inf, 9.0, 0.02, math.nan, -0.0])
+
+    np.testing.assert_allclose(
+        ranges(scan), [0.9, math.inf, math.inf, 0.1, math.nan, 0.1, math.nan, math.nan], rtol=1e-6
+    )
+    assert (scan.angle_min, scan.angle_increment) == (0.0, math.tau / 8)
+
+
+def test_clockwise_degrees_become_counter_clockwise_bins() -> None:
+    turn = Turn(SMALL)
+    turn.clockwise([0.0], [1000], 0, 0)
+    turn.clockwise([90.0], [2000], None, 40 * MS)
+    turn.clockwise([270.0], [2500], None, 80 * MS)
+    scan = turn.clockwise([0.0], [1000], 0, 100 * MS)
+
+    assert scan is not None
+    got = ranges(scan)
+    assert (got[0], got[6], got[2]) == (1.0, 2.0, 2.5)
+
+
+def test_a_turn_whose_start_was_not_seen_is_no_scan() -> None:
+    turn = Turn(SMALL)
+    turn.clockwise([90.0], [2000], None, 0)
+
+    assert turn.clockwise([0.0], [1000], 0, 50 * MS) is None
+
+
+@pytest.mark.parametrize("took_ms", [20, 301])
+def test_a_turn_that_came_too_fast_or_too_slowly_to_be_true_is_no_scan(took_ms: int) -> None:
+    turn = Turn(SMALL)
+    for n in range(5):
+        turn.clockwise([30.0 * n], [1000], None if n else 0, n * took_ms * MS // 5)
+
+    assert turn.clockwise([0.0], [1000], 0, took_ms * MS) is None
+
+
+def test_what_came_before_a_turn_of_silence_is_forgotten() -> None:
+    turn = Turn(SMALL)
+    turn.clockwise([0.0], [1000], 0, 0)
+    turn.clockwise([200.0], [1000], None, 101 * MS)
+
+    assert turn.clockwise([0.0], [1000], 0, 150 * MS) is None
+
+
+def test_the_emulator_sends_4500_samples_a_second_in_frames_of_twelve(tmp_path: Path) -> None:
+    body, wire = waffle(), Wire()
+    device = LdDevice(body, options(tmp_path), wire)
+    device.reset()
+    run_for(body, device, 1.0)
+    frames = [ld.decode(sent) for sent in wire.sent]
+
+    assert len(frames) == 375
+    assert all(frame is not None for frame in frames)
+    first, last = frames[0], frames[-1]
+    assert first is not None
+    assert last is not None
+    assert (first.speed, first.start, first.end) == (3600, 0, 880)
+    assert last.time_ms == 1000
+
+
+def test_a_scan_of_the_emulated_lidar_is_the_scan_of_the_simulation() -> None:
+    body, wire, clock = waffle(), Wire(), FakeClock()
+    device = LdDevice(body, options(Path()), wire)
+    device.reset()
+    source = Ld19(options(Path()), LIDAR, clock)
+    scans = []
+    source.emit = scans.append
+    for _ in range(50):
+        run_for(body, device, 0.01)
+        clock._now += 10 * MS
+        source.received(b"".join(wire.sent))
+        wire.sent.clear()
+
+    assert len(scans) == 3  # the first turn was not seen to begin, the fifth not to end
+    assert agree(scans[-1], truth(body)) == 1.0
+    assert not np.isnan(ranges(scans[-1])).any()
+
+
+async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(tmp_path: Path) -> None:
+    async with (
+        emulated(LdDevice, options(tmp_path)) as station,
+        Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
+    ):
+        scan = (await listener.more(3))[-1]
+        assert agree(scan, truth(station.device.body)) > 0.99
+        assert listener.source.health.connected
+        assert listener.source.health.errors == 0
+
+        station.set(Faults(unplugged=True))
+        await until(lambda: listener.source.problem)
+        assert listener.source.problem == f"no {tmp_path}/scan: is it plugged in?"
+        assert not listener.source.health.connected
+
+        station.set(NONE)
+        await listener.more(2)
+        assert listener.source.health.reconnects >= 1
+        await until(lambda: not listener.source.problem)
+
+
+async def test_silence_is_told_in_one_line_and_ends_by_itself(tmp_path: Path) -> None:
+    async with (
+        emulated(LdDevice, options(tmp_path)) as station,
+        Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
+    ):
+        await listener.more(1)
+        station.set(Faults(silence=True))
+        await until(lambda: listener.source.problem)
+        station.set(NONE)
+        await listener.more(1)
+
+
+async def test_bit_errors_and_half_frames_cost_frames_and_nothing_else(tmp_path: Path) -> None:
+    async with (
+        emulated(LdDevice, options(tmp_path)) as station,
+        Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
+    ):
+        await listener.more(1)
+        station.set(Faults(bit_errors=0.001, half_frames=0.01, garbage=0.01))
+        scans = await listener.more(10)
+        real = truth(station.device.body)
+
+        assert listener.source.health.errors > 5
+        for scan in scans:
+            missing = np.isnan(ranges(scan)).sum()
+            assert agree(scan, real) > 0.98 - missing / 360
+
+
+async def test_an_ld19_that_was_left_out_says_nothing_comes(tmp_path: Path) -> None:
+    async with emulated(LdDevice, options(tmp_path)) as station:
+        station.set(Faults(silence=True))
+        async with Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener:
+            await until(lambda: listener.source.problem)
+            assert listener.source.problem == (
+                f"nothing comes from {tmp_path}/scan: is the LD19 powered, and wired both ways?"
+            )
