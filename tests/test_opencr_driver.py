@@ -43,6 +43,9 @@ class Cable(Link):
         self.drops: list[str] = []
         self._decoder = Decoder()
 
+    def __str__(self) -> str:
+        return "Cable"
+
     def open(self) -> None:
         self.plug()
 
@@ -333,8 +336,9 @@ async def test_a_port_on_which_nobody_answers_is_knocked_at_and_opened_anew(rig:
 async def test_silent_motors_and_debug_mode_count_as_a_body_that_does_not_answer(
     rig: Rig, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level("INFO")
     rig.board.feed(dynamixel.write(200, 14, b"\x01"))
-    await rig.drive(0.0, 0.0, 60)
+    await rig.drive(0.0, 0.0, 700)
     assert not (await rig.driver.read_state()).link.connected
     assert "does not stop by itself" in rig.driver.problem
     rig.board.feed(dynamixel.write(200, 14, b"\x00"))
@@ -344,8 +348,11 @@ async def test_silent_motors_and_debug_mode_count_as_a_body_that_does_not_answer
     rig.board.feed(dynamixel.write(200, 18, b"\x00"))
     await rig.drive(0.0, 0.0, 60)
     assert (await rig.driver.read_state()).link.connected
-    said = [record.message for record in caplog.records]
-    assert sum("does not stop by itself" in text for text in said) == 1
+    assert [record.message for record in caplog.records] == [
+        "OpenCR is in debug mode, in which it does not stop by itself: restart it",
+        "OpenCR reaches no motors: switch their power on, then press its reset button",
+        "OpenCR on Cable answers, firmware 5",
+    ]
 
 
 async def test_garbage_and_a_board_that_restarts_do_not_move_the_pose(rig: Rig) -> None:

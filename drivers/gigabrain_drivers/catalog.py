@@ -107,6 +107,8 @@ def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions
         forbid_unknown_fields=True,
     )
     options = getattr(config.load(path, exact), section)
+    if options.lidar:
+        robot = msgspec.structs.replace(robot, lidar=options.lidar)
     if borrowed:
         options = with_ports(options)
     return robot, driver, at_emulator(options, run.emulator), path.parent

@@ -6,7 +6,7 @@ from typing import Any
 from msgspec import Struct
 
 from gigabrain_schemas.base import Finite, Name, NonNegative, Positive
-from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_zenoh.settings import LinkName
 
 LINKS: tuple[LinkName, ...] = ("sim", "emulated", "real")
@@ -52,6 +52,7 @@ class LinkOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     driver: str
     scan: ScanOptions | None = None  # a lidar that the driver carries, see lidars.base.carry
+    lidar: Lidar | None = None  # what it measures, where that is not what the body's file says
 
 
 class Run(Struct, frozen=True, kw_only=True):

@@ -5,6 +5,9 @@ DEVICES = {
     "line": "gigabrain_drivers.emulators.line_base:LineBase",
     "ld06": "gigabrain_drivers.emulators.ld:LdDevice",
     "ld19": "gigabrain_drivers.emulators.ld:LdDevice",
+    "lds01": "gigabrain_drivers.emulators.lds:Lds01Device",
+    "lds02": "gigabrain_drivers.emulators.lds:Lds02Device",
+    "lds03": "gigabrain_drivers.emulators.lds:Lds03Device",
     "rplidar": "gigabrain_drivers.emulators.rplidar:RplidarDevice",
     "opencr": "gigabrain_drivers.emulators.opencr:OpenCr",
 }

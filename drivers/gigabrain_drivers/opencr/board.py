@@ -19,6 +19,7 @@ LOST_NS = 100_000_000  # without an answer it counts as lost,
 GIVE_UP_NS = 160_000_000  # and then its line is closed, with all that is still queued in it
 KNOCK_NS = 100_000_000  # between two attempts to get an answer at all
 PATIENCE_NS = 1_000_000_000  # for the first answer, until the port is opened anew
+SETTLE_NS = 500_000_000  # after which a problem is spoken of
 ANSWER_S = 0.01  # how long the answer to a question is waited for
 WATCHDOG_FIRMWARE = 5  # before that, the byte of the debug mode was part of a clock
 
@@ -43,7 +44,8 @@ class Board:
         self._opened_ns = self._knocked_ns = self._asked_ns = self._fresh_ns = clock.now_ns()
         self._waiting_ns: int | None = None  # since when questions have been without an answer
         self._newest: Readings | None = None
-        self._complaint = ""
+        self._complaint = "not there yet"
+        self._well_ns = clock.now_ns()
 
     @property
     def ready(self) -> bool:
@@ -95,7 +97,7 @@ class Board:
 
     def look(self, now_ns: int) -> None:
         """To be called often: knocks where nobody has answered, gives up where nobody will."""
-        self._speak_up()
+        self._speak_up(now_ns)
         if not self.link.connected:
             return
         if self._waiting_ns and now_ns - self._waiting_ns > GIVE_UP_NS:
@@ -105,9 +107,13 @@ class Board:
         elif not self.ready and now_ns - self._knocked_ns >= KNOCK_NS:
             self._knock()
 
-    def _speak_up(self) -> None:
-        """A fault is logged once when it begins and once when it ends."""
+    def _speak_up(self, now_ns: int) -> None:
+        """A problem that stays is logged once when it begins and once when it ends."""
         problem, before = self.problem, self._complaint
+        if not problem:
+            self._well_ns = now_ns
+        elif now_ns - self._well_ns < SETTLE_NS:
+            return
         if problem == before:
             return
         self._complaint = problem

@@ -1,0 +1,181 @@
+"""LDS-01, LDS-02 and LDS-03 as a body carries them: vendors' corrections, emulated rooms, ptys."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gigabrain_drivers.emulators.base import Device
+from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.lds import Lds01Device, Lds02Device, Lds03Device, lens_distance
+from gigabrain_drivers.lidars.lds01 import Lds01
+from gigabrain_drivers.lidars.lds02 import Lds02, from_axis
+from gigabrain_drivers.lidars.lds03 import Lds03, trusted
+from gigabrain_drivers.lidars.serial_source import SerialSource
+from gigabrain_drivers.protocols import ld, lds01, lds03
+from gigabrain_drivers.robot import ScanOptions
+from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.body import Lidar
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.clock import Clock, FakeClock
+from tests.lidar_rig import LIDAR, Listener, Wire, agree, emulated, run_for, truth, until, waffle
+
+MS = 1_000_000
+COARSE = Lidar(beams=180, rate_hz=10, range_min=0.16, range_max=3.5)
+SLOW = Lidar(beams=360, rate_hz=5, range_min=0.12, range_max=3.5)
+ALL: list[tuple[type[SerialSource], type[Device], Lidar]] = [
+    (Lds01, Lds01Device, SLOW),
+    (Lds02, Lds02Device, COARSE),
+    (Lds03, Lds03Device, LIDAR),
+]
+each = pytest.mark.parametrize(("source", "device", "lidar"), ALL, ids=["lds01", "lds02", "lds03"])
+
+
+def options(folder: Path = Path()) -> ScanOptions:
+    return ScanOptions(driver="lds", port=str(folder / "scan"))
+
+
+def scans_of(source: SerialSource, clock: FakeClock, pieces: list[bytes]) -> list[LaserScan]:
+    """What a source makes of pieces that come 10 ms apart."""
+    found: list[LaserScan] = []
+    source.emit = found.append
+    for piece in pieces:
+        clock._now += 10 * MS
+        source.received(piece)
+    return found
+
+
+def test_lds01s_last_sample_looks_ahead_and_the_ones_before_to_the_right() -> None:
+    def packet(number: int) -> lds01.Packet:
+        first = 6 * number
+        return lds01.Packet(number, 300.0, (9,) * 6, tuple(range(1000 + first, 1006 + first)))
+
+    clock = FakeClock()
+    pieces = [
+        b"".join(lds01.encode(packet(n % 60)) for n in range(turn * 60 + at, turn * 60 + at + 3))
+        for turn in range(3)
+        for at in range(0, 60, 3)
+    ]
+    scan = ranges(scans_of(Lds01(options(), SLOW, clock), clock, pieces)[0])
+    assert scan[[0, 1, 90, 270, 359]] == pytest.approx([1.359, 1.358, 1.269, 1.089, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("distance", "seen"),
+    [(1000, (-5.6258, 1010.77)), (200, (-1.0300, 205.93)), (8000, (-6.6522, 8060.16))],
+)
+def test_lds02_is_corrected_as_the_vendor_does(distance: int, seen: tuple[float, float]) -> None:
+    assert from_axis(0.0, distance) == pytest.approx(seen, abs=0.01)
+    assert from_axis(90.0, distance)[0] == pytest.approx(90 + seen[0], abs=0.01)
+
+
+def test_no_return_is_left_where_it_is() -> None:
+    assert from_axis(12.0, 0) == (12.0, 0)
+
+
+@pytest.mark.parametrize("distance", [200.0, 1000.0, 8000.0])
+def test_the_emulated_lens_is_the_corrections_other_side(distance: float) -> None:
+    assert from_axis(0.0, lens_distance(distance))[1] == pytest.approx(distance)
+
+
+def test_lds02_frames_are_ld_frames_with_the_correction() -> None:
+    frame = ld.Frame(3600, 0, 1100, (1000,) * 6 + (0,) * 6, (200,) * 12, 0)
+    angles, distances = Lds02(options(), COARSE, FakeClock()).place(frame)
+    assert angles[:2] == pytest.approx((-5.626, -4.626), abs=1e-3)
+    assert angles[6] == 6.0
+    assert distances == pytest.approx((1010.77,) * 6 + (0,) * 6, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("sample", "distance"),
+    [
+        (lds03.Sample(0.0, 1000, 10, False), 1000.0),
+        (lds03.Sample(0.0, 0, 0, False), 0.0),
+        (lds03.Sample(0.0, 150, 66, False), 150.0),
+        (lds03.Sample(0.0, 150, 65, True), 150.0),
+        (lds03.Sample(0.0, 150, 65, False), math.nan),
+        (lds03.Sample(0.0, 151, 0, False), 151.0),
+    ],
+)
+def test_lds03_samples_that_are_near_and_weak_are_not_trusted(
+    sample: lds03.Sample, distance: float
+) -> None:
+    assert trusted(sample) == pytest.approx(distance, nan_ok=True)
+
+
+@each
+def test_an_emulated_scan_is_the_simulations(
+    source: type[SerialSource], device: type[Device], lidar: Lidar
+) -> None:
+    body, wire, clock = waffle(), Wire(), FakeClock()
+    emulator = device(body, options(), wire)
+    emulator.reset()
+    emulator.feed(lds01.START + lds03.START)
+    pieces = []
+    for _ in range(100):
+        run_for(body, emulator, 0.01)
+        pieces.append(b"".join(wire.sent))
+        wire.sent.clear()
+    scans = scans_of(source(options(), lidar, clock), clock, pieces)
+    assert len(scans) >= 3
+    expected = truth()[:: 360 // lidar.beams]
+    assert agree(scans[-1], expected, within=0.1) > 0.97
+    assert np.isnan(ranges(scans[-1])).mean() < 0.03
+
+
+@each
+async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(
+    tmp_path: Path, source: type[SerialSource], device: type[Device], lidar: Lidar
+) -> None:
+    async with (
+        emulated(device, options(tmp_path)) as station,
+        Listener(source(options(tmp_path), lidar, Clock())) as listener,
+    ):
+        scan = (await listener.more(2))[-1]
+        expected = truth()[:: 360 // lidar.beams]
+        assert agree(scan, expected, within=0.1) > 0.95
+        assert listener.source.health.connected
+        station.set(Faults(unplugged=True))
+        await until(lambda: not listener.source.health.connected)
+        station.set(NONE)
+        await listener.more(2)
+        assert listener.source.health.reconnects >= 1
+
+
+@each
+async def test_noise_costs_frames_and_nothing_else(
+    tmp_path: Path, source: type[SerialSource], device: type[Device], lidar: Lidar
+) -> None:
+    async with (
+        emulated(device, options(tmp_path)) as station,
+        Listener(source(options(tmp_path), lidar, Clock())) as listener,
+    ):
+        await listener.more(1)
+        station.set(Faults(half_frames=0.02, garbage=0.02))
+        await until(lambda: listener.source.health.errors > 3)
+        station.set(NONE)
+        await listener.more(2)
+
+
+@pytest.mark.parametrize(
+    ("source", "device"), [(Lds01, Lds01Device), (Lds03, Lds03Device)], ids=["lds01", "lds03"]
+)
+async def test_a_lidar_that_was_switched_on_later_is_started_again(
+    tmp_path: Path, source: type[SerialSource], device: type[Device]
+) -> None:
+    async with (
+        emulated(device, options(tmp_path)) as station,
+        Listener(source(options(tmp_path), SLOW, Clock())) as listener,
+    ):
+        await listener.more(1)
+        station.device.reset()
+        await listener.more(2)
+
+
+async def test_a_lidar_is_brought_to_rest_when_its_port_is_closed(tmp_path: Path) -> None:
+    async with emulated(Lds01Device, options(tmp_path)) as station:
+        async with Listener(Lds01(options(tmp_path), SLOW, Clock())) as listener:
+            await listener.more(1)
+        sweep = station.device._sweep  # type: ignore[attr-defined]
+        await until(lambda: not sweep._rate_hz)
