@@ -2,6 +2,7 @@
 
 import asyncio
 import functools
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -39,9 +40,10 @@ def waffle(world: str = "arena") -> EmulatedBody:
     return emulated_body("turtlebot3_waffle", Run(folder=Path(), world=world))
 
 
-def truth(body: EmulatedBody) -> NDArray[np.float32]:
+@functools.cache
+def truth() -> NDArray[np.float32]:
     """What the simulation's own lidar sees from where the body stands, (360,) [m]."""
-    return body.simulation.scan()
+    return waffle().simulation.scan()
 
 
 def run_for(body: EmulatedBody, device: Device, seconds: float) -> None:
@@ -88,9 +90,12 @@ class Listener:
 
 async def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
     """Wait for something that will happen; generous, since machines may be busy."""
-    async with asyncio.timeout(seconds):
-        while not condition():
-            await asyncio.sleep(0.01)
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        if condition():
+            return
+        await asyncio.sleep(0.01)
+    raise TimeoutError
 
 
 def agree(scan: LaserScan, expected: NDArray[np.float32], within: float = 0.06) -> float:

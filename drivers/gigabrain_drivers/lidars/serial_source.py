@@ -123,13 +123,16 @@ class SerialSource(ScanSource):
 
     def no_answer(self) -> str:
         """What may be wrong where bytes come that make no sense, or none at all."""
+        where = f"{self.link} at {self.baud} baud"
         if not self._newest:
-            return (
-                f"nothing comes from {self.link}: is the {self.name} powered, and wired both ways?"
-            )
-        other = who_sends(self._newest)
+            return f"nothing comes from {where}: is the {self.name} powered, and wired both ways?"
+        other = self.stranger()
         guess = f"it looks like {other}" if other else "another lidar, or another baud rate?"
-        return f"what comes from {self.link} is no {self.name} at {self.baud} baud: {guess}"
+        return f"what comes from {where} is no {self.name}: {guess}"
+
+    def stranger(self) -> str:
+        """Which other lidar sends what comes, or an empty text."""
+        return who_sends(self._newest)
 
     def finished(self, scan: LaserScan | None) -> None:
         """A turn has ended; hands its scan on, if it is one."""
