@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from gigabrain_drivers.base import Driver
 from gigabrain_drivers.kinematics import Twist, base_of
 from gigabrain_drivers.lidars.base import ScanSource, carry
-from gigabrain_drivers.line_options import BITS_PER_BYTE, LineOptions
+from gigabrain_drivers.line_options import BITS_PER_BYTE, LineOptions, check_wheels
 from gigabrain_drivers.line_report import LineReport
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_drivers.protocols.line import Decoder
@@ -24,7 +24,7 @@ from gigabrain_schemas.body import LinkHealth, RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
+from gigabrain_zenoh.errors import BodyLost, Unsupported
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 from gigabrain_zenoh.logs import Fault
 
@@ -35,7 +35,6 @@ LEAST_SILENT_NS = 100_000_000
 REPEAT_SHARE = 0.9  # of the repetition's period: ticks are not that even
 PATIENCE_NS = 500_000_000  # without a good line, before something is said
 BUMPER = "bumper"  # flags of such names are bumpers
-WHEEL_PARTS = ("_position", "_velocity", "_effort", "_temperature")
 PROBE_S = 2.5  # an Arduino that opening has reset takes two seconds to say anything
 LAST_WORD_NS = 10_000_000  # and the time of one line, before a port is closed
 SEQUENCES = 1 << 16
@@ -51,7 +50,8 @@ class LineDriver(Driver):
         self._base = base_of(robot)
         self._command = options.command_template()
         self._decoder = Decoder(options.state_templates())
-        self._check_wheels()
+        check_wheels(options, robot, run.link, self._base)
+        self._by_wheels = any(name.startswith("wheel_") for name in self._command.names)
         self._clock = Clock()
         self.link = SerialLink(options.port, options.baud, self._clock, probe=self._is_ours)
         self.link.on_bytes, self.link.on_open = self._received, self._opened
@@ -154,12 +154,16 @@ class LineDriver(Driver):
 
     def _rounded(self, velocity: Velocity) -> Velocity:
         """What is left of a velocity after it was written with the line's digits."""
-        sent = self._command.sent
         return Velocity(
-            linear_x=sent("linear_x", velocity.linear_x),
-            linear_y=sent("linear_y", velocity.linear_y),
-            angular_z=sent("angular_z", velocity.angular_z),
+            linear_x=self._kept("linear_x", velocity.linear_x),
+            linear_y=self._kept("linear_y", velocity.linear_y),
+            angular_z=self._kept("angular_z", velocity.angular_z),
         )
+
+    def _kept(self, name: str, value: float) -> float:
+        if name in self._command.names:
+            return self._command.sent(name, value)
+        return value + 0.0 if self._by_wheels else 0.0
 
     def _start(self) -> None:
         start = self.options.start.encode()
@@ -228,19 +232,3 @@ class LineDriver(Driver):
             if decoder.feed(port.read(max(1, port.in_waiting))):
                 return True
         return False
-
-    def _check_wheels(self) -> None:
-        """Raises ConfigError for a wheel that the base does not have."""
-        kind, has = self.robot.drive_type, self._base.wheels if self._base else ()
-        known = {f"wheel_{name}{part}" for name in has for part in ("", *WHEEL_PARTS)}
-        templates = {"command": self._command}
-        templates |= {f"state[{i}]": t for i, t in enumerate(self.options.state_templates())}
-        for field, template in templates.items():
-            for name in sorted(template.names):
-                if not name.startswith("wheel_") or name in known:
-                    continue
-                wheels = ", ".join(has) or "none without wheel_radius and wheel_separation"
-                raise ConfigError(
-                    f"{self.robot.robot_type}: {self.run.link}.{field}: no {name} on a {kind} "
-                    f"base; its wheels: {wheels}"
-                )

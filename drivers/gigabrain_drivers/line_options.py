@@ -4,16 +4,19 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
+from gigabrain_drivers.kinematics import Base
 from gigabrain_drivers.links import ports
 from gigabrain_drivers.protocols.line import LONGEST, Template
 from gigabrain_drivers.protocols.line_fields import COMMAND, STATE
-from gigabrain_drivers.robot import LinkOptions
+from gigabrain_drivers.robot import LinkOptions, RobotFile
 from gigabrain_schemas.base import Name, Positive
+from gigabrain_zenoh.errors import ConfigError
 
 Text = Annotated[str, Meta(max_length=LONGEST)]
 Rate = Annotated[float, Meta(ge=10, le=200)]
 
 BITS_PER_BYTE = 10  # 8N1
+WHEEL_PARTS = ("_position", "_velocity", "_effort", "_temperature")
 
 
 class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -93,6 +96,22 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
             if needed > self.baud:
                 raise ValueError(
                     f"baud: {name} lines of {longest} bytes at {rate:g} Hz need {needed:.0f}"
+                )
+
+
+def check_wheels(options: LineOptions, robot: RobotFile, link: str, base: Base | None) -> None:
+    """Raises ConfigError for a wheel that the base does not have."""
+    templates = {"command": options.command_template()}
+    templates |= {f"state[{i}]": t for i, t in enumerate(options.state_templates())}
+    has = base.wheels if base else ()
+    known = {f"wheel_{name}{part}" for name in has for part in ("", *WHEEL_PARTS)}
+    for field, template in templates.items():
+        for name in sorted(template.names):
+            if name.startswith("wheel_") and name not in known:
+                wheels = ", ".join(has) or "none, as the file does not give their measures"
+                raise ConfigError(
+                    f"{robot.robot_type}: {link}.{field}: no {name} on a {robot.drive_type} base; "
+                    f"its wheels: {wheels}"
                 )
 
 

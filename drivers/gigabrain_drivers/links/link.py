@@ -79,7 +79,7 @@ class Link(abc.ABC):
         except BlockingIOError:
             sent = 0
         except OSError as error:
-            self.drop(_why(error))
+            self.drop(why(error))
             return False
         if sent < len(data):
             self._cut_short()
@@ -88,15 +88,15 @@ class Link(abc.ABC):
             self.trace("tx", data)
         return True
 
-    def drop(self, why: str) -> None:
+    def drop(self, reason: str) -> None:
         """Give the present connection up, with all that is queued in it, and connect anew."""
         if self._fd is None:
             return
-        fd, self._fd, self.problem = self._fd, None, why
+        fd, self._fd, self.problem = self._fd, None, reason
         asyncio.get_running_loop().remove_reader(fd)
         self._shut()
         self._ended.set()
-        self.on_lost(why)
+        self.on_lost(reason)
 
     async def close(self) -> None:
         """Let go of the port. Any number of times."""
@@ -126,7 +126,7 @@ class Link(abc.ABC):
             try:
                 fd = await self._connect()
             except (LinkProblem, OSError) as error:
-                self.problem = _why(error)
+                self.problem = why(error)
                 await self._clock.sleep_ns(retry_ns)
                 retry_ns = min(2 * retry_ns, LONGEST_RETRY_NS)
                 continue
@@ -161,7 +161,7 @@ class Link(abc.ABC):
         except BlockingIOError:
             return
         except OSError as error:
-            self.drop(_why(error))
+            self.drop(why(error))
             return
         if not data:  # the other end is gone; left in the loop, this would spin
             self.drop("the other end is gone: unplugged?")
@@ -172,9 +172,10 @@ class Link(abc.ABC):
         self.on_bytes(data)
 
 
-def _why(error: Exception) -> str:
-    if isinstance(error, OSError):
-        return str(error.strerror or error)
+def why(error: Exception) -> str:
+    """In words; asyncio puts its own before the system's."""
+    if isinstance(error, OSError) and error.errno:
+        return os.strerror(error.errno)
     return str(error)
 
 

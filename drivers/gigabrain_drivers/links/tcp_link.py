@@ -5,7 +5,7 @@ import contextlib
 import socket
 import struct
 
-from gigabrain_drivers.links.link import Link, LinkProblem
+from gigabrain_drivers.links.link import Link, LinkProblem, why
 from gigabrain_zenoh.clock import Clock
 
 CONNECT_S = 1.0
@@ -45,7 +45,7 @@ class TcpLink(Link):
             raise LinkProblem(f"no host {self._host!r}: {error.strerror}") from None
         except OSError as error:
             self._shut()
-            raise LinkProblem(f"{self}: {error.strerror or error}") from None
+            raise LinkProblem(f"{self}: {why(error)}") from None
         except asyncio.CancelledError:
             self._shut()
             raise

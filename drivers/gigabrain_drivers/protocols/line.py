@@ -40,7 +40,7 @@ class Field:
 
     def read(self, text: str) -> float:
         """The value in SI units of a text that fits the pattern."""
-        return (int(text, 16) if self.format[-1] in "xX" else float(text)) * self.factor
+        return (int(text, 16) if self.format[-1] in "xX" else float(text)) * self.factor + 0.0
 
 
 class Template:

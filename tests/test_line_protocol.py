@@ -1,0 +1,203 @@
+"""Lines of text by template: written, read back, and hostile ones refused."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gigabrain_drivers.protocols.checks import CHECKS
+from gigabrain_drivers.protocols.line import LONGEST, Decoder, Template
+from gigabrain_drivers.protocols.line_fields import COMMAND, STATE, UNITS, factor
+
+BARE = Template("V,{linear_x:.3f},{angular_z:.3f}\n", COMMAND)
+TICKS = Template(
+    "S,{wheel_left_position|tick:d},{wheel_right_position|tick:d},{battery_voltage|mV:d},"
+    "{wheel_left_temperature|0.1C:d},{flags:02X}*{crc16}\n",
+    STATE,
+    4096,
+)
+
+
+def test_a_tenth_forwards_and_half_a_radian() -> None:
+    line = BARE.encode({"linear_x": 0.1, "angular_z": 0.5})
+    assert line == bytes.fromhex("562c302e3130302c302e3530300a")  # V,0.100,0.500
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("xor8", 0x31), ("crc8", 0xF4), ("crc16", 0x29B1), ("crc32", 0xCBF43926)],
+)
+def test_checksums_of_the_usual_nine_digits(name: str, value: int) -> None:
+    assert CHECKS[name].of(b"123456789") == value
+
+
+def test_an_nmea_sentence_of_its_standard() -> None:
+    template = Template("$GPGLL,{_},N,{_},W,{_},A*{xor8}\n", STATE)
+    assert template.decode(b"$GPGLL,4916.45,N,12311.12,W,225444,A*31") == {}
+    assert template.decode(b"$GPGLL,4916.45,N,12311.12,W,225445,A*31") is None
+
+
+def test_a_state_line_in_si_units() -> None:
+    line = b"S,-4096,2048,12345,315,0A*"
+    crc = CHECKS["crc16"].of(line[:-1])
+    values = TICKS.decode(line + f"{crc:04X}".encode())
+    assert values is not None
+    assert values["wheel_left_position"] == pytest.approx(-math.tau)
+    assert values["wheel_right_position"] == pytest.approx(math.pi)
+    assert values["battery_voltage"] == pytest.approx(12.345)
+    assert values["wheel_left_temperature"] == pytest.approx(31.5)
+    assert values["flags"] == 0x0A
+
+
+def test_the_crc_of_a_whole_line_is_this() -> None:
+    values = {"wheel_left_position": math.tau, "battery_voltage": 12.0, "flags": 1.0}
+    assert TICKS.encode(values) == b"S,4096,0,12000,0,01*563E\n"
+
+
+@given(st.floats(-9.0, 9.0), st.floats(-9.0, 9.0))
+def test_what_is_written_is_read_back_to_the_last_digit(x: float, z: float) -> None:
+    values = BARE.decode(BARE.encode({"linear_x": x, "angular_z": z})[:-1])
+    assert values is not None
+    assert values == {"linear_x": BARE.sent("linear_x", x), "angular_z": BARE.sent("angular_z", z)}
+    assert abs(values["linear_x"] - x) <= 0.0005000001
+
+
+@given(st.data())
+def test_every_field_comes_back_in_every_unit(data: st.DataObject) -> None:
+    for known in (COMMAND, STATE):
+        name = data.draw(st.sampled_from([n for n in known if n != "_"]))
+        unit = data.draw(st.sampled_from(list(UNITS[known[name]])))
+        whole = known[name] in ("count", "flags")
+        value = float(data.draw(st.integers(0, 65535))) if whole else data.draw(st.floats(-50, 50))
+        form = "" if whole else ":.6f"
+        template = Template(f"X {{{name}|{unit}{form}}} *{{crc32}}\r\n", known, 4096)
+        back = template.decode(template.encode({name: value})[:-2])
+        assert back is not None
+        assert back[name] == pytest.approx(value, abs=2e-5)
+
+
+def test_zero_has_no_sign() -> None:
+    assert BARE.encode({"linear_x": -0.0001, "angular_z": -0.0}) == b"V,0.000,0.000\n"
+    assert str(BARE.sent("linear_x", -0.0001)) == "0.0"
+
+
+def test_a_unit_may_have_a_number_before_it_and_a_sign() -> None:
+    assert factor("temperature", "0.1C", None) == pytest.approx(0.1)
+    assert factor("speed", "0.01 m/s", None) == pytest.approx(0.01)
+    assert factor("angle", "-tick", 4096) == pytest.approx(-math.tau / 4096)
+    assert factor("turning speed", "rpm", None) == pytest.approx(0.10471976)
+    with pytest.raises(ValueError, match="it is a voltage: expected V or mV"):
+        factor("voltage", "0.1", None)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("V,{liner_x}\n", "no field 'liner_x'; did you mean 'linear_x'"),
+        ("V,{linear_x", "expected a newline"),
+        (r"V,{linear_x}\n", "in YAML, write it in double quotes"),
+        ("V,{linear_x|rpm}\n", r"\{linear_x\}: it is a speed: expected m/s or cm/s or mm/s"),
+        ("V,{linear_x|0m/s}\n", "expected a number other than 0"),
+        ("V,{linear_x:.3q}\n", r"\{linear_x\}: expected a format such as .3f, d or 02x"),
+        ("V,{linear_x:x}\n", "a speed has a sign"),
+        ("V,{linear_x},{linear_x}\n", "linear_x stands in it twice"),
+        ("V,{linear_x},{\n", "a brace without its partner"),
+        ("V,}{linear_x}\n", "a brace without its partner"),
+        ("V,{crc16},{linear_x}\n", r"the checksum \{crc16\} must stand last"),
+        ("V,{linear_x}*{crc16};\n", r"the checksum \{crc16\} must stand last"),
+        ("V\n", "there is no field in it"),
+        ("V,{wheel_steering|tick}\n", "'tick' needs `ticks_per_turn`"),
+        ("Ü,{linear_x}\n", "expected printable ASCII"),
+        ("V\x07,{linear_x}\n", "expected printable ASCII"),
+        ("V" * 300 + ",{linear_x}\n", "expected at most 256 characters"),
+        ("V,{linear_x!r}\n", "no field"),
+        ("V,{linear_x.__class__}\n", "no field"),
+    ],
+)
+def test_a_mistake_in_a_template_is_named(text: str, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        Template(text, COMMAND)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"V,nan,0.000", b"V,inf,0.000", b"V,-inf,0.000", b"V,1e3,0.000", b"V,0x1p3,0.000",
+        b"V,0.10,0.500", b"V,0.1000,0.500", b"V,.100,0.500", b"V,0.100", b"V,0.100,0.500,",
+        b" V,0.100,0.500", b"v,0.100,0.500", b"V,+0.100,0.500", b"V,--0.100,0.500", b"",
+        b"V,0.100,0.500V,0.100,0.500", b"V,0,100,0.500", "V,\u0660.100,0.500".encode(),
+        b"V,0.100,0.500\x00", b"V,1_0.000,0.500", b"V,9999999999999.000,0.000",
+    ],
+)  # fmt: skip
+def test_what_is_not_exactly_such_a_line_is_none(line: bytes) -> None:
+    assert BARE.decode(line) is None
+
+
+def test_a_number_without_a_given_format_may_be_padded_and_short() -> None:
+    template = Template("O {linear_x} {angular_z}\n", STATE)
+    assert template.decode(b"O   0.5 -1.") == {"linear_x": 0.5, "angular_z": -1.0}
+    assert template.decode(b"O 1e9 0") is None
+
+
+def lines(count: int) -> list[bytes]:
+    return [BARE.encode({"linear_x": n / 1000, "angular_z": 0.5}) for n in range(count)]
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=30))
+def test_however_the_bytes_are_cut_the_lines_are_whole(cuts: list[int]) -> None:
+    data, decoder, found = b"".join(lines(20)), Decoder((BARE,)), []
+    for cut in cuts:
+        found += decoder.feed(data[:cut])
+        data = data[cut:]
+    found += decoder.feed(data)
+    assert [values["linear_x"] for values in found] == [n / 1000 for n in range(20)]
+    assert decoder.errors == 0
+
+
+def test_a_banner_is_no_error_and_what_comes_between_is() -> None:
+    decoder = Decoder((BARE,))
+    decoder.feed(b"\xff\x00Arduino\r\nbooting\r\n" + lines(1)[0])
+    assert decoder.errors == 0
+    decoder.feed(b"oops\n\n" + lines(1)[0])
+    assert decoder.errors == 1
+
+
+def test_a_line_that_is_too_long_costs_one_error_and_the_next_one_is_read() -> None:
+    decoder = Decoder((BARE,))
+    decoder.feed(lines(1)[0])
+    for _ in range(50):
+        decoder.feed(b"x" * 100)
+    assert len(decoder._rest) <= LONGEST
+    assert decoder.feed(b"\n" + lines(1)[0]) == [{"linear_x": 0.0, "angular_z": 0.5}]
+    assert decoder.errors == 1
+
+
+@given(st.binary(max_size=2000))
+def test_no_bytes_make_it_raise_or_grow(data: bytes) -> None:
+    decoder = Decoder((BARE, TICKS))
+    decoder.feed(data)
+    assert len(decoder._rest) <= LONGEST
+
+
+def test_a_crlf_line_and_its_bare_cousin_are_read_alike() -> None:
+    template = Template("V,{linear_x:.3f}\r\n", COMMAND)
+    assert Decoder((template,)).feed(b"V,0.100\r\nV,0.200\n") == [
+        {"linear_x": 0.1},
+        {"linear_x": 0.2},
+    ]
+
+
+def test_every_single_flipped_bit_of_a_checked_line_is_noticed() -> None:
+    line = TICKS.encode({"wheel_left_position": 3.0, "battery_voltage": 12.0})[:-1]
+    right = TICKS.decode(line)
+    for bit in range(8 * len(line)):
+        flipped = bytearray(line)
+        flipped[bit // 8] ^= 1 << bit % 8
+        assert TICKS.decode(bytes(flipped)) in (None, right)  # the case of a hex digit is no error
+
+
+def test_a_bare_line_lets_a_flipped_digit_through() -> None:
+    line = bytearray(b"V,0.100,0.500")
+    line[4] ^= 8  # 1 -> 9
+    assert BARE.decode(bytes(line)) == {"linear_x": 0.9, "angular_z": 0.5}

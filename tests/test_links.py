@@ -1,0 +1,290 @@
+"""Links: they keep themselves open, never block or raise, and send nothing late."""
+
+import asyncio
+import socket
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+import serial
+
+from gigabrain_drivers.emulators.pty import Pty
+from gigabrain_drivers.links import ports
+from gigabrain_drivers.links.link import Link
+from gigabrain_drivers.links.serial_link import SerialLink, open_port
+from gigabrain_drivers.links.tcp_link import TcpLink
+from gigabrain_zenoh.clock import Clock
+
+GENEROUS_S = 5.0
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Wait for something that must come true."""
+    async with asyncio.timeout(GENEROUS_S):
+        while not condition():  # noqa: ASYNC110 - nothing here could set an event
+            await asyncio.sleep(0.002)
+
+
+class Heard:
+    """What a link told its owner."""
+
+    def __init__(self, link: Link) -> None:
+        self.data, self.opened, self.lost = b"", 0, list[str]()
+        link.on_bytes, link.on_open, link.on_lost = self._bytes, self._opened, self.lost.append
+
+    def _bytes(self, data: bytes) -> None:
+        self.data += data
+
+    def _opened(self) -> None:
+        self.opened += 1
+
+
+@pytest.fixture
+async def pty(tmp_path: Path) -> AsyncIterator[Pty]:
+    port = Pty(tmp_path / "base")
+    port.plug()
+    yield port
+    port.unplug()
+
+
+@pytest.fixture
+async def link(pty: Pty) -> AsyncIterator[SerialLink]:
+    link = SerialLink(str(pty.path), 115200, Clock())
+    yield link
+    await link.close()
+
+
+async def test_bytes_go_both_ways(pty: Pty, link: SerialLink) -> None:
+    heard, back = Heard(link), list[bytes]()
+    pty.on_bytes = back.append
+    link.open()
+    await until(lambda: link.connected)
+    assert link.write(b"V,0.100,0.500\n")
+    pty.write(b"\x00\n\r\xff")  # a raw line changes nothing
+    await until(lambda: back and heard.data)
+    assert (b"".join(back), heard.data) == (b"V,0.100,0.500\n", b"\x00\n\r\xff")
+    assert (heard.opened, heard.lost, link.problem) == (1, [], "")
+
+
+async def test_a_port_that_is_not_there_yet_is_waited_for(tmp_path: Path) -> None:
+    pty, link = Pty(tmp_path / "base"), SerialLink(str(tmp_path / "base"), 115200, Clock())
+    link.open()
+    assert not link.write(b"too early")
+    await until(lambda: "is it plugged in?" in link.problem)
+    pty.plug()
+    await until(lambda: link.connected)
+    assert link.reconnects == 0
+    await link.close()
+    pty.unplug()
+
+
+async def test_an_unplugged_port_is_noticed_and_reopened(pty: Pty, link: SerialLink) -> None:
+    heard, back = Heard(link), list[bytes]()
+    pty.on_bytes = back.append
+    link.open()
+    await until(lambda: link.connected)
+    pty.unplug()
+    await until(lambda: heard.lost)
+    assert not link.connected
+    assert not link.write(b"lost")
+    pty.plug()
+    await until(lambda: link.connected)
+    assert (heard.opened, link.reconnects, link.health.reconnects) == (2, 1, 1)
+    assert link.write(b"new")
+    await until(lambda: back)
+    assert back == [b"new"]  # and nothing from before
+
+
+async def test_a_port_that_was_unplugged_does_not_spin(pty: Pty, link: SerialLink) -> None:
+    link.open()
+    await until(lambda: link.connected)
+    pty.unplug()
+    await until(lambda: not link.connected)
+    began = time.thread_time()
+    await asyncio.sleep(0.3)
+    assert time.thread_time() - began < 0.15  # it would have been 0.3
+
+
+async def test_a_host_that_reads_nothing_gets_nothing_old(pty: Pty, link: SerialLink) -> None:
+    link.open()
+    await until(lambda: link.connected)
+    loop = asyncio.get_running_loop()
+    assert pty._master is not None
+    loop.remove_reader(pty._master)  # the device stands still
+    sent = 0
+    while link.write(b"x" * 64):
+        sent += 1
+        assert sent < 10_000
+    back: list[bytes] = []
+    pty.on_bytes = back.append
+    loop.add_reader(pty._master, pty._readable)
+    await asyncio.sleep(0.05)
+    assert back == []  # what waited to be sent was thrown away
+    assert link.write(b"new")
+    await until(lambda: back == [b"new"])
+
+
+async def test_two_cannot_have_one_port(pty: Pty, link: SerialLink) -> None:
+    link.open()
+    await until(lambda: link.connected)
+    other = SerialLink(str(pty.path), 115200, Clock())
+    other.open()
+    await until(lambda: "in use by pid" in other.problem)
+    await other.close()
+    assert link.connected
+
+
+async def test_modem_lines_that_are_not_there_are_no_fault(pty: Pty, link: SerialLink) -> None:
+    link.set_dtr(False)
+    link.open()
+    await until(lambda: link.connected)
+    link.set_dtr(False)
+    link.set_rts(True)
+    assert link.connected
+
+
+async def test_close_works_in_any_state_any_number_of_times(pty: Pty) -> None:
+    link = SerialLink(str(pty.path), 115200, Clock())
+    await link.close()
+    link.open()
+    await link.close()  # while it is opening
+    await link.close()
+    link.open()
+    await until(lambda: link.connected)
+    await link.close()
+    assert (link.connected, link.problem) == (False, "closed")
+    again = open_port(str(pty.path), 115200)  # nothing holds it any more
+    again.close()
+
+
+async def test_a_trace_shows_both_ways(pty: Pty, link: SerialLink) -> None:
+    seen: list[tuple[str, bytes]] = []
+    link.trace = lambda way, data: seen.append((way, data))
+    link.open()
+    await until(lambda: link.connected)
+    link.write(b"out")
+    pty.write(b"in")
+    await until(lambda: len(seen) == 2)
+    assert seen == [("tx", b"out"), ("rx", b"in")]
+
+
+async def test_the_age_is_that_of_the_newest_bytes(pty: Pty, link: SerialLink) -> None:
+    link.open()
+    await until(lambda: link.connected)
+    await asyncio.sleep(0.05)
+    assert link.health.age_ms >= 45
+    heard = Heard(link)
+    pty.write(b"x")
+    await until(lambda: heard.data)
+    assert link.health.age_ms < 45
+
+
+async def test_auto_takes_the_port_that_answers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right, wrong = Pty(tmp_path / "right"), Pty(tmp_path / "another")
+    for pty in (right, wrong):
+        pty.plug()
+    paths = [str(wrong.path), str(tmp_path / "gone"), str(right.path)]
+    monkeypatch.setattr(ports, "candidates", lambda port: paths)
+    right.on_bytes = lambda data: right.write(b"mycustombot") and None
+
+    def probe(port: serial.Serial) -> bool:
+        port.write(b"who?")
+        return b"mycustombot" in port.read(11)
+
+    link = SerialLink("auto", 115200, Clock(), probe=probe)
+    link.open()
+    await until(lambda: link.connected)
+    assert link.path == str(right.path)
+    await link.close()
+    for pty in (right, wrong):
+        pty.unplug()
+
+
+def test_a_usb_port_is_named_by_its_numbers() -> None:
+    assert ports.usb_id("usb:0483:5740") == (0x0483, 0x5740, "")
+    assert ports.usb_id("usb:10c4:ea60:0001") == (0x10C4, 0xEA60, "0001")
+    with pytest.raises(ValueError, match="expected usb:VID:PID"):
+        ports.usb_id("usb:0483")
+    with pytest.raises(ValueError, match="hexadecimal"):
+        ports.usb_id("usb:048x:5740")
+
+
+def test_what_is_wrong_with_a_port_says_what_to_do() -> None:
+    assert ports.missing("usb:0483:5740") == "no USB device 0483:5740: is it plugged in?"
+    assert 'KERNEL=="ttyACM9", MODE="0666"' in ports.refused(
+        "/dev/ttyACM9", PermissionError(13, "Permission denied")
+    )
+
+
+def server() -> socket.socket:
+    listening = socket.create_server(("127.0.0.1", 0))
+    listening.settimeout(GENEROUS_S)
+    return listening
+
+
+async def test_tcp_there_and_back_and_again_after_the_peer_is_gone() -> None:
+    with server() as listening:
+        link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=None)
+        heard = Heard(link)
+        link.open()
+        peer, _ = await asyncio.to_thread(listening.accept)
+        await until(lambda: link.connected)
+        assert link.write(b"hello")
+        assert await asyncio.to_thread(peer.recv, 100) == b"hello"
+        peer.close()
+        await until(lambda: heard.lost)
+        peer, _ = await asyncio.to_thread(listening.accept)
+        await until(lambda: link.connected)
+        assert link.reconnects == 1
+        await link.close()
+        peer.close()
+
+
+async def test_a_tcp_peer_that_falls_silent_is_dropped_and_gets_nothing_old() -> None:
+    with server() as listening:
+        link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=100_000_000)
+        heard = Heard(link)
+        link.open()
+        frozen, _ = await asyncio.to_thread(listening.accept)
+        await until(lambda: link.connected)
+        while not heard.lost:
+            link.write(b"old")
+            await asyncio.sleep(0.01)
+        assert "nothing heard for" in heard.lost[0]
+        peer, _ = await asyncio.to_thread(listening.accept)
+        peer.sendall(b"alive")
+        await until(lambda: heard.data)
+        link.write(b"new")
+        assert await asyncio.to_thread(peer.recv, 100) == b"new"
+        await link.close()
+        frozen.close()
+        peer.close()
+
+
+async def test_a_tcp_peer_that_takes_nothing_is_dropped_in_the_middle_of_a_frame() -> None:
+    with server() as listening:
+        link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=None)
+        heard = Heard(link)
+        link.open()
+        peer, _ = await asyncio.to_thread(listening.accept)
+        await until(lambda: link.connected)
+        while link.write(b"x" * 65536):
+            pass
+        assert heard.lost == ["it does not take what is sent to it"]
+        await link.close()
+        peer.close()
+
+
+@pytest.mark.parametrize(
+    ("host", "complaint"), [("127.0.0.1", "refused"), ("no.such.host.invalid", "no host")]
+)
+async def test_a_tcp_port_that_cannot_be_reached_says_so(host: str, complaint: str) -> None:
+    with server() as listening:
+        port = listening.getsockname()[1]
+    link = TcpLink(host, port, Clock())
+    link.open()
+    await until(lambda: complaint in link.problem)
+    await link.close()
