@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator
 import numpy as np
 
 from gigabrain_drivers.base import Driver
+from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import TICK_NS, Message, Pose, Velocity
@@ -41,14 +42,19 @@ class MockBody(Driver):
         self._noise = np.random.default_rng(run.seed)
         self._ticks = 0
         self._scan: LaserScan | None = None
+        self._lidar: ScanSource | None = None  # a real one, where its link has one
 
     async def open(self) -> None:
-        """Nothing to connect to."""
+        """Nothing to connect to, but for a lidar that it may carry."""
         self._open = True
+        self._lidar = carry(self, Clock())
 
     async def close(self) -> None:
         """Forget the connection."""
         self._open, self._velocity = False, ZERO
+        lidar, self._lidar = self._lidar, None
+        if lidar:
+            await lidar.close()
 
     async def stop(self) -> None:
         """At rest at once."""
@@ -91,7 +97,7 @@ class MockBody(Driver):
         """The scan of a round room, with a centimetre of noise."""
         if sensor_name != "scan":
             raise Unsupported(f"the mock has no sensor {sensor_name!r}; it has: scan")
-        return self._scan
+        return self._lidar.newest if self._lidar else self._scan
 
     def _advance(self) -> None:
         v, pose = self._velocity, self._pose
@@ -102,7 +108,7 @@ class MockBody(Driver):
             yaw=math.remainder(pose.yaw + v.angular_z * TICK_S, 2 * math.pi),
         )
         self._ticks += 1
-        lidar = self.robot.lidar
+        lidar = None if self._lidar else self.robot.lidar
         if lidar and self._ticks % max(1, round(1 / (lidar.rate_hz * TICK_S))) == 0:
             ranges = ROOM_M + self._noise.normal(0.0, 0.01, lidar.beams)
             self._scan = LaserScan(

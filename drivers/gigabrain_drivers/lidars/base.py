@@ -28,6 +28,7 @@ class ScanSource(abc.ABC):
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         self.options, self.lidar, self.clock = options, lidar, clock
         self.emit: Callable[[LaserScan], None] = lambda scan: None  # the owner puts its own here
+        self.newest: LaserScan | None = None  # set by `carry`
 
     @abc.abstractmethod
     def open(self) -> None:
@@ -72,6 +73,11 @@ def carry(driver: Driver, clock: Clock) -> ScanSource | None:
             "expected its beams, rate_hz, range_min and range_max"
         )
     source = source_class(options.driver)(options, lidar, clock)
-    source.emit = lambda scan: driver.emit(SCAN, scan)
+
+    def hand_on(scan: LaserScan) -> None:
+        source.newest = scan
+        driver.emit(SCAN, scan)
+
+    source.emit = hand_on
     source.open()
     return source
