@@ -185,8 +185,8 @@ class LineDriver(Driver):
         for values in self._decoder.feed(data):
             self._report.take(values, now_ns)
             first, self._heard_ns = self._heard_ns is None, now_ns
-            if first:
-                self._sent_ns = 0
+            if first:  # it has booted: what it was told before is forgotten
+                self._sent_ns, self._started = 0, False
                 self._send(ZERO)
             self._tell_flags()
         self.link.errors = self._decoder.errors

@@ -14,6 +14,7 @@ from gigabrain_schemas.body import Battery, BodyDescription, Joint
 VELOCITY_S = 0.05  # a velocity from positions is taken over so much time: one line is noise
 SLACK = 3.0  # a step so many times longer than the body can go is no step ...
 SLACK_M = 0.05  # ... but the lines' own unevenness is
+GAP_NS = 100_000_000  # without a line: the firmware may have restarted
 LONGEST_S = 0.2  # a speed says nothing of a longer time
 STILL = Twist(0.0, 0.0, 0.0)
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
@@ -49,7 +50,10 @@ class LineReport:
         if {"x", "y", "yaw"} <= values.keys():
             pose = Pose(x=values["x"], y=values["y"], yaw=values["yaw"])
             last, self._pose = self._pose or pose, pose
-            self._move(between(last, pose), now_ns)
+            step = between(last, pose)
+            if self._after_gap(now_ns) and _length(between(ORIGIN, pose)) < _length(step):
+                step = between(ORIGIN, pose)
+            self._move(step, now_ns)
         elif (angles := self._of_wheels(values, "position")) and self._base:
             self._roll(angles, now_ns)
         elif self._pose is None and self._angles is None and "linear_x" in values:
@@ -112,16 +116,27 @@ class LineReport:
         """The wheels stand at these angles."""
         assert self._base is not None
         last, self._angles = self._angles or angles, angles
-        turned = []
-        for name, now, before, span in zip(self._wheels, angles, last, self._spans, strict=True):
-            if name in ANGLES:
-                turned.append(now)
-                self._turned[name] = now
-                continue
-            turned.append(math.remainder(now - before, span) if span else now - before)
-        if self._move(self._base.to_body(tuple(turned)), now_ns):
+        turned = self._differences(angles, last)
+        if self._after_gap(now_ns) and sum(map(abs, angles)) < sum(map(abs, turned)):
+            turned = angles
+        if self._move(self._base.to_body(turned), now_ns):
             for name, angle in zip(self._wheels, turned, strict=True):
-                self._turned[name] += angle if name not in ANGLES else 0.0
+                self._turned[name] = angle if name in ANGLES else self._turned[name] + angle
+
+    def _differences(self, now: tuple[float, ...], before: tuple[float, ...]) -> tuple[float, ...]:
+        """By how much each wheel turned; a wheel that steers has an angle of its own."""
+        steps = []
+        for name, angle, last, span in zip(self._wheels, now, before, self._spans, strict=True):
+            way = angle if name in ANGLES else angle - last
+            steps.append(math.remainder(way, span) if span else way)
+        return tuple(steps)
+
+    def _after_gap(self, now_ns: int) -> bool:
+        """Whether the firmware may have been started anew since the last line.
+
+        If so, what counts is the shorter way: from where it stopped, or from zero.
+        """
+        return now_ns - (self._now_ns or now_ns) > GAP_NS
 
     def _move(self, step: Twist, now_ns: int) -> bool:
         """The body has made a step since the last line, if it can have made it."""
@@ -137,6 +152,10 @@ class LineReport:
         while sum(took for took, _ in self._steps) - self._steps[0][0] >= VELOCITY_S:
             self._steps.popleft()
         return step is not STILL
+
+
+def _length(step: Twist) -> float:
+    return math.hypot(step.linear_x, step.linear_y)
 
 
 def _scaled(twist: Twist, by: float) -> Twist:

@@ -1,0 +1,142 @@
+"""A body on a text line without physics: the emulated firmware moves it by kinematics alone."""
+
+import asyncio
+import math
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from gigabrain_drivers import catalog
+from gigabrain_drivers.emulators.base import Snapshot
+from gigabrain_drivers.emulators.faults import NONE
+from gigabrain_drivers.emulators.line_base import LineBase
+from gigabrain_drivers.emulators.station import Station
+from gigabrain_drivers.kinematics import Twist, base_of
+from gigabrain_drivers.line import LineDriver
+from gigabrain_drivers.odometry import advanced
+from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.sim.physics import Charge, ImuSample, Odometry, Wheel
+from gigabrain_schemas.base import Pose
+from gigabrain_zenoh.clock import Clock
+
+GENEROUS_S = 5.0
+BARE = """\
+summary: a base for tests
+robot_type: tested
+drive_type: differential
+wheel_separation: 0.5
+wheel_radius: 0.08
+max_linear_speed: 0.4
+max_angular_speed: 1.2
+footprint: [[0.2, 0.3], [-0.2, 0.3], [-0.2, -0.3], [0.2, -0.3]]
+real:
+  driver: line
+  port: "{port}"
+  command: "V,{linear_x:.3f},{angular_z:.3f}\\n"
+  state: ["S,{wheel_left_position|tick},{wheel_right_position|tick},{flags:02x}*{crc16}\\n"]
+  ticks_per_turn: 4096
+  flags: [watchdog, estop, bumper_left, bumper_right]
+"""
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Wait for something that must come true."""
+    async with asyncio.timeout(GENEROUS_S):
+        while not condition():  # noqa: ASYNC110 - nothing here could set an event
+            await asyncio.sleep(0.002)
+
+
+class IdealBody:
+    """Goes at once as fast as it is told; time passes when somebody looks."""
+
+    def __init__(self, robot: RobotFile) -> None:
+        self.robot, self.bumper = robot, False
+        self._base = base_of(robot)
+        self._pose, self._yaw = Pose(x=0.0, y=0.0, yaw=0.0), 0.0
+        self._angles = [0.0] * (len(self._base.wheels) if self._base else 0)
+        self.commanded = (0.0, 0.0, 0.0)
+        self._then_ns = Clock().now_ns()
+
+    def command(self, linear_x: float, linear_y: float, angular_z: float) -> None:
+        self._pass()
+        self.commanded = (linear_x, linear_y, angular_z)
+
+    @property
+    def snapshot(self) -> Snapshot:
+        self._pass()
+        x, _, turn = self.commanded
+        names = self._base.wheels if self._base else ()
+        speeds = self._base.to_wheels(Twist(*self.commanded)) if self._base else ()
+        wheels = zip(names, self._angles, speeds, strict=True)
+        return Snapshot(
+            time_ns=self._then_ns,
+            odometry=Odometry(self._pose.x, self._pose.y, self._yaw, x, turn),
+            wheels=tuple(Wheel(f"wheel_{n}_joint", a, s, 0.0, 30.0) for n, a, s in wheels),
+            imu=ImuSample((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)),
+            battery=Charge(12.0, 80.0, 0.5),
+            bumper=self.bumper,
+        )
+
+    def _pass(self) -> None:
+        now_ns = Clock().now_ns()
+        seconds, self._then_ns = (now_ns - self._then_ns) / 1e9, now_ns
+        step = Twist(*(part * seconds for part in self.commanded))
+        self._pose = advanced(self._pose, step)
+        self._yaw += step.angular_z
+        if self._base:
+            for i, angle in enumerate(self._base.to_wheels(step)):
+                self._angles[i] += angle
+
+
+class Bench:
+    """A driver and the firmware that it talks to, joined by a pty."""
+
+    def __init__(self, folder: Path, text: str = BARE) -> None:
+        port = folder / "base"
+        (folder / "robot.yaml").write_text(text.replace("{port}", str(port)))
+        run = Run(folder=folder, link="real")
+        self.robot, driver = catalog.make_driver(str(folder / "robot.yaml"), run)
+        assert isinstance(driver, LineDriver)
+        self.driver: LineDriver = driver
+        self.body: Any = IdealBody(self.robot)
+        options = driver.options
+        self.station = Station(
+            lambda wire: LineBase(self.body, options, wire), LineBase.port(options), Clock()
+        )
+
+    @property
+    def firmware(self) -> LineBase:
+        device = self.station.device
+        assert isinstance(device, LineBase)
+        return device
+
+    async def connected(self) -> bool:
+        return (await self.driver.read_state()).link.connected
+
+    async def until_connected(self, wanted: bool = True) -> None:
+        async with asyncio.timeout(GENEROUS_S):
+            while await self.connected() is not wanted:  # noqa: ASYNC110
+                await asyncio.sleep(0.002)
+
+    async def drive(self, seconds: float, linear_x: float, angular_z: float = 0.0) -> None:
+        """Command as the driver's process does: every 20 ms."""
+        for _ in range(math.ceil(seconds / 0.02)):
+            await self.driver.set_base_velocity(linear_x, 0.0, angular_z)
+            await asyncio.sleep(0.02)
+
+
+@asynccontextmanager
+async def bench(folder: Path, text: str = BARE, plugged: bool = True) -> AsyncIterator[Bench]:
+    """Both ends switched on and, unless told otherwise, in touch."""
+    it = Bench(folder, text)
+    it.station.start()
+    if not plugged:
+        it.station.set(type(NONE)(unplugged=True))
+    try:
+        async with it.driver:
+            if plugged:
+                await it.until_connected()
+            yield it
+    finally:
+        await it.station.close()

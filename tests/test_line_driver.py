@@ -1,0 +1,239 @@
+"""A body without code on a real pty: it obeys, stops, comes back, and never with old bytes."""
+
+import asyncio
+import math
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.links import ports
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.errors import BodyLost
+from tests.line_rig import BARE, bench, until
+
+ZERO = Velocity()
+
+
+async def test_it_obeys_and_reports_what_its_wheels_did(tmp_path: Path) -> None:
+    async with bench(tmp_path) as it:
+        await it.drive(0.5, 0.3, 0.6)
+        state = await it.driver.read_state()
+        assert it.body.commanded == (0.3, 0.0, 0.6)
+        assert state.velocity.linear_x == pytest.approx(0.3, abs=0.03)
+        assert state.velocity.angular_z == pytest.approx(0.6, abs=0.06)
+        await it.driver.stop()
+        await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
+        await asyncio.sleep(0.05)
+        state, true = await it.driver.read_state(), it.body.snapshot.odometry
+        assert (state.pose.x, state.pose.y) == pytest.approx((true.x, true.y), abs=0.002)
+        assert state.pose.yaw == pytest.approx(true.yaw, abs=0.005)
+        assert [joint.name for joint in state.joints] == ["wheel_left_joint", "wheel_right_joint"]
+        assert state.link.connected
+        assert state.link.errors == 0
+
+
+async def test_what_it_returns_is_what_was_written(tmp_path: Path) -> None:
+    async with bench(tmp_path) as it:
+        sent = await it.driver.set_base_velocity(0.12345, 0.3, 9.0)
+        assert sent == Velocity(linear_x=0.123, linear_y=0.0, angular_z=1.2)
+        await until(lambda: it.firmware.executed and it.firmware.executed[-1] == sent)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+async def test_what_is_no_number_is_zero_for_all(tmp_path: Path, bad: float) -> None:
+    async with bench(tmp_path) as it:
+        await it.driver.set_base_velocity(0.2, 0.0, 0.0)
+        assert await it.driver.set_base_velocity(0.2, 0.0, bad) == ZERO
+        await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
+
+
+async def test_nothing_is_written_before_the_body_was_heard_and_then_zero(tmp_path: Path) -> None:
+    async with bench(tmp_path, plugged=False) as it:
+        written: list[bytes] = []
+        it.driver.link.trace = lambda way, data: written.append(data) if way == "tx" else None
+        assert await it.driver.set_base_velocity(0.2, 0.0, 0.0) == ZERO
+        it.station.set(Faults(silence=True))
+        await until(lambda: it.driver.link.connected)
+        assert await it.driver.set_base_velocity(0.2, 0.0, 0.0) == ZERO
+        assert written == []
+        it.station.set(NONE)
+        await until(lambda: written)
+        assert written == [b"V,0.000,0.000\n"]
+        assert (await it.driver.set_base_velocity(0.2, 0.0, 0.0)).linear_x == 0.2
+
+
+async def test_a_silent_commander_leaves_the_line_silent_and_the_firmware_stops(
+    tmp_path: Path,
+) -> None:
+    async with bench(tmp_path) as it:
+        await it.drive(0.1, 0.2)
+        before = len(it.firmware.executed)
+        await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
+        assert len(it.firmware.executed) <= before + 1  # by itself, not by a command
+
+
+async def test_an_unplugged_body_is_lost_at_once_and_comes_back_with_zero(tmp_path: Path) -> None:
+    async with bench(tmp_path) as it:
+        await it.drive(0.1, 0.2)
+        it.station.set(Faults(unplugged=True))
+        await it.until_connected(False)
+        assert await it.driver.set_base_velocity(0.2, 0.0, 0.0) == ZERO
+        await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
+        it.firmware.executed.clear()
+        it.station.set(NONE)
+        await it.until_connected()
+        await until(lambda: it.firmware.executed)
+        assert it.firmware.executed[0] == ZERO
+        await it.drive(0.1, 0.2)
+        assert it.body.commanded == (0.2, 0.0, 0.0)
+        assert (await it.driver.read_state()).link.reconnects == 1
+
+
+@pytest.mark.parametrize("fault", [Faults(silence=True), Faults(frozen=True)])
+async def test_a_body_that_falls_silent_is_lost_although_its_port_is_there(
+    tmp_path: Path, fault: Faults
+) -> None:
+    async with bench(tmp_path) as it:
+        it.station.set(fault)
+        await it.until_connected(False)
+        assert it.driver.link.connected
+        it.station.set(NONE)
+        await it.until_connected()
+
+
+async def test_garbage_and_half_lines_are_counted_and_nothing_comes_of_them(
+    tmp_path: Path,
+) -> None:
+    async with bench(tmp_path) as it:
+        it.station.set(Faults(garbage=0.3, half_frames=0.2, bit_errors=0.005))
+        await it.drive(1.0, 0.2)
+        it.station.set(NONE)
+        await it.until_connected()
+        state = await it.driver.read_state()
+        assert state.link.errors > 0
+        assert state.pose.x == pytest.approx(it.body.snapshot.odometry.x, abs=0.05)
+
+
+async def test_a_reboot_does_not_move_the_pose(tmp_path: Path) -> None:
+    async with bench(tmp_path) as it:
+        await it.drive(0.4, 0.4)
+        await it.driver.stop()
+        await asyncio.sleep(0.05)
+        before = (await it.driver.read_state()).pose.x
+        assert before > 0.1
+        it.station.set(Faults(reboot=True))
+        await it.until_connected(False)
+        it.station.set(NONE)  # banner, then counters from zero
+        await it.until_connected()
+        state = await it.driver.read_state()
+        assert state.pose.x == pytest.approx(before, abs=0.005)
+        assert (state.link.errors, state.velocity.linear_x) == (2, 0.0)  # two lines of banner
+
+
+async def test_a_brown_out_switches_the_body_off_and_it_comes_back_at_rest(tmp_path: Path) -> None:
+    async with bench(tmp_path) as it:
+        await it.drive(0.1, 0.2)
+        it.station.set(Faults(brown_out=6.0))
+        await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
+        await it.until_connected(False)
+        it.station.set(NONE)
+        await it.until_connected()
+        assert it.body.commanded == (0.0, 0.0, 0.0)
+
+
+async def test_flags_are_logged_once_and_bumpers_reported(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    text = BARE.replace("bumper_left", "bumper")
+    async with bench(tmp_path, text) as it:
+        await it.drive(0.1, 0.0)
+        caplog.clear()
+        it.body.bumper = True
+        await asyncio.sleep(0.3)  # and nobody commands: the firmware raises `watchdog`
+        assert (await it.driver.read_state()).bumpers == (True, False)
+        said = [record.message for record in caplog.records]
+        assert said.count("the firmware reports: watchdog") == 1
+        await it.drive(0.1, 0.0)
+        said = [record.message for record in caplog.records]
+        assert said.count("the firmware no longer reports: watchdog") == 1
+        assert not any("bumper" in text for text in said)
+
+
+async def test_a_loss_is_said_once_with_the_reason_and_its_end_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", "gigabrain_drivers.line")
+    async with bench(tmp_path, plugged=False) as it:
+        async with asyncio.timeout(5):
+            while not caplog.records:
+                await it.connected()
+                await asyncio.sleep(0.01)
+        await asyncio.sleep(0.1)
+        await it.connected()
+        assert [record.message.partition(": ")[2] for record in caplog.records] == [
+            f"no {tmp_path}/base: is it plugged in?"
+        ]
+        it.station.set(NONE)
+        await it.until_connected()
+        assert "heard again" in caplog.text
+
+
+async def test_an_unchanged_command_is_repeated_at_its_rate_and_a_new_one_goes_at_once(
+    tmp_path: Path,
+) -> None:
+    async with bench(tmp_path) as it:
+        written: list[bytes] = []
+        it.driver.link.trace = lambda way, data: written.append(data) if way == "tx" else None
+        for _ in range(10):
+            await it.driver.set_base_velocity(0.1, 0.0, 0.0)
+        await it.driver.set_base_velocity(0.2, 0.0, 0.0)
+        assert written == [b"V,0.100,0.000\n", b"V,0.200,0.000\n"]
+        await it.drive(0.1, 0.2)
+        assert 3 <= len(written) <= 7
+
+
+STARTED = BARE.replace(
+    "  ticks_per_turn", '  start: "ENABLE\\n"\n  stop: "DISABLE\\n"\n  ticks_per_turn'
+)
+
+
+async def test_start_and_stop_strings_frame_the_motion(tmp_path: Path) -> None:
+    async with bench(tmp_path, STARTED) as it:
+        written: list[bytes] = []
+        it.driver.link.trace = lambda way, data: written.append(data) if way == "tx" else None
+        await it.driver.set_base_velocity(0.2, 0.0, 0.0)
+        await until(lambda: it.body.commanded == (0.2, 0.0, 0.0))
+        await it.driver.stop()
+        await it.driver.stop()
+        await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
+        await it.driver.set_base_velocity(0.1, 0.0, 0.0)
+        await until(lambda: it.body.commanded == (0.1, 0.0, 0.0))
+        assert [line for line in written if not line.startswith(b"V,0.0")] == [
+            b"ENABLE\n", b"V,0.200,0.000\n", b"DISABLE\n", b"ENABLE\n", b"V,0.100,0.000\n",
+        ]  # fmt: skip
+
+
+async def test_stop_and_close_work_in_any_state(tmp_path: Path) -> None:
+    async with bench(tmp_path) as it:
+        await it.drive(0.1, 0.2)
+        for _ in range(3):
+            await it.driver.close()
+            await it.driver.stop()
+        await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
+        with pytest.raises(BodyLost):
+            await it.driver.set_base_velocity(0.1, 0.0, 0.0)
+
+
+async def test_auto_finds_the_port_from_which_right_lines_come(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = [str(tmp_path / "nothing"), str(tmp_path / "base")]
+    async with bench(tmp_path) as it:
+        await it.driver.link.close()
+        monkeypatch.setattr(ports, "candidates", lambda port: paths)
+        it.driver.link._port = "auto"
+        it.driver.link.open()
+        await it.until_connected()
+        assert it.driver.link.path == str(tmp_path / "base")
