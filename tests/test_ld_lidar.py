@@ -3,6 +3,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gigabrain_drivers.emulators.faults import NONE, Faults
 from gigabrain_drivers.emulators.ld import LdDevice
@@ -162,3 +164,10 @@ async def test_an_ld19_that_was_left_out_says_nothing_comes(tmp_path: Path) -> N
                 f"nothing comes from {tmp_path}/scan at 230400 baud: "
                 "is the LD19 powered, and wired both ways?"
             )
+
+
+@given(st.lists(st.binary(max_size=200), max_size=20))
+async def test_no_bytes_make_a_source_raise(pieces: list[bytes]) -> None:
+    source = Ld19(options(Path()), LIDAR, FakeClock())
+    for piece in pieces:
+        source.received(piece)

@@ -7,7 +7,7 @@ from typing import Literal
 
 import serial
 
-from gigabrain_drivers.lidars.rplidar_start import BAUDS, FAMILIES, MODELS, Trouble, start
+from gigabrain_drivers.lidars.rplidar_start import BAUDS, FAMILIES, MODELS, STOP_S, Trouble, start
 from gigabrain_drivers.lidars.serial_source import LOOK_NS, SerialSource
 from gigabrain_drivers.protocols import rplidar
 from gigabrain_drivers.protocols.rplidar import Answer, Info
@@ -20,6 +20,7 @@ log = logging.getLogger(__name__)
 
 ANSWER_S = 0.5
 SPIN_UP_NS = 4_000_000_000  # from the request to scan to the first sample
+INFO_BYTES = 27  # its descriptor and itself
 SILENT_NS = 1_000_000_000  # then it is started again
 PWM = 660  # of 1023, the vendor's usual motor power
 
@@ -96,13 +97,13 @@ class Rplidar(SerialSource):
         return f"no {self.name} answers on {self.link} at any of {bauds} baud: {guess}"
 
     def probe(self, port: serial.Serial) -> bool:
-        """Whether an RPLIDAR answers here, at the present baud rate."""
-        port.write(rplidar.request(rplidar.STOP))
-        time.sleep(0.02)
-        port.reset_input_buffer()
-        port.write(rplidar.request(rplidar.GET_INFO))
-        found = rplidar.Decoder().feed(port.read(27))
-        return any(isinstance(item, Answer) for item in found)
+        """Whether an RPLIDAR answers here, at any of the baud rates that are tried."""
+        for baud in self._bauds:
+            port.baudrate = baud
+            if answers(port):
+                self._use(baud)
+                return True
+        return False
 
     async def run(self) -> None:
         """Start it, and start it again whenever it falls silent; until cancelled."""
@@ -168,19 +169,20 @@ class Rplidar(SerialSource):
     async def _keep_scanning(self) -> None:
         while True:
             await self._connected.wait()
+            connection = self.link.reconnects
             try:
                 await start(self, self.options.scan_mode)
-                await self._follow()
+                await self._follow(connection)
             except Trouble as trouble:
                 self._trouble = str(trouble)
                 self._next_baud()
                 self.link.drop(self._trouble)
 
-    async def _follow(self) -> None:
-        """While samples come. Raises Trouble."""
+    async def _follow(self, connection: int) -> None:
+        """While samples come over the same connection. Raises Trouble."""
         limit, began_ns = SPIN_UP_NS, self.clock.now_ns()
         async for now_ns in self.clock.every(LOOK_NS):
-            if not self.link.connected:
+            if not self.link.connected or self.link.reconnects != connection:
                 return
             if self._samples_ns > began_ns:
                 limit, self._trouble = SILENT_NS, ""
@@ -189,11 +191,25 @@ class Rplidar(SerialSource):
 
     def _next_baud(self) -> None:
         """Where the model is not known and nothing was understood, try the next baud rate."""
-        if not self._understood and len(self._bauds) > 1:
-            self._bauds.append(self._bauds.pop(0))
-            self.baud = self.link.baud = self._bauds[0]
+        if not self._understood:
+            self._use(self._bauds[1 % len(self._bauds)])
+
+    def _use(self, baud: int) -> None:
+        at = self._bauds.index(baud)
+        self._bauds = self._bauds[at:] + self._bauds[:at]
+        self.baud = self.link.baud = baud
 
     def _lost(self, why: str) -> None:
         self._connected.clear()
         if self._asked and not self._asked[1].done():
             self._asked[1].set_exception(Trouble(why))
+
+
+def answers(port: serial.Serial) -> bool:
+    """Whether an RPLIDAR says who it is, at the port's present baud rate."""
+    port.write(rplidar.request(rplidar.STOP))
+    time.sleep(STOP_S)
+    port.reset_input_buffer()
+    port.write(rplidar.request(rplidar.GET_INFO))
+    found = rplidar.Decoder().feed(port.read(INFO_BYTES))
+    return any(isinstance(item, Answer) for item in found)
