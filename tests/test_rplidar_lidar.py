@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from gigabrain_drivers.emulators.faults import NONE, Faults
 from gigabrain_drivers.emulators.ld import LdDevice
 from gigabrain_drivers.emulators.rplidar import RplidarDevice
+from gigabrain_drivers.lidars import rplidar_start, serial_source
 from gigabrain_drivers.lidars.ld import Ld19
 from gigabrain_drivers.lidars.rplidar import Rplidar, RplidarOptions
 from gigabrain_drivers.protocols import rplidar
@@ -27,6 +28,12 @@ def options(folder: Path, **settings: Any) -> RplidarOptions:
 
 def listen(its: RplidarOptions) -> Listener:
     return Listener(Rplidar(its, LIDAR, Clock()))
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial_source, "PATIENCE_NS", 600_000_000)
+    monkeypatch.setattr(rplidar_start, "RESET_S", 0.2)
 
 
 @pytest.mark.parametrize(
@@ -129,6 +136,7 @@ async def test_a_wrong_model_means_a_wrong_baud_rate_and_so_silence_which_is_tol
 ) -> None:
     its = options(tmp_path, model="a1")
     async with emulated(RplidarDevice, its) as station:
+        await asyncio.sleep(0.1)  # until its banner has been said
         station.set(Faults(deaf=True))
         async with listen(its) as listener:
             await until(lambda: listener.source.problem)
