@@ -1,5 +1,7 @@
 """Dynamixel Protocol 2.0, by the vendor's manual, the vendor's SDK and hostile input."""
 
+import random
+
 import dynamixel_sdk
 import pytest
 from hypothesis import given
@@ -134,3 +136,16 @@ def test_what_had_begun_is_forgotten_when_asked() -> None:
     decoder.clear()
     assert decoder.feed(status(200)) == [Packet(200, STATUS, b"\0")]
     assert decoder.errors == 0
+
+
+def test_noise_of_one_byte_in_a_thousand_makes_no_wrong_command() -> None:
+    noise = random.Random(7)
+    sent = [write(200, 150, noise.randbytes(24)) for _ in range(20_000)]
+    stream = bytearray(b"".join(sent))
+    for at in noise.sample(range(len(stream)), len(stream) // 1000):
+        stream[at] ^= noise.randint(1, 255)
+    decoder, found = Decoder(), list[Packet]()
+    for at in range(0, len(stream), 1000):
+        found += decoder.feed(bytes(stream[at : at + 1000]))
+    assert {encode(packet) for packet in found} <= set(sent)
+    assert 19_200 < len(found) < 19_400

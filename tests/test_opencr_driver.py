@@ -16,6 +16,7 @@ from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.emulators.station import Station
 from gigabrain_drivers.links.link import Link
+from gigabrain_drivers.opencr.board import is_opencr
 from gigabrain_drivers.opencr.driver import OpenCrDriver, OpenCrOptions, imu_of
 from gigabrain_drivers.protocols import dynamixel, opencr
 from gigabrain_drivers.protocols.dynamixel import Decoder, Packet
@@ -377,6 +378,31 @@ def test_an_attitude_that_cannot_be_is_left_out(broken: tuple[float, ...]) -> No
     data = bytearray(172)
     data[86:102] = struct.pack("<4f", *broken)
     assert imu_of(opencr.readings(bytes(data))) is None
+
+
+@pytest.mark.parametrize(
+    ("answer", "ours"),
+    [
+        (dynamixel.status(200, b"\x00\x50\x05"), True),
+        (dynamixel.status(200, b"\x06\x04\x26"), False),
+        (b"", False),
+        (b"\x54\x2c" * 7, False),
+    ],
+    ids=["opencr", "a motor", "nobody", "a lidar"],
+)
+def test_a_port_is_known_by_its_answer(answer: bytes, ours: bool) -> None:
+    class Port:
+        written = b""
+
+        def write(self, data: bytes) -> None:
+            self.written += data
+
+        def read(self, _size: int) -> bytes:
+            return answer
+
+    port = Port()
+    assert is_opencr(port) is ours  # type: ignore[arg-type]
+    assert port.written == dynamixel.ping(200)
 
 
 async def until(true: Callable[[], bool]) -> None:

@@ -5,6 +5,7 @@ import contextlib
 import logging
 from collections.abc import Callable
 
+import serial
 from msgspec.structs import replace
 
 from gigabrain_drivers.links.link import Link
@@ -21,6 +22,7 @@ KNOCK_NS = 100_000_000  # between two attempts to get an answer at all
 PATIENCE_NS = 1_000_000_000  # for the first answer, until the port is opened anew
 SETTLE_NS = 500_000_000  # after which a problem is spoken of
 ANSWER_S = 0.01  # how long the answer to a question is waited for
+ANSWER_BYTES = 14  # of the answer to a ping
 WATCHDOG_FIRMWARE = 5  # before that, the byte of the debug mode was part of a clock
 
 
@@ -171,6 +173,14 @@ class Board:
         self._fresh_ns, self._waiting_ns, self._newest = self._asked_ns, None, now
         self.on_readings(now)
         self._answered.set()
+
+
+def is_opencr(port: serial.Serial) -> bool:
+    """Whether an OpenCR answers on this port. Runs in a thread; may raise OSError."""
+    port.write(dynamixel.ping(opencr.ID))
+    answers = dynamixel.Decoder().feed(port.read(ANSWER_BYTES))
+    models = [opencr.model_of(packet.params[1:]) for packet in answers]
+    return any(model is not None and model[0] == opencr.MODEL for model in models)
 
 
 def _ignore(_: Readings) -> None:

@@ -16,7 +16,7 @@ from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_drivers.odometry import Encoders, Odometry
-from gigabrain_drivers.opencr.board import Board
+from gigabrain_drivers.opencr.board import Board, is_opencr
 from gigabrain_drivers.protocols import opencr
 from gigabrain_drivers.protocols.opencr import Readings
 from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
@@ -39,7 +39,7 @@ MOST_ACCELERATION = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit 
 class OpenCrOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The board's part of a robot's file."""
 
-    port: str = f"usb:{opencr.USB_ID}"  # a path, or usb:VID:PID[:SERIAL]
+    port: str = f"usb:{opencr.USB_ID}"  # a path, usb:VID:PID[:SERIAL], or auto
 
 
 class OpenCrDriver(Driver):
@@ -65,7 +65,7 @@ class OpenCrDriver(Driver):
                 "wheel_radius and wheel_separation"
             )
         self._clock = clock or Clock()
-        self.link = link or SerialLink(options.port, opencr.BAUD, self._clock)
+        self.link = link or SerialLink(options.port, opencr.BAUD, self._clock, probe=is_opencr)
         self._board = Board(self.link, self._clock)
         self._board.on_readings = self._take
         self._base, self._odometry = base, Odometry(base)
