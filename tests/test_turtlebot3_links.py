@@ -1,0 +1,60 @@
+"""The two TurtleBot3 as their files describe them: real ports, and both emulated as a whole."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.catalog import make_driver
+from gigabrain_drivers.emulators.emulator import Emulator
+from gigabrain_drivers.robot import Run
+from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.sensors import Imu, LaserScan
+from gigabrain_schemas.topics import Topic
+from gigabrain_zenoh.clock import Clock
+from tests.lidar_rig import until
+
+ROBOTS = ["turtlebot3_burger", "turtlebot3_waffle"]
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_the_real_link_is_the_board_on_usb_and_a_lidar_beside_it(robot: str) -> None:
+    _, driver = make_driver(robot, Run(folder=Path(), link="real"))
+    assert driver.options.port == "usb:0483:5740"
+    assert driver.options.scan.port == "usb:10c4:ea60"
+
+
+def test_a_link_may_have_another_lidar_than_the_simulation() -> None:
+    real, _ = make_driver("turtlebot3_waffle", Run(folder=Path(), link="real"))
+    simulated, _ = make_driver("turtlebot3_waffle", Run(folder=Path()))
+    assert real.lidar
+    assert simulated.lidar
+    assert (real.lidar.beams, real.lidar.range_max) == (220, 8.0)
+    assert (simulated.lidar.beams, simulated.lidar.range_max) == (360, 3.5)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+async def test_the_emulated_robot_drives_and_sees(robot: str, tmp_path: Path) -> None:
+    run = Run(folder=Path(), link="emulated", emulator=str(tmp_path))
+    description, driver = make_driver(robot, run)
+    seen: list[Message] = []
+
+    def take(_: Topic[Message], message: Message) -> None:
+        seen.append(message)
+
+    driver.emit = take
+    async with asyncio.timeout(20), Emulator(robot, run) as emulator:
+        async with driver:
+            async for _ in driver.ticks(Clock()):
+                state = await driver.read_state()
+                await driver.set_base_velocity(0.1, 0.0, 0.0)
+                scans = [message for message in seen if isinstance(message, LaserScan)]
+                if scans and state.pose.x > 0.02:
+                    break
+            assert state.pose.x == pytest.approx(emulator.body.snapshot.odometry.x, abs=0.02)
+            assert any(isinstance(message, Imu) for message in seen)
+            assert await driver.get_sensor_data("scan") is scans[-1]
+            assert description.lidar
+            assert len(ranges(scans[-1])) == description.lidar.beams
+        await until(lambda: emulator.body.commanded == (0.0, 0.0, 0.0))  # the last zero arrives
