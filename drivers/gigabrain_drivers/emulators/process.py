@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import logging
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,11 +14,13 @@ from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.faults import Faults
 from gigabrain_drivers.robot import Run
 from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.child import Lines
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.settings import EmulatorConfig
 
 log = logging.getLogger(__name__)
 
+READ_BYTES = 4096
 LOOK_S = 0.05  # how often the file with the faults is looked at
 FAULTS_FILE = "faults.json"  # {STATION: {FAULT: VALUE}}, in the folder of the ports
 
@@ -93,21 +96,21 @@ def _told(emulator: Emulator, line: str, say: Callable[[str], None]) -> None:
 @contextlib.contextmanager
 def _lines(take: Callable[[str], None]) -> Iterator[None]:
     """Call `take` with each line of standard input, where that can be waited for."""
-    loop = asyncio.get_running_loop()
+    loop, fd, lines = asyncio.get_running_loop(), sys.stdin.fileno(), Lines()
 
     def readable() -> None:
-        line = sys.stdin.readline()
-        if line:
-            take(line)
-        else:
-            loop.remove_reader(sys.stdin)
+        data = os.read(fd, READ_BYTES)
+        for line in lines.feed(data):
+            take(line.decode(errors="replace"))
+        if not data:
+            loop.remove_reader(fd)
 
     try:
-        loop.add_reader(sys.stdin, readable)
-    except (OSError, ValueError):  # a file, or nothing at all
+        loop.add_reader(fd, readable)
+    except OSError:  # a file
         yield
         return
     try:
         yield
     finally:
-        loop.remove_reader(sys.stdin)
+        loop.remove_reader(fd)

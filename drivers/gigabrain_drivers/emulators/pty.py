@@ -20,6 +20,7 @@ class Pty:
         self.lost_bytes = 0  # that the host did not read in time; a UART loses them as well
         self._byte_s = BITS_PER_BYTE / baud if baud else 0.0
         self._out_free = self._in_free = 0.0  # when the wire will be free again [loop time]
+        self._plugged = 0  # how often: what was on the wire before it was unplugged is gone
         self._master: int | None = None
         self._slave: int | None = None
 
@@ -32,6 +33,7 @@ class Pty:
         """Make the port appear, with nothing old in it. Nothing if it is there."""
         if self._master is not None:
             return
+        self._plugged += 1
         self._master, self._slave = os.openpty()  # the slave stays open: no EIO between clients
         for end in (self._master, self._slave):
             tty.setraw(end)
@@ -58,32 +60,25 @@ class Pty:
         """To the host; False when the port is unplugged."""
         if self._master is None:
             return False
-        self._out_free = self._after(self._out_free, len(data), self._send, self._master, data)
+        self._out_free = self._after(self._out_free, self._send, data)
         return True
 
-    def _after(
-        self,
-        free: float,
-        size: int,
-        act: Callable[[int, bytes], None],
-        master: int,
-        data: bytes,
-    ) -> float:
+    def _after(self, free: float, act: Callable[[int, bytes], None], data: bytes) -> float:
         """Act once the bytes have been on the wire; returns when it is free again."""
         if not self._byte_s:
-            act(master, data)
+            act(self._plugged, data)
             return free
         loop = asyncio.get_running_loop()
-        free = max(free, loop.time()) + size * self._byte_s
-        loop.call_at(free, act, master, data)
+        free = max(free, loop.time()) + len(data) * self._byte_s
+        loop.call_at(free, act, self._plugged, data)
         return free
 
-    def _send(self, master: int, data: bytes) -> None:
-        if master != self._master:  # unplugged meanwhile
+    def _send(self, plugged: int, data: bytes) -> None:
+        if plugged != self._plugged or self._master is None:  # unplugged meanwhile
             return
         sent = 0
         with contextlib.suppress(BlockingIOError, OSError):
-            sent = os.write(master, data)
+            sent = os.write(self._master, data)
         self.lost_bytes += len(data) - sent
 
     def _readable(self) -> None:
@@ -93,8 +88,8 @@ class Pty:
             data = os.read(self._master, READ_BYTES)
         except (BlockingIOError, OSError):
             return
-        self._in_free = self._after(self._in_free, len(data), self._take, self._master, data)
+        self._in_free = self._after(self._in_free, self._take, data)
 
-    def _take(self, master: int, data: bytes) -> None:
-        if master == self._master:
+    def _take(self, plugged: int, data: bytes) -> None:
+        if plugged == self._plugged and self._master is not None:
             self.on_bytes(data)

@@ -1,0 +1,213 @@
+"""mycustombot: in MuJoCo directly, and on its real driver with bytes on a pty."""
+
+import asyncio
+import math
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gigabrain_drivers import catalog
+from gigabrain_drivers.base import Driver
+from gigabrain_drivers.emulators.emulator import Emulator
+from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.line_base import LineBase
+from gigabrain_drivers.robot import Run
+from gigabrain_drivers.sim.driver import MujocoOptions, sim_body
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.world import World
+from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import SCAN
+from gigabrain_zenoh.errors import ConfigError
+from tests.line_rig import until
+
+EMPTY = World(name="empty", description="", half_x=5.0, half_y=5.0, shapes=())
+
+
+@pytest.fixture
+def simulation() -> Simulation:
+    robot, _, options, folder = catalog.load_link("mycustombot", Run(folder=Path()))
+    assert isinstance(options, MujocoOptions)
+    return Simulation(sim_body(robot, options, Run(folder=folder)), EMPTY, 0)
+
+
+def run(simulation: Simulation, seconds: float) -> None:
+    for _ in range(round(seconds * 100)):
+        simulation.advance()
+
+
+def test_it_weighs_twelve_kilograms_and_stands_level(simulation: Simulation) -> None:
+    model = simulation.model
+    base = model.body("robot/base").id
+    assert model.body_subtreemass[base] == pytest.approx(12.0)
+    run(simulation, 1.0)
+    height = simulation.data.qpos[model.joint("robot/free").qposadr[0] + 2]
+    assert height == pytest.approx(0.08, abs=0.001)
+
+
+def test_its_outline_is_that_of_its_file(simulation: Simulation) -> None:
+    corners = catalog.load_robot("mycustombot").footprint
+    outline = simulation.truth.footprint
+    assert max(x for x, _ in corners) >= outline.front >= 0.19
+    assert min(x for x, _ in corners) <= outline.rear <= -0.39
+    assert max(y for _, y in corners) == pytest.approx(outline.half_width, abs=0.003)
+
+
+def test_it_drives_as_it_is_told_within_a_percent(simulation: Simulation) -> None:
+    simulation.command(0.3, 0.6)
+    run(simulation, 2.0)
+    assert simulation.truth.speed() == pytest.approx((0.3, 0.6), rel=0.01)
+
+
+def test_a_square_closes_within_a_centimetre_by_odometry(simulation: Simulation) -> None:
+    def drive(x: float, turn: float, done: float) -> None:
+        start = simulation.odometry()
+        while True:
+            now = simulation.odometry()
+            way = math.hypot(now.x - start.x, now.y - start.y) if x else now.yaw - start.yaw
+            rest = done - way
+            if rest < 0.0005:
+                break
+            speed = min(1.0, 3 * rest + 0.02)
+            simulation.command(x * speed, turn * speed)
+            simulation.advance()
+        simulation.command(0.0, 0.0)
+        run(simulation, 0.4)
+
+    begin, estimate = simulation.truth.pose(), simulation.odometry()
+    for _ in range(4):
+        drive(0.25, 0.0, 2.0)
+        drive(0.0, 0.6, math.pi / 2)
+    end, last = simulation.truth.pose(), simulation.odometry()
+    true = (end.x - begin.x, end.y - begin.y)
+    cos, sin = math.cos(begin.yaw), math.sin(begin.yaw)
+    forward, left = cos * true[0] + sin * true[1], cos * true[1] - sin * true[0]
+    error = math.hypot(forward - (last.x - estimate.x), left - (last.y - estimate.y))
+    assert error < 0.01
+    turned = math.remainder(end.yaw - begin.yaw - (last.yaw - estimate.yaw), math.tau)
+    assert abs(math.degrees(turned)) < 0.5
+
+
+def test_its_lidar_looks_between_the_decks_all_round(simulation: Simulation) -> None:
+    seen = simulation.scan()
+    assert seen.shape == (450,)
+    assert np.all(seen > 0.5)  # nothing of itself
+
+
+async def test_without_its_emulator_the_robot_is_not_there_yet(tmp_path: Path) -> None:
+    run = Run(folder=Path(), link="emulated", emulator=str(tmp_path))
+    _, driver = catalog.make_driver("mycustombot", run)
+    async with driver:
+        await asyncio.sleep(0.02)
+        assert not (await driver.read_state()).link.connected
+
+
+class Pair:
+    """The emulated robot and its real driver."""
+
+    def __init__(self, emulator: Emulator, driver: Driver) -> None:
+        self.emulator, self.driver = emulator, driver
+        self.scans: list[LaserScan] = []
+        driver.emit = lambda topic, message: (
+            self.scans.append(message) if topic is SCAN and isinstance(message, LaserScan) else None
+        )
+
+    def speed(self) -> float:
+        return self.emulator.body.snapshot.odometry.linear_x
+
+
+@pytest.fixture
+async def pair(tmp_path: Path) -> AsyncIterator[Pair]:
+    run = Run(folder=Path(), link="emulated", emulator=str(tmp_path))
+    _, driver = catalog.make_driver("mycustombot", run)
+    async with Emulator("mycustombot", run) as emulator:
+        it = Pair(emulator, driver)
+        async with driver:
+            yield it
+
+
+async def connected(pair: Pair, wanted: bool = True) -> None:
+    async with asyncio.timeout(5):
+        while (await pair.driver.read_state()).link.connected is not wanted:  # noqa: ASYNC110
+            await asyncio.sleep(0.005)
+
+
+async def drive(pair: Pair, seconds: float, speed: float = 0.2) -> None:
+    for _ in range(round(seconds * 50)):
+        await pair.driver.set_base_velocity(speed, 0.0, 0.0)
+        await asyncio.sleep(0.02)
+
+
+async def test_it_drives_in_mujoco_by_bytes_alone(pair: Pair) -> None:
+    await connected(pair)
+    await drive(pair, 1.0)
+    assert pair.speed() == pytest.approx(0.2, abs=0.02)
+    state = await pair.driver.read_state()
+    assert state.velocity.linear_x == pytest.approx(0.2, abs=0.03)
+    assert state.pose.x == pytest.approx(pair.emulator.body.snapshot.odometry.x, abs=0.03)
+    assert state.battery is not None
+    assert 12.0 < state.battery.voltage < 12.6
+    assert [j.temperature is not None for j in state.joints] == [True, True]
+    await until(lambda: len(pair.scans) >= 2)
+    assert ranges(pair.scans[-1]).shape == (450,)
+
+
+async def test_the_scan_and_the_base_fail_apart(pair: Pair) -> None:
+    await connected(pair)
+    await until(lambda: pair.scans)
+    pair.emulator.set({"scan": Faults(unplugged=True)})
+    await asyncio.sleep(0.1)
+    assert (await pair.driver.read_state()).link.connected
+    pair.emulator.set({"base": Faults(unplugged=True)})
+    await connected(pair, wanted=False)
+    pair.scans.clear()
+    await until(lambda: pair.scans)
+
+
+@pytest.mark.parametrize("fault", [Faults(unplugged=True), Faults(deaf=True)])
+async def test_a_body_that_hears_nothing_any_more_stops_by_itself(
+    pair: Pair, fault: Faults
+) -> None:
+    await connected(pair)
+    await drive(pair, 0.5)
+    assert pair.speed() > 0.1
+    pair.emulator.set({"base": fault})
+    for _ in range(100):
+        await pair.driver.set_base_velocity(0.2, 0.0, 0.0)
+        await asyncio.sleep(0.02)
+        if abs(pair.speed()) < 0.001:
+            break
+    assert abs(pair.speed()) < 0.001
+
+
+async def test_no_old_bytes_are_obeyed_after_a_freeze(pair: Pair) -> None:
+    await connected(pair)
+    device = pair.emulator.stations["base"].device
+    assert isinstance(device, LineBase)
+    await drive(pair, 0.2)
+    pair.emulator.set({"base": Faults(unplugged=True)})
+    await drive(pair, 0.2)
+    device.executed.clear()
+    pair.emulator.set({"base": NONE})
+    await connected(pair)
+    await until(lambda: device.executed)
+    assert device.executed[0].linear_x == 0.0
+
+
+def test_faults_are_words(tmp_path: Path) -> None:
+    emulator = Emulator("mycustombot", Run(folder=Path(), link="emulated", emulator=str(tmp_path)))
+    both = emulator.faults_of("silence bit_errors=0.01")
+    assert both == dict.fromkeys(("base", "scan"), Faults(silence=True, bit_errors=0.01))
+    assert emulator.faults_of("scan unplugged") == {"base": NONE, "scan": Faults(unplugged=True)}
+    assert emulator.faults_of("off") == {"base": NONE, "scan": NONE}
+    with pytest.raises(ConfigError, match="no fault 'silense'; did you mean 'silence'"):
+        emulator.faults_of("silense")
+    with pytest.raises(ConfigError, match="bit_errors"):
+        emulator.faults_of("bit_errors=2")
+
+
+def test_a_robot_without_a_model_cannot_be_emulated(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="has no link 'emulated'; it has: sim"):
+        Emulator("mock", Run(folder=Path(), link="emulated", emulator=str(tmp_path)))
