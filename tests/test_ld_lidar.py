@@ -72,6 +72,15 @@ def test_what_came_before_a_turn_of_silence_is_forgotten() -> None:
     assert turn.clockwise([0.0], [1000], 0, 150 * MS) is None
 
 
+def test_a_lidar_that_never_ends_a_turn_does_not_fill_the_memory() -> None:
+    turn, most = Turn(SMALL), 0
+    for n in range(3000):
+        turn.clockwise([1.0] * 12, [1000] * 12, None, n * MS)
+        most = max(most, len(turn._angles))
+
+    assert most <= 20_000
+
+
 def test_the_emulator_sends_4500_samples_a_second_in_frames_of_twelve(tmp_path: Path) -> None:
     body, wire = waffle(), Wire()
     device = LdDevice(body, options(tmp_path), wire)
