@@ -136,8 +136,10 @@ def _zone_causes(memory: Memory) -> tuple[Cause, ...]:
 def _blind(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause, ...]:
     if body.lidar is None:
         return ()
+    if inputs.scan_age_ns is None:
+        return (Cause(code="scan_lost", text="no scan has come yet"),)
     limit_ns = scan_limit_ns(body)
-    if inputs.scan_age_ns is None or inputs.scan_age_ns > limit_ns:
+    if inputs.scan_age_ns > limit_ns:
         text = f"no scan for more than {limit_ns // 1_000_000} ms"
         return (Cause(code="scan_lost", text=text),)
     if memory.problem:
