@@ -47,7 +47,9 @@ class Service(Generic[Q, R]):
     key: str
     request: type[Q]
     reply: type[R]
-    many: bool = False
+    priority: Priority = "interactive_high"
+    max_bytes: int = 64 * KB  # of the request and of each reply; larger ones are not even decoded
+    many: bool = False  # one key per process below this one
 
     def at(self, name: str = "") -> str:
         """The key of this service; at the process `name` where there are many."""
@@ -61,7 +63,7 @@ STATE = Topic(
     max_bytes=32 * KB,
 )  # fmt: skip
 BODY = Topic("robot/body", body.Body, 1, keep=True, max_bytes=16 * KB)
-IMAGE = Topic("robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True)
+IMAGE = Topic("robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True, depth=8)
 WORLD = Topic("robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB)
 POSE = Topic("robot/pose", brain.PoseInMap, 10)
 MAP = Topic("robot/map", brain.OccupancyGrid, 1, keep=True, max_bytes=1024 * KB)
@@ -87,7 +89,7 @@ TOPICS: tuple[Topic[Any], ...] = (
     HEALTH, LOG,
 )  # fmt: skip
 
-ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply)
+ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time")
 RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply)
 ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply)
 GOAL = Service("robot/goal", requests.GoalRequest, requests.GoalReply)
@@ -95,3 +97,9 @@ MISSION = Service("robot/mission", requests.MissionRequest, requests.MissionRepl
 DESCRIBE = Service("robot/describe", requests.DescribeRequest, requests.Description, many=True)
 
 SERVICES: tuple[Service[Any, Any], ...] = (ESTOP, RELEASE, ENABLE, GOAL, MISSION, DESCRIBE)
+
+
+def messages() -> tuple[type[Message], ...]:
+    """Every message type that a topic or a service carries, once."""
+    asked = (side for service in SERVICES for side in (service.request, service.reply))
+    return tuple(dict.fromkeys((*(topic.type for topic in TOPICS), *asked)))
