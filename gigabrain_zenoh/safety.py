@@ -24,6 +24,7 @@ from gigabrain_zenoh.stop_zone import NEAREST, cap, free_distances, in_zone
 log = logging.getLogger(__name__)
 
 SYSTEMS = ("perception", "decision", "control")
+SCANS_TO_START = 2  # whoever answers the first has been heard by the second, however slow
 SUSTAIN_TICKS = 25  # how long a battery or motor must be out of bounds (0.5 s)
 LONGEST_STEP_TICKS = 5  # a sample after a longer gap speaks for no more than this
 REPEAT_TICKS = 2  # the verdict is repeated every 40 ms, and at once when it changes
@@ -46,6 +47,7 @@ class Memory(msgspec.Struct, frozen=True, kw_only=True):
 
     boot: int = 0
     tick: int = 0
+    scans: int = 0  # how many have been looked at
     basis: int = 0  # the scan that `free` was read from
     problem: str = ""  # why that scan cannot be believed
     free_ahead: float | None = None  # [m] until the body would touch, None for nothing in the way
@@ -62,7 +64,7 @@ def step(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Memory,
     if state.boot != memory.boot:  # the driver has started anew
         memory = Memory(boot=state.boot, tick=state.tick)
     memory = _look(body, _count(body, memory, state), inputs)
-    stop = (*_blind(body, memory, inputs), *_silent(inputs), *_worn(body, memory))
+    stop = (*_blind(body, memory, inputs), *_silent(body, memory, inputs), *_worn(body, memory))
     zones = _zone_causes(memory)
     caps = SpeedCaps(
         forward=cap(body, memory.free_ahead, memory.stopped_ahead),
@@ -111,6 +113,7 @@ def _look(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
     speed = inputs.state.velocity.linear_x
     return replace(
         memory,
+        scans=memory.scans + 1,
         basis=scan.basis,
         problem=problem,
         free_ahead=ahead,
@@ -147,12 +150,14 @@ def _blind(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause
     return ()
 
 
-def _silent(inputs: Inputs) -> tuple[Cause, ...]:
+def _silent(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause, ...]:
     """The brain's processes matter while the brain drives; a person or a script looks itself.
 
     While nobody drives they matter too, since the brain would be next; but where all three are
     silent there is no brain, and a script need not wait for one.
     """
+    if body.lidar and memory.scans < SCANS_TO_START:
+        return (Cause(code="starting", text="safety has only just begun to look"),)
     commander = inputs.state.gate.commander
     if commander not in ("", BRAIN) or (not commander and len(inputs.silent) == len(SYSTEMS)):
         return ()
@@ -237,6 +242,7 @@ def _tell(state: RobotState, before: SafetyState, now: SafetyState) -> None:
     fresh = tuple(cause for cause in now.causes if cause.code not in known)
     if fresh:
         data = {"event": "held back", "causes": ",".join(cause.code for cause in fresh)}
-        log.warning("%s: %s", now.verdict, in_words(fresh), extra={"data": data})
+        level = logging.WARNING if now.verdict == "stop" else logging.INFO
+        log.log(level, "%s: %s", now.verdict, in_words(fresh), extra={"data": data})
     elif before.causes and not now.causes:
         log.info("nothing holds the body back", extra={"data": {"event": "free"}})

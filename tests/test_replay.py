@@ -7,7 +7,6 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.brain import CmdVel, Intent, Twist, WorldModel
@@ -20,9 +19,8 @@ from gigabrain_zenoh.limits import ZERO
 from gigabrain_zenoh.replay import Event, Node, record, replay
 from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.transport import LocalNetwork
-from tests.brain_rig import BOOT, DRIVING, TICK_NS, body, scan, state
+from tests.brain_rig import BOOT, DRIVING, TICK_NS, body, round_room, scan, state
 
-ROOM_M = 2.0  # radius of a round room
 SYSTEMS: dict[str, tuple[Node, str]] = {
     "perception": (functools.partial(perception.run, PerceptionConfig()), "robot/world"),
     "decision": (functools.partial(decision.run, DecisionConfig()), "robot/intent"),
@@ -51,15 +49,10 @@ class Plant:
         now = state(tick, v=v, w=w, pose=(self.x, self.y, self.yaw), gate=DRIVING)
         self._bus.publish(STATE, now, basis=tick)
         if tick % 5 == 0:
-            ranges = np.full(360, math.nan) if blind else self._ranges()
+            ranges = round_room(2.0, self.x, self.y, self.yaw)
+            ranges += self._noise.normal(0.0, 0.005, 360)
+            ranges = np.full(360, math.nan) if blind else ranges
             self._bus.publish(SCAN, scan(ranges, tick), basis=tick)
-
-    def _ranges(self) -> NDArray[np.float64]:
-        """To the wall: the positive root of |p + d u| = R."""
-        angles = self.yaw + np.radians(np.arange(360.0))
-        along = self.x * np.cos(angles) + self.y * np.sin(angles)
-        to_wall: NDArray[np.float64] = np.sqrt(along**2 + ROOM_M**2 - self.x**2 - self.y**2) - along
-        return to_wall + self._noise.normal(0.0, 0.005, 360)
 
     def _obey(self, _key: str, command: CmdVel) -> None:
         self._told = Velocity(linear_x=command.linear_x, angular_z=command.angular_z)

@@ -136,9 +136,10 @@ class DriverProcess:
         for _ in range(passed):
             self._step(gate.Tick(state.velocity, self._wall_ns(), faults))
         self._bus.time.tick = self._gate.tick
-        self._announce(state)
         if self._lockstep:
-            await self._wait_for_brain(self._lockstep, state)
+            await self._in_step(self._lockstep, state)
+        else:
+            self._announce(state)
         await self._obey()
 
     def _announce(self, state: RobotState) -> None:
@@ -154,18 +155,23 @@ class DriverProcess:
             bus.publish(BODY, self._body)
             self._measure()
 
-    async def _wait_for_brain(self, lockstep: Lockstep, state: RobotState) -> None:
-        """The first tick waits until the whole brain is there, so that runs can be repeated."""
-        scan = await self._newest_scan()
-        lockstep.begin(self._gate.tick, self._scan_tick)
+    async def _in_step(self, lockstep: Lockstep, state: RobotState) -> None:
+        """Announce the tick and wait until it is answered.
+
+        The first one waits until the whole brain has answered a scan, so that runs can be repeated.
+        """
         if self._gate.tick > 1:
+            self._announce(state)
+            lockstep.begin(self._gate.tick, self._scan_tick)
             await lockstep.answered()
             return
-        while not await lockstep.wait(REPEAT_S):
+        scan, answered = await self._newest_scan(), False
+        while not answered:
             if scan:
                 self._sensors.append((SCAN, scan))
             self._announce(state)
             lockstep.begin(self._gate.tick, self._scan_tick)
+            answered = await lockstep.wait(REPEAT_S)
 
     async def _newest_scan(self) -> Message | None:
         return await self._driver.get_sensor_data("scan") if self._robot.lidar else None
