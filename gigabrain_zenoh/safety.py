@@ -9,11 +9,27 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.base import Cause, Message
-from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.body import Body, BodyDescription, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, SCAN, STATE, WORLD
+from gigabrain_schemas.topics import (
+    BODY,
+    CMD_VEL,
+    HEALTH,
+    IMAGE,
+    IMU,
+    INTENT,
+    LOG,
+    MAP,
+    POSE,
+    SAFETY,
+    SCAN,
+    STATE,
+    WORLD,
+    Topic,
+    command_topic,
+)
 from gigabrain_zenoh.ages import scan_limit_ns as scan_limit_ns
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.causes import in_words
@@ -24,6 +40,8 @@ from gigabrain_zenoh.stop_zone import NEAREST, cap, free_distances, in_zone
 log = logging.getLogger(__name__)
 
 SYSTEMS = ("perception", "decision", "control")
+# what nobody else listens to yet, so that what is bad on these keys is counted all the same
+OVERHEARD: tuple[Topic[Any], ...] = (IMU, IMAGE, POSE, MAP, HEALTH, LOG)
 SCANS_TO_START = 2  # whoever answers the first has been heard by the second, however slow
 SUSTAIN_TICKS = 25  # how long a battery or motor must be out of bounds (0.5 s)
 LONGEST_STEP_TICKS = 5  # a sample after a longer gap speaks for no more than this
@@ -220,11 +238,18 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
         if command.source == BRAIN:
             commands.take(command)
 
-    bodies = bus.latest(BODY)
+    def hear_body(body: Body) -> None:
+        topic = command_topic(body.description)
+        if topic.key not in bus.listens:
+            bus.subscribe(topic, hear_command)
+
+    bodies = bus.latest(BODY, hear_body)
     states = bus.latest(STATE, judge)
     scans = bus.latest(SCAN, judge)
     commands = Latest(CMD_VEL, bus.clock, bus.time)
     bus.subscribe(CMD_VEL, hear_command)
+    for topic in OVERHEARD:
+        bus.subscribe(topic, lambda _key, _message: None)
     systems: dict[str, Latest[Any]] = {
         "perception": bus.latest(WORLD),
         "decision": bus.latest(INTENT),

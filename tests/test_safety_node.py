@@ -170,3 +170,11 @@ async def test_a_cause_is_logged_once_when_it_begins_and_once_when_it_ends(
         "stop: decision is silent",
         "nothing holds the body back",
     ]
+
+
+@pytest.mark.parametrize("key", ["robot/imu", "robot/map", "robot/pose", "robot/log"])
+async def test_what_is_bad_on_a_key_that_nobody_else_reads_is_counted(key: str) -> None:
+    async with Chain() as chain:
+        await started(chain)
+        chain.network.deliver(key, b"\xc1garbage")
+        assert chain.bus.rejected == {key: 1}

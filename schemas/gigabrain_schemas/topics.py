@@ -1,6 +1,6 @@
 """The one table of topics. Adding a topic means adding a line here, and nowhere else."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
 from gigabrain_schemas import body, brain, requests, safety, sensors
@@ -83,6 +83,12 @@ HEALTH = Topic(
     "robot/health", safety.Health, 1, priority="background", many=True, depth=32, max_bytes=16 * KB
 )
 LOG = Topic("robot/log", safety.LogRecord, 10, priority="background", depth=256, max_bytes=16 * KB)
+
+
+def command_topic(of: body.BodyDescription) -> Topic[brain.CmdVel]:
+    """The topic that a body obeys: CMD_VEL, unless its file says otherwise."""
+    return CMD_VEL if of.control_topic == CMD_VEL.key else replace(CMD_VEL, key=of.control_topic)
+
 
 TOPICS: tuple[Topic[Any], ...] = (
     SCAN, IMU, STATE, BODY, IMAGE, WORLD, POSE, MAP, INTENT, TELEOP, CMD_VEL, JOINT_CMD, SAFETY,
