@@ -201,6 +201,7 @@ class GateMachine(RuleBasedStateMachine):
         before = self.state
         self.state, outcome = gate.step(self.config, before, event)
         assert gate.step(self.config, before, event) == (self.state, outcome)
+        assert self.state.safety == self.said
         self.keep_books(before, event, outcome)
         self.check_mode(before, event)
         self.check_causes(before, event)
@@ -240,6 +241,8 @@ class GateMachine(RuleBasedStateMachine):
     def check_causes(self, before: gate.GateState, event: gate.Event) -> None:
         if before.mode != "latched" or not isinstance(event, gate.Release):
             assert latching(before.causes) <= latching(self.state.causes)
+        if isinstance(event, gate.Tick):
+            assert latching(self.faults) <= latching(self.state.causes)
         if latching(self.state.causes):
             assert self.state.mode in ("latched", "stopping")
         assert (self.state.causes == ()) or self.state.mode != "enabled"
