@@ -38,13 +38,20 @@ ROOM = 64  # messages that wait for a slow `async for`; the oldest give way
 
 @asynccontextmanager
 async def connect(
-    connect: str | None = None, *, namespace: str = "", source: str = "", take: bool = False
+    connect: str | None = None,
+    *,
+    namespace: str = "",
+    source: str = "",
+    take: bool = False,
+    wait: bool = True,
 ) -> AsyncIterator["Robot"]:
     """A robot to drive and to listen to.
 
     `connect` is its router's Zenoh endpoint; without it, the only robot that runs on this machine.
     `source` is the name under which the gate knows this script; with `take` it takes the body over
-    from whoever drives. Raises BusError when there is no router, BodyLost when there is no driver.
+    from whoever drives. With `wait` the body's first state is waited for: without, an e-stop can be
+    sent to a body that says nothing. Raises BusError when there is no router, BodyLost when there
+    is no driver.
     """
     from gigabrain_zenoh.zenoh_transport import ZenohTransport  # takes a while: only when used
 
@@ -57,7 +64,8 @@ async def connect(
     bus = Bus(transport, Clock(), source or f"script-{os.getpid()}")
     try:
         robot = Robot(bus, take=take)
-        await robot.read_state()
+        if wait:
+            await robot.read_state()
         yield robot
         await robot.stop()
     finally:
@@ -73,6 +81,7 @@ class Robot:
         self._bodies = bus.latest(BODY)
         self._target: Velocity | None = None
         self._until_tick = 0
+        self._held = (0, 0)  # boot and the gate's count when this script last got the body
         self._arrived = asyncio.Event()
 
     async def set_base_velocity(
@@ -81,14 +90,16 @@ class Robot:
         """Drive [m/s, m/s, rad/s] for one second, or until the next call; returns what was asked.
 
         What was asked is what the body's limits leave of it. The first call asks the gate for the
-        body. Raises Refused, with the gate's reason, when it does not let this script drive.
+        body. Raises Refused, with the gate's reason, when it does not let this script drive, or
+        when somebody else has taken the body over meanwhile.
         """
         state, body = await self.read_state(), self._bodies.current
         wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
         if body:
             wanted = clamp(wanted, limits_of(body.description))
-        if state.gate.commander != self._bus.process or state.gate.mode != "enabled":
-            await self.enable(take=self._take)
+        if not self._drives(state):
+            reply = await self.enable(take=self._take and not self._held[0])
+            self._held = state.boot, reply.gate.enables
         self._target, self._until_tick = wanted, self._bus.time.tick + HOLD_TICKS
         self._send()
         return wanted
@@ -181,6 +192,13 @@ class Robot:
                 await arrived.wait()
         finally:
             close()
+
+    def _drives(self, state: RobotState) -> bool:
+        """Whether the body obeys this script; it still does in a state from before the answer."""
+        gate, (boot, enables) = state.gate, self._held
+        if state.boot == boot and gate.enables < enables:
+            return True
+        return gate.mode == "enabled" and gate.commander == self._bus.process
 
     def _repeat(self, _: RobotState) -> None:
         self._arrived.set()
