@@ -168,6 +168,18 @@ async def test_commands_that_are_played_back_move_nothing(tmp_path: Path) -> Non
         assert robot.counters["refused_old"] > 100
 
 
+async def test_a_second_estop_counts_after_a_restart_too(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        await press(robot)
+        assert (await press(robot)).gate.estop_generation == 2
+        await robot.kill("driver")
+        robot.start_driver()
+        await robot.go(50)
+        assert not (await release(robot, 1)).ok  # of the stop before the last
+        assert (await release(robot, 2)).ok
+
+
 async def test_a_speed_that_is_not_a_number_stops_the_body_at_once(tmp_path: Path) -> None:
     async with Robot(tmp_path, resume="manual") as robot:
         await robot.go(50)

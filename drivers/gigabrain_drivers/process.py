@@ -179,7 +179,7 @@ class DriverProcess:
         self._gate, outcome = gate.step(self._gate_config, before, event)
         if self._gate.output != before.output:
             self._wake.set()
-        if (before.mode, before.causes) != (self._gate.mode, self._gate.causes):
+        if _remembered(before) != _remembered(self._gate):
             self._changed(before)
         return outcome
 
@@ -269,6 +269,10 @@ class DriverProcess:
                 self._bus.latency_ms[name] = value
         if self._lockstep:
             self._bus.counters["lockstep_timeouts"] = self._lockstep.timeouts
+
+
+def _remembered(state: gate.GateState) -> tuple[object, ...]:
+    return state.mode, state.causes, state.estop_generation
 
 
 async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None:
