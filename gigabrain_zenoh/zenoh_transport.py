@@ -245,6 +245,5 @@ def _unpack(reply: zenoh.Reply) -> bytes | str:
 
 
 def _timed_out(reply: zenoh.Reply) -> bool:
-    """Zenoh says so itself, in the form of an answer from nobody."""
-    late = reply.err is not None and reply.err.payload.to_bytes() == b"Timeout"
-    return late and reply.replier_id is None
+    """Zenoh says so itself, here or in the router, in the form of an error."""
+    return reply.err is not None and reply.err.payload.to_bytes() == b"Timeout"

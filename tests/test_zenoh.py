@@ -125,9 +125,10 @@ async def test_a_busy_loop_gets_the_newest_and_not_the_backlog(
         lambda: b"200" in ear.payloads,
     )
     # the last ones may have come after the loop was free again: they make a second mailbox full
-    numbers = sorted({int(payload) for payload in ear.payloads} - {200})
+    numbers = [int(payload) for payload in ear.payloads if payload != b"200"]
+    assert numbers == sorted(numbers)
     assert len(numbers) <= most
-    assert numbers == list(range(200 - len(numbers), 200))
+    assert set(numbers) <= set(range(198 - most, 200))
 
 
 async def test_who_has_stopped_listening_hears_nothing(net: Robot) -> None:

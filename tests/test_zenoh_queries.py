@@ -39,6 +39,17 @@ class Late:
         await asyncio.sleep(60)
         return b"", ""
 
+    async def asked_by(self, asker: ZenohTransport) -> "asyncio.Future[list[bytes | str]]":
+        """A question of `asker` that has come here and waits for its answer."""
+        async with asyncio.timeout(30):
+            while True:
+                asking = asyncio.ensure_future(asker.query("robot/goal", b"", "", 60.0, "data"))
+                begun = asyncio.ensure_future(self.began.wait())
+                await asyncio.wait((asking, begun), return_when=asyncio.FIRST_COMPLETED)
+                if not asking.done():
+                    return asking
+                begun.cancel()  # asked before the server was known
+
 
 async def ask(
     transport: ZenohTransport, key: str, payload: bytes = b"", wanted: int = 1
@@ -124,12 +135,7 @@ async def test_an_asker_gets_nothing_at_once_when_the_server_leaves(net: Robot) 
     late = Late()
     server, asker = await net.client(), await net.client()
     server.serve("robot/goal", late.answer)
-    asking = asyncio.ensure_future(asker.query("robot/goal", b"", "", 30.0, "data"))
-    async with asyncio.timeout(20):
-        while not late.began.is_set():
-            await asyncio.sleep(0.01)
-            if asking.done():  # asked before the server was known
-                asking = asyncio.ensure_future(asker.query("robot/goal", b"", "", 30.0, "data"))
+    asking = await late.asked_by(asker)
     await server.close()
     async with asyncio.timeout(20):  # less than the asker's own patience
         assert await asking == []
@@ -137,9 +143,9 @@ async def test_an_asker_gets_nothing_at_once_when_the_server_leaves(net: Robot) 
 
 async def test_an_asker_that_leaves_does_not_wait(net: Robot) -> None:
     server, asker = await net.client(), await net.client()
-    server.serve("robot/goal", Late().answer)
-    asking = asyncio.ensure_future(asker.query("robot/goal", b"", "", 60.0, "data"))
-    await asyncio.sleep(0)
+    late = Late()
+    server.serve("robot/goal", late.answer)
+    asking = await late.asked_by(asker)
     await asker.close()
     async with asyncio.timeout(10):
         assert await asking == []
@@ -147,9 +153,9 @@ async def test_an_asker_that_leaves_does_not_wait(net: Robot) -> None:
 
 async def test_an_asker_that_is_cancelled_leaves_nothing_behind(net: Robot) -> None:
     server, asker = await net.client(), await net.client()
-    server.serve("robot/goal", Late().answer)
-    asking = asyncio.ensure_future(asker.query("robot/goal", b"", "", 0.1, "data"))
-    await asyncio.sleep(0.01)
+    late = Late()
+    server.serve("robot/goal", late.answer)
+    asking = await late.asked_by(asker)
     asking.cancel()
     with pytest.raises(asyncio.CancelledError):
         await asking

@@ -50,9 +50,11 @@ class RouterProcess:
         self._process.send_signal(signal.SIGSTOP)
 
     def kill(self) -> None:
-        """SIGKILL."""
+        """SIGKILL. May be called twice."""
         self._process.kill()
-        self._process.communicate()
+        self._process.wait()
+        assert self._process.stdout
+        self._process.stdout.close()
 
 
 @contextlib.contextmanager
