@@ -97,6 +97,10 @@ class Onlooker:
         end = self.state.tick + count
         await until(lambda: self.state.tick >= end, f"{count} more ticks")
 
+    def moved(self, start: RobotState) -> float:
+        """How far the body is now from where it was [m]."""
+        return math.dist((start.pose.x, start.pose.y), (self.state.pose.x, self.state.pose.y))
+
     def travel_until_rest(self, start: RobotState) -> float:
         """The path [m] by odometry from `start` until the body first came to rest."""
         path, before = 0.0, start
