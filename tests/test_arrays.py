@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gigabrain_schemas import arrays
+from gigabrain_schemas.body import Thresholds
 from gigabrain_schemas.brain import JointCommand, Obstacle, OccupancyGrid, TrajectoryPoint
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import Image, LaserScan
@@ -46,6 +47,8 @@ def image(encoding: Any, height: int, width: int, data: bytes) -> Image:
         (lambda: JointCommand(name=("a", "b"), position=(0.0,)), "2 names"),
         (lambda: JointCommand(name=("a",), position=(0.0,), velocity=(0.0,)), "1 names"),
         (lambda: JointCommand(name=("a",)), "1 names"),
+        (lambda: Thresholds(battery_warn=4.0), "battery_stop must not be above battery_warn"),
+        (lambda: Thresholds(motor_warn=71.0), "motor_stop must not be below motor_warn"),
     ],
 )
 def test_lengths_and_limits_have_to_agree(build: Callable[[], Any], complaint: str) -> None:
