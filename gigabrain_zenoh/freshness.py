@@ -8,6 +8,7 @@ from gigabrain_zenoh.clock import Clock
 
 M = TypeVar("M", bound=Message)
 
+LEAD_TICKS = 5  # how far behind the robot a process may be with reading its states
 CLOCK_KEYS = (STATE.key, SCAN.key)  # what the driver sends on these moves the robot's clock
 
 
@@ -47,9 +48,18 @@ class Latest(Generic[M]):
             return False
         self.newest = message
         self._arrived_ns = self._clock.now_ns()
-        # a start of the driver that is still to be heard of has its own count
-        self._arrived_tick = time.tick if message.boot in (0, time.boot) else message.tick
+        self._arrived_tick = self._arrival(message)
         return True
+
+    def _arrival(self, message: M) -> int:
+        """The robot's tick when `message` came, as far as this process can tell."""
+        now = self._time.tick
+        if not message.boot:
+            return now
+        if message.boot != self._time.boot:
+            return message.tick  # a start of the driver that is still to be heard of: its own count
+        # whoever lags behind with the robot's states has the true tick only from the message
+        return max(now, min(message.tick, now + LEAD_TICKS))
 
     @property
     def current(self) -> M | None:
