@@ -8,12 +8,13 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.requests import DescribeRequest, Description
+from gigabrain_schemas.requests import DescribeRequest, Description, EnableRequest
 from gigabrain_schemas.safety import Health, LogRecord
-from gigabrain_schemas.topics import DESCRIBE, HEALTH, LOG, SAFETY, STATE, WORLD
+from gigabrain_schemas.topics import DESCRIBE, ENABLE, HEALTH, LOG, SAFETY, STATE, WORLD
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.gate import BRAIN
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.stack import PATIENCE_S, until
@@ -80,6 +81,14 @@ class Onlooker:
             return roomy and velocity.linear_x > speed and abs(velocity.angular_z) < STRAIGHT
 
         await until(driving, f"driving straight at {speed} m/s")
+
+    async def hand_to_brain(self) -> None:
+        """As a person: let the brain drive, as soon as nothing speaks against it."""
+        while True:
+            replies = await self.bus.ask(ENABLE, EnableRequest(source=BRAIN))
+            if replies and replies[0].ok:
+                return
+            await self.ticks(5)
 
     async def still(self, ticks: int = 10) -> None:
         """Wait until the body has been at rest for `ticks`."""

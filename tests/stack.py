@@ -14,6 +14,7 @@ from typing import IO
 
 import msgspec
 
+from gigabrain_zenoh.running import Running
 from gigabrain_zenoh.settings import Endpoint
 
 ROOT = Path(__file__).parent.parent
@@ -159,3 +160,10 @@ def endpoint_of(deployment: Path) -> Endpoint:
     """Where to meet the robot of a deployment file that `Home.deployment` wrote."""
     values = msgspec.json.decode(deployment.read_bytes())
     return Endpoint(connect=(values["router"],), namespace=values.get("namespace", ""))
+
+
+async def robot_of(home: Home, command: Command) -> Endpoint:
+    """Where to meet the robot that a command has just started."""
+    note = home.folder / "run" / "gigabrain" / f"{command.pid}.json"
+    await until(note.exists, "the robot is announced")
+    return msgspec.json.decode(note.read_bytes(), type=Running).endpoint

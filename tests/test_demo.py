@@ -7,14 +7,11 @@ import signal
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 
 from gigabrain_zenoh.report import Observed, make_report, summary
-from gigabrain_zenoh.running import Running
-from gigabrain_zenoh.settings import Endpoint
 from tests.onlooker import looking_on
-from tests.stack import ROOT, Command, Home, until
+from tests.stack import ROOT, Command, Home, robot_of, until
 
 BODIES = ROOT / "drivers" / "gigabrain_drivers" / "bodies"
 FIELDS = {
@@ -39,13 +36,6 @@ async def undisturbed(home: Home, *options: str) -> dict[str, Any]:
         if report["lockstep_timeouts"] == 0:
             return report
     pytest.skip("this machine is too busy to run undisturbed")
-
-
-async def robot_of(home: Home, demo: Command) -> Endpoint:
-    """Where to meet the robot of a demo that has just been started."""
-    note = home.folder / "run" / "gigabrain" / f"{demo.pid}.json"
-    await until(note.exists, "the demo's note")
-    return msgspec.json.decode(note.read_bytes(), type=Running).endpoint
 
 
 @pytest.mark.parametrize(

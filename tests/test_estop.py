@@ -12,7 +12,6 @@ from gigabrain_schemas.requests import ReleaseRequest
 from gigabrain_schemas.topics import RELEASE
 from gigabrain_zenoh.client import Robot
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.gate import BRAIN
 from tests.onlooker import Onlooker, looking_on
 from tests.stack import Home, endpoint_of, until
 
@@ -42,7 +41,7 @@ async def go_on(robot: Onlooker) -> None:
     assert (await person.release()).text == "released; enable it to move"
     await robot.ticks(40)
     assert robot.state.gate.mode == "idle"  # also where it resumes by itself: a person stopped it
-    assert (await person.enable(BRAIN)).text == "control drives"
+    await robot.hand_to_brain()
 
 
 async def test_it_stops_the_body_and_keeps_it_stopped(robot: Onlooker) -> None:

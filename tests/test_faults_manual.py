@@ -28,21 +28,6 @@ async def robot(deployment: Path) -> AsyncIterator[Onlooker]:
         yield onlooker
 
 
-async def enabled(robot: Onlooker) -> None:
-    """A person lets the brain drive; the gate may first want to see the brain healthy again."""
-    person = Robot(robot.bus)
-
-    async def try_it() -> bool:
-        try:
-            await person.enable(BRAIN)
-        except Refused:
-            return False
-        return True
-
-    while not await try_it():
-        await robot.ticks(5)
-
-
 async def test_nothing_moves_until_it_is_released_and_enabled(robot: Onlooker) -> None:
     await robot.ticks(50)
     assert (robot.state.gate.mode, robot.state.gate.causes[0].code) == ("latched", "boot")
@@ -52,7 +37,7 @@ async def test_nothing_moves_until_it_is_released_and_enabled(robot: Onlooker) -
     await person.release()
     await robot.ticks(50)
     assert (robot.state.gate.mode, robot.state.pose.x) == ("idle", 0.0)
-    await enabled(robot)
+    await robot.hand_to_brain()
     await robot.straight()
 
 
@@ -61,7 +46,7 @@ async def test_after_a_fault_it_stands_until_a_person_enables_it(
     robot: Onlooker, victim: str
 ) -> None:
     if robot.state.gate.mode == "idle":
-        await enabled(robot)
+        await robot.hand_to_brain()
     pid = await robot.pid(victim)
     await robot.straight()
     start = robot.state
@@ -73,6 +58,6 @@ async def test_after_a_fault_it_stands_until_a_person_enables_it(
     await until(lambda: not robot.state.gate.causes, "nothing speaks against driving any more")
     await robot.ticks(50)
     assert robot.moved(start) <= limit_m
-    await enabled(robot)
+    await robot.hand_to_brain()
     await robot.straight(room=0.0)
     assert (await robot.truth())["stale_commands_executed"] == 0
