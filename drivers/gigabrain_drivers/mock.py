@@ -45,7 +45,7 @@ class MockBody(Driver):
         self._lidar: ScanSource | None = None  # a real one, where its link has one
 
     async def open(self) -> None:
-        """Nothing to connect to, but for a lidar that it may carry; else a scan is there at once."""
+        """Nothing to connect to but a lidar that it may carry; else a scan is there at once."""
         self._open = True
         self._lidar = carry(self, Clock())
         if self._lidar is None:
