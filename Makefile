@@ -41,7 +41,9 @@ bench: setup
 	$(BIN)/gigabrain bench stack
 
 mutation: setup
+	rm -rf mutants
 	$(BIN)/mutmut run
+	@test -z "$$($(BIN)/mutmut results)" || { $(BIN)/mutmut results; exit 1; }
 
 golden: setup
 	$(BIN)/python -m gigabrain_schemas.golden

@@ -1,89 +1,29 @@
 """Typed publish, subscribe and ask. The bus speaks messages; a transport speaks bytes."""
 
 import asyncio
-import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
-from gigabrain_schemas.base import TICK_NS, Message
-from gigabrain_schemas.topics import SCAN, STATE, Service, Topic
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.topics import Service, Topic
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import GigabrainError, Refused
-from gigabrain_zenoh.transport import Transport
+from gigabrain_zenoh.freshness import CLOCK_KEYS, Latest, RobotTime
+from gigabrain_zenoh.rejections import Rejections
+from gigabrain_zenoh.transport import Close, OnSample, Transport
 
-log = logging.getLogger(__name__)
+__all__ = ["Bus", "Latest", "RobotTime"]
+
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
 
-CLOCK_TOPICS = (STATE.key, SCAN.key)  # what the driver sends on these moves the robot's clock
-
-
-class RobotTime:
-    """The newest tick that this process has seen, and of which start of the driver."""
-
-    def __init__(self) -> None:
-        self.boot = 0
-        self.tick = 0
-
-    def see(self, message: Message) -> None:
-        """Take note of the tick on a message from the driver."""
-        if message.boot != self.boot:
-            self.boot, self.tick = message.boot, message.tick
-        elif message.tick > self.tick:
-            self.tick = message.tick
-
-
-class Latest(Generic[M]):
-    """The newest message on a topic, while it is still worth believing."""
-
-    def __init__(self, topic: Topic[M], clock: Clock, time: RobotTime) -> None:
-        self._topic, self._clock, self._time = topic, clock, time
-        self._by_wall = topic.key in CLOCK_TOPICS
-        self.newest: M | None = None
-        self._arrived_ns = 0
-        self._arrived_tick = 0
-
-    def take(self, message: M) -> bool:
-        """Keep `message` unless it is older than what is held; says whether it was kept."""
-        held = self.newest
-        if held and message.boot and message.boot == held.boot and message.tick < held.tick:
-            return False
-        self.newest = message
-        self._arrived_ns, self._arrived_tick = self._clock.now_ns(), self._time.tick
-        return True
-
-    @property
-    def current(self) -> M | None:
-        """The newest message, however old, unless it is from an earlier start of the driver."""
-        message = self.newest
-        return message if message and message.boot in (0, self._time.boot) else None
-
-    def age_ns(self) -> int | None:
-        """Age of the newest message [ns]: by the robot's clock, or by arrival where that is more.
-
-        None when there is none, or when it belongs to an earlier start of the driver.
-        """
-        message = self.current
-        if message is None:
-            return None
-        age = (self._time.tick - self._arrived_tick) * TICK_NS
-        if message.boot:
-            age = max(age, (self._time.tick - message.tick) * TICK_NS)
-        if self._by_wall or not message.boot:
-            age = max(age, self._clock.now_ns() - self._arrived_ns)
-        return max(age, 0)
-
-    def fresh(self, within_ns: int | None = None) -> M | None:
-        """The newest message, or None once it is older than its promised rate allows."""
-        age = self.age_ns()
-        limit = self._topic.stale_after_ns if within_ns is None else within_ns
-        return self.newest if age is not None and age <= limit else None
+FETCH_S = 1.0  # how long the one who keeps a value may take to hand it over
 
 
 class Bus:
@@ -95,12 +35,12 @@ class Bus:
         self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.sent: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
-        self.rejected: Counter[str] = Counter()
+        self._rejections = Rejections(clock)
+        self.rejected = self._rejections.counts
         self.listens: list[str] = []
         self.counters: Counter[str] = Counter()  # what a node counts of its own, for its health
         self.latency_ms: dict[str, float] = {}  # what a node measures, for its health
         self.report: Callable[[], Mapping[str, float | int | str | None]] = dict
-        self._faulty: set[str] = set()
         self._kept: dict[str, bytes] = {}
         self._fetching: set[asyncio.Task[None]] = set()
 
@@ -129,8 +69,6 @@ class Bus:
         latest = Latest(topic, self.clock, self.time)
 
         def take(_key: str, message: M) -> None:
-            if topic.key in CLOCK_TOPICS:
-                self.time.see(message)
             if latest.take(message) and on_new:
                 on_new(message)
 
@@ -144,70 +82,82 @@ class Bus:
         on_bad: Callable[[bytes], None] | None = None,
         *,
         name: str = "*",
-    ) -> None:
-        """Call `on_message(key, message)` for each valid arrival, `on_bad(payload)` for others."""
-        decode = Codec(topic.type, topic.max_bytes).decode
+    ) -> Close:
+        """Call `on_message(key, message)` for each valid arrival, `on_bad(payload)` for others.
 
-        def receive(key: str, payload: bytes, encoding: str) -> None:
-            self.received[key] += 1
+        Returns the function that ends it.
+        """
+        decode, pattern = Codec(topic.type, topic.max_bytes).decode, topic.at(name)
+        moves_time = topic.key in CLOCK_KEYS
+
+        def receive(key: str, payload: bytes) -> None:
+            self.received[pattern] += 1
             try:
-                message = decode(payload, encoding)
+                message = decode(payload)
             except ValueError as error:
-                self._reject(key, error)
+                self._rejections.reject(pattern, error)
                 if on_bad:
                     on_bad(payload)
                 return
-            if self._faulty and key in self._faulty:
-                self._faulty.discard(key)
-                log.info("%s is valid again", key, extra={"data": {"event": "accepted"}})
+            self._rejections.accept(pattern)
+            if moves_time:
+                self.time.see(message)
             on_message(key, message)
 
-        self.listens.append(topic.at(name))
-        self._transport.subscribe(topic.at(name), self._guard(receive), topic.depth)
+        guarded = self._guard(receive)
+        ends = self._transport.subscribe(pattern, guarded, topic.depth)
+        self.listens.append(pattern)
         if topic.keep and not topic.many:
-            self._fetch(topic, receive)
+            self._fetch(topic, guarded)
+
+        def close() -> None:
+            ends()
+            if pattern in self.listens:
+                self.listens.remove(pattern)
+
+        return close
 
     def serve(
         self, service: Service[Q, R], answer: Callable[[Q], Awaitable[R]], *, name: str = ""
     ) -> None:
         """Answer `service`. An empty request counts as one with nothing but defaults."""
-        decode = Codec(service.request, 64 * 1024).decode
-        key = service.at(name)
+        decode, key = Codec(service.request, service.max_bytes).decode, service.at(name)
+        encoding = codec.encoding_of(service.reply)
 
-        async def reply(payload: bytes, encoding: str) -> tuple[bytes, str]:
+        async def reply(payload: bytes) -> tuple[bytes, str]:
             self.received[key] += 1
             try:
-                request = decode(payload or b"{}", encoding)
+                request = decode(payload or b"{}")
             except ValueError as error:
-                self._reject(key, error)
+                self._rejections.reject(key, error)
                 raise Refused(f"not a valid {service.request.__name__}: {error}") from None
+            self._rejections.accept(key)
             try:
-                answered = await answer(request)
+                return codec.encode(await answer(request)), encoding
             except GigabrainError:
                 raise
             except Exception as error:
                 self._fail(error)
-                raise
-            return codec.encode(answered), codec.encoding_of(service.reply)
+                raise Refused(f"{self.process or key} failed: {error!r}") from error
 
         self._transport.serve(key, reply)
 
     async def ask(
         self, service: Service[Q, R], request: Q, *, timeout_s: float = 1.0, name: str = ""
     ) -> list[R]:
-        """Every answer to `request`; empty when nobody serves it. Raises Refused, with a reason."""
-        decode = Codec(service.reply, 1024 * 1024).decode
-        replies = await self._transport.query(
-            service.at(name), codec.encode(request), codec.encoding_of(service.request), timeout_s
-        )
+        """Every answer that comes in time; none when nobody serves it. Raises Refused, with why."""
+        decode, key = Codec(service.reply, service.max_bytes).decode, service.at(name)
+        payload, encoding = codec.encode(request), codec.encoding_of(service.request)
         answers = []
-        for reply in replies:
+        for reply in await self._transport.query(
+            key, payload, encoding, timeout_s, service.priority
+        ):
             if isinstance(reply, str):
                 raise Refused(reply)
             try:
-                answers.append(decode(*reply))
+                answers.append(decode(reply))
             except ValueError as error:
-                self._reject(service.at(name), error)
+                self._rejections.reject(key, error)
         return answers
 
     async def close(self) -> None:
@@ -216,19 +166,12 @@ class Bus:
             task.cancel()
         await self._transport.close()
 
-    def _reject(self, key: str, error: ValueError) -> None:
-        self.rejected[key] += 1
-        if key not in self._faulty:
-            self._faulty.add(key)
-            data = {"event": "rejected", "key": key}
-            log.warning("dropped a message on %s: %s", key, error, extra={"data": data})
-
-    def _guard(self, receive: Callable[[str, bytes, str], None]) -> Callable[..., None]:
+    def _guard(self, receive: OnSample) -> OnSample:
         """A fault in a node ends its process: `failed` carries it to whoever runs the node."""
 
-        def guarded(key: str, payload: bytes, encoding: str) -> None:
+        def guarded(key: str, payload: bytes) -> None:
             try:
-                receive(key, payload, encoding)
+                receive(key, payload)
             except Exception as error:  # noqa: BLE001 - handed on whole, to be raised by the runner
                 self._fail(error)
 
@@ -242,19 +185,19 @@ class Bus:
         first = key not in self._kept
         self._kept[key] = payload
 
-        async def answer(_payload: bytes, _encoding: str) -> tuple[bytes, str]:
+        async def answer(_payload: bytes) -> tuple[bytes, str]:
             return self._kept[key], encoding
 
         if first:
             self._transport.serve(key, answer)
 
-    def _fetch(self, topic: Topic[Any], receive: Callable[[str, bytes, str], None]) -> None:
+    def _fetch(self, topic: Topic[Any], receive: OnSample) -> None:
         """Ask for the kept value, for a subscriber that comes after it was sent."""
 
         async def fetch() -> None:
-            for reply in await self._transport.query(topic.key, b"", "", 1.0):
+            for reply in await self._transport.query(topic.key, b"", "", FETCH_S, topic.priority):
                 if not isinstance(reply, str):
-                    receive(topic.key, *reply)
+                    receive(topic.key, reply)
 
         task = asyncio.get_running_loop().create_task(fetch())
         self._fetching.add(task)

@@ -2,13 +2,12 @@
 
 import asyncio
 import os
-from collections import deque
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import TypeVar
+from typing import Any, TypeVar, overload
 
 from gigabrain_schemas.base import Message, Velocity
-from gigabrain_schemas.body import Joint, RobotState
+from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import (
@@ -18,14 +17,15 @@ from gigabrain_schemas.topics import (
     ESTOP,
     RELEASE,
     STATE,
-    TOPICS,
     Service,
     Topic,
 )
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, BusError, Refused, Unsupported, unknown
+from gigabrain_zenoh.errors import BodyLost, BusError, Refused, Unsupported
+from gigabrain_zenoh.hold import Hold
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
+from gigabrain_zenoh.listening import listen, topic_named
 from gigabrain_zenoh.running import find_endpoint
 
 M = TypeVar("M", bound=Message)
@@ -33,18 +33,25 @@ Q = TypeVar("Q", bound=Message)
 
 HOLD_TICKS = 50  # a velocity lasts one second of the robot's time unless it is asked for again
 ROUTER_S, ANSWER_S = 3.0, 1.0  # how long a router, and a robot, may take to answer
-ROOM = 64  # messages that wait for a slow `async for`; the oldest give way
+BODY_TICKS = 100  # the driver says twice in that time what the body is
 
 
 @asynccontextmanager
 async def connect(
-    connect: str | None = None, *, namespace: str = "", source: str = "", take: bool = False
+    connect: str | None = None,
+    *,
+    namespace: str = "",
+    source: str = "",
+    take: bool = False,
+    wait: bool = True,
 ) -> AsyncIterator["Robot"]:
     """A robot to drive and to listen to.
 
     `connect` is its router's Zenoh endpoint; without it, the only robot that runs on this machine.
     `source` is the name under which the gate knows this script; with `take` it takes the body over
-    from whoever drives. Raises BusError when there is no router, BodyLost when there is no driver.
+    from whoever drives. With `wait` the body's first state is waited for: without, an e-stop can be
+    sent to a body that says nothing. Raises BusError when there is no router, BodyLost when there
+    is no driver.
     """
     from gigabrain_zenoh.zenoh_transport import ZenohTransport  # takes a while: only when used
 
@@ -57,7 +64,8 @@ async def connect(
     bus = Bus(transport, Clock(), source or f"script-{os.getpid()}")
     try:
         robot = Robot(bus, take=take)
-        await robot.read_state()
+        if wait:
+            await robot.read_state()
         yield robot
         await robot.stop()
     finally:
@@ -73,6 +81,7 @@ class Robot:
         self._bodies = bus.latest(BODY)
         self._target: Velocity | None = None
         self._until_tick = 0
+        self._hold = Hold(bus.process)
         self._arrived = asyncio.Event()
 
     async def set_base_velocity(
@@ -81,14 +90,14 @@ class Robot:
         """Drive [m/s, m/s, rad/s] for one second, or until the next call; returns what was asked.
 
         What was asked is what the body's limits leave of it. The first call asks the gate for the
-        body. Raises Refused, with the gate's reason, when it does not let this script drive.
+        body, which this script then keeps. Raises Refused, with the gate's reason, when it does not
+        let this script drive, and when somebody else has taken the body over or latched it.
         """
-        state, body = await self.read_state(), self._bodies.current
+        state, body = await self.read_state(), await self.read_body()
         wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
-        if body:
-            wanted = clamp(wanted, limits_of(body.description))
-        if state.gate.commander != self._bus.process or state.gate.mode != "enabled":
-            await self.enable(take=self._take)
+        wanted = clamp(wanted, limits_of(body))
+        if not self._hold.has(state):
+            await self._acquire()
         self._target, self._until_tick = wanted, self._bus.time.tick + HOLD_TICKS
         self._send()
         return wanted
@@ -103,7 +112,7 @@ class Robot:
         await self.stop()
 
     async def stop(self) -> None:
-        """Come to rest, if this script drives."""
+        """Come to rest, if this script drives. It keeps the body."""
         if self._target is None:
             return
         self._target, self._until_tick = ZERO, self._bus.time.tick + HOLD_TICKS
@@ -113,12 +122,14 @@ class Robot:
             if state is None or at_rest:
                 break
             await self._ticks(1)
-        self._target = None
 
     async def enable(self, source: str = "", *, take: bool = False) -> GateReply:
         """Ask the gate for the body, for this script or for `source`. Raises Refused, and why."""
         request = EnableRequest(source=source or self._bus.process, take=take)
-        return self._granted(await self._ask(ENABLE, request))
+        reply = self._granted(await self._ask(ENABLE, request))
+        if request.source == self._bus.process:
+            self._hold.granted(self._bus.time.boot, reply.gate)
+        return reply
 
     async def release(self) -> GateReply:
         """Let go of a latched gate; it takes an enable as well to move. Raises Refused."""
@@ -140,6 +151,14 @@ class Robot:
             raise BodyLost("no robot/state; is the driver running?")
         return state
 
+    async def read_body(self) -> BodyDescription:
+        """What the body is: its limits, its outline, its sensors. Raises BodyLost."""
+        for _ in range(BODY_TICKS):
+            if body := self._bodies.current:
+                return body.description
+            await self._ticks(1)
+        raise BodyLost("no robot/body; is the driver running?")
+
     async def get_joint_states(self) -> tuple[Joint, ...]:
         """All joints as measured. Raises BodyLost."""
         return (await self.read_state()).joints
@@ -151,44 +170,49 @@ class Robot:
 
     async def get_sensor_data(self, sensor_name: str) -> Message:
         """The next reading of `scan`, `imu` or any other topic. Raises BodyLost after a second."""
-        readings: AsyncIterator[Message] = self.topic(sensor_name)
+        readings = self.topic(sensor_name)
         try:
-            return await asyncio.wait_for(anext(readings), ANSWER_S)
+            reading: Message = await asyncio.wait_for(anext(readings), ANSWER_S)
         except TimeoutError:
             raise BodyLost(f"nobody sends robot/{sensor_name}") from None
+        return reading
+
+    @overload
+    def topic(self, topic: Topic[M]) -> AsyncIterator[M]: ...
+
+    @overload
+    def topic(self, topic: str) -> AsyncIterator[Any]: ...
 
     def topic(self, topic: Topic[M] | str) -> AsyncIterator[M]:
         """Every message on a topic from now on: `async for scan in robot.topic("scan")`.
 
         Raises UnknownName for a topic that is not in the table.
         """
-        return self._listen(_topic(topic))
+        return listen(self._bus, topic_named(topic) if isinstance(topic, str) else topic)
 
-    async def _listen(self, topic: Topic[M]) -> AsyncIterator[M]:
-        waiting: deque[M] = deque(maxlen=ROOM)
-        arrived = asyncio.Event()
+    async def _acquire(self) -> None:
+        """Ask the gate for the body, once it has come to rest from whatever it was doing."""
+        state = await self.read_state()
+        if self._hold.lost:
+            who = state.gate.commander or "an e-stop"
+            raise Refused(
+                f"{state.robot_type}: {who} has the body; ask again with enable(take=True)"
+            )
+        for _ in range(HOLD_TICKS):
+            if state.gate.mode != "stopping":
+                break
+            await self._ticks(1)
+            state = await self.read_state()
+        await self.enable(take=self._take)
 
-        def take(_key: str, message: M) -> None:
-            waiting.append(message)
-            arrived.set()
-
-        close = self._bus.subscribe(topic, take)
-        try:
-            while True:
-                while waiting:
-                    yield waiting.popleft()
-                arrived.clear()
-                await arrived.wait()
-        finally:
-            close()
-
-    def _repeat(self, _: RobotState) -> None:
+    def _repeat(self, state: RobotState) -> None:
+        self._hold.see(state)
         self._arrived.set()
         self._send()
 
     def _send(self) -> None:
         target = self._target
-        if target is None:
+        if target is None or self._hold.lost:
             return
         if self._bus.time.tick > self._until_tick:
             target = ZERO
@@ -220,12 +244,3 @@ class Robot:
         if not reply.ok:
             raise Refused(f"{reply.robot_type}: {reply.text}")
         return reply
-
-
-def _topic(topic: Topic[M] | str) -> Topic[M]:
-    if isinstance(topic, Topic):
-        return topic
-    known: dict[str, Topic[M]] = {t.key.removeprefix("robot/"): t for t in TOPICS}
-    if topic.removeprefix("robot/") not in known:
-        raise unknown("topic", topic, known)
-    return known[topic.removeprefix("robot/")]

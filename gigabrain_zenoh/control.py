@@ -9,7 +9,7 @@ from gigabrain_schemas.base import TICK_NS, Message, Velocity
 from gigabrain_schemas.body import BodyDescription, ControlGains, RobotState
 from gigabrain_schemas.brain import CmdVel, Intent
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
-from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, STATE, TELEOP
+from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, TELEOP, command_topic
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.gate import BRAIN
 from gigabrain_zenoh.limits import NO_CAPS, ZERO, clamp, limits_of, ramp
@@ -174,7 +174,7 @@ class EarlierCaps:
 
 
 async def run(bus: Bus, ready: Callable[[], None]) -> None:
-    """A command per state, and at once when decision has thought again."""
+    """A command at the body's rate, and at once when decision has thought again."""
     memory = Memory()
     teleop, caps = Teleop(bus.clock.now_ns), EarlierCaps()
 
@@ -189,8 +189,11 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
             teleop=teleop.velocity(state, echo_wanted=body.link == "real"),
             caps=caps.at(state),
         )
+        before = memory.basis
         memory, command = step(body.description, memory, inputs)
-        bus.publish(CMD_VEL, command, basis=memory.basis)
+        due = state.tick % body.description.control.period_ticks == 0
+        if due or memory.basis != before:
+            bus.publish(command_topic(body.description), command, basis=memory.basis)
 
     def think_again(intent: Intent) -> None:
         # an intent of a tick whose state is still on its way waits for that state

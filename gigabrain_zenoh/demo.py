@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import sys
+import time
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.launch import STOP_S, stop_signals
 from gigabrain_zenoh.live_view import HeadlessView, LiveView, View
 from gigabrain_zenoh.logs import new_run_dir
-from gigabrain_zenoh.report import Report, make_report, summary, write_report
+from gigabrain_zenoh.report import Observed, Report, check_place, make_report, summary, write_report
 from gigabrain_zenoh.running import announced
 from gigabrain_zenoh.supervisor import Supervisor
 from gigabrain_zenoh.watch import Watch
@@ -24,6 +26,7 @@ from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 LOOK_S = 0.1  # how often the run is looked at
 STALLED_S = 60.0  # without a tick of the robot's clock
+ANSWER_S, HASTY_S = 5.0, 0.2  # how long the truth may take; and once a person wants it to end
 
 
 class DemoOptions(Struct, frozen=True, kw_only=True):
@@ -39,6 +42,8 @@ class Demo:
 
     def __init__(self, deployment: Deployment, options: DemoOptions) -> None:
         self._deployment, self._options = with_free_port(deployment), options
+        if options.report:
+            check_place(options.report)
         self._run_dir = new_run_dir(None, "demo")
         specs = process_specs(
             self._deployment,
@@ -51,7 +56,7 @@ class Demo:
         self._decisions: list[tuple[float, str]] = []
         self._failures: list[str] = []
         self._refusal = ""  # what a process said before it ended
-        self._faults: list[str] = []
+        self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
 
     async def run(self) -> int:
         """The exit code: 0 for a run without contact, with motion, with all processes alive.
@@ -100,34 +105,41 @@ class Demo:
                     self._failures.append(f"the robot's clock stood still for {STALLED_S:.0f} s")
                     break
             view.show()
-        return await self._ask_for_truth(watch)
+        return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)
 
     def _over(self, watch: Watch) -> bool:
         seconds = self._options.seconds
         return seconds is not None and watch.seconds >= seconds - 1e-6
 
     def _view(self, watch: Watch) -> View:
+        seconds = self._options.seconds
         if self._options.headless or not sys.stdout.isatty():
-            return HeadlessView(watch, self._options.seconds)
-        return LiveView(watch, self._supervisor, self._deployment, self._faults)
+            return HeadlessView(watch, seconds)
+        return LiveView(watch, self._supervisor, self._deployment, self._faults, seconds)
 
-    async def _ask_for_truth(self, watch: Watch) -> Report | None:
-        names = [n for n, status in self._supervisor.statuses.items() if status.state == "ready"]
-        told = await asyncio.gather(*(watch.describe(name) for name in names))
-        answers = {answer.process: answer for answer in told if answer}
-        truth = {key: value for a in answers.values() for key, value in a.report.items()}
-        if "driver" not in answers or "contacts" not in truth:
+    async def _ask_for_truth(self, watch: Watch, within_s: float) -> Report | None:
+        statuses = self._supervisor.statuses
+        names = [name for name, status in statuses.items() if status.state == "ready"]
+        told = await asyncio.gather(*(watch.describe(name, within_s) for name in names))
+        answers = {answer.process: answer.report for answer in told if answer}
+        if "driver" not in answers:
             return None
-        return make_report(
-            truth,
-            self._decisions,
+        seen = Observed(
+            body=watch.state.newest.robot_type if watch.state.newest else self._deployment.body,
+            world=self._deployment.world,
+            seed=self._deployment.seed,
             speed=self._deployment.speed,
+            seconds=watch.seconds,
+            distance_m=watch.distance_m,
+            decisions=tuple(self._decisions),
             deaths=self._supervisor.deaths,
-            restarts=sum(status.restarts for status in self._supervisor.statuses.values()),
-            rejected=sum(int(a.report.get("rejected_messages") or 0) for a in answers.values()),
+            restarts=sum(status.restarts for status in statuses.values()),
+            rejected=sum(int(report.get("rejected_messages") or 0) for report in answers.values()),
         )
+        told_of_all = {key: value for report in answers.values() for key, value in report.items()}
+        return make_report(told_of_all, seen)  # the truth is the simulator's, wherever it runs
 
-    def _record(self, name: str, record: Mapping[str, Any]) -> None:
+    def _record(self, _name: str, record: Mapping[str, Any]) -> None:
         """A line of somebody's log."""
         event, level = record.get("event"), record.get("level")
         if event == "decision":
@@ -137,8 +149,8 @@ class Demo:
         if event in ("given up", "died"):
             self._failures.append(str(record.get("text", "")))
         if level in ("warning", "error", "critical"):
-            self._faults.append(f"{name}: {record.get('text', '')}")
-            del self._faults[:-4]
+            text = f"{record['process']}: {record.get('text', '')}"
+            self._faults.append((time.monotonic(), text))
 
     def _finish(self, report: Report | None, *, stopped: bool) -> int:
         if report and self._options.report:

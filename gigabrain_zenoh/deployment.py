@@ -1,8 +1,9 @@
 """A deployment file: which body on which link, and which process runs on which host."""
 
+import re
 import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -10,7 +11,7 @@ from typing import Any, Literal
 import msgspec
 from msgspec import Struct
 
-from gigabrain_zenoh import config
+from gigabrain_zenoh import config, config_yaml
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.keeper import ProcessSpec
 from gigabrain_zenoh.process_config import ProcessConfig
@@ -44,7 +45,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     speed: Speed = 1.0
     resume: Resume = "manual"
     namespace: str = ""  # the robot's own part of the key space, where one router serves several
-    router: str = "tcp/127.0.0.1:7447"  # where the router listens; port 0 for any free one
+    router: str = "tcp/127.0.0.1:7447"  # where it listens; port 0 for any, where all is on one host
     insecure: bool = False  # allow a router that other machines can reach
     hosts: dict[str, tuple[ProcessName, ...]] = msgspec.field(
         default_factory=lambda: {"robot": ALL}
@@ -53,6 +54,10 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     decision: DecisionConfig = DecisionConfig()
 
     def __post_init__(self) -> None:
+        if not self.hosts:
+            raise ValueError("hosts: expected at least one, with the processes that it runs")
+        if len(self.hosts) > 1 and self.router.endswith(":0"):
+            raise ValueError(f"router {self.router}: several hosts must know its port")
         placed = [name for names in self.hosts.values() for name in names]
         twice = sorted({name for name in placed if placed.count(name) > 1})
         if twice:
@@ -76,17 +81,39 @@ def deployment_folder() -> Path:
     return installed if installed.is_dir() else package.parent / "deploy"
 
 
-def load_deployment(name: str) -> Deployment:
-    """Read a deployment file: a path, or the name of one of ours. Raises ConfigError."""
+def deployment_path(name: str) -> Path:
+    """The deployment file at a path, or the one of ours with that name. Raises UnknownName."""
     path = Path(name)
     ours = {file.stem: file for file in sorted(deployment_folder().glob("*.yaml"))}
     if not path.exists() and not name.endswith((".yaml", ".yml")):
         if name not in ours:
             raise unknown("deployment", name, ours)
-        path = ours[name]
-    elif not path.exists() and path.stem in ours and path.parent in (Path(), Path("deploy")):
-        path = ours[path.stem]
+        return ours[name]
+    if not path.exists() and path.stem in ours and path.parent in (Path(), Path("deploy")):
+        return ours[path.stem]
+    return path
+
+
+def load_deployment(path: Path) -> Deployment:
+    """Read a deployment file. Raises ConfigError with file, line and what was expected."""
     return config.load(path, Deployment)
+
+
+def located(path: Path, error: ConfigError) -> ConfigError:
+    """What a process says of a name that it was given, with that name's line in the file."""
+    if named := re.match(r"no \w+ ('.*?');", str(error)):
+        for node in _scalars(config_yaml.read(path.read_text(encoding="utf-8"))):
+            if repr(node.value) == named[1]:
+                return ConfigError(f"{path}:{node.line}: {error}")
+    return error
+
+
+def _scalars(node: config_yaml.Node) -> Iterator[config_yaml.Node]:
+    children = [entry.node for entry in node.entries or ()] + list(node.items or ())
+    if not children:
+        yield node
+    for child in children:
+        yield from _scalars(child)
 
 
 def host_of(deployment: Deployment, name: str | None) -> str:
@@ -107,9 +134,12 @@ def with_free_port(deployment: Deployment) -> Deployment:
     host, _, port = address.rpartition(":")
     if port != "0":
         return deployment
-    with socket.socket() as probe:
-        probe.bind((host, 0))
-        free = probe.getsockname()[1]
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        with socket.create_server((host.strip("[]"), 0), family=family) as probe:
+            free = probe.getsockname()[1]
+    except OSError as error:
+        raise ConfigError(f"router {deployment.router}: {error.strerror}") from None
     return msgspec.structs.replace(deployment, router=f"{protocol}/{host}:{free}")
 
 

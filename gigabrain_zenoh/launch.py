@@ -8,7 +8,12 @@ from contextlib import contextmanager
 from typing import Any
 
 from gigabrain_zenoh import log_text
-from gigabrain_zenoh.deployment import Deployment, client_endpoint, process_specs
+from gigabrain_zenoh.deployment import (
+    Deployment,
+    client_endpoint,
+    process_specs,
+    with_free_port,
+)
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.logs import new_run_dir, state_dir
 from gigabrain_zenoh.running import announced
@@ -38,6 +43,7 @@ async def up(
 
     Raises ConfigError when the run folder or the state folder cannot be written.
     """
+    deployment = with_free_port(deployment)
     label = deployment.namespace or deployment.body.replace("/", "-")
     run_dir = new_run_dir(None, label)
     remembers = state_dir() / "robots" / label

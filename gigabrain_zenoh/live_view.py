@@ -1,8 +1,10 @@
 """What a person sees of a running demo: one calm page in the terminal, or a line now and then."""
 
 import sys
+import time
+from collections.abc import Sequence
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Literal, Protocol, Self
 
 from rich.console import Group
 from rich.live import Live
@@ -16,6 +18,7 @@ from gigabrain_zenoh.supervisor import Supervisor
 from gigabrain_zenoh.watch import Watch
 
 FRAMES_HZ = 4
+FAULT_S = 30.0  # how long a fault stays on the page
 LINE_S = 10.0  # of the robot's time between two lines without a terminal
 GATE_COLOURS = {"enabled": "green", "idle": "yellow", "stopping": "yellow", "latched": "red"}
 
@@ -66,14 +69,21 @@ class HeadlessView:
 
 
 class LiveView:
-    """The whole robot on one page."""
+    """The whole robot on one page, and the last page left behind."""
 
     def __init__(
-        self, watch: Watch, supervisor: Supervisor, deployment: Deployment, faults: list[str]
+        self,
+        watch: Watch,
+        supervisor: Supervisor,
+        deployment: Deployment,
+        faults: Sequence[tuple[float, str]],
+        seconds: float | None,
     ) -> None:
         self._watch, self._supervisor, self._deployment = watch, supervisor, deployment
-        self._faults = faults
-        self._live = Live(refresh_per_second=FRAMES_HZ, get_renderable=self._page)
+        self._faults, self._seconds = faults, seconds
+        # drawn on the loop's thread, from one moment's values; its own screen survives resizing
+        self._live = Live(self._page(), screen=True, auto_refresh=False)
+        self._next_s = 0.0
 
     def __enter__(self) -> Self:
         self._live.start()
@@ -81,29 +91,37 @@ class LiveView:
 
     def __exit__(self, *_: object) -> None:
         self._live.stop()
+        self._live.console.print(self._page())
 
     def show(self) -> None:
-        """Rich redraws the page by itself."""
+        """Draw it anew, a few times a second."""
+        now_s = time.monotonic()
+        if now_s >= self._next_s:
+            self._next_s = now_s + 1 / FRAMES_HZ
+            self._live.update(self._page(), refresh=True)
 
     def _page(self) -> Panel:
-        deployment = self._deployment
+        deployment, watch = self._deployment, self._watch
         speed = "" if deployment.speed == 1.0 else f" · ×{deployment.speed:g}"
         title = f"{deployment.body} · {deployment.world} · seed {deployment.seed}{speed}"
+        gate = watch.state.newest.gate.mode if watch.state.newest else "idle"
+        headline = "bold cyan" if gate == "enabled" else f"bold {GATE_COLOURS[gate]}"
         parts: list[Text | Table] = [
-            Text(doing(self._watch), style="bold cyan", justify="center"),
+            _line(doing(watch), headline, "center"),
             Text(),
             self._figures(),
             Text(),
             self._processes(),
         ]
-        parts += [Text(fault, style="yellow", overflow="ellipsis") for fault in self._faults]
+        now_s = time.monotonic()
+        parts += [_line(text, "yellow") for at_s, text in self._faults if now_s - at_s < FAULT_S]
         return Panel(Group(*parts), title=title, subtitle="Ctrl-C ends it", padding=(1, 2))
 
     def _figures(self) -> Table:
         watch, state = self._watch, self._watch.state.newest
         table = Table.grid(expand=True)
-        for _ in range(4):
-            table.add_column(justify="center")
+        for ratio in (3, 3, 2, 2):
+            table.add_column(justify="center", ratio=ratio, no_wrap=True)
         gate = Text("-", style="dim")
         battery = "-"
         if state:
@@ -116,31 +134,38 @@ class LiveView:
         chain = f"{p50:.1f} ms (p99 {p99:.1f})" if p50 and p99 else "-"
         names = ("driven", "scan → command", "gate", "battery")
         table.add_row(*(Text(name, style="dim") for name in names))
-        driven = f"{watch.distance_m:.2f} m in {watch.seconds:.0f} s"
+        of = f" of {self._seconds:.0f}" if self._seconds else ""
+        driven = f"{watch.distance_m:.2f} m in {watch.seconds:.0f}{of} s"
         table.add_row(driven, chain, gate, battery)
         return table
 
     def _processes(self) -> Table:
         table = Table(box=None, expand=True, pad_edge=False, header_style="dim")
-        table.add_column("process", style="bold", width=11)
+        table.add_column("process", style="bold", width=10)
         table.add_column("state", width=11)
         table.add_column("pid", justify="right", width=7)
         table.add_column("CPU", justify="right", width=6)
-        table.add_column("memory", justify="right", width=7)
+        table.add_column("memory", justify="right", width=6)
         table.add_column("what it does", ratio=1, no_wrap=True, overflow="ellipsis")
         for name, status in self._supervisor.statuses.items():
-            health = self._watch.health.get(name)
-            style = "green" if status.state == "ready" else "yellow"
+            ready = status.state == "ready"
+            health = self._watch.health.get(name) if ready else None
             again = f" ↻{status.restarts}" if status.restarts else ""
+            style = "green" if ready else "red" if status.state == "given up" else "yellow"
             table.add_row(
                 name,
-                Text(f"{status.state}{again}", style=style),
+                _line(f"{status.state}{again}", style),
                 str(status.pid or ""),
                 f"{health.cpu * 100:.1f} %" if health else "",
                 f"{health.rss_bytes / 1e6:.0f} MB" if health else "",
-                _activity(name, self._watch),
+                _activity(name, self._watch) if ready else "",
             )
         return table
+
+
+def _line(text: str, style: str, justify: Literal["left", "center"] = "left") -> Text:
+    """A line that ends in an ellipsis where there is no room for all of it."""
+    return Text(text, style=style, justify=justify, no_wrap=True, overflow="ellipsis")
 
 
 def doing(watch: Watch) -> str:
@@ -170,7 +195,9 @@ def _activity(name: str, watch: Watch) -> str:
         return _seen(watch)
     if name == "decision":
         intent = watch.intent.fresh()
-        return intent.reason if intent else "silent"
+        if intent is None:
+            return "silent"
+        return f"{intent.reason.partition(':')[0]} · {intent.progress:.0%}"
     if name == "control":
         command = watch.command.fresh()
         if command is None:

@@ -1,6 +1,6 @@
 """What a demo run came to."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +19,35 @@ class Latency(Struct, frozen=True, kw_only=True):
     p99: float | None
 
 
+class Observed(Struct, frozen=True, kw_only=True):
+    """What was seen of a run from outside."""
+
+    body: str
+    world: str
+    seed: int
+    speed: float
+    seconds: float  # of the robot's time
+    distance_m: float  # by odometry
+    decisions: tuple[tuple[float, str], ...]
+    deaths: int
+    restarts: int
+    rejected: int
+
+
 class Report(Struct, frozen=True, kw_only=True):
-    """One run. Contacts, clearance and distance are MuJoCo's truth, not the robot's own view."""
+    """One run. Contacts, clearance and distance are MuJoCo's truth, not the robot's own view.
+
+    A body that is not simulated knows no such truth: its contacts and clearance are null, and its
+    distance is that of its odometry.
+    """
 
     body: str
     world: str
     seed: int
     sim_seconds: float
     distance_m: float
-    contacts: int
-    min_clearance_m: float
+    contacts: int | None
+    min_clearance_m: float | None
     turns: int
     restarts: int
     rejected_messages: int
@@ -45,42 +64,46 @@ class Report(Struct, frozen=True, kw_only=True):
         return self.verdict == "ok"
 
 
-def make_report(
-    truth: Mapping[str, Any],
-    decisions: Sequence[tuple[float, str]],
-    *,
-    speed: float,
-    deaths: int,
-    restarts: int,
-    rejected: int,
-) -> Report:
-    """Put together what the driver says of the truth and what the supervisor saw."""
-    distance, contacts = float(truth["distance_m"]), int(truth["contacts"])
+def make_report(told: Mapping[str, Any], seen: Observed) -> Report:
+    """Put together what the driver says of itself and of the truth, and what else was seen."""
+    distance, contacts = float(told.get("distance_m", seen.distance_m)), told.get("contacts")
+    return Report(
+        body=told.get("body", seen.body),
+        world=seen.world,
+        seed=seen.seed,
+        sim_seconds=told.get("sim_seconds", round(seen.seconds, 2)),
+        distance_m=round(distance, 3),
+        contacts=contacts,
+        min_clearance_m=told.get("min_clearance_m"),
+        turns=sum(words.startswith("turning") for _, words in seen.decisions),
+        restarts=seen.restarts,
+        rejected_messages=seen.rejected,
+        stale_commands_executed=told["stale_commands_executed"],
+        scan_to_cmd_ms=Latency(p50=told["scan_to_cmd_p50_ms"], p99=told["scan_to_cmd_p99_ms"]),
+        speed=seen.speed,
+        lockstep_timeouts=told["lockstep_timeouts"],
+        decisions=seen.decisions,
+        verdict=_verdict(distance, contacts or 0, seen.deaths),
+    )
+
+
+def _verdict(distance_m: float, contacts: int, deaths: int) -> str:
     faults = []
     if contacts:
-        faults.append(f"{contacts} contact{'s' if contacts > 1 else ''}")
-    if distance < MOTION_M:
+        faults.append(_count(contacts, "contact"))
+    if distance_m < MOTION_M:
         faults.append("no motion")
     if deaths:
         faults.append(f"{deaths} process{'es' if deaths > 1 else ''} died")
-    return Report(
-        body=truth["body"],
-        world=truth["world"],
-        seed=truth["seed"],
-        sim_seconds=truth["sim_seconds"],
-        distance_m=distance,
-        contacts=contacts,
-        min_clearance_m=truth["min_clearance_m"],
-        turns=sum(words.startswith("turning") for _, words in decisions),
-        restarts=restarts,
-        rejected_messages=rejected,
-        stale_commands_executed=truth["stale_commands_executed"],
-        scan_to_cmd_ms=Latency(p50=truth["scan_to_cmd_p50_ms"], p99=truth["scan_to_cmd_p99_ms"]),
-        speed=speed,
-        lockstep_timeouts=truth["lockstep_timeouts"],
-        decisions=tuple(decisions),
-        verdict=", ".join(faults) or "ok",
-    )
+    return ", ".join(faults) or "ok"
+
+
+def check_place(path: Path) -> None:
+    """Before the run rather than after it. Raises ConfigError where no report can be written."""
+    if not path.parent.is_dir():
+        raise ConfigError(f"cannot write the report {path}: no such folder")
+    if path.is_dir():
+        raise ConfigError(f"cannot write the report {path}: it is a folder")
 
 
 def write_report(report: Report, path: Path) -> None:
@@ -94,9 +117,14 @@ def write_report(report: Report, path: Path) -> None:
 def summary(report: Report) -> str:
     """One line for people."""
     p50, p99 = report.scan_to_cmd_ms.p50 or 0.0, report.scan_to_cmd_ms.p99 or 0.0
-    return (
-        f"{report.verdict}: {report.distance_m:.2f} m in {report.sim_seconds:.0f} s, "
-        f"{report.turns} turns, {report.contacts} contacts, "
-        f"closest {report.min_clearance_m:.2f} m, "
-        f"scan to command {p50:.1f} ms (p99 {p99:.1f} ms)"
-    )
+    parts = [
+        f"{report.verdict}: {report.distance_m:.2f} m in {report.sim_seconds:.0f} s",
+        _count(report.turns, "turn"),
+    ]
+    if report.contacts is not None and report.min_clearance_m is not None:
+        parts += [_count(report.contacts, "contact"), f"closest {report.min_clearance_m:.2f} m"]
+    return ", ".join([*parts, f"scan to command {p50:.1f} ms (p99 {p99:.1f})"])
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

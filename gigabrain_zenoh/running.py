@@ -33,11 +33,12 @@ def folder() -> Path:
 def announced(label: str, endpoint: Endpoint) -> Iterator[None]:
     """Leave a note while the block runs."""
     note = folder() / f"{os.getpid()}.json"
+    robot = Running(pid=os.getpid(), label=label, endpoint=endpoint)
     try:
         note.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        note.write_bytes(
-            msgspec.json.encode(Running(pid=os.getpid(), label=label, endpoint=endpoint))
-        )
+        fresh = note.with_suffix(".new")  # nobody finds half a note
+        fresh.write_bytes(msgspec.json.encode(robot))
+        fresh.replace(note)
     except OSError as error:
         raise ConfigError(f"cannot write {note}: {error.strerror}; set XDG_RUNTIME_DIR") from None
     try:

@@ -9,11 +9,27 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.base import Cause, Message
-from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.body import Body, BodyDescription, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, SCAN, STATE, WORLD
+from gigabrain_schemas.topics import (
+    BODY,
+    CMD_VEL,
+    HEALTH,
+    IMAGE,
+    IMU,
+    INTENT,
+    LOG,
+    MAP,
+    POSE,
+    SAFETY,
+    SCAN,
+    STATE,
+    WORLD,
+    Topic,
+    command_topic,
+)
 from gigabrain_zenoh.ages import scan_limit_ns as scan_limit_ns
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.causes import in_words
@@ -24,6 +40,9 @@ from gigabrain_zenoh.stop_zone import NEAREST, cap, free_distances, in_zone
 log = logging.getLogger(__name__)
 
 SYSTEMS = ("perception", "decision", "control")
+# what nobody else listens to yet, so that what is bad on these keys is counted all the same
+OVERHEARD: tuple[Topic[Any], ...] = (IMU, IMAGE, POSE, MAP, HEALTH, LOG)
+SCANS_TO_START = 2  # whoever answers the first has been heard by the second, however slow
 SUSTAIN_TICKS = 25  # how long a battery or motor must be out of bounds (0.5 s)
 LONGEST_STEP_TICKS = 5  # a sample after a longer gap speaks for no more than this
 REPEAT_TICKS = 2  # the verdict is repeated every 40 ms, and at once when it changes
@@ -46,6 +65,7 @@ class Memory(msgspec.Struct, frozen=True, kw_only=True):
 
     boot: int = 0
     tick: int = 0
+    scans: int = 0  # how many have been looked at
     basis: int = 0  # the scan that `free` was read from
     problem: str = ""  # why that scan cannot be believed
     free_ahead: float | None = None  # [m] until the body would touch, None for nothing in the way
@@ -62,7 +82,7 @@ def step(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Memory,
     if state.boot != memory.boot:  # the driver has started anew
         memory = Memory(boot=state.boot, tick=state.tick)
     memory = _look(body, _count(body, memory, state), inputs)
-    stop = (*_blind(body, memory, inputs), *_silent(inputs), *_worn(body, memory))
+    stop = (*_blind(body, memory, inputs), *_silent(body, memory, inputs), *_worn(body, memory))
     zones = _zone_causes(memory)
     caps = SpeedCaps(
         forward=cap(body, memory.free_ahead, memory.stopped_ahead),
@@ -111,6 +131,7 @@ def _look(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
     speed = inputs.state.velocity.linear_x
     return replace(
         memory,
+        scans=memory.scans + 1,
         basis=scan.basis,
         problem=problem,
         free_ahead=ahead,
@@ -136,8 +157,10 @@ def _zone_causes(memory: Memory) -> tuple[Cause, ...]:
 def _blind(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause, ...]:
     if body.lidar is None:
         return ()
+    if inputs.scan_age_ns is None:
+        return (Cause(code="scan_lost", text="no scan has come yet"),)
     limit_ns = scan_limit_ns(body)
-    if inputs.scan_age_ns is None or inputs.scan_age_ns > limit_ns:
+    if inputs.scan_age_ns > limit_ns:
         text = f"no scan for more than {limit_ns // 1_000_000} ms"
         return (Cause(code="scan_lost", text=text),)
     if memory.problem:
@@ -145,12 +168,14 @@ def _blind(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause
     return ()
 
 
-def _silent(inputs: Inputs) -> tuple[Cause, ...]:
+def _silent(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause, ...]:
     """The brain's processes matter while the brain drives; a person or a script looks itself.
 
     While nobody drives they matter too, since the brain would be next; but where all three are
     silent there is no brain, and a script need not wait for one.
     """
+    if body.lidar and memory.scans < SCANS_TO_START:
+        return (Cause(code="starting", text="safety has only just begun to look"),)
     commander = inputs.state.gate.commander
     if commander not in ("", BRAIN) or (not commander and len(inputs.silent) == len(SYSTEMS)):
         return ()
@@ -213,11 +238,18 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
         if command.source == BRAIN:
             commands.take(command)
 
-    bodies = bus.latest(BODY)
+    def hear_body(body: Body) -> None:
+        topic = command_topic(body.description)
+        if topic.key not in bus.listens:
+            bus.subscribe(topic, hear_command)
+
+    bodies = bus.latest(BODY, hear_body)
     states = bus.latest(STATE, judge)
     scans = bus.latest(SCAN, judge)
     commands = Latest(CMD_VEL, bus.clock, bus.time)
     bus.subscribe(CMD_VEL, hear_command)
+    for topic in OVERHEARD:
+        bus.subscribe(topic, lambda _key, _message: None)
     systems: dict[str, Latest[Any]] = {
         "perception": bus.latest(WORLD),
         "decision": bus.latest(INTENT),
@@ -235,6 +267,7 @@ def _tell(state: RobotState, before: SafetyState, now: SafetyState) -> None:
     fresh = tuple(cause for cause in now.causes if cause.code not in known)
     if fresh:
         data = {"event": "held back", "causes": ",".join(cause.code for cause in fresh)}
-        log.warning("%s: %s", now.verdict, in_words(fresh), extra={"data": data})
+        level = logging.WARNING if now.verdict == "stop" else logging.INFO
+        log.log(level, "%s: %s", now.verdict, in_words(fresh), extra={"data": data})
     elif before.causes and not now.causes:
         log.info("nothing holds the body back", extra={"data": {"event": "free"}})

@@ -1,16 +1,18 @@
 """What the bus asks of whatever moves its bytes, and one that stays inside the process."""
 
 import asyncio
+import contextlib
 from collections import deque
 from collections.abc import Awaitable, Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
-from gigabrain_schemas.topics import Topic
+from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.errors import GigabrainError
 
-OnSample = Callable[[str, bytes, str], None]  # key, payload, encoding
-Answer = Callable[[bytes, str], Awaitable[tuple[bytes, str]]]  # payload, encoding, both ways
-Close = Callable[[], None]
+OnSample = Callable[[str, bytes], None]  # key, payload
+Answer = Callable[[bytes], Awaitable[tuple[bytes, str]]]  # payload; payload and its encoding
+Close = Callable[[], None]  # may be called twice
+T = TypeVar("T")
 
 
 class Transport(Protocol):
@@ -29,9 +31,9 @@ class Transport(Protocol):
         ...
 
     async def query(
-        self, key: str, payload: bytes, encoding: str, timeout_s: float
-    ) -> list[tuple[bytes, str] | str]:
-        """Ask all who serve `key`: a (payload, encoding) per answer, a text per error."""
+        self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
+    ) -> list[bytes | str]:
+        """Ask all who serve `key`: a payload per answer that came in time, a text per error."""
         ...
 
     async def close(self) -> None:
@@ -44,48 +46,41 @@ class LocalNetwork:
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, bytes]] = []
-        self._listeners: dict[str, list[OnSample]] = {}
-        self._servers: dict[str, Answer] = {}
-        self._queue: deque[tuple[str, bytes, str]] = deque()
+        self._listeners: list[tuple[str, OnSample]] = []
+        self._servers: list[tuple[str, Answer]] = []
+        self._queue: deque[tuple[str, bytes]] = deque()
         self._delivering = False
 
     def transport(self) -> "LocalTransport":
         """A new end."""
         return LocalTransport(self)
 
-    def deliver(self, key: str, payload: bytes, encoding: str = "application/msgpack") -> None:
+    def deliver(self, key: str, payload: bytes) -> None:
         """Hand `payload` to the listeners, after whatever is on its way already."""
-        self._queue.append((key, payload, encoding))
+        self._queue.append((key, payload))
         if self._delivering:
             return
         self._delivering = True
         try:
             while self._queue:
-                key, payload, encoding = self._queue.popleft()
-                for pattern, listeners in list(self._listeners.items()):
-                    if pattern == key or _matches(pattern, key):
-                        for on_sample in list(listeners):
-                            on_sample(key, payload, encoding)
+                key, payload = self._queue.popleft()
+                for pattern, on_sample in tuple(self._listeners):
+                    if _matches(pattern, key):
+                        on_sample(key, payload)
         finally:
             self._delivering = False
 
     def listen(self, key: str, on_sample: OnSample) -> Close:
         """Register a listener."""
-        self._listeners.setdefault(key, []).append(on_sample)
-        return lambda: self._listeners[key].remove(on_sample)
+        return _added(self._listeners, (key, on_sample))
 
     def serve(self, key: str, answer: Answer) -> Close:
-        """Register the one who answers on `key`."""
-        self._servers[key] = answer
+        """Register one who answers on `key`."""
+        return _added(self._servers, (key, answer))
 
-        def close() -> None:
-            self._servers.pop(key, None)
-
-        return close
-
-    def server(self, key: str) -> Answer | None:
-        """Who answers on `key`."""
-        return self._servers.get(key)
+    def servers(self, pattern: str) -> list[Answer]:
+        """Who answers on `pattern`."""
+        return [answer for key, answer in self._servers if _matches(pattern, key)]
 
 
 class LocalTransport:
@@ -98,7 +93,7 @@ class LocalTransport:
     def publish(self, topic: Topic[Any], key: str, payload: bytes, encoding: str) -> None:
         """Record `payload` and hand it to the listeners."""
         self._network.sent.append((key, payload))
-        self._network.deliver(key, payload, encoding)
+        self._network.deliver(key, payload)
 
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
         """Register a listener."""
@@ -106,23 +101,19 @@ class LocalTransport:
         return self._closers[-1]
 
     def serve(self, key: str, answer: Answer) -> Close:
-        """Register the one who answers on `key`."""
+        """Register one who answers on `key`."""
         self._closers.append(self._network.serve(key, answer))
         return self._closers[-1]
 
     async def query(
-        self, key: str, payload: bytes, encoding: str, timeout_s: float
-    ) -> list[tuple[bytes, str] | str]:
-        """Ask the one who serves `key`."""
-        answer = self._network.server(key)
-        if answer is None:
-            return []
-        try:
-            return [await asyncio.wait_for(answer(payload, encoding), timeout_s)]
-        except TimeoutError:
-            return []
-        except GigabrainError as error:
-            return [str(error)]
+        self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
+    ) -> list[bytes | str]:
+        """Ask all who serve `key`."""
+        replies = []
+        for answer in self._network.servers(key):
+            with contextlib.suppress(TimeoutError):
+                replies.append(await asyncio.wait_for(_text_or(answer, payload), timeout_s))
+        return replies
 
     async def close(self) -> None:
         """Leave the network."""
@@ -130,6 +121,24 @@ class LocalTransport:
             self._closers.pop()()
 
 
+async def _text_or(answer: Answer, payload: bytes) -> bytes | str:
+    try:
+        return (await answer(payload))[0]
+    except GigabrainError as error:
+        return str(error)
+
+
+def _added(entries: list[T], entry: T) -> Close:
+    entries.append(entry)
+
+    def close() -> None:
+        with contextlib.suppress(ValueError):  # closed already
+            entries.remove(entry)
+
+    return close
+
+
 def _matches(pattern: str, key: str) -> bool:
-    prefix, star, rest = pattern.partition("*")
-    return star == "*" and not rest and key.startswith(prefix) and "/" not in key[len(prefix) :]
+    """As Zenoh does, of a pattern whose last part may be a star."""
+    start, _, last = pattern.rpartition("/")
+    return pattern == key or (last == "*" and key.rpartition("/")[0] == start)

@@ -5,6 +5,7 @@ from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import CMD_VEL, DESCRIBE, HEALTH, INTENT, SAFETY, STATE, WORLD
 from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.errors import Refused
 
 
 class Watch:
@@ -29,9 +30,12 @@ class Watch:
 
     async def describe(self, process: str, timeout_s: float = 0.3) -> Description | None:
         """What a process says of itself, or None when it does not answer."""
-        replies = await self._bus.ask(
-            DESCRIBE, DescribeRequest(), timeout_s=timeout_s, name=process
-        )
+        try:
+            replies = await self._bus.ask(
+                DESCRIBE, DescribeRequest(), timeout_s=timeout_s, name=process
+            )
+        except Refused:
+            return None
         return replies[0] if replies else None
 
     def _healthy(self, _key: str, health: Health) -> None:

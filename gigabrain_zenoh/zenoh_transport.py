@@ -2,24 +2,27 @@
 
 import asyncio
 import contextlib
+import functools
 import json
 import logging
 import threading
-from collections import deque
+from collections.abc import Callable
 from typing import Any
 
-import msgspec
 import zenoh
 from zenoh.handlers import Callback
 
-from gigabrain_schemas.topics import Topic
+from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.bridge import Bridge
-from gigabrain_zenoh.errors import BusError, GigabrainError
+from gigabrain_zenoh.errors import BusError, ConfigError, GigabrainError
+from gigabrain_zenoh.mailbox import Mailbox
+from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.transport import Answer, Close, OnSample
+from gigabrain_zenoh.zenoh_config import explain, plain, session_config
 
 log = logging.getLogger(__name__)
 
-PRIORITIES = {
+PRIORITIES: dict[Priority, zenoh.Priority] = {
     "real_time": zenoh.Priority.REAL_TIME,
     "interactive_high": zenoh.Priority.INTERACTIVE_HIGH,
     "data_high": zenoh.Priority.DATA_HIGH,
@@ -30,42 +33,15 @@ CONGESTION = {"drop": zenoh.CongestionControl.DROP, "block": zenoh.CongestionCon
 CLOSE_S = 0.5  # a session may take ten seconds to close on a link that loses packets
 
 
-class Endpoint(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Where a process finds the others."""
-
-    connect: tuple[str, ...] = ()  # Zenoh endpoints, such as tcp/127.0.0.1:7447
-    listen: tuple[str, ...] = ()  # of a router
-    namespace: str = ""  # the robot's own part of the key space
-
-
 def _config(endpoint: Endpoint) -> zenoh.Config:
-    """Client of a router, or the router itself; explicit endpoints, no multicast, short leases."""
-    settings: dict[str, Any] = {
-        "mode": "router" if endpoint.listen else "client",
-        "listen/endpoints": list(endpoint.listen),
-        "connect/endpoints": list(endpoint.connect),
-        "connect/timeout_ms": -1,
-        "connect/exit_on_failure": False,
-        "connect/retry": {
-            "period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2,
-        },
-        "scouting/multicast/enabled": False,
-        "transport/unicast/open_timeout": 1000,
-        "transport/unicast/accept_timeout": 1000,
-        "transport/link/tx/lease": 400,
-        "transport/link/tx/keep_alive": 4,
-        "transport/link/tx/queue/size": {"real_time": 16, "data_high": 16, "data": 16},
-        "transport/link/rx/max_message_size": 16 << 20,
-        "transport/shared_memory/enabled": False,
-    }  # fmt: skip
-    if endpoint.namespace:
-        settings["namespace"] = endpoint.namespace
     config = zenoh.Config()
-    for key, value in settings.items():
+    for key, value in session_config(endpoint).items():
         try:
             config.insert_json5(key, json.dumps(value))
         except zenoh.ZError as error:
-            raise BusError(f"{key} = {value!r} is not accepted by Zenoh: {error}") from None
+            raise ConfigError(
+                f"{key} = {value!r} is refused by Zenoh: {plain(str(error))}"
+            ) from None
     return config
 
 
@@ -73,20 +49,17 @@ async def open_session(endpoint: Endpoint) -> zenoh.Session:
     """Open a session, waiting for the router as long as it takes.
 
     In a daemon thread, not in the loop's executor: the process must be able to end meanwhile.
-    Raises BusError when a router cannot listen.
+    Raises BusError when a router cannot listen, ConfigError for an endpoint that is none.
     """
     config = _config(endpoint)
     loop = asyncio.get_running_loop()
     opened: asyncio.Future[zenoh.Session] = loop.create_future()
 
     def settle(session: zenoh.Session | None, error: zenoh.ZError | None) -> None:
-        if opened.cancelled():
-            if session:
-                session.close()
-        elif session:
+        if session:
             opened.set_result(session)
-        else:
-            opened.set_exception(error or BusError("no session"))
+        elif error:
+            opened.set_exception(error)
 
     def work() -> None:
         session, fault = None, None
@@ -96,25 +69,35 @@ async def open_session(endpoint: Endpoint) -> zenoh.Session:
             fault = error
         try:
             loop.call_soon_threadsafe(settle, session, fault)
-        except RuntimeError:  # the loop is gone: nobody waits any more
+        except RuntimeError:  # the loop is gone
             if session:
-                session.close()
+                _close(session)
 
-    threading.Thread(target=work, name="zenoh-open", daemon=True).start()
+    _in_thread(work)
     try:
-        return await opened
+        return await asyncio.shield(opened)
     except zenoh.ZError as error:
-        raise BusError(_explain(endpoint, error)) from None
+        raise BusError(explain(endpoint, str(error))) from None
+    except asyncio.CancelledError:
+        opened.add_done_callback(_discard)
+        raise
 
 
-def _explain(endpoint: Endpoint, error: zenoh.ZError) -> str:
-    text = str(error)
-    if endpoint.listen and "address already in use" in text.lower():
-        where = ", ".join(endpoint.listen)
-        return f"the router's port is taken ({where}); stop what uses it or choose another --listen"
-    if endpoint.listen:
-        return f"the router cannot listen on {', '.join(endpoint.listen)}: {text.splitlines()[0]}"
-    return f"no session with {', '.join(endpoint.connect)}: {text.splitlines()[0]}"
+def _discard(opened: asyncio.Future[zenoh.Session]) -> None:
+    """Close a session that nobody waits for any more."""
+    if opened.exception() is None:
+        _in_thread(functools.partial(_close, opened.result()))
+
+
+def _in_thread(work: Callable[[], None]) -> None:
+    threading.Thread(target=work, name="zenoh-session", daemon=True).start()
+
+
+def _close(session: zenoh.Session) -> None:
+    try:
+        session.close()
+    except zenoh.ZError as error:
+        log.debug("closing the session: %s", error)
 
 
 async def close_session(session: zenoh.Session) -> None:
@@ -123,14 +106,11 @@ async def close_session(session: zenoh.Session) -> None:
     done = asyncio.Event()
 
     def work() -> None:
-        try:
-            session.close()
-        except zenoh.ZError as error:
-            log.debug("closing the session: %s", error)
+        _close(session)
         with contextlib.suppress(RuntimeError):  # the loop did not wait
             loop.call_soon_threadsafe(done.set)
 
-    threading.Thread(target=work, name="zenoh-close", daemon=True).start()
+    _in_thread(work)
     try:
         await asyncio.wait_for(done.wait(), CLOSE_S)
     except TimeoutError:
@@ -143,9 +123,11 @@ class ZenohTransport:
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._bridge = Bridge()
+        self._loop = asyncio.get_running_loop()
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._declared: list[Any] = []
         self._tasks: set[asyncio.Task[None]] = set()
+        self._asking: set[asyncio.Future[None]] = set()
         self._closed = False
 
     @classmethod
@@ -168,7 +150,12 @@ class ZenohTransport:
 
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
         """Listen; samples that pile up while the loop is busy give way to newer ones."""
-        mailbox = _Mailbox(self._bridge, on_sample, depth)
+        fixed = "" if "*" in key else key
+
+        def deliver(sample: zenoh.Sample) -> None:
+            on_sample(fixed or str(sample.key_expr), sample.payload.to_bytes())
+
+        mailbox = Mailbox(self._bridge, deliver, depth)
         return self._undeclare(self._session.declare_subscriber(key, mailbox.put))
 
     def serve(self, key: str, answer: Answer) -> Close:
@@ -176,16 +163,15 @@ class ZenohTransport:
 
         async def run(query: zenoh.Query) -> None:
             with query:  # dropped at the end, else the asker waits for its timeout
-                payload = query.payload.to_bytes() if query.payload else b""
-                encoding = str(query.encoding) if query.encoding else ""
+                asked = query.payload
                 try:
-                    reply, reply_encoding = await answer(payload, encoding)
-                    query.reply(query.key_expr, reply, encoding=reply_encoding)
+                    payload, encoding = await answer(asked.to_bytes() if asked else b"")
+                    query.reply(key, payload, encoding=encoding)
                 except GigabrainError as error:
                     query.reply_err(str(error))
 
         def start(query: zenoh.Query) -> None:
-            task = asyncio.get_running_loop().create_task(run(query))
+            task = self._loop.create_task(run(query))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
@@ -195,11 +181,11 @@ class ZenohTransport:
         return self._undeclare(declared)
 
     async def query(
-        self, key: str, payload: bytes, encoding: str, timeout_s: float
-    ) -> list[tuple[bytes, str] | str]:
+        self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
+    ) -> list[bytes | str]:
         """Ask all who serve `key`. A direct callback: an indirect one costs a thread per query."""
         replies: list[zenoh.Reply] = []
-        done = asyncio.get_running_loop().create_future()
+        done = self._loop.create_future()
 
         def finish(_: None) -> None:
             if not done.done():
@@ -209,10 +195,23 @@ class ZenohTransport:
             replies.append, drop=lambda: self._bridge.post(finish, None), indirect=False
         )
         self._session.get(
-            key, handler, payload=payload, encoding=encoding or None, timeout=timeout_s
+            key,
+            handler,
+            payload=payload,
+            encoding=encoding or None,
+            timeout=timeout_s,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,  # else one answer per key is all we get
+            priority=PRIORITIES[priority],
+            congestion_control=zenoh.CongestionControl.DROP,  # never block the loop
+            express=True,
         )
-        await done
-        return [_unpack(reply) for reply in replies]
+        self._asking.add(done)
+        try:
+            await done
+        finally:
+            self._asking.discard(done)
+        return [_unpack(reply) for reply in replies if not _timed_out(reply)]
 
     async def close(self) -> None:
         """Close the session and stop delivering."""
@@ -222,45 +221,29 @@ class ZenohTransport:
         self._bridge.close()
         for task in self._tasks:
             task.cancel()
+        for done in self._asking:
+            if not done.done():
+                done.set_result(None)
         await close_session(self._session)
 
     def _undeclare(self, declared: Any) -> Close:
         self._declared.append(declared)
 
         def close() -> None:
-            self._declared.remove(declared)
-            declared.undeclare()
+            if declared in self._declared:
+                self._declared.remove(declared)
+                declared.undeclare()
 
         return close
 
 
-def _unpack(reply: zenoh.Reply) -> tuple[bytes, str] | str:
+def _unpack(reply: zenoh.Reply) -> bytes | str:
     if reply.ok is not None:
-        return reply.ok.payload.to_bytes(), str(reply.ok.encoding)
+        return reply.ok.payload.to_bytes()
     assert reply.err is not None
     return reply.err.payload.to_bytes().decode(errors="replace")
 
 
-class _Mailbox:
-    """The newest samples of one subscription, on their way to the loop."""
-
-    def __init__(self, bridge: Bridge, on_sample: OnSample, depth: int) -> None:
-        self._bridge, self._on_sample = bridge, on_sample
-        self._samples: deque[zenoh.Sample] = deque(maxlen=depth)
-        self._posted = False
-
-    def put(self, sample: zenoh.Sample) -> None:
-        """Take a sample on Zenoh's thread."""
-        self._samples.append(sample)
-        if not self._posted:
-            self._posted = True
-            self._bridge.post(_Mailbox._deliver, self)
-
-    def _deliver(self) -> None:
-        self._posted = False
-        while self._samples:
-            try:
-                sample = self._samples.popleft()
-            except IndexError:  # a newer one has just pushed it out
-                break
-            self._on_sample(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding))
+def _timed_out(reply: zenoh.Reply) -> bool:
+    """Zenoh says so itself, here or in the router, in the form of an error."""
+    return reply.err is not None and reply.err.payload.to_bytes() == b"Timeout"

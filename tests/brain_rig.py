@@ -108,6 +108,13 @@ def open_space(**hits_at_degrees: float) -> NDArray[np.float32]:
     return values
 
 
+def round_room(radius: float, x: float, y: float, yaw: float) -> NDArray[np.float64]:
+    """What 360 beams measure at (x, y, yaw) in a round room: |p + d u| = radius, solved for d."""
+    angles = yaw + np.radians(np.arange(360.0))
+    along: NDArray[np.float64] = x * np.cos(angles) + y * np.sin(angles)
+    return np.sqrt(along**2 + radius**2 - x**2 - y**2) - along
+
+
 class Bench:
     """One node under test. Used as `async with Bench(node) as bench:`."""
 

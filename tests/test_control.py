@@ -235,6 +235,9 @@ def test_nothing_winds_up_at_the_bodys_own_limit() -> None:
     assert drive.memory.gain_x < 1.01
     slower = drive.speeds(500, want(0.2))
     assert max(slower[20:]) < 0.2 / 0.9 * 1.02
+    for _ in range(500):
+        drive.go(want(w=1.82))
+    assert drive.memory.gain_z < 1.01
 
 
 def test_a_blocked_wheel_is_corrected_by_a_quarter_at_the_most() -> None:

@@ -3,9 +3,10 @@
 import itertools
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_schemas.base import Message, Velocity
-from gigabrain_schemas.body import GateStatus
+from gigabrain_schemas.body import ControlGains, GateStatus
 from gigabrain_schemas.brain import Intent, Twist
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, STATE, TELEOP, Topic
@@ -13,7 +14,7 @@ from gigabrain_zenoh import control
 from gigabrain_zenoh.control import EarlierCaps
 from gigabrain_zenoh.limits import NO_CAPS
 from gigabrain_zenoh.teleop import Teleop
-from tests.brain_rig import BOOT, DRIVING, TICK_NS, Bench, body, state
+from tests.brain_rig import BOOT, DRIVING, TICK_NS, WAFFLE, Bench, body, state
 
 MS = 1_000_000
 
@@ -258,3 +259,22 @@ def test_what_the_operator_asks_for_is_passed_on_whole() -> None:
     stick.push(50, 11, Twist(linear_x=0.1, linear_y=-0.2, angular_z=0.3))
     found = stick.teleop.velocity(state(1), echo_wanted=False)
     assert found == Velocity(linear_x=0.1, linear_y=-0.2, angular_z=0.3)
+
+
+async def test_a_body_that_wants_25_commands_a_second_gets_every_second_tick() -> None:
+    slow = replace(WAFFLE, control=ControlGains(rate_hz=25.0))
+    async with Chain() as chain:
+        chain.send(BODY, body(slow))
+        for tick in range(1, 9):
+            chain.send(STATE, state(tick))
+        assert [c.tick for c in chain.sent(CMD_VEL)] == [2, 4, 6, 8]
+        chain.send(STATE, state(9))
+        chain.send(INTENT, intent(9))  # decision has thought again: that does not wait
+        assert [(c.tick, c.basis) for c in chain.sent(CMD_VEL)] == [(9, 9)]
+
+
+async def test_a_body_with_a_control_topic_of_its_own_is_commanded_there() -> None:
+    async with Chain() as chain:
+        chain.send(BODY, body(replace(WAFFLE, control_topic="robot/base/cmd")))
+        chain.send(STATE, state(1))
+        assert [key for key, _ in chain.network.sent] == ["robot/base/cmd"]

@@ -284,7 +284,7 @@ async def test_without_a_state_it_says_nothing() -> None:
         node.send(STATE, state(10))
         node.sent(INTENT)
         await node.clock.advance(260_000_000)  # the driver has stopped
-        node.send(WORLD, world(11))
+        node.send(WORLD, world(10))
         assert node.sent(INTENT) == []
 
 

@@ -34,7 +34,7 @@ def judge(
         scan_age_ns=None if age_ms is None else round(age_ms * MS),
         silent=silent,
     )
-    return step(body, memory or Memory(boot=now.boot), inputs)[1]
+    return step(body, memory or Memory(boot=now.boot, scans=1), inputs)[1]
 
 
 def codes(verdict: SafetyState) -> list[str]:
@@ -45,7 +45,7 @@ class Watch:
     """Safety over time: a tick and a fresh scan at each call, free space unless it is said."""
 
     def __init__(self) -> None:
-        self.memory, self.tick = Memory(), 0
+        self.memory, self.tick = Memory(boot=7, scans=1), 0
 
     def sees(
         self, ahead: float | None = None, behind: float | None = None, v: float = 0.0
@@ -87,7 +87,8 @@ def test_a_lost_scan_stops_the_body_after_250_ms() -> None:
     lost = judge(age_ms=250.001)
     assert lost.verdict == "stop"
     assert lost.causes == (Cause(code="scan_lost", text="no scan for more than 250 ms"),)
-    assert codes(judge(age_ms=None)) == ["scan_lost"]
+    text = "no scan has come yet"
+    assert judge(age_ms=None).causes == (Cause(code="scan_lost", text=text),)
 
 
 def test_a_slow_lidar_may_take_one_and_a_half_periods() -> None:
@@ -188,9 +189,9 @@ def test_a_zone_goes_by_the_speed_towards_it() -> None:
 def test_a_scan_waits_for_the_state_of_its_tick() -> None:
     near = open_space(deg_0=0.2)
     memory, verdict = step(
-        BODY, Memory(boot=7), Inputs(state=state(4), scan=scan(near, 5), scan_age_ns=0)
+        BODY, Memory(boot=7, scans=1), Inputs(state=state(4), scan=scan(near, 5), scan_age_ns=0)
     )
-    assert (memory.basis, verdict.causes) == (0, ())
+    assert (memory.basis, memory.free_ahead, codes(verdict)) == (0, None, ["starting"])
     memory, verdict = step(
         BODY, memory, Inputs(state=state(5, v=0.2), scan=scan(near, 5), scan_age_ns=0)
     )
@@ -201,7 +202,7 @@ def test_a_scan_waits_for_the_state_of_its_tick() -> None:
 def test_a_scan_is_judged_once_by_the_speed_of_its_own_time() -> None:
     seen = scan(open_space(deg_0=0.255), 1)  # 0.18 m free
     memory, first = step(
-        BODY, Memory(boot=7), Inputs(state=state(1, v=0.2), scan=seen, scan_age_ns=0)
+        BODY, Memory(boot=7, scans=1), Inputs(state=state(1, v=0.2), scan=seen, scan_age_ns=0)
     )
     _, later = step(BODY, memory, Inputs(state=state(3, v=0.26), scan=seen, scan_age_ns=0))
     assert codes(first) == codes(later) == []
@@ -273,7 +274,7 @@ def test_one_sample_after_a_long_gap_does_not_count_as_half_a_second() -> None:
 
 
 def test_asked_again_within_a_tick_nothing_counts_twice() -> None:
-    memory = Memory(boot=7)
+    memory = Memory(boot=7, scans=1)
     low = Inputs(state=state(1, battery=1.0), scan=scan(open_space()), scan_age_ns=0)
     for _ in range(100):
         memory, verdict = step(BODY, memory, low)
@@ -294,7 +295,19 @@ def test_a_new_start_of_the_driver_is_judged_afresh() -> None:
     now = state(1, boot=8, battery=1.0)
     memory, verdict = step(BODY, watch.memory, Inputs(state=now, scan_age_ns=None))
     assert memory == Memory(boot=8, tick=1)
-    assert codes(verdict) == ["scan_lost"]
+    assert codes(verdict) == ["scan_lost", "starting"]
+
+
+def test_nothing_moves_before_the_second_scan() -> None:
+    memory, found = Memory(), []
+    for tick in (1, 2, 5, 6):
+        seen = scan(open_space(), 5 if tick >= 5 else 1)
+        inputs = Inputs(state=state(tick), scan=seen, scan_age_ns=0)
+        memory, verdict = step(BODY, memory, inputs)
+        found.append(codes(verdict))
+    assert found == [["starting"], ["starting"], [], []]
+    bare = replace(BODY, lidar=None)
+    assert step(bare, Memory(), Inputs(state=state(1)))[1] == SafetyState(verdict="ok")
 
 
 def test_several_causes_stand_side_by_side() -> None:

@@ -17,7 +17,8 @@ class Lockstep:
     verdict of safety, that rest on that scan. So decisions do not depend on how fast a machine is.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, period_ticks: int = 1) -> None:
+        self._period = period_ticks  # from one command of control to the next
         self._tick = self._basis = 0
         self._echo = self._echo_basis = self._judged = 0
         self._wake = asyncio.Event()
@@ -25,7 +26,7 @@ class Lockstep:
 
     def begin(self, tick: int, basis: int) -> None:
         """A tick has been sent out; `basis` is the tick of the newest scan, or 0."""
-        self._tick, self._basis = tick, basis
+        self._tick, self._basis = tick - tick % self._period, basis
         self._wake.clear()
 
     def command(self, command: CmdVel) -> None:

@@ -45,9 +45,11 @@ class MockBody(Driver):
         self._lidar: ScanSource | None = None  # a real one, where its link has one
 
     async def open(self) -> None:
-        """Nothing to connect to, but for a lidar that it may carry."""
+        """Nothing to connect to but a lidar that it may carry; else a scan is there at once."""
         self._open = True
         self._lidar = carry(self, Clock())
+        if self._lidar is None:
+            self._scan = self._look()
 
     async def close(self) -> None:
         """Forget the connection."""
@@ -110,12 +112,19 @@ class MockBody(Driver):
         self._ticks += 1
         lidar = None if self._lidar else self.robot.lidar
         if lidar and self._ticks % max(1, round(1 / (lidar.rate_hz * TICK_S))) == 0:
-            ranges = ROOM_M + self._noise.normal(0.0, 0.01, lidar.beams)
-            self._scan = LaserScan(
-                angle_min=0.0,
-                angle_increment=2 * math.pi / lidar.beams,
-                range_min=lidar.range_min,
-                range_max=lidar.range_max,
-                ranges=ranges_bytes(ranges),
-            )
-            self.emit(SCAN, self._scan)
+            self._scan = self._look()
+            if self._scan:
+                self.emit(SCAN, self._scan)
+
+    def _look(self) -> LaserScan | None:
+        lidar = self.robot.lidar
+        if lidar is None:
+            return None
+        ranges = ROOM_M + self._noise.normal(0.0, 0.01, lidar.beams)
+        return LaserScan(
+            angle_min=0.0,
+            angle_increment=2 * math.pi / lidar.beams,
+            range_min=lidar.range_min,
+            range_max=lidar.range_max,
+            ranges=ranges_bytes(ranges),
+        )

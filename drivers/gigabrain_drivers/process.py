@@ -1,10 +1,8 @@
 """The driver process: joins a body to the bus, through the gate. Written once for all bodies."""
 
 import asyncio
-import dataclasses
 import logging
 import secrets
-from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,21 +15,23 @@ from gigabrain_drivers.catalog import make_driver, ports_folder
 from gigabrain_drivers.latch import Latched, LatchFile
 from gigabrain_drivers.lockstep import REPEAT_S, Lockstep
 from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.round_trip import RoundTrip
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import (
     BODY,
-    CMD_VEL,
     ENABLE,
     ESTOP,
+    JOINT_CMD,
     RELEASE,
     SAFETY,
     SCAN,
     STATE,
     Topic,
+    command_topic,
 )
 from gigabrain_zenoh import causes as why
 from gigabrain_zenoh import gate
@@ -45,7 +45,6 @@ log = logging.getLogger(__name__)
 
 BODY_EVERY_TICKS = 50  # once a second
 STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
-LATENCIES = 20_000  # newest scan-to-command times that the figures are drawn from
 
 
 class RawSpeeds(msgspec.Struct):
@@ -77,11 +76,9 @@ class DriverProcess:
             estop_generation=latched.estop_generation,
         )
         bus.time.boot = self._gate.boot
-        self._lockstep = Lockstep() if driver.lockstep else None
+        self._lockstep = Lockstep(robot.control.period_ticks) if driver.lockstep else None
         self._sensors: list[tuple[Topic[Any], Message]] = []  # of the present tick
-        self._scan_tick = 0  # newest tick that carried a scan
-        self._scan_sent_ns = 0
-        self._latencies: deque[float] = deque(maxlen=LATENCIES)  # [ms]
+        self._round_trip = RoundTrip()
         self._wake = asyncio.Event()
         self._line = asyncio.Lock()  # one call at a time goes out to the body
         driver.emit = lambda topic, message: self._sensors.append((topic, message))
@@ -91,8 +88,8 @@ class DriverProcess:
         """Serve the body until cancelled; it is safe when this ends, however it ends."""
         bus = self._bus
         async with self._driver:
-            command_topic = replace_key(CMD_VEL, self._robot.control_topic)
-            bus.subscribe(command_topic, self._on_command, self._on_bad_command)
+            bus.subscribe(command_topic(self._robot), self._on_command, self._on_bad_command)
+            bus.subscribe(JOINT_CMD, self._on_joint_command)
             bus.latest(SAFETY, self._on_safety)
             bus.serve(ESTOP, self._on_estop)
             bus.serve(RELEASE, self._on_release)
@@ -119,15 +116,12 @@ class DriverProcess:
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """What the body and this process can say of the whole run."""
-        times = sorted(self._latencies)
         figures: dict[str, float | int | str | None] = {
-            "scan_to_cmd_p50_ms": percentile(times, 0.50),
-            "scan_to_cmd_p99_ms": percentile(times, 0.99),
             "stale_commands_executed": self._bus.counters["stale_commands_executed"],
             "lockstep_timeouts": self._lockstep.timeouts if self._lockstep else 0,
             "ticks": self._gate.tick,
         }
-        return {**self._driver.report(), **figures}
+        return {**self._driver.report(), **self._round_trip.report(), **figures}
 
     async def _tick(self, passed: int) -> None:
         """20 ms of the body's time, or several where the process was held up."""
@@ -136,36 +130,45 @@ class DriverProcess:
         for _ in range(passed):
             self._step(gate.Tick(state.velocity, self._wall_ns(), faults))
         self._bus.time.tick = self._gate.tick
-        self._announce(state)
         if self._lockstep:
-            await self._wait_for_brain(self._lockstep, state)
+            await self._in_step(self._lockstep, state)
+        else:
+            self._announce(state)
         await self._obey()
 
     def _announce(self, state: RobotState) -> None:
-        """State first: whoever gets the scan of a tick can expect to have seen its state."""
+        """The scan first: it has the longest way to go until it is a command."""
         bus, tick = self._bus, self._gate.tick
-        bus.publish(STATE, replace(state, gate=gate.status(self._gate)), basis=tick)
         for topic, message in self._sensors:
             if topic is SCAN:
-                self._scan_tick, self._scan_sent_ns = tick, bus.clock.now_ns()
-            bus.publish(topic, message, basis=tick)
+                self._round_trip.sent(tick, bus.clock.now_ns())
+                bus.publish(topic, message, basis=tick)
+        bus.publish(STATE, replace(state, gate=gate.status(self._gate)), basis=tick)
+        for topic, message in self._sensors:
+            if topic is not SCAN:
+                bus.publish(topic, message, basis=tick)
         self._sensors.clear()
         if tick % BODY_EVERY_TICKS == 0:
             bus.publish(BODY, self._body)
             self._measure()
 
-    async def _wait_for_brain(self, lockstep: Lockstep, state: RobotState) -> None:
-        """The first tick waits until the whole brain is there, so that runs can be repeated."""
-        scan = await self._newest_scan()
-        lockstep.begin(self._gate.tick, self._scan_tick)
+    async def _in_step(self, lockstep: Lockstep, state: RobotState) -> None:
+        """Announce the tick and wait until it is answered.
+
+        The first one waits until the whole brain has answered a scan, so that runs can be repeated.
+        """
         if self._gate.tick > 1:
+            self._announce(state)
+            lockstep.begin(self._gate.tick, self._round_trip.scan_tick)
             await lockstep.answered()
             return
-        while not await lockstep.wait(REPEAT_S):
+        scan, answered = await self._newest_scan(), False
+        while not answered:
             if scan:
                 self._sensors.append((SCAN, scan))
             self._announce(state)
-            lockstep.begin(self._gate.tick, self._scan_tick)
+            lockstep.begin(self._gate.tick, self._round_trip.scan_tick)
+            answered = await lockstep.wait(REPEAT_S)
 
     async def _newest_scan(self) -> Message | None:
         return await self._driver.get_sensor_data("scan") if self._robot.lidar else None
@@ -176,7 +179,7 @@ class DriverProcess:
         self._gate, outcome = gate.step(self._gate_config, before, event)
         if self._gate.output != before.output:
             self._wake.set()
-        if (before.mode, before.causes) != (self._gate.mode, self._gate.causes):
+        if _remembered(before) != _remembered(self._gate):
             self._changed(before)
         return outcome
 
@@ -203,15 +206,19 @@ class DriverProcess:
             log.info("gate %s: %s", now.mode, reason, extra={"data": data})
 
     def _on_command(self, _key: str, command: CmdVel) -> None:
+        arrived_ns = self._bus.clock.now_ns()
         outcome = self._step(gate.Command(command, self._wall_ns()))
         if outcome.refused:
             self._bus.counters[f"refused_{outcome.refused}"] += 1
         if command.boot == self._gate.boot:
-            if command.basis and command.basis == self._scan_tick and self._scan_sent_ns:
-                self._latencies.append((self._bus.clock.now_ns() - self._scan_sent_ns) / 1e6)
-                self._scan_sent_ns = 0
+            counts = self._gate.mode == "enabled"
+            self._round_trip.answered(command.basis, arrived_ns, counts=counts)
             if self._lockstep:
                 self._lockstep.command(command)
+
+    def _on_joint_command(self, _key: str, _command: JointCommand) -> None:
+        """No body of this package has joints to command; a refusal that can be seen."""
+        self._bus.counters["refused_no_joints"] += 1
 
     def _on_bad_command(self, payload: bytes) -> None:
         """Not a valid command: was it the commander, with a value that is not a number?"""
@@ -255,23 +262,17 @@ class DriverProcess:
         return None if self._lockstep else self._bus.clock.now_ns()
 
     def _measure(self) -> None:
-        times = sorted(self._latencies)
-        for name, share in (("scan_to_cmd_p50", 0.50), ("scan_to_cmd_p99", 0.99)):
-            value = percentile(times, share)
+        figures = self._round_trip.report()
+        for name in ("scan_to_cmd_p50", "scan_to_cmd_p99"):
+            value = figures[f"{name}_ms"]
             if value is not None:
                 self._bus.latency_ms[name] = value
         if self._lockstep:
             self._bus.counters["lockstep_timeouts"] = self._lockstep.timeouts
 
 
-def percentile(ordered: list[float], share: float) -> float | None:
-    """The value that `share` of `ordered` do not exceed."""
-    return ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else None
-
-
-def replace_key(topic: Topic[CmdVel], key: str) -> Topic[CmdVel]:
-    """`topic` under another key."""
-    return topic if topic.key == key else dataclasses.replace(topic, key=key)
+def _remembered(state: gate.GateState) -> tuple[object, ...]:
+    return state.mode, state.causes, state.estop_generation
 
 
 async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None:

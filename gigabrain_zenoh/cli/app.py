@@ -3,10 +3,9 @@
 import os
 import sys
 
-from cyclopts import App
+from cyclopts import App, CycloptsError
 
-from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.version import __version__
+from gigabrain_zenoh.errors import ConfigError, GigabrainError
 
 COMMANDS = "gigabrain_zenoh.cli"
 
@@ -16,7 +15,8 @@ def make_app() -> App:
     app = App(
         name="gigabrain",
         help="A robot brain of three systems that any body can wear.",
-        version=__version__,
+        help_format="plaintext",  # the default, Markdown, takes twice as long to start
+        version=_version,
     )
     lazy = (
         ("demo", "run:demo", "Drive a simulated robot round a room, until Ctrl-C."),
@@ -56,13 +56,23 @@ def make_app() -> App:
     return app
 
 
+def _version() -> str:
+    from gigabrain_zenoh.version import __version__  # takes a while: only when asked for
+
+    return __version__
+
+
 def main() -> None:
     """Entry of the `gigabrain` command."""
+    call = make_app()
     try:
-        code = make_app()(sys.argv[1:], result_action="return_value")
+        code = call(exit_on_error=False, print_error=False, result_action="return_value")
     except GigabrainError as error:
         print(f"gigabrain: {error}", file=sys.stderr)
         code = error.exit_code
+    except CycloptsError as error:
+        print(f"gigabrain: {' '.join(str(error).split())}", file=sys.stderr)
+        code = ConfigError.exit_code
     except KeyboardInterrupt:
         code = 130
     sys.stdout.flush()

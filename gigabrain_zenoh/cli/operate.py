@@ -25,7 +25,7 @@ def estop(*, connect: str | None = None, namespace: str = "", reason: str = "") 
     reason
         For the log.
     """
-    return _ask(connect, namespace, lambda robot: robot.estop(reason), "CONFIRMED by ")
+    return _ask(connect, namespace, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False)
 
 
 def release(*, connect: str | None = None, namespace: str = "") -> int:
@@ -65,10 +65,12 @@ def _ask(
     namespace: str,
     ask: Callable[[Robot], Awaitable[GateReply]],
     prefix: str = "",
+    *,
+    wait: bool = True,
 ) -> int:
     async def run() -> None:
         source = f"{getpass.getuser()}-cli"
-        async with connect_robot(connect, namespace=namespace, source=source) as robot:
+        async with connect_robot(connect, namespace=namespace, source=source, wait=wait) as robot:
             began = time.perf_counter()
             reply = await ask(robot)
             took_ms = (time.perf_counter() - began) * 1e3

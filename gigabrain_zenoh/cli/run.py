@@ -6,7 +6,13 @@ from typing import Literal
 
 import msgspec
 
-from gigabrain_zenoh.deployment import Deployment, host_of, load_deployment
+from gigabrain_zenoh.deployment import (
+    Deployment,
+    deployment_path,
+    host_of,
+    load_deployment,
+    located,
+)
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.settings import LinkName, Resume
 
@@ -88,8 +94,12 @@ def up(deployment: str, *, host: str | None = None, level: str = "info") -> int:
     """
     from gigabrain_zenoh.launch import up as run
 
-    loaded = load_deployment(deployment)
-    return asyncio.run(run(loaded, host_of(loaded, host), _say, level))
+    path = deployment_path(deployment)
+    loaded = load_deployment(path)
+    try:
+        return asyncio.run(run(loaded, host_of(loaded, host), _say, level))
+    except ConfigError as error:
+        raise located(path, error) from None
 
 
 def _say(line: str) -> None:

@@ -22,6 +22,7 @@ from gigabrain_schemas.sensors import ImuData
 GateMode = Literal["latched", "idle", "enabled", "stopping"]
 DriveType = Literal["differential", "omni", "mecanum", "ackermann", "quadruped", "arm"]
 SafeState = Literal["stop", "hold", "park", "limp"]
+Key = Annotated[str, Meta(pattern=r"^\w+(/\w+)*$", max_length=128)]
 
 
 class Joint(Record, frozen=True, kw_only=True):
@@ -89,11 +90,17 @@ class Lidar(Record, frozen=True, kw_only=True):
 
 
 class ControlGains(Record, frozen=True, kw_only=True):
-    """How control corrects the measured velocity."""
+    """How often control commands, and how it corrects the measured velocity."""
 
     linear_integral: NonNegative = 1.5  # [1/s]
     angular_integral: NonNegative = 1.5  # [1/s]
     max_correction: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.25  # of the commanded speed
+    rate_hz: Annotated[float, Meta(ge=12.5, le=50.0)] = 50.0  # of commands; whole ticks apart
+
+    @property
+    def period_ticks(self) -> int:
+        """Ticks from one command to the next."""
+        return round(50.0 / self.rate_hz)
 
 
 class Thresholds(Record, frozen=True, kw_only=True):
@@ -130,6 +137,7 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     thresholds: Thresholds = Thresholds()
     control: ControlGains = ControlGains()
     safe_state: SafeState = "stop"
+    control_topic: Key = "robot/cmd_vel"  # the key that its driver obeys
 
 
 class Body(Message, frozen=True, kw_only=True):

@@ -30,6 +30,10 @@ class Obstacle(Record, frozen=True, kw_only=True):
     radius: NonNegative  # [m]
     covariance: tuple[Finite, ...] = ()  # of (x, y, velocity_x, velocity_y), 16 values by row
 
+    def __post_init__(self) -> None:
+        if len(self.covariance) not in (0, 16):
+            raise ValueError(f"covariance needs 16 values or none, got {len(self.covariance)}")
+
 
 class WorldModel(Message, frozen=True, kw_only=True):
     """What is round the robot now, in the body's frame."""
@@ -53,6 +57,9 @@ class PoseInMap(Message, frozen=True, kw_only=True):
     localized: bool = True
 
 
+CELL_VALUES = bytes((*range(101), 255))  # as int8: 0 to 100, and -1
+
+
 class OccupancyGrid(Message, frozen=True, kw_only=True):
     """A map. The last value is kept for those who join late."""
 
@@ -66,6 +73,8 @@ class OccupancyGrid(Message, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if len(self.cells) != self.width * self.height:
             raise ValueError(f"{self.width} x {self.height} cells but {len(self.cells)} bytes")
+        if self.cells.translate(None, CELL_VALUES):
+            raise ValueError("a cell is 0 to 100, or -1")
 
 
 class TrajectoryPoint(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):

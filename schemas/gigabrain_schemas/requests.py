@@ -79,5 +79,5 @@ class Description(Message, frozen=True, kw_only=True):
     version: Name
     publishes: tuple[str, ...] = ()
     subscribes: tuple[str, ...] = ()
-    report: dict[str, float | int | str | None] = field(default_factory=dict)
+    report: dict[str, Finite | int | str | None] = field(default_factory=dict)
     # of a simulation: its truth, for reports only

@@ -57,6 +57,8 @@ class Image(Message, frozen=True, kw_only=True):
     data: bytes  # row by row, little-endian
 
     def __post_init__(self) -> None:
+        if not self.data:
+            raise ValueError("an image holds at least one pixel")
         if self.encoding == "jpeg":
             return
         expected = self.height * self.width * PIXEL_BYTES[self.encoding]

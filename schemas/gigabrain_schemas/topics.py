@@ -1,6 +1,6 @@
 """The one table of topics. Adding a topic means adding a line here, and nowhere else."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
 from gigabrain_schemas import body, brain, requests, safety, sensors
@@ -47,7 +47,9 @@ class Service(Generic[Q, R]):
     key: str
     request: type[Q]
     reply: type[R]
-    many: bool = False
+    priority: Priority = "interactive_high"
+    max_bytes: int = 64 * KB  # of the request and of each reply; larger ones are not even decoded
+    many: bool = False  # one key per process below this one
 
     def at(self, name: str = "") -> str:
         """The key of this service; at the process `name` where there are many."""
@@ -61,7 +63,7 @@ STATE = Topic(
     max_bytes=32 * KB,
 )  # fmt: skip
 BODY = Topic("robot/body", body.Body, 1, keep=True, max_bytes=16 * KB)
-IMAGE = Topic("robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True)
+IMAGE = Topic("robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True, depth=8)
 WORLD = Topic("robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB)
 POSE = Topic("robot/pose", brain.PoseInMap, 10)
 MAP = Topic("robot/map", brain.OccupancyGrid, 1, keep=True, max_bytes=1024 * KB)
@@ -82,12 +84,18 @@ HEALTH = Topic(
 )
 LOG = Topic("robot/log", safety.LogRecord, 10, priority="background", depth=256, max_bytes=16 * KB)
 
+
+def command_topic(of: body.BodyDescription) -> Topic[brain.CmdVel]:
+    """The topic that a body obeys: CMD_VEL, unless its file says otherwise."""
+    return CMD_VEL if of.control_topic == CMD_VEL.key else replace(CMD_VEL, key=of.control_topic)
+
+
 TOPICS: tuple[Topic[Any], ...] = (
     SCAN, IMU, STATE, BODY, IMAGE, WORLD, POSE, MAP, INTENT, TELEOP, CMD_VEL, JOINT_CMD, SAFETY,
     HEALTH, LOG,
 )  # fmt: skip
 
-ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply)
+ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time")
 RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply)
 ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply)
 GOAL = Service("robot/goal", requests.GoalRequest, requests.GoalReply)
@@ -95,3 +103,9 @@ MISSION = Service("robot/mission", requests.MissionRequest, requests.MissionRepl
 DESCRIBE = Service("robot/describe", requests.DescribeRequest, requests.Description, many=True)
 
 SERVICES: tuple[Service[Any, Any], ...] = (ESTOP, RELEASE, ENABLE, GOAL, MISSION, DESCRIBE)
+
+
+def messages() -> tuple[type[Message], ...]:
+    """Every message type that a topic or a service carries, once."""
+    asked = (side for service in SERVICES for side in (service.request, service.reply))
+    return tuple(dict.fromkeys((*(topic.type for topic in TOPICS), *asked)))

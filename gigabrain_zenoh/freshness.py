@@ -1,0 +1,89 @@
+"""How old a message is, by the robot's clock, and whether it still counts."""
+
+from typing import Generic, TypeVar
+
+from gigabrain_schemas.base import TICK_NS, Message
+from gigabrain_schemas.topics import SCAN, STATE, Topic
+from gigabrain_zenoh.clock import Clock
+
+M = TypeVar("M", bound=Message)
+
+LEAD_TICKS = 5  # how far behind the robot a process may be with reading its states
+CLOCK_KEYS = (STATE.key, SCAN.key)  # what the driver sends on these moves the robot's clock
+
+
+class RobotTime:
+    """The newest tick that this process has seen, and of which start of the driver."""
+
+    def __init__(self) -> None:
+        self.boot = 0
+        self.tick = 0
+
+    def see(self, message: Message) -> None:
+        """Take note of the tick on a message from the driver; a new start begins anew."""
+        if message.boot == self.boot:
+            self.tick = max(self.tick, message.tick)
+        elif message.boot:
+            self.boot, self.tick = message.boot, message.tick
+
+
+class Latest(Generic[M]):
+    """The newest message on a topic, while it is still worth believing."""
+
+    def __init__(self, topic: Topic[M], clock: Clock, time: RobotTime) -> None:
+        self._topic, self._clock, self._time = topic, clock, time
+        self._by_wall = topic.key in CLOCK_KEYS  # nothing else tells when the robot's clock stops
+        self.newest: M | None = None
+        self._arrived_ns = 0
+        self._arrived_tick = 0
+
+    def take(self, message: M) -> bool:
+        """Keep `message` unless it is older than what is held; says whether it was kept.
+
+        A tick that the robot has not reached yet does not keep others out.
+        """
+        held, time = self.newest, self._time
+        same_start = held and message.boot and message.boot == held.boot
+        if held and same_start and message.tick < min(held.tick, time.tick):
+            return False
+        self.newest = message
+        self._arrived_ns = self._clock.now_ns()
+        self._arrived_tick = self._arrival(message)
+        return True
+
+    def _arrival(self, message: M) -> int:
+        """The robot's tick when `message` came, as far as this process can tell."""
+        now = self._time.tick
+        if not message.boot:
+            return now
+        if message.boot != self._time.boot:
+            return message.tick  # a start of the driver that is still to be heard of: its own count
+        # whoever lags behind with the robot's states has the true tick only from the message
+        return max(now, min(message.tick, now + LEAD_TICKS))
+
+    @property
+    def current(self) -> M | None:
+        """The newest message, however old, unless it is from another start of the driver."""
+        message = self.newest
+        return message if message and message.boot in (0, self._time.boot) else None
+
+    def age_ns(self) -> int | None:
+        """Age of the newest message [ns]: by the robot's clock, or by arrival where that is more.
+
+        None when there is none, or when it belongs to another start of the driver.
+        """
+        message = self.current
+        if message is None:
+            return None
+        age = (self._time.tick - self._arrived_tick) * TICK_NS
+        if message.boot:
+            age = max(age, (self._time.tick - message.tick) * TICK_NS)
+        if self._by_wall or not message.boot:
+            age = max(age, self._clock.now_ns() - self._arrived_ns)
+        return max(age, 0)
+
+    def fresh(self, within_ns: int | None = None) -> M | None:
+        """The newest message, or None once it is older than its promised rate allows."""
+        age = self.age_ns()
+        limit = self._topic.stale_after_ns if within_ns is None else within_ns
+        return self.newest if age is not None and age <= limit else None

@@ -1,0 +1,89 @@
+import base64
+import math
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from gigabrain_schemas import arrays
+from gigabrain_schemas.body import Thresholds
+from gigabrain_schemas.brain import JointCommand, Obstacle, OccupancyGrid, TrajectoryPoint
+from gigabrain_schemas.examples import EXAMPLES
+from gigabrain_schemas.sensors import Image, LaserScan
+
+
+def grid(width: int, height: int, cells: bytes) -> OccupancyGrid:
+    return OccupancyGrid(
+        resolution=0.05, width=width, height=height, origin_x=0.0, origin_y=0.0, cells=cells
+    )
+
+
+def scan(ranges: bytes, **change: float) -> LaserScan:
+    geometry = {"angle_min": 0.0, "angle_increment": 0.1, "range_min": 0.1, "range_max": 3.5}
+    return LaserScan(**(geometry | change), ranges=ranges)  # type: ignore[arg-type]
+
+
+def image(encoding: Any, height: int, width: int, data: bytes) -> Image:
+    return Image(frame_id="camera", encoding=encoding, height=height, width=width, data=data)
+
+
+@pytest.mark.parametrize(
+    ("build", "complaint"),
+    [
+        (lambda: scan(b"12345"), "float32"),
+        (lambda: scan(b""), "float32"),
+        (lambda: scan(bytes(4), angle_increment=0.0), "angle_increment"),
+        (lambda: scan(bytes(4), range_max=0.1), "range_max"),
+        (lambda: grid(3, 2, bytes(5)), "3 x 2 cells but 5 bytes"),
+        (lambda: grid(2, 1, bytes((0, 101))), "0 to 100, or -1"),
+        (lambda: grid(2, 1, bytes((0, 254))), "0 to 100, or -1"),
+        (lambda: image("depth16", 2, 3, bytes(11)), "needs 12 bytes, got 11"),
+        (lambda: image("rgb8", 2, 3, bytes(6)), "needs 18 bytes, got 6"),
+        (lambda: image("jpeg", 2, 3, b""), "at least one pixel"),
+        (lambda: image("mono8", 0, 0, b""), "at least one pixel"),
+        (lambda: Obstacle(id=1, x=0.0, y=0.0, radius=0.1, covariance=(0.0,) * 9), "16 values"),
+        (lambda: JointCommand(name=("a", "b"), position=(0.0,)), "2 names"),
+        (lambda: JointCommand(name=("a",), position=(0.0,), velocity=(0.0,)), "1 names"),
+        (lambda: JointCommand(name=("a",)), "1 names"),
+        (lambda: Thresholds(battery_warn=4.0), "battery_stop must not be above battery_warn"),
+        (lambda: Thresholds(motor_warn=71.0), "motor_stop must not be below motor_warn"),
+    ],
+)
+def test_lengths_and_limits_have_to_agree(build: Callable[[], Any], complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        build()
+
+
+def test_a_scan_may_hold_inf_and_nan_and_is_read_without_a_copy() -> None:
+    message = EXAMPLES["LaserScan"]
+    assert isinstance(message, LaserScan)
+    view = arrays.ranges(message)
+    assert not view.flags.writeable
+    assert not view.flags.owndata
+    expected = [0.83, 1.25, 3.49, math.inf, math.inf, math.nan, 2.5, 0.9]
+    np.testing.assert_array_equal(view, np.array(expected, "<f4"))
+    assert arrays.ranges_bytes(view.astype(np.float64)) == message.ranges
+
+
+def test_a_map_and_a_picture_are_read_row_by_row() -> None:
+    cells = arrays.cells(grid(4, 2, bytes((0, 0, 100, 255, 0, 37, 100, 255))))
+    assert cells.tolist() == [[0, 0, 100, -1], [0, 37, 100, -1]]
+    depth = arrays.pixels(image("depth16", 1, 2, b"\x01\x00\x00\x01"))
+    assert depth.tolist() == [[1, 256]]
+    colours = arrays.pixels(image("rgb8", 1, 2, bytes(range(6))))
+    assert colours.tolist() == [[[0, 1, 2], [3, 4, 5]]]
+    with pytest.raises(ValueError, match="decoded first"):
+        arrays.pixels(image("jpeg", 1, 2, b"\xff\xd8"))
+
+
+def test_json_carries_arrays_in_base64() -> None:
+    plain = msgspec.json.decode(msgspec.json.encode(scan(bytes(4))))
+    assert base64.b64decode(plain["ranges"]) == b"\0\0\0\0"
+
+
+def test_a_trajectory_point_is_a_short_array_on_the_wire() -> None:
+    assert (
+        msgspec.json.encode(TrajectoryPoint(t=0.5, x=1.0, y=0.0, yaw=0.0)) == b"[0.5,1.0,0.0,0.0]"
+    )

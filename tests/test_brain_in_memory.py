@@ -1,0 +1,217 @@
+"""A whole robot, in memory and in fake time: it drives, and whatever falls silent stops it."""
+
+import itertools
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE
+from tests.brain_in_memory import Robot, ticks_until, travelled
+
+# after how many ticks the body brakes, and how far it may go until it stands still [m]
+SILENCES = [
+    ("perception", 13, 0.15),
+    ("decision", 6, 0.10),
+    ("control", 6, 0.10),
+    ("safety", 8, 0.10),
+]
+
+
+async def driving(robot: Robot) -> None:
+    """Wait until it is at full speed."""
+    await robot.go(100)
+    assert robot.mode == "enabled"
+    assert robot.body.speeds[-1] == pytest.approx(0.26)
+
+
+async def release(robot: Robot, generation: int) -> GateReply:
+    request = ReleaseRequest(estop_generation=generation, source="test")
+    return (await robot.operator.ask(RELEASE, request))[0]
+
+
+async def enable(robot: Robot) -> GateReply:
+    return (await robot.operator.ask(ENABLE, EnableRequest(source="control")))[0]
+
+
+async def press(robot: Robot) -> GateReply:
+    return (await robot.operator.ask(ESTOP, EstopRequest(source="test")))[0]
+
+
+def stops(speeds: list[float], ticks: int, metres: float) -> None:
+    """It brakes in time, on a ramp and for good, and gets no farther than it may."""
+    assert ticks_until(speeds, lambda v: v < 0.259) - 1 <= ticks
+    still = ticks_until(speeds, lambda v: v == 0.0)
+    assert still - 1 <= ticks + 13  # 0.26 m/s at 1 m/s²
+    assert set(speeds[still:]) <= {0.0}
+    assert travelled(speeds) <= metres
+    assert max(a - b for a, b in itertools.pairwise(speeds)) < 0.0201
+
+
+async def test_it_enables_itself_and_drives_straight_on(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        speeds = await robot.go(200)
+        assert robot.state
+        pose = robot.state.pose
+    assert pose.x == pytest.approx(travelled(speeds), abs=0.006)
+    assert pose.x > 0.5
+    assert (pose.y, pose.yaw) == (0.0, 0.0)
+    ups = [b - a for a, b in itertools.pairwise(speeds)]
+    assert max(ups) == pytest.approx(0.02)  # 1 m/s²
+    assert min(ups) >= 0.0
+    assert speeds[-1] == pytest.approx(0.26)
+
+
+@pytest.mark.parametrize(("name", "ticks", "metres"), SILENCES)
+async def test_a_process_that_dies_stops_the_body_and_it_goes_on_when_it_is_back(
+    name: str, ticks: int, metres: float, tmp_path: Path
+) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        await robot.kill(name)
+        stops(await robot.go(100), ticks, metres)
+        assert robot.mode == "idle"
+        robot.start(name)
+        await robot.go(100)
+        assert robot.body.speeds[-1] == pytest.approx(0.26)
+        assert robot.counters["stale_commands_executed"] == 0
+
+
+@pytest.mark.parametrize(("name", "ticks", "metres"), SILENCES)
+async def test_a_process_that_freezes_stops_the_body_and_nothing_stale_comes_of_it(
+    name: str, ticks: int, metres: float, tmp_path: Path
+) -> None:
+    async with Robot(tmp_path, resume="manual") as robot:
+        await robot.go(50)
+        await release(robot, 0)
+        await enable(robot)
+        await driving(robot)
+        robot.freeze(name)
+        stops(await robot.go(250), ticks, metres)
+        robot.thaw(name)
+        assert set(await robot.go(100)) == {0.0}  # all that was missed came at once
+        assert robot.mode == "idle"
+        assert robot.counters["stale_commands_executed"] == 0
+        assert (await enable(robot)).ok
+        await driving(robot)
+
+
+async def test_with_manual_resume_it_moves_only_when_released_and_enabled(tmp_path: Path) -> None:
+    async with Robot(tmp_path, resume="manual") as robot:
+        assert set(await robot.go(100)) == {0.0}
+        assert (robot.mode, robot.causes) == ("latched", ["boot"])
+        assert not (await enable(robot)).ok
+        assert (await release(robot, 0)).ok
+        assert set(await robot.go(100)) == {0.0}
+        assert robot.mode == "idle"
+        assert (await enable(robot)).ok
+        assert (await robot.go(3))[0] == 0.0
+        await driving(robot)
+
+
+async def test_an_estop_stops_in_the_same_tick_and_stays_latched(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        reply = await press(robot)
+        assert (reply.ok, reply.gate.mode, reply.gate.estop_generation) == (True, "latched", 1)
+        assert set(await robot.go(200)) == {0.0}
+        assert (robot.mode, robot.causes) == ("latched", ["estop"])
+        assert not (await enable(robot)).ok
+        assert not (await release(robot, 0)).ok  # of a stop that nobody has looked at
+        assert (await release(robot, 1)).ok
+        assert set(await robot.go(100)) == {0.0}  # nor does it go on by itself
+        assert (await enable(robot)).ok
+        await driving(robot)
+
+
+async def test_an_estop_survives_a_restart_of_the_driver(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        await press(robot)
+        await robot.kill("driver")
+        robot.start_driver()
+        assert set(await robot.go(200)) == {0.0}
+        assert (robot.mode, robot.causes) == ("latched", ["estop"])
+        assert (await release(robot, 1)).ok
+
+
+async def test_a_driver_that_starts_anew_finds_a_brain_that_begins_anew(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        assert robot.state
+        boot = robot.state.boot
+        await robot.kill("driver")
+        robot.start_driver()
+        await driving(robot)
+        assert robot.state.boot != boot
+        assert robot.counters["stale_commands_executed"] == 0
+
+
+async def test_commands_that_are_played_back_move_nothing(tmp_path: Path) -> None:
+    async with Robot(tmp_path, resume="manual") as robot:
+        await robot.go(50)
+        await release(robot, 0)
+        await enable(robot)
+        await driving(robot)
+        await press(robot)
+        await robot.go(30)
+        await release(robot, 1)
+        await robot.kill("control")
+        legal = [payload for key, payload in robot.network.sent if key == CMD_VEL.key]
+        assert len(legal) > 150
+        for payload in legal:
+            robot.network.deliver(CMD_VEL.key, payload)
+        assert set(await robot.go(50)) == {0.0}
+        assert (await enable(robot)).ok is False
+        assert robot.counters["refused_old"] > 100
+
+
+async def test_a_second_estop_counts_after_a_restart_too(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        await press(robot)
+        assert (await press(robot)).gate.estop_generation == 2
+        await robot.kill("driver")
+        robot.start_driver()
+        await robot.go(50)
+        assert not (await release(robot, 1)).ok  # of the stop before the last
+        assert (await release(robot, 2)).ok
+
+
+async def test_a_speed_that_is_not_a_number_stops_the_body_at_once(tmp_path: Path) -> None:
+    async with Robot(tmp_path, resume="manual") as robot:
+        await robot.go(50)
+        await release(robot, 0)
+        await enable(robot)
+        await driving(robot)
+        assert robot.state
+        wrong = CmdVel(linear_x=float("nan"), source="control", boot=robot.state.boot)
+        robot.network.deliver(CMD_VEL.key, msgspec.msgpack.encode(wrong))
+        assert await robot.go(1) == [0.0]
+        assert (robot.mode, robot.causes) == ("stopping", ["nan"])
+        assert set(await robot.go(50)) == {0.0}
+        assert robot.mode == "idle"
+
+
+async def test_garbage_on_every_key_leaves_the_drive_alone(tmp_path: Path) -> None:
+    garbage = (
+        b"",
+        b"\xc1",
+        b"\xff" * 100,
+        b"{}",
+        b"[]",
+        b"null",
+        b'{"linear_x": true}',
+        b"x" * 2**21,
+    )
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        keys = {key for key, _ in robot.network.sent}
+        assert len(keys) == 7
+        for payload in garbage:
+            for key in keys:
+                robot.network.deliver(key, payload)
+            assert await robot.go(5) == pytest.approx([0.26] * 5)
+        assert robot.mode == "enabled"

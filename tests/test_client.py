@@ -1,0 +1,179 @@
+"""`gigabrain_zenoh.connect()`: a script beside a robot that drives itself."""
+
+import itertools
+import math
+import re
+from collections.abc import AsyncIterator
+
+import pytest
+
+import gigabrain_zenoh
+from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.sensors import Imu, LaserScan
+from gigabrain_schemas.topics import SCAN
+from gigabrain_zenoh.client import Robot, connect
+from gigabrain_zenoh.errors import BodyLost, BusError, Refused, UnknownName, Unsupported
+from tests.onlooker import Onlooker, looking_on
+from tests.stack import Command, Home, free_port, robot_of, until
+
+
+@pytest.fixture(scope="module")
+def demo(shared_home: Home) -> Command:
+    return shared_home.start("demo", "--headless")
+
+
+@pytest.fixture
+async def robot(
+    shared_home: Home, demo: Command, monkeypatch: pytest.MonkeyPatch
+) -> AsyncIterator[Onlooker]:
+    """The robot of the demo, driving itself; scripts find it without being told where it is."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(shared_home.folder / "run"))
+    async with looking_on(await robot_of(shared_home, demo)) as onlooker:
+        await until(lambda: onlooker.state.gate.mode == "enabled", "driving")
+        yield onlooker
+
+
+async def square(script: Robot) -> None:
+    for _ in range(4):
+        await script.drive(linear_x=0.2, seconds=1.5)
+        await script.drive(angular_z=1.0, seconds=math.pi / 2)
+
+
+async def test_a_script_drives_a_square_and_the_brain_goes_on_afterwards(robot: Onlooker) -> None:
+    async with gigabrain_zenoh.connect(take=True, source="square") as script:
+        for _ in range(4):  # where a busy machine makes the gate stop half way, once more
+            await script.set_base_velocity(0.0)
+            await robot.still()
+            start = robot.state
+            await square(script)
+            if robot.state.gate.enables == start.gate.enables:
+                break
+        assert robot.state.gate.commander == "square"
+        assert robot.moved(start) < 0.05
+        assert abs(math.remainder(robot.state.pose.yaw - start.pose.yaw, math.tau)) < 0.15
+        x = [state.pose.x for state in robot.states if state.tick > start.tick]
+        assert max(x) - min(x) > 0.25
+    await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
+    await robot.straight(speed=0.15, room=0.0)
+
+
+async def test_a_script_keeps_the_body_while_it_thinks(robot: Onlooker) -> None:
+    async with connect(take=True, source="thinker") as script:
+        await script.drive(angular_z=0.5, seconds=0.4)
+        await robot.ticks(75)
+        assert robot.state.gate.commander == "thinker"
+        assert robot.state.velocity.angular_z < 0.05
+        await script.drive(angular_z=-0.5, seconds=0.4)
+    await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
+
+
+async def test_without_take_it_is_refused_and_told_who_drives(robot: Onlooker) -> None:
+    async with connect() as script:
+        with pytest.raises(Refused) as refused:
+            await script.set_base_velocity(0.1)
+    assert str(refused.value) == "turtlebot3_waffle: control drives; take it over with take=true"
+    assert robot.state.gate.commander == "control"
+
+
+async def test_a_script_that_was_taken_over_does_not_take_the_body_back(robot: Onlooker) -> None:
+    async with connect(take=True, source="script") as script, connect(source="person") as person:
+        await script.set_base_velocity(0.1)
+        await person.enable(take=True)
+        await person.set_base_velocity(0.05)
+        await until(lambda: robot.state.gate.commander == "person", "the person drives")
+        await robot.ticks(5)
+        with pytest.raises(Refused, match=r"person has the body; ask again with enable\(take=True"):
+            await script.set_base_velocity(0.1)
+        await script.enable(take=True)
+        await script.set_base_velocity(0.1)
+        await until(lambda: robot.state.gate.commander == "script", "the script drives again")
+    await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
+
+
+async def test_a_velocity_lasts_one_second_and_is_cut_to_what_the_body_can(
+    robot: Onlooker,
+) -> None:
+    async with connect(take=True) as script:
+        asked = await script.set_base_velocity(0.0, 0.5, -9.0)
+        assert (asked.linear_x, asked.linear_y, asked.angular_z) == (0.0, 0.0, -1.82)
+        await until(lambda: robot.state.velocity.angular_z < -1.6, "turning")
+        begin = next(s.tick for s in robot.states if s.velocity.angular_z < -1.0)
+        await robot.still()
+        end = max(s.tick for s in robot.states if s.velocity.angular_z < -1.0)
+        assert 35 <= end - begin <= 75
+    await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
+
+
+async def test_what_the_robot_says_can_be_listened_to(robot: Onlooker) -> None:
+    async with connect() as script:
+        scans = []
+        async for scan in script.topic("scan"):
+            scans.append(scan)
+            if len(scans) == 3:
+                break
+        assert [type(scan) for scan in scans] == [LaserScan] * 3
+        assert len(ranges(scans[0])) == 360
+        assert [b.tick - a.tick for a, b in itertools.pairwise(scans)] == [5, 5]
+        assert isinstance(await script.get_sensor_data("imu"), Imu)
+        assert isinstance(await anext(script.topic(SCAN)), LaserScan)
+        state = await script.read_state()
+        assert state.robot_type == "turtlebot3_waffle"
+        assert [joint.name for joint in await script.get_joint_states()] == [
+            joint.name for joint in state.joints
+        ]
+
+
+async def test_what_there_is_not_is_said_in_words(robot: Onlooker) -> None:
+    async with connect() as script:
+        with pytest.raises(UnknownName, match=r"no topic 'scna'; did you mean 'scan'\? known: "):
+            script.topic("scna")
+        with pytest.raises(BodyLost, match="nobody sends robot/map"):
+            await script.get_sensor_data("map")
+        with pytest.raises(Unsupported, match="no joint that can be positioned"):
+            await script.set_joint_position("arm", 1.0)
+
+
+async def test_several_robots_are_listed(
+    robot: Onlooker, shared_home: Home, demo: Command, home: Home
+) -> None:
+    second = shared_home.start("demo", "--headless", "--world", "house")
+    first_at, second_at = await robot_of(shared_home, demo), await robot_of(shared_home, second)
+    with pytest.raises(BusError) as error:
+        async with connect():
+            pass
+    text = str(error.value)
+    assert text.startswith("several robots run here; choose one with --connect: ")
+    assert f"{first_at.connect[0]} (turtlebot3_waffle in arena)" in text
+    assert f"{second_at.connect[0]} (turtlebot3_waffle in house)" in text
+    second.close()
+    async with connect(first_at.connect[0]) as script:
+        assert (await script.read_state()).boot == robot.state.boot
+
+
+async def test_no_robot_no_router_and_no_driver_are_told_apart(
+    tmp_path_factory: pytest.TempPathFactory, home: Home, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(home.folder / "run"))
+    with pytest.raises(BusError, match=r"^no robot runs here; start one with `gigabrain demo`"):
+        async with connect():
+            pass
+    nowhere = f"tcp/127.0.0.1:{free_port()}"
+    with pytest.raises(BusError, match=re.escape(f"no router answers at {nowhere}")):
+        async with connect(nowhere):
+            pass
+    home.start("router", "--listen", nowhere)
+    with pytest.raises(BodyLost, match="is the driver running"):
+        async with connect(nowhere):
+            pass
+    with pytest.raises(BodyLost, match="NOT CONFIRMED: no driver answers robot/estop"):
+        async with connect(nowhere, wait=False) as script:
+            await script.estop()
+
+
+async def test_the_release_goes_by_what_is_known_of_the_e_stop(robot: Onlooker) -> None:
+    async with connect() as script:
+        assert isinstance(script, Robot)
+        await script.estop("test")
+        await robot.still(ticks=30)
+        assert (await script.release()).text == "released; enable it to move"
+        await robot.hand_to_brain()

@@ -1,0 +1,174 @@
+"""`gigabrain demo`: what a run reports, and when it counts as failed."""
+
+import json
+import os
+import re
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gigabrain_zenoh.report import Observed, make_report, summary
+from tests.onlooker import looking_on
+from tests.stack import ROOT, Command, Home, robot_of, until
+
+BODIES = ROOT / "drivers" / "gigabrain_drivers" / "bodies"
+FIELDS = {
+    "body", "world", "seed", "sim_seconds", "distance_m", "contacts", "min_clearance_m", "turns",
+    "restarts", "rejected_messages", "stale_commands_executed", "scan_to_cmd_ms",
+}  # fmt: skip
+
+
+async def run(home: Home, *options: str) -> tuple[Command, dict[str, Any]]:
+    """A demo with `options` to its end, and its report."""
+    path = home.folder / f"report-{len(list(home.folder.iterdir()))}.json"
+    demo = await home.run("demo", "--headless", "--report", str(path), *options)
+    assert path.exists(), demo.err
+    return demo, json.loads(path.read_bytes())
+
+
+async def undisturbed(home: Home, *options: str) -> dict[str, Any]:
+    """The report of a run in which no process was held up for 150 ms by whatever else runs here."""
+    for _ in range(3):
+        demo, report = await run(home, *options)
+        assert await demo.ended() == 0
+        if report["lockstep_timeouts"] == 0:
+            return report
+    pytest.skip("this machine is too busy to run undisturbed")
+
+
+@pytest.mark.parametrize(
+    ("world", "body"),
+    [
+        ("arena", "turtlebot3_waffle"),
+        ("house", "turtlebot3_burger"),
+        ("random:3", "turtlebot3_waffle"),
+    ],
+)
+async def test_a_robot_roams_without_touching_anything(home: Home, world: str, body: str) -> None:
+    options = ("--world", world, "--body", body, "--seconds", "20", "--speed", "10")
+    demo, report = await run(home, *options)
+    assert await demo.ended() == 0
+    assert report.keys() >= FIELDS
+    assert (report["body"], report["world"], report["seed"]) == (body, world, 0)
+    assert report["sim_seconds"] == 20.0
+    assert report["distance_m"] > 0.5
+    assert report["contacts"] == 0
+    assert 0.0 < report["min_clearance_m"] < 3.0
+    assert (report["restarts"], report["rejected_messages"]) == (0, 0)
+    assert report["stale_commands_executed"] == 0
+    assert 0.0 < report["scan_to_cmd_ms"]["p50"] <= report["scan_to_cmd_ms"]["p99"]
+    assert re.match(r"ok: \d+\.\d\d m in 20 s, \d+ turns?, 0 contacts, closest ", demo.out)
+    assert home.processes() == []
+
+
+async def test_the_same_seed_gives_the_same_decisions_at_any_speed(home: Home) -> None:
+    options = ("--world", "warehouse", "--seconds", "20", "--seed", "4", "--speed")
+    slow, fast = await undisturbed(home, *options, "2"), await undisturbed(home, *options, "5")
+    assert len(slow["decisions"]) >= 3
+    assert slow["decisions"] == fast["decisions"]
+    assert slow["distance_m"] == fast["distance_m"]
+    assert (slow["contacts"], fast["contacts"]) == (0, 0)
+
+
+async def test_a_robot_that_touches_something_fails_the_run(home: Home) -> None:
+    """Its file says that its lidar looks backwards, so it sees no wall ahead."""
+    waffle = BODIES / "turtlebot3_waffle"
+    text = (waffle / "robot.yaml").read_text()
+    text = text.replace("x: -0.064}", "x: -0.064, yaw: 3.14159}")
+    text = text.replace("driver: mujoco,", f"driver: mujoco, model: {waffle / 'model.xml'},")
+    blind = home.folder / "blind.yaml"
+    blind.write_text(text)
+    options = ("--world", "house", "--seconds", "12", "--speed", "10")
+    demo, report = await run(home, "--body", str(blind), *options)
+    assert await demo.ended() == 1
+    assert report["contacts"] > 0
+    assert report["min_clearance_m"] == 0.0
+    assert re.match(r"\d+ contacts?: ", demo.out)
+
+
+async def test_a_robot_that_does_not_move_fails_the_run(home: Home) -> None:
+    demo, report = await run(home, "--resume", "manual", "--seconds", "3", "--speed", "10")
+    assert await demo.ended() == 1
+    assert demo.out.startswith("no motion: 0.00 m in 3 s, 0 turns, 0 contacts")
+    assert report["verdict"] == "no motion"
+
+
+async def test_a_process_that_dies_fails_the_run_but_does_not_end_it(home: Home) -> None:
+    report = home.folder / "report.json"
+    options = ("--seconds", "12", "--speed", "4", "--headless", "--report", str(report))
+    demo = home.start("demo", *options)
+    async with looking_on(await robot_of(home, demo)) as robot:
+        await until(lambda: robot.state.gate.mode == "enabled", "driving")
+        os.kill(await robot.pid("perception"), signal.SIGKILL)
+    assert await demo.ended() == 1
+    told = json.loads(report.read_bytes())
+    assert (told["verdict"], told["restarts"]) == ("1 process died", 1)
+    assert (told["sim_seconds"], told["contacts"]) == (12.0, 0)
+
+
+async def test_a_body_without_a_truth_of_its_own_is_judged_by_its_odometry(home: Home) -> None:
+    demo, report = await run(home, "--body", "mock", "--seconds", "4", "--speed", "4")
+    assert await demo.ended() == 0
+    assert (report["contacts"], report["min_clearance_m"]) == (None, None)
+    assert report["distance_m"] > 0.2
+    assert "contact" not in demo.out
+
+
+@pytest.mark.parametrize("frozen", ["none", "router", "driver", "decision"])
+async def test_ctrl_c_ends_all_of_it_also_when_one_hangs(home: Home, frozen: str) -> None:
+    demo = home.start("demo", "--headless")
+    async with looking_on(await robot_of(home, demo)) as robot:
+        await until(lambda: robot.state.gate.mode == "enabled", "driving")
+        assert len(home.processes()) == 6
+        if frozen != "none":
+            os.kill(await robot.pid(frozen), signal.SIGSTOP)
+        demo.send(signal.SIGINT)
+        assert await demo.ended() == 0
+    assert home.processes() == []
+    assert list((home.folder / "run" / "gigabrain").iterdir()) == []
+
+
+async def test_two_demos_side_by_side_do_not_meet(home: Home) -> None:
+    demos = [home.start("demo", "--headless", "--seed", seed) for seed in ("1", "2")]
+    boots = []
+    for demo in demos:
+        async with looking_on(await robot_of(home, demo)) as robot:
+            await robot.ticks(25)
+            boots.append({state.boot for state in robot.states})
+    assert [len(boots[0]), len(boots[1])] == [1, 1]
+    assert boots[0] != boots[1]
+    for demo in demos:
+        demo.send(signal.SIGINT)
+    assert [await demo.ended() for demo in demos] == [0, 0]
+
+
+def test_a_run_is_judged_by_contacts_motion_and_deaths() -> None:
+    told = {
+        "body": "waffle", "distance_m": 0.049, "contacts": 2, "min_clearance_m": 0.0,
+        "sim_seconds": 9.0, "stale_commands_executed": 0, "scan_to_cmd_p50_ms": 1.25,
+        "scan_to_cmd_p99_ms": None, "lockstep_timeouts": 0,
+    }  # fmt: skip
+    seen = Observed(
+        body="waffle", world="arena", seed=1, speed=1.0, seconds=9.02, distance_m=0.06,
+        decisions=((1.0, "turning left: obstacle"), (2.0, "forward 0.20 m/s")), deaths=1,
+        restarts=1, rejected=3,
+    )  # fmt: skip
+    report = make_report(told, seen)
+    assert not report.ok
+    assert summary(report) == (
+        "2 contacts, no motion, 1 process died: 0.05 m in 9 s, 1 turn, 2 contacts, "
+        "closest 0.00 m, scan to command 1.2 ms (p99 0.0)"
+    )
+    assert (report.rejected_messages, report.turns, report.sim_seconds) == (3, 1, 9.0)
+
+
+async def test_a_report_that_cannot_be_written_is_refused_before_anything_starts(
+    home: Home,
+) -> None:
+    nowhere = Path("nowhere") / "report.json"
+    demo = await home.run("demo", "--headless", "--seconds", "1", "--report", str(nowhere))
+    assert await demo.ended() == 2
+    assert demo.err == "gigabrain: cannot write the report nowhere/report.json: no such folder\n"
+    assert not (home.folder / "state").exists()

@@ -1,0 +1,72 @@
+"""Whether a script still has the body, from state to state."""
+
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import GateMode, GateStatus, RobotState
+from gigabrain_zenoh.hold import Hold
+
+
+def state(mode: GateMode, commander: str = "", enables: int = 1, boot: int = 7) -> RobotState:
+    return RobotState(
+        boot=boot,
+        robot_type="waffle",
+        pose=Pose(x=0.0, y=0.0, yaw=0.0),
+        velocity=Velocity(),
+        gate=GateStatus(mode=mode, commander=commander, enables=enables),
+    )
+
+
+def granted() -> Hold:
+    hold = Hold("script")
+    hold.granted(7, GateStatus(mode="enabled", commander="script", enables=4))
+    return hold
+
+
+def after(*states: RobotState) -> tuple[bool, bool]:
+    """(has, lost) of a script that was granted the body and then sees `states`."""
+    hold = granted()
+    for each in states:
+        hold.see(each)
+    return hold.has(states[-1]), hold.lost
+
+
+def test_before_it_asks_it_has_nothing_and_loses_nothing() -> None:
+    hold = Hold("script")
+    hold.see(state("enabled", "control"))
+    hold.see(state("latched"))
+    assert (hold.has(state("enabled", "control")), hold.lost) == (False, False)
+
+
+def test_states_from_before_the_answer_say_nothing() -> None:
+    assert after(state("enabled", "control", 3)) == (True, False)
+    assert after(state("latched", "", 3)) == (True, False)
+
+
+def test_it_has_the_body_while_the_gate_names_it() -> None:
+    assert after(state("enabled", "script", 4)) == (True, False)
+
+
+def test_a_stop_that_passes_does_not_lose_it_even_when_the_brain_has_gone_on() -> None:
+    stopped = (state("stopping", "script", 4), state("idle", "", 4))
+    assert after(*stopped) == (False, False)
+    assert after(*stopped, state("enabled", "control", 5)) == (False, False)
+
+
+def test_somebody_who_takes_it_over_has_it_for_good() -> None:
+    taken = (state("enabled", "script", 4), state("enabled", "person", 5))
+    assert after(*taken) == (False, True)
+    assert after(*taken, state("idle", "", 5), state("enabled", "control", 6)) == (False, True)
+
+
+def test_a_latch_loses_it_until_it_asks_anew() -> None:
+    hold = granted()
+    for each in (state("latched", "", 4), state("idle", "", 4)):
+        hold.see(each)
+    assert hold.lost
+    hold.granted(7, GateStatus(mode="enabled", commander="script", enables=5))
+    hold.see(state("idle", "", 4))
+    assert (hold.lost, hold.has(state("idle", "", 4))) == (False, True)
+    assert not hold.has(state("enabled", "control", 6))
+
+
+def test_another_start_of_the_driver_gives_it_nothing() -> None:
+    assert after(state("idle", "", 0, boot=8)) == (False, False)

@@ -1,0 +1,148 @@
+"""How fast a body may go, and how fast it may change that."""
+
+import pytest
+
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.safety import SpeedCaps
+from gigabrain_zenoh.limits import ZERO, Limits, clamp, limits_of, ramp
+
+LIMITS = Limits(
+    linear_speed=0.5,
+    lateral_speed=0.25,
+    angular_speed=2.0,
+    linear_acceleration=1.0,
+    linear_deceleration=2.0,
+    angular_acceleration=4.0,
+)
+
+
+def test_the_limits_are_those_of_the_bodys_file() -> None:
+    body = BodyDescription(
+        robot_type="test",
+        drive_type="omni",
+        footprint=((0.1, 0.1), (-0.1, 0.1), (-0.1, -0.1)),
+        max_linear_speed=0.26,
+        max_lateral_speed=0.2,
+        max_angular_speed=1.8,
+        max_linear_acceleration=0.9,
+        max_linear_deceleration=1.1,
+        max_angular_acceleration=3.3,
+    )
+    assert limits_of(body) == Limits(
+        linear_speed=0.26,
+        lateral_speed=0.2,
+        angular_speed=1.8,
+        linear_acceleration=0.9,
+        linear_deceleration=1.1,
+        angular_acceleration=3.3,
+    )
+
+
+def test_what_is_within_the_limits_passes_unchanged() -> None:
+    for sign in (1, -1):
+        velocity = Velocity(linear_x=0.5 * sign, linear_y=0.25 * sign, angular_z=2.0 * sign)
+        assert clamp(velocity, LIMITS) == velocity
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_is_beyond_them_is_cut_axis_by_axis(sign: int) -> None:
+    asked = Velocity(linear_x=0.51 * sign, linear_y=0.26 * sign, angular_z=2.1 * sign)
+    cut = Velocity(linear_x=0.5 * sign, linear_y=0.25 * sign, angular_z=2.0 * sign)
+    assert clamp(asked, LIMITS) == cut
+    assert clamp(Velocity(linear_x=9.0 * sign, angular_z=1.0), LIMITS) == Velocity(
+        linear_x=0.5 * sign, angular_z=1.0
+    )
+
+
+@pytest.mark.parametrize(
+    ("caps", "most", "least"),
+    [
+        (SpeedCaps(forward=0.1), (0.1, 0.25, 2.0), (-0.5, -0.25, -2.0)),
+        (SpeedCaps(backward=0.1), (0.5, 0.25, 2.0), (-0.1, -0.25, -2.0)),
+        (SpeedCaps(left=0.1), (0.5, 0.1, 2.0), (-0.5, -0.25, -2.0)),
+        (SpeedCaps(right=0.1), (0.5, 0.25, 2.0), (-0.5, -0.1, -2.0)),
+        (SpeedCaps(rotation=0.1), (0.5, 0.25, 0.1), (-0.5, -0.25, -0.1)),
+        (SpeedCaps(forward=0.0, rotation=0.0), (0.0, 0.25, 0.0), (-0.5, -0.25, 0.0)),
+    ],
+)
+def test_a_cap_holds_in_its_own_direction(
+    caps: SpeedCaps, most: tuple[float, float, float], least: tuple[float, float, float]
+) -> None:
+    fast = Velocity(linear_x=9.0, linear_y=9.0, angular_z=9.0)
+    back = Velocity(linear_x=-9.0, linear_y=-9.0, angular_z=-9.0)
+    assert clamp(fast, LIMITS, caps) == Velocity(
+        linear_x=most[0], linear_y=most[1], angular_z=most[2]
+    )
+    assert clamp(back, LIMITS, caps) == Velocity(
+        linear_x=least[0], linear_y=least[1], angular_z=least[2]
+    )
+
+
+def test_a_cap_above_the_bodys_own_limit_changes_nothing() -> None:
+    caps = SpeedCaps(forward=9.0, backward=9.0, left=9.0, right=9.0, rotation=9.0)
+    fast = Velocity(linear_x=9.0, linear_y=-9.0, angular_z=9.0)
+    back = Velocity(linear_x=-9.0, linear_y=9.0, angular_z=-9.0)
+    assert clamp(fast, LIMITS, caps) == Velocity(linear_x=0.5, linear_y=-0.25, angular_z=2.0)
+    assert clamp(back, LIMITS, caps) == Velocity(linear_x=-0.5, linear_y=0.25, angular_z=-2.0)
+
+
+@pytest.mark.parametrize(
+    ("current", "target", "after"),
+    [
+        (0.0, 0.5, 0.125),  # gaining speed: 1 m/s2 for 1/8 s
+        (0.0, -0.5, -0.125),
+        (0.25, 0.5, 0.375),
+        (-0.25, -0.5, -0.375),
+        (0.5, 0.0, 0.25),  # losing it: 2 m/s2
+        (-0.5, 0.0, -0.25),
+        (0.5, 0.375, 0.375),
+        (-0.5, -0.375, -0.375),
+        (0.0, 0.0625, 0.0625),  # no further than the target
+        (0.375, 0.375, 0.375),
+        (-0.375, -0.375, -0.375),
+        (0.0, 0.0, 0.0),
+        (0.5, -0.5, 0.25),  # turning round: it brakes first
+        (0.125, -0.5, 0.0),
+        (-0.125, 0.5, 0.0),
+        (0.25, -0.0625, 0.0),
+        (-0.25, 0.0625, 0.0),
+        (2.0, -2.0, 1.75),
+        (-2.0, 2.0, -1.75),
+    ],
+)
+def test_a_step_along_each_linear_axis(current: float, target: float, after: float) -> None:
+    assert ramp(Velocity(linear_x=current), Velocity(linear_x=target), LIMITS, 0.125) == Velocity(
+        linear_x=after
+    )
+    assert ramp(Velocity(linear_y=current), Velocity(linear_y=target), LIMITS, 0.125) == Velocity(
+        linear_y=after
+    )
+
+
+@pytest.mark.parametrize(
+    ("current", "target", "after"),
+    [
+        (0.0, 2.0, 0.5),  # 4 rad/s2 for 1/8 s, both ways
+        (0.0, -2.0, -0.5),
+        (2.0, 0.0, 1.5),
+        (-2.0, 0.0, -1.5),
+        (0.25, -2.0, 0.0),
+        (-0.25, 2.0, 0.0),
+        (1.0, 1.25, 1.25),
+    ],
+)
+def test_a_step_of_turning(current: float, target: float, after: float) -> None:
+    assert ramp(Velocity(angular_z=current), Velocity(angular_z=target), LIMITS, 0.125) == Velocity(
+        angular_z=after
+    )
+
+
+def test_a_ramp_reaches_its_target_exactly() -> None:
+    velocity, target = ZERO, Velocity(linear_x=0.3, linear_y=-0.1, angular_z=1.7)
+    for _ in range(40):
+        velocity = ramp(velocity, target, LIMITS, 0.02)
+    assert velocity == target
+    for _ in range(40):
+        velocity = ramp(velocity, ZERO, LIMITS, 0.02)
+    assert velocity == ZERO

@@ -1,0 +1,108 @@
+"""The page that `gigabrain demo` shows in a terminal, and Ctrl-C typed there."""
+
+import fcntl
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator
+
+import pytest
+from rich.cells import cell_len
+
+from tests.stack import GIGABRAIN, Home, until
+
+# becomes the leader of the terminal's session, as a shell would, and then the command
+AT_TERMINAL = "import os, sys; os.login_tty(0); os.execv(sys.argv[1], sys.argv[1:])"
+COLUMNS, ROWS = 80, 24
+HOME = "\x1b[H"
+CONTROL = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]")
+
+
+class Terminal:
+    """A terminal of 80 x 24 in which a `gigabrain` command runs."""
+
+    def __init__(self, home: Home, *arguments: str) -> None:
+        self._screen, tty = pty.openpty()
+        fcntl.ioctl(tty, termios.TIOCSWINSZ, struct.pack("HHHH", ROWS, COLUMNS, 0, 0))
+        os.set_blocking(self._screen, False)
+        environment = {
+            k: v for k, v in home.environment.items() if k not in ("COLUMNS", "NO_COLOR")
+        }
+        self._process = subprocess.Popen(
+            (sys.executable, "-c", AT_TERMINAL, *GIGABRAIN, *arguments),
+            stdin=tty, stdout=tty, stderr=tty,
+            env=environment | {"TERM": "xterm-256color"},
+        )  # fmt: skip
+        os.close(tty)
+        self.shown = ""
+
+    @property
+    def running(self) -> bool:
+        """Whether the command still runs; reads what it has shown meanwhile."""
+        try:
+            while data := os.read(self._screen, 65536):
+                self.shown += data.decode()
+        except BlockingIOError:
+            pass
+        except OSError:  # how Linux tells that nobody holds the terminal any more
+            return False
+        return self._process.poll() is None
+
+    def shows(self, text: str) -> bool:
+        """Whether the newest page says `text`."""
+        return self.running and any(text in line for line in self.page())
+
+    def page(self) -> list[str]:
+        """The lines of the newest whole page."""
+        pages = self.shown.split(HOME)
+        return CONTROL.sub("", pages[-2] if len(pages) > 2 else "").splitlines()
+
+    def type(self, keys: str) -> None:
+        """Press keys."""
+        os.write(self._screen, keys.encode())
+
+    async def ended(self) -> int:
+        """Wait for the command's end; its exit code."""
+        await until(lambda: not self.running, "the end of the command")
+        return self._process.wait(5.0)
+
+    def close(self) -> None:
+        """End it."""
+        self._process.kill()
+        self._process.wait(5.0)
+        os.close(self._screen)
+
+
+@pytest.fixture
+def terminal(home: Home) -> Iterator[Terminal]:
+    place = Terminal(home, "demo", "--world", "house", "--seconds", "600")
+    yield place
+    place.close()
+
+
+async def test_the_page_shows_the_whole_robot_and_ctrl_c_ends_it(
+    home: Home, terminal: Terminal
+) -> None:
+    await until(lambda: terminal.shows("enabled") and terminal.shows(" ms (p99 "), "driving")
+    page = terminal.page()
+    assert len(page) <= ROWS
+    assert {cell_len(line) for line in page if line.strip()} == {COLUMNS}
+    text = "\n".join(page)
+    assert "turtlebot3_waffle · house · seed 0" in page[0]
+    assert re.search(r"\d\.\d\d m in \d+ of 600 s", text)
+    assert re.search(r"100 %  1\d\.\d V", text)
+    for name in ("router", "driver", "perception", "decision", "control", "safety"):
+        assert re.search(rf"│  {name} +ready +\d+ +\d+\.\d % +\d+ MB  \S", text), text
+    assert re.search(r"decision .* (forward|turning right) · \d+%", text)
+    assert re.search(r"control .* [+-]\d\.\d\d m/s  [+-]\d\.\d\d rad/s", text)
+    terminal.type("\x03")
+    assert await terminal.ended() == 0
+    assert home.processes() == []
+    last = CONTROL.sub("", terminal.shown.rpartition("\x1b[?1049l")[2])
+    assert "Ctrl-C ends it" in last  # the last page stays, with the result below
+    assert re.search(r"\d\.\d\d m in \d+ s, \d+ turns?, 0 contacts, closest", last)
+    assert "Traceback" not in terminal.shown

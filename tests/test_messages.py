@@ -1,0 +1,188 @@
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gigabrain_schemas import golden
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.brain import (
+    CmdVel,
+)
+from gigabrain_schemas.examples import EXAMPLES
+from gigabrain_schemas.export import export
+from gigabrain_schemas.topics import SERVICES, TOPICS, messages
+from tests.wire_rig import as_map, codec, dotted, leaves, refuses
+
+HEADER = {"stamp_ns", "seq", "boot", "tick", "basis"}
+
+# what a client may leave out, beside the header, and still be understood
+REQUIRED: dict[str, set[str]] = {
+    "LaserScan": {"angle_min", "angle_increment", "range_min", "range_max", "ranges"},
+    "Imu": {"orientation", "angular_velocity", "linear_acceleration"},
+    "Image": {"frame_id", "encoding", "height", "width", "data"},
+    "RobotState": {"robot_type", "pose", "velocity"},
+    "Body": {"description", "link"},
+    "WorldModel": {"scan_ok", "obstacle_ahead"},
+    "PoseInMap": {"x", "y", "yaw", "covariance"},
+    "OccupancyGrid": {"resolution", "width", "height", "origin_x", "origin_y", "cells"},
+    "Intent": {"behaviour", "reason"},
+    "Twist": {"linear_x"},
+    "CmdVel": {"linear_x"},
+    "JointCommand": {"name"},
+    "SafetyState": {"verdict"},
+    "Health": {
+        "process", "pid", "host", "uptime_s", "cpu", "rss_bytes", "received_hz", "sent_hz",
+        "rejected", "latency_ms", "counters",
+    },
+    "LogRecord": {"process", "level", "event", "text"},
+    "EstopRequest": set(),
+    "ReleaseRequest": {"estop_generation"},
+    "EnableRequest": {"source"},
+    "GateReply": {"ok", "text", "robot_type", "gate"},
+    "GoalRequest": {"x", "y"},
+    "GoalReply": {"ok", "text"},
+    "MissionRequest": {"mission"},
+    "MissionReply": {"ok", "text"},
+    "DescribeRequest": set(),
+    "Description": {"process", "pid", "host", "version"},
+}  # fmt: skip
+
+by_name = pytest.mark.parametrize("name", sorted(EXAMPLES))
+
+
+def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
+    assert {topic.at("*"): (topic.type.__name__, topic.hz) for topic in TOPICS} == {
+        "robot/scan": ("LaserScan", 10),
+        "robot/imu": ("Imu", 100),
+        "robot/state": ("RobotState", 50),
+        "robot/body": ("Body", 1),
+        "robot/image/*": ("Image", 10),
+        "robot/world": ("WorldModel", 10),
+        "robot/pose": ("PoseInMap", 10),
+        "robot/map": ("OccupancyGrid", 1),
+        "robot/intent": ("Intent", 50),
+        "robot/teleop": ("Twist", 20),
+        "robot/cmd_vel": ("CmdVel", 50),
+        "robot/joint_cmd": ("JointCommand", 50),
+        "robot/safety": ("SafetyState", 20),
+        "robot/health/*": ("Health", 1),
+        "robot/log": ("LogRecord", 10),
+    }
+    assert [service.at("*") for service in SERVICES] == [
+        "robot/estop", "robot/release", "robot/enable", "robot/goal", "robot/mission",
+        "robot/describe/*",
+    ]  # fmt: skip
+
+
+def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
+    assert {topic.key: topic.stale_after_ns for topic in TOPICS} == {
+        "robot/scan": 250_000_000,
+        "robot/imu": 50_000_000,
+        "robot/state": 250_000_000,
+        "robot/body": 5_000_000_000,
+        "robot/image": 500_000_000,
+        "robot/world": 250_000_000,
+        "robot/pose": 500_000_000,
+        "robot/map": 5_000_000_000,
+        "robot/intent": 100_000_000,
+        "robot/teleop": 250_000_000,
+        "robot/cmd_vel": 100_000_000,
+        "robot/joint_cmd": 100_000_000,
+        "robot/safety": 150_000_000,
+        "robot/health": 5_000_000_000,
+        "robot/log": 500_000_000,
+    }
+
+
+def test_no_stream_blocks_its_sender_and_only_what_moves_or_stops_the_body_goes_first() -> None:
+    assert {topic.congestion for topic in TOPICS} == {"drop"}
+    assert [topic.key for topic in TOPICS if topic.priority == "real_time"] == [
+        "robot/cmd_vel", "robot/joint_cmd", "robot/safety",
+    ]  # fmt: skip
+    assert [service.key for service in SERVICES if service.priority == "real_time"] == [
+        "robot/estop"
+    ]
+
+
+def test_every_message_has_an_example_in_which_every_field_is_used() -> None:
+    assert {message.__name__ for message in messages()} == set(EXAMPLES) == set(REQUIRED)
+    unused = {
+        dotted(name, path)
+        for name in EXAMPLES
+        for path, value in leaves(as_map(name))
+        if value is None
+    }
+    assert unused == {"WorldModel.sectors.3", "Description.report.min_clearance_m"}
+
+
+@pytest.mark.parametrize("message", messages())
+def test_every_message_is_frozen_and_documented_and_carries_the_header(
+    message: type[Message],
+) -> None:
+    assert message.__struct_config__.frozen
+    assert message.__doc__
+    assert message.__doc__.strip().endswith(".")
+    assert set(message.__struct_fields__) >= HEADER
+
+
+def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
+    stored = {path.name: path.read_bytes() for path in golden.FOLDER.iterdir()}
+    assert stored == golden.files()
+    assert len(stored) == 50
+
+
+@by_name
+def test_golden_files_decode_to_the_example(name: str) -> None:
+    for kind in ("msgpack", "json"):
+        payload = (golden.FOLDER / f"{name}.{kind}").read_bytes()
+        decoded = codec(name).decode(payload)
+        # compared encoded: a scan may hold nan, which does not equal itself
+        assert msgspec.msgpack.encode(decoded) == msgspec.msgpack.encode(EXAMPLES[name])
+
+
+def test_writing_the_golden_files_removes_those_of_messages_that_are_gone(tmp_path: Path) -> None:
+    (tmp_path / "Gone.json").write_text("{}")
+    golden.write(tmp_path)
+    assert not (tmp_path / "Gone.json").exists()
+    assert (tmp_path / "CmdVel.msgpack").read_bytes() == golden.files()["CmdVel.msgpack"]
+
+
+def test_the_wire_format_is_a_map_of_named_fields() -> None:
+    assert msgspec.msgpack.encode(CmdVel(linear_x=0.5, seq=3)) == (
+        b"\x89\xa8stamp_ns\x00\xa3seq\x03\xa4boot\x00\xa4tick\x00\xa5basis\x00"
+        b"\xa8linear_x\xcb\x3f\xe0\x00\x00\x00\x00\x00\x00\xa8linear_y\xcb"
+        b"\x00\x00\x00\x00\x00\x00\x00\x00\xa9angular_z\xcb\x00\x00\x00\x00\x00\x00\x00\x00"
+        b"\xa6source\xa0"
+    )
+
+
+def test_the_export_is_a_schema_per_message_and_two_tables(tmp_path: Path) -> None:
+    written = export(tmp_path / "new")
+    assert {path.stem for path in written} == {*EXAMPLES, "topics", "services"}
+    schema = msgspec.json.decode((tmp_path / "new" / "CmdVel.json").read_bytes())
+    assert schema["$defs"]["CmdVel"]["required"] == ["linear_x"]
+    assert schema["$defs"]["CmdVel"]["additionalProperties"] is False
+    topics = msgspec.json.decode((tmp_path / "new" / "topics.json").read_bytes())
+    assert next(row for row in topics if row["key"] == "robot/cmd_vel") == {
+        "key": "robot/cmd_vel", "message": "CmdVel", "rate_hz": 50, "stale_after_ms": 100,
+        "priority": "real_time", "congestion": "drop", "express": True, "keep": False,
+        "depth": 16, "max_bytes": 1024,
+    }  # fmt: skip
+    services = msgspec.json.decode((tmp_path / "new" / "services.json").read_bytes())
+    assert services[0] == {
+        "key": "robot/estop", "request": "EstopRequest", "reply": "GateReply",
+        "priority": "real_time", "max_bytes": 65536,
+    }  # fmt: skip
+
+
+@by_name
+def test_a_person_may_leave_out_what_has_a_default_and_nothing_else(name: str) -> None:
+    whole = as_map(name)
+    for key in whole:
+        rest = {k: v for k, v in whole.items() if k != key}
+        expected = key in REQUIRED[name] or (name, key) == ("JointCommand", "position")
+        assert refuses(name, msgspec.msgpack.encode(rest)) is expected, key
+        assert refuses(name, msgspec.json.encode(rest)) is expected, key
+    least = {key: whole[key] for key in REQUIRED[name]}
+    if name != "JointCommand":  # which needs a position or a velocity as well
+        assert not refuses(name, msgspec.msgpack.encode(least))

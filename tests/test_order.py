@@ -1,0 +1,134 @@
+"""In lock-step a drive is the same whichever message of a tick is quicker."""
+
+import asyncio
+import functools
+import logging
+import random
+from pathlib import Path
+
+import msgspec
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_drivers import lockstep
+from gigabrain_drivers.catalog import load_robot
+from gigabrain_drivers.mock import MockBody, MockOptions
+from gigabrain_drivers.process import DriverProcess
+from gigabrain_drivers.robot import Run
+from gigabrain_schemas.arrays import ranges_bytes
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import STATE
+from gigabrain_zenoh import perception
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.replay import Node
+from gigabrain_zenoh.settings import DriverConfig, PerceptionConfig
+from gigabrain_zenoh.transport import Close, LocalNetwork, LocalTransport, OnSample
+from tests.brain_in_memory import BRAIN
+from tests.brain_rig import round_room
+
+BOLD = PerceptionConfig(ahead=0.3, corridor=0.05, turning_room=0.0)  # as close as safety allows
+Pending = tuple[str, bytes, OnSample]
+
+
+class ShuffledEnd(LocalTransport):
+    """One process's end of a ShuffledNetwork: what comes is kept until its turn comes."""
+
+    def __init__(self, network: LocalNetwork) -> None:
+        super().__init__(network)
+        self.pending: list[Pending] = []  # in order of sending
+
+    def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
+        def keep(key: str, payload: bytes) -> None:
+            self.pending.append((key, payload, on_sample))
+
+        return super().subscribe(key, keep, depth)
+
+    @property
+    def states_pending(self) -> int:
+        """How many ticks this process is behind."""
+        return sum(key == STATE.key for key, _, _ in self.pending)
+
+    def deliver_one(self, draw: random.Random) -> None:
+        """Any of the oldest per key; but a new tick is heard of after all that went before it."""
+        heads: dict[str, Pending] = {}
+        for place, entry in enumerate(self.pending):
+            if entry[0] != STATE.key or place == 0:
+                heads.setdefault(entry[0], entry)
+        key, payload, on_sample = chosen = draw.choice(list(heads.values()))
+        self.pending.remove(chosen)
+        on_sample(key, payload)
+
+
+class Roamer(MockBody):
+    """The mock, in a room that stays where it is."""
+
+    def _look(self) -> LaserScan | None:
+        scan, here = super()._look(), self._pose
+        assert scan
+        ranges = round_room(1.2, here.x, here.y, here.yaw) + self._noise.normal(0.0, 0.01, 360)
+        return replace(scan, ranges=ranges_bytes(ranges))
+
+
+Story = list[tuple[int, str, Velocity, Pose]]
+
+
+async def drive(folder: Path, seed: int, ticks: int) -> Story:
+    """Mode, speed and place at each tick of a drive whose messages are shuffled by `seed`."""
+    draw, network, clock = random.Random(seed), LocalNetwork(), FakeClock()
+    robot = load_robot("mock")
+    body = Roamer(robot, MockOptions(driver="mock"), Run(folder=folder, speed=100.0))
+    config = DriverConfig(body="mock", speed=100.0, resume="auto", state_dir=str(folder))
+    ends = [ShuffledEnd(network) for _ in range(5)]
+    driver_bus, *brain_buses = [Bus(end, clock) for end in ends]
+    driver = DriverProcess(config, robot, body, driver_bus)
+    brain: dict[str, Node] = {**BRAIN, "perception": functools.partial(perception.run, BOLD)}
+    running = [
+        asyncio.ensure_future(node(bus, lambda: None))
+        for bus, node in zip(brain_buses, brain.values(), strict=True)
+    ]
+    running.append(asyncio.ensure_future(driver.run(lambda: None)))
+    while driver_bus.time.tick <= ticks:
+        waiting = [end for end in ends if end.pending]
+        behind = [end for end in waiting if end.states_pending > 1]
+        if waiting:
+            draw.choice(behind or waiting).deliver_one(draw)
+        await asyncio.sleep(0)
+        for task in running:
+            if task.done():
+                task.result()
+    for task in running:
+        task.cancel()
+    await asyncio.gather(*running, return_exceptions=True)
+    for bus in (driver_bus, *brain_buses):
+        await bus.close()
+    assert driver.report()["lockstep_timeouts"] == 0
+    return story(network)[:ticks]
+
+
+def story(network: LocalNetwork) -> Story:
+    """What the states say; the first tick is announced until the brain is there, so only once."""
+    decode = msgspec.msgpack.Decoder(RobotState).decode
+    states = {(s := decode(data)).tick: s for key, data in network.sent if key == STATE.key}
+    return [(s.tick, s.gate.mode, s.velocity, s.pose) for s in states.values()]
+
+
+@pytest.fixture(autouse=True)
+def no_timeouts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slow machine is another matter."""
+    monkeypatch.setattr(lockstep, "PATIENCE_S", 60.0)
+
+
+async def test_a_drive_is_the_same_whichever_message_is_quicker(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "gigabrain_zenoh.safety")
+    first, *others = [await drive(tmp_path / str(seed), seed, 350) for seed in range(6)]
+    assert all(other == first for other in others)
+    modes, speeds = {mode for _, mode, _, _ in first}, [v for _, _, v, _ in first]
+    assert modes == {"latched", "enabled"}
+    assert max(v.linear_x for v in speeds) == pytest.approx(0.26)
+    assert min(v.angular_z for v in speeds) == pytest.approx(-0.5)
+    assert caplog.messages.count("slow: obstacle 0.15 m ahead of the body") == 6

@@ -1,0 +1,200 @@
+import itertools
+import time
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+import zenoh
+
+from gigabrain_schemas.body import GateStatus, RobotState
+from gigabrain_schemas.brain import CmdVel, Intent, OccupancyGrid, Twist
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.requests import GateReply
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import (
+    CMD_VEL,
+    HEALTH,
+    IMAGE,
+    INTENT,
+    MAP,
+    STATE,
+    TELEOP,
+)
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.zenoh_transport import ZenohTransport
+from tests.bus_rig import until
+from tests.zenoh_rig import Ear, Robot, repeat, robot
+
+REPLY = GateReply(ok=True, text="stopped", robot_type="mock", gate=GateStatus())
+
+
+@pytest.fixture
+async def net() -> AsyncIterator[Robot]:
+    async with robot() as made:
+        await made.router()
+        yield made
+
+
+async def test_what_is_sent_arrives_unchanged(net: Robot) -> None:
+    sender, receiver = await net.client(), await net.client()
+    ear, star = Ear(receiver, "robot/teleop"), Ear(receiver, "robot/image/*")
+    payload = bytes(range(256)) * 3
+
+    def send() -> None:
+        sender.publish(TELEOP, "robot/teleop", payload, "application/x")
+        sender.publish(IMAGE, "robot/image/front", b"", "application/x")
+        sender.publish(IMAGE, "robot/image/rear", payload, "application/x")
+
+    await repeat(send, lambda: ear.heard and len(set(star.heard)) == 2)
+    assert set(ear.heard) == {("robot/teleop", payload)}
+    assert set(star.heard) == {("robot/image/front", b""), ("robot/image/rear", payload)}
+
+
+async def test_a_message_of_a_megabyte_arrives_whole(net: Robot) -> None:
+    sender, receiver = await net.client(), await net.client()
+    ear = Ear(receiver, "robot/map")
+    payload = bytes(range(256)) * 4096
+    await repeat(lambda: sender.publish(MAP, "robot/map", payload, ""), lambda: ear.heard)
+    assert set(ear.payloads) == {payload}
+
+
+async def test_messages_keep_their_order(net: Robot) -> None:
+    sender, receiver = await net.client(), await net.client()
+    ear = Ear(receiver, "robot/cmd_vel")
+    count = itertools.count()
+
+    def send() -> None:
+        for _ in range(10):
+            sender.publish(CMD_VEL, "robot/cmd_vel", b"%d" % next(count), "")
+
+    await repeat(send, lambda: len(ear.heard) >= 100)
+    numbers = [int(payload) for payload in ear.payloads]
+    assert numbers == sorted(set(numbers))
+
+
+async def test_each_topic_goes_out_with_the_quality_of_service_of_its_line(net: Robot) -> None:
+    samples: dict[str, zenoh.Sample] = {}
+    net.raw().declare_subscriber("robot/**", lambda s: samples.update({str(s.key_expr): s}))
+    bus = Bus(await net.client(), Clock())
+
+    def send() -> None:
+        bus.publish(CMD_VEL, CmdVel(linear_x=0.2))
+        bus.publish(TELEOP, Twist(linear_x=0.2))
+        bus.publish(INTENT, example(Intent))
+        bus.publish(HEALTH, example(Health), name="control")
+
+    await repeat(send, lambda: len(samples) == 4)
+
+    def qos(key: str) -> tuple[Any, ...]:
+        sample = samples[key]
+        return sample.priority, sample.congestion_control, sample.express, str(sample.encoding)
+
+    drop, kind = zenoh.CongestionControl.DROP, "application/msgpack;gigabrain."
+    assert qos("robot/cmd_vel") == (zenoh.Priority.REAL_TIME, drop, True, kind + "CmdVel")
+    assert qos("robot/teleop") == (zenoh.Priority.INTERACTIVE_HIGH, drop, False, kind + "Twist")
+    assert qos("robot/intent") == (zenoh.Priority.DATA, drop, False, kind + "Intent")
+    assert qos("robot/health/control") == (zenoh.Priority.BACKGROUND, drop, False, kind + "Health")
+
+
+def publish_200_without_leaving_the_loop(sender: ZenohTransport, arrived: set[int]) -> None:
+    """Each goes out once the one before has gone round."""
+    deadline = time.monotonic() + 30
+    for number in range(200):
+        while number not in arrived and time.monotonic() < deadline:
+            sender.publish(CMD_VEL, "robot/cmd_vel", b"%d" % number, "")
+            for _ in range(200):
+                if number in arrived:
+                    break
+                time.sleep(0.0005)
+    assert len(arrived) == 200
+
+
+@pytest.mark.parametrize(("depth", "most"), [(1, 2), (16, 32)])
+async def test_a_busy_loop_gets_the_newest_and_not_the_backlog(
+    net: Robot, depth: int, most: int
+) -> None:
+    sender, receiver = await net.client(), await net.client()
+    ear, arrived = Ear(receiver, "robot/cmd_vel", depth), set[int]()
+    net.raw().declare_subscriber(
+        "robot/cmd_vel", lambda sample: arrived.add(int(sample.payload.to_bytes()))
+    )
+    publish_200_without_leaving_the_loop(sender, arrived)
+    await repeat(
+        lambda: sender.publish(CMD_VEL, "robot/cmd_vel", b"200", ""),
+        lambda: b"200" in ear.payloads,
+    )
+    # the last ones may have come after the loop was free again: they make a second mailbox full
+    numbers = [int(payload) for payload in ear.payloads if payload != b"200"]
+    assert numbers == sorted(numbers)
+    assert len(numbers) <= most
+    assert set(numbers) <= set(range(198 - most, 200))
+
+
+async def test_who_has_stopped_listening_hears_nothing(net: Robot) -> None:
+    sender, receiver = await net.client(), await net.client()
+    ear, other = Ear(receiver, "robot/teleop"), Ear(receiver, "robot/teleop")
+    ear.close()
+    ear.close()
+    await repeat(lambda: sender.publish(TELEOP, "robot/teleop", b"x", ""), lambda: other.heard)
+    assert ear.heard == []
+
+
+async def test_a_message_on_the_bus_is_the_same_over_zenoh(net: Robot) -> None:
+    one, two = Bus(await net.client(), Clock(), "one"), Bus(await net.client(), Clock(), "two")
+    states = two.latest(STATE)
+    one.time.boot, one.time.tick = 7, 50
+    sent: list[RobotState] = []
+    await repeat(
+        lambda: sent.append(one.publish(STATE, example(RobotState), basis=50)),
+        lambda: states.newest,
+    )
+    assert states.newest in sent
+    assert (two.time.boot, two.time.tick) == (7, 50)
+
+
+async def test_a_client_of_another_language_may_send_json(net: Robot) -> None:
+    bus, raw = Bus(await net.client(), Clock()), net.raw()
+    seen: set[float] = set()
+    bus.subscribe(TELEOP, lambda _, twist: seen.add(twist.linear_x))
+
+    def send() -> None:
+        raw.put("robot/teleop", b'{"linear_x": 0.1}', encoding="application/json")
+        raw.put("robot/teleop", b'{"linear_x": 0.2}')
+
+    await repeat(send, lambda: seen == {0.1, 0.2})
+    assert bus.rejected.total() == 0
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"\xc1" * 100, b'{"linear_x": NaN}', bytes(1_100_000), None],
+    ids=["random", "nan", "oversized", "delete"],
+)
+async def test_what_a_hostile_client_sends_is_dropped_and_counted(
+    net: Robot, payload: bytes | None
+) -> None:
+    bus, raw = Bus(await net.client(), Clock()), net.raw()
+    twists = bus.latest(TELEOP)
+
+    def send() -> None:
+        if payload is None:
+            raw.delete("robot/teleop")
+        else:
+            raw.put("robot/teleop", payload)
+
+    await repeat(send, lambda: bus.rejected["robot/teleop"])
+    assert twists.newest is None
+    await repeat(lambda: raw.put("robot/teleop", b'{"linear_x": 0.1}'), lambda: twists.newest)
+    assert not bus.failed.done()
+
+
+async def test_late_joiners_get_the_kept_value(net: Robot) -> None:
+    one = Bus(await net.client(), Clock(), "one")
+    one.publish(MAP, example(OccupancyGrid))
+    sent = one.publish(MAP, example(OccupancyGrid))
+    late = Bus(await net.client(), Clock(), "late")
+    maps = late.latest(MAP)
+    await until(lambda: maps.newest)
+    assert maps.newest == sent
+    assert sent.seq == 2

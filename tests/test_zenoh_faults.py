@@ -1,0 +1,221 @@
+import asyncio
+import gc
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from gigabrain_schemas.topics import SCAN, TELEOP
+from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.zenoh_transport import ZenohTransport
+from tests.bus_rig import until
+from tests.zenoh_rig import Ear, free_endpoint, repeat, robot, router_process
+
+
+def client_of(endpoint: str) -> Awaitable[ZenohTransport]:
+    return ZenohTransport.open(Endpoint(connect=(endpoint,)))
+
+
+async def echo(payload: bytes) -> tuple[bytes, str]:
+    return payload, ""
+
+
+async def test_a_router_whose_port_is_taken_says_so_in_one_line() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
+        with pytest.raises(BusError) as caught:
+            await ZenohTransport.open(Endpoint(listen=(endpoint,)))
+    assert str(caught.value) == (
+        f"the router's port is taken ({endpoint}); stop what uses it, or choose another"
+    )
+
+
+async def test_a_router_that_cannot_listen_says_why_in_one_line() -> None:
+    with pytest.raises(BusError) as caught:
+        await ZenohTransport.open(Endpoint(listen=("unixsock-stream//nowhere/at/all",)))
+    assert str(caught.value).startswith("the router cannot listen on unixsock-stream//nowhere")
+    assert "\n" not in str(caught.value)
+    assert ".rs:" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["foo", "", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "tcp/127.0.0.1:x", "http/127.0.0.1:80",
+     "127.0.0.1:7447", "tcp//127.0.0.1:7447", "unixsock-stream/"],
+)  # fmt: skip
+async def test_what_is_no_endpoint_is_refused_instead_of_waited_for(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"is not a Zenoh endpoint; expected one like tcp/127"):
+        await ZenohTransport.open(Endpoint(connect=(text,)))
+
+
+async def test_nowhere_to_go_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no router to connect to"):
+        await ZenohTransport.open(Endpoint())
+
+
+@pytest.mark.parametrize("namespace", ["a//b", "/a", "a/", "a*", "robot/*", "a#b", "a?b"])
+async def test_what_is_no_namespace_is_refused_in_one_line(namespace: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        await ZenohTransport.open(Endpoint(listen=(free_endpoint(),), namespace=namespace))
+    text = str(caught.value)
+    assert text.startswith(f"namespace = '{namespace}' is refused by Zenoh: ")
+    assert "\n" not in text
+    assert ".rs" not in text
+
+
+async def test_a_client_waits_for_its_router() -> None:
+    endpoint = free_endpoint()
+    opening = asyncio.ensure_future(client_of(endpoint))
+    await asyncio.sleep(0.3)
+    assert not opening.done()
+    with router_process(endpoint):
+        async with asyncio.timeout(20):
+            client = await opening
+        await client.close()
+
+
+async def test_waiting_for_a_router_may_be_given_up_and_its_session_is_closed() -> None:
+    async with robot() as net:
+        opening = asyncio.ensure_future(client_of(net.endpoint))
+        await asyncio.sleep(0.1)
+        opening.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await opening
+        await net.router()
+        # the thread that was left waiting finds the router, and lets go of it again
+        await until(lambda: "zenoh-session" not in {t.name for t in threading.enumerate()})
+
+
+async def test_a_session_that_opens_just_as_it_is_given_up_is_closed() -> None:
+    async with robot() as net:
+        router = await net.router()
+        for turns in range(40):
+            opening = asyncio.ensure_future(client_of(net.endpoint))
+            for _ in range(turns):
+                await asyncio.sleep(0.0005)
+            opening.cancel()
+            try:
+                await (await opening).close()
+            except asyncio.CancelledError:
+                continue
+        await until(lambda: "zenoh-session" not in {t.name for t in threading.enumerate()})
+        await until(lambda: not router._session.info.transports())
+
+
+def test_a_process_that_gives_up_waiting_ends_by_itself() -> None:
+    program = f"""
+import asyncio
+from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.zenoh_transport import ZenohTransport
+async def main():
+    endpoint = Endpoint(connect=("{free_endpoint()}",))
+    try:
+        await asyncio.wait_for(ZenohTransport.open(endpoint), 0.1)
+    except TimeoutError:
+        print("gave up")
+asyncio.run(main())
+"""
+    ended = subprocess.run(
+        (sys.executable, "-c", program), capture_output=True, text=True, timeout=30, check=False
+    )
+    assert (ended.stdout, ended.stderr, ended.returncode) == ("gave up\n", "", 0)
+
+
+async def test_a_router_that_is_killed_and_comes_back_carries_data_and_queries_again() -> None:
+    endpoint = free_endpoint()
+    with router_process(endpoint) as router:
+        sender, receiver = await client_of(endpoint), await client_of(endpoint)
+        ear = Ear(receiver, "robot/scan")
+        receiver.serve("robot/goal", echo)
+        await repeat(lambda: sender.publish(SCAN, "robot/scan", b"1", ""), lambda: ear.heard)
+        router.kill()
+        sender.publish(SCAN, "robot/scan", b"lost", "")
+        assert await sender.query("robot/goal", b"", "", 0.2, "data") == []
+    with router_process(endpoint):
+        await repeat(
+            lambda: sender.publish(SCAN, "robot/scan", b"2", ""), lambda: b"2" in ear.payloads
+        )
+        replies: list[bytes | str] = []
+        async with asyncio.timeout(30):
+            while not replies:
+                replies = await sender.query("robot/goal", b"x", "", 1.0, "data")
+        assert replies == [b"x"]
+        await sender.close()
+        await receiver.close()
+    assert b"lost" not in ear.payloads
+
+
+def stuck(sender: ZenohTransport) -> None:
+    """Send more than the kernel takes, to a router that reads nothing."""
+    for _ in range(200):
+        sender.publish(SCAN, "robot/scan", bytes(100_000), "")
+
+
+async def gone(router_is: str, use: Callable[[ZenohTransport], None]) -> None:
+    endpoint = free_endpoint()
+    with router_process(endpoint) as router:
+        client = await client_of(endpoint)
+        ear = Ear(client, "robot/teleop")
+        await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: ear.heard)
+        (router.freeze if router_is == "frozen" else router.kill)()
+        use(client)
+        asking = asyncio.ensure_future(client.query("robot/goal", b"", "", 60.0, "data"))
+        await asyncio.sleep(0)
+        async with asyncio.timeout(5):  # Zenoh's own close takes ten
+            await client.close()
+            assert await asking == []
+    await until(lambda: "zenoh-session" not in {t.name for t in threading.enumerate()})
+
+
+@pytest.mark.parametrize("router_is", ["killed", "frozen"])
+async def test_leaving_does_not_wait_for_a_router_that_is_gone(router_is: str) -> None:
+    await gone(router_is, lambda _: None)
+
+
+async def test_leaving_does_not_wait_for_a_link_that_is_stuck() -> None:
+    await gone("frozen", stuck)
+
+
+async def test_publishing_into_a_stuck_link_does_not_stop_the_loop() -> None:
+    endpoint = free_endpoint()
+    with router_process(endpoint) as router:
+        client = await client_of(endpoint)
+        router.freeze()
+        async with asyncio.timeout(10):  # a blocking publisher would need 5 s for each
+            stuck(client)
+            await asyncio.sleep(0)
+        await client.close()
+    await until(lambda: "zenoh-session" not in {t.name for t in threading.enumerate()})
+
+
+def handles() -> tuple[int, int]:
+    """Open descriptors, and threads: one per subscription and queryable."""
+    return len(os.listdir("/dev/fd")), threading.active_count()
+
+
+async def one_life() -> None:
+    async with robot() as net:
+        await net.router()
+        one, two = await net.client(), await net.client("red")
+        ears = [Ear(one, f"robot/{name}") for name in ("a", "b", "c")] + [Ear(two, "robot/teleop")]
+        one.serve("robot/goal", echo)
+        await repeat(lambda: one.publish(TELEOP, "robot/a", b"x", ""), lambda: ears[0].heard)
+        await one.query("robot/goal", b"x", "", 5.0, "data")
+
+
+async def test_nothing_is_left_of_sessions_that_were_closed() -> None:
+    await one_life()  # what Zenoh itself opens stays for the next session
+    await until(lambda: threading.active_count() == 1)
+    gc.collect()
+    before = handles()
+    for _ in range(5):
+        await one_life()
+    gc.collect()
+    await until(lambda: all(now <= then for now, then in zip(handles(), before, strict=True)))

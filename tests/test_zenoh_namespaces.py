@@ -1,0 +1,84 @@
+from collections.abc import AsyncIterator
+
+import pytest
+
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.requests import DescribeRequest, Description
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import DESCRIBE, HEALTH, TELEOP
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import Clock
+from tests.bus_rig import until
+from tests.zenoh_rig import Ear, Robot, repeat, robot
+
+
+@pytest.fixture
+async def net() -> AsyncIterator[Robot]:
+    async with robot() as made:
+        yield made
+
+
+async def describe(_: DescribeRequest) -> Description:
+    return example(Description)
+
+
+async def test_two_robots_on_one_router_do_not_hear_each_other(net: Robot) -> None:
+    await net.router()
+    red, blue = await net.client("red"), await net.client("blue")
+    red_ear, blue_ear = Ear(await net.client("red"), "robot/*"), Ear(blue, "robot/*")
+
+    def send() -> None:
+        red.publish(TELEOP, "robot/teleop", b"red", "")
+        blue.publish(TELEOP, "robot/teleop", b"blue", "")
+
+    await repeat(send, lambda: red_ear.heard and blue_ear.heard)
+    assert set(red_ear.heard) == {("robot/teleop", b"red")}
+    assert set(blue_ear.heard) == {("robot/teleop", b"blue")}
+
+
+async def test_the_fleet_hears_each_robot_under_its_name(net: Robot) -> None:
+    await net.router()
+    red, fleet = await net.client("red"), await net.client()
+    ear = Ear(fleet, "red/robot/*")
+    await repeat(lambda: red.publish(TELEOP, "robot/teleop", b"x", ""), lambda: ear.heard)
+    assert set(ear.heard) == {("red/robot/teleop", b"x")}
+
+
+async def test_a_question_stays_within_its_robot(net: Robot) -> None:
+    await net.router()
+    red, blue = Bus(await net.client("red"), Clock()), Bus(await net.client("blue"), Clock())
+    asker = Bus(await net.client("red"), Clock())
+    red.serve(DESCRIBE, describe, name="driver")
+    blue.serve(DESCRIBE, describe, name="driver")
+    replies: list[Description] = []
+    while not replies:
+        replies = await asker.ask(DESCRIBE, DescribeRequest(), name="*", timeout_s=5)
+    assert replies == [example(Description)]
+
+
+async def test_a_router_in_a_namespace_is_one_of_the_robots_processes(net: Robot) -> None:
+    """It answers and reports there, and still joins those of any other namespace."""
+    router = Bus(await net.router("red"), Clock(), "router")
+    red, fleet = Bus(await net.client("red"), Clock()), await net.client()
+    heard: list[tuple[str, Health]] = []
+    red.subscribe(HEALTH, lambda key, health: heard.append((key, health)))
+    of_fleet = Ear(fleet, "red/robot/health/*")
+    await repeat(
+        lambda: router.publish(HEALTH, example(Health), name="router"),
+        lambda: heard and of_fleet.heard,
+    )
+    assert heard[0][0] == "robot/health/router"
+    assert of_fleet.heard[0][0] == "red/robot/health/router"
+    router.serve(DESCRIBE, describe, name="router")
+    assert await red.ask(DESCRIBE, DescribeRequest(), name="router", timeout_s=20)
+
+    blue, blue_ear = await net.client("blue"), Ear(await net.client("blue"), "robot/*")
+    await repeat(lambda: blue.publish(TELEOP, "robot/teleop", b"b", ""), lambda: blue_ear.heard)
+    assert not await Bus(blue, Clock()).ask(DESCRIBE, DescribeRequest(), name="router")
+
+
+async def test_a_router_in_a_namespace_hears_its_robot(net: Robot) -> None:
+    router, red = await net.router("red"), await net.client("red")
+    ear = Ear(router, "robot/teleop")
+    await repeat(lambda: red.publish(TELEOP, "robot/teleop", b"x", ""), lambda: ear.heard)
+    await until(lambda: ear.heard[0] == ("robot/teleop", b"x"))
