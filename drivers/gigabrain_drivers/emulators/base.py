@@ -11,8 +11,9 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 from msgspec import Struct
 
 from gigabrain_drivers.emulators.pty import Pty
+from gigabrain_drivers.kinematics import Gait
 from gigabrain_drivers.robot import RobotFile, Run
-from gigabrain_drivers.sim.physics import Charge, ImuSample, Odometry, Simulation, Wheel
+from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry, Simulation
 from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_zenoh.errors import BodyLost
 
@@ -24,7 +25,7 @@ class Snapshot(NamedTuple):
 
     time_ns: int  # simulated
     odometry: Odometry
-    wheels: tuple[Wheel, ...]  # left, right
+    wheels: tuple[Motor, ...]  # left, right; or all joints of legs
     imu: ImuSample
     battery: Charge
     bumper: bool
@@ -44,6 +45,7 @@ class EmulatedBody:
         self._halt = threading.Event()
         self._thread: threading.Thread | None = None
         self._commanded = (0.0, 0.0, 0.0)
+        self._gait: Gait | None = None  # instead of a velocity
         self._cpu_s = 0.0
         self.snapshot = self._look()
 
@@ -61,7 +63,11 @@ class EmulatedBody:
 
     def command(self, linear_x: float, linear_y: float, angular_z: float) -> None:
         """What the motors aim for from the next step on [m/s, m/s, rad/s]."""
-        self._commanded = (linear_x, linear_y, angular_z)
+        self._commanded, self._gait = (linear_x, linear_y, angular_z), None
+
+    def walk(self, gait: Gait) -> None:
+        """What the legs of a quadruped aim for from the next step on."""
+        self._gait = gait
 
     @property
     def commanded(self) -> tuple[float, float, float]:
@@ -105,8 +111,10 @@ class EmulatedBody:
             self._cpu_s = time.thread_time() - began
 
     def _step(self) -> None:
-        linear_x, _, angular_z = self._commanded
-        self._simulation.command(linear_x, angular_z)
+        if self._gait:
+            self._simulation.walk(self._gait)
+        else:
+            self._simulation.drive(*self._commanded)
         self._simulation.advance()
         self.snapshot = snapshot = self._look()
         for tell in self.on_step:

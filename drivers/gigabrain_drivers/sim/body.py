@@ -2,6 +2,10 @@
 
 from dataclasses import dataclass, field
 
+from gigabrain_drivers.kinematics import Walker
+from gigabrain_drivers.legs.gait import WALKER
+from gigabrain_drivers.legs.geometry import JOINT_NAMES, LEGS, LegGeometry
+
 
 @dataclass(frozen=True, kw_only=True)
 class SimLidar:
@@ -40,16 +44,31 @@ class SimMotor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimBody:
+class SimModel:
+    """What every body has. Its model's base body is `base`, with the free joint `free`.
+
+    Geoms of the base that are called `hull_...` make up the body's outline.
+    """
+
+    model: str  # MJCF
+    lidar: SimLidar | None = field(default_factory=SimLidar)
+    battery: SimBattery = field(default_factory=SimBattery)
+    motor: SimMotor = field(default_factory=SimMotor)
+
+    def parts(self) -> tuple[tuple[str, str], ...]:
+        """(kind, name) of what the model has to have besides base, sensors and lidar."""
+        return ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimBody(SimModel):
     """A differential-drive body for the simulation.
 
-    The model's base body is `base` with its origin between the wheels and the free joint `free`;
-    geoms called `hull_...` make up its outline. Each name of `wheels` (left, right) is a body,
+    The base's origin lies between the wheels. Each name of `wheels` (left, right) is a body,
     an actuator and, with `_joint` after it, a joint. `wheel_radius` and `wheel_separation` are
     what the base's own kinematics believes; the truth is in the model.
     """
 
-    model: str  # MJCF
     wheel_radius: float  # [m], turns commands into wheel speeds
     wheel_separation: float  # [m]
     odometry_wheel_radius: float | None = None  # [m], turns encoder ticks into metres
@@ -58,6 +77,54 @@ class SimBody:
     max_wheel_acceleration: float = 60.0  # [rad/s2]
     wheels: tuple[str, str] = ("wheel_left", "wheel_right")
     encoder_ticks: int = 4096  # per turn
-    lidar: SimLidar | None = field(default_factory=SimLidar)
-    battery: SimBattery = field(default_factory=SimBattery)
-    motor: SimMotor = field(default_factory=SimMotor)
+
+    def parts(self) -> tuple[tuple[str, str], ...]:
+        """Wheels."""
+        return tuple(
+            part
+            for wheel in self.wheels
+            for part in (
+                ("body", wheel),
+                ("geom", wheel),
+                ("joint", f"{wheel}_joint"),
+                ("actuator", wheel),
+            )
+        )
+
+
+LEG_BATTERY = SimBattery(
+    capacity_ah=8.0,
+    full_voltage=29.4,  # seven lithium cells
+    nominal_voltage=25.2,
+    empty_voltage=21.0,
+    internal_resistance_ohm=0.05,
+    idle_current_a=1.2,
+    drive_current_a=0.0,  # legs draw what they need to bear the weight
+)
+LEG_MOTOR = SimMotor(
+    torque_per_ampere=1.4,
+    resistance_ohm=0.25,
+    heat_capacity=180.0,
+    thermal_resistance=2.5,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimQuadruped(SimModel):
+    """A body on four legs of three joints for the simulation.
+
+    The base's origin lies on the hips' axes. Each of `legs.geometry.JOINT_NAMES` is a joint and
+    its position servo; each leg has a touch sensor `..._contact` on its foot.
+    """
+
+    geometry: LegGeometry = field(default_factory=LegGeometry)
+    walker: Walker = WALKER  # turns velocities into gaits
+    encoder_ticks: int = 65536  # per turn of a joint
+    contact_n: float = 8.0  # [N], from which on a foot counts as bearing weight
+    battery: SimBattery = LEG_BATTERY
+    motor: SimMotor = LEG_MOTOR
+
+    def parts(self) -> tuple[tuple[str, str], ...]:
+        """Legs."""
+        joints = [part for name in JOINT_NAMES for part in (("joint", name), ("actuator", name))]
+        return (*joints, *(("sensor", f"{leg}_contact") for leg in LEGS))

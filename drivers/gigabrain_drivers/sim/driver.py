@@ -6,13 +6,21 @@ import math
 import threading
 import time
 from collections.abc import AsyncIterator, Mapping
+from dataclasses import replace
 from typing import Annotated, NamedTuple
 
 from msgspec import Meta
 
 from gigabrain_drivers.base import Driver
 from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
-from gigabrain_drivers.sim.body import SimBattery, SimBody, SimLidar
+from gigabrain_drivers.sim.body import (
+    LEG_BATTERY,
+    SimBattery,
+    SimBody,
+    SimLidar,
+    SimModel,
+    SimQuadruped,
+)
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.tick import TICK_NS as STEP_NS
 from gigabrain_drivers.sim.worlds import load_world
@@ -100,7 +108,7 @@ class MujocoDriver(Driver):
         self._thread = self._bridge = self._reading = None
 
     async def stop(self) -> None:
-        """Brake the wheels."""
+        """Come to rest."""
         self._simulation.command(0.0, 0.0)
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
@@ -122,12 +130,12 @@ class MujocoDriver(Driver):
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Turn the wheels; sideways is not to be had."""
+        """Drive or walk; bodies on two wheels leave out what is sideways."""
         if self._reading is None:
             raise BodyLost("the simulation is not open")
         self._commanded_ns = self._simulation.time_ns
-        forward, turn = self._simulation.command(linear_x, angular_z)
-        return Velocity(linear_x=forward, angular_z=turn)
+        to = self._simulation.drive(linear_x, linear_y, angular_z)
+        return Velocity(linear_x=to.linear_x, linear_y=to.linear_y, angular_z=to.angular_z)
 
     async def read_state(self) -> RobotState:
         """The state at the end of the newest tick."""
@@ -211,6 +219,8 @@ class MujocoDriver(Driver):
         if self._simulation.time_ns - self._commanded_ns >= DEAD_MAN_NS:
             self._simulation.command(0.0, 0.0)
         self._simulation.advance()
+        if self._simulation.fallen:
+            raise BodyLost(f"fell over after {self._simulation.time_ns / 1e9:.2f} s")
 
     def _post(self, reading: Reading | Exception | None) -> None:
         bridge = self._bridge
@@ -225,8 +235,8 @@ class MujocoDriver(Driver):
         state = RobotState(
             robot_type=self.robot.robot_type,
             pose=Pose(x=odometry.x, y=odometry.y, yaw=math.remainder(odometry.yaw, math.tau)),
-            velocity=Velocity(linear_x=odometry.linear_x, angular_z=odometry.angular_z),
-            joints=tuple(Joint(**wheel._asdict()) for wheel in simulation.wheels()),
+            velocity=Velocity(**simulation.velocity()._asdict()),
+            joints=tuple(Joint(**motor._asdict()) for motor in simulation.motors()),
             battery=Battery(
                 voltage=charge.voltage, percentage=charge.percentage, current=charge.current
             ),
@@ -254,30 +264,42 @@ class MujocoDriver(Driver):
         )
 
 
-def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimBody:
+def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
     """The body as the simulation wants it. Raises ConfigError when there is no model."""
     path = run.folder / options.model
     try:
         model = path.read_text(encoding="utf-8")
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; `model` names its MJCF file") from None
-    lidar = robot.lidar
+    lidar = _sim_lidar(robot, options)
+    if robot.drive_type == "quadruped":
+        battery = replace(
+            LEG_BATTERY,
+            capacity_ah=options.battery_capacity,
+            percentage=options.battery_percentage,
+        )
+        return SimQuadruped(model=model, lidar=lidar, battery=battery)
     return SimBody(
         model=model,
         wheel_radius=robot.wheel_radius,
         wheel_separation=robot.wheel_separation,
         odometry_wheel_radius=options.odometry_wheel_radius,
         wheel_scale=options.wheel_scale,
-        lidar=SimLidar(
-            beams=lidar.beams,
-            rate_hz=lidar.rate_hz,
-            range_min=lidar.range_min,
-            range_max=lidar.range_max,
-            noise_m=options.lidar_noise,
-        )
-        if lidar
-        else None,
+        lidar=lidar,
         battery=SimBattery(
             capacity_ah=options.battery_capacity, percentage=options.battery_percentage
         ),
+    )
+
+
+def _sim_lidar(robot: RobotFile, options: MujocoOptions) -> SimLidar | None:
+    lidar = robot.lidar
+    if lidar is None:
+        return None
+    return SimLidar(
+        beams=lidar.beams,
+        rate_hz=lidar.rate_hz,
+        range_min=lidar.range_min,
+        range_max=lidar.range_max,
+        noise_m=options.lidar_noise,
     )

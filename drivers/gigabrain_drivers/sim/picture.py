@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_drivers.sim.body import SimBody
+from gigabrain_drivers.sim.body import SimModel
 from gigabrain_drivers.sim.geometry import Pose, clearance
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.world import World
@@ -28,7 +28,7 @@ FINER = 2  # drawn this many times as large, then averaged
 
 
 def render(
-    body: SimBody, world: World, seed: int, path: Path, width: int = 1280, height: int = 720
+    body: SimModel, world: World, seed: int, path: Path, width: int = 1280, height: int = 720
 ) -> None:
     """Write a PNG of the robot at its start. Raises ConfigError where nothing can be drawn."""
     simulation = Simulation(body, world, seed)

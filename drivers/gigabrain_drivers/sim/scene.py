@@ -5,7 +5,7 @@ import math
 
 import mujoco
 
-from gigabrain_drivers.sim.body import SimBody
+from gigabrain_drivers.sim.body import SimBody, SimModel
 from gigabrain_drivers.sim.geometry import Box, Pose, Shape
 from gigabrain_drivers.sim.looks import FLOOR, add_light, add_materials
 from gigabrain_drivers.sim.person import RADIUS_M
@@ -18,7 +18,7 @@ PERSON = "person"
 PERSON_HEIGHT_M = 1.45  # to the shoulders
 
 
-def compile_scene(body: SimBody, world: World) -> mujoco.MjModel:
+def compile_scene(body: SimModel, world: World) -> mujoco.MjModel:
     """The model of `body` at the start of `world`. Raises ConfigError for a bad robot model."""
     mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)  # instead of a file
     spec = world_spec(world)
@@ -37,10 +37,12 @@ def yaw_quaternion(pose: Pose) -> tuple[float, float, float, float]:
     return math.cos(pose.yaw / 2), 0.0, 0.0, math.sin(pose.yaw / 2)
 
 
-def _robot_spec(body: SimBody) -> mujoco.MjSpec:
+def _robot_spec(body: SimModel) -> mujoco.MjSpec:
     """The robot's own model; worn wheels are smaller and hang lower, so the base stays level."""
     spec = mujoco.MjSpec.from_string(body.model)
     _check_names(spec, body)
+    if not isinstance(body, SimBody):
+        return spec
     for name in body.wheels:
         wheel = spec.body(name)
         radius = spec.geom(name).size[0]
@@ -50,16 +52,21 @@ def _robot_spec(body: SimBody) -> mujoco.MjSpec:
     return spec
 
 
-def _check_names(spec: mujoco.MjSpec, body: SimBody) -> None:
+def _check_names(spec: mujoco.MjSpec, body: SimModel) -> None:
     """Raises ValueError naming what the model must have and has not."""
-    wanted = [(spec.body, "body", "base"), (spec.joint, "joint", "free")]
-    for wheel in body.wheels:
-        wanted += [(spec.body, "body", wheel), (spec.geom, "geom", wheel)]
-        wanted += [(spec.joint, "joint", f"{wheel}_joint"), (spec.actuator, "actuator", wheel)]
-    wanted += [(spec.sensor, "sensor", name) for name in ("gyro", "accelerometer", "attitude")]
+    wanted = [("body", "base"), ("joint", "free"), *body.parts()]
+    wanted += [("sensor", name) for name in ("gyro", "accelerometer", "attitude")]
     if body.lidar:
-        wanted.append((spec.site, "site", "lidar"))
-    missing = [f"{kind} {name!r}" for find, kind, name in wanted if find(name) is None]
+        wanted.append(("site", "lidar"))
+    find = {
+        "body": spec.body,
+        "joint": spec.joint,
+        "geom": spec.geom,
+        "actuator": spec.actuator,
+        "sensor": spec.sensor,
+        "site": spec.site,
+    }
+    missing = [f"{kind} {name!r}" for kind, name in wanted if find[kind](name) is None]
     if missing:
         raise ValueError(f"it has no {', no '.join(missing)}")
 

@@ -2,22 +2,12 @@
 
 import math
 from collections import deque
-from typing import NamedTuple
 
 from gigabrain_drivers.sim.body import SimBody
+from gigabrain_drivers.sim.locomotion import Odometry
 from gigabrain_drivers.sim.tick import TICK_S
 
 VELOCITY_TICKS = 5  # velocity is measured over 50 ms: a finer one would be encoder noise
-
-
-class Odometry(NamedTuple):
-    """Where the encoders say that the base is, from (0, 0, 0) at the start."""
-
-    x: float  # [m]
-    y: float  # [m]
-    yaw: float  # [rad], not wrapped
-    linear_x: float  # [m/s]
-    angular_z: float  # [rad/s]
 
 
 class DifferentialBase:

@@ -1,0 +1,163 @@
+"""Legs: their geometry both ways, gaits both ways, and odometry by what a robot feels."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gigabrain_drivers.kinematics import Gait, Twist
+from gigabrain_drivers.legs.gait import WALKER, sound
+from gigabrain_drivers.legs.geometry import JOINT_NAMES, LegGeometry, Vector
+from gigabrain_drivers.legs.odometry import LegOdometry
+from gigabrain_drivers.legs.senses import Senses
+
+GEOMETRY = LegGeometry()
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+UP = (0.0, 0.0, 9.81)
+legs = st.integers(0, 3)
+twists = st.builds(Twist, st.floats(-0.5, 0.5), st.floats(-0.2, 0.2), st.floats(-1.0, 1.0))
+
+
+def angles_of(leg: int) -> st.SearchStrategy[Vector]:
+    bend = GEOMETRY.legs[leg].bend
+    hips, knees = st.floats(-0.4, 1.2), st.floats(0.6, 2.5)
+    return st.tuples(st.floats(-0.6, 0.6), hips, knees).map(
+        lambda a: (a[0], -bend * a[1], bend * a[2])
+    )
+
+
+@given(st.data(), legs)
+def test_from_angles_to_the_foot_and_back(data: st.DataObject, number: int) -> None:
+    leg, angles = GEOMETRY.legs[number], data.draw(angles_of(number))
+    assert leg.joints(leg.foot(angles)) == pytest.approx(angles, abs=1e-9)
+
+
+@given(st.data(), legs)
+def test_the_jacobian_is_how_the_foot_moves(data: st.DataObject, number: int) -> None:
+    leg, angles, step = GEOMETRY.legs[number], data.draw(angles_of(number)), 1e-6
+    for joint, column in enumerate(leg.jacobian(angles)):
+        more, less = list(angles), list(angles)
+        more[joint] += step
+        less[joint] -= step
+        ends = zip(leg.foot(tuple(more)), leg.foot(tuple(less)), strict=True)  # type: ignore[arg-type]
+        assert [(a - b) / (2 * step) for a, b in ends] == pytest.approx(column, abs=1e-8)
+
+
+@given(twists)
+def test_a_velocity_is_a_gait_and_a_gait_a_velocity(twist: Twist) -> None:
+    gait = WALKER.to_gait(twist)
+    assert sound(gait)
+    assert WALKER.to_body(gait) == pytest.approx(twist, abs=1e-9)
+
+
+@given(twists)
+def test_a_gait_becomes_the_same_gait_again(twist: Twist) -> None:
+    gait = WALKER.to_gait(twist)
+    again = WALKER.to_gait(WALKER.to_body(gait))
+    for mine, its in zip(gait, again, strict=True):
+        assert mine == pytest.approx(its, abs=1e-9)
+
+
+def test_alpha_at_a_walk() -> None:
+    gait = WALKER.to_gait(Twist(0.36, 0.072, -0.9))
+    assert gait == Gait(
+        stride_x=pytest.approx(0.1),
+        stride_y=pytest.approx(0.02),
+        turn=pytest.approx(-0.25),
+        frequency=3.6,
+        duty=0.6,
+        phases=(0.0, 0.5, 0.5, 0.0),
+        height=0.29,
+    )
+
+
+def test_standing_the_feet_are_under_the_hips_and_the_knees_face_each_other() -> None:
+    stand = GEOMETRY.standing(0.29)
+    feet = [leg.foot(angles) for leg, angles in zip(GEOMETRY.legs, stand, strict=True)]
+    assert feet[0] == pytest.approx((0.19, 0.135, -0.29))
+    assert feet[3] == pytest.approx((-0.19, -0.135, -0.29))
+    assert [knee > 0 for _, _, knee in stand] == [False, False, True, True]
+    assert JOINT_NAMES[:4] == (
+        "front_left_abduction", "front_left_hip", "front_left_knee", "front_right_abduction",
+    )  # fmt: skip
+
+
+def test_a_foot_out_of_reach_is_approached_as_far_as_the_leg_goes() -> None:
+    leg = GEOMETRY.legs[0]
+    x, y, z = leg.foot(leg.joints((0.19, 0.135, -1.0)))
+    assert (x, y) == pytest.approx((0.19, 0.135), abs=0.05)
+    assert z == pytest.approx(-0.4196, abs=0.001)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"stride_x": math.nan},
+        {"frequency": 0.0},
+        {"frequency": math.inf},
+        {"stride_x": 0.2, "stride_y": 0.2},
+        {"turn": -0.7},
+        {"duty": 0.95},
+        {"height": 0.5},
+        {"phases": (0.0, 0.5, 0.5, 1.0)},
+    ],
+)
+def test_a_gait_that_legs_cannot_walk_is_not_sound(wrong: dict[str, object]) -> None:
+    assert not sound(WALKER.to_gait(Twist(0.3, 0.0, 0.0))._replace(**wrong))  # type: ignore[arg-type]
+
+
+def walked(twist: Twist, seconds: float, lifted: tuple[int, ...] = ()) -> LegOdometry:
+    """Feet that stand on the floor while the body glides over them; some hang in the air."""
+    odometry, passed = LegOdometry(GEOMETRY), 0.01
+    contacts = tuple(leg not in lifted for leg in range(4))
+    stand = GEOMETRY.standing(0.29)
+    radius = GEOMETRY.foot
+    rates = []
+    for leg, angles in zip(GEOMETRY.legs, stand, strict=True):
+        x, y, _ = leg.foot(angles)
+        wanted = (twist.angular_z * y - twist.linear_x, -twist.angular_z * x - twist.linear_y, 0.0)
+        rates.append(_rates(leg.jacobian(angles), wanted, radius))
+    senses = Senses(stand, tuple(rates), contacts, LEVEL, (0.0, 0.0, twist.angular_z), UP)
+    for _ in range(round(seconds / passed)):
+        odometry.update(senses, passed)
+    return odometry
+
+
+def _rates(columns: tuple[Vector, ...], wanted: Vector, radius: float) -> Vector:
+    """Joint rates that move the point where a rolling ball of `radius` touches as wanted."""
+    import numpy as np
+
+    matrix = np.array(columns).T
+    matrix[0, 1:] -= radius
+    matrix[1, 0] += radius
+    a, b, c = np.linalg.solve(matrix, wanted).tolist()
+    return a, b, c
+
+
+def test_feet_that_stand_tell_how_the_body_moves() -> None:
+    odometry = walked(Twist(0.2, 0.0, 0.0), 1.0)
+    assert odometry.velocity == pytest.approx((0.2, 0.0, 0.0), abs=1e-3)
+    assert odometry.pose.x == pytest.approx(0.2, abs=0.02)
+
+
+def test_feet_in_the_air_tell_nothing() -> None:
+    odometry = walked(Twist(0.2, 0.0, 0.0), 1.0, lifted=(0, 1, 2, 3))
+    assert odometry.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+
+
+def test_turning_on_the_spot_goes_nowhere() -> None:
+    odometry = walked(Twist(0.0, 0.0, 0.8), 1.0, lifted=(0, 3))
+    assert (odometry.pose.x, odometry.pose.y) == pytest.approx((0.0, 0.0), abs=1e-3)
+    assert odometry.pose.yaw == pytest.approx(0.8, abs=1e-9)
+
+
+def test_a_tilted_body_at_rest_stays_where_it_is() -> None:
+    tilt = 0.1
+    attitude = (math.sin(tilt / 2), 0.0, 0.0, math.cos(tilt / 2))
+    felt = (0.0, 9.81 * math.sin(tilt), 9.81 * math.cos(tilt))
+    odometry, still = LegOdometry(GEOMETRY), ((0.0, 0.0, 0.0),) * 4
+    senses = Senses(GEOMETRY.standing(0.29), still, (False,) * 4, attitude, (0.0, 0.0, 0.0), felt)
+    for _ in range(100):
+        odometry.update(senses, 0.01)
+    assert odometry.velocity == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
