@@ -40,7 +40,10 @@ __all__ = [
     "SimMotor",
     "SimQuadruped",
     "Simulation",
+    "Wheel",
 ]
+
+Wheel = Motor  # what the motors of a base on wheels report
 
 EDGE_OF_THE_WORLD_M = 1e3
 
