@@ -67,6 +67,7 @@ class LineDriver(Driver):
         self._sent_ns = self._seq = 0
         self._open = False
         self._silence = Fault(log)
+        self._told_flags = 0
         self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
         self._lidar: ScanSource | None = None
         self._scan: LaserScan | None = None
@@ -213,6 +214,9 @@ class LineDriver(Driver):
 
     def _tell_flags(self) -> None:
         """Say once when a flag is raised and once when it falls."""
+        if self._report.flags == self._told_flags:
+            return
+        self._told_flags = self._report.flags
         for bit, name in enumerate(self.options.flags):
             if BUMPER in name:
                 continue

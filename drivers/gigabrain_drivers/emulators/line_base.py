@@ -103,7 +103,10 @@ class LineBase(Device):
         return Velocity(**{k: v for k, v in values.items() if k in Twist._fields})
 
     def _silent(self) -> bool:
-        return self._obeyed_ns is None or self._now_ns - self._obeyed_ns > SILENT_NS
+        """Whether the last command will be too old by the next step."""
+        if self._obeyed_ns is None:
+            return True
+        return self._now_ns + self.period_s * 1e9 - self._obeyed_ns > SILENT_NS
 
     def _browned_out(self) -> bool:
         voltage = self.body.snapshot.battery.voltage
