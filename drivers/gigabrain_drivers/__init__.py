@@ -2,6 +2,7 @@
 
 # name in a robot's file -> "module:class"; imported only when used, so a body's SDK stays optional
 DRIVERS = {
+    "alpha": "gigabrain_drivers.alpha:AlphaDriver",
     "line": "gigabrain_drivers.line:LineDriver",
     "mock": "gigabrain_drivers.mock:MockBody",
     "mujoco": "gigabrain_drivers.sim.driver:MujocoDriver",

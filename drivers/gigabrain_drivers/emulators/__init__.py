@@ -2,6 +2,7 @@
 
 # driver of a link, or of its scan source -> the device that answers it, imported only when used
 DEVICES = {
+    "alpha": "gigabrain_drivers.emulators.alpha:Alpha",
     "line": "gigabrain_drivers.emulators.line_base:LineBase",
     "ld06": "gigabrain_drivers.emulators.ld:LdDevice",
     "ld19": "gigabrain_drivers.emulators.ld:LdDevice",

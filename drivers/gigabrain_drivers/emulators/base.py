@@ -29,6 +29,8 @@ class Snapshot(NamedTuple):
     imu: ImuSample
     battery: Charge
     bumper: bool
+    contacts: tuple[bool, ...] = ()  # which feet bear weight
+    fallen: bool = False
 
 
 class EmulatedBody:
@@ -129,6 +131,8 @@ class EmulatedBody:
             imu=simulation.imu(),
             battery=simulation.battery(),
             bumper=simulation.bumper(),
+            contacts=simulation.contacts(),
+            fallen=simulation.fallen,
         )
 
 

@@ -1,0 +1,222 @@
+"""Alpha's protocol: gaits to the body, its state back, in frames with a CRC-32.
+
+docs/firmware_alpha.md describes it for those who write the firmware. All numbers are little-endian:
+
+    0   2  magic a5 5a          4   1  type                  6   4  sequence, counts up, wraps
+    2   2  bytes of payload     5   1  version, 1           10   n  payload, then 4 of CRC-32
+
+A frame is believed when its CRC is right, its type known, of that type's length, and all numbers
+in it are numbers. Encoders and decoders for both ends, pure.
+"""
+
+import math
+import struct
+import zlib
+from typing import NamedTuple
+
+from gigabrain_drivers.kinematics import Gait
+from gigabrain_drivers.legs.senses import Senses
+
+PORT = 8080
+SILENCE_NS = 100_000_000  # without a sound command, after which the body stops
+STALE_MS = 150  # a command that rests on an older state than this is refused
+STATE_HZ = 100
+MAGIC, VERSION = b"\xa5\x5a", 1
+WALK, STOP, STATE = 0x01, 0x02, 0x81
+SEQUENCES = 1 << 32
+
+WALKING, SILENT, FALLEN = 1, 2, 4  # flags: feet step; stopped by silence; lies on the floor
+
+_HEADER = struct.Struct("<2sHBBI")
+_CRC = struct.Struct("<I")
+_GAIT = struct.Struct("<I10f")
+_STATE = struct.Struct("<III B B 3f 4f3f3f 36f 12h")
+_LENGTHS = {WALK: _GAIT.size, STOP: 0, STATE: _STATE.size}
+_FASTEST = 1e4  # beyond which, either way, no number in a state is a measurement
+
+
+class Frame(NamedTuple):
+    """One frame; what its payload holds depends on its type."""
+
+    type: int
+    sequence: int
+    payload: bytes = b""
+
+
+class Walk(NamedTuple):
+    """A command to walk."""
+
+    seen: int  # [ms], the body's own clock in the newest state that the sender knows
+    gait: Gait
+
+
+class State(NamedTuple):
+    """What the body says of itself, 100 times a second."""
+
+    milliseconds: int  # since the firmware began, wraps
+    echo: int  # sequence of the newest command that was obeyed; 0 for none
+    refused: int  # how many frames were no sound command
+    flags: int
+    voltage: float  # [V]
+    current: float  # [A], positive while it drains
+    percentage: float  # [%]
+    senses: Senses
+    torques: tuple[float, ...]  # [N m], of the twelve joints, leg by leg
+    temperatures: tuple[float, ...]  # [deg C], of their motors
+
+
+def encode(frame: Frame) -> bytes:
+    """The bytes of a frame on the wire."""
+    length, sequence = len(frame.payload), frame.sequence % SEQUENCES
+    head = _HEADER.pack(MAGIC, length, frame.type, VERSION, sequence)
+    body = head + frame.payload
+    return body + _CRC.pack(zlib.crc32(body))
+
+
+def walk(command: Walk, sequence: int) -> bytes:
+    """A command to walk."""
+    seen, gait = command
+    values = (gait.stride_x, gait.stride_y, gait.turn, gait.frequency, gait.duty)
+    return encode(Frame(WALK, sequence, _GAIT.pack(seen, *values, *gait.phases, gait.height)))
+
+
+def stop(sequence: int) -> bytes:
+    """A command to come to rest and stand."""
+    return encode(Frame(STOP, sequence))
+
+
+def walk_of(frame: Frame) -> Walk | None:
+    """The command in a frame, or None where it holds what is not a number."""
+    seen, x, y, turn, frequency, duty, a, b, c, d, height = _GAIT.unpack(frame.payload)
+    if not all(map(math.isfinite, (x, y, turn, frequency, duty, a, b, c, d, height))):
+        return None
+    return Walk(seen, Gait(x, y, turn, frequency, duty, (a, b, c, d), height))
+
+
+def stale(seen: int, now: int) -> bool:
+    """Whether a command that has `seen` this time [ms] is too old at `now`, across the wrap."""
+    return (now - seen) % SEQUENCES > STALE_MS
+
+
+def state(now: State, sequence: int) -> bytes:
+    """The body's report."""
+    senses = now.senses
+    feet = sum(1 << foot for foot, touches in enumerate(senses.contacts) if touches)
+    joints = [angle for leg in senses.joints for angle in leg]
+    rates = [rate for leg in senses.rates for rate in leg]
+    each = zip(joints, rates, now.torques, strict=True)
+    payload = _STATE.pack(
+        now.milliseconds % SEQUENCES,
+        now.echo,
+        now.refused % SEQUENCES,
+        now.flags,
+        feet,
+        now.voltage,
+        now.current,
+        now.percentage,
+        *senses.orientation,
+        *senses.angular_velocity,
+        *senses.linear_acceleration,
+        *(value for joint in each for value in joint),
+        *(max(-32768, min(32767, round(10 * value))) for value in now.temperatures),
+    )
+    return encode(Frame(STATE, sequence, payload))
+
+
+def state_of(frame: Frame) -> State | None:
+    """The report in a frame, or None where it holds what cannot have been measured."""
+    milliseconds, echo, refused, flags, feet, *rest = _STATE.unpack(frame.payload)
+    numbers, temperatures = rest[:49], rest[49:]
+    if not all(abs(value) < _FASTEST for value in numbers):
+        return None
+    voltage, current, percentage, *rest = numbers
+    (x, y, z, w), rate, acceleration, joints = rest[:4], rest[4:7], rest[7:10], rest[10:]
+    norm = math.hypot(x, y, z, w)
+    if not 0.9 < norm < 1.1 or voltage < 0 or not 0 <= percentage <= 100:
+        return None
+    senses = Senses(
+        joints=_by_leg(joints[0::3]),
+        rates=_by_leg(joints[1::3]),
+        contacts=tuple(bool(feet >> foot & 1) for foot in range(4)),
+        orientation=(x / norm, y / norm, z / norm, w / norm),
+        angular_velocity=(rate[0], rate[1], rate[2]),
+        linear_acceleration=(acceleration[0], acceleration[1], acceleration[2]),
+    )
+    return State(
+        milliseconds=milliseconds,
+        echo=echo,
+        refused=refused,
+        flags=flags,
+        voltage=voltage,
+        current=current,
+        percentage=percentage,
+        senses=senses,
+        torques=tuple(joints[2::3]),
+        temperatures=tuple(value / 10 for value in temperatures),
+    )
+
+
+def newer(sequence: int, than: int) -> bool:
+    """Whether one sequence number comes after another, across the wrap."""
+    return 0 < (sequence - than) % SEQUENCES < SEQUENCES // 2
+
+
+class Decoder:
+    """Finds frames in whatever comes in. `errors` counts stretches of bytes that were no frame.
+
+    A broken frame costs no more than itself: the search goes on right behind its magic.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._lost = False  # inside a stretch that was counted
+        self.errors = 0
+
+    def clear(self) -> None:
+        """Forget what has begun to come in."""
+        self._buffer.clear()
+        self._lost = False
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that `data` completes, in order."""
+        buffer, frames = self._buffer, []
+        buffer += data
+        while self._at_magic():
+            if len(buffer) < _HEADER.size:
+                break
+            _, length, kind, version, sequence = _HEADER.unpack_from(buffer)
+            size = _HEADER.size + length + _CRC.size
+            if version != VERSION or _LENGTHS.get(kind) != length:
+                self._skip(len(MAGIC))
+            elif len(buffer) < size:
+                break
+            elif (
+                zlib.crc32(buffer[: size - _CRC.size])
+                != _CRC.unpack_from(buffer, size - _CRC.size)[0]
+            ):
+                self._skip(len(MAGIC))
+            else:
+                payload = bytes(buffer[_HEADER.size : size - _CRC.size])
+                frames.append(Frame(kind, sequence, payload))
+                del buffer[:size]
+                self._lost = False
+        return frames
+
+    def _at_magic(self) -> bool:
+        """Drop what is before the next magic; whether there is one."""
+        at = self._buffer.find(MAGIC)
+        if at < 0:
+            at = len(self._buffer) - self._buffer.endswith(MAGIC[:1])
+        if at:
+            self._skip(at)
+        return len(self._buffer) >= len(MAGIC)
+
+    def _skip(self, count: int) -> None:
+        del self._buffer[:count]
+        self.errors += not self._lost
+        self._lost = True
+
+
+def _by_leg(values: list[float]) -> tuple[tuple[float, float, float], ...]:
+    each = iter(values)
+    return tuple(zip(each, each, each, strict=True))
