@@ -16,6 +16,7 @@ from gigabrain_drivers.legs.geometry import JOINT_NAMES, LegGeometry
 from gigabrain_drivers.legs.odometry import LegOdometry
 from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_drivers.links.address import AddressLink
+from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_drivers.protocols import alpha
 from gigabrain_drivers.protocols.alpha import Decoder, Frame, State
 from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
@@ -51,6 +52,10 @@ class AlphaDriver(Driver):
         super().__init__(robot, options, run)
         self._clock = Clock()
         self.link = AddressLink(options.port, self._clock)
+        self.link.wording = Wording(
+            Spelling(alpha.Decoder().feed, alpha.describe),
+            Spelling(alpha.Decoder().feed, alpha.describe),
+        )
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
         self._limits = limits_of(robot)

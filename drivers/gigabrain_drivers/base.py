@@ -1,6 +1,7 @@
 """The hardware abstraction layer: what every body offers."""
 
 import abc
+import math
 from collections.abc import AsyncIterator, Callable, Mapping
 from types import TracebackType
 from typing import Any, ClassVar, Self
@@ -11,6 +12,7 @@ from gigabrain_schemas.body import Joint, RobotState
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import Unsupported
+from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 
 Emit = Callable[[Topic[Any], Message], None]
 
@@ -81,6 +83,13 @@ class Driver(abc.ABC):
     ) -> Velocity:
         """Drive [m/s, m/s, rad/s]; returns what was really sent. Raises BodyLost."""
         raise Unsupported(f"{type(self).__name__} has no base to drive")
+
+    def bounded(self, linear_x: float, linear_y: float, angular_z: float) -> Velocity:
+        """A command within the body's own limits; where one value is no number, all are zero."""
+        if not all(map(math.isfinite, (linear_x, linear_y, angular_z))):
+            return ZERO
+        wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
+        return clamp(wanted, limits_of(self.robot))
 
     async def set_joint_position(self, joint_name: str, position: float) -> float:
         """Move one joint [rad or m]; returns what was really sent. Raises BodyLost."""

@@ -17,7 +17,8 @@ from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_drivers.line_options import BITS_PER_BYTE, LineOptions, check_wheels
 from gigabrain_drivers.line_report import LineReport
 from gigabrain_drivers.links.serial_link import SerialLink
-from gigabrain_drivers.protocols.line import Decoder
+from gigabrain_drivers.links.wording import Spelling, Wording
+from gigabrain_drivers.protocols.line import Decoder, describe
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import LinkHealth, RobotState
@@ -54,6 +55,10 @@ class LineDriver(Driver):
         self._by_wheels = any(name.startswith("wheel_") for name in self._command.names)
         self._clock = Clock()
         self.link = SerialLink(options.port, options.baud, self._clock, probe=self._is_ours)
+        self.link.wording = Wording(
+            Spelling(Decoder([self._command]).feed, describe),
+            Spelling(Decoder(options.state_templates()).feed, describe),
+        )
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
         self._report = LineReport(options, robot, self._base)

@@ -79,10 +79,11 @@ class MockBody(Driver):
         """Take on the velocity at once."""
         if not self._open:
             raise BodyLost("the mock is not open")
+        to = self.bounded(linear_x, 0.0, angular_z)
         self._velocity = Velocity(
-            linear_x=linear_x * self._gain, linear_y=0.0, angular_z=angular_z * self._gain
+            linear_x=to.linear_x * self._gain, angular_z=to.angular_z * self._gain
         )
-        return Velocity(linear_x=linear_x, linear_y=0.0, angular_z=angular_z)
+        return to
 
     async def read_state(self) -> RobotState:
         """Where it has driven to."""

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from gigabrain_drivers.base import Driver
 from gigabrain_drivers.catalog import make_driver, ports_folder
 from gigabrain_drivers.latch import Latched, LatchFile
+from gigabrain_drivers.links.wording import of_command
 from gigabrain_drivers.lockstep import REPEAT_S, Lockstep
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.round_trip import RoundTrip
@@ -191,7 +192,9 @@ class DriverProcess:
                 await self._driver.stop()
                 return
             to = now.output
-            await self._driver.set_base_velocity(to.linear_x, to.linear_y, to.angular_z)
+            sent = await self._driver.set_base_velocity(to.linear_x, to.linear_y, to.angular_z)
+            if log.isEnabledFor(logging.DEBUG):
+                log.debug("%s", of_command(to, sent))
         if now.mode == "enabled" and now.command and to != ZERO:
             late = gate.age_ns(now, now.command.tick, self._wall_ns()) > STALE_NS
             self._bus.counters["stale_commands_executed"] += late

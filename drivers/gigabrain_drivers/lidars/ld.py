@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import serial
 
 from gigabrain_drivers.lidars.serial_source import SerialSource
+from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_drivers.protocols import ld
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock
@@ -24,6 +25,7 @@ class Ld(SerialSource):
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         super().__init__(options, lidar, clock, self.rate_baud)
+        self.link.wording = Wording(received=Spelling(ld.Decoder().feed, ld.describe))
         self._decoder = ld.Decoder()
         self._last: float | None = None  # [deg], of the newest sample
         self._understood = False

@@ -5,6 +5,7 @@ from typing import Any
 import serial
 
 from gigabrain_drivers.lidars.serial_source import SerialSource
+from gigabrain_drivers.links.wording import Spelling, Wording, whole
 from gigabrain_drivers.protocols import lds01
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock
@@ -22,6 +23,9 @@ class Lds01(SerialSource):
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         super().__init__(options, lidar, clock, lds01.BAUD)
+        self.link.wording = Wording(
+            Spelling(whole, lds01.describe_command), Spelling(lds01.Decoder().feed, lds01.describe)
+        )
         self._decoder = lds01.Decoder()
         self._last: int | None = None  # number of the newest packet
         self._told_ns = 0  # when it was last told to start, or last seen to turn

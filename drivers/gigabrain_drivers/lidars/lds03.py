@@ -6,6 +6,7 @@ from typing import Any
 import serial
 
 from gigabrain_drivers.lidars.serial_source import SerialSource
+from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_drivers.protocols import lds03
 from gigabrain_drivers.protocols.lds03 import Sample
 from gigabrain_schemas.body import Lidar
@@ -27,6 +28,10 @@ class Lds03(SerialSource):
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         super().__init__(options, lidar, clock, lds03.BAUD)
+        self.link.wording = Wording(
+            Spelling(lds03.CommandDecoder().feed, lds03.describe_command),
+            Spelling(lds03.Decoder().feed, lds03.describe),
+        )
         self._decoder = lds03.Decoder()
         self._cleared = self._started = self._understood = False
         self._told_ns = 0  # when it was last told something, or last seen to turn

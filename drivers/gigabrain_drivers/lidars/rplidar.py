@@ -9,6 +9,7 @@ import serial
 
 from gigabrain_drivers.lidars.rplidar_start import BAUDS, FAMILIES, MODELS, STOP_S, Trouble, start
 from gigabrain_drivers.lidars.serial_source import LOOK_NS, SerialSource
+from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_drivers.protocols import rplidar
 from gigabrain_drivers.protocols.rplidar import Answer, Info
 from gigabrain_drivers.protocols.rplidar_scans import Samples
@@ -50,6 +51,10 @@ class Rplidar(SerialSource):
         self._bauds = [model.baud] if model else list(BAUDS)
         super().__init__(options, lidar, clock, self._bauds[0])
         self.link.on_lost = self._lost
+        self.link.wording = Wording(
+            Spelling(rplidar.RequestDecoder().feed, rplidar.describe_request),
+            Spelling(rplidar.Decoder().feed, rplidar.describe),
+        )
         self._decoder = rplidar.Decoder()
         self._connected = asyncio.Event()
         self._asked: tuple[int, asyncio.Future[bytes]] | None = None

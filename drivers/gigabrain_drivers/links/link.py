@@ -3,11 +3,15 @@
 import abc
 import asyncio
 import contextlib
+import logging
 import os
 from collections.abc import Callable
 
+from gigabrain_drivers.links.wording import Wording
 from gigabrain_schemas.body import LinkHealth
 from gigabrain_zenoh.clock import Clock
+
+log = logging.getLogger(__name__)
 
 Trace = Callable[[str, bytes], None]
 
@@ -34,6 +38,7 @@ class Link(abc.ABC):
         self.on_open: Callable[[], None] = _nothing
         self.on_lost: Callable[[str], None] = _ignore
         self.trace: Trace | None = None  # ("tx" or "rx", bytes)
+        self.wording = Wording()  # for the log at debug level; the owner puts its protocol's here
         self.problem = "not opened"
         self.errors = 0  # frames that the owner threw away
         self.reconnects = 0
@@ -84,8 +89,7 @@ class Link(abc.ABC):
         if sent < len(data):
             self._cut_short()
             return False
-        if self.trace:
-            self.trace("tx", data)
+        self._tell("tx", data)
         return True
 
     def drop(self, reason: str) -> None:
@@ -119,6 +123,13 @@ class Link(abc.ABC):
     @abc.abstractmethod
     def _cut_short(self) -> None:
         """A write went out in part; see to it that the rest never goes out later."""
+
+    def _tell(self, way: str, data: bytes) -> None:
+        if self.trace:
+            self.trace(way, data)
+        if log.isEnabledFor(logging.DEBUG):
+            for line in self.wording.lines(way, data):
+                log.debug("%s %s", self, line)
 
     async def _keep_open(self) -> None:
         retry_ns = FIRST_RETRY_NS
@@ -167,8 +178,7 @@ class Link(abc.ABC):
             self.drop("the other end is gone: unplugged?")
             return
         self._heard_ns = self._clock.now_ns()
-        if self.trace:
-            self.trace("rx", data)
+        self._tell("rx", data)
         self.on_bytes(data)
 
 

@@ -9,6 +9,7 @@ import serial
 from msgspec.structs import replace
 
 from gigabrain_drivers.links.link import Link
+from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_drivers.protocols import dynamixel, opencr
 from gigabrain_drivers.protocols.opencr import Readings
 from gigabrain_schemas.body import LinkHealth
@@ -37,6 +38,10 @@ class Board:
         self.link = link
         self.link.on_open, self.link.on_lost = self._opened, self._lost
         self.link.on_bytes = self._take
+        self.link.wording = Wording(
+            Spelling(dynamixel.Decoder().feed, opencr.describe),
+            Spelling(dynamixel.Decoder().feed, opencr.describe),
+        )
         self.on_readings: Callable[[Readings], None] = _ignore  # set by the owner
         self._clock = clock
         self._decoder = dynamixel.Decoder()

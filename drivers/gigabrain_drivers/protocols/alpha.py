@@ -161,6 +161,26 @@ def newer(sequence: int, than: int) -> bool:
     return 0 < (sequence - than) % SEQUENCES < SEQUENCES // 2
 
 
+def describe(frame: Frame) -> str:
+    """A frame in words."""
+    if frame.type == WALK and (command := walk_of(frame)):
+        gait = command.gait
+        return (
+            f"{frame.sequence} walk: stride {gait.stride_x:.4f} {gait.stride_y:.4f} m, "
+            f"turn {gait.turn:.4f} rad, frequency {gait.frequency:.2f} Hz, duty {gait.duty:.2f}, "
+            f"height {gait.height:.3f} m; seen {command.seen} ms"
+        )
+    if frame.type == STOP:
+        return f"{frame.sequence} stop"
+    if frame.type == STATE and (now := state_of(frame)):
+        feet = "".join("x" if touches else "." for touches in now.senses.contacts)
+        return (
+            f"{frame.sequence} state: {now.milliseconds} ms, echo {now.echo}, refused "
+            f"{now.refused}, flags {now.flags}, {now.voltage:.2f} V, feet {feet}"
+        )
+    return f"{frame.sequence} unsound frame of type {frame.type:#04x}"
+
+
 class Decoder:
     """Finds frames in whatever comes in. `errors` counts stretches of bytes that were no frame.
 

@@ -82,6 +82,16 @@ def decode(data: bytes) -> Frame | None:
     return Frame(speed, start, end, fields[4:-3:2], fields[5:-3:2], time_ms)
 
 
+def describe(frame: Frame) -> str:
+    """A frame in words."""
+    seen = [distance for distance in frame.distances if distance]
+    span = f"{min(seen)} to {max(seen)} mm" if seen else "no return"
+    return (
+        f"{POINTS} points from {frame.start / 100:.2f} to {frame.end / 100:.2f} deg clockwise, "
+        f"{span}, {frame.speed / 360:.2f} turns/s"
+    )
+
+
 class Decoder:
     """Finds the frames in a stream of bytes, whatever else is in it."""
 

@@ -33,6 +33,20 @@ def encode(packet: Packet) -> bytes:
     return frame + bytes([0xFF - sum(frame) & 0xFF]) * 2
 
 
+def describe(packet: Packet) -> str:
+    """A packet in words."""
+    first = packet.number * SAMPLES
+    return (
+        f"samples {first} to {first + SAMPLES - 1} of 360: {' '.join(map(str, packet.ranges))} mm, "
+        f"{packet.rpm:.1f} rpm"
+    )
+
+
+def describe_command(command: bytes) -> str:
+    """A command to the lidar in words."""
+    return {START: "start", STOP: "stop"}.get(command, "unknown command")
+
+
 class Decoder:
     """Finds packets in whatever comes in. `errors` counts stretches of other bytes."""
 

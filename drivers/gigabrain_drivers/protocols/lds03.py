@@ -49,6 +49,37 @@ def encode(packet: Packet) -> bytes:
     return _HEADER + head + struct.pack("<H", _check(head, body)) + body
 
 
+def describe(packet: Packet) -> str:
+    """A packet in words."""
+    first, last = packet.samples[0], packet.samples[-1]
+    turn = f"a turn begins at {packet.rate:.1f} Hz, " if packet.begins else ""
+    return (
+        f"{turn}{len(packet.samples)} samples from {first.angle:.2f} deg, {first.distance} mm "
+        f"to {last.angle:.2f} deg, {last.distance} mm"
+    )
+
+
+class CommandDecoder:
+    """Finds commands in what goes to the lidar."""
+
+    def __init__(self) -> None:
+        self._newest = b""
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """The commands that `data` completes."""
+        found = []
+        for value in data:
+            self._newest = self._newest[-3:] + bytes((value,))
+            if self._newest == command(self._newest[2] if len(self._newest) == 4 else 0):
+                found.append(self._newest)
+        return found
+
+
+def describe_command(command: bytes) -> str:
+    """A command to the lidar in words."""
+    return {START: "start", STOP: "stop"}.get(command, "unknown command")
+
+
 class Decoder:
     """Finds packets in whatever comes in. `errors` counts stretches of other bytes."""
 

@@ -11,7 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from gigabrain_drivers.protocols.checks import CHECKS
-from gigabrain_drivers.protocols.line_fields import DEFAULT_FORMATS, IGNORED, factor
+from gigabrain_drivers.protocols.line_fields import (
+    COMMAND,
+    DEFAULT_FORMATS,
+    IGNORED,
+    STATE,
+    UNITS,
+    factor,
+)
 from gigabrain_zenoh.errors import unknown
 
 LONGEST = 256  # bytes of a line
@@ -167,6 +174,17 @@ def _pattern(form: str, decimals: str | None) -> str:
         return f"{padding}{sign}[0-9]{{1,12}}"
     places = int(decimals) if decimals else 6 if "." not in form else 0
     return rf"{padding}{sign}[0-9]{{1,12}}" + (rf"\.[0-9]{{{places}}}" if places else "")
+
+
+def describe(values: Mapping[str, float]) -> str:
+    """The numbers of a line in words, in SI units, volts, degrees C and percent."""
+    told = []
+    for name, value in values.items():
+        quantity = {**STATE, **COMMAND}[name]
+        unit = next(iter(UNITS[quantity]))
+        number = f"{round(value):#x}" if quantity == "flags" else f"{value:.4g}"
+        told.append(f"{name} {number} {unit}".strip())
+    return ", ".join(told)
 
 
 class Decoder:

@@ -124,5 +124,49 @@ def torque(on: bool) -> bytes:
     return dynamixel.write(ID, TORQUE, bytes([on]))
 
 
+def describe(packet: dynamixel.Packet) -> str:
+    """A packet between a host and the board, in words."""
+    kind, params = packet.instruction, packet.params
+    if kind == dynamixel.STATUS:
+        return _answer_in_words(params)
+    if kind == dynamixel.PING:
+        return f"ping {packet.id}"
+    if kind == dynamixel.READ and len(params) == 4:
+        address, length = struct.unpack("<HH", params)
+        return f"read {length} bytes at {address}"
+    if kind != dynamixel.WRITE or len(params) < 3:
+        return f"instruction {kind:02x}"
+    address, data = params[0] | params[1] << 8, params[2:]
+    if address == HEARTBEAT and len(data) == 1:
+        return f"heartbeat {data[0]}"
+    if address == TORQUE and len(data) == 1:
+        return f"motors {'on' if data[0] else 'off'}"
+    if address == VELOCITY and len(data) == 24:
+        forward, _, _, _, _, turn = struct.unpack("<6i", data)
+        return (
+            f"velocity: linear x {forward} x 0.01 m/s = {forward * SPEED_UNIT:.2f} m/s, "
+            f"angular z {turn} x 0.01 rad/s = {turn * SPEED_UNIT:.2f} rad/s"
+        )
+    return f"write {len(data)} bytes at {address}"
+
+
+def _answer_in_words(params: bytes) -> str:
+    if not params:
+        return "status without an error byte"
+    error, data = params[0] & 0x7F, params[1:]
+    if error:
+        return f"status: error {error}"
+    if model := model_of(data):
+        return f"status: model {model[0]:#06x}, firmware {model[1]}"
+    if len(data) != LENGTH:
+        return f"status: ok, {len(data)} bytes" if data else "status: ok"
+    now = readings(data)
+    left, right = now.velocities
+    return (
+        f"state: heartbeat {now.heartbeat}, {now.voltage:.2f} V, wheels {left:.3f} {right:.3f} "
+        f"rad/s at {now.ticks[0]} {now.ticks[1]} ticks, device status {now.device_status}"
+    )
+
+
 def _hundredths(value: float) -> int:
     return max(-10_000, min(10_000, round(value / SPEED_UNIT)))

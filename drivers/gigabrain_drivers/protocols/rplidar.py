@@ -22,6 +22,13 @@ STANDARD, EXPRESS, DENSE = 0x81, 0x82, 0x85
 MODE_COUNT, MODE_MICROSECONDS, MODE_DISTANCE = 0x70, 0x71, 0x74  # keys of GET_CONF
 MODE_ANSWER, MODE_TYPICAL, MODE_NAME = 0x75, 0x7C, 0x7F
 
+REQUESTS = {
+    STOP: "stop", RESET: "reset", SCAN: "scan", FORCE_SCAN: "force scan",
+    GET_INFO: "get info", GET_HEALTH: "get health", GET_SAMPLERATE: "get sample rate",
+    EXPRESS_SCAN: "express scan", GET_CONF: "get setting", SET_SPEED: "set speed",
+    SET_PWM: "set motor", GET_BOARD: "get board",
+}  # fmt: skip
+
 _SIZES = {INFO: 20, HEALTH: 3, SAMPLERATE: 4, BOARD: 4}
 _LONGEST_CONF = 64  # bytes
 _DESCRIPTOR = struct.Struct("<2sIB")
@@ -198,6 +205,26 @@ class Request(NamedTuple):
 
     command: int
     payload: bytes = b""
+
+
+def describe(item: "Answer | Samples") -> str:
+    """What the lidar sent, in words; samples are those of the block before."""
+    if isinstance(item, Samples):
+        seen = [distance for distance in item.distances if distance]
+        span = f"{min(seen):.0f} to {max(seen):.0f} mm" if seen else "no return"
+        return f"{len(item.angles)} samples from {item.angles[0]:.2f} deg clockwise, {span}"
+    if item.kind == INFO:
+        info = Info.read(item.data)
+        return f"info: model {info.model:#04x}, firmware {info.firmware[0]}.{info.firmware[1]:02}"
+    if item.kind == HEALTH:
+        return f"health: status {Health.read(item.data).status}"
+    return f"answer of type {item.kind:#04x}, {len(item.data)} bytes"
+
+
+def describe_request(request: "Request") -> str:
+    """What a host asks for, in words."""
+    name = REQUESTS.get(request.command, f"request {request.command:#04x}")
+    return f"{name} {request.payload.hex(' ')}".strip()
 
 
 class RequestDecoder:

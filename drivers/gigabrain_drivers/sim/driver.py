@@ -134,7 +134,8 @@ class MujocoDriver(Driver):
         if self._reading is None:
             raise BodyLost("the simulation is not open")
         self._commanded_ns = self._simulation.time_ns
-        to = self._simulation.drive(linear_x, linear_y, angular_z)
+        wanted = self.bounded(linear_x, linear_y, angular_z)
+        to = self._simulation.drive(wanted.linear_x, wanted.linear_y, wanted.angular_z)
         return Velocity(linear_x=to.linear_x, linear_y=to.linear_y, angular_z=to.angular_z)
 
     async def read_state(self) -> RobotState:

@@ -1,0 +1,153 @@
+"""Checks of a driver by itself: opens, obeys within limits, returns what it sent, never raises."""
+
+import asyncio
+import functools
+import math
+import time
+from collections.abc import Awaitable, Callable
+
+from gigabrain_drivers.conformance.result import Failed, Finding
+from gigabrain_drivers.conformance.session import Session
+from gigabrain_drivers.conformance.subject import Subject
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.limits import clamp, limits_of
+
+RAMP_TICKS = 75  # 1.5 s, to get to a speed
+HOLD_TICKS = 15
+TOLERANCE = 0.1  # of the wanted speed, and
+UNIT = 0.02  # [m/s], [rad/s]: the coarsest step in which a body may take its commands
+NEVER = 2.0  # [s], that `stop` and `close` may take
+FAR = 10.0  # times more than the body can
+
+
+async def opens(subject: Subject) -> Finding:
+    """The body is heard after `open`."""
+    begin = time.monotonic()
+    async with Session(subject) as it:
+        await it.connected()
+    return Finding(True, f"heard after {(time.monotonic() - begin) * 1e3:.0f} ms")
+
+
+async def obeys(subject: Subject) -> Finding:
+    """Forwards, then turning: the measured speed is the commanded one."""
+    robot, told = subject.robot, []
+    wishes = (
+        ("linear_x", Velocity(linear_x=0.5 * robot.max_linear_speed)),
+        ("angular_z", Velocity(angular_z=-0.5 * robot.max_angular_speed)),
+    )
+    async with Session(subject) as it:
+        await it.connected()
+        for axis, wish in wishes:
+            it.wanted, wanted = wish, getattr(wish, axis)
+            slack = TOLERANCE * abs(wanted) + UNIT
+
+            there = functools.partial(_near, it, axis, wanted, slack)
+            ticks = await it.until(there, RAMP_TICKS)
+            measured = getattr(it.state.velocity, axis) if it.state else math.nan
+            if ticks is None:
+                return Finding(False, f"{axis} {measured:.3f} instead of {wanted:.3f}")
+            told.append(f"{axis} {measured:.3f} of {wanted:.3f} after {ticks} ticks")
+    return Finding(True, "; ".join(told))
+
+
+def _near(it: Session, axis: str, wanted: float, slack: float) -> bool:
+    assert it.state
+    measured: float = getattr(it.state.velocity, axis)
+    return abs(measured - wanted) <= slack
+
+
+async def limits(subject: Subject) -> Finding:
+    """What is asked of it ten times too fast is sent no faster than the body's file allows."""
+    robot = subject.robot
+    most = Velocity(linear_x=robot.max_linear_speed, angular_z=robot.max_angular_speed)
+    worst = 0.0
+    async with Session(subject) as it:
+        await it.connected()
+        for asked in (
+            Velocity(linear_x=FAR * most.linear_x),
+            Velocity(angular_z=-FAR * most.angular_z),
+            Velocity(linear_x=-FAR * most.linear_x, angular_z=FAR * most.angular_z),
+        ):
+            it.wanted = asked
+            await it.go_on(HOLD_TICKS)
+            sent = it.sent or Velocity()
+            told = subject.told(it.state)
+            worst = max(
+                worst,
+                abs(sent.linear_x) / most.linear_x,
+                abs(sent.angular_z) / most.angular_z,
+                abs(told[0]) / (most.linear_x * (1 + TOLERANCE)),
+                abs(told[2]) / (most.angular_z * (1 + TOLERANCE)),
+            )
+    return Finding(worst <= 1.001, f"at most {worst:.2f} of max speed")
+
+
+async def returns(subject: Subject) -> Finding:
+    """What it returns is what the body was told, rounded and clamped as it was."""
+    robot, worst = subject.robot, 0.0
+    asked = Velocity(
+        linear_x=-0.41234 * robot.max_linear_speed,
+        linear_y=robot.max_lateral_speed,
+        angular_z=0.31234 * robot.max_angular_speed,
+    )
+    async with Session(subject) as it:
+        await it.connected()
+        it.wanted = asked
+
+        def off() -> float:
+            sent, told = it.sent or Velocity(), subject.told(it.state)
+            pairs = zip((sent.linear_x, sent.linear_y, sent.angular_z), told, strict=True)
+            return max(abs(a - b) for a, b in pairs)
+
+        await it.go_on(2)
+        await it.until(lambda: off() <= UNIT / 2, RAMP_TICKS)
+        worst, sent = off(), it.sent or Velocity()
+    within = clamp(asked, limits_of(robot))
+    honest = abs(sent.linear_x - within.linear_x) <= UNIT
+    speeds = f"returned {sent.linear_x:.4f}, {sent.angular_z:.4f}"
+    return Finding(honest and worst <= UNIT, f"{speeds}; told differs by {worst:.4f}")
+
+
+async def refuses_nan(subject: Subject) -> Finding:
+    """What is not a number never reaches the body, also without the gate before it."""
+    async with Session(subject) as it:
+        await it.connected()
+        for bad in (math.nan, math.inf, -math.inf):
+            sent = await it.driver.set_base_velocity(
+                bad, 0.0, 0.5 * subject.robot.max_angular_speed
+            )
+            speeds = (sent.linear_x, sent.linear_y, sent.angular_z)
+            if any(speeds):
+                return Finding(False, f"{bad} became {speeds}")
+    return Finding(True, "nan, inf and -inf all became zero")
+
+
+async def never_raises(subject: Subject) -> Finding:
+    """`stop` and `close`: before open, twice, after close, and with the line cut or frozen."""
+    calls = 0
+
+    async def quietly(what: str, call: Callable[[], Awaitable[None]]) -> None:
+        nonlocal calls
+        calls += 1
+        try:
+            async with asyncio.timeout(NEVER):
+                await call()
+        except Exception as error:  # the very thing that is looked for
+            raise Failed(f"{what}: {error!r}") from error
+
+    states = ["never opened", "opened", *(("unplugged", "frozen") if subject.has_peer else ())]
+    for state in states:
+        driver = subject.driver()
+        try:
+            if state != "never opened":
+                await driver.open()
+                await asyncio.sleep(0.1)
+            if state in ("unplugged", "frozen"):
+                subject.faults(state)
+            for what in ("stop", "stop", "close", "stop", "close"):
+                await quietly(f"{what}, {state}", getattr(driver, what))
+        finally:
+            await driver.close()
+            if subject.has_peer:
+                subject.faults("")
+    return Finding(True, f"{calls} calls, {len(states)} states")

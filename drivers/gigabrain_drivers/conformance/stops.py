@@ -1,0 +1,107 @@
+"""Checks behind the gate: the body stops whenever its commander is not to be trusted."""
+
+import asyncio
+import contextlib
+import math
+import sys
+
+import msgspec
+
+from gigabrain_drivers.conformance.result import Failed, Finding
+from gigabrain_drivers.conformance.rig import Rig, stop_ticks
+from gigabrain_zenoh.limits import ZERO
+
+SILENCE = 7  # ticks: 100 ms without a command, told in the next tick
+AT_ONCE = 2
+DISORDER_TICKS = 35
+COMMANDER = "import time\nwhile True:\n print(flush=True)\n time.sleep(0.02)\n"
+
+
+async def silence(rig: Rig) -> Finding:
+    """The commander falls silent at full drive."""
+    await rig.drive()
+    rig.wanted = None
+    return await _stopped(rig, stop_ticks(rig, SILENCE))
+
+
+async def not_a_number(rig: Rig) -> Finding:
+    """The commander sends NaN: zero at once, without a ramp."""
+    await rig.drive(-1.0)
+    rig.wanted = None
+    last, calls = rig.last, len(rig.tap.calls)
+    if last is None:
+        raise Failed("nothing was commanded")
+    rig.deliver({**msgspec.structs.asdict(last), "linear_x": math.nan, "seq": last.seq + 1})
+    told = await rig.until(lambda: rig.tap.calls[calls:], AT_ONCE)
+    zero = told is not None and rig.tap.calls[calls].asked == ZERO
+    found = await _stopped(rig, stop_ticks(rig, AT_ONCE))
+    said = "zero at once" if zero else "not zero at once"
+    return Finding(found.ok and zero, f"{said}; {found.measured}")
+
+
+async def disorder(rig: Rig) -> Finding:
+    """Old, duplicated and reordered commands: none is obeyed, and none counts as being alive."""
+    wanted = await rig.drive()
+    earlier = rig.last
+    await rig.go_on(12)
+    rig.wanted, last, calls = None, rig.last, len(rig.tap.calls)
+    if earlier is None or last is None:
+        raise Failed("nothing was commanded")
+    before, end = sum(rig.refused.values()), rig.tick + DISORDER_TICKS
+    back = -wanted.linear_x
+    replace = msgspec.structs.replace
+    at_rest: int | None = None
+    begin = rig.tick
+    while rig.tick < end:
+        rig.deliver(replace(last, linear_x=back))  # a duplicate
+        rig.deliver(replace(last, linear_x=back, seq=last.seq - 3))  # overtaken
+        rig.deliver(replace(earlier, linear_x=back, seq=last.seq + 100))  # old, though new by count
+        rig.deliver(replace(last, linear_x=back, seq=last.seq + 200, tick=rig.tick + 1000))
+        if at_rest is None and rig.rests:
+            at_rest = rig.tick - begin
+        await rig.go_on(1)
+    refused = sum(rig.refused.values()) - before
+    backward = sum(1 for call in rig.tap.calls[calls:] if call.asked.linear_x * back > 0)
+    good = backward == 0 and at_rest is not None and at_rest <= stop_ticks(rig, SILENCE)
+    rest = "never at rest" if at_rest is None else f"at rest after {at_rest} ticks"
+    return Finding(good, f"{refused} refused, {backward} obeyed; {rest}")
+
+
+async def killed(rig: Rig) -> Finding:
+    """The commander is a process, and ends by SIGKILL."""
+    await rig.drive(-1.0)
+    wanted = rig.wanted
+    commander = await asyncio.create_subprocess_exec(
+        sys.executable, "-S", "-c", COMMANDER, stdout=asyncio.subprocess.PIPE
+    )
+    try:
+        relay = asyncio.create_task(_relay(rig, commander))
+        if await rig.until(lambda: rig.wanted is None, 250) is None:
+            raise Failed("the commander's process did not start")
+        await rig.go_on(15)
+        if rig.mode != "enabled" or wanted is None:
+            raise Failed(f"the commander's process was not obeyed; gate {rig.mode}")
+    finally:
+        commander.kill()
+        await commander.wait()
+    found = await _stopped(rig, stop_ticks(rig, SILENCE))
+    relay.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await relay
+    return found
+
+
+async def _relay(rig: Rig, commander: asyncio.subprocess.Process) -> None:
+    """A command for each line of the commander, which takes over from the rig with its first."""
+    assert commander.stdout
+    velocity = rig.wanted or ZERO
+    while await commander.stdout.readline():
+        rig.wanted = None
+        rig.command(velocity)
+
+
+async def _stopped(rig: Rig, most: int) -> Finding:
+    ticks = await rig.until(lambda: rig.rests, most)
+    if ticks is None:
+        return Finding(False, f"still moving after {most} ticks")
+    return Finding(True, f"at rest after {ticks} ticks of at most {most}")

@@ -1,0 +1,75 @@
+"""Checks of rates and of the way from a command to its bytes."""
+
+import asyncio
+
+from gigabrain_drivers.conformance.result import Failed, Finding
+from gigabrain_drivers.conformance.rig import Rig
+from gigabrain_drivers.conformance.subject import link_of
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.clock import Clock
+
+RATE_TICKS = 70  # 1.4 s
+SCAN_TICKS = 350  # a lidar may take so long to turn
+OF_TICKS = 0.9  # of the ticks that must bring a state
+SCAN_SLACK = 0.25  # of the lidar's rate
+OLD_MS = 100.0
+SAMPLES = 40
+MID_TICK_S = 0.008
+MOST_MS = 1.0
+
+
+async def reports(rig: Rig) -> Finding:
+    """A state per tick, fresh; scans as often as the body's file says."""
+    lidar = rig.robot.lidar
+    if await rig.until(lambda: rig.state and (rig.scan or not lidar), SCAN_TICKS) is None:
+        raise Failed(f"no state and scan within {SCAN_TICKS} ticks")
+    assert rig.state
+    begin, states, scans, oldest = rig.tick, rig.states, rig.scans, 0.0
+
+    def look() -> bool:
+        nonlocal oldest
+        assert rig.state
+        oldest = max(oldest, rig.state.link.age_ms)
+        return False
+
+    await rig.until(look, RATE_TICKS)
+    ticks, states, scans = rig.tick - begin, rig.states - states, rig.scans - scans
+    good = states >= OF_TICKS * ticks and oldest <= OLD_MS
+    text = f"{states} in {ticks} ticks, at most {oldest:.0f} ms old"
+    if lidar and rig.scan:
+        rate = scans / (ticks * 0.02)
+        beams = len(rig.scan.ranges) // 4
+        good = good and abs(rate / lidar.rate_hz - 1) <= SCAN_SLACK and beams == lidar.beams
+        text += f"; scans of {beams} beams at {rate:.1f} Hz of {lidar.rate_hz:g}"
+    return Finding(good, text)
+
+
+async def latency(rig: Rig) -> Finding:
+    """From a command on the bus, through the gate and the driver, to its bytes on the line."""
+    link, clock = link_of(rig.tap.inner), Clock()
+    times: list[float] = []
+    asked_ns = 0
+
+    def trace(way: str, _: bytes) -> None:
+        nonlocal asked_ns
+        if way == "tx" and rig.tap.speaking and asked_ns:
+            times.append((clock.now_ns() - asked_ns) / 1e6)
+            asked_ns = 0
+
+    wanted = await rig.drive()
+    step = 0.02 * min(rig.robot.max_linear_acceleration, rig.robot.max_linear_deceleration)
+    rig.wanted, link.trace = None, trace
+    try:
+        for i in range(SAMPLES):
+            await rig.go_on(1)
+            await asyncio.sleep(MID_TICK_S)
+            asked_ns = clock.now_ns()
+            rig.command(Velocity(linear_x=wanted.linear_x - (i % 2) * step))
+    finally:
+        link.trace = None
+    await rig.pause()
+    if len(times) < SAMPLES // 2:
+        return Finding(False, f"{len(times)} of {SAMPLES} commands led to bytes")
+    times.sort()
+    p50, p95 = times[len(times) // 2], times[int(len(times) * 0.95)]
+    return Finding(p50 <= MOST_MS, f"p50 {p50:.2f} ms, p95 {p95:.2f} ms of {len(times)}")

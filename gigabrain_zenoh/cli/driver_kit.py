@@ -1,0 +1,118 @@
+"""`gigabrain driver test`, `new` and `trace`: for whoever writes drivers."""
+
+import asyncio
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Literal
+
+from gigabrain_zenoh.process import find
+from gigabrain_zenoh.settings import LinkName
+
+COLOURS = {"pass": "green", "fail": "bold red", "n/a": "dim"}
+
+
+def test(name: str, *, link: Literal["sim", "emulated"] | None = None) -> int:  # noqa: PT028
+    """Check whether a driver does all that every driver has to do; ends with 1 if it does not.
+
+    Example: gigabrain driver test mycustombot --link emulated
+
+    A check that says nothing about a link is shown as n/a with the reason, not as passed.
+
+    Parameters
+    ----------
+    name
+        A known robot, or the path of a robot's YAML file.
+    link
+        The emulated one, where the robot has one: it shows more than the simulated one.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    links = find("gigabrain_drivers.catalog:links_of")(
+        find("gigabrain_drivers.catalog:load_robot")(name)
+    )
+    chosen: LinkName = link or ("emulated" if "emulated" in links else "sim")
+    table = Table(title=f"{name}, link {chosen}")
+    for title in ("check", "criterion", "measured", "verdict"):
+        table.add_column(title)
+    console = Console()
+    with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder, console.status("") as status:
+        running = find("gigabrain_drivers.conformance.kit:check")
+        results = asyncio.run(running(name, chosen, Path(folder), lambda r: status.update(r.check)))
+    for result in results:
+        colour = COLOURS[result.verdict]
+        table.add_row(*result[:-1], f"[{colour}]{result.verdict}[/]")
+    console.print(table)
+    return int(any(result.verdict == "fail" for result in results))
+
+
+def trace(
+    name: str,
+    *,
+    link: Literal["emulated", "real"] = "emulated",
+    part: Literal["base", "scan"] = "base",
+    seconds: float = 2.0,
+    linear_x: float = 0.0,
+    angular_z: float = 0.0,
+) -> int:
+    """Show the bytes on a body's line both ways, each frame decoded beside its hex.
+
+    Example: gigabrain driver trace mycustombot --seconds 0.5 --linear-x 0.1
+
+    It starts the driver itself: on an emulator of its own, or on the real port, which nobody else
+    may have open then; a real body is commanded zero only. A driver that runs already writes the
+    same lines to its log with: gigabrain driver run NAME --link real --level debug
+
+    Parameters
+    ----------
+    name
+        A known robot, or the path of a robot's YAML file.
+    link
+        Which line.
+    part
+        The body's own line, or that of its lidar.
+    seconds
+        How long [s].
+    linear_x
+        What an emulated body is commanded all the time [m/s].
+    angular_z
+        What an emulated body is commanded all the time [rad/s].
+    """
+    from gigabrain_schemas.base import Velocity
+
+    with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
+        tracing = find("gigabrain_drivers.trace:run")(
+            name,
+            link,
+            Path(folder),
+            part=part,
+            seconds=seconds,
+            wanted=Velocity(linear_x=linear_x, angular_z=angular_z),
+            say=lambda line: print(line, flush=True),
+        )
+        try:
+            asyncio.run(tracing)
+        except BrokenPipeError:  # whoever was reading has seen enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+def new(name: str, *, folder: Path = Path()) -> int:
+    """Write the package of a new driver, which passes `gigabrain driver test` as it is.
+
+    Example: gigabrain driver new myrobot
+
+    Nothing that exists is overwritten.
+
+    Parameters
+    ----------
+    name
+        Of the robot and of its driver: lower-case letters, digits and underscores.
+    folder
+        Where the package's folder is made.
+    """
+    path = find("gigabrain_drivers.conformance.new:write")(name, folder)
+    print(f"{path}: edit robot.yaml and driver.py; README.md says how to go on")
+    return 0

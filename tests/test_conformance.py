@@ -1,0 +1,30 @@
+"""Every robot of the package passes the driver author's kit, on every link without hardware."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.catalog import links_of, load_robot, robot_files
+from gigabrain_drivers.conformance import kit
+
+NEEDS_A_PEER = {
+    "stops when it is killed",
+    "stops unplugged",
+    "stops on a frozen peer",
+    "reconnects",
+    "command to byte",
+}
+
+
+@pytest.mark.parametrize("name", robot_files())
+async def test_every_robot_passes_the_kit(name: str, tmp_path: Path) -> None:
+    links = [link for link in links_of(load_robot(name)) if link != "real"]
+    checked = await asyncio.gather(
+        *(kit.check(name, link, tmp_path / link, lambda result: None) for link in links)
+    )
+    for link, results in zip(links, checked, strict=True):
+        assert [result for result in results if result.verdict == "fail"] == []
+        assert len(results) == 16
+        not_applicable = {result.check for result in results if result.verdict == "n/a"}
+        assert not_applicable == (NEEDS_A_PEER if link == "sim" else set())
