@@ -94,7 +94,7 @@ class Alpha(Device):
     @property
     def _milliseconds(self) -> int:
         """The firmware's clock."""
-        return (self._now_ns - (self._began_ns or self._now_ns)) // 1_000_000
+        return 0 if self._began_ns is None else (self._now_ns - self._began_ns) // 1_000_000
 
     def _obey(self, gait: Gait, sequence: int) -> None:
         self._last = self._echo = sequence

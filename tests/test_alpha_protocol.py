@@ -1,0 +1,193 @@
+"""Alpha's frames: literal bytes, both ways, and whatever else may come down a line."""
+
+import math
+import random
+import struct
+import zlib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gigabrain_drivers.kinematics import Gait, Twist
+from gigabrain_drivers.legs.gait import WALKER
+from gigabrain_drivers.legs.senses import Senses
+from gigabrain_drivers.protocols import alpha
+from gigabrain_drivers.protocols.alpha import Decoder, Frame, State, Walk
+
+# the vectors of docs/firmware_alpha.md
+STOP_1 = bytes.fromhex("a55a0000020101000000d58d9383")
+WALK_2 = bytes.fromhex(
+    "a55a2c00010102000000e8030000cdcccc3d000000000000000066666640"
+    "9a99193f000000000000003f0000003f00000000e17a943e51c540ed"
+)
+FORWARD = Gait(0.1, 0.0, 0.0, 3.6, 0.6, (0.0, 0.5, 0.5, 0.0), 0.29)
+
+singles = st.floats(-1000, 1000, width=32)
+gaits = st.builds(
+    Gait, singles, singles, singles, singles, singles, st.tuples(*[singles] * 4), singles
+)
+
+
+def a_state(**changes: object) -> State:
+    legs = tuple((leg + 0.25, leg + 0.5, -leg - 0.75) for leg in range(4))
+    senses = Senses(
+        joints=legs,
+        rates=tuple((-1.5, 2.0, leg * 0.5) for leg in range(4)),
+        contacts=(True, False, False, True),
+        orientation=(0.0, 0.0, 0.0, 1.0),
+        angular_velocity=(0.125, -0.25, 0.5),
+        linear_acceleration=(0.0, 0.0, 9.8125),
+    )
+    state = State(
+        milliseconds=1000,
+        echo=7,
+        refused=3,
+        flags=alpha.WALKING,
+        voltage=25.5,
+        current=3.75,
+        percentage=87.5,
+        senses=senses,
+        torques=tuple(range(12)),
+        temperatures=(31.5,) * 11 + (-5.0,),
+    )
+    return state._replace(**changes)
+
+
+def test_the_vectors_of_the_firmware_page() -> None:
+    assert alpha.stop(1) == STOP_1
+    assert alpha.walk(Walk(1000, FORWARD), 2) == WALK_2
+    frames = Decoder().feed(STOP_1 + WALK_2)
+    assert [(frame.type, frame.sequence) for frame in frames] == [(0x02, 1), (0x01, 2)]
+    command = alpha.walk_of(frames[1])
+    assert command
+    assert command.seen == 1000
+    assert command.gait[:3] == pytest.approx((0.1, 0.0, 0.0))
+
+
+def test_crc_and_lengths_are_those_of_the_firmware_page() -> None:
+    assert zlib.crc32(b"123456789") == 0xCBF43926
+    assert len(alpha.state(a_state(), 1)) == 248
+    assert alpha.state(a_state(), 0x01020304)[:10] == bytes.fromhex("a55aea00810104030201")
+
+
+def test_each_number_of_a_state_is_where_the_firmware_page_says() -> None:
+    data = alpha.state(a_state(), 5)
+    assert struct.unpack_from("<III", data, 10) == (1000, 7, 3)
+    assert (data[22], data[23]) == (1, 0b1001)
+    assert struct.unpack_from("<3f", data, 24) == (25.5, 3.75, 87.5)
+    assert struct.unpack_from("<4f", data, 36) == (0.0, 0.0, 0.0, 1.0)
+    assert struct.unpack_from("<3f", data, 52) == (0.125, -0.25, 0.5)
+    assert struct.unpack_from("<3f", data, 64) == (0.0, 0.0, 9.8125)
+    assert struct.unpack_from("<3f", data, 76) == (0.25, -1.5, 0.0)
+    assert struct.unpack_from("<3f", data, 208) == (-3.75, 1.5, 11.0)
+    assert struct.unpack_from("<h", data, 220) == (315,)
+    assert struct.unpack_from("<h", data, 242) == (-50,)
+
+
+@given(gaits, st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
+def test_a_command_there_and_back(gait: Gait, seen: int, sequence: int) -> None:
+    (frame,) = Decoder().feed(alpha.walk(Walk(seen, gait), sequence))
+    assert frame.sequence == sequence
+    assert alpha.walk_of(frame) == Walk(seen, gait)
+
+
+@given(st.floats(-0.5, 0.5), st.floats(-0.2, 0.2), st.floats(-1, 1))
+def test_a_velocity_survives_the_wire_to_a_millionth(x: float, y: float, turn: float) -> None:
+    (frame,) = Decoder().feed(alpha.walk(Walk(0, WALKER.to_gait(Twist(x, y, turn))), 1))
+    command = alpha.walk_of(frame)
+    assert command
+    assert WALKER.to_body(command.gait) == pytest.approx((x, y, turn), abs=1e-6)
+
+
+def test_a_state_there_and_back() -> None:
+    (frame,) = Decoder().feed(alpha.state(a_state(), 9))
+    assert alpha.state_of(frame) == a_state()
+
+
+@given(st.lists(st.integers(1, 60), max_size=40))
+def test_frames_are_found_however_they_are_cut(cuts: list[int]) -> None:
+    stream = alpha.stop(1) + alpha.walk(Walk(0, FORWARD), 2) + alpha.state(a_state(), 3)
+    decoder, found = Decoder(), list[Frame]()
+    for cut in cuts:
+        found += decoder.feed(stream[:cut])
+        stream = stream[cut:]
+    found += decoder.feed(stream)
+    assert [frame.sequence for frame in found] == [1, 2, 3]
+    assert decoder.errors == 0
+
+
+@given(st.binary(max_size=400))
+def test_no_bytes_make_the_decoder_raise_or_keep_more_than_a_frame(noise: bytes) -> None:
+    decoder = Decoder()
+    decoder.feed(noise)
+    decoder.feed(b"\x00" * 300)
+    assert [frame.sequence for frame in decoder.feed(STOP_1)] == [1]
+    assert len(decoder._buffer) <= 248
+
+
+@given(st.binary(min_size=44, max_size=44))
+def test_no_payload_makes_a_command_raise(payload: bytes) -> None:
+    command = alpha.walk_of(Frame(alpha.WALK, 1, payload))
+    assert command is None or all(map(math.isfinite, command.gait.phases))
+
+
+@given(st.binary(min_size=234, max_size=234))
+def test_no_payload_makes_a_state_raise(payload: bytes) -> None:
+    state = alpha.state_of(Frame(alpha.STATE, 1, payload))
+    assert state is None or 0.99 < math.hypot(*state.senses.orientation) < 1.01
+
+
+def test_a_broken_frame_costs_no_more_than_itself() -> None:
+    broken = bytearray(WALK_2)
+    broken[20] ^= 1
+    decoder = Decoder()
+    assert [f.sequence for f in decoder.feed(STOP_1 + bytes(broken) + STOP_1)] == [1, 1]
+    assert decoder.errors == 1
+
+
+def test_a_length_that_does_not_belong_to_its_type_is_not_waited_for() -> None:
+    wrong = bytearray(WALK_2)
+    wrong[2:4] = b"\xff\xff"
+    assert [f.sequence for f in Decoder().feed(bytes(wrong) + STOP_1)] == [1]
+
+
+def test_another_version_is_not_obeyed() -> None:
+    other = bytearray(STOP_1[:-4])
+    other[5] = 2
+    assert Decoder().feed(bytes(other) + struct.pack("<I", zlib.crc32(other))) == []
+
+
+def test_what_is_not_a_number_is_no_command_and_no_state() -> None:
+    walk = alpha.walk(Walk(0, FORWARD._replace(turn=math.nan)), 1)
+    assert alpha.walk_of(Decoder().feed(walk)[0]) is None
+    state = alpha.state(a_state(voltage=math.inf), 1)
+    assert alpha.state_of(Decoder().feed(state)[0]) is None
+
+
+def test_sequences_and_times_wrap() -> None:
+    assert alpha.newer(2, 1)
+    assert alpha.newer(3, 2**32 - 1)
+    assert not alpha.newer(1, 1)
+    assert not alpha.newer(2**32 - 1, 3)
+    assert not alpha.stale(2**32 - 50, 100)
+    assert alpha.stale(2**32 - 50, 101)
+    assert alpha.stale(100, 99)  # from the future: from another start of the firmware
+
+
+@pytest.mark.parametrize(("rate", "least"), [(0.001, 0.9), (0.05, 0.03)])
+def test_byte_errors_make_no_wrong_command(rate: float, least: float) -> None:
+    noise, count = random.Random(1), 20_000
+    decoder, right = Decoder(), 0
+    for sequence in range(count):
+        gait = FORWARD._replace(stride_x=struct.unpack("<f", struct.pack("<f", sequence))[0])
+        data = bytearray(alpha.walk(Walk(sequence, gait), sequence))
+        for place in range(len(data)):
+            if noise.random() < rate:
+                data[place] ^= noise.randint(1, 255)
+        for frame in decoder.feed(bytes(data)):
+            command = alpha.walk_of(frame)
+            assert command
+            assert frame.sequence == command.seen == command.gait.stride_x
+            right += 1
+    assert right > least * count
