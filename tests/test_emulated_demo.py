@@ -1,0 +1,65 @@
+"""`--link emulated`: the real driver, the emulator beside it, and one brain that knows neither."""
+
+import json
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gigabrain_zenoh.deployment import Deployment, process_specs
+from gigabrain_zenoh.process_config import ProcessConfig
+from tests.stack import Home
+
+
+def specs(tmp_path: Path, link: str) -> dict[str, tuple[tuple[str, ...], ProcessConfig]]:
+    deployment = msgspec.convert({"body": "mycustombot", "link": link}, Deployment)
+    found = process_specs(deployment, "robot", tmp_path, tmp_path / "state")
+    return {
+        spec.name: (spec.after, msgspec.json.decode(spec.argv[-1], type=ProcessConfig))
+        for spec in found
+    }
+
+
+def test_the_emulator_is_started_before_the_driver_and_told_the_same_folder(
+    tmp_path: Path,
+) -> None:
+    found = specs(tmp_path, "emulated")
+    assert list(found)[:3] == ["router", "emulator", "driver"]
+    assert found["driver"][0] == ("router", "emulator")
+    assert found["emulator"][0] == ("router",)
+    ports = str(tmp_path / "ports")
+    assert found["emulator"][1].settings["folder"] == ports
+    assert found["driver"][1].settings["emulator"] == ports
+
+
+@pytest.mark.parametrize("link", ["sim", "real"])
+def test_other_links_have_no_emulator(tmp_path: Path, link: str) -> None:
+    found = specs(tmp_path, link)
+    assert "emulator" not in found
+    assert found["driver"][0] == ("router",)
+
+
+async def test_a_robot_roams_by_bytes_on_two_serial_lines(home: Home) -> None:
+    path = home.folder / "report.json"
+    demo = await home.run(
+        "demo", "--body", "mycustombot", "--link", "emulated", "--seconds", "8",
+        "--headless", "--report", str(path),
+    )  # fmt: skip
+    assert await demo.ended() == 0, demo.err
+    report = json.loads(path.read_bytes())
+    assert (report["body"], report["contacts"], report["restarts"]) == ("mycustombot", 0, 0)
+    assert report["distance_m"] > 0.3
+    assert report["min_clearance_m"] > 0.05
+
+
+async def test_a_real_body_starts_neither_released_nor_enabled(home: Home) -> None:
+    demo = await home.run(
+        "demo", "--body", "mycustombot", "--link", "real", "--seconds", "1.5", "--headless"
+    )
+    await demo.ended()
+    assert "enabled" not in "".join(p.read_text() for p in home.folder.rglob("driver.jsonl"))
+    refused = await home.run(
+        "demo", "--body", "mycustombot", "--link", "real", "--resume", "auto", "--headless"
+    )
+    assert await refused.ended() == 2
+    assert "resume: auto is for simulation" in refused.err
