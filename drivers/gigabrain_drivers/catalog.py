@@ -1,6 +1,7 @@
 """Finds robots and drivers by name: ours, those of installed packages, and people's own files."""
 
 import importlib
+import importlib.util
 from importlib import resources
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -25,7 +26,24 @@ Options = TypeVar("Options", bound=Struct)
 def robot_files() -> dict[str, Path]:
     """Every known robot and its file, by name."""
     bodies = Path(str(resources.files("gigabrain_drivers") / "bodies"))
-    return {path.parent.name: path for path in sorted(bodies.glob("*/robot.yaml"))}
+    ours = {path.parent.name: path for path in sorted(bodies.glob("*/robot.yaml"))}
+    return {**_robots_of_packages(), **ours}
+
+
+def _robots_of_packages() -> dict[str, Path]:
+    """A package that offers a driver may have a robot.yaml of the driver's name in its folder."""
+    found = {}
+    for point in entry_points(group="gigabrain.drivers"):
+        spec = importlib.util.find_spec(point.module.partition(".")[0])
+        for folder in (spec.submodule_search_locations or ()) if spec else ():
+            if (path := Path(folder) / "robot.yaml").is_file():
+                found[point.name] = path
+    return found
+
+
+def known_drivers() -> list[str]:
+    """The names of all drivers: ours, and those that installed packages offer."""
+    return [*DRIVERS, *(point.name for point in entry_points(group="gigabrain.drivers"))]
 
 
 def robot_path(name: str) -> Path:
@@ -54,6 +72,16 @@ def links_of(robot: RobotFile) -> list[LinkName]:
     if {"sim", "real"} <= known:
         known.add("emulated")
     return [name for name in LINKS if name in known]
+
+
+def simulated(link: LinkName) -> list[str]:
+    """The robots that can be had over `link` with MuJoCo behind it, which knows the truth."""
+    known = {name: load_robot(name) for name in robot_files()}
+    return [
+        name
+        for name, robot in known.items()
+        if link in links_of(robot) and robot.sim and robot.sim.get("driver") == "mujoco"
+    ]
 
 
 def driver_class(name: str) -> type[Driver]:

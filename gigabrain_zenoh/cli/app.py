@@ -42,15 +42,25 @@ def make_app() -> App:
         app.command(f"{COMMANDS}.{where}", name=name, help=summary)
     groups = (
         ("driver", "run", "process:driver", "Drivers of bodies.", "Start the driver of a body."),
+        ("driver", "new", "driver_kit:new", "", "Write the package of a new driver."),
+        ("driver", "test", "driver_kit:test", "", "Check a driver against all that it must do."),
+        ("driver", "trace", "driver_kit:trace", "", "Show the bytes on a body's line, decoded."),
         ("schema", "export", "schema:export", "Messages.", "Write JSON Schema of every message."),
     )
+    subs: dict[str, App] = {}
     for group, name, where, about, summary in groups:
-        sub = App(name=group, help=about)
-        sub.command(f"{COMMANDS}.{where}", name=name, help=summary)
-        app.command(sub)
+        if group not in subs:
+            subs[group] = App(name=group, help=about)
+            app.command(subs[group])
+        subs[group].command(f"{COMMANDS}.{where}", name=name, help=summary)
     bench = App(name="bench", help="Measure this machine.")
     bench.command(f"{COMMANDS}.bench:chain", name="chain", help="From scan to command, timed.")
     bench.command(f"{COMMANDS}.bench:stack", name="stack", help="CPU, memory and time to start.")
+    bench.command(
+        f"{COMMANDS}.bench_bodies:bodies",
+        name="bodies",
+        help="One brain, all bodies, side by side.",
+    )
     app.command(bench)
     app.command(f"{COMMANDS}.completion:completion", name="completion", help="Shell completion.")
     return app

@@ -12,6 +12,7 @@ from msgspec import Struct
 
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.kinematics import Gait
+from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry, Simulation
 from gigabrain_drivers.sim.tick import TICK_S
@@ -73,8 +74,12 @@ class EmulatedBody:
 
     @property
     def commanded(self) -> tuple[float, float, float]:
-        """What the motors aim for."""
-        return self._commanded
+        """What the motors aim for; of a gait, the velocity that its steps amount to."""
+        gait = self._gait
+        if gait is None:
+            return self._commanded
+        linear_x, linear_y, angular_z = WALKER.to_body(gait)
+        return linear_x, linear_y, angular_z
 
     @property
     def simulation(self) -> Simulation:

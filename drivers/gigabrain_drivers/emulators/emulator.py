@@ -3,6 +3,7 @@
 import functools
 import importlib
 from collections.abc import Mapping
+from importlib.metadata import entry_points
 from types import TracebackType
 from typing import Any, Self
 
@@ -84,7 +85,13 @@ class Emulator:
 
 
 def device_class(driver: str) -> type[Device]:
-    """The device that answers a driver or a scan source. Raises UnknownName."""
+    """The device that answers a driver or a scan source, ours or an installed package's.
+
+    Packages offer theirs in the group `gigabrain.emulators`. Raises UnknownName.
+    """
+    offered = {point.name: point for point in entry_points(group="gigabrain.emulators")}
+    if driver not in DEVICES and driver in offered:
+        return offered[driver].load()  # type: ignore[no-any-return]
     if driver not in DEVICES:
         raise unknown("emulator for driver", driver, DEVICES)
     module, _, attribute = DEVICES[driver].partition(":")

@@ -1,0 +1,116 @@
+"""What `gigabrain driver new` writes is a package that passes the kit; what breaks it does not."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers import catalog
+from gigabrain_drivers.conformance import direct, kit, new
+from gigabrain_drivers.conformance.subject import Subject
+from gigabrain_zenoh.errors import ConfigError
+
+
+def installed(folder: Path, site: Path) -> Path:
+    """What pip makes of a package: its modules, and beside them what says so; the folder."""
+    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+    lines = [
+        f"[{group}]\n" + "\n".join(f"{name} = {where}" for name, where in points.items())
+        for group, points in project["entry-points"].items()
+    ]
+    info = site / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    info.mkdir(parents=True)
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    (info / "METADATA").write_text(
+        f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    )
+    package = next(path for path in folder.iterdir() if path.name.endswith("_driver"))
+    return package.rename(site / package.name)
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    return tmp_path / "site"
+
+
+async def test_a_new_driver_passes_the_kit_by_its_name(tmp_path: Path, site: Path) -> None:
+    folder = new.write("kit_probe", tmp_path)
+    assert folder == tmp_path / "gigabrain-kit-probe"
+    package = installed(folder, site)
+    assert catalog.robot_files()["kit_probe"] == package / "robot.yaml"
+    results = await kit.check("kit_probe", "sim", tmp_path / "kit", lambda result: None)
+    assert [result for result in results if result.verdict == "fail"] == []
+    assert sum(result.verdict == "pass" for result in results) == 11
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    folder = new.write("kit_twice", tmp_path)
+    (folder / "README.md").write_text("mine")
+    with pytest.raises(ConfigError, match="exists; nothing was written"):
+        new.write("kit_twice", tmp_path)
+    assert (folder / "README.md").read_text() == "mine"
+
+
+@pytest.mark.parametrize("name", ["My Robot", "class", "1st", "a", "../x", "robot_"])
+def test_a_name_that_no_module_can_have_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="expected lower-case letters"):
+        new.write(name, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["mock", "turtlebot3_waffle", "line"])
+def test_a_name_that_is_taken_is_refused(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="already"):
+        new.write(name, tmp_path)
+
+
+def broken(name: str, folder: Path, site: Path, old: str, by: str) -> Subject:
+    """A new driver with one mistake in it."""
+    path = installed(new.write(name, folder), site) / "driver.py"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, by))
+    return Subject(name, "sim", folder)
+
+
+async def test_a_driver_that_ignores_its_limits_fails(tmp_path: Path, site: Path) -> None:
+    plain = "Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)"
+    bounded = "self.bounded(linear_x, linear_y, angular_z)"
+    async with broken("kit_fast", tmp_path, site, bounded, plain) as subject:
+        found = await direct.limits(subject)
+        assert (found.ok, found.measured) == (False, "at most 10.00 of max speed")
+        assert not (await direct.refuses_nan(subject)).ok
+
+
+async def test_a_driver_whose_stop_raises_fails(tmp_path: Path, site: Path) -> None:
+    stop = '"""Bring the body to rest."""'
+    async with broken("kit_loud", tmp_path, site, stop, 'raise OSError("gone")') as subject:
+        found = await direct.never_raises(subject)
+        assert (found.ok, found.measured) == (False, "stop, never opened: OSError('gone')")
+
+
+async def test_a_driver_that_returns_what_it_did_not_send_fails(tmp_path: Path, site: Path) -> None:
+    honest = "return self._velocity\n"
+    lying = "return self.bounded(linear_x / 2, linear_y, angular_z)\n"
+    async with broken("kit_lies", tmp_path, site, honest, lying) as subject:
+        assert not (await direct.returns(subject)).ok
+
+
+async def test_a_driver_that_raises_something_else_fails_and_the_kit_goes_on(
+    tmp_path: Path, site: Path
+) -> None:
+    reads = '"""What the body measures."""'
+    subject = broken("kit_bad", tmp_path, site, reads, "raise KeyError('battery')")
+    async with subject:
+        results = await kit.run(subject, lambda result: None)
+    verdicts = {result.check: result for result in results}
+    assert len(results) == 16
+    assert verdicts["opens"].verdict == "fail"
+    assert "KeyError" in verdicts["opens"].measured
+    assert verdicts["never raises"].verdict == "pass"
+
+
+def test_the_kit_moves_no_real_body(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="for the links sim and emulated"):
+        Subject("mycustombot", "real", tmp_path)
