@@ -1,5 +1,6 @@
 """Alpha by `--link sim`: the MuJoCo driver with a quadruped in it."""
 
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -56,9 +57,13 @@ async def test_a_body_that_has_fallen_over_is_lost() -> None:
         await anext(ticks)
         driver._simulation.data.qpos[3:7] = (0.5, 0.866, 0.0, 0.0)  # on its side
         with pytest.raises(BodyLost, match="fell over"):
-            for _ in range(20):
-                await anext(ticks)
+            await _drain(ticks)
         await ticks.aclose()  # type: ignore[attr-defined]
+
+
+async def _drain(ticks: AsyncIterator[int]) -> None:
+    for _ in range(20):
+        await anext(ticks)
 
 
 def test_its_file_says_what_the_others_may_know() -> None:

@@ -37,11 +37,17 @@ async def emulate(config: EmulatorConfig, say: Callable[[str], None]) -> None:
     """Be the body until cancelled; faults are read from standard input, line by line."""
     async with emulator_of(config) as emulator:
         for name, port in emulator.ports.items():
-            say(f"{config.body} in {config.world}: {name} at {port}")
+            say(f"{config.body} in {config.world}: {name} at {where(port)}")
         say(f"faults, one line each: [{'|'.join(emulator.stations)}] "
             f"{' '.join(Faults.__struct_fields__)}; off ends them")  # fmt: skip
         with _lines(lambda line: _told(emulator, line, say)):
             await watch(emulator, Path(config.folder) / FAULTS_FILE)
+
+
+def where(port: str) -> str:
+    """What to connect to: the port itself, or the address that is written there."""
+    path = Path(port)
+    return path.read_text(encoding="ascii").strip() if path.is_file() else port
 
 
 def emulator_of(config: EmulatorConfig) -> Emulator:
