@@ -148,7 +148,7 @@ def test_a_model_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_a_link_that_the_body_does_not_have_lists_those_that_it_has() -> None:
     with pytest.raises(ConfigError, match="has no link 'real'; it has: sim"):
-        catalog.make_driver(WAFFLE, Run(folder=Path(), link="real"))
+        catalog.make_driver("mock", Run(folder=Path(), link="real"))
 
 
 def test_an_option_of_the_simulator_that_does_not_exist_is_refused_with_its_line(
