@@ -39,7 +39,11 @@ ALONE = (
     Check("opens", "heard within 5 s", direct.opens),
     Check("obeys", "measured speed within 10 % + 0.02", direct.obeys),
     Check("obeys within limits", "asked 10 times too fast: at most its max speeds", direct.limits),
-    Check("returns what it sent", "as the body was told, to 0.02", direct.returns),
+    Check(
+        "returns what it sent",
+        "as the body was told, to 0.02; without a peer, as it moves",
+        direct.returns,
+    ),
     Check("refuses NaN itself", "all zero, nothing raised", direct.refuses_nan),
     Check("never raises", "stop and close, in any state, within 2 s", direct.never_raises),
     Check(

@@ -89,12 +89,12 @@ async def _cut(rig: Rig, fault: str) -> Finding:
         await rig.go_on(QUIET_TICKS)
     finally:
         rig.subject.faults("")
-    thawed = await rig.until(lambda: not rig.rests, QUIET_TICKS)  # what piled up must not count
+    thawed = await rig.until(lambda: any(rig.subject.told(rig.state)), QUIET_TICKS)
     if await rig.until(lambda: rig.state and rig.state.link.connected, BACK_TICKS) is None:
         raise Failed(f"not heard again after {BACK_TICKS} ticks")
     told = "never told to the gate" if noticed is None else f"known after {noticed} ticks"
     stood = "still moving" if rest is None else f"at rest after {(noticed or 0) + rest}"
-    again = "" if thawed is None else "; old bytes moved it"
+    again = "" if thawed is None else "; then what had piled up moved it"
     return Finding(None not in (noticed, rest) and not again, f"{told}, {stood}{again}")
 
 
