@@ -1,0 +1,143 @@
+"""What goes over a line, in words: each frame beside its own bytes, whatever the pieces."""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gigabrain_drivers.links import link as links
+from gigabrain_drivers.links.wording import Spelling, Wording, of_command, whole
+from gigabrain_drivers.protocols import alpha, dynamixel, ld, lds01, lds03, opencr, rplidar
+from gigabrain_drivers.protocols.line import Decoder, Template, describe
+from gigabrain_drivers.protocols.line_fields import COMMAND
+from gigabrain_drivers.trace import run
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.errors import ConfigError
+from tests.line_rig import bench
+
+LINE = Template("V,{linear_x:.3f},{angular_z|deg/s:.1f}\n", COMMAND)
+FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [
+    (
+        dynamixel.Decoder().feed,
+        opencr.describe,
+        "ff ff fd 00 c8 1d 00 03 96 00 0a 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 "
+        "32 00 00 00 4d 37",
+        "velocity: linear x 10 x 0.01 m/s = 0.10 m/s, angular z 50 x 0.01 rad/s = 0.50 rad/s",
+    ),
+    (
+        dynamixel.Decoder().feed,
+        opencr.describe,
+        "ff ff fd 00 c8 06 00 03 13 00 07 23 a7",
+        "heartbeat 7",
+    ),
+    (
+        dynamixel.Decoder().feed,
+        opencr.describe,
+        "ff ff fd 00 c8 07 00 02 0a 00 ac 00 b6 2f",
+        "read 172 bytes at 10",
+    ),
+    (
+        dynamixel.Decoder().feed,
+        opencr.describe,
+        "ff ff fd 00 c8 07 00 55 00 00 50 05 4c b7",
+        "status: model 0x5000, firmware 5",
+    ),
+    (
+        ld.Decoder().feed,
+        ld.describe,
+        "54 2c 68 08 ab 7e e0 00 e4 dc 00 e2 d9 00 e5 d5 00 e3 d3 00 e4 d0 00 e9 cd 00 e4 ca 00 e2 "
+        "c7 00 e9 c5 00 e5 c2 00 e5 c0 00 e5 be 82 3a 1a 50",
+        "12 points from 324.27 to 334.70 deg clockwise, 192 to 224 mm, 5.98 turns/s",
+    ),
+    (whole, lds01.describe_command, "62", "start"),
+    (lds03.CommandDecoder().feed, lds03.describe_command, "aa 55 f5 0a", "stop"),
+    (
+        lds03.Decoder().feed,
+        lds03.describe,
+        "aa 55 15 02 01 05 81 05 af 57 90 a1 0f 68 c9 0f",
+        "a turn begins at 1.0 Hz, 2 samples from 10.00 deg, 1000 mm to 11.00 deg, 1010 mm",
+    ),
+    (
+        rplidar.RequestDecoder().feed,
+        rplidar.describe_request,
+        "a5 82 05 00 00 00 00 00 22",
+        "express scan 00 00 00 00 00",
+    ),
+    (alpha.Decoder().feed, alpha.describe, alpha.stop(7).hex(" "), "7 stop"),
+    (
+        Decoder([LINE]).feed,
+        describe,
+        LINE.encode({"linear_x": 0.1, "angular_z": 0.5}).hex(" "),
+        "linear_x 0.1 m/s, angular_z 0.4992 rad/s",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("feed", "words", "frame", "text"), FRAMES, ids=[f[3][:20] for f in FRAMES]
+)
+def test_a_frame_stands_beside_its_bytes(
+    feed: Callable[[bytes], Any], words: Callable[[Any], str], frame: str, text: str
+) -> None:
+    spelling, data = Spelling(feed, words), bytes.fromhex(frame)
+    assert spelling.spell(data[:3]) + spelling.spell(data[3:]) == [f"{frame}  {text}"]
+    assert spelling.spell(data) == [f"{frame}  {text}"]
+
+
+def test_bytes_that_are_no_frame_are_shown_as_they_are() -> None:
+    spelling = Spelling(dynamixel.Decoder().feed, opencr.describe)
+    told = spelling.spell(bytes(600))
+    assert [line[-8:] for line in told] == ["no frame"]
+    assert Wording().lines("tx", b"\x01\xff") == ["tx 01 ff"]
+
+
+def test_a_command_is_told_as_received_and_as_converted() -> None:
+    asked, sent = Velocity(linear_x=0.123, angular_z=-0.456), Velocity(linear_x=0.12)
+    assert of_command(asked, sent) == (
+        "command linear_x 0.1230 m/s, linear_y 0.0000 m/s, angular_z -0.4560 rad/s -> "
+        "sent linear_x 0.1200 m/s, linear_y 0.0000 m/s, angular_z 0.0000 rad/s"
+    )
+
+
+async def test_a_trace_shows_both_ways_and_leaves_the_log_as_it_was(tmp_path: Path) -> None:
+    before, lines = (links.log.level, list(links.log.handlers)), list[str]()
+    await run(
+        "mycustombot",
+        "emulated",
+        tmp_path,
+        part="base",
+        seconds=1.5,
+        wanted=Velocity(linear_x=0.1),
+        say=lines.append,
+    )
+    assert (
+        "tx 56 2c 30 2e 31 30 30 2c 30 2e 30 30 30 0a  linear_x 0.1 m/s, angular_z 0 rad/s" in lines
+    )
+    assert any(line.startswith("rx 53 2c") and "battery_voltage" in line for line in lines)
+    assert any(line.startswith("command linear_x 0.1000 m/s") for line in lines)
+    assert (links.log.level, list(links.log.handlers)) == before
+
+
+async def test_the_log_has_the_same_lines_at_debug_level(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG, links.__name__)
+    async with bench(tmp_path) as it:
+        await it.drive(0.1, 0.2)
+    sent = f"{tmp_path}/base tx 56 2c 30 2e 32 30 30 2c 30 2e 30 30 30 0a  linear_x 0.2 m/s"
+    assert any(message.startswith(sent) for message in caplog.messages)
+
+
+async def test_a_real_body_is_not_moved_by_a_trace(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="not moved without its gate"):
+        await run(
+            "mycustombot",
+            "real",
+            tmp_path,
+            part="base",
+            seconds=1.0,
+            wanted=Velocity(linear_x=0.1),
+            say=print,
+        )
