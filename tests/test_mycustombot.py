@@ -14,7 +14,7 @@ from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.faults import NONE, Faults
 from gigabrain_drivers.emulators.line_base import LineBase
 from gigabrain_drivers.robot import Run
-from gigabrain_drivers.sim.driver import MujocoOptions, sim_body
+from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.world import World
 from gigabrain_schemas.arrays import ranges

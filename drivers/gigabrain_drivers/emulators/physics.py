@@ -5,7 +5,7 @@ from msgspec.structs import replace
 from gigabrain_drivers import catalog
 from gigabrain_drivers.emulators.base import EmulatedBody
 from gigabrain_drivers.robot import Run
-from gigabrain_drivers.sim.driver import MujocoOptions, sim_body
+from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import ConfigError

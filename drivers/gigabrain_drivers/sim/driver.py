@@ -6,21 +6,11 @@ import math
 import threading
 import time
 from collections.abc import AsyncIterator, Mapping
-from dataclasses import replace
-from typing import Annotated, NamedTuple
-
-from msgspec import Meta
+from typing import NamedTuple
 
 from gigabrain_drivers.base import Driver
-from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
-from gigabrain_drivers.sim.body import (
-    LEG_BATTERY,
-    SimBattery,
-    SimBody,
-    SimLidar,
-    SimModel,
-    SimQuadruped,
-)
+from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.tick import TICK_NS as STEP_NS
 from gigabrain_drivers.sim.worlds import load_world
@@ -28,10 +18,7 @@ from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import (
     TICK_NS,
     Message,
-    NonNegative,
-    Percentage,
     Pose,
-    Positive,
     Velocity,
 )
 from gigabrain_schemas.body import Battery, Joint, RobotState
@@ -46,17 +33,6 @@ STEP_S = STEP_NS / 1e9
 DEAD_MAN_NS = 150_000_000  # of simulated time: as long as a firmware would wait
 LATE_S = 0.25  # further behind than this, time is dropped instead of raced after
 SPEEDS = (0.1, 100.0)
-
-
-class MujocoOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The simulator's part of a robot's file."""
-
-    model: str = "model.xml"  # MJCF, beside the robot's file
-    battery_capacity: Positive = 1.8  # [Ah]
-    battery_percentage: Percentage = 100.0  # [%], at the start
-    lidar_noise: NonNegative = 0.01  # [m], standard deviation
-    wheel_scale: Annotated[float, Meta(ge=0.5, le=2.0)] = 1.0  # true wheel radius / wheel_radius
-    odometry_wheel_radius: Positive | None = None  # [m], where odometry is calibrated by itself
 
 
 class Reading(NamedTuple):
@@ -263,44 +239,3 @@ class MujocoDriver(Driver):
             range_max=lidar.range_max,
             ranges=ranges_bytes(self._simulation.scan()),
         )
-
-
-def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
-    """The body as the simulation wants it. Raises ConfigError when there is no model."""
-    path = run.folder / options.model
-    try:
-        model = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; `model` names its MJCF file") from None
-    lidar = _sim_lidar(robot, options)
-    if robot.drive_type == "quadruped":
-        battery = replace(
-            LEG_BATTERY,
-            capacity_ah=options.battery_capacity,
-            percentage=options.battery_percentage,
-        )
-        return SimQuadruped(model=model, lidar=lidar, battery=battery)
-    return SimBody(
-        model=model,
-        wheel_radius=robot.wheel_radius,
-        wheel_separation=robot.wheel_separation,
-        odometry_wheel_radius=options.odometry_wheel_radius,
-        wheel_scale=options.wheel_scale,
-        lidar=lidar,
-        battery=SimBattery(
-            capacity_ah=options.battery_capacity, percentage=options.battery_percentage
-        ),
-    )
-
-
-def _sim_lidar(robot: RobotFile, options: MujocoOptions) -> SimLidar | None:
-    lidar = robot.lidar
-    if lidar is None:
-        return None
-    return SimLidar(
-        beams=lidar.beams,
-        rate_hz=lidar.rate_hz,
-        range_min=lidar.range_min,
-        range_max=lidar.range_max,
-        noise_m=options.lidar_noise,
-    )

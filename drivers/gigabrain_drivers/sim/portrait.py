@@ -4,7 +4,8 @@ from pathlib import Path
 
 from gigabrain_drivers.catalog import make_driver
 from gigabrain_drivers.robot import Run
-from gigabrain_drivers.sim.driver import MujocoDriver, sim_body
+from gigabrain_drivers.sim.driver import MujocoDriver
+from gigabrain_drivers.sim.options import sim_body
 from gigabrain_drivers.sim.picture import render
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import Unsupported
