@@ -1,0 +1,1 @@
+"""What `gigabrain bench` measures, and against what."""
