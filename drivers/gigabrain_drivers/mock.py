@@ -59,12 +59,15 @@ class MockBody(Driver):
         """By the host's clock, or as fast as the brain answers when time is lock-stepped."""
         if self.lockstep:
             while True:
+                self._turn()
                 self._advance()
                 yield 1
         async for passed in super().ticks(clock):
             for _ in range(passed):
                 self._advance()
             yield passed
+            await clock.sleep_ns(TICK_NS // 2)  # a lidar keeps no step with the body's states
+            self._turn()
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
@@ -103,6 +106,9 @@ class MockBody(Driver):
             yaw=math.remainder(pose.yaw + v.angular_z * TICK_S, 2 * math.pi),
         )
         self._ticks += 1
+
+    def _turn(self) -> None:
+        """Emit a scan in as many ticks as the lidar takes for a turn."""
         lidar = self.robot.lidar
         if lidar and self._ticks % max(1, round(1 / (lidar.rate_hz * TICK_S))) == 0:
             self._scan = self._look()
