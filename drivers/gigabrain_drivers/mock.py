@@ -39,7 +39,7 @@ class MockBody(Driver):
         self._velocity = ZERO
         self._pose = Pose(x=0.0, y=0.0, yaw=0.0)
         self._noise = np.random.default_rng(run.seed)
-        self._ticks = 0
+        self._ticks = self._next_scan = 0
         self._scan: LaserScan | None = None
 
     async def open(self) -> None:
@@ -108,9 +108,10 @@ class MockBody(Driver):
         self._ticks += 1
 
     def _turn(self) -> None:
-        """Emit a scan in as many ticks as the lidar takes for a turn."""
-        lidar = self.robot.lidar
-        if lidar and self._ticks % max(1, round(1 / (lidar.rate_hz * TICK_S))) == 0:
+        """Emit a scan whenever the lidar has finished a turn."""
+        if self.robot.lidar and self._ticks >= self._next_scan:
+            period = max(1, round(1 / (self.robot.lidar.rate_hz * TICK_S)))
+            self._next_scan = (self._ticks // period + 1) * period
             self._scan = self._look()
             if self._scan:
                 self.emit(SCAN, self._scan)
