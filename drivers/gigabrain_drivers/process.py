@@ -44,7 +44,6 @@ from gigabrain_zenoh.settings import DriverConfig
 log = logging.getLogger(__name__)
 
 BODY_EVERY_TICKS = 50  # once a second
-BODY_AT_TICK = 1  # of these, where no scan is due that it could hold up: those come at multiples
 STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
 
 
@@ -156,7 +155,7 @@ class DriverProcess:
         for topic, message in self._sensors:
             self._send(topic, message)
         self._sensors.clear()
-        if tick % BODY_EVERY_TICKS == BODY_AT_TICK:
+        if tick % BODY_EVERY_TICKS == 0:
             bus.publish(BODY, self._body)
             self._measure()
 
