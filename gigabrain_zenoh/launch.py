@@ -14,7 +14,7 @@ from gigabrain_zenoh.deployment import (
     process_specs,
     with_free_port,
 )
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.logs import new_run_dir, state_dir
 from gigabrain_zenoh.running import announced
 from gigabrain_zenoh.supervisor import Supervisor
@@ -41,7 +41,8 @@ async def up(
 ) -> int:
     """Keep a host's processes running until Ctrl-C; the exit code.
 
-    Raises ConfigError when the run folder or the state folder cannot be written.
+    Raises ConfigError when what a process was given is wrong, or a folder cannot be written, and
+    BusError when the router cannot run, without which nothing else can.
     """
     deployment = with_free_port(deployment)
     label = deployment.namespace or deployment.body.replace("/", "-")
@@ -54,18 +55,27 @@ async def up(
     def show(_name: str, record: Mapping[str, Any]) -> None:
         nonlocal refusal
         if record.get("event") == "failed":
-            refusal = str(record.get("text", ""))
+            before, refusal = refusal, str(record.get("text", ""))
+            if refusal == before:  # told already, when it was tried the first time
+                return
         say(log_text.readable(record, colour=False))
 
     say(f"{deployment.body} on {host}: {', '.join(spec.name for spec in specs)}; logs in {run_dir}")
     with stop_signals() as stop, announced(label, client_endpoint(deployment)):
         async with Supervisor(specs, show) as supervisor:
             running = asyncio.ensure_future(supervisor.run())
-            while not stop.is_set() and not running.done() and not supervisor.misconfigured:
+            while not stop.is_set() and not running.done() and not _hopeless(supervisor):
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), LOOK_S)
             await supervisor.stop(STOP_S)
             await running
             if supervisor.misconfigured:
                 raise ConfigError(refusal)
+            if "router" in supervisor.given_up:
+                raise BusError(refusal or "the router keeps dying")
             return 1 if supervisor.given_up else 0
+
+
+def _hopeless(supervisor: Supervisor) -> bool:
+    """Whether what has been given up leaves nothing to keep running."""
+    return bool(supervisor.misconfigured) or "router" in supervisor.given_up

@@ -32,13 +32,13 @@ def step(config: PerceptionConfig, body: BodyDescription, scan: LaserScan) -> Wo
     if problem:
         return _unknown(problem)
     x, y = hits(lidar, scan, config.ignore_below)
-    distances, bearings = np.sqrt(x * x + y * y), np.arctan2(y, x)
-    ahead = distances[_ahead(config, body, x, y, distances, bearings)]
+    squares, bearings = x * x + y * y, np.arctan2(y, x)
+    ahead = squares[_ahead(config, body, x, y, squares, bearings)]
     return WorldModel(
         scan_ok=True,
         obstacle_ahead=ahead.size > 0,
-        distance_ahead=float(ahead.min()) if ahead.size else None,
-        sectors=_nearest_per_sector(config.sectors, distances, bearings),
+        distance_ahead=math.sqrt(ahead.min()) if ahead.size else None,
+        sectors=_nearest_per_sector(config.sectors, squares, bearings),
     )
 
 
@@ -58,7 +58,8 @@ def scan_problem(lidar: Lidar, values: NDArray[np.float32], nearest: float) -> s
         return "the lidar sees nothing at all"
     if 2 * found <= count:
         return f"{count - found} of {count} beams are missing"
-    if count >= STUCK_BEAMS and values[0] < np.inf and (values == values[0]).all():
+    alike = count >= STUCK_BEAMS and values[0] == values[1] < np.inf
+    if alike and (values == values[0]).all():
         return "all beams report the same distance"
     return ""
 
@@ -91,9 +92,10 @@ def beams(
     return np.cos(angles), np.sin(angles)
 
 
-def turning_radius(body: BodyDescription) -> float:
-    """Radius of the circle that the footprint sweeps when it turns on the spot [m]."""
-    return max(math.hypot(x, y) for x, y in body.footprint)
+@lru_cache(maxsize=8)
+def _reach(footprint: tuple[tuple[float, float], ...]) -> tuple[float, float]:
+    """How far the footprint reaches ahead, and when it turns on the spot [m]."""
+    return max(x for x, _ in footprint), max(math.hypot(x, y) for x, y in footprint)
 
 
 @lru_cache(maxsize=8)
@@ -110,26 +112,26 @@ def _ahead(
     body: BodyDescription,
     x: Floats,
     y: Floats,
-    distances: Floats,
+    squares: Floats,
     bearings: Floats,
 ) -> NDArray[np.bool_]:
-    """Hits in the cone ahead, or in the strip that the body needs to drive on and still turn."""
+    """Hits in the cone ahead, or in the strip that the body needs to drive on and still turn.
+
+    `squares` are those of the distances [m2], for only one of them needs its root.
+    """
     half_angle = math.radians(config.sector_deg) / 2 + EDGE
-    cone = (np.abs(bearings) <= half_angle) & (distances <= config.ahead + EDGE)
-    front = max(corner for corner, _ in body.footprint)
-    half_width = turning_radius(body) + config.turning_room
-    strip = (x > 0) & (x <= front + config.corridor) & (np.abs(y) <= half_width)
+    cone = (np.abs(bearings) <= half_angle) & (squares <= (config.ahead + EDGE) ** 2)
+    front, radius = _reach(body.footprint)
+    strip = (x > 0) & (x <= front + config.corridor) & (np.abs(y) <= radius + config.turning_room)
     return cone | strip
 
 
-def _nearest_per_sector(
-    count: int, distances: Floats, bearings: Floats
-) -> tuple[float | None, ...]:
-    turns = (bearings + EDGE) / (2 * math.pi)
-    index = np.floor(turns * count + 0.5).astype(np.intp)
+def _nearest_per_sector(count: int, squares: Floats, bearings: Floats) -> tuple[float | None, ...]:
+    # shifted by a whole turn, so that cutting off the fraction rounds down
+    index = (bearings * (count / math.tau) + (count + 0.5 + EDGE)).astype(np.intp) % count
     nearest = np.full(count, np.inf)
-    np.minimum.at(nearest, index, distances)  # negative indices count from the end, as they should
-    return tuple(d if d < math.inf else None for d in nearest.tolist())
+    np.minimum.at(nearest, index, squares)
+    return tuple(math.sqrt(d) if d < math.inf else None for d in nearest.tolist())
 
 
 def _unknown(problem: str) -> WorldModel:

@@ -34,6 +34,10 @@ log = logging.getLogger("gigabrain")
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 PATIENCE_S = 1.0  # how long the router may be missing before somebody is told
 
+# Zenoh's work in one thread, sending apart: a message wakes half as many threads on its way. A
+# documented variable of Zenoh's (zenoh_runtime::ZRuntime); whoever sets it has the last word.
+ZENOH_RUNTIME = "(rx: (handover: app), acc: (handover: app), net: (handover: app))"
+
 
 @dataclass(frozen=True)
 class Program:
@@ -85,6 +89,8 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
 
 def run(config: ProcessConfig) -> int:
     """Run one process to its end; the exit code."""
+    gc.disable()  # until ready: what is imported and set up is no garbage
+    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
     try:
         run_dir = Path(config.run_dir) if config.run_dir else None
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
@@ -97,6 +103,8 @@ def run(config: ProcessConfig) -> int:
     except Exception:
         log.critical("died of an error in the program", exc_info=True)
         return 1
+    finally:
+        gc.enable()
     return 0
 
 
@@ -136,6 +144,7 @@ async def _node(bus: Bus, node: Node) -> None:
 def _ready() -> None:
     gc.collect()
     gc.freeze()  # what set-up made stays: collections look at new objects only
+    gc.enable()
     log.info("ready", extra={"data": {"event": "ready", "pid": os.getpid()}})
 
 

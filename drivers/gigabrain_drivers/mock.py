@@ -40,7 +40,7 @@ class MockBody(Driver):
         self._velocity = ZERO
         self._pose = Pose(x=0.0, y=0.0, yaw=0.0)
         self._noise = np.random.default_rng(run.seed)
-        self._ticks = 0
+        self._ticks = self._next_scan = 0
         self._scan: LaserScan | None = None
         self._lidar: ScanSource | None = None  # a real one, where its link has one
 
@@ -66,12 +66,15 @@ class MockBody(Driver):
         """By the host's clock, or as fast as the brain answers when time is lock-stepped."""
         if self.lockstep:
             while True:
+                self._turn()
                 self._advance()
                 yield 1
         async for passed in super().ticks(clock):
             for _ in range(passed):
                 self._advance()
             yield passed
+            await clock.sleep_ns(TICK_NS // 2)  # a lidar keeps no step with the body's states
+            self._turn()
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
@@ -111,8 +114,13 @@ class MockBody(Driver):
             yaw=math.remainder(pose.yaw + v.angular_z * TICK_S, 2 * math.pi),
         )
         self._ticks += 1
+
+    def _turn(self) -> None:
+        """Emit a scan whenever the lidar has finished a turn."""
         lidar = None if self._lidar else self.robot.lidar
-        if lidar and self._ticks % max(1, round(1 / (lidar.rate_hz * TICK_S))) == 0:
+        if lidar and self._ticks >= self._next_scan:
+            period = max(1, round(1 / (lidar.rate_hz * TICK_S)))
+            self._next_scan = (self._ticks // period + 1) * period
             self._scan = self._look()
             if self._scan:
                 self.emit(SCAN, self._scan)

@@ -78,11 +78,11 @@ class DriverProcess:
         )
         bus.time.boot = self._gate.boot
         self._lockstep = Lockstep(robot.control.period_ticks) if driver.lockstep else None
-        self._sensors: list[tuple[Topic[Any], Message]] = []  # of the present tick
+        self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
         self._round_trip = RoundTrip()
         self._wake = asyncio.Event()
         self._line = asyncio.Lock()  # one call at a time goes out to the body
-        driver.emit = lambda topic, message: self._sensors.append((topic, message))
+        driver.emit = self._emit
         bus.report = self.report
 
     async def run(self, ready: Callable[[], None]) -> None:
@@ -137,17 +137,24 @@ class DriverProcess:
             self._announce(state)
         await self._obey()
 
+    def _emit(self, topic: Topic[Any], message: Message) -> None:
+        """A sensor has something: it waits for nobody's period, unless time waits for the brain."""
+        if self._lockstep or not self._gate.tick:
+            self._sensors.append((topic, message))
+        else:
+            self._send(topic, message)
+
+    def _send(self, topic: Topic[Any], message: Message) -> None:
+        tick = self._gate.tick
+        if topic is SCAN:
+            self._round_trip.sent(tick, self._bus.clock.now_ns())
+        self._bus.publish(topic, message, basis=tick)
+
     def _announce(self, state: RobotState) -> None:
-        """The scan first: it has the longest way to go until it is a command."""
         bus, tick = self._bus, self._gate.tick
-        for topic, message in self._sensors:
-            if topic is SCAN:
-                self._round_trip.sent(tick, bus.clock.now_ns())
-                bus.publish(topic, message, basis=tick)
         bus.publish(STATE, replace(state, gate=gate.status(self._gate)), basis=tick)
         for topic, message in self._sensors:
-            if topic is not SCAN:
-                bus.publish(topic, message, basis=tick)
+            self._send(topic, message)
         self._sensors.clear()
         if tick % BODY_EVERY_TICKS == 0:
             bus.publish(BODY, self._body)

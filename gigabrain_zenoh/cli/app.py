@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError
 
@@ -10,8 +11,17 @@ from gigabrain_zenoh.errors import ConfigError, GigabrainError
 COMMANDS = "gigabrain_zenoh.cli"
 
 
-def make_app() -> App:
-    """All commands, by name, with the module that holds each."""
+def make_app(chosen: Sequence[str] = ()) -> App:
+    """All commands, by name, with the module that holds each.
+
+    A command that is among the `chosen` words brings its own help; of the others a line will do,
+    so that they need not be imported.
+    """
+
+    def add(to: App, where: str, name: str, summary: str) -> None:
+        told = None if name in chosen else summary
+        to.command(f"{COMMANDS}.{where}", name=name, help=told)
+
     app = App(
         name="gigabrain",
         help="A robot brain of three systems that any body can wear.",
@@ -39,7 +49,7 @@ def make_app() -> App:
         ("view", "view:view", "Draw a robot in its world into a PNG file."),
     )
     for name, where, summary in lazy:
-        app.command(f"{COMMANDS}.{where}", name=name, help=summary)
+        add(app, where, name, summary)
     groups = (
         ("driver", "run", "process:driver", "Drivers of bodies.", "Start the driver of a body."),
         ("driver", "new", "driver_kit:new", "", "Write the package of a new driver."),
@@ -52,17 +62,13 @@ def make_app() -> App:
         if group not in subs:
             subs[group] = App(name=group, help=about)
             app.command(subs[group])
-        subs[group].command(f"{COMMANDS}.{where}", name=name, help=summary)
+        add(subs[group], where, name, summary)
     bench = App(name="bench", help="Measure this machine.")
-    bench.command(f"{COMMANDS}.bench:chain", name="chain", help="From scan to command, timed.")
-    bench.command(f"{COMMANDS}.bench:stack", name="stack", help="CPU, memory and time to start.")
-    bench.command(
-        f"{COMMANDS}.bench_bodies:bodies",
-        name="bodies",
-        help="One brain, all bodies, side by side.",
-    )
+    add(bench, "bench:chain", "chain", "From scan to command, timed.")
+    add(bench, "bench:stack", "stack", "CPU, memory and time to start.")
+    add(bench, "bench_bodies:bodies", "bodies", "One brain, all bodies, side by side.")
     app.command(bench)
-    app.command(f"{COMMANDS}.completion:completion", name="completion", help="Shell completion.")
+    add(app, "completion:completion", "completion", "Shell completion.")
     return app
 
 
@@ -74,7 +80,7 @@ def _version() -> str:
 
 def main() -> None:
     """Entry of the `gigabrain` command."""
-    call = make_app()
+    call = make_app(sys.argv[1:])
     try:
         code = call(exit_on_error=False, print_error=False, result_action="return_value")
     except GigabrainError as error:

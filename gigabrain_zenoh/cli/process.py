@@ -7,7 +7,10 @@ from typing import Annotated, Any, Literal
 import msgspec
 from cyclopts import Parameter
 
+from gigabrain_zenoh import behaviours
+from gigabrain_zenoh.cli.checked import checked
 from gigabrain_zenoh.logs import state_dir
+from gigabrain_zenoh.process import find, run
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.settings import DriverConfig, Endpoint, LinkName, Resume
 
@@ -70,6 +73,7 @@ def decision(
     turn
         Which way it turns from an obstacle.
     """
+    behaviours.load(behaviour)  # a wrong name is better told now than once there is a router
     return _run("decision", place, {"behaviour": behaviour, "turn": turn})
 
 
@@ -125,24 +129,24 @@ def driver(
         The folder for what must survive a restart: what latched it.
     """
     label = place.namespace or Path(name).stem
-    settings = DriverConfig(
-        body=name,
-        link=link,
-        world=world,
-        seed=seed,
-        speed=speed,
-        resume=resume,
-        emulator=str(ports.absolute()) if ports else "",
-        state_dir=str(remember or state_dir() / "robots" / label),
-    )
+    values = {
+        "body": name,
+        "link": link,
+        "world": world,
+        "seed": seed,
+        "speed": speed,
+        "resume": resume,
+        "emulator": str(ports.absolute()) if ports else "",
+        "state_dir": str(remember or state_dir() / "robots" / label),
+    }
+    settings = checked(values, DriverConfig)
+    find("gigabrain_drivers.catalog:load_robot")(name)  # as above
     return _run("driver", place, msgspec.to_builtins(settings))
 
 
 def _run(
     name: str, place: Place, settings: dict[str, Any], endpoint: Endpoint | None = None
 ) -> int:
-    from gigabrain_zenoh.process import run
-
     return run(
         ProcessConfig(
             name=name,

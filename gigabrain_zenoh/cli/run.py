@@ -4,8 +4,7 @@ import asyncio
 from pathlib import Path
 from typing import Literal
 
-import msgspec
-
+from gigabrain_zenoh.cli.checked import checked
 from gigabrain_zenoh.deployment import (
     Deployment,
     deployment_path,
@@ -73,7 +72,7 @@ def demo(
         "router": "tcp/127.0.0.1:0",
         "decision": {"turn": turn},
     }
-    deployment = _checked(values)
+    deployment = checked(values, Deployment)
     options = DemoOptions(seconds=seconds, headless=headless, report=report)
     return asyncio.run(Demo(deployment, options).run())
 
@@ -104,12 +103,3 @@ def up(deployment: str, *, host: str | None = None, level: str = "info") -> int:
 
 def _say(line: str) -> None:
     print(line, flush=True)
-
-
-def _checked(values: dict[str, object]) -> Deployment:
-    try:
-        return msgspec.convert(values, Deployment)
-    except msgspec.ValidationError as error:
-        text, _, path = str(error).partition(" - at `$.")
-        name = path.rstrip("`")
-        raise ConfigError(f"--{name}: {text}" if name else text) from None

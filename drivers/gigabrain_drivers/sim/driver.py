@@ -36,11 +36,11 @@ SPEEDS = (0.1, 100.0)
 
 
 class Reading(NamedTuple):
-    """What the physics thread hands over after each tick."""
+    """What the physics thread hands over after each step of 10 ms."""
 
-    state: RobotState
-    imu: tuple[Imu, ...]
-    scan: LaserScan | None
+    imu: Imu
+    scan: LaserScan | None = None  # when the lidar has finished a turn, between two states
+    state: RobotState | None = None  # with the last step of a tick
 
 
 class MujocoDriver(Driver):
@@ -67,11 +67,15 @@ class MujocoDriver(Driver):
         self._thread: threading.Thread | None = None
         self._bridge: Bridge | None = None
         self._readings: asyncio.Queue[Reading | Exception | None] = asyncio.Queue()
-        self._reading: Reading | None = None
+        self._state: RobotState | None = None
+        self._newest: dict[str, Message] = {}  # by sensor
 
     async def open(self) -> None:
         """Take the first readings; time stands still until somebody asks for ticks."""
-        self._reading = self._read(with_scan=self.robot.lidar is not None)
+        self._state = self._look()
+        self._newest = {"imu": self._imu()}
+        if self.robot.lidar:
+            self._newest["scan"] = self._scan()
 
     async def close(self) -> None:
         """End the physics thread."""
@@ -81,7 +85,7 @@ class MujocoDriver(Driver):
             await asyncio.to_thread(self._thread.join)
         if self._bridge:
             self._bridge.close()
-        self._thread = self._bridge = self._reading = None
+        self._thread = self._bridge = self._state = None
 
     async def stop(self) -> None:
         """Come to rest."""
@@ -92,8 +96,8 @@ class MujocoDriver(Driver):
         self._bridge = Bridge()
         self._thread = threading.Thread(target=self._work, name="physics", daemon=True)
         self._thread.start()
+        self._permits.release()
         while True:
-            self._permits.release()
             reading = await self._readings.get()
             if reading is None:
                 self.finished = True
@@ -101,13 +105,15 @@ class MujocoDriver(Driver):
             if isinstance(reading, Exception):
                 raise reading
             self._take(reading)
-            yield 1
+            if reading.state:
+                yield 1
+                self._permits.release()
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
         """Drive or walk; bodies on two wheels leave out what is sideways."""
-        if self._reading is None:
+        if self._state is None:
             raise BodyLost("the simulation is not open")
         self._commanded_ns = self._simulation.time_ns
         wanted = self.bounded(linear_x, linear_y, angular_z)
@@ -116,17 +122,14 @@ class MujocoDriver(Driver):
 
     async def read_state(self) -> RobotState:
         """The state at the end of the newest tick."""
-        if self._reading is None:
+        if self._state is None:
             raise BodyLost("the simulation is not open")
-        return self._reading.state
+        return self._state
 
     async def get_sensor_data(self, sensor_name: str) -> Message | None:
         """The newest `scan` or `imu`."""
-        reading = self._reading
-        if sensor_name == "scan" and self.robot.lidar:
-            return reading.scan if reading else None
-        if sensor_name == "imu":
-            return reading.imu[-1] if reading else None
+        if sensor_name in self._newest:
+            return self._newest[sensor_name]
         raise Unsupported(
             f"{self.robot.robot_type} has no sensor {sensor_name!r}; it has: scan, imu"
         )
@@ -147,12 +150,12 @@ class MujocoDriver(Driver):
         }
 
     def _take(self, reading: Reading) -> None:
-        scan = reading.scan or (self._reading.scan if self._reading else None)
-        self._reading = reading._replace(scan=scan)
+        self._state = reading.state or self._state
+        self._newest["imu"] = reading.imu
+        self.emit(IMU, reading.imu)
         if reading.scan:
+            self._newest["scan"] = reading.scan
             self.emit(SCAN, reading.scan)
-        for sample in reading.imu:
-            self.emit(IMU, sample)
 
     def _work(self) -> None:
         """The physics thread."""
@@ -164,23 +167,17 @@ class MujocoDriver(Driver):
             if self._ticks == self._last_ticks:
                 self._post(None)
                 return
-            samples = []
-            for _ in range(STEPS):
+            self._ticks += 1
+            for step in range(STEPS):
                 done += 1
                 start = self._keep_pace(start, done)
                 if self._halt.is_set():
                     return
                 try:
-                    self._step()
+                    self._post(self._step(last=step == STEPS - 1))
                 except BodyLost as error:
                     self._post(error)
                     return
-                samples.append(self._imu())
-            self._ticks += 1
-            due = self._ticks >= self._next_scan
-            if due:
-                self._next_scan += self._scan_ticks
-            self._post(self._read(with_scan=due)._replace(imu=tuple(samples)))
             self._physics_s = time.thread_time() - began
 
     def _keep_pace(self, start: float, done: int) -> float:
@@ -192,12 +189,19 @@ class MujocoDriver(Driver):
             start -= wait
         return start
 
-    def _step(self) -> None:
+    def _step(self, *, last: bool) -> Reading:
         if self._simulation.time_ns - self._commanded_ns >= DEAD_MAN_NS:
             self._simulation.command(0.0, 0.0)
         self._simulation.advance()
         if self._simulation.fallen:
             raise BodyLost(f"fell over after {self._simulation.time_ns / 1e9:.2f} s")
+        if last:
+            return Reading(self._imu(), state=self._look())
+        # a lidar keeps no step with the states: between two of them nobody else needs a core
+        due = self._ticks >= self._next_scan
+        if due:
+            self._next_scan += self._scan_ticks
+        return Reading(self._imu(), scan=self._scan() if due else None)
 
     def _post(self, reading: Reading | Exception | None) -> None:
         bridge = self._bridge
@@ -205,11 +209,11 @@ class MujocoDriver(Driver):
             with contextlib.suppress(RuntimeError):  # the loop is gone
                 bridge.post(self._readings.put_nowait, reading)
 
-    def _read(self, *, with_scan: bool) -> Reading:
+    def _look(self) -> RobotState:
         simulation = self._simulation
         odometry, charge = simulation.odometry(), simulation.battery()
-        imu = self._imu()
-        state = RobotState(
+        imu = simulation.imu()
+        return RobotState(
             robot_type=self.robot.robot_type,
             pose=Pose(x=odometry.x, y=odometry.y, yaw=math.remainder(odometry.yaw, math.tau)),
             velocity=Velocity(**simulation.velocity()._asdict()),
@@ -224,7 +228,6 @@ class MujocoDriver(Driver):
             ),
             bumpers=(simulation.bumper(),),
         )
-        return Reading(state, (imu,), self._scan() if with_scan else None)
 
     def _imu(self) -> Imu:
         return Imu(**self._simulation.imu()._asdict())

@@ -1,0 +1,99 @@
+"""`gigabrain bench chain` and `gigabrain bench stack`: what this machine makes of it."""
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+from cyclopts import Parameter
+from rich.console import Console, RenderableType
+
+from gigabrain_zenoh.errors import ConfigError
+
+FASTEST_HZ = 50.0  # one scan per tick of the robot's clock
+
+
+def chain(
+    *,
+    seconds: float = 10.0,
+    rounds: int = 3,
+    rates: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (10.0, 50.0),
+    json: Path | None = None,
+) -> int:
+    """Time the way from a scan to its command, beside a bare Zenoh relay.
+
+    Example: gigabrain bench chain --seconds 10 --rounds 3 --rates 10 50
+
+    Parameters
+    ----------
+    seconds
+        Length of each run [s].
+    rounds
+        How often the chain and the relay take turns.
+    rates
+        How many scans a second [Hz].
+    json
+        Write all figures into this file.
+    """
+    from gigabrain_zenoh.bench.chain import measure_chain
+    from gigabrain_zenoh.bench.tables import chain_page
+
+    _above_zero("seconds", seconds)
+    _above_zero("rounds", rounds)
+    for rate in rates:
+        if not 0 < rate <= FASTEST_HZ:
+            raise ConfigError(f"--rates: expected above 0, at most {FASTEST_HZ:g}, got {rate:g}")
+    result = asyncio.run(measure_chain(seconds, rounds, rates, _progress))
+    _finish(chain_page(result), result, json)
+    return 0
+
+
+def stack(
+    *,
+    seconds: float = 20.0,
+    body: str = "turtlebot3_waffle",
+    world: str = "arena",
+    json: Path | None = None,
+) -> int:
+    """Measure what a whole robot needs: CPU, memory, and time to start.
+
+    Example: gigabrain bench stack --seconds 20 --world house
+
+    Parameters
+    ----------
+    seconds
+        How long to measure [s].
+    body
+        Which robot; see `gigabrain robots`.
+    world
+        Where it drives; see `gigabrain worlds`.
+    json
+        Write all figures into this file.
+    """
+    from gigabrain_zenoh.bench.stack import measure_stack
+    from gigabrain_zenoh.bench.tables import stack_page
+
+    _above_zero("seconds", seconds)
+    result = asyncio.run(measure_stack(body, world, seconds, _progress))
+    _finish(stack_page(result), result, json)
+    return 0
+
+
+def _above_zero(name: str, value: float) -> None:
+    if not 0 < value < 1e6:
+        raise ConfigError(f"--{name}: expected a number above 0, got {value:g}")
+
+
+def _progress(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _finish(page: RenderableType, result: msgspec.Struct, json: Path | None) -> None:
+    Console().print(page)
+    if json is None:
+        return
+    try:
+        json.write_bytes(msgspec.json.format(msgspec.json.encode(result)) + b"\n")
+    except OSError as error:
+        raise ConfigError(f"cannot write {json}: {error.strerror}") from None

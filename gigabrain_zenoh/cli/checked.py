@@ -1,0 +1,20 @@
+"""Options of a command as a Struct, refused in one line that names the option."""
+
+from collections.abc import Mapping
+from typing import TypeVar
+
+import msgspec
+
+from gigabrain_zenoh.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def checked(values: Mapping[str, object], type: type[T]) -> T:
+    """`values` as a `type`. Raises ConfigError for the first that does not fit."""
+    try:
+        return msgspec.convert(values, type)
+    except msgspec.ValidationError as error:
+        text, _, path = str(error).partition(" - at `$.")
+        name = path.rstrip("`").replace("_", "-")
+        raise ConfigError(f"--{name}: {text[0].lower()}{text[1:]}" if name else text) from None

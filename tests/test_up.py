@@ -1,0 +1,214 @@
+"""`gigabrain up` and the single processes: starting, restarting, giving up, leaving nothing."""
+
+import os
+import re
+import signal
+import socket
+from functools import partial
+
+import pytest
+
+from gigabrain_zenoh.client import Robot
+from gigabrain_zenoh.settings import Endpoint
+from tests.onlooker import looking_on
+from tests.stack import ROOT, Command, Home, endpoint_of, free_port, robot_of, until
+
+ALL = ["router", "driver", "perception", "decision", "control", "safety"]
+READY = re.compile(r"^\S+ (\w+) +info +ready pid=\d+$", re.MULTILINE)
+
+
+def ready(command: Command) -> list[str]:
+    """The processes that have said so, in the order in which they did."""
+    return READY.findall(command.out)
+
+
+def started(command: Command, process: str, times: int) -> bool:
+    return ready(command).count(process) == times
+
+
+async def test_it_starts_in_readiness_order_restarts_what_dies_and_ends_cleanly(
+    home: Home,
+) -> None:
+    file = home.deployment()
+    up = home.start("up", str(file))
+    await until(lambda: len(ready(up)) == 6, "six processes are ready")
+    assert up.out.startswith(
+        "turtlebot3_waffle on robot: router, driver, perception, decision, control, safety; "
+    )
+    assert ready(up)[0] == "router"
+    assert sorted(ready(up)) == sorted(ALL)
+    assert len(home.processes()) == 6
+    async with looking_on(endpoint_of(file)) as robot:
+        os.kill(await robot.pid("safety"), signal.SIGKILL)
+        await until(lambda: ready(up)[6:] == ["safety"], "safety is ready again")
+        assert "safety ended with signal 9 (Killed); next start in 0.2 s" in up.out
+        up.send(signal.SIGINT)
+        assert await up.ended() == 0
+    assert up.err == ""
+    assert home.processes() == []
+
+
+async def test_after_five_deaths_within_a_minute_a_process_is_given_up_in_one_line(
+    home: Home,
+) -> None:
+    up = home.start("up", str(home.deployment()))
+    async with looking_on(await robot_of(home, up)) as robot:
+        for death in range(5):
+            await until(partial(started, up, "decision", death + 1), f"start {death + 1}")
+            os.kill(await robot.pid("decision"), signal.SIGKILL)
+        given_up = "decision ended with signal 9 (Killed) and is given up: 5 deaths within 60 s"
+        await until(lambda: given_up in up.out, "it is given up")
+        assert len([line for line in up.out.splitlines() if given_up in line]) == 1
+        await robot.ticks(25)  # the others go on, and the body stands
+        assert robot.state.gate.mode == "latched"
+    up.send(signal.SIGINT)
+    assert await up.ended() == 1
+
+
+async def test_nothing_survives_its_death_not_even_what_is_frozen(home: Home) -> None:
+    file = home.deployment()
+    up = home.start("up", str(file))
+    async with looking_on(endpoint_of(file)) as robot:
+        os.kill(await robot.pid("control"), signal.SIGSTOP)
+        assert len(home.processes()) == 6
+        up.send(signal.SIGKILL)
+        await until(lambda: not home.processes(), "no orphan is left")
+
+
+async def test_the_hosts_of_a_deployment_make_one_robot(home: Home) -> None:
+    ours = (ROOT / "deploy" / "three_hosts.yaml").read_text()
+    where = f"tcp/127.0.0.1:{free_port()}"
+    file = home.folder / "three_hosts.yaml"
+    file.write_text(re.sub(r"router: tcp/\S+", f"router: {where}", ours))
+    brain = home.start("up", str(file), "--host", "brain")
+    body = home.start("up", str(file), "--host", "robot")
+    async with looking_on(Endpoint(connect=(where,))) as robot:
+        await until(lambda: len(ready(brain)) == 2 and len(ready(body)) == 4, "all are ready")
+        assert sorted(ready(brain)) == ["decision", "perception"]
+        person = Robot(robot.bus)
+        await robot.ticks(30)
+        await person.release()
+        await robot.hand_to_brain()
+        await robot.straight(speed=0.15, room=0.0)
+        os.kill(brain.pid, signal.SIGKILL)  # the whole host
+        await robot.still()
+        assert robot.state.gate.mode in ("stopping", "idle")
+
+
+@pytest.mark.parametrize("name", ["demo", "deploy/demo.yaml", "three_hosts"])
+async def test_the_deployments_that_come_with_it_can_be_read(home: Home, name: str) -> None:
+    up = await home.run("up", name, "--host", "robto")
+    assert up.err == {
+        "three_hosts": "gigabrain: no host 'robto'; did you mean 'robot'? known: brain, robot\n"
+    }.get(name, "gigabrain: no host 'robto'; did you mean 'robot'? known: robot\n")
+    assert await up.ended() == 2
+
+
+async def test_of_several_hosts_one_must_be_chosen(home: Home) -> None:
+    up = await home.run("up", "three_hosts")
+    assert up.err == "gigabrain: which host is this? choose one with --host: robot, brain\n"
+    assert await up.ended() == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "complaint"),
+    [
+        ("body: mock\nbody: mock", 2, "duplicate key 'body', first on line 1; expected it once"),
+        ("wrold: arena", 1, "unknown field 'wrold'; did you mean 'world'?"),
+        ("world: arena\nspeed: .nan", 2, ".nan is not allowed; expected a finite number"),
+        ("speed: 1000", 1, "speed: expected a number"),
+        ("seed: -1", 1, "seed: expected a whole number"),
+        ("decision:\n  turn: rihgt", 2, "turn: expected one of"),
+        ("decision: {angular_speed: 57 deg/s}", 1, "angular_speed: expected a number"),
+        ("hosts: {}", 1, "hosts: expected at least one"),
+        ("hosts:\n  a: [driver]\n  b: [driver]", 1, "driver must run once, on one host"),
+        ("router: tcp/0.0.0.0:7447", 1, "can be reached by anybody on the network"),
+        ("link: real\nresume: auto", 1, "resume: auto is for simulation"),
+        ("body: turtlebot3_wafle", 1, "no robot 'turtlebot3_wafle'; did you mean 'turtlebot3_w"),
+        ("seed: 3\nworld: hose", 2, "no world 'hose'; did you mean 'house'? known: arena, house"),
+        ("decision:\n  behaviour: avod", 2, "no behaviour 'avod'; did you mean 'avoid'?"),
+    ],
+)
+async def test_what_is_wrong_in_a_file_is_said_with_its_line(
+    home: Home, text: str, line: int, complaint: str
+) -> None:
+    file = home.folder / "robot.yaml"
+    free = "" if "router" in text else f"\nrouter: tcp/127.0.0.1:{free_port()}"
+    file.write_text(f"{text}{free}\n")
+    up = await home.run("up", str(file))
+    assert await up.ended() == 2
+    assert up.err.startswith(f"gigabrain: {file}:{line}: ")
+    assert complaint in up.err
+    assert up.err.count("\n") == 1
+    assert home.processes() == []
+
+
+async def test_a_taken_port_is_said_in_one_line(home: Home) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        where = f"tcp/127.0.0.1:{other.getsockname()[1]}"
+        up = home.start("up", str(home.deployment(router=where)))
+        router = await home.run("router", "--listen", where)
+        taken = f"the router's port is taken ({where}); stop what uses it, or choose another"
+        assert (await router.ended(), router.err.count("\n"), taken in router.err) == (1, 1, True)
+        assert await up.ended() == 1
+        assert up.err == f"gigabrain: {taken}\n"
+        assert up.out.count(taken) == 1
+
+
+async def test_a_missing_router_is_waited_for_and_said_in_one_line(home: Home) -> None:
+    where = f"tcp/127.0.0.1:{free_port()}"
+    perception = home.start("perception", "--connect", where)
+    waiting = f"no router at {where} yet; waiting for it (start one with: gigabrain router)"
+    await until(lambda: waiting in perception.err, "it says what it waits for")
+    home.start("router", "--listen", where)
+    await until(lambda: "ready" in perception.err, "it goes on")
+    assert perception.err.count("\n") == 2
+    perception.send(signal.SIGINT)
+    assert await perception.ended() == 0
+
+
+async def test_a_process_that_waits_for_its_router_can_be_ended(home: Home) -> None:
+    control = home.start("control", "--connect", f"tcp/127.0.0.1:{free_port()}")
+    await until(lambda: "waiting for it" in control.err, "it waits")
+    control.send(signal.SIGTERM)
+    assert await control.ended() == 0
+
+
+async def test_a_second_driver_for_the_same_body_is_refused_in_one_line(home: Home) -> None:
+    where = f"tcp/127.0.0.1:{free_port()}"
+    home.start("router", "--listen", where)
+    first = home.start("driver", "run", "mock", "--connect", where)
+    await until(lambda: "ready" in first.err, "the first driver")
+    second = await home.run("driver", "run", "mock", "--connect", where)
+    assert await second.ended() == 2
+    assert f"a driver is already running here (pid {first.pid} on " in second.err
+    assert second.err.count("\n") == 1
+    namesake = home.start(
+        "driver", "run", "mock", "--connect", where, "--namespace", "other"
+    )  # fmt: skip
+    await until(lambda: "ready" in namesake.err, "a driver in a namespace of its own")
+
+
+@pytest.mark.parametrize("where", ["state", "run", "run_dir", "remember"])
+async def test_a_folder_that_cannot_be_written_is_said_in_one_line(home: Home, where: str) -> None:
+    """A file stands where the folder should be, which stops root as well."""
+    place = home.folder / where
+    place.write_text("")
+    router = ("--connect", f"tcp/127.0.0.1:{free_port()}")
+    commands: dict[str, tuple[str, ...]] = {
+        "state": ("up", str(home.deployment())),
+        "run": ("demo", "--headless", "--seconds", "1"),
+        "run_dir": ("perception", "--run-dir", str(place), *router),
+        "remember": ("driver", "run", "mock", "--remember", str(place)),
+    }
+    if where == "remember":
+        listen = f"tcp/127.0.0.1:{free_port()}"
+        home.start("router", "--listen", listen)
+        commands[where] += ("--connect", listen)
+    command = await home.run(*commands[where])
+    assert await command.ended() == 2
+    assert "cannot write" in command.err
+    assert str(place) in command.err
+    assert command.err.count("\n") == 1
