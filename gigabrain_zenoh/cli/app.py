@@ -8,7 +8,35 @@ from cyclopts import App, CycloptsError
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 
-COMMANDS = "gigabrain_zenoh.cli"
+MODULES = "gigabrain_zenoh.cli"
+
+# command -> where it is, and what it does in a line
+COMMANDS = {
+    "demo": ("run:demo", "Drive a simulated robot round a room, until Ctrl-C."),
+    "up": ("run:up", "Start what a deployment file puts on this host, and keep it running."),
+    "router": ("process:router", "Start the router that joins the other processes."),
+    "perception": ("process:perception", "Start perception."),
+    "decision": ("process:decision", "Start decision."),
+    "control": ("process:control", "Start control."),
+    "safety": ("process:safety", "Start safety."),
+    "driver run": ("process:driver", "Start the driver of a body."),
+    "driver new": ("driver_kit:new", "Write the package of a new driver."),
+    "driver test": ("driver_kit:test", "Check a driver against all that it must do."),
+    "driver trace": ("driver_kit:trace", "Show the bytes on a body's line, decoded."),
+    "emulate": ("emulate:emulate", "Be a robot's body on real ports, in MuJoCo."),
+    "estop": ("operate:estop", "Stop the robot at once, and latch it."),
+    "release": ("operate:release", "Let go of a latched gate."),
+    "enable": ("operate:enable", "Let the robot's brain drive."),
+    "robots": ("names:robots", "List the robots that there are."),
+    "worlds": ("names:worlds", "List the simulated worlds that there are."),
+    "view": ("view:view", "Draw a robot in its world into a PNG file."),
+    "bench chain": ("bench:chain", "From scan to command, timed."),
+    "bench stack": ("bench:stack", "CPU, memory and time to start."),
+    "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
+    "schema export": ("schema:export", "Write JSON Schema of every message."),
+    "completion": ("completion:completion", "Shell completion."),
+}
+GROUPS = {"driver": "Drivers of bodies.", "bench": "Measure this machine.", "schema": "Messages."}
 
 
 def make_app(chosen: Sequence[str] = ()) -> App:
@@ -17,58 +45,19 @@ def make_app(chosen: Sequence[str] = ()) -> App:
     A command that is among the `chosen` words brings its own help; of the others a line will do,
     so that they need not be imported.
     """
-
-    def add(to: App, where: str, name: str, summary: str) -> None:
-        told = None if name in chosen else summary
-        to.command(f"{COMMANDS}.{where}", name=name, help=told)
-
     app = App(
         name="gigabrain",
         help="A robot brain of three systems that any body can wear.",
         help_format="plaintext",  # the default, Markdown, takes twice as long to start
         version=_version,
     )
-    lazy = (
-        ("demo", "run:demo", "Drive a simulated robot round a room, until Ctrl-C."),
-        ("up", "run:up", "Start what a deployment file puts on this host, and keep it running."),
-        ("router", "process:router", "Start the router that joins the other processes."),
-        ("perception", "process:perception", "Start perception."),
-        ("decision", "process:decision", "Start decision."),
-        ("control", "process:control", "Start control."),
-        ("safety", "process:safety", "Start safety."),
-        ("estop", "operate:estop", "Stop the robot at once, and latch it."),
-        ("release", "operate:release", "Let go of a latched gate."),
-        ("enable", "operate:enable", "Let the robot's brain drive."),
-        (
-            "emulate",
-            "emulate:emulate",
-            "Be a robot's body on real ports, in MuJoCo.",
-        ),
-        ("robots", "names:robots", "List the robots that there are."),
-        ("worlds", "names:worlds", "List the simulated worlds that there are."),
-        ("view", "view:view", "Draw a robot in its world into a PNG file."),
-    )
-    for name, where, summary in lazy:
-        add(app, where, name, summary)
-    groups = (
-        ("driver", "run", "process:driver", "Drivers of bodies.", "Start the driver of a body."),
-        ("driver", "new", "driver_kit:new", "", "Write the package of a new driver."),
-        ("driver", "test", "driver_kit:test", "", "Check a driver against all that it must do."),
-        ("driver", "trace", "driver_kit:trace", "", "Show the bytes on a body's line, decoded."),
-        ("schema", "export", "schema:export", "Messages.", "Write JSON Schema of every message."),
-    )
-    subs: dict[str, App] = {}
-    for group, name, where, about, summary in groups:
-        if group not in subs:
-            subs[group] = App(name=group, help=about)
-            app.command(subs[group])
-        add(subs[group], where, name, summary)
-    bench = App(name="bench", help="Measure this machine.")
-    add(bench, "bench:chain", "chain", "From scan to command, timed.")
-    add(bench, "bench:stack", "stack", "CPU, memory and time to start.")
-    add(bench, "bench_bodies:bodies", "bodies", "One brain, all bodies, side by side.")
-    app.command(bench)
-    add(app, "completion:completion", "completion", "Shell completion.")
+    groups = {name: App(name=name, help=about) for name, about in GROUPS.items()}
+    for group in groups.values():
+        app.command(group)
+    for command, (where, summary) in COMMANDS.items():
+        within, _, name = command.rpartition(" ")
+        told = None if name in chosen else summary
+        groups.get(within, app).command(f"{MODULES}.{where}", name=name, help=told)
     return app
 
 
