@@ -46,8 +46,12 @@ class BodyLost(GigabrainError):
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownName:
-    """The error for a name that is not among `known`, with the nearest one as a suggestion."""
+    """The error for a name that is not among `known`, with the nearest one as a suggestion.
+
+    Part of a name is enough: a wafle is a turtlebot3_waffle.
+    """
     names = sorted(known)
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    hint = f"; did you mean {close[0]!r}?" if close else ";"
+    parts = {part: whole for whole in names for part in (*whole.split("_"), whole)}
+    close = difflib.get_close_matches(name, parts, n=1, cutoff=0.5)
+    hint = f"; did you mean {parts[close[0]]!r}?" if close else ";"
     return UnknownName(f"no {kind} {name!r}{hint} known: {', '.join(names)}")

@@ -10,14 +10,9 @@ from importlib.metadata import version
 import pytest
 from cyclopts import App
 
-from gigabrain_zenoh.cli.app import make_app
+from gigabrain_zenoh.cli.app import COMMANDS, make_app
 from tests.stack import GIGABRAIN, Home, free_port
 
-COMMANDS = (
-    "demo", "up", "router", "perception", "decision", "control", "safety", "driver run", "estop",
-    "release", "enable", "robots", "worlds", "view", "schema export", "bench chain", "bench stack",
-    "completion",
-)  # fmt: skip
 # takes longer than all the rest of `gigabrain --help` together
 HEAVY = {"numpy", "zenoh", "mujoco", "asyncio", "yaml", "rich.markdown", "importlib.metadata"}
 
@@ -76,11 +71,11 @@ async def test_the_version_is_that_of_the_package(home: Home) -> None:
         ("demo --speed 1000", "--speed: expected `float` <= 100.0"),
         ("demo --seconds nan", "--seconds: expected a number above 0, got nan"),
         ("demo --resume auto --link real", "resume: auto is for simulation"),
-        ("demo --body wafle", "no robot 'wafle'; known: mock, turtlebot3_burger, turtlebot3_wa"),
+        ("demo --body wafle", "no robot 'wafle'; did you mean 'turtlebot3_waffle'? known: alpha,"),
         ("demo --body turtlebot3_wafle", "did you mean 'turtlebot3_waffle'?"),
         ("demo --world hose", "no world 'hose'; did you mean 'house'? known: arena, house,"),
         ("demo --world random:x", "random:SEED wants a whole number, as in random:7"),
-        ("driver run mcok", "no robot 'mcok'; did you mean 'mock'? known: mock,"),
+        ("driver run mcok", "no robot 'mcok'; did you mean 'mock'? known: alpha, mock,"),
         ("driver run mock --speed 0", "--speed: expected `float` >= 0.1"),
         ("decision --behaviour avod", "no behaviour 'avod'; did you mean 'avoid'?"),
         ("up dmeo", "no deployment 'dmeo'; did you mean 'demo'? known: demo, three_hosts"),
@@ -102,7 +97,9 @@ async def test_what_is_mistyped_is_refused_in_one_line(
 async def test_robots_and_worlds_are_listed(home: Home) -> None:
     robots = (await home.run("robots")).out.splitlines()
     assert [line.split()[0] for line in robots] == [
+        "alpha",
         "mock",
+        "mycustombot",
         "turtlebot3_burger",
         "turtlebot3_waffle",
     ]
