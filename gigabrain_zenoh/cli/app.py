@@ -8,6 +8,11 @@ from cyclopts import App, CycloptsError
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 
 COMMANDS = "gigabrain_zenoh.cli"
+TRACE = """Show the bytes on a body's line, decoded.
+
+Starts the driver itself, on an emulator of its own or on the real port, where it commands zero only.
+A driver that runs already logs the same lines with: gigabrain driver run NAME --level debug
+"""
 
 
 def make_app() -> App:
@@ -44,7 +49,7 @@ def make_app() -> App:
         ("driver", "run", "process:driver", "Drivers of bodies.", "Start the driver of a body."),
         ("driver", "new", "driver_kit:new", "", "Write the package of a new driver."),
         ("driver", "test", "driver_kit:test", "", "Check a driver against all that it must do."),
-        ("driver", "trace", "driver_kit:trace", "", "Show the bytes on a body's line, decoded."),
+        ("driver", "trace", "driver_kit:trace", "", TRACE),
         ("schema", "export", "schema:export", "Messages.", "Write JSON Schema of every message."),
     )
     subs: dict[str, App] = {}
