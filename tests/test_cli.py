@@ -103,7 +103,7 @@ async def test_robots_and_worlds_are_listed(home: Home) -> None:
         "turtlebot3_burger",
         "turtlebot3_waffle",
     ]
-    assert all(re.search(r"  \S.* \(sim\)  /.*robot\.yaml$", line) for line in robots)
+    assert all(re.search(r"  \S.* \(sim.*\)  /.*robot\.yaml$", line) for line in robots)
     worlds = (await home.run("worlds")).out.splitlines()
     assert [line.split()[0] for line in worlds] == ["arena", "house", "warehouse", "random:SEED"]
 

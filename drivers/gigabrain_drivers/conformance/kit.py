@@ -55,8 +55,8 @@ ALONE = (
 )
 GATED = (
     GateCheck("reports at its rate", "9 of 10 ticks, 100 ms old; scans to 25 %", timing.reports),
-    GateCheck("stops on silence", "7 ticks, its ramp, 15 of the body", stops.silence),
-    GateCheck("stops on NaN", "zero in 2 ticks, 15 of the body", stops.not_a_number),
+    GateCheck("stops on silence", "7 ticks, its ramp, 15 of the body (legs: 30)", stops.silence),
+    GateCheck("stops on NaN", "zero in 2 ticks, 15 of the body (legs: 30)", stops.not_a_number),
     GateCheck("stops on disorder", "nothing obeyed; as on silence", stops.disorder),
     GateCheck("stops on SIGKILL", "of the commander; as on silence", stops.killed),
     GateCheck(

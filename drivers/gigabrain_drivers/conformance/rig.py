@@ -29,6 +29,8 @@ from gigabrain_zenoh.transport import LocalNetwork
 KIT = "kit"  # the commander
 ENABLE_TICKS = 250
 MOVE_TICKS = 100
+SETTLE_TICKS = 15  # of the body, after the ramp of its commands
+STEP_TICKS = 30  # of a body that walks
 ATTEMPTS = 3  # a machine that stands still for 100 ms has the gate shut
 SHARE = 0.5  # of the body's greatest speed, which the checks drive at
 MOVING = 0.6  # of the wanted speed, from which the body counts as moving
@@ -173,7 +175,11 @@ class Rig(Timeline):
         self.scan, self.scans = scan, self.scans + 1
 
 
-def stop_ticks(rig: Rig, reaction: int, body: int = 15) -> int:
-    """The most ticks from a cause to standstill: until it is seen, the ramp, and the body's own."""
+def stop_ticks(rig: Rig, reaction: int, body: int = 0) -> int:
+    """The most ticks from a cause to standstill: until it is seen, the ramp, and the body's own.
+
+    What walks has to end its step, and to settle.
+    """
     ramp = rig.speed / rig.robot.max_linear_deceleration / 0.02
-    return reaction + round(ramp + 0.5) + body
+    own = STEP_TICKS if rig.robot.drive_type == "quadruped" else SETTLE_TICKS
+    return reaction + round(ramp + 0.5) + (body or own)
