@@ -156,6 +156,8 @@ class Demo:
             write_report(report, self._options.report)
         if report:
             print(summary(report))
+        if stopped and report is None:
+            print("ended; the driver did not answer, so there is no report", file=sys.stderr)
         if stopped:
             return 0
         if report and report.ok:

@@ -88,8 +88,7 @@ async def test_the_hosts_of_a_deployment_make_one_robot(home: Home) -> None:
         person = Robot(robot.bus)
         await robot.ticks(30)
         await person.release()
-        await robot.hand_to_brain()
-        await robot.straight(speed=0.15, room=0.0)
+        await robot.straight(speed=0.15, room=0.0, by_hand=True)
         os.kill(brain.pid, signal.SIGKILL)  # the whole host
         await robot.still()
         assert robot.state.gate.mode in ("stopping", "idle")
