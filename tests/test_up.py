@@ -65,6 +65,19 @@ async def test_after_five_deaths_within_a_minute_a_process_is_given_up_in_one_li
     assert await up.ended() == 1
 
 
+async def test_it_goes_on_when_nobody_reads_what_it_says(home: Home) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    up = home.start("up", str(home.deployment()), stdout=writer)
+    os.close(writer)
+    async with looking_on(await robot_of(home, up)) as robot:
+        await robot.pids()
+        await robot.ticks(25)
+        up.send(signal.SIGINT)
+        assert await up.ended() == 0
+    assert up.err == ""
+
+
 async def test_nothing_survives_its_death_not_even_what_is_frozen(home: Home) -> None:
     file = home.deployment()
     up = home.start("up", str(file))
