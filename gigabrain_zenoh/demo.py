@@ -157,9 +157,11 @@ class Demo:
             write_report(report, self._options.report)
         if report:
             print(summary(report))
+        if stopped and report is None:
+            print("ended; the driver did not answer, so there is no report", file=sys.stderr)
         if stopped:
             return 0
-        if report and report.ok:
+        if report and report.ok and not self._failures:
             return 0
         if self._supervisor.misconfigured:
             raise ConfigError(self._refusal)

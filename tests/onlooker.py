@@ -69,8 +69,13 @@ class Onlooker:
         """What the driver knows that the robot does not."""
         return dict((await self.describe("driver")).report)
 
-    async def straight(self, speed: float = 0.25, room: float = 1.6) -> None:
-        """Wait until the robot drives straight on at `speed` [m/s] with `room` [m] ahead."""
+    async def straight(
+        self, speed: float = 0.25, room: float = 1.6, *, by_hand: bool = False
+    ) -> None:
+        """Wait until the robot drives straight on at `speed` [m/s] with `room` [m] ahead.
+
+        `by_hand` enables it as a person would, again and again where a busy machine stops it.
+        """
 
         def driving() -> bool:
             world = self.world.fresh()
@@ -80,7 +85,17 @@ class Onlooker:
             roomy = ahead is None or ahead > room
             return roomy and velocity.linear_x > speed and abs(velocity.angular_z) < STRAIGHT
 
-        await until(driving, f"driving straight at {speed} m/s")
+        async def enable() -> None:
+            while True:
+                await until(lambda: self.state.gate.mode == "idle", "idle", math.inf)
+                await self.hand_to_brain()
+
+        person = asyncio.ensure_future(enable()) if by_hand else None
+        try:
+            await until(driving, f"driving straight at {speed} m/s")
+        finally:
+            if person:
+                person.cancel()
 
     async def hand_to_brain(self) -> None:
         """As a person: let the brain drive, as soon as nothing speaks against it."""

@@ -42,13 +42,19 @@ def free_port() -> int:
 class Command:
     """One `gigabrain` command in a process of its own, its output in files."""
 
-    def __init__(self, out: Path, environment: dict[str, str], arguments: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        out: Path,
+        environment: dict[str, str],
+        arguments: tuple[str, ...],
+        stdout: int | None = None,
+    ) -> None:
         self._paths = out.with_suffix(".out"), out.with_suffix(".err")
         self._files: tuple[IO[bytes], ...] = tuple(path.open("wb") for path in self._paths)
         self._process = subprocess.Popen(
             (*GIGABRAIN, *arguments),
             stdin=subprocess.DEVNULL,
-            stdout=self._files[0],
+            stdout=self._files[0] if stdout is None else stdout,
             stderr=self._files[1],
             env=environment,
             start_new_session=True,
@@ -111,10 +117,10 @@ class Home:
             "COLUMNS": "100",
         }
 
-    def start(self, *arguments: str) -> Command:
-        """Start a `gigabrain` command."""
+    def start(self, *arguments: str, stdout: int | None = None) -> Command:
+        """Start a `gigabrain` command; what it prints goes to `stdout`, or into `Command.out`."""
         out = self.folder / f"command-{next(self._numbers)}"
-        self._commands.append(Command(out, self.environment, arguments))
+        self._commands.append(Command(out, self.environment, arguments, stdout))
         return self._commands[-1]
 
     async def run(self, *arguments: str) -> Command:

@@ -37,18 +37,15 @@ async def test_nothing_moves_until_it_is_released_and_enabled(robot: Onlooker) -
     await person.release()
     await robot.ticks(50)
     assert (robot.state.gate.mode, robot.state.pose.x) == ("idle", 0.0)
-    await robot.hand_to_brain()
-    await robot.straight()
+    await robot.straight(by_hand=True)
 
 
 @pytest.mark.parametrize("victim", [*SYSTEMS[1:], "router"])
 async def test_after_a_fault_it_stands_until_a_person_enables_it(
     robot: Onlooker, victim: str
 ) -> None:
-    if robot.state.gate.mode == "idle":
-        await robot.hand_to_brain()
     pid = await robot.pid(victim)
-    await robot.straight()
+    await robot.straight(by_hand=True)
     start = robot.state
     os.kill(pid, signal.SIGKILL)
     await until(lambda: robot.state.gate.mode == "idle", "the gate shuts")
@@ -58,6 +55,5 @@ async def test_after_a_fault_it_stands_until_a_person_enables_it(
     await until(lambda: not robot.state.gate.causes, "nothing speaks against driving any more")
     await robot.ticks(50)
     assert robot.moved(start) <= limit_m
-    await robot.hand_to_brain()
-    await robot.straight(room=0.0)
+    await robot.straight(room=0.0, by_hand=True)
     assert (await robot.truth())["stale_commands_executed"] == 0

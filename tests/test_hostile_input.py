@@ -79,7 +79,7 @@ async def test_a_flood_on_every_key_is_dropped_and_counted_and_the_robot_drives_
     home: Home,
 ) -> None:
     path, chance = home.folder / "report.json", random.Random(7)
-    demo = home.start("demo", "--headless", "--seconds", "16", "--report", str(path))
+    demo = home.start("demo", "--headless", "--seconds", "12", "--report", str(path))
     endpoint = await robot_of(home, demo)
     async with looking_on(endpoint) as robot, stranger_at(endpoint) as (transport, _):
         await until(lambda: robot.state.gate.mode == "enabled", "driving")

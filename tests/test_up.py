@@ -65,6 +65,19 @@ async def test_after_five_deaths_within_a_minute_a_process_is_given_up_in_one_li
     assert await up.ended() == 1
 
 
+async def test_it_goes_on_when_nobody_reads_what_it_says(home: Home) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    up = home.start("up", str(home.deployment()), stdout=writer)
+    os.close(writer)
+    async with looking_on(await robot_of(home, up)) as robot:
+        await robot.pids()
+        await robot.ticks(25)
+        up.send(signal.SIGINT)
+        assert await up.ended() == 0
+    assert up.err == ""
+
+
 async def test_nothing_survives_its_death_not_even_what_is_frozen(home: Home) -> None:
     file = home.deployment()
     up = home.start("up", str(file))
@@ -88,8 +101,7 @@ async def test_the_hosts_of_a_deployment_make_one_robot(home: Home) -> None:
         person = Robot(robot.bus)
         await robot.ticks(30)
         await person.release()
-        await robot.hand_to_brain()
-        await robot.straight(speed=0.15, room=0.0)
+        await robot.straight(speed=0.15, room=0.0, by_hand=True)
         os.kill(brain.pid, signal.SIGKILL)  # the whole host
         await robot.still()
         assert robot.state.gate.mode in ("stopping", "idle")

@@ -1,5 +1,6 @@
 """The table of commands. Importing it is what `gigabrain --help` costs: keep it light."""
 
+import contextlib
 import os
 import sys
 from collections.abc import Sequence
@@ -80,6 +81,10 @@ def main() -> None:
         code = ConfigError.exit_code
     except KeyboardInterrupt:
         code = 130
-    sys.stdout.flush()
-    sys.stderr.flush()
+    except BrokenPipeError:  # nobody reads on, as in `gigabrain robots | head -1`
+        code = 1
+    with contextlib.suppress(BrokenPipeError):
+        sys.stdout.flush()
+    with contextlib.suppress(BrokenPipeError):
+        sys.stderr.flush()
     os._exit(code if isinstance(code, int) else 0)  # Zenoh's threads must not hold it back

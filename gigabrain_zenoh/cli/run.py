@@ -1,6 +1,7 @@
 """`gigabrain demo` and `gigabrain up`: a whole robot."""
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -96,10 +97,21 @@ def up(deployment: str, *, host: str | None = None, level: str = "info") -> int:
     path = deployment_path(deployment)
     loaded = load_deployment(path)
     try:
-        return asyncio.run(run(loaded, host_of(loaded, host), _say, level))
+        return asyncio.run(run(loaded, host_of(loaded, host), _printer(), level))
     except ConfigError as error:
         raise located(path, error) from None
 
 
-def _say(line: str) -> None:
-    print(line, flush=True)
+def _printer() -> Callable[[str], None]:
+    """Prints lines for as long as somebody reads them: a robot goes on without its pager."""
+    read = True
+
+    def say(line: str) -> None:
+        nonlocal read
+        try:
+            if read:
+                print(line, flush=True)
+        except BrokenPipeError:
+            read = False
+
+    return say
