@@ -4,8 +4,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from tests.stack import Home
+
+# how long an example takes says something of the machine, and nothing of the code
+settings.register_profile("gigabrain", deadline=None)
+settings.load_profile("gigabrain")
 
 
 @pytest.fixture

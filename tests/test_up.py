@@ -135,7 +135,7 @@ async def test_of_several_hosts_one_must_be_chosen(home: Home) -> None:
         ("hosts: {}", 1, "hosts: expected at least one"),
         ("hosts:\n  a: [driver]\n  b: [driver]", 1, "driver must run once, on one host"),
         ("router: tcp/0.0.0.0:7447", 1, "can be reached by anybody on the network"),
-        ("link: real\nresume: auto", 1, "resume: auto is for simulation"),
+        ("link: real\nresume: auto", 2, "resume: auto is for simulation"),
         ("body: turtlebot3_wafle", 1, "no robot 'turtlebot3_wafle'; did you mean 'turtlebot3_w"),
         ("seed: 3\nworld: hose", 2, "no world 'hose'; did you mean 'house'? known: arena, house"),
         ("decision:\n  behaviour: avod", 2, "no behaviour 'avod'; did you mean 'avoid'?"),
