@@ -9,7 +9,22 @@ from cyclopts import App, CycloptsError
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 
-COMMANDS = "gigabrain_zenoh.cli"
+FOLDER = "gigabrain_zenoh.cli"
+COMMANDS = (  # name, module and function, what it does
+    ("demo", "run:demo", "Drive a simulated robot round a room, until Ctrl-C."),
+    ("up", "run:up", "Start what a deployment file puts on this host, and keep it running."),
+    ("router", "process:router", "Start the router that joins the other processes."),
+    ("perception", "process:perception", "Start perception."),
+    ("decision", "process:decision", "Start decision."),
+    ("control", "process:control", "Start control."),
+    ("safety", "process:safety", "Start safety."),
+    ("estop", "operate:estop", "Stop the robot at once, and latch it."),
+    ("release", "operate:release", "Let go of a latched gate."),
+    ("enable", "operate:enable", "Let the robot's brain drive."),
+    ("robots", "names:robots", "List the robots that there are."),
+    ("worlds", "names:worlds", "List the simulated worlds that there are."),
+    ("view", "view:view", "Draw a robot in its world into a PNG file."),
+)
 
 
 def make_app(chosen: Sequence[str] = ()) -> App:
@@ -21,7 +36,7 @@ def make_app(chosen: Sequence[str] = ()) -> App:
 
     def add(to: App, where: str, name: str, summary: str) -> None:
         told = None if name in chosen else summary
-        to.command(f"{COMMANDS}.{where}", name=name, help=told)
+        to.command(f"{FOLDER}.{where}", name=name, help=told)
 
     app = App(
         name="gigabrain",
@@ -29,22 +44,7 @@ def make_app(chosen: Sequence[str] = ()) -> App:
         help_format="plaintext",  # the default, Markdown, takes twice as long to start
         version=_version,
     )
-    lazy = (
-        ("demo", "run:demo", "Drive a simulated robot round a room, until Ctrl-C."),
-        ("up", "run:up", "Start what a deployment file puts on this host, and keep it running."),
-        ("router", "process:router", "Start the router that joins the other processes."),
-        ("perception", "process:perception", "Start perception."),
-        ("decision", "process:decision", "Start decision."),
-        ("control", "process:control", "Start control."),
-        ("safety", "process:safety", "Start safety."),
-        ("estop", "operate:estop", "Stop the robot at once, and latch it."),
-        ("release", "operate:release", "Let go of a latched gate."),
-        ("enable", "operate:enable", "Let the robot's brain drive."),
-        ("robots", "names:robots", "List the robots that there are."),
-        ("worlds", "names:worlds", "List the simulated worlds that there are."),
-        ("view", "view:view", "Draw a robot in its world into a PNG file."),
-    )
-    for name, where, summary in lazy:
+    for name, where, summary in COMMANDS:
         add(app, where, name, summary)
     groups = (
         ("driver", "run", "process:driver", "Drivers of bodies.", "Start the driver of a body."),
