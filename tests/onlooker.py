@@ -70,7 +70,7 @@ class Onlooker:
         return dict((await self.describe("driver")).report)
 
     async def straight(
-        self, speed: float = 0.25, room: float = 1.6, *, by_hand: bool = False
+        self, speed: float = 0.25, room: float = 1.3, *, by_hand: bool = False
     ) -> None:
         """Wait until the robot drives straight on at `speed` [m/s] with `room` [m] ahead.
 

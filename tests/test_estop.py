@@ -59,7 +59,7 @@ async def test_it_stops_the_body_and_keeps_it_stopped(robot: Onlooker) -> None:
     with pytest.raises(Refused, match=r"latched: e-stop pressed by operator; release it first"):
         await Robot(robot.bus, take=True).set_base_velocity(0.2)
     await go_on(robot)
-    await robot.straight()
+    await robot.straight(room=0.0)
 
 
 async def test_the_command_says_who_has_confirmed_it(
@@ -100,7 +100,7 @@ async def test_it_survives_the_death_of_the_driver(robot: Onlooker) -> None:
     assert robot.state.gate.estop_generation == generation
     assert (robot.state.pose.x, robot.state.pose.y) == (0.0, 0.0)
     await go_on(robot)
-    await robot.straight()
+    await robot.straight(room=0.0)
 
 
 async def test_only_who_knows_of_the_newest_e_stop_can_release_it(robot: Onlooker) -> None:
@@ -115,4 +115,4 @@ async def test_only_who_knows_of_the_newest_e_stop_can_release_it(robot: Onlooke
     )
     assert robot.state.gate.mode == "latched"
     await go_on(robot)
-    await robot.straight()
+    await robot.straight(room=0.0)

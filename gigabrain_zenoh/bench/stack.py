@@ -66,15 +66,13 @@ def targets(result: StackResult) -> list[Target]:
             name="CPU without physics",
             value=100 * result.cpu_without_physics,
             limit=CPU_PERCENT,
-            unit="% of one core",
+            unit="%",
         ),
     ]
     if result.physics_cpu is not None:
         percent = 100 * result.physics_cpu
         found.append(
-            Target(
-                name="physics and lidar", value=percent, limit=PHYSICS_PERCENT, unit="% of one core"
-            )
+            Target(name="physics and lidar", value=percent, limit=PHYSICS_PERCENT, unit="%")
         )
     small = [p for p in result.processes if p.name != SIMULATOR or result.physics_cpu is None]
     largest = max(small, key=lambda process: process.rss_bytes)

@@ -1,6 +1,6 @@
 """The results as tables for people."""
 
-from rich.console import Group
+from rich.console import Group, JustifyMethod
 from rich.table import Table
 from rich.text import Text
 
@@ -17,16 +17,17 @@ def chain_page(result: ChainResult) -> Group:
     runs = f"runs of {result.seconds:g} s in turns, median of {len(result.rates[0].chain)}"
     sent = ", ".join(str(size) for size in result.payload_bytes)
     return Group(
-        _compared(result.rates, f"Scan to command ({runs})"),
+        _title(f"Scan to command ({runs})"),
+        _compared(result.rates),
         Text(
             f"The relay is four plain Zenoh processes on a router like ours, which put what they "
             f"get ({sent} bytes). Our router, driver, perception, decision, control and safety run "
-            f"as under `gigabrain up`: safety is no part of the chain, but without it the gate "
-            f"stays shut.",
+            "as under `gigabrain up`: safety is no part of the chain, but without it the gate "
+            "stays shut.",
             style="dim",
         ),
-        Text(),
-        _hops(result.hops, result.overheard),
+        _title(f"Where it goes [ms] (with somebody listening: {result.overheard.p50_ms:.2f} ms)"),
+        _hops(result.hops),
         Text(
             "Work of each kind is timed by itself in a process that sleeps a tick in between, as "
             "ours do. The rest is Zenoh, the kernel, and waiting for a core that another process "
@@ -36,14 +37,14 @@ def chain_page(result: ChainResult) -> Group:
     )
 
 
-def _compared(rates: tuple[Compared, ...], title: str) -> Table:
-    table = _table(title, "rate", "who", "n", "p50 [ms]", "p99 [ms]", "ratio p50", "ratio p99")
+def _compared(rates: tuple[Compared, ...]) -> Table:
+    table = _table("rate", "who", "n", "p50 [ms]", "p99 [ms]", "ratio p50", "ratio p99")
     for one in rates:
         rate = f"{one.rate_hz:g} Hz"
         _figures(table, rate, "bare relay", over_rounds(one.relay))
         ratios = (_ratio(one.ratio_p50, TARGET_P50), _ratio(one.ratio_p99, TARGET_P99))
         _figures(table, "", "gigabrain", over_rounds(one.chain), *ratios)
-        _figures(table, "", "relay, no router", one.peers)
+        _figures(table, "", "no router", one.peers)
         table.add_section()
     return table
 
@@ -56,9 +57,8 @@ def _ratio(value: float, limit: float) -> Text:
     return Text(f"{value:.2f} (≤ {limit:g})", style="green" if value <= limit else "yellow")
 
 
-def _hops(hops: tuple[Hop, ...], total: Figures) -> Table:
-    title = f"Where the time goes [ms] (with somebody listening: p50 {total.p50_ms:.2f} ms)"
-    table = _table(title, "hop", "took", "encode, put", "bridge", "decode", "step", "rest")
+def _hops(hops: tuple[Hop, ...]) -> Table:
+    table = _table("hop", "took", "encode, put", "bridge", "decode", "step", "rest")
     for hop in hops:
         parts = (hop.took, hop.put, hop.bridge, hop.decode, hop.step, hop.rest)
         table.add_row(hop.name, *(f"{part:.3f}" for part in parts))
@@ -68,13 +68,13 @@ def _hops(hops: tuple[Hop, ...], total: Figures) -> Table:
 def stack_page(result: StackResult) -> Group:
     """What `gigabrain bench stack` prints."""
     title = f"{result.body} in {result.world} at real time, {result.seconds:g} s"
-    table = _table(title, "process", "CPU", "memory")
+    table = _table("process", "CPU", "memory")
     for process in result.processes:
         table.add_row(process.name, f"{process.cpu:.1%}", f"{process.rss_bytes / MB:.0f} MB")
-    held = _table("Targets", "figure", "measured", "at most", "")
+    held = _table("figure", "measured", "at most", "")
     for target in targets(result):
         held.add_row(*_target(target))
-    return Group(table, Text(), held)
+    return Group(_title(title), table, _title("Targets (CPU of one core)"), held)
 
 
 def _target(target: Target) -> tuple[str, str, str, Text]:
@@ -83,9 +83,14 @@ def _target(target: Target) -> tuple[str, str, str, Text]:
     return target.name, value, limit, verdict
 
 
-def _table(title: str, first: str, *others: str) -> Table:
-    table = Table(title=Text(title), title_justify="left", title_style="bold")
-    table.add_column(first)
+def _title(text: str) -> Text:
+    return Text(f"\n{text}", style="bold")
+
+
+def _table(first: str, *others: str) -> Table:
+    table = Table()
+    table.add_column(first, no_wrap=True)
     for name in others:
-        table.add_column(Text(name), justify="left" if name == "who" else "right")
+        justify: JustifyMethod = "left" if name == "who" else "right"
+        table.add_column(Text(name), justify=justify, no_wrap=True)
     return table
