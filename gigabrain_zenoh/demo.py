@@ -143,7 +143,10 @@ class Demo:
         """A line of somebody's log."""
         event, level = record.get("event"), record.get("level")
         if event == "decision":
-            self._decisions.append((round(record["tick"] * 0.02, 2), str(record["reason"])))
+            decided = round(record["tick"] * 0.02, 2), str(record["reason"])
+            if self._decisions and self._decisions[-1][0] == decided[0]:
+                self._decisions.pop()  # the last word of a tick counts
+            self._decisions.append(decided)
         if event == "failed":
             self._refusal = str(record.get("text", ""))
         if event in ("given up", "died"):

@@ -32,7 +32,7 @@ class Latest(Generic[M]):
 
     def __init__(self, topic: Topic[M], clock: Clock, time: RobotTime) -> None:
         self._topic, self._clock, self._time = topic, clock, time
-        self._by_wall = topic.key in CLOCK_KEYS  # nothing else tells when the robot's clock stops
+        self._by_wall = topic.key == STATE.key  # nothing else tells when the robot's clock stops
         self.newest: M | None = None
         self._arrived_ns = 0
         self._arrived_tick = 0

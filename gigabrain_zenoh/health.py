@@ -13,7 +13,6 @@ from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import DESCRIBE, HEALTH
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.version import __version__
 
 PERIOD_NS = 1_000_000_000
 ASK_S = 0.3  # how long another process of the same name may take to answer
@@ -40,6 +39,8 @@ async def answer_to_name(bus: Bus) -> None:
         )
 
     async def describe(_: DescribeRequest) -> Description:
+        from gigabrain_zenoh.version import __version__  # 25 ms, which no start should wait for
+
         return Description(
             process=bus.process,
             pid=os.getpid(),

@@ -100,12 +100,20 @@ def run(config: ProcessConfig) -> int:
     except GigabrainError as error:
         log.error("%s", error, extra={"data": {"event": "failed"}})
         return error.exit_code
-    except Exception:
-        log.critical("died of an error in the program", exc_info=True)
+    except Exception as error:
+        first = _first(error)
+        log.critical("died of %s: %s", type(first).__name__, first, exc_info=True)
         return 1
     finally:
         gc.enable()
     return 0
+
+
+def _first(error: BaseException) -> BaseException:
+    """What went wrong first, within whatever groups."""
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    return error
 
 
 async def _run(config: ProcessConfig, node: Node) -> None:

@@ -259,6 +259,6 @@ def test_looking_does_not_change_what_happens() -> None:
 
 def test_the_robot_model_leaves_the_options_to_the_world() -> None:
     model = compile_scene(waffle(), load_world("house", 0))
-    assert model.opt.timestep == 0.002
+    assert model.opt.timestep == 0.005
     assert model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert model.opt.impratio == 10

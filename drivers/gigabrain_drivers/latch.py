@@ -63,4 +63,7 @@ class LatchFile:
 
 
 def _unwritable(folder: Path, error: OSError) -> str:
-    return f"cannot write {folder}: {error.strerror}; choose another --state-dir"
+    return (
+        f"cannot write {folder}: {error.strerror}; make it writable, "
+        "or name another with --remember or XDG_STATE_HOME"
+    )

@@ -223,7 +223,7 @@ class DriverProcess:
         if command.boot == self._gate.boot:
             counts = self._gate.mode == "enabled"
             self._round_trip.answered(command.basis, arrived_ns, counts=counts)
-            if self._lockstep:
+            if self._lockstep and command.source == (self._gate.commander or gate.BRAIN):
                 self._lockstep.command(command)
 
     def _on_joint_command(self, _key: str, _command: JointCommand) -> None:

@@ -1,6 +1,7 @@
 """Drive straight on; turn on the spot while something is ahead; wait while nothing is known."""
 
 import math
+from functools import lru_cache
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import Intent, TrajectoryPoint, WorldModel
@@ -78,6 +79,7 @@ class Avoid:
         )
 
 
+@lru_cache(maxsize=16)
 def expected_trajectory(twist: Velocity) -> tuple[TrajectoryPoint, ...]:
     """Where a constant twist leads from the present pose, as an arc in the body's frame."""
     v, w = twist.linear_x, twist.angular_z

@@ -2,5 +2,5 @@
 
 TICK_NS = 10_000_000  # one advance of the simulation
 TICK_S = TICK_NS / 1e9
-SUBSTEPS = 5  # physics steps in a tick
+SUBSTEPS = 2  # physics steps in a tick
 TIMESTEP_S = TICK_S / SUBSTEPS
