@@ -133,13 +133,12 @@ async def test_without_a_brain_a_script_may_drive() -> None:
     assert {causes for _, causes in driven} == {()}
 
 
-async def test_silence_is_judged_by_the_robots_clock_and_the_scan_by_arrival_as_well() -> None:
+async def test_silence_is_judged_by_the_robots_clock_alone() -> None:
     async with Chain() as chain:
         await started(chain)
         await chain.clock.advance(200_000_000)  # the driver was held up; its time stood still
         found = await chain.go(3, scans=False)
-    assert found[-1] == (23, ("scan_lost",))  # 260 ms after it came, only 60 ms by the tick
-    assert {causes for _, causes in found[:-1]} <= {()}
+    assert {causes for _, causes in found} <= {()}  # 260 ms after the scan came, 60 ms by the tick
 
 
 async def test_a_driver_that_starts_anew_is_judged_afresh() -> None:

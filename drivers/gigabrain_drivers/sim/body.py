@@ -54,6 +54,7 @@ class SimModel:
     lidar: SimLidar | None = field(default_factory=SimLidar)
     battery: SimBattery = field(default_factory=SimBattery)
     motor: SimMotor = field(default_factory=SimMotor)
+    substeps: int = 2  # physics steps in a tick of 10 ms; wheels roll as well on 5 ms as on 1 ms
 
     def parts(self) -> tuple[tuple[str, str], ...]:
         """(kind, name) of what the model has to have besides base, sensors and lidar."""
@@ -117,6 +118,7 @@ class SimQuadruped(SimModel):
     its position servo; each leg has a touch sensor `..._contact` on its foot.
     """
 
+    substeps: int = 5  # feet that meet the ground ask for finer steps than wheels do
     geometry: LegGeometry = field(default_factory=LegGeometry)
     walker: Walker = WALKER  # turns velocities into gaits
     encoder_ticks: int = 65536  # per turn of a joint

@@ -21,7 +21,7 @@ from gigabrain_drivers.sim.person import Person
 from gigabrain_drivers.sim.rolling import Rolling
 from gigabrain_drivers.sim.scene import PERSON, ROBOT, compile_scene, yaw_quaternion
 from gigabrain_drivers.sim.streams import Stream, generator
-from gigabrain_drivers.sim.tick import SUBSTEPS, TICK_NS
+from gigabrain_drivers.sim.tick import TICK_NS
 from gigabrain_drivers.sim.truth import Truth
 from gigabrain_drivers.sim.walking import Walking
 from gigabrain_drivers.sim.wear import Battery, Charge
@@ -54,7 +54,7 @@ class Simulation:
     def __init__(self, body: SimModel, world: World, seed: int) -> None:
         self.model = compile_scene(body, world)
         self.data = mujoco.MjData(self.model)
-        self._ticks = 0
+        self._ticks, self._substeps = 0, body.substeps
         self._locomotion = locomotion_of(body, self.model, self.data)
         self._height = int(self.model.joint(f"{ROBOT}free").qposadr[0]) + 2
         self._battery = Battery(body.battery)
@@ -97,7 +97,7 @@ class Simulation:
             self._person.advance(lambda x, y: self.truth.footprint.distance(robot, x, y))
             self._place_person()
         self._locomotion.act()
-        mujoco.mj_step(self.model, self.data, nstep=SUBSTEPS)
+        mujoco.mj_step(self.model, self.data, nstep=self._substeps)
         self._ticks += 1
         self._check()
         self._sample = self._imu.sample()

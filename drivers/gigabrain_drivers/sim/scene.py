@@ -9,7 +9,7 @@ from gigabrain_drivers.sim.body import SimBody, SimModel
 from gigabrain_drivers.sim.geometry import Box, Pose, Shape
 from gigabrain_drivers.sim.looks import FLOOR, add_light, add_materials
 from gigabrain_drivers.sim.person import RADIUS_M
-from gigabrain_drivers.sim.tick import TIMESTEP_S
+from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_drivers.sim.world import World
 from gigabrain_zenoh.errors import ConfigError
 
@@ -22,6 +22,7 @@ def compile_scene(body: SimModel, world: World) -> mujoco.MjModel:
     """The model of `body` at the start of `world`. Raises ConfigError for a bad robot model."""
     mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)  # instead of a file
     spec = world_spec(world)
+    spec.option.timestep = TICK_S / body.substeps
     start = world.start
     try:
         robot = _robot_spec(body)
@@ -89,7 +90,6 @@ def world_spec(world: World) -> mujoco.MjSpec:
 
 def _set_options(spec: mujoco.MjSpec) -> None:
     """The solver's settings; the robots' models have none, or they would be ignored."""
-    spec.option.timestep = TIMESTEP_S
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10

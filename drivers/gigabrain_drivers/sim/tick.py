@@ -2,5 +2,3 @@
 
 TICK_NS = 10_000_000  # one advance of the simulation
 TICK_S = TICK_NS / 1e9
-SUBSTEPS = 2  # physics steps in a tick
-TIMESTEP_S = TICK_S / SUBSTEPS
