@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from gigabrain_drivers import DRIVERS
 from gigabrain_drivers.base import Driver
-from gigabrain_drivers.lidars.base import source_class
+from gigabrain_drivers.lidars.base import check_rate, source_class
 from gigabrain_drivers.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError, unknown
@@ -137,9 +137,18 @@ def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions
     options = getattr(config.load(path, exact), section)
     if options.lidar:
         robot = msgspec.structs.replace(robot, lidar=options.lidar)
+    if options.scan:
+        _check_lidar(path, options.scan.driver, robot)
     if borrowed:
         options = with_ports(options)
     return robot, driver, at_emulator(options, run.emulator), path.parent
+
+
+def _check_lidar(path: Path, name: str, robot: RobotFile) -> None:
+    try:
+        check_rate(name, robot.lidar)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def with_ports(options: LinkOptions) -> LinkOptions:
