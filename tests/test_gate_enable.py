@@ -133,3 +133,16 @@ def test_a_second_enable_is_counted_and_is_no_command() -> None:
     assert rig.mode == "enabled"
     rig.tick()
     assert rig.mode == "stopping"
+
+
+def test_the_brain_takes_the_body_from_nobody_unless_a_person_hands_it_over() -> None:
+    rig = enabled("alice")
+    rig.live(3)
+    for by in ("", "control"):
+        assert rig.feed(gate.Enable("control", take=True, by=by)) == gate.Outcome(
+            ok=False, text="alice drives; only a person hands it to the brain"
+        )
+    assert rig.state.commander == "alice"
+    assert rig.feed(gate.Enable("control", take=True, by="bob")) == gate.Outcome(
+        text="control drives"
+    )
