@@ -29,6 +29,7 @@ COMMANDS = {
     "release": ("operate:release", "Let go of a latched gate."),
     "enable": ("operate:enable", "Let the robot's brain drive."),
     "audit": ("audit:audit", "Show who did what to the robot."),
+    "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
     "worlds": ("names:worlds", "List the simulated worlds that there are."),
     "view": ("view:view", "Draw a robot in its world into a PNG file."),
