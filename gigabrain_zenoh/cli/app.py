@@ -28,6 +28,7 @@ COMMANDS = {
     "estop": ("operate:estop", "Stop the robot at once, and latch it."),
     "release": ("operate:release", "Let go of a latched gate."),
     "enable": ("operate:enable", "Let the robot's brain drive."),
+    "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
     "worlds": ("names:worlds", "List the simulated worlds that there are."),
     "view": ("view:view", "Draw a robot in its world into a PNG file."),
