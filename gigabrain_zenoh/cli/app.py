@@ -86,8 +86,7 @@ def main() -> None:
         code = 130
     except BrokenPipeError:  # nobody reads on, as in `gigabrain robots | head -1`
         code = 1
-    with contextlib.suppress(BrokenPipeError):
-        sys.stdout.flush()
-    with contextlib.suppress(BrokenPipeError):
-        sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):  # nobody is there to read it, or the disk is full
+            stream.flush()
     os._exit(code if isinstance(code, int) else 0)  # Zenoh's threads must not hold it back
