@@ -70,5 +70,7 @@ def test_its_emulator_is_found_by_its_drivers_name(package: Path) -> None:
 
 
 def test_a_driver_without_an_emulator_is_named(package: Path) -> None:
-    with pytest.raises(UnknownName, match="no emulator for driver 'forein_base'; did you mean 'foreign_base'"):
+    with pytest.raises(
+        UnknownName, match="no emulator for driver 'forein_base'; did you mean 'foreign_base'"
+    ):
         device_class("forein_base")
