@@ -120,7 +120,7 @@ def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions
     robot = config.load(path, RobotFile)
     if run.link not in links_of(robot):
         has = ", ".join(links_of(robot)) or "none"
-        raise ConfigError(f"{path.parent.name} has no link {run.link!r}; it has: {has}")
+        raise ConfigError(f"{robot.robot_type} has no link {run.link!r}; it has: {has}")
     borrowed = run.link == "emulated" and robot.emulated is None
     section: LinkName = "real" if borrowed else run.link
     link = getattr(robot, section)
