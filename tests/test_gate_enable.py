@@ -16,7 +16,8 @@ def test_a_latched_gate_is_not_enabled() -> None:
     rig.live(5)
     before = rig.state
     assert rig.feed(gate.Enable("control", take=True)) == gate.Outcome(
-        ok=False, text="latched: e-stop pressed by alice; release it first"
+        ok=False,
+        text="latched: e-stop pressed by alice (find out why it was pressed); release it first",
     )
     assert rig.state == before
 
@@ -71,8 +72,9 @@ def test_all_that_speaks_against_it_is_said() -> None:
     rig.tick(8, faults=(LOST,))
     assert rig.feed(gate.Enable("control")) == gate.Outcome(
         ok=False,
-        text="not now: the body does not answer; the safety process is silent; "
-        "no good command for 100 ms",
+        text="not now: the body does not answer; the safety process is silent (start the safety "
+        "process, or read its log to see why it ended); no good command for 100 ms (see that "
+        "whoever drives runs and reaches the robot, then enable it again)",
     )
 
 

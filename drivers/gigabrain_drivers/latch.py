@@ -10,8 +10,9 @@ from gigabrain_zenoh.errors import ConfigError
 
 UNREADABLE = Cause(
     code="latch_unreadable",
-    text="the file that remembers what latched the gate cannot be read; look at the robot first",
+    text="the file that remembers what latched the gate cannot be read",
     latching=True,
+    remedy="look at the robot, then release it",
 )
 
 

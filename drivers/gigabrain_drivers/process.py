@@ -74,6 +74,7 @@ class DriverProcess:
         self._line = asyncio.Lock()  # one call at a time goes out to the body
         driver.emit = self._emit
         bus.report = self.report
+        bus.progress = lambda: self._gate.tick
 
     async def run(self, ready: Callable[[], None]) -> None:
         """Serve the body until cancelled; it is safe when this ends, however it ends."""

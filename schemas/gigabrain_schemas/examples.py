@@ -50,8 +50,12 @@ M = TypeVar("M", bound=Message)
 STAMP_NS = 1_767_225_600_000_000_000  # 2026-01-01
 BOOT = 81_985_529_216_486_895
 
-ZONE = Cause(code="zone_ahead", text="obstacle 0.14 m ahead of the body")
-LOW = Cause(code="battery_low", text="battery at 14 %")
+ZONE = Cause(
+    code="zone_ahead",
+    text="obstacle 0.14 m ahead of the body",
+    remedy="turn or back away, or clear the way",
+)
+LOW = Cause(code="battery_low", text="battery at 14 %", remedy="charge it soon")
 GATE = GateStatus(
     mode="enabled", causes=(ZONE,), estop_generation=2, commander="control", enables=3
 )
