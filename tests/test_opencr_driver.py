@@ -26,7 +26,7 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import Imu
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.clock import Clock, FakeClock
-from gigabrain_zenoh.errors import Unsupported
+from gigabrain_zenoh.errors import BodyLost, Unsupported
 
 MS = 1_000_000
 WAFFLE = load_robot("turtlebot3_waffle")
@@ -460,3 +460,21 @@ async def test_over_a_real_pty_it_drives_stops_and_survives_what_a_cable_can_do(
     finally:
         await station.close()
         await body.close()
+
+
+async def test_its_motors_can_be_let_go_and_the_next_connection_holds_them_again(rig: Rig) -> None:
+    def torques() -> list[int]:
+        written = [p.params for p in rig.cable.sent if p.instruction == dynamixel.WRITE]
+        return [params[2] for params in written if params[:2] == b"\x95\x00"]
+
+    assert torques() == [1]
+    await rig.driver.limp()
+    await rig.drive(0.2, 0.0, 200)
+    await rig.driver.stop()
+    assert torques() == [1, 0]
+    rig.cable.drop("unplugged")
+    with pytest.raises(BodyLost, match="unplugged"):
+        await rig.driver.limp()
+    rig.cable.plug()
+    await rig.wait(100)
+    assert torques() == [1, 0, 1]

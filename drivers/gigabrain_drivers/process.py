@@ -4,7 +4,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 from msgspec.structs import replace
@@ -17,7 +17,7 @@ from gigabrain_drivers.lockstep import REPEAT_S, Lockstep
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.round_trip import RoundTrip
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.body import Body, RobotState
+from gigabrain_schemas.body import Body, RobotState, SafeState
 from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import (
@@ -255,4 +255,10 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
         emulator=config.emulator or str(ports_folder(config.body)),
     )
     robot, driver = make_driver(config.body, where)
+    if not driver.can(robot.safe_state):
+        known = ", ".join(name for name in get_args(SafeState) if driver.can(name))
+        raise ConfigError(
+            f"safe_state: {robot.safe_state} is more than {type(driver).__name__} can do; "
+            f"expected one of: {known}"
+        )
     await DriverProcess(config, robot, driver, bus).run(ready)
