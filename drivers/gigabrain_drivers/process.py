@@ -10,6 +10,7 @@ import msgspec
 from msgspec.structs import replace
 
 from gigabrain_drivers.base import Driver
+from gigabrain_drivers.button_watch import ButtonWatch
 from gigabrain_drivers.catalog import make_driver, ports_folder
 from gigabrain_drivers.gatekeeper import Gatekeeper
 from gigabrain_drivers.links.wording import of_command
@@ -68,6 +69,8 @@ class DriverProcess:
         self._gatekeeper = Gatekeeper(
             gate_config, robot.robot_type, bus, Path(config.state_dir), self._wake.set
         )
+        press = self._gatekeeper.press
+        self._button = ButtonWatch(bus, press) if config.button else None
         self._lockstep = Lockstep(robot.control.period_ticks) if driver.lockstep else None
         self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
         self._round_trip = RoundTrip()
@@ -122,7 +125,8 @@ class DriverProcess:
     async def _tick(self, passed: int) -> None:
         """20 ms of the body's time, or several where the process was held up."""
         state = await self._driver.read_state()
-        faults = () if state.link.connected else (why.LINK_LOST,)
+        button = self._button.faults() if self._button else ()
+        faults = button if state.link.connected else (why.LINK_LOST, *button)
         for _ in range(passed):
             self._gatekeeper.step(gate.Tick(state.velocity, self._wall_ns(), faults))
         self._bus.time.tick = self._gate.tick
