@@ -169,6 +169,15 @@ class Subject:
         """How long the path of the body has been so far, by the physics [m]."""
         return float((await self.truth())["distance_m"])
 
+    async def simulated(self, seconds: float) -> dict[str, Any]:
+        """Let an emulated body's own time go on, whoever else lives; the truth after that."""
+        truth = await self.truth()
+        end_s = float(truth["sim_seconds"]) + seconds
+        while float(truth["sim_seconds"]) < end_s:
+            await asyncio.sleep(0.02)
+            truth = await self.truth()
+        return truth
+
     async def drive(self, room: float = 1.3) -> None:
         """Have the brain drive straight on at full speed, as a person would: by hand."""
         await self.release()
