@@ -28,6 +28,8 @@ COMMANDS = {
     "estop": ("operate:estop", "Stop the robot at once, and latch it."),
     "release": ("operate:release", "Let go of a latched gate."),
     "enable": ("operate:enable", "Let the robot's brain drive."),
+    "audit": ("audit:audit", "Show who did what to the robot."),
+    "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
     "worlds": ("names:worlds", "List the simulated worlds that there are."),
     "view": ("view:view", "Draw a robot in its world into a PNG file."),
@@ -84,8 +86,7 @@ def main() -> None:
         code = 130
     except BrokenPipeError:  # nobody reads on, as in `gigabrain robots | head -1`
         code = 1
-    with contextlib.suppress(BrokenPipeError):
-        sys.stdout.flush()
-    with contextlib.suppress(BrokenPipeError):
-        sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):  # nobody is there to read it, or the disk is full
+            stream.flush()
     os._exit(code if isinstance(code, int) else 0)  # Zenoh's threads must not hold it back

@@ -1,5 +1,7 @@
 """What a check found."""
 
+import statistics
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
 Verdict = Literal["pass", "fail", "n/a"]
@@ -18,6 +20,7 @@ class Finding(NamedTuple):
 
     ok: bool
     measured: str
+    times_ms: Mapping[str, float] = {}  # from the fault on, of a check that can be repeated
 
 
 class Result(NamedTuple):
@@ -27,3 +30,17 @@ class Result(NamedTuple):
     criterion: str
     measured: str
     verdict: Verdict
+
+
+def summary(findings: Sequence[Finding]) -> str:
+    """What several repetitions of one check found: the worst and the median of each time."""
+    bad = [finding for finding in findings if not finding.ok]
+    if len(findings) == 1:
+        return findings[0].measured
+    if bad:
+        return f"{len(bad)} of {len(findings)} times not so: {bad[0].measured}"
+    told = []
+    for name in findings[0].times_ms:
+        times = [finding.times_ms[name] for finding in findings]
+        told.append(f"{name} after {max(times):.0f}, median {statistics.median(times):.0f} ms")
+    return f"worst of {len(findings)}: {'; '.join(told)}"

@@ -175,11 +175,11 @@ class Rig(Timeline):
         self.scan, self.scans = scan, self.scans + 1
 
 
-def stop_ticks(rig: Rig, reaction: int, body: int = 0) -> int:
+def stop_ticks(rig: Rig, reaction: int) -> int:
     """The most ticks from a cause to standstill: until it is seen, the ramp, and the body's own.
 
     What walks has to end its step, and to settle.
     """
     ramp = rig.speed / rig.robot.max_linear_deceleration / 0.02
     own = STEP_TICKS if rig.robot.drive_type == "quadruped" else SETTLE_TICKS
-    return reaction + round(ramp + 0.5) + (body or own)
+    return reaction + round(ramp + 0.5) + own

@@ -9,6 +9,7 @@ import msgspec
 
 from gigabrain_drivers.conformance.result import Failed, Finding
 from gigabrain_drivers.conformance.rig import Rig, stop_ticks
+from gigabrain_schemas.base import TICK_NS
 from gigabrain_zenoh.limits import ZERO
 
 SILENCE = 7  # ticks: 100 ms without a command, told in the next tick
@@ -104,4 +105,5 @@ async def _stopped(rig: Rig, most: int) -> Finding:
     ticks = await rig.until(lambda: rig.rests, most)
     if ticks is None:
         return Finding(False, f"still moving after {most} ticks")
-    return Finding(True, f"at rest after {ticks} ticks of at most {most}")
+    text = f"at rest after {ticks} ticks of at most {most}"
+    return Finding(True, text, {"at rest": ticks * TICK_NS / 1e6})

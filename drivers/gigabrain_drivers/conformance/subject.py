@@ -7,6 +7,7 @@ from typing import Self
 from gigabrain_drivers import catalog
 from gigabrain_drivers.base import Driver
 from gigabrain_drivers.conformance.result import NotApplicable
+from gigabrain_drivers.emulators.base import Device
 from gigabrain_drivers.emulators.emulator import BASE, Emulator
 from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.robot import Run
@@ -66,6 +67,17 @@ class Subject:
     def faults(self, words: str) -> None:
         """Have these faults at the base's end of the line; none for an empty text."""
         self.peer.set(self.peer.faults_of(f"{BASE} {words}"))
+
+    @property
+    def promise(self) -> str:
+        """After how long without a command the body's own firmware stops its motors."""
+        device = type(self._emulator.stations[BASE].device) if self._emulator else Device
+        return f"{device.watchdog_ns / 1e6:.0f} ms ({device.promised_in})"
+
+    @property
+    def promised_ms(self) -> float:
+        """The same as a number [ms]."""
+        return self.peer.stations[BASE].device.watchdog_ns / 1e6
 
     def told(self, state: RobotState | None) -> tuple[float, float, float]:
         """What the motors are told now, as the peer knows it, or as the body moves without one."""

@@ -200,6 +200,8 @@ class Device(abc.ABC):
 
     Options: ClassVar[type[Struct]]  # those of the driver or scan source that it answers
     period_s: ClassVar[float] = 0.01  # between two steps
+    watchdog_ns: ClassVar[int] = 150_000_000  # without a command, until its motors are told zero
+    promised_in: ClassVar[str] = "the rule for firmware"  # where its makers say so
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         self.body, self.options, self.wire = body, options, wire
