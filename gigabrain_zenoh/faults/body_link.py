@@ -1,18 +1,23 @@
 """Faults of the line to the body, and of the body itself. Its physics and firmware live on."""
 
+import functools
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from gigabrain_schemas.body import RobotState
+from gigabrain_zenoh.faults.chaos import Chaos
 from gigabrain_zenoh.faults.fault import Failed, Measured, Skipped
-from gigabrain_zenoh.faults.rig import Rig
+from gigabrain_zenoh.faults.proxy import TcpProxy
+from gigabrain_zenoh.faults.rig import Rig, deployment_of
 from gigabrain_zenoh.faults.stopping import TICK_MS
-from gigabrain_zenoh.faults.subject import Subject
+from gigabrain_zenoh.faults.subject import Subject, configured
 from gigabrain_zenoh.faults.waiting import until
+from gigabrain_zenoh.keeper import ProcessSpec
 from gigabrain_zenoh.process import find
 
 NOISE = "gigabrain_drivers.conformance.noise"
+IN_FRONT = "gigabrain_drivers.links.line_proxy:in_front_of"
 CHECK = "*{crc16}"  # at the end of a command; what it costs to have none: docs/firmware_line.md
 LINES, LONG_LINES = 20_000, 1_000_000
 BYTE_ERRORS = (0.001, 0.05)
@@ -20,6 +25,7 @@ NOISY_TICKS = 50
 PHYSICS_MS = 10.0  # one step
 HEARD_MS = 25.0  # a body that reports 50 times a second or more is never older while it is heard
 RESTED_TICKS = 50
+REST_S = 1.0  # of simulated time, in which every body has come to rest
 TURNING, ROLLING = 0.2, 0.02  # [rad/s], [m/s]
 RUNAWAY = 0.12  # [m/s]
 
@@ -74,6 +80,73 @@ async def tcp_frozen(rig: Rig) -> Measured:
         "old commands obeyed": float(again["motors_moved_s"] > rest["sim_seconds"]),
         "moved again": float(again["distance_m"]) - float(rest["distance_m"]),
     }
+
+
+async def tcp_cut(rig: Rig) -> Measured:
+    """The connection ends with RST, with FIN, or stays open while nothing comes through."""
+    await rig.give_up()
+    folder = rig.fresh_folder()
+    deployment = deployment_of(rig.options, "tcp")
+    async with (
+        rig.new(deployment, functools.partial(_through, str(folder))) as subject,
+        find(IN_FRONT)(subject.ports, folder) as proxies,
+    ):
+        proxy = next(p for p in proxies.values() if isinstance(p, TcpProxy))
+        await subject.settle()
+        safe = {
+            "RST": await _cut(subject, lambda: proxy.cut(reset=True)),
+            "FIN": await _cut(subject, proxy.cut),
+            "half-open": await _cut(subject, lambda: proxy.set(Chaos(hole=True)), proxy.set),
+        }
+        await subject.check()
+    figures = {f"safe after {name}": cut.safe_ms for name, cut in safe.items()}
+    return {
+        **figures,
+        "back after": max(cut.back_s for cut in safe.values()),
+        "moved again": max(cut.again_m for cut in safe.values()),
+    }
+
+
+class Cut(NamedTuple):
+    """What came of a cut connection."""
+
+    safe_ms: float
+    back_s: float
+    again_m: float
+
+
+async def _cut(
+    subject: Subject, cut: Callable[[], None], heal: Callable[[], None] | None = None
+) -> Cut:
+    """Cut while it drives; heal after a second."""
+    onlooker = subject.onlooker
+    await subject.drive(room=0.8)
+    start = onlooker.state
+    cut()
+    await _shut(subject)
+    states = _from(subject, start)
+    shut = _shut_tick(subject, start)
+    heard = [s.tick for s in states if s.tick < shut and s.link.age_ms <= HEARD_MS]
+    healed = start.tick
+    rest = await subject.simulated(REST_S)
+    if heal:
+        heal()
+        healed = onlooker.state.tick
+    await until(lambda: onlooker.state.link.connected, "the body is heard again")
+    back = next(
+        s.tick for s in _from(subject, start) if s.tick > max(shut, healed) and s.link.connected
+    )
+    await onlooker.ticks(RESTED_TICKS)
+    again_m = await subject.distance() - float(rest["distance_m"])
+    last = heard[-1] if heard else start.tick
+    return Cut((shut - last) * TICK_MS, (back - healed) * TICK_MS / 1e3, again_m)
+
+
+def _through(folder: str, specs: list[ProcessSpec]) -> list[ProcessSpec]:
+    """The same processes, with a driver that looks for its body's ports in `folder`."""
+    return [
+        spec if spec.name != "driver" else configured(spec, {"emulator": folder}) for spec in specs
+    ]
 
 
 async def telemetry_frozen(rig: Rig) -> Measured:
