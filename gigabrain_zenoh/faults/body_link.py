@@ -22,7 +22,6 @@ CHECK = "*{crc16}"  # at the end of a command; what it costs to have none: docs/
 LINES, LONG_LINES = 20_000, 1_000_000
 BYTE_ERRORS = (0.001, 0.05)
 NOISY_TICKS = 50
-PHYSICS_MS = 10.0  # one step
 HEARD_MS = 25.0  # a body that reports 50 times a second or more is never older while it is heard
 RESTED_TICKS = 50
 REST_S = 1.0  # of simulated time, in which every body has come to rest
@@ -42,7 +41,7 @@ async def serial_unplugged(rig: Rig) -> Measured:
     back_s, again = await _back(subject)
     return {
         "reported after": reported_ms,
-        "motors zero after": told_s * 1e3 + PHYSICS_MS,
+        "motors zero after": told_s * 1e3,
         "back after": back_s,
         "moved again": float(again["distance_m"]) - float(rest_m),
         "deaths": subject.supervisor.deaths - deaths,

@@ -1,15 +1,18 @@
 """Faults of processes: killed, frozen, and with a part that hangs."""
 
+import asyncio
 import signal
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 
 from gigabrain_schemas.requests import EnableRequest
 from gigabrain_schemas.topics import ENABLE
 from gigabrain_zenoh.faults.fault import Measured
 from gigabrain_zenoh.faults.rig import Rig, deployment_of
-from gigabrain_zenoh.faults.stopping import Stop, creep, stop_by
+from gigabrain_zenoh.faults.stopping import TICK_MS, Stop, creep, stop_by
 from gigabrain_zenoh.faults.subject import Subject
+from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.gate import BRAIN
 from gigabrain_zenoh.keeper import ProcessSpec
 
@@ -30,12 +33,19 @@ async def decision_frozen(rig: Rig) -> Measured:
     return _figures(stop, again_m)
 
 
-async def decision_thawed(rig: Rig) -> Measured:
-    """SIGCONT after a while: what it says of the past moves nothing."""
+async def frozen_and_thawed(rig: Rig) -> Measured:
+    """SIGCONT after a while, of decision and of the driver: the past moves nothing."""
     subject = await rig.robot("sim")
     ticks = FROZEN_LONG_TICKS if rig.long else FROZEN_TICKS
     stop, _ = await _frozen(subject, "decision", ticks)
-    return await _thawed(subject, stop)
+    decision = await _thawed(subject, stop.distance_m)
+    await subject.drive()
+    subject.freeze("driver")
+    await asyncio.sleep(ticks * TICK_MS / 1e3)  # the robot's own time stands still with it
+    subject.thaw()
+    await until(lambda: subject.onlooker.state.gate.mode == "idle", "the gate shuts")
+    await subject.onlooker.still()
+    return _worse(decision, await _thawed(subject, await subject.distance()))
 
 
 async def control_killed_or_frozen(rig: Rig) -> Measured:
@@ -43,18 +53,19 @@ async def control_killed_or_frozen(rig: Rig) -> Measured:
     subject = await rig.robot("sim")
     killed = _figures(*await _killed(subject, "control"))
     stop, again_m = await _frozen(subject, "control", RESTED_TICKS)
-    frozen = {**_figures(stop, again_m), **await _thawed(subject, stop)}
-    return {name: max(value, killed.get(name, value)) for name, value in frozen.items()}
+    frozen = _worse(_figures(stop, again_m), await _thawed(subject, stop.distance_m))
+    return _worse(killed, frozen)
 
 
-async def perception_killed(rig: Rig) -> Measured:
-    """kill -9: what the brain knows grows old."""
-    stop, again_m = await _killed(await rig.robot("sim"), "perception")
-    return _figures(stop, again_m)
+async def perception_killed_or_frozen(rig: Rig) -> Measured:
+    """What the brain knows grows old."""
+    subject = await rig.robot("sim")
+    killed = _figures(*await _killed(subject, "perception"))
+    return _worse(killed, _figures(*await _frozen(subject, "perception", RESTED_TICKS)))
 
 
-async def safety_killed(rig: Rig) -> Measured:
-    """kill -9; and frozen: nobody can enable the robot without it."""
+async def safety_killed_or_frozen(rig: Rig) -> Measured:
+    """Nobody can enable the robot without it."""
     subject = await rig.robot("sim")
     killed = _figures(*await _killed(subject, "safety"))
     stop, _ = await _frozen(subject, "safety", 0)
@@ -63,12 +74,8 @@ async def safety_killed(rig: Rig) -> Measured:
         replies = await bus.ask(ENABLE, EnableRequest(source=BRAIN))
         enabled += any(reply.ok for reply in replies)
         await subject.onlooker.ticks(5)
-    again_m = await subject.distance() - stop.distance_m
-    frozen = _figures(stop, again_m)
-    return {
-        **{name: max(value, killed[name]) for name, value in frozen.items()},
-        "enabled without it": enabled,
-    }
+    frozen = _figures(stop, await subject.distance() - stop.distance_m)
+    return {**_worse(killed, frozen), "enabled without it": enabled}
 
 
 async def one_part_of_decision_hangs(rig: Rig) -> Measured:
@@ -104,13 +111,18 @@ async def _frozen(subject: Subject, victim: str, ticks: int) -> tuple[Stop, floa
     return stop, await creep(subject, ticks)
 
 
-async def _thawed(subject: Subject, stop: Stop) -> dict[str, float]:
+async def _thawed(subject: Subject, rest_m: float) -> dict[str, float]:
     """What the victim of a freeze has done since it thawed, until a person enables the robot."""
     subject.thaw()
     await subject.onlooker.ticks(RESTED_TICKS)
     truth = await subject.onlooker.truth()
-    again_m = await subject.distance() - stop.distance_m
+    again_m = await subject.distance() - rest_m
     return {"stale executed": float(truth["stale_commands_executed"]), "moved again": again_m}
+
+
+def _worse(one: Mapping[str, float], two: Mapping[str, float]) -> dict[str, float]:
+    """All figures of both; of those that both have, the greater."""
+    return {name: max(one.get(name, 0.0), two.get(name, 0.0)) for name in {**one, **two}}
 
 
 def _figures(stop: Stop, again_m: float) -> dict[str, float]:

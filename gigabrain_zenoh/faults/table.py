@@ -18,19 +18,19 @@ STALE = "stale executed <= 0"  # commands that rest on data older than 250 ms
 FAULTS: tuple[Fault, ...] = (
     Fault(1, "decision-killed", PROCESS, "sim", f"{STOP}, {STILL}"),
     Fault(2, "decision-frozen", PROCESS, "sim", f"{STOP}, {STILL}"),
-    Fault(3, "decision-thawed", PROCESS, "sim", f"{STALE}, {STILL}"),
+    Fault(3, "frozen-and-thawed", PROCESS, "sim", f"{STALE}, {STILL}"),
     Fault(4, "control-killed-or-frozen", PROCESS, "sim", f"{STOP}, {STALE}, {STILL}"),
     Fault(
-        5, "perception-killed", PROCESS, "sim",
+        5, "perception-killed-or-frozen", PROCESS, "sim",
         f"zero after <= 320 ms, travel <= 0.15 m, {STILL}",
     ),
     Fault(
-        6, "safety-killed", PROCESS, "sim",
+        6, "safety-killed-or-frozen", PROCESS, "sim",
         f"zero after <= 250 ms, travel <= 0.1 m, {STILL}, enabled without it <= 0",
     ),
     Fault(
         7, "gate-killed", DEATHS, "serial",
-        f"motors zero after <= 150 ms, not latched at start <= 0, "
+        f"motors zero after <= 150 ms, not latched at start <= 0, enabled while latched <= 0, "
         f"commands of the old boot obeyed <= 0, {STILL}",
     ),
     Fault(
@@ -148,7 +148,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         45, "automatic-recovery", DEATHS, "auto",
-        "drives again after <= 10 s, stale executed <= 0, latches passed over <= 0",
+        "drives again after <= 3 s, stale executed <= 0, latches passed over <= 0",
     ),
 )  # fmt: skip
 
