@@ -36,12 +36,14 @@ def imu(orientation: tuple[float, float, float, float] = LEVEL, push: float = 0.
 class Patrol:
     """A body under safety's eyes."""
 
-    def __init__(self, body: BodyDescription = BODY) -> None:
+    def __init__(
+        self, body: BodyDescription = BODY, values: NDArray[np.floating] | None = None
+    ) -> None:
         self.body, self.memory = body, Memory()
         self.tick, self.pose = 0, Pose(x=0.0, y=0.0, yaw=0.0)
         self.verdict = SafetyState(verdict="stop")
         self.state = state(0)
-        self.go(10)
+        self.go(10, values=values)
 
     def go(
         self,
@@ -98,7 +100,10 @@ class Patrol:
     ) -> RobotState:
         pose = self.pose
         self.pose = replace(
-            pose, x=pose.x + 0.02 * moves.linear_x, yaw=pose.yaw + 0.02 * moves.angular_z
+            pose,
+            x=pose.x + 0.02 * moves.linear_x,
+            y=pose.y + 0.02 * moves.linear_y,
+            yaw=pose.yaw + 0.02 * moves.angular_z,
         )
         return replace(
             state(1),
