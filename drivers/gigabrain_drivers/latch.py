@@ -47,6 +47,14 @@ class LatchFile:
         self.write(found)
         return found
 
+    def keep(self, latched: Latched) -> str:
+        """Write; the problem in one line, or an empty text. From one thread at a time."""
+        try:
+            self.write(latched)
+        except ConfigError as error:
+            return str(error)
+        return ""
+
     def write(self, latched: Latched) -> None:
         """On disk when this returns. Raises ConfigError when the folder cannot be written."""
         if latched == self._written and self._path.exists():

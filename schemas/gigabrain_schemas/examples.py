@@ -3,6 +3,7 @@
 import struct
 from typing import TypeVar
 
+from gigabrain_schemas.audit import AuditPage, AuditRecord, AuditRequest
 from gigabrain_schemas.base import Cause, Message, Pose, Velocity
 from gigabrain_schemas.body import (
     Battery,
@@ -28,6 +29,7 @@ from gigabrain_schemas.brain import (
     Twist,
     WorldModel,
 )
+from gigabrain_schemas.button import ButtonState
 from gigabrain_schemas.requests import (
     DescribeRequest,
     Description,
@@ -195,6 +197,9 @@ BRAIN: tuple[Message, ...] = (
 )  # fmt: skip
 
 SAFETY: tuple[Message, ...] = (
+    ButtonState(
+        stamp_ns=STAMP_NS, seq=40, boot=BOOT, tick=206, pressed=True, text="the contact is open"
+    ),
     SafetyState(
         stamp_ns=STAMP_NS, seq=103, boot=BOOT, tick=206, basis=205,
         verdict="slow",
@@ -229,10 +234,22 @@ SAFETY: tuple[Message, ...] = (
     ),
 )  # fmt: skip
 
+REFUSED = AuditRecord(
+    stamp_ns=STAMP_NS, seq=9, boot=BOOT, tick=206,
+    process="driver",
+    what="refused",
+    source="script-4711",
+    ok=False,
+    code="commander",
+    text="its commands are not obeyed (commander); control drives",
+    times=50,
+)  # fmt: skip
+AUDIT: tuple[Message, ...] = (REFUSED, AuditRequest(newest=20), AuditPage(records=(REFUSED,)))
+
 REQUESTS: tuple[Message, ...] = (
     EstopRequest(stamp_ns=STAMP_NS, seq=1, source="operator", reason="a child runs in"),
     ReleaseRequest(stamp_ns=STAMP_NS, seq=1, estop_generation=2, source="operator"),
-    EnableRequest(stamp_ns=STAMP_NS, seq=1, source="control", take=True),
+    EnableRequest(stamp_ns=STAMP_NS, seq=1, source="control", take=True, by="ann"),
     GateReply(
         stamp_ns=STAMP_NS, seq=1, boot=BOOT, tick=205,
         ok=True, text="control holds the body", robot_type="turtlebot3_waffle", gate=GATE,
@@ -255,7 +272,7 @@ REQUESTS: tuple[Message, ...] = (
 
 EXAMPLES: dict[str, Message] = {
     type(message).__name__: message
-    for message in (*SENSORS, *BODY, *BRAIN, *SAFETY, *REQUESTS)
+    for message in (*SENSORS, *BODY, *BRAIN, *SAFETY, *AUDIT, *REQUESTS)
 }  # fmt: skip
 
 
