@@ -12,8 +12,6 @@ from contextlib import ExitStack, contextmanager
 
 import pytest
 
-SUBNET = "198.18.77"  # set apart for such things by RFC 2544
-OURS = f"{SUBNET}.254"  # this process's own address on the switch
 HOLD = "ip link set lo up && echo held && exec cat"
 
 
@@ -45,14 +43,15 @@ class Namespace:
 
 
 class Network:
-    """A switch with hosts on it, and this process as one more."""
+    """A switch with hosts on it, and this process as one more at the address `ours`."""
 
-    def __init__(self, stack: ExitStack, names: Sequence[str]) -> None:
+    def __init__(self, stack: ExitStack, names: Sequence[str], subnet: int) -> None:
+        net = f"198.18.{subnet}"  # set apart for such things by RFC 2544
         self._switch = _held(stack)
         self._in_switch("link", "add", "switch", "type", "bridge")
         self._in_switch("link", "set", "switch", "up")
         self.hosts = {name: _held(stack) for name in names}
-        self.address = {name: f"{SUBNET}.{number}" for number, name in enumerate(names, 1)}
+        self.address = {name: f"{net}.{number}" for number, name in enumerate(names, 1)}
         for name, host in self.hosts.items():
             _ip(
                 "link", "add", name, "netns", str(self._switch.pid),
@@ -61,10 +60,10 @@ class Network:
             _ip("address", "add", f"{self.address[name]}/24", "dev", "eth0", inside=host)
             _ip("link", "set", "eth0", "up", inside=host)
             self.join(name)
-        ours = f"gb{os.getpid()}"
+        self.ours, ours = f"{net}.254", f"gb{os.getpid()}n{subnet}"
         _ip("link", "add", ours, "type", "veth", "peer", "name", "ours", "netns", self._pid)
         stack.callback(subprocess.run, ("ip", "link", "delete", ours), capture_output=True)
-        _ip("address", "add", f"{OURS}/24", "dev", ours)
+        _ip("address", "add", f"{self.ours}/24", "dev", ours)
         _ip("link", "set", ours, "up")
         self.join("ours")
 
@@ -99,8 +98,11 @@ def _ip(*words: str, inside: Namespace | None = None) -> None:
 
 
 @contextmanager
-def network(*names: str) -> Iterator[Network]:
-    """Hosts with those names on one switch; the test is skipped where there can be none."""
+def network(*names: str, subnet: int = 77) -> Iterator[Network]:
+    """Hosts with those names on one switch; the test is skipped where there can be none.
+
+    Networks that are there at the same time need a `subnet` each, below 256.
+    """
     if os.geteuid() != 0:
         pytest.skip("network namespaces need root")
     for tool in ("ip", "unshare", "nsenter"):
@@ -108,7 +110,7 @@ def network(*names: str) -> Iterator[Network]:
             pytest.skip(f"network namespaces need {tool}")
     with ExitStack() as stack:
         try:
-            made = Network(stack, names)
+            made = Network(stack, names, subnet)
         except OSError as error:
             pytest.skip(f"no network of namespaces here: {error}")
         yield made
