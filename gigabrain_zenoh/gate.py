@@ -232,8 +232,11 @@ def _enable(config: GateConfig, state: GateState, event: Enable) -> tuple[GateSt
         return _no(state, f"latched: {why.in_words(state.causes)}; release it first")
     if state.mode == "stopping":
         return _no(state, "still stopping; try again when it is idle")
-    if state.commander not in ("", event.source) and not event.take:
-        return _no(state, f"{state.commander} drives; take it over with take=true")
+    if state.commander not in ("", event.source):
+        if not event.take:
+            return _no(state, f"{state.commander} drives; take it over with take=true")
+        if event.source == BRAIN and event.by in ("", BRAIN):
+            return _no(state, f"{state.commander} drives; only a person hands it to the brain")
     found = against(config, state, event.source)
     if found:
         return _no(state, f"not now: {why.in_words(found)}")

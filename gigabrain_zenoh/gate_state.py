@@ -92,6 +92,7 @@ class Enable(msgspec.Struct, frozen=True):
 
     source: str
     take: bool = False
+    by: str = ""  # who asks for it, where that is somebody else
 
 
 Event = Tick | Command | NotFinite | Safety | Estop | Release | Enable

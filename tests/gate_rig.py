@@ -25,6 +25,11 @@ CRASHED = Cause(code="collision", text="it has hit something", latching=True)
 HOT = Cause(code="motor_hot", text="a motor is hot", latching=True)
 
 
+def plain(causes: tuple[Cause, ...]) -> list[tuple[str, str]]:
+    """Codes and sentences, without the advice."""
+    return [(cause.code, cause.text) for cause in causes]
+
+
 class Rig:
     """One gate and its present state. Times are counted back from now, in ticks."""
 

@@ -244,7 +244,7 @@ def test_the_brain_is_heard_whoever_drives_so_that_it_can_take_over() -> None:
         rig.safety()
         rig.send(source="alice")
         assert rig.send(0.1) == refused("commander")
-    assert rig.feed(gate.Enable("control", take=True)).ok
+    assert rig.feed(gate.Enable("control", take=True, by="alice")).ok
     rig.tick()
     rig.safety()
     assert rig.state.output == ZERO  # it is heard, not obeyed
@@ -257,7 +257,9 @@ def test_the_brain_takes_over_by_what_it_says_not_by_what_the_other_said() -> No
         rig.tick()
         rig.safety()
         rig.send(source="alice")
-    assert rig.feed(gate.Enable("control", take=True)) == gate.Outcome(
-        ok=False, text="not now: no good command for 100 ms"
+    assert rig.feed(gate.Enable("control", take=True, by="alice")) == gate.Outcome(
+        ok=False,
+        text="not now: no good command for 100 ms (see that whoever drives runs and reaches the "
+        "robot, then enable it again)",
     )
     assert (rig.mode, rig.state.commander) == ("enabled", "alice")

@@ -16,7 +16,8 @@ def test_a_latched_gate_is_not_enabled() -> None:
     rig.live(5)
     before = rig.state
     assert rig.feed(gate.Enable("control", take=True)) == gate.Outcome(
-        ok=False, text="latched: e-stop pressed by alice; release it first"
+        ok=False,
+        text="latched: e-stop pressed by alice (find out why it was pressed); release it first",
     )
     assert rig.state == before
 
@@ -71,8 +72,9 @@ def test_all_that_speaks_against_it_is_said() -> None:
     rig.tick(8, faults=(LOST,))
     assert rig.feed(gate.Enable("control")) == gate.Outcome(
         ok=False,
-        text="not now: the body does not answer; the safety process is silent; "
-        "no good command for 100 ms",
+        text="not now: the body does not answer; the safety process is silent (start the safety "
+        "process, or read its log to see why it ended); no good command for 100 ms (see that "
+        "whoever drives runs and reaches the robot, then enable it again)",
     )
 
 
@@ -131,3 +133,16 @@ def test_a_second_enable_is_counted_and_is_no_command() -> None:
     assert rig.mode == "enabled"
     rig.tick()
     assert rig.mode == "stopping"
+
+
+def test_the_brain_takes_the_body_from_nobody_unless_a_person_hands_it_over() -> None:
+    rig = enabled("alice")
+    rig.live(3)
+    for by in ("", "control"):
+        assert rig.feed(gate.Enable("control", take=True, by=by)) == gate.Outcome(
+            ok=False, text="alice drives; only a person hands it to the brain"
+        )
+    assert rig.state.commander == "alice"
+    assert rig.feed(gate.Enable("control", take=True, by="bob")) == gate.Outcome(
+        text="control drives"
+    )

@@ -2,18 +2,32 @@
 
 import asyncio
 import re
+from contextlib import AbstractAsyncContextManager
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
 
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.faults.call import Address
-from gigabrain_zenoh.faults.chaos import CALM, WAYS, Told, told
+from gigabrain_zenoh.faults.chaos import CALM, WAYS, Chaos, Told, Way, told
+from gigabrain_zenoh.faults.damage import Figures
 from gigabrain_zenoh.faults.proxy import TcpProxy
+from gigabrain_zenoh.process import find
 from gigabrain_zenoh.typed import typed_lines
 
 ENDPOINT = re.compile(r"(?:(?:tcp|tls|ws)/)?(?P<host>\[[^\]]+\]|[^/:\[\]]+):(?P<port>\d+)")
 
 
-def proxy(to: str, *, listen: str = "tcp/127.0.0.1:0", chaos: str = "", seed: int = 0) -> int:
-    """Stand in front of a router, or of a body's TCP port, and spoil the line, until Ctrl-C.
+def proxy(
+    to: str,
+    *,
+    listen: str = "tcp/127.0.0.1:0",
+    baud: int = 115200,
+    chaos: str = "",
+    seed: int = 0,
+) -> int:
+    """Stand in front of a router or of a body's port, and spoil the line, until Ctrl-C.
 
     Example: gigabrain proxy tcp/127.0.0.1:7447 --listen tcp/127.0.0.1:7448
 
@@ -25,27 +39,51 @@ def proxy(to: str, *, listen: str = "tcp/127.0.0.1:0", chaos: str = "", seed: in
     Parameters
     ----------
     to
-        What it stands in front of: a Zenoh endpoint, or HOST:PORT.
+        What it stands in front of: a Zenoh endpoint, HOST:PORT, or the path of a serial port.
     listen
-        Where it listens; port 0 for any free one.
+        Where it is instead; port 0 for any free one. For a serial port, the path of the new one.
+    baud
+        Of a serial port.
     chaos
         What goes wrong from the start, in the same words.
     seed
         For what is left to chance.
     """
     begin = told(chaos)
-    asyncio.run(_stand(TcpProxy(_address(to), _address(listen), seed=seed), begin))
+    if to.startswith("/"):
+        line_proxy = find("gigabrain_drivers.links.line_proxy:LineProxy")
+        made: Spoiled = line_proxy(to, _path(listen), baud=baud, seed=seed)
+    else:
+        made = TcpProxy(_address(to), _address(listen), seed=seed)
+    asyncio.run(_stand(made, begin))
     return 0
 
 
-async def _stand(proxy: TcpProxy, begin: Told) -> None:
+class Spoiled(AbstractAsyncContextManager[object], Protocol):
+    """A proxy for any kind of line."""
+
+    figures: dict[Way, Figures]
+
+    def set(self, chaos: Chaos = CALM, *ways: Way) -> None:
+        """Have this go wrong."""
+
+    def cut(self, *, reset: bool = False) -> None:
+        """End what is open."""
+
+    async def plug(self) -> None:
+        """Be there."""
+
+    async def unplug(self) -> None:
+        """Be gone."""
+
+
+async def _stand(proxy: Spoiled, begin: Told) -> None:
     async with proxy:
-        host, port = proxy.address
-        _say(f"{host}:{port} leads to what is spoiled")
+        await obey(proxy, begin)
+        _say(f"{proxy} leads to what is spoiled")
         _say(f"type [{'|'.join(WAYS)}] {' '.join(CALM.__struct_fields__)}; "
              "cut[=rst] unplug plug figures; off ends it")  # fmt: skip
         wishes: asyncio.Queue[str] = asyncio.Queue()
-        await obey(proxy, begin)
         with typed_lines(wishes.put_nowait):
             while True:
                 try:
@@ -54,18 +92,23 @@ async def _stand(proxy: TcpProxy, begin: Told) -> None:
                     _say(str(error))
 
 
-async def obey(proxy: TcpProxy, wish: Told) -> None:
+async def obey(proxy: Spoiled, wish: Told) -> None:
     """Do what a typed line asks for."""
     if wish.cut:
         proxy.cut(reset=wish.cut == "rst")
     if wish.unplugged is not None:
         await (proxy.unplug if wish.unplugged else proxy.plug)()
     if wish.figures:
-        _say(f"{proxy.open_calls} of {proxy.calls} calls open, {proxy.cuts} cut")
         for way, figures in proxy.figures.items():
-            _say(f"{way}: {figures}")
+            _say(f"{way}: {msgspec.json.encode(figures).decode()}")
     if wish.ways:
         proxy.set(wish.chaos, *wish.ways)
+
+
+def _path(listen: str) -> Path:
+    if "/" not in listen or listen.startswith("tcp/"):
+        raise ConfigError(f"--listen: expected the path of the new port, got {listen!r}")
+    return Path(listen)
 
 
 def _address(text: str) -> Address:

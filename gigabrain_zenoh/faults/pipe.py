@@ -16,7 +16,7 @@ class Pipe:
     def __init__(
         self,
         damage: Damage,
-        hand_on: Callable[[bytes], None],
+        hand_on: Callable[[bytes], object],
         on_room: Callable[[bool], None],
         on_end: Callable[[], None],
     ) -> None:

@@ -31,6 +31,9 @@ class TcpProxy:
         self._server: asyncio.Server | None = None
         self._open: set[Call] = set()
 
+    def __str__(self) -> str:
+        return "{}:{}".format(*self._listen)
+
     @property
     def address(self) -> Address:
         """(host, port) where it listens, also while it is unplugged."""

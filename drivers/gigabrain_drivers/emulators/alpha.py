@@ -26,6 +26,8 @@ class Alpha(Device):
 
     Options = AlphaOptions
     period_s: ClassVar[float] = 1 / alpha.STATE_HZ
+    watchdog_ns = alpha.SILENCE_NS
+    promised_in = "firmware_alpha.md"
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         super().__init__(body, options, wire)
@@ -74,7 +76,7 @@ class Alpha(Device):
         if self._began_ns is None:
             self._began_ns = now_ns
         self._now_ns = now_ns
-        if self._obeyed_ns is None or now_ns - self._obeyed_ns >= alpha.SILENCE_NS:
+        if self._obeyed_ns is None or now_ns - self._obeyed_ns >= self.watchdog_ns:
             self._silent, self._last = True, None
             self._walk(REST)
         self._sent += 1
