@@ -147,11 +147,15 @@ async def test_with_manual_resume_no_fault_of_the_network_ends_in_motion(tmp_pat
         async with looking_on(site.endpoint) as robot:
             await robot.ticks(50)
             assert robot.state.gate.mode == "latched"
-            await Robot(robot.bus).release()
+            person = Robot(robot.bus)
+            await person.release()
             await robot.straight(0.15, by_hand=True)
             net.cut("brain")
-            await asyncio.sleep(0.5)
+            await asyncio.sleep(1.0)  # the router has noticed, and is heard nevertheless
+            await person.estop()
+            assert robot.state.gate.mode == "latched"
             net.join("brain")
+            await person.release()
             await stands_until_enabled(robot)
             await robot.straight(0.15, by_hand=True)
             await killed_router(site, robot)
