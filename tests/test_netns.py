@@ -66,10 +66,11 @@ class Ears:
         robot.bus.subscribe(INTENT, lambda _key, intent: self.intents.append(intent))
         robot.bus.subscribe(CMD_VEL, lambda _key, command: self.commands.append(command))
 
-    def last_word(self, after: int) -> int:
-        """The tick of decision's last intent before it fell silent, at tick `after` or later."""
+    def silence(self, after: int) -> tuple[int, int]:
+        """The ticks of decision's last intent before it fell silent, and of the first one then."""
         ticks = [intent.tick for intent in self.intents if intent.tick >= after]
-        return next((a for a, b in pairwise(ticks) if b - a > 3), ticks[-1])
+        gaps = ((a, b) for a, b in pairwise(ticks) if b - a > STOP_TICKS)
+        return next(gaps, (ticks[-1], ticks[-1]))
 
 
 @pytest.fixture(scope="module")
@@ -106,13 +107,13 @@ async def test_a_brain_that_is_cut_off_stops_the_robot_and_holds_up_nobody_else(
     back = robot.state.tick
     await robot.straight(0.15, room=0.0)
     assert robot.state.tick - back <= RETURN_TICKS
-    last = ears.last_word(start)
-    late = [c.linear_x for c in ears.commands if last + STOP_TICKS <= c.tick <= back]
+    last, first = ears.silence(start)
+    late = [c.linear_x for c in ears.commands if last + STOP_TICKS <= c.tick < min(first, back)]
     assert all(speed < 0.2 for speed in late)  # slower than it drove, from the first one on
     standing = [s for s in robot.states if last + STOP_TICKS + REST_TICKS <= s.tick <= back]
     assert all(at_rest(state) for state in standing)
     heard = [s.tick for s in robot.states if start <= s.tick <= back]
-    assert max(b - a for a, b in pairwise(heard)) <= 10  # nobody is held up
+    assert max(b - a for a, b in pairwise(heard)) <= 25  # nobody else is held up
     await nothing_stale_or_touched(robot)
 
 
@@ -152,9 +153,10 @@ async def test_with_manual_resume_no_fault_of_the_network_ends_in_motion(tmp_pat
             await robot.straight(0.15, by_hand=True)
             net.cut("brain")
             await asyncio.sleep(1.0)  # the router has noticed, and is heard nevertheless
-            await person.estop()
-            assert robot.state.gate.mode == "latched"
+            assert (await person.estop()).gate.mode == "latched"
             net.join("brain")
+            await until(lambda: robot.state.gate.mode == "latched", "everybody knows")
+            await robot.ticks(10)
             await person.release()
             await stands_until_enabled(robot)
             await robot.straight(0.15, by_hand=True)
