@@ -30,8 +30,8 @@ def folder() -> Path:
 
 
 @contextmanager
-def announced(label: str, endpoint: Endpoint) -> Iterator[None]:
-    """Leave a note while the block runs."""
+def announced(label: str, endpoint: Endpoint) -> Iterator[Path]:
+    """Leave a note while the block runs; its path."""
     note = folder() / f"{os.getpid()}.json"
     robot = Running(pid=os.getpid(), label=label, endpoint=endpoint)
     try:
@@ -42,7 +42,7 @@ def announced(label: str, endpoint: Endpoint) -> Iterator[None]:
     except OSError as error:
         raise ConfigError(f"cannot write {note}: {error.strerror}; set XDG_RUNTIME_DIR") from None
     try:
-        yield
+        yield note
     finally:
         note.unlink(missing_ok=True)
 
