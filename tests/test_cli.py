@@ -141,4 +141,6 @@ async def test_an_e_stop_that_reaches_nobody_says_so(home: Home) -> None:
     where = f"tcp/127.0.0.1:{free_port()}"
     unreachable = await home.run("estop", "--connect", where)
     assert await unreachable.ended() == 1
-    assert unreachable.err == (f"gigabrain: no router answers at {where}; is the robot running?\n")
+    assert unreachable.err == (
+        f"gigabrain: no router answers at {where}; is the robot running, and without keys?\n"
+    )
