@@ -149,7 +149,10 @@ def client_endpoint(deployment: Deployment, host: str = "") -> Endpoint:
 
 
 def local_endpoint(deployment: Deployment, host: str) -> Endpoint:
-    """Where this machine's tools meet it: first by the router's Unix socket, where there is one."""
+    """Where `host` meets it itself: with keys by the Unix socket of its own router, if it has one.
+
+    Nobody on the network can be in the way there.
+    """
     endpoint = client_endpoint(deployment, host)
     if not endpoint.keys or "router" not in deployment.hosts[host]:
         return endpoint
@@ -183,7 +186,7 @@ def process_specs(
     settings = dict(_settings(deployment, run_dir, state_dir, seconds))
     specs = []
     for name in names:
-        endpoint = client_endpoint(deployment, host)
+        endpoint = local_endpoint(deployment, host)
         if name == "router":
             endpoint = _door(deployment, endpoint)
             settings[name] = msgspec.to_builtins(router_config(endpoint, state_dir))
@@ -210,10 +213,9 @@ def process_specs(
 
 
 def _door(deployment: Deployment, endpoint: Endpoint) -> Endpoint:
-    """Where the router listens. With keys also where nobody on the network can be in the way."""
-    local = (local_socket(),) if endpoint.keys else ()
+    """The router's side of where others connect."""
     return msgspec.structs.replace(
-        endpoint, listen=(*endpoint.connect, *local), connect=(), fleet=deployment.fleet
+        endpoint, listen=endpoint.connect[::-1], connect=(), fleet=deployment.fleet
     )
 
 

@@ -72,7 +72,8 @@ RIGHTS: Mapping[Role, Rights | None] = {
 def access_control(robots: Sequence[str], own: str = "") -> dict[str, Any]:
     """Zenoh's `access_control` for a router of these robots (their namespaces); deny by default.
 
-    Whoever comes by the Unix socket is an operator of `own`, or of all without it.
+    Whoever comes by the Unix socket is the robot `own`: only the user who runs it can, and could
+    read its key as well. Beside a router of no robot it is an operator of all.
     """
     of = {
         common_name(role, robot): list(_rules(role, robot)) for robot in robots for role in RIGHTS
@@ -86,7 +87,9 @@ def access_control(robots: Sequence[str], own: str = "") -> dict[str, Any]:
         subjects.append({"id": name, "cert_common_names": [name]})
         policies.append({"subjects": [name], "rules": ids})
     subjects.append({"id": LOCAL, "link_protocols": ["unixsock-stream"]})
-    near = [common_name("operator", robot) for robot in robots if own in ("", robot)]
+    near = [common_name("operator", robot) for robot in robots]
+    if own in robots:
+        near = [common_name("robot", own)]
     ids = [rule["id"] for name in near for rule in of[name]]
     policies.append({"subjects": [LOCAL], "rules": ids})
     return {

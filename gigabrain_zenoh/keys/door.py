@@ -30,7 +30,7 @@ class Door:
 
     def link(self, link: Link) -> None:
         """Somebody has come, or has gone."""
-        name = link.name or "a local tool"
+        name = link.name or "a local process"
         if not link.there:
             if self._links.pop(link.zid, None):
                 log.info("%s at %s has left", name, link.address)
