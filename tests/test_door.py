@@ -15,7 +15,7 @@ import zenoh
 from gigabrain_schemas.audit import AuditRecord
 from gigabrain_zenoh import audit_file
 from gigabrain_zenoh.client import connect
-from gigabrain_zenoh.errors import BodyLost
+from gigabrain_zenoh.errors import NotConfirmed
 from gigabrain_zenoh.keys.zenoh_log import Denied, TurnedAway, ZenohLog
 from gigabrain_zenoh.settings import Endpoint
 from tests.keys_rig import make_fleet, raw
@@ -152,7 +152,7 @@ async def test_nothing_listens_but_the_router_and_a_socket_of_its_user(
 async def test_who_may_not_ask_is_told_so(gate: Gate) -> None:
     at = f"tls/127.0.0.1:{gate.port}"
     keys = str(gate.fleet / "viewer@red")
-    with pytest.raises(BodyLost, match=r"or viewer@red may not ask for it"):
+    with pytest.raises(NotConfirmed, match=r"or viewer@red may not ask for it"):
         async with connect(at, namespace="red", keys=keys, wait=False) as robot:
             await robot.estop()
 

@@ -9,6 +9,8 @@ from pathlib import Path
 from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.client import Robot
 from gigabrain_zenoh.client import connect as connect_robot
+from gigabrain_zenoh.errors import BusError, NotConfirmed
+from gigabrain_zenoh.estop import BY_HAND
 from gigabrain_zenoh.gate import BRAIN
 
 
@@ -18,6 +20,9 @@ def estop(
     """Stop the robot at once, and latch it.
 
     Example: gigabrain estop --reason "somebody is in the way"
+
+    Ends with 3, and NOT CONFIRMED, when no body has said that it stands: then somebody has to
+    press the hardware e-stop, or cut the power.
 
     Parameters
     ----------
@@ -30,9 +35,12 @@ def estop(
     reason
         For the log.
     """
-    return _ask(
-        connect, namespace, keys, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False
-    )
+    try:
+        return _ask(
+            connect, namespace, keys, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False
+        )
+    except BusError as error:
+        raise NotConfirmed(f"NOT CONFIRMED: {error}; {BY_HAND}") from None
 
 
 def release(*, connect: str | None = None, namespace: str = "", keys: Path | None = None) -> int:

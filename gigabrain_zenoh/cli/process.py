@@ -161,6 +161,19 @@ def driver(
     return _run("driver", place, msgspec.to_builtins(settings))
 
 
+def button(*, port: str, place: Place = HERE) -> int:
+    """Start an e-stop button: a normally closed contact between TX and RX of a serial adapter.
+
+    Example: gigabrain button --port usb:0403:6001
+
+    Parameters
+    ----------
+    port
+        The adapter: a path, or usb:VID:PID[:SERIAL].
+    """
+    return _run("button", place, {"port": port})
+
+
 def _keys(place: Place) -> str:
     return str(place.keys.expanduser().absolute()) if place.keys else ""
 
