@@ -10,7 +10,8 @@ from typing import Any
 from gigabrain_zenoh import log_text
 from gigabrain_zenoh.deployment import (
     Deployment,
-    client_endpoint,
+    check_keys,
+    local_endpoint,
     process_specs,
     with_free_port,
 )
@@ -33,6 +34,7 @@ async def up(
     Raises ConfigError when what a process was given is wrong, or a folder cannot be written, and
     BusError when the router cannot run, without which nothing else can.
     """
+    check_keys(deployment, host)
     deployment = with_free_port(deployment)
     label = deployment.namespace or deployment.body.replace("/", "-")
     notifier = Notifier.from_environment()
@@ -51,7 +53,7 @@ async def up(
         say(log_text.readable(record, colour=False))
 
     say(f"{deployment.body} on {host}: {', '.join(spec.name for spec in specs)}; logs in {run_dir}")
-    with stop_signals() as stop, announced(label, client_endpoint(deployment)) as note:
+    with stop_signals() as stop, announced(label, local_endpoint(deployment, host)) as note:
         async with Supervisor(specs, show) as supervisor:
             running = asyncio.ensure_future(supervisor.run())
             while not stop.is_set() and not running.done() and not _hopeless(supervisor):

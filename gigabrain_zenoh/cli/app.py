@@ -29,6 +29,10 @@ COMMANDS = {
     "estop": ("operate:estop", "Stop the robot at once, and latch it."),
     "release": ("operate:release", "Let go of a latched gate."),
     "enable": ("operate:enable", "Let the robot's brain drive."),
+    "keys new": ("keys:new", "Make a fleet's own authority, which issues identities."),
+    "keys issue": ("keys:issue", "Make an identity: a folder to copy to its host."),
+    "keys list": ("keys:identities", "List identities, and when they expire."),
+    "keys zenohd": ("keys:zenohd", "Print the configuration of a router for a larger site."),
     "audit": ("audit:audit", "Show who did what to the robot."),
     "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
@@ -41,7 +45,12 @@ COMMANDS = {
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
 }
-GROUPS = {"driver": "Drivers of bodies.", "bench": "Measure this machine.", "schema": "Messages."}
+GROUPS = {
+    "driver": "Drivers of bodies.",
+    "keys": "Who may do what.",
+    "bench": "Measure this machine.",
+    "schema": "Messages.",
+}
 
 
 def make_app(chosen: Sequence[str] = ()) -> App:
