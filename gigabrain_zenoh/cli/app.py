@@ -29,6 +29,7 @@ COMMANDS = {
     "estop": ("operate:estop", "Stop the robot at once, and latch it."),
     "release": ("operate:release", "Let go of a latched gate."),
     "enable": ("operate:enable", "Let the robot's brain drive."),
+    "teleop": ("teleop:teleop", "Drive by keys or by a gamepad."),
     "audit": ("audit:audit", "Show who did what to the robot."),
     "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
