@@ -38,6 +38,7 @@ COMMANDS = {
     "bench chain": ("bench:chain", "From scan to command, timed."),
     "bench stack": ("bench:stack", "CPU, memory and time to start."),
     "faults": ("faults:faults", "Break the robot in 44 ways, and see whether it stops."),
+    "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
