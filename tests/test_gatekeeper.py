@@ -1,5 +1,7 @@
 """Who drives, who is told, and what is written down: a whole robot in memory."""
 
+import asyncio
+import threading
 from pathlib import Path
 
 import msgspec
@@ -90,6 +92,22 @@ async def test_an_e_stop_is_on_disk_when_it_is_confirmed(tmp_path: Path) -> None
         ("estop", "ann", "stopped and latched; e-stop number 1, a child")
     ]
     assert (entries[0].what, entries[-1].what) == ("boot", "end")
+
+
+async def test_a_disk_that_hangs_holds_up_the_confirmation_and_no_tick(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        wakes = threading.Event()
+        monkeypatch.setattr("os.fsync", lambda _fd: wakes.wait(10.0))
+        asking = asyncio.create_task(robot.operator.ask(ESTOP, EstopRequest(source="ann")))
+        assert (await robot.go(50))[1:] == [0.0] * 49
+        assert robot.mode == "latched"
+        assert not asking.done()
+        wakes.set()
+        [reply] = await asking
+        assert reply.text == "stopped and latched; e-stop number 1"
 
 
 async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: Path) -> None:
