@@ -5,7 +5,6 @@ the body 100 ms later (docs/firmware_alpha.md).
 """
 
 import logging
-import math
 
 from msgspec.structs import replace
 
@@ -26,7 +25,7 @@ from gigabrain_schemas.sensors import Imu, ImuData, LaserScan
 from gigabrain_schemas.topics import IMU, SCAN
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported
-from gigabrain_zenoh.limits import ZERO, clamp, limits_of
+from gigabrain_zenoh.limits import ZERO
 from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
@@ -58,7 +57,6 @@ class AlphaDriver(Driver):
         )
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
-        self._limits = limits_of(robot)
         self._decoder, self._odometry = Decoder(), LegOdometry(LegGeometry())
         self._sequence = 0  # of the newest command
         self._unsound = 0  # whole frames without sense
@@ -113,11 +111,9 @@ class AlphaDriver(Driver):
             raise BodyLost("the connection is not open")
         if self._heard_ns is None:  # it may still be starting
             return ZERO
-        wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
-        numbers = all(map(math.isfinite, (linear_x, linear_y, angular_z)))
-        if not numbers or self._untold or self._fallen:
-            wanted = ZERO
-        to = clamp(wanted, self._limits)
+        to = self.bounded(linear_x, linear_y, angular_z)
+        if self._untold or self._fallen:
+            to = ZERO
         if self._parked and to == ZERO:
             self.link.write(alpha.park(self._next()))
             return ZERO
