@@ -56,6 +56,7 @@ PROGRAMS = {
     "emulator": Program(
         "gigabrain_drivers.emulators.process:run", "gigabrain_zenoh.settings:EmulatorConfig"
     ),
+    "button": Program("gigabrain_drivers.button:run", "gigabrain_zenoh.settings:ButtonConfig"),
     "perception": Program(
         "gigabrain_zenoh.perception:run", "gigabrain_zenoh.settings:PerceptionConfig"
     ),

@@ -14,11 +14,10 @@ from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.kinematics import Gait, Twist, base_of
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.sim.pace import Pace
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry, Simulation
 from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_zenoh.errors import BodyLost
-
-LATE_S = 0.25  # further behind than this, time is dropped instead of raced after
 
 
 class Snapshot(NamedTuple):
@@ -119,14 +118,9 @@ class EmulatedBody:
         }
 
     def _work(self) -> None:
-        start, done, began = time.perf_counter(), 0, time.thread_time()
+        pace, began = Pace(TICK_S), time.thread_time()
         while not self._halt.is_set():
-            done += 1
-            wait = start + done * TICK_S - time.perf_counter()
-            if wait > 0:
-                time.sleep(wait)
-            elif wait < -LATE_S:
-                start -= wait
+            pace.wait()
             try:
                 self._step()
             except BodyLost as error:

@@ -97,7 +97,7 @@ def device_class(driver: str) -> type[Device]:
     if driver not in DEVICES and driver in offered:
         return offered[driver].load()  # type: ignore[no-any-return]
     if driver not in DEVICES:
-        raise unknown("emulator for driver", driver, DEVICES)
+        raise unknown("emulator for driver", driver, [*DEVICES, *offered])
     module, _, attribute = DEVICES[driver].partition(":")
     return getattr(importlib.import_module(module), attribute)  # type: ignore[no-any-return]
 
