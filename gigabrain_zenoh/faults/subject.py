@@ -34,6 +34,7 @@ Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
 TIRELESS = Backoff(factor=1.0, deaths=10_000)
 FAULTS_FILE = "faults.json"  # as the emulator's process reads it
 STOP_S = 1.5
+FULL_SHARE = 0.96  # of a speed counts as having reached it
 
 
 class Subject:
@@ -186,9 +187,14 @@ class Subject:
         return truth
 
     async def drive(self, room: float = 1.3) -> None:
-        """Have the brain drive straight on at full speed, as a person would: by hand."""
+        """Have the brain drive straight on as fast as it may, as a person would: by hand."""
+        onlooker = self.onlooker
         await self.release()
-        await self.onlooker.straight(room=room, by_hand=self.deployment.resume == "manual")
+        await until(lambda: onlooker.bodies.current, "the driver says what its body is")
+        body = onlooker.bodies.current
+        most = body.description.max_linear_speed if body else 0.0
+        speed = FULL_SHARE * min(self.deployment.decision.linear_speed, most)
+        await onlooker.straight(speed, room, by_hand=self.deployment.resume == "manual")
 
     async def release(self) -> None:
         """As a person: let go of a latched gate, as soon as that is possible."""

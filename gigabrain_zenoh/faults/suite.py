@@ -11,7 +11,7 @@ from gigabrain_zenoh.faults.rig import Options, Rig
 from gigabrain_zenoh.faults.waiting import StallWatch
 from gigabrain_zenoh.process import find
 
-STALL_S = 0.15  # standing still for longer, this machine and not the robot is to blame
+STALL_S = 0.1  # standing still for longer, this machine and not the robot is to blame
 TRIES = 3  # runs that end in such a stall are run again so often
 LIMIT_S = 300.0  # for one run of one test in its short form
 STAGES = ("sim", "auto", "serial", "tcp", "")
