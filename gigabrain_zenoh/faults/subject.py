@@ -1,6 +1,7 @@
 """The robot that is broken on purpose: all its processes, and whoever looks on."""
 
 import asyncio
+import contextlib
 import os
 import signal
 from collections.abc import Callable, Mapping
@@ -114,9 +115,12 @@ class Subject:
         return pid
 
     def send(self, name: str, number: signal.Signals) -> int:
-        """Send a signal to a process; its pid."""
+        """Send a signal to a process; its pid. Raises Failed where it has died by itself."""
         pid = self.pid(name)
-        os.kill(pid, number)
+        try:
+            os.kill(pid, number)
+        except ProcessLookupError:
+            raise Failed(f"{name} has died by itself") from None
         return pid
 
     def kill(self, name: str) -> int:
@@ -132,7 +136,8 @@ class Subject:
         alive = {status.pid for status in self.supervisor.statuses.values()}
         for pid in self._frozen & alive:
             if pid is not None:
-                os.kill(pid, signal.SIGCONT)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGCONT)
         self._frozen.clear()
 
     async def ready(self) -> None:
