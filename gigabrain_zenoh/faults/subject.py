@@ -199,7 +199,7 @@ class Subject:
         body = onlooker.bodies.current
         most = body.description.max_linear_speed if body else 0.0
         speed = FULL_SHARE * min(self.deployment.decision.linear_speed, most)
-        await onlooker.straight(speed, room, by_hand=self.deployment.resume == "manual")
+        await onlooker.straight(speed, room, by_hand=True)
 
     async def release(self) -> None:
         """As a person: let go of a latched gate, as soon as that is possible."""
