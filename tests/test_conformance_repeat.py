@@ -21,7 +21,9 @@ def test_the_worst_and_the_median_of_each_time_are_told() -> None:
 
 def test_one_failure_among_many_is_counted_and_named() -> None:
     found = [Finding(True, "fine", {"known": 1.0}), Finding(False, "still moving")]
-    assert summary([*found, found[0]]) == "1 of 3 times not so: still moving"
+    assert summary([*found, found[0]]) == (
+        "1 times not so: still moving; worst of 3: known after 1, median 1 ms"
+    )
 
 
 def test_a_single_try_says_what_it_measured() -> None:

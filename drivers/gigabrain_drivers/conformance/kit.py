@@ -44,7 +44,7 @@ class GateCheck(NamedTuple):
     repeated: bool = False
 
 
-CUT = "motors told zero {promise} + 100, then 15 ticks (legs: 30)"
+CUT = "zero {promise}; both + 100; at rest 15 ticks (legs: 30) later"
 ALONE = (
     Check("opens", "heard within 5 s", direct.opens),
     Check("obeys", "measured speed within 10 % + 0.02", direct.obeys),
@@ -77,14 +77,14 @@ GATED = (
     GateCheck("stops on SIGKILL", "of the commander; as on silence", stops.killed, repeated=True),
     GateCheck(
         "stops unplugged",
-        f"known in 100 ms; {CUT}",
+        f"known in 100 ms, motors told {CUT}",
         line_faults.unplugged,
         with_peer=True,
         repeated=True,
     ),
     GateCheck(
         "stops on a frozen peer",
-        f"known in 240 ms; {CUT}",
+        f"known in 250 ms, motors told {CUT}",
         line_faults.frozen,
         with_peer=True,
         repeated=True,

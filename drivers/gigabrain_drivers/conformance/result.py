@@ -34,13 +34,15 @@ class Result(NamedTuple):
 
 def summary(findings: Sequence[Finding]) -> str:
     """What several repetitions of one check found: the worst and the median of each time."""
-    bad = [finding for finding in findings if not finding.ok]
     if len(findings) == 1:
         return findings[0].measured
-    if bad:
-        return f"{len(bad)} of {len(findings)} times not so: {bad[0].measured}"
-    told = []
-    for name in findings[0].times_ms:
-        times = [finding.times_ms[name] for finding in findings]
-        told.append(f"{name} after {max(times):.0f}, median {statistics.median(times):.0f} ms")
-    return f"worst of {len(findings)}: {'; '.join(told)}"
+    bad = [finding for finding in findings if not finding.ok]
+    told = [_spread(name, findings) for name in findings[0].times_ms]
+    worst = f"worst of {len(findings)}: {'; '.join(told)}"
+    return f"{len(bad)} times not so: {bad[0].measured}; {worst}" if bad else worst
+
+
+def _spread(name: str, findings: Sequence[Finding]) -> str:
+    """The worst and the median of those that have this time."""
+    times = [finding.times_ms[name] for finding in findings if name in finding.times_ms]
+    return f"{name} after {max(times):.0f}, median {statistics.median(times):.0f} ms"

@@ -115,9 +115,12 @@ class Rig(Timeline):
         """A command as it is, header and all."""
         self.network.deliver(self.topic.at(), codec.encode(command))
 
-    async def drive(self, sign: float = 1.0) -> Velocity:
-        """Have the gate opened and the body moving; the velocity that is commanded from then on."""
-        wanted = Velocity(linear_x=sign * self.speed)
+    async def drive(self) -> Velocity:
+        """Have the gate opened and the body moving, to and fro in turn.
+
+        Returns the velocity that is commanded from then on.
+        """
+        wanted = Velocity(linear_x=self.subject.way() * self.speed)
         for _ in range(ATTEMPTS):
             self.wanted = ZERO
             await self._enable()

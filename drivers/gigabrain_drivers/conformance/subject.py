@@ -33,6 +33,7 @@ class Subject:
         self.run = Run(folder=folder, link=link, world=WORLD, emulator=str(folder / "ports"))
         self.robot, _, _, _ = catalog.load_link(name, self.run)
         self._emulator: Emulator | None = None
+        self._way = -1
 
     async def __aenter__(self) -> Self:
         if self.link == "emulated":
@@ -51,6 +52,11 @@ class Subject:
     def driver(self) -> Driver:
         """A new driver, not opened yet."""
         return catalog.make_driver(self.name, self.run)[1]
+
+    def way(self) -> int:
+        """1 or -1, the other one each time: who drives to and fro does not come to a wall."""
+        self._way = -self._way
+        return self._way
 
     @property
     def has_peer(self) -> bool:
