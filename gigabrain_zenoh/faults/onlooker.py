@@ -51,7 +51,7 @@ class Onlooker:
         self.safety, self.world = bus.latest(SAFETY), bus.latest(WORLD)
         self.intent = bus.latest(INTENT)
         bus.latest(STATE, self.states.append)
-        bus.latest(BODY, self._join)
+        self.bodies = bus.latest(BODY, self._join)
         bus.subscribe(HEALTH, self._hear)
         bus.subscribe(LOG, lambda _key, record: self.logs.append(record))
 
