@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 PYTHON ?= python3
 DONE := $(VENV)/.done
 
-.PHONY: setup demo test lint unit bench mutation golden pictures clean
+.PHONY: setup demo test lint unit bench mutation golden recordings pictures clean
 
 setup: $(DONE)
 
@@ -47,6 +47,9 @@ mutation: setup
 
 golden: setup
 	$(BIN)/python -m gigabrain_schemas.golden
+
+recordings: setup
+	$(BIN)/python -m gigabrain_zenoh.recording.drives tests/recordings
 
 pictures: setup
 	$(BIN)/gigabrain view --png docs/pictures/waffle_in_house.png --world house --seed 1

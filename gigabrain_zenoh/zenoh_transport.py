@@ -17,7 +17,7 @@ from gigabrain_zenoh.bridge import Bridge
 from gigabrain_zenoh.errors import BusError, ConfigError, GigabrainError
 from gigabrain_zenoh.mailbox import Mailbox
 from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.transport import Answer, Close, OnSample
+from gigabrain_zenoh.transport import Answer, Close, OnRaw, OnSample
 from gigabrain_zenoh.zenoh_config import explain, plain, session_config
 
 log = logging.getLogger(__name__)
@@ -157,6 +157,14 @@ class ZenohTransport:
 
         mailbox = Mailbox(self._bridge, deliver, depth)
         return self._undeclare(self._session.declare_subscriber(key, mailbox.put))
+
+    def tap(self, pattern: str, on_raw: OnRaw) -> Close:
+        """Listen in Zenoh's own thread; nothing gives way to anything."""
+
+        def deliver(sample: zenoh.Sample) -> None:
+            on_raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes())
+
+        return self._undeclare(self._session.declare_subscriber(pattern, deliver))
 
     def serve(self, key: str, answer: Answer) -> Close:
         """Answer queries, each in a task of its own."""
