@@ -1,6 +1,7 @@
 """Typed publish, subscribe and ask. The bus speaks messages; a transport speaks bytes."""
 
 import asyncio
+import itertools
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeVar
@@ -41,6 +42,8 @@ class Bus:
         self.counters: Counter[str] = Counter()  # what a node counts of its own, for its health
         self.latency_ms: dict[str, float] = {}  # what a node measures, for its health
         self.report: Callable[[], Mapping[str, float | int | str | None]] = dict
+        # changes for as long as work gets done: the loop's turns, where a node knows nothing better
+        self.progress: Callable[[], int] = itertools.count().__next__
         self._kept: dict[str, bytes] = {}
         self._fetching: set[asyncio.Task[None]] = set()
 

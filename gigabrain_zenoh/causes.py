@@ -2,21 +2,80 @@
 
 from gigabrain_schemas.base import Cause
 
-BOOT = Cause(code="boot", text="just started; nobody has released it yet")
-SILENCE = Cause(code="silence", text="no good command for 100 ms")
-STALE = Cause(code="stale", text="commands rest on sensor data that is too old")
-SAFETY_SILENT = Cause(code="safety_silent", text="the safety process is silent")
-SAFETY_STOP = Cause(code="safety_stop", text="the safety process says stop")
-NOT_FINITE = Cause(code="nan", text="the commander sent a value that is not a number")
-NAN_STORM = Cause(
-    code="nan_storm", text="the commander kept sending values that are not numbers", latching=True
+BOOT = Cause(
+    code="boot",
+    text="just started; nobody has released it yet",
+    remedy="see that nobody is in its way",
 )
-LINK_LOST = Cause(code="link_lost", text="the body does not answer")
+SILENCE = Cause(
+    code="silence",
+    text="no good command for 100 ms",
+    remedy="see that whoever drives runs and reaches the robot, then enable it again",
+)
+STALE = Cause(
+    code="stale",
+    text="commands rest on sensor data that is too old",
+    remedy="see that the lidar, perception and decision keep up, then enable it again",
+)
+SAFETY_SILENT = Cause(
+    code="safety_silent",
+    text="the safety process is silent",
+    remedy="start the safety process, or read its log to see why it ended",
+)
+SAFETY_STOP = Cause(
+    code="safety_stop",
+    text="the safety process says stop",
+    remedy="read the log of the safety process",
+)
+NOT_FINITE = Cause(
+    code="nan",
+    text="the commander sent a value that is not a number",
+    remedy="repair the program that sends it",
+)
+NAN_STORM = Cause(
+    code="nan_storm",
+    text="the commander kept sending values that are not numbers",
+    latching=True,
+    remedy="repair the program that sends them, then release the robot",
+)
+LINK_LOST = Cause(
+    code="link_lost",
+    text="the body does not answer",
+    remedy="look at its power, its cable or its network",
+)
+
+
+BUTTON_AWAITED = Cause(
+    code="button_lost",
+    text="the e-stop button has not been heard yet",
+    remedy="start its process, and see that its adapter is plugged in",
+)
+BUTTON_LOST = Cause(
+    code="button_lost",
+    text="the e-stop button is silent",
+    latching=True,
+    remedy="see that its process runs, then release the robot",
+)
+
+
+def button(text: str) -> Cause:
+    """The e-stop button is pressed, or cannot be believed."""
+    return Cause(
+        code="button",
+        text=f"e-stop button: {text}"[:500],
+        latching=True,
+        remedy="let the button go, or mend its wire or adapter, then release the robot",
+    )
 
 
 def estop(source: str) -> Cause:
     """An e-stop, by whom."""
-    return Cause(code="estop", text=f"e-stop pressed by {source}"[:500], latching=True)
+    return Cause(
+        code="estop",
+        text=f"e-stop pressed by {source}"[:500],
+        latching=True,
+        remedy="find out why it was pressed",
+    )
 
 
 def latching(causes: tuple[Cause, ...]) -> tuple[Cause, ...]:
@@ -31,5 +90,12 @@ def merge(known: tuple[Cause, ...], more: tuple[Cause, ...]) -> tuple[Cause, ...
 
 
 def in_words(causes: tuple[Cause, ...]) -> str:
-    """`causes` as one phrase, short enough to stand in a reply with words around it."""
-    return "; ".join(cause.text for cause in causes)[:400]
+    """`causes` as one phrase, short enough to stand in a reply with words around it.
+
+    What to do about a cause follows it in brackets.
+    """
+    return "; ".join(map(_in_words, causes))[:400]
+
+
+def _in_words(cause: Cause) -> str:
+    return f"{cause.text} ({cause.remedy})" if cause.remedy else cause.text

@@ -6,23 +6,26 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar, overload
 
+from gigabrain_schemas.audit import AuditRecord, AuditRequest
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import (
+    AUDIT_LOG,
     BODY,
     CMD_VEL,
     ENABLE,
-    ESTOP,
     RELEASE,
     STATE,
     Service,
     Topic,
 )
+from gigabrain_zenoh.audit_file import in_order
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, BusError, Refused, Unsupported
+from gigabrain_zenoh.estop import press
 from gigabrain_zenoh.hold import Hold
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 from gigabrain_zenoh.listening import listen, topic_named
@@ -125,7 +128,8 @@ class Robot:
 
     async def enable(self, source: str = "", *, take: bool = False) -> GateReply:
         """Ask the gate for the body, for this script or for `source`. Raises Refused, and why."""
-        request = EnableRequest(source=source or self._bus.process, take=take)
+        me = self._bus.process
+        request = EnableRequest(source=source or me, take=take, by=me)
         reply = self._granted(await self._ask(ENABLE, request))
         if request.source == self._bus.process:
             self._hold.granted(self._bus.time.boot, reply.gate)
@@ -138,9 +142,22 @@ class Robot:
         return self._granted(await self._ask(RELEASE, request))
 
     async def estop(self, reason: str = "") -> GateReply:
-        """Stop at once and latch. Raises BodyLost when no body has confirmed it."""
-        request = EstopRequest(source=self._bus.process, reason=reason)
-        return await self._ask(ESTOP, request)
+        """Stop at once and latch; this script's own commands stop first.
+
+        Raises NotConfirmed when no body has confirmed it within two seconds.
+        """
+        self._target = None
+        return await press(self._bus, reason)
+
+    async def audit(self, newest: int = 100) -> tuple[AuditRecord, ...]:
+        """The newest entries of the audit log, oldest first. Raises BodyLost where nobody has one.
+
+        They are those of every process that keeps one, within a second.
+        """
+        pages = await self._bus.ask(AUDIT_LOG, AuditRequest(newest=newest), timeout_s=ANSWER_S)
+        if not pages:
+            raise BodyLost("nobody here keeps an audit log; is the driver running?")
+        return in_order([page.records for page in pages])[-newest:]
 
     async def read_state(self) -> RobotState:
         """What the body measures. Raises BodyLost when it is silent for a second."""
@@ -236,7 +253,7 @@ class Robot:
     async def _ask(self, service: Service[Q, GateReply], request: Q) -> GateReply:
         replies = await self._bus.ask(service, request, timeout_s=ANSWER_S)
         if not replies:
-            raise BodyLost(f"NOT CONFIRMED: no driver answers {service.key}")
+            raise BodyLost(f"no driver answers {service.key}; is it running?")
         return replies[0]
 
     @staticmethod

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from gigabrain_zenoh import lifeline
+from gigabrain_zenoh import heartbeat, lifeline
 from gigabrain_zenoh.backoff import Backoff, Patience
 from gigabrain_zenoh.child import Child
 from gigabrain_zenoh.errors import ConfigError
@@ -39,6 +39,7 @@ class ProcessStatus:
     restarts: int = 0
     last_exit: int | None = None  # exit code, or minus the signal's number
     ready_after_s: float | None = None  # from its last start
+    progress_s: float = 0.0  # when it last got on with its work (loop time)
 
 
 @dataclass
@@ -131,10 +132,20 @@ class Keeper:
             self.status.pid = self.child.pid
             return self.child
 
+    @property
+    def stuck(self) -> bool:
+        """Whether it runs and gets nowhere."""
+        silent_s = asyncio.get_running_loop().time() - self.status.progress_s
+        return self.status.state == "ready" and silent_s > heartbeat.STUCK_S
+
     def _take(self, record: dict[str, Any]) -> None:
+        if record["event"] == heartbeat.EVENT:
+            self.status.progress_s = asyncio.get_running_loop().time()
+            return
         if record["event"] == "ready" and self.status.state == "starting":
             self.status.state = "ready"
-            self.status.ready_after_s = asyncio.get_running_loop().time() - self._started_s
+            self.status.progress_s = asyncio.get_running_loop().time()
+            self.status.ready_after_s = self.status.progress_s - self._started_s
             self.settled.set()
         self._shared.on_record(self.spec.name, record)
 

@@ -2,9 +2,7 @@
 
 import asyncio
 import contextlib
-import signal
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from gigabrain_zenoh import log_text
@@ -17,23 +15,12 @@ from gigabrain_zenoh.deployment import (
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.logs import new_run_dir, state_dir
 from gigabrain_zenoh.running import announced
+from gigabrain_zenoh.sd_notify import Notifier
+from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.supervisor import Supervisor
 
 STOP_S = 1.5
 LOOK_S = 0.1
-
-
-@contextmanager
-def stop_signals() -> Iterator[asyncio.Event]:
-    """An event that Ctrl-C and SIGTERM set."""
-    stop, loop = asyncio.Event(), asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    try:
-        yield stop
-    finally:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.remove_signal_handler(number)
 
 
 async def up(
@@ -46,6 +33,7 @@ async def up(
     """
     deployment = with_free_port(deployment)
     label = deployment.namespace or deployment.body.replace("/", "-")
+    notifier = Notifier.from_environment()
     run_dir = new_run_dir(None, label)
     remembers = state_dir() / "robots" / label
     specs = process_specs(deployment, host, run_dir, remembers, level=level)
@@ -65,8 +53,10 @@ async def up(
         async with Supervisor(specs, show) as supervisor:
             running = asyncio.ensure_future(supervisor.run())
             while not stop.is_set() and not running.done() and not _hopeless(supervisor):
+                _report(supervisor, notifier)
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), LOOK_S)
+            notifier.stopping()
             await supervisor.stop(STOP_S)
             await running
             if supervisor.misconfigured:
@@ -79,3 +69,20 @@ async def up(
 def _hopeless(supervisor: Supervisor) -> bool:
     """Whether what has been given up leaves nothing to keep running."""
     return bool(supervisor.misconfigured) or "router" in supervisor.given_up
+
+
+def _report(supervisor: Supervisor, notifier: Notifier) -> None:
+    """Tell the service manager how all are doing; what was given up is told, not waited for."""
+    states = {name: status.state for name, status in supervisor.statuses.items()}
+    not_yet = [name for name, state in states.items() if state not in ("ready", "given up")]
+    problems = {
+        "given up": supervisor.given_up,
+        "stuck": supervisor.stuck,
+        "not ready": tuple(not_yet),
+    }
+    told = [f"{what}: {', '.join(names)}" for what, names in problems.items() if names]
+    notifier.status("; ".join(told) or f"all ready: {', '.join(states)}")
+    if not not_yet:
+        notifier.ready()
+    if not supervisor.stuck:
+        notifier.alive()

@@ -55,16 +55,16 @@ def encode(record: Mapping[str, Any]) -> bytes:
 def readable(record: Mapping[str, Any], *, colour: bool = False) -> str:
     """`12:03:44 driver     warning  text key=value`, in local time, without its newline."""
     clock = time.strftime("%H:%M:%S", time.localtime(record["t"] / 1e9))
-    level, text = str(record["level"]), _printable(record.get("text") or record["event"])
+    level, text = str(record["level"]), printable(record.get("text") or record["event"])
     data = [
-        f"{_printable(key)}={_printable(_value(value))}"
+        f"{printable(key)}={printable(_value(value))}"
         for key, value in record.items()
         if key not in _SHOWN_APART
     ]
     shown = f"\033[{_COLOURS[level]}m{level:<8}\033[0m" if colour and level in _COLOURS else level
-    line = f"{clock} {_printable(record['process']):<10} {shown:<8} {' '.join([text, *data])}"
+    line = f"{clock} {printable(record['process']):<10} {shown:<8} {' '.join([text, *data])}"
     rest = str(record.get("traceback", "")).splitlines()
-    return "\n".join([line, *("    " + _printable(more) for more in rest)])
+    return "\n".join([line, *("    " + printable(more) for more in rest)])
 
 
 def _plain(value: object) -> object:
@@ -85,7 +85,7 @@ def _value(value: object) -> str:
     return encode({"": value})[4:-1].decode()
 
 
-def _printable(text: object) -> str:
+def printable(text: object) -> str:
     """Text from anywhere must not move the cursor of the terminal that shows it."""
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in str(text))
 

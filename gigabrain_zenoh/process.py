@@ -10,7 +10,6 @@ import gc
 import importlib
 import logging
 import os
-import signal
 import sys
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
@@ -25,8 +24,10 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, unknown
 from gigabrain_zenoh.health import answer_to_name, publish_health
+from gigabrain_zenoh.heartbeat import beat
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 log = logging.getLogger("gigabrain")
@@ -53,6 +54,7 @@ PROGRAMS = {
     "emulator": Program(
         "gigabrain_drivers.emulators.process:run", "gigabrain_zenoh.settings:EmulatorConfig"
     ),
+    "button": Program("gigabrain_drivers.button:run", "gigabrain_zenoh.settings:ButtonConfig"),
     "perception": Program(
         "gigabrain_zenoh.perception:run", "gigabrain_zenoh.settings:PerceptionConfig"
     ),
@@ -120,16 +122,14 @@ def _first(error: BaseException) -> BaseException:
 
 
 async def _run(config: ProcessConfig, node: Node) -> None:
-    stop = asyncio.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        asyncio.get_running_loop().add_signal_handler(number, stop.set)
-    work = asyncio.ensure_future(_work(config, node))
-    stopped = asyncio.ensure_future(stop.wait())
-    await asyncio.wait((work, stopped), return_when=asyncio.FIRST_COMPLETED)
-    work.cancel()
-    stopped.cancel()
-    with contextlib.suppress(asyncio.CancelledError):
-        await work
+    with stop_signals() as stop:
+        work = asyncio.ensure_future(_work(config, node))
+        stopped = asyncio.ensure_future(stop.wait())
+        await asyncio.wait((work, stopped), return_when=asyncio.FIRST_COMPLETED)
+        work.cancel()
+        stopped.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await work
 
 
 async def _work(config: ProcessConfig, node: Node) -> None:
@@ -140,6 +140,8 @@ async def _work(config: ProcessConfig, node: Node) -> None:
         await answer_to_name(bus)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(publish_health(bus))
+            if config.json_console:
+                tasks.create_task(beat(bus.clock, lambda: bus.progress()))
             tasks.create_task(_node(bus, node))
     except* GigabrainError as group:
         raise group.exceptions[0] from None

@@ -48,6 +48,7 @@ LONGEST_STEP_TICKS = 5  # a sample after a longer gap speaks for no more than th
 REPEAT_TICKS = 2  # the verdict is repeated every 40 ms, and at once when it changes
 HEARTBEAT_NS = 150_000_000  # how long decision and control may be silent
 WORLD_MARGIN_NS = 50_000_000  # how much later than a scan its world may come
+LOOK_AT_LIDAR = "look at the lidar's power and cable"
 CONE_DEG = 30.0  # [deg], the cone ahead of which something must be known
 
 
@@ -148,7 +149,11 @@ def _zone_causes(memory: Memory) -> tuple[Cause, ...]:
         ("zone_behind", "behind", memory.stopped_behind, memory.free_behind),
     )
     return tuple(
-        Cause(code=code, text=f"obstacle {free or 0.0:.2f} m {where} of the body")
+        Cause(
+            code=code,
+            text=f"obstacle {free or 0.0:.2f} m {where} of the body",
+            remedy="turn or back away, or clear the way",
+        )
         for code, where, stopped, free in zones
         if stopped
     )
@@ -158,13 +163,14 @@ def _blind(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause
     if body.lidar is None:
         return ()
     if inputs.scan_age_ns is None:
-        return (Cause(code="scan_lost", text="no scan has come yet"),)
+        return (Cause(code="scan_lost", text="no scan has come yet", remedy=LOOK_AT_LIDAR),)
     limit_ns = scan_limit_ns(body)
     if inputs.scan_age_ns > limit_ns:
         text = f"no scan for more than {limit_ns // 1_000_000} ms"
-        return (Cause(code="scan_lost", text=text),)
+        return (Cause(code="scan_lost", text=text, remedy=LOOK_AT_LIDAR),)
     if memory.problem:
-        return (Cause(code="scan_blind", text=memory.problem),)
+        remedy = "clean and uncover the lidar, or move the robot to where it sees walls"
+        return (Cause(code="scan_blind", text=memory.problem, remedy=remedy),)
     return ()
 
 
@@ -175,21 +181,31 @@ def _silent(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Caus
     silent there is no brain, and a script need not wait for one.
     """
     if body.lidar and memory.scans < SCANS_TO_START:
-        return (Cause(code="starting", text="safety has only just begun to look"),)
+        text = "safety has only just begun to look"
+        return (Cause(code="starting", text=text, remedy="wait for the second scan"),)
     commander = inputs.state.gate.commander
     if commander not in ("", BRAIN) or (not commander and len(inputs.silent) == len(SYSTEMS)):
         return ()
-    return tuple(Cause(code=f"{name}_silent", text=f"{name} is silent") for name in inputs.silent)
+    return tuple(
+        Cause(
+            code=f"{name}_silent",
+            text=f"{name} is silent",
+            remedy=f"start {name}, or read its log to see why it is silent",
+        )
+        for name in inputs.silent
+    )
 
 
 def _worn(body: BodyDescription, memory: Memory) -> tuple[Cause, ...]:
     found = []
     if memory.low_ticks >= SUSTAIN_TICKS:
-        text = f"battery at or below {body.thresholds.battery_stop:g} %; charge it"
-        found.append(Cause(code="battery_empty", text=text, latching=True))
+        text = f"battery at or below {body.thresholds.battery_stop:g} %"
+        remedy = "charge it, then release the robot"
+        found.append(Cause(code="battery_empty", text=text, latching=True, remedy=remedy))
     if memory.hot_ticks >= SUSTAIN_TICKS:
-        text = f"a motor has {body.thresholds.motor_stop:g} °C or more; let it cool"
-        found.append(Cause(code="motor_hot", text=text, latching=True))
+        text = f"a motor has {body.thresholds.motor_stop:g} °C or more"
+        remedy = "let it cool, then release the robot"
+        found.append(Cause(code="motor_hot", text=text, latching=True, remedy=remedy))
     return tuple(found)
 
 
@@ -197,11 +213,12 @@ def _warnings(body: BodyDescription, state: RobotState) -> tuple[Cause, ...]:
     limits, found = body.thresholds, []
     if state.battery and state.battery.percentage <= limits.battery_warn:
         text = f"battery at {state.battery.percentage:.0f} %"
-        found.append(Cause(code="battery_low", text=text))
+        found.append(Cause(code="battery_low", text=text, remedy="charge it soon"))
     for joint in state.joints:
         if joint.temperature is not None and joint.temperature >= limits.motor_warn:
             text = f"{joint.name} has {joint.temperature:.0f} °C"
-            found.append(Cause(code="motor_warm", text=text))
+            remedy = "drive more gently, or let it rest"
+            found.append(Cause(code="motor_warm", text=text, remedy=remedy))
     return tuple(found)
 
 

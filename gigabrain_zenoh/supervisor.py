@@ -49,6 +49,11 @@ class Supervisor:
         given_up = (self.statuses[name] for name in self.given_up)
         return tuple(s.name for s in given_up if s.last_exit == ConfigError.exit_code)
 
+    @property
+    def stuck(self) -> tuple[str, ...]:
+        """Names of the processes that run and get nowhere."""
+        return tuple(name for name, keeper in self._keepers.items() if keeper.stuck)
+
     async def __aenter__(self) -> Self:
         return self
 

@@ -1,11 +1,16 @@
 """Watches a robot from outside: the newest of everything that people want to see."""
 
+import asyncio
+import contextlib
+
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import CMD_VEL, DESCRIBE, HEALTH, INTENT, SAFETY, STATE, WORLD
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import Refused
+
+ASK_S, PAUSE_S = 1.0, 0.1  # of one question, and until the next
 
 
 class Watch:
@@ -29,14 +34,21 @@ class Watch:
         return self._bus.time.tick * 0.02
 
     async def describe(self, process: str, timeout_s: float = 0.3) -> Description | None:
-        """What a process says of itself, or None when it does not answer."""
-        try:
-            replies = await self._bus.ask(
-                DESCRIBE, DescribeRequest(), timeout_s=timeout_s, name=process
-            )
-        except Refused:
-            return None
-        return replies[0] if replies else None
+        """What a process says of itself, or None when it does not answer.
+
+        Asked again until the time is over: a machine that stalled may have cost either side its
+        session, which comes back by itself, but a question in between goes nowhere.
+        """
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + timeout_s
+        while (left_s := end_s - loop.time()) > 0:
+            with contextlib.suppress(Refused):
+                for reply in await self._bus.ask(
+                    DESCRIBE, DescribeRequest(), timeout_s=min(left_s, ASK_S), name=process
+                ):
+                    return reply
+            await asyncio.sleep(min(left_s, PAUSE_S))
+        return None
 
     def _healthy(self, _key: str, health: Health) -> None:
         self.health[health.process] = health

@@ -25,6 +25,11 @@ CRASHED = Cause(code="collision", text="it has hit something", latching=True)
 HOT = Cause(code="motor_hot", text="a motor is hot", latching=True)
 
 
+def plain(causes: tuple[Cause, ...]) -> list[tuple[str, str]]:
+    """Codes and sentences, without the advice."""
+    return [(cause.code, cause.text) for cause in causes]
+
+
 class Rig:
     """One gate and its present state. Times are counted back from now, in ticks."""
 
@@ -126,6 +131,18 @@ def enabled(source: str = "control", *, basis_ns: int = 250_000_000) -> Rig:
     """All is well and `source` holds the body. It is tick 25."""
     rig = idle(basis_ns=basis_ns)
     assert rig.feed(gate.Enable(source)).ok
+    return rig
+
+
+def calm(source: str = "control") -> Rig:
+    """`source` holds the body, and the 100 ms in which nobody moves it are over with this tick."""
+    rig = enabled(source)
+    for _ in range(4):
+        rig.tick()
+        rig.safety()
+        rig.send(source=source)
+    rig.tick()
+    rig.safety()
     return rig
 
 

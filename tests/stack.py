@@ -1,6 +1,5 @@
 """A robot as people start it: `gigabrain` commands as processes, and their ends."""
 
-import asyncio
 import contextlib
 import itertools
 import os
@@ -8,28 +7,20 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
 import msgspec
 
+from gigabrain_zenoh.faults.waiting import PATIENCE_S as PATIENCE_S
+from gigabrain_zenoh.faults.waiting import until as until
 from gigabrain_zenoh.running import Running
 from gigabrain_zenoh.settings import Endpoint
 
 ROOT = Path(__file__).parent.parent
 SOURCES = (ROOT, ROOT / "drivers", ROOT / "schemas")
 GIGABRAIN = (sys.executable, "-P", "-c", "from gigabrain_zenoh.cli.app import main; main()")
-PATIENCE_S = 60.0  # far more than anything here takes on a busy machine
-
-
-async def until(condition: Callable[[], object], what: str, within_s: float = PATIENCE_S) -> None:
-    """Wait for `condition`; AssertionError names `what` when it never comes true."""
-    loop = asyncio.get_running_loop()
-    end_s = loop.time() + within_s
-    while not condition():
-        assert loop.time() < end_s, f"not within {within_s:g} s: {what}"
-        await asyncio.sleep(0.01)
 
 
 def free_port() -> int:

@@ -22,7 +22,7 @@ def test_every_robot_file_is_valid_and_named_like_its_folder(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "separation", "speed"),
-    [("turtlebot3_waffle", 0.287, 0.26), ("turtlebot3_burger", 0.160, 0.22)],
+    [("turtlebot3_waffle", 0.287, 0.26), ("turtlebot3_burger", 0.160, 0.21)],
 )
 def test_the_turtlebots_have_their_makers_figures(
     name: str, separation: float, speed: float

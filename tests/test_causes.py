@@ -34,3 +34,9 @@ def test_causes_merge_by_code_and_by_whether_they_latch() -> None:
     assert causes.merge((LOST,), (latched,)) == (LOST, latched)
     assert causes.merge((), (LOST, HOT)) == (LOST, HOT)
     assert causes.merge((LOST, HOT), ()) == (LOST, HOT)
+
+
+def test_what_to_do_about_a_cause_follows_it() -> None:
+    lost = Cause(code="link_lost", text="the body does not answer", remedy="look at its cable")
+    words = "the body does not answer (look at its cable); a motor is hot"
+    assert causes.in_words((lost, HOT)) == words

@@ -16,7 +16,13 @@ def test_it_boots_latched_and_at_rest() -> None:
     state = gate.GateState(boot=BOOT)
     assert gate.status(state) == GateStatus(
         mode="latched",
-        causes=(Cause(code="boot", text="just started; nobody has released it yet"),),
+        causes=(
+            Cause(
+                code="boot",
+                text="just started; nobody has released it yet",
+                remedy="see that nobody is in its way",
+            ),
+        ),
         estop_generation=0,
         commander="",
         enables=0,
@@ -35,7 +41,14 @@ def test_the_status_shows_who_drives_and_what_has_happened() -> None:
     rig.feed(gate.Estop("bob"))
     assert gate.status(rig.state) == GateStatus(
         mode="latched",
-        causes=(Cause(code="estop", text="e-stop pressed by bob", latching=True),),
+        causes=(
+            Cause(
+                code="estop",
+                text="e-stop pressed by bob",
+                latching=True,
+                remedy="find out why it was pressed",
+            ),
+        ),
         estop_generation=1,
         enables=1,
     )
@@ -50,8 +63,10 @@ def test_without_auto_resume_nothing_but_a_person_opens_it() -> None:
     rig.live(200, 0.2)
     assert (rig.mode, rig.state.output) == ("idle", ZERO)
     assert rig.feed(gate.Enable("control")) == gate.Outcome(text="control drives")
-    rig.live(2, 0.2)
-    assert (rig.mode, rig.state.output) == ("enabled", Velocity(linear_x=0.04))
+    rig.live(4, 0.2)  # for 100 ms it stands, however much somebody wants
+    assert (rig.mode, rig.state.output) == ("enabled", ZERO)
+    rig.live(1, 0.2)
+    assert (rig.mode, rig.state.output) == ("enabled", Velocity(linear_x=0.02))
 
 
 @pytest.mark.parametrize("generation", [0, 1, 3])

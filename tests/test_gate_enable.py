@@ -16,7 +16,8 @@ def test_a_latched_gate_is_not_enabled() -> None:
     rig.live(5)
     before = rig.state
     assert rig.feed(gate.Enable("control", take=True)) == gate.Outcome(
-        ok=False, text="latched: e-stop pressed by alice; release it first"
+        ok=False,
+        text="latched: e-stop pressed by alice (find out why it was pressed); release it first",
     )
     assert rig.state == before
 
@@ -71,8 +72,9 @@ def test_all_that_speaks_against_it_is_said() -> None:
     rig.tick(8, faults=(LOST,))
     assert rig.feed(gate.Enable("control")) == gate.Outcome(
         ok=False,
-        text="not now: the body does not answer; the safety process is silent; "
-        "no good command for 100 ms",
+        text="not now: the body does not answer; the safety process is silent (start the safety "
+        "process, or read its log to see why it ended); no good command for 100 ms (see that "
+        "whoever drives runs and reaches the robot, then enable it again)",
     )
 
 
@@ -109,9 +111,11 @@ def test_whoever_takes_over_starts_anew() -> None:
     rig.feed(gate.Enable("bob", take=True))
     assert rig.state.output == ZERO  # alice's last command is forgotten
     rig.send(0.2, source="alice", seq=1001)
-    rig.tick()
-    assert rig.send(0.2, source="bob", seq=0).refused == ""
-    assert rig.state.output == Velocity(linear_x=0.02)
+    for told in (0.0, 0.0, 0.0, 0.0, 0.02):
+        rig.tick()
+        rig.safety()
+        assert rig.send(0.2, source="bob", seq=rig.state.tick).refused == ""
+        assert rig.state.output == Velocity(linear_x=told)
 
 
 def test_a_second_enable_is_counted_and_is_no_command() -> None:
@@ -131,3 +135,47 @@ def test_a_second_enable_is_counted_and_is_no_command() -> None:
     assert rig.mode == "enabled"
     rig.tick()
     assert rig.mode == "stopping"
+
+
+def test_the_brain_takes_the_body_from_nobody_unless_a_person_hands_it_over() -> None:
+    rig = enabled("alice")
+    rig.live(3)
+    for by in ("", "control"):
+        assert rig.feed(gate.Enable("control", take=True, by=by)) == gate.Outcome(
+            ok=False, text="alice drives; only a person hands it to the brain"
+        )
+    assert rig.state.commander == "alice"
+    assert rig.feed(gate.Enable("control", take=True, by="bob")) == gate.Outcome(
+        text="control drives"
+    )
+
+
+def test_a_held_joystick_moves_nothing_in_the_first_100_ms() -> None:
+    rig = idle()
+    for _ in range(30):  # somebody holds it while the gate is shut
+        rig.tick()
+        rig.safety()
+        rig.send(0.26, source="alice")
+    assert rig.feed(gate.Enable("alice")).ok
+    told = []
+    for _ in range(6):
+        rig.send(0.26, source="alice")
+        told.append(rig.state.output.linear_x)
+        rig.tick()
+        rig.safety()
+    assert told == [0.0, 0.0, 0.0, 0.0, 0.0, 0.02]
+
+
+def test_a_release_under_a_held_joystick_moves_nothing_without_an_enable() -> None:
+    rig = enabled("alice")
+    rig.feed(gate.Estop("bob"))
+    for _ in range(40):
+        rig.tick()
+        rig.safety()
+        rig.send(0.26, source="alice")
+    assert rig.feed(gate.Release(1)).ok
+    for _ in range(40):
+        rig.tick()
+        rig.safety()
+        assert rig.send(0.26, source="alice").refused == "not_enabled"
+    assert (rig.mode, rig.state.commander, rig.state.output) == ("idle", "", ZERO)

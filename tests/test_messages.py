@@ -35,6 +35,10 @@ REQUIRED: dict[str, set[str]] = {
         "rejected", "latency_ms", "counters",
     },
     "LogRecord": {"process", "level", "event", "text"},
+    "ButtonState": {"pressed"},
+    "AuditRecord": {"process", "what", "source"},
+    "AuditRequest": set(),
+    "AuditPage": set(),
     "EstopRequest": set(),
     "ReleaseRequest": {"estop_generation"},
     "EnableRequest": {"source"},
@@ -66,11 +70,13 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/joint_cmd": ("JointCommand", 50),
         "robot/safety": ("SafetyState", 20),
         "robot/health/*": ("Health", 1),
+        "robot/button": ("ButtonState", 20),
         "robot/log": ("LogRecord", 10),
+        "robot/audit": ("AuditRecord", 10),
     }
     assert [service.at("*") for service in SERVICES] == [
         "robot/estop", "robot/release", "robot/enable", "robot/goal", "robot/mission",
-        "robot/describe/*",
+        "robot/audit_log", "robot/describe/*",
     ]  # fmt: skip
 
 
@@ -90,14 +96,16 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/joint_cmd": 100_000_000,
         "robot/safety": 150_000_000,
         "robot/health": 5_000_000_000,
+        "robot/button": 200_000_000,
         "robot/log": 500_000_000,
+        "robot/audit": 500_000_000,
     }
 
 
 def test_no_stream_blocks_its_sender_and_only_what_moves_or_stops_the_body_goes_first() -> None:
     assert {topic.congestion for topic in TOPICS} == {"drop"}
     assert [topic.key for topic in TOPICS if topic.priority == "real_time"] == [
-        "robot/cmd_vel", "robot/joint_cmd", "robot/safety",
+        "robot/cmd_vel", "robot/joint_cmd", "robot/safety", "robot/button",
     ]  # fmt: skip
     assert [service.key for service in SERVICES if service.priority == "real_time"] == [
         "robot/estop"
@@ -128,7 +136,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in golden.FOLDER.iterdir()}
     assert stored == golden.files()
-    assert len(stored) == 50
+    assert len(stored) == 58
 
 
 @by_name

@@ -92,7 +92,7 @@ def test_a_square_closes_within_a_centimetre_by_odometry(simulation: Simulation)
 
 def test_its_lidar_looks_between_the_decks_all_round(simulation: Simulation) -> None:
     seen = simulation.scan()
-    assert seen.shape == (450,)
+    assert seen.shape == (360,)
     assert np.all(seen > 0.5)  # nothing of itself
 
 
@@ -151,7 +151,7 @@ async def test_it_drives_in_mujoco_by_bytes_alone(pair: Pair) -> None:
     assert 12.0 < state.battery.voltage < 12.6
     assert [j.temperature is not None for j in state.joints] == [True, True]
     await until(lambda: len(pair.scans) >= 2)
-    assert ranges(pair.scans[-1]).shape == (450,)
+    assert ranges(pair.scans[-1]).shape == (360,)
 
 
 async def test_the_scan_and_the_base_fail_apart(pair: Pair) -> None:

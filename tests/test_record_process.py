@@ -1,4 +1,4 @@
-"""The recorder beside a real robot: as a command, as a process of a deployment, killed, restarted."""
+"""The recorder beside a real robot: as a command, as a process of a deployment, and killed."""
 
 import os
 import signal
@@ -62,7 +62,7 @@ async def test_what_cannot_be_recorded_is_said_in_one_line(home: Home) -> None:
     assert lost.err == "gigabrain: no router answers at tcp/127.0.0.1:9; is the robot running?\n"
     assert await lost.ended() == 1
     none = await home.run("record", "--split-time", "-1")
-    assert none.err.startswith("gigabrain: --split-s: expected")
+    assert none.err.startswith("gigabrain: --split-time: expected a number above 0, got -1")
     assert await none.ended() == 2
     demo = await home.run("demo", "--record", str(there))
     assert demo.err == f"gigabrain: {there} exists; choose another file\n"

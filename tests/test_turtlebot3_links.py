@@ -1,11 +1,12 @@
 """The two TurtleBot3 as their files describe them: real ports, and both emulated as a whole."""
 
 import asyncio
+import math
 from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.catalog import make_driver
+from gigabrain_drivers.catalog import make_driver, robot_path
 from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.robot import Run
 from gigabrain_schemas.arrays import ranges
@@ -13,6 +14,7 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.sensors import Imu, LaserScan
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import ConfigError
 from tests.lidar_rig import until
 
 ROBOTS = ["turtlebot3_burger", "turtlebot3_waffle"]
@@ -58,3 +60,29 @@ async def test_the_emulated_robot_drives_and_sees(robot: str, tmp_path: Path) ->
             assert description.lidar
             assert len(ranges(scans[-1])) == description.lidar.beams
         await until(lambda: emulator.body.commanded == (0.0, 0.0, 0.0))  # the last zero arrives
+
+
+@pytest.mark.parametrize(("rate", "refused"), [("10", True), ("5", False)])
+def test_an_lds01_is_only_believed_at_its_own_five_turns_a_second(
+    rate: str, refused: bool, tmp_path: Path
+) -> None:
+    mine = tmp_path / "robot.yaml"
+    text = robot_path("turtlebot3_burger").read_text()
+    assert "driver: lds03" in text
+    assert "rate_hz: 10" in text
+    mine.write_text(
+        text.replace("driver: lds03", "driver: lds01").replace("rate_hz: 10", f"rate_hz: {rate}")
+    )
+    run = Run(folder=Path(), link="real")
+    if refused:
+        with pytest.raises(ConfigError, match=r"robot.yaml: .* lds01 makes 5 turns a second"):
+            make_driver(str(mine), run)
+    else:
+        assert make_driver(str(mine), run)[1].options.scan.driver == "lds01"
+
+
+def test_the_burger_is_limited_to_what_its_motors_make_of_61_rpm() -> None:
+    robot, _ = make_driver("turtlebot3_burger", Run(folder=Path()))
+    assert robot.max_linear_speed == pytest.approx(61 / 60 * math.tau * 0.033, rel=0.005)
+    assert robot.max_angular_speed == pytest.approx(61 / 60 * math.tau * 0.033 / 0.08, rel=0.005)
+    assert (robot.max_linear_speed, robot.max_angular_speed) == (0.21, 2.63)

@@ -5,7 +5,6 @@ the body 100 ms later (docs/firmware_alpha.md).
 """
 
 import logging
-import math
 
 from msgspec.structs import replace
 
@@ -26,7 +25,7 @@ from gigabrain_schemas.sensors import Imu, ImuData, LaserScan
 from gigabrain_schemas.topics import IMU, SCAN
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported
-from gigabrain_zenoh.limits import ZERO, clamp, limits_of
+from gigabrain_zenoh.limits import ZERO
 from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
@@ -58,7 +57,6 @@ class AlphaDriver(Driver):
         )
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
-        self._limits = limits_of(robot)
         self._decoder, self._odometry = Decoder(), LegOdometry(LegGeometry())
         self._sequence = 0  # of the newest command
         self._unsound = 0  # whole frames without sense
@@ -67,7 +65,7 @@ class AlphaDriver(Driver):
         self._heard_ns: int | None = None  # when the newest state came; none since it opened
         self._hoping_ns = self._clock.now_ns()  # since when there is none
         self._untold = False  # whether a loss has not been reported yet
-        self._open = False
+        self._open = self._parked = False
         self._silence, self._fall = Fault(log), Fault(log)
         self._imu: Imu | None = None
         self._lidar: ScanSource | None = None
@@ -93,9 +91,17 @@ class AlphaDriver(Driver):
             await self._lidar.close()
 
     async def stop(self) -> None:
-        """Come to rest and stand."""
+        """Come to rest and stand; a body that lies goes on lying."""
         if self._heard_ns is not None:
-            self.link.write(alpha.stop(self._next()))
+            say = alpha.park if self._parked else alpha.stop
+            self.link.write(say(self._next()))
+
+    async def park(self) -> None:
+        """Lie down; only a step gets it up again."""
+        if self._heard_ns is None:
+            raise BodyLost(f"{self.link}: {self.link.problem or 'the body is silent'}")
+        self._parked = True
+        self.link.write(alpha.park(self._next()))
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
@@ -105,11 +111,13 @@ class AlphaDriver(Driver):
             raise BodyLost("the connection is not open")
         if self._heard_ns is None:  # it may still be starting
             return ZERO
-        wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
-        numbers = all(map(math.isfinite, (linear_x, linear_y, angular_z)))
-        if not numbers or self._untold or self._fallen:
-            wanted = ZERO
-        to = clamp(wanted, self._limits)
+        to = self.bounded(linear_x, linear_y, angular_z)
+        if self._untold or self._fallen:
+            to = ZERO
+        if self._parked and to == ZERO:
+            self.link.write(alpha.park(self._next()))
+            return ZERO
+        self._parked = False
         gait = WALKER.to_gait(Twist(to.linear_x, to.linear_y, to.angular_z))
         seen = self._last[1] if self._last else 0
         if not self.link.write(alpha.walk(alpha.Walk(seen, gait), self._next())):
@@ -173,8 +181,10 @@ class AlphaDriver(Driver):
         if last:
             passed = (state.milliseconds - last[1]) % MILLISECONDS
             self._odometry.update(state.senses, passed / 1000)
-        if first:
-            self.link.write(alpha.stop(self._next()))
+        if first:  # what lies stays so until somebody wants it to walk
+            self._parked = bool(state.flags & alpha.PARKED)
+            say = alpha.park if self._parked else alpha.stop
+            self.link.write(say(self._next()))
         senses = state.senses
         self._imu = Imu(
             orientation=senses.orientation,

@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from gigabrain_drivers import DRIVERS
 from gigabrain_drivers.base import Driver
-from gigabrain_drivers.lidars.base import source_class
+from gigabrain_drivers.lidars.base import check_rate, source_class
 from gigabrain_drivers.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError, unknown
@@ -120,7 +120,7 @@ def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions
     robot = config.load(path, RobotFile)
     if run.link not in links_of(robot):
         has = ", ".join(links_of(robot)) or "none"
-        raise ConfigError(f"{path.parent.name} has no link {run.link!r}; it has: {has}")
+        raise ConfigError(f"{robot.robot_type} has no link {run.link!r}; it has: {has}")
     borrowed = run.link == "emulated" and robot.emulated is None
     section: LinkName = "real" if borrowed else run.link
     link = getattr(robot, section)
@@ -137,9 +137,18 @@ def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions
     options = getattr(config.load(path, exact), section)
     if options.lidar:
         robot = msgspec.structs.replace(robot, lidar=options.lidar)
+    if options.scan:
+        _check_lidar(path, options.scan.driver, robot)
     if borrowed:
         options = with_ports(options)
     return robot, driver, at_emulator(options, run.emulator), path.parent
+
+
+def _check_lidar(path: Path, name: str, robot: RobotFile) -> None:
+    try:
+        check_rate(name, robot.lidar)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
 
 
 def with_ports(options: LinkOptions) -> LinkOptions:

@@ -10,8 +10,9 @@ from gigabrain_zenoh.errors import ConfigError
 
 UNREADABLE = Cause(
     code="latch_unreadable",
-    text="the file that remembers what latched the gate cannot be read; look at the robot first",
+    text="the file that remembers what latched the gate cannot be read",
     latching=True,
+    remedy="look at the robot, then release it",
 )
 
 
@@ -45,6 +46,14 @@ class LatchFile:
             raise ConfigError(_unwritable(self._folder, error)) from None
         self.write(found)
         return found
+
+    def keep(self, latched: Latched) -> str:
+        """Write; the problem in one line, or an empty text. From one thread at a time."""
+        try:
+            self.write(latched)
+        except ConfigError as error:
+            return str(error)
+        return ""
 
     def write(self, latched: Latched) -> None:
         """On disk when this returns. Raises ConfigError when the folder cannot be written."""

@@ -5,7 +5,6 @@ stops the body (docs/firmware_line.md).
 """
 
 import logging
-import math
 import time
 
 import serial
@@ -26,7 +25,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported
-from gigabrain_zenoh.limits import ZERO, clamp, limits_of
+from gigabrain_zenoh.limits import ZERO
 from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
@@ -62,7 +61,6 @@ class LineDriver(Driver):
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
         self._report = LineReport(options, robot, self._base)
-        self._limits = limits_of(robot)
         self._silent_ns = max(round(MISSED / options.state_hz * 1e9), LEAST_SILENT_NS)
         self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
         self._heard_ns: int | None = None  # when the newest good line came; none since it opened
@@ -109,10 +107,7 @@ class LineDriver(Driver):
         """Drive; a value that is not a number is zero for all, and so is all while it is lost."""
         if not self._open:
             raise BodyLost("the line is not open")
-        wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
-        if not all(map(math.isfinite, (linear_x, linear_y, angular_z))):
-            wanted = ZERO
-        self._send(clamp(wanted, self._limits))
+        self._send(self.bounded(linear_x, linear_y, angular_z))
         return self._sent
 
     async def read_state(self) -> RobotState:

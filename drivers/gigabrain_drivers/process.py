@@ -2,32 +2,28 @@
 
 import asyncio
 import logging
-import secrets
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 from msgspec.structs import replace
 
 from gigabrain_drivers.base import Driver
+from gigabrain_drivers.button_watch import ButtonWatch
 from gigabrain_drivers.catalog import make_driver, ports_folder
-from gigabrain_drivers.latch import Latched, LatchFile
+from gigabrain_drivers.gatekeeper import Gatekeeper
 from gigabrain_drivers.links.wording import of_command
 from gigabrain_drivers.lockstep import REPEAT_S, Lockstep
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.round_trip import RoundTrip
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.body import Body, RobotState
+from gigabrain_schemas.body import Body, RobotState, SafeState
 from gigabrain_schemas.brain import CmdVel, JointCommand
-from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import (
     BODY,
-    ENABLE,
-    ESTOP,
     JOINT_CMD,
-    RELEASE,
     SAFETY,
     SCAN,
     STATE,
@@ -64,42 +60,44 @@ class DriverProcess:
     def __init__(self, config: DriverConfig, robot: RobotFile, driver: Driver, bus: Bus) -> None:
         self._config, self._robot, self._driver, self._bus = config, robot, driver, bus
         self._body = Body(description=robot.description(), link=config.link)
-        self._gate_config = gate.GateConfig(
+        gate_config = gate.GateConfig(
             limits=limits_of(robot),
             basis_ns=scan_limit_ns(robot),
             auto_resume=config.resume == "auto",
         )
-        self._latch = LatchFile(Path(config.state_dir))
-        latched = self._latch.read()
-        self._gate = gate.GateState(
-            boot=secrets.randbits(47) + 1,
-            causes=latched.causes or (why.BOOT,),
-            estop_generation=latched.estop_generation,
+        self._wake = asyncio.Event()
+        self._gatekeeper = Gatekeeper(
+            gate_config, robot.robot_type, bus, Path(config.state_dir), self._wake.set
         )
-        bus.time.boot = self._gate.boot
+        press = self._gatekeeper.press
+        self._button = ButtonWatch(bus, press) if config.button else None
         self._lockstep = Lockstep(robot.control.period_ticks) if driver.lockstep else None
         self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
         self._round_trip = RoundTrip()
-        self._wake = asyncio.Event()
         self._line = asyncio.Lock()  # one call at a time goes out to the body
         driver.emit = self._emit
         bus.report = self.report
+        bus.progress = lambda: self._gate.tick
 
     async def run(self, ready: Callable[[], None]) -> None:
         """Serve the body until cancelled; it is safe when this ends, however it ends."""
+        try:
+            async with self._driver:
+                await self._serve(ready)
+        finally:
+            await self._gatekeeper.close()
+
+    async def _serve(self, ready: Callable[[], None]) -> None:
         bus = self._bus
-        async with self._driver:
-            bus.subscribe(command_topic(self._robot), self._on_command, self._on_bad_command)
-            bus.subscribe(JOINT_CMD, self._on_joint_command)
-            bus.latest(SAFETY, self._on_safety)
-            bus.serve(ESTOP, self._on_estop)
-            bus.serve(RELEASE, self._on_release)
-            bus.serve(ENABLE, self._on_enable)
-            bus.publish(BODY, self._body)
-            ready()
-            async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(self._live())
-                tasks.create_task(self._obeying())
+        bus.subscribe(command_topic(self._robot), self._on_command, self._on_bad_command)
+        bus.subscribe(JOINT_CMD, self._on_joint_command)
+        bus.latest(SAFETY, self._on_safety)
+        self._gatekeeper.serve(self._driver.stop)
+        bus.publish(BODY, self._body)
+        ready()
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._live())
+            tasks.create_task(self._obeying())
 
     async def _live(self) -> None:
         async for passed in self._driver.ticks(self._bus.clock):
@@ -127,10 +125,12 @@ class DriverProcess:
     async def _tick(self, passed: int) -> None:
         """20 ms of the body's time, or several where the process was held up."""
         state = await self._driver.read_state()
-        faults = () if state.link.connected else (why.LINK_LOST,)
+        button = self._button.faults() if self._button else ()
+        faults = button if state.link.connected else (why.LINK_LOST, *button)
         for _ in range(passed):
-            self._step(gate.Tick(state.velocity, self._wall_ns(), faults))
+            self._gatekeeper.step(gate.Tick(state.velocity, self._wall_ns(), faults))
         self._bus.time.tick = self._gate.tick
+        self._gatekeeper.every_tick()
         if self._lockstep:
             await self._in_step(self._lockstep, state)
         else:
@@ -181,15 +181,9 @@ class DriverProcess:
     async def _newest_scan(self) -> Message | None:
         return await self._driver.get_sensor_data("scan") if self._robot.lidar else None
 
-    def _step(self, event: gate.Event) -> gate.Outcome:
-        """One event through the gate; what latches it is on disk before anybody is told."""
-        before = self._gate
-        self._gate, outcome = gate.step(self._gate_config, before, event)
-        if self._gate.output != before.output:
-            self._wake.set()
-        if _remembered(before) != _remembered(self._gate):
-            self._changed(before)
-        return outcome
+    @property
+    def _gate(self) -> gate.GateState:
+        return self._gatekeeper.state
 
     async def _obey(self) -> None:
         """Have the body do what the gate lets through."""
@@ -206,20 +200,9 @@ class DriverProcess:
             late = gate.age_ns(now, now.command.tick, self._wall_ns()) > STALE_NS
             self._bus.counters["stale_commands_executed"] += late
 
-    def _changed(self, before: gate.GateState) -> None:
-        now = self._gate
-        latched = why.latching(now.causes)
-        self._latch.write(Latched(causes=latched, estop_generation=now.estop_generation))
-        if now.mode != before.mode:
-            reason = why.in_words(now.causes) or f"commander {now.commander or 'nobody'}"
-            data = {"event": "gate", "mode": now.mode, "tick": now.tick, "reason": reason}
-            log.info("gate %s: %s", now.mode, reason, extra={"data": data})
-
     def _on_command(self, _key: str, command: CmdVel) -> None:
         arrived_ns = self._bus.clock.now_ns()
-        outcome = self._step(gate.Command(command, self._wall_ns()))
-        if outcome.refused:
-            self._bus.counters[f"refused_{outcome.refused}"] += 1
+        self._gatekeeper.command(gate.Command(command, self._wall_ns()))
         if command.boot == self._gate.boot:
             counts = self._gate.mode == "enabled"
             self._round_trip.answered(command.basis, arrived_ns, counts=counts)
@@ -239,33 +222,12 @@ class DriverProcess:
         speeds = (raw.linear_x, raw.linear_y, raw.angular_z)
         if all(abs(speed) < float("inf") for speed in speeds):
             return
-        self._step(gate.NotFinite(raw.source, raw.boot))
+        self._gatekeeper.step(gate.NotFinite(raw.source, raw.boot))
 
     def _on_safety(self, said: SafetyState) -> None:
-        self._step(gate.Safety(said))
+        self._gatekeeper.step(gate.Safety(said))
         if self._lockstep and said.boot == self._gate.boot:
             self._lockstep.verdict(said)
-
-    async def _on_estop(self, request: EstopRequest) -> GateReply:
-        await self._driver.stop()  # before anything else, disk and log included
-        log.warning("e-stop by %s %s", request.source, request.reason)
-        return self._reply(gate.Estop(request.source))
-
-    async def _on_release(self, request: ReleaseRequest) -> GateReply:
-        log.info("%s asks for a release", request.source)
-        return self._reply(gate.Release(request.estop_generation))
-
-    async def _on_enable(self, request: EnableRequest) -> GateReply:
-        return self._reply(gate.Enable(request.source, request.take))
-
-    def _reply(self, event: gate.Event) -> GateReply:
-        outcome = self._step(event)
-        return GateReply(
-            ok=outcome.ok,
-            text=outcome.text,
-            robot_type=self._robot.robot_type,
-            gate=gate.status(self._gate),
-        )
 
     def _wall_ns(self) -> int | None:
         """The host's clock; none where time is lock-stepped and the wall says nothing."""
@@ -279,10 +241,6 @@ class DriverProcess:
                 self._bus.latency_ms[name] = value
         if self._lockstep:
             self._bus.counters["lockstep_timeouts"] = self._lockstep.timeouts
-
-
-def _remembered(state: gate.GateState) -> tuple[object, ...]:
-    return state.mode, state.causes, state.estop_generation
 
 
 async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None:
@@ -301,4 +259,10 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
         emulator=config.emulator or str(ports_folder(config.body)),
     )
     robot, driver = make_driver(config.body, where)
+    if not driver.can(robot.safe_state):
+        known = ", ".join(name for name in get_args(SafeState) if driver.can(name))
+        raise ConfigError(
+            f"safe_state: {robot.safe_state} is more than {type(driver).__name__} can do; "
+            f"expected one of: {known}"
+        )
     await DriverProcess(config, robot, driver, bus).run(ready)

@@ -24,10 +24,13 @@ COMMANDS = {
     "driver new": ("driver_kit:new", "Write the package of a new driver."),
     "driver test": ("driver_kit:test", "Check a driver against all that it must do."),
     "driver trace": ("driver_kit:trace", "Show the bytes on a body's line, decoded."),
+    "button": ("process:button", "Start an e-stop button on a serial adapter."),
     "emulate": ("emulate:emulate", "Be a robot's body on real ports, in MuJoCo."),
     "estop": ("operate:estop", "Stop the robot at once, and latch it."),
     "release": ("operate:release", "Let go of a latched gate."),
     "enable": ("operate:enable", "Let the robot's brain drive."),
+    "audit": ("audit:audit", "Show who did what to the robot."),
+    "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
     "worlds": ("names:worlds", "List the simulated worlds that there are."),
     "record": ("record:record", "Record what a robot says into an MCAP file, until Ctrl-C."),
@@ -41,6 +44,7 @@ COMMANDS = {
     "view": ("view:view", "Draw a robot in its world into a PNG file."),
     "bench chain": ("bench:chain", "From scan to command, timed."),
     "bench stack": ("bench:stack", "CPU, memory and time to start."),
+    "faults": ("faults:faults", "Break the robot in 44 ways, and see whether it stops."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
@@ -96,8 +100,7 @@ def main() -> None:
         code = 130
     except BrokenPipeError:  # nobody reads on, as in `gigabrain robots | head -1`
         code = 1
-    with contextlib.suppress(BrokenPipeError):
-        sys.stdout.flush()
-    with contextlib.suppress(BrokenPipeError):
-        sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError):  # nobody is there to read it, or the disk is full
+            stream.flush()
     os._exit(code if isinstance(code, int) else 0)  # Zenoh's threads must not hold it back

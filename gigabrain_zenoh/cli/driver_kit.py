@@ -5,7 +5,10 @@ import os
 import sys
 import tempfile
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import LinkName
@@ -13,7 +16,12 @@ from gigabrain_zenoh.settings import LinkName
 COLOURS = {"pass": "green", "fail": "bold red", "n/a": "dim"}
 
 
-def test(name: str, *, link: Literal["sim", "emulated"] | None = None) -> int:  # noqa: PT028
+def test(
+    name: str,
+    *,
+    link: Literal["sim", "emulated"] | None = None,  # noqa: PT028
+    repeat: Annotated[int, Parameter(validator=Number(gte=1))] = 1,  # noqa: PT028
+) -> int:
     """Check whether a driver does all that every driver has to do; ends with 1 if it does not.
 
     Example: gigabrain driver test mycustombot --link emulated
@@ -26,6 +34,9 @@ def test(name: str, *, link: Literal["sim", "emulated"] | None = None) -> int:  
         A known robot, or the path of a robot's YAML file.
     link
         The emulated one, where the robot has one: it shows more than the simulated one.
+    repeat
+        How often each stop is tried, by silence, SIGKILL, and a line that is cut or hangs; the
+        table then shows the worst and the median.
     """
     from rich.console import Console
     from rich.table import Table
@@ -40,7 +51,7 @@ def test(name: str, *, link: Literal["sim", "emulated"] | None = None) -> int:  
     console = Console()
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder, console.status("") as status:
         running = find("gigabrain_drivers.conformance.kit:check")
-        results = asyncio.run(running(name, chosen, Path(folder), lambda r: status.update(r.check)))
+        results = asyncio.run(running(name, chosen, Path(folder), status.update, repeat))
     for result in results:
         colour = COLOURS[result.verdict]
         table.add_row(*result[:-1], f"[{colour}]{result.verdict}[/]")

@@ -1,6 +1,7 @@
 """`gigabrain demo` and `gigabrain up`: a whole robot."""
 
 import asyncio
+import errno
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -119,7 +120,7 @@ def _printer() -> Callable[[str], None]:
         try:
             if read:
                 print(line, flush=True)
-        except BrokenPipeError:
-            read = False
+        except OSError as error:  # the pager has ended, or the terminal; a disk may have room again
+            read = error.errno == errno.ENOSPC
 
     return say

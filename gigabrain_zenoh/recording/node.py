@@ -2,6 +2,7 @@
 
 import asyncio
 import functools
+import itertools
 import logging
 import threading
 import time
@@ -56,6 +57,12 @@ def path_of(config: RecorderConfig) -> Path:
     return folder / file_name()
 
 
+def free(path: Path) -> Path:
+    """`path`, or where it exists the first numbered one beside it that does not."""
+    others = (path.with_name(f"{path.stem}_{n}{path.suffix}") for n in itertools.count(1))
+    return path if not path.exists() else next(other for other in others if not other.exists())
+
+
 @contextmanager
 def listening(bus: Bus, recorder: Recorder, names: tuple[str, ...]) -> Iterator[None]:
     """Whatever comes over the bus goes to the recorder, while the block runs."""
@@ -96,7 +103,7 @@ def recover_others(folder: Path) -> None:
 
 async def run(config: RecorderConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Record until the process ends."""
-    path = path_of(config)
+    path = free(path_of(config))  # after a restart it goes on in another file
     recorder = Recorder(path, config)
     recover_others(path.parent)
     with recorder, listening(bus, recorder, config.topics):

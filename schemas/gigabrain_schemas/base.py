@@ -56,3 +56,4 @@ class Cause(Record, frozen=True, kw_only=True):
     code: Name  # see gigabrain_zenoh.causes
     text: Text  # a sentence for people
     latching: bool = False  # stays until a person releases it
+    remedy: Text = ""  # what to do about it, in the imperative

@@ -3,6 +3,7 @@
 import struct
 from typing import TypeVar
 
+from gigabrain_schemas.audit import AuditPage, AuditRecord, AuditRequest
 from gigabrain_schemas.base import Cause, Message, Pose, Velocity
 from gigabrain_schemas.body import (
     Battery,
@@ -28,6 +29,7 @@ from gigabrain_schemas.brain import (
     Twist,
     WorldModel,
 )
+from gigabrain_schemas.button import ButtonState
 from gigabrain_schemas.requests import (
     DescribeRequest,
     Description,
@@ -48,8 +50,12 @@ M = TypeVar("M", bound=Message)
 STAMP_NS = 1_767_225_600_000_000_000  # 2026-01-01
 BOOT = 81_985_529_216_486_895
 
-ZONE = Cause(code="zone_ahead", text="obstacle 0.14 m ahead of the body")
-LOW = Cause(code="battery_low", text="battery at 14 %")
+ZONE = Cause(
+    code="zone_ahead",
+    text="obstacle 0.14 m ahead of the body",
+    remedy="turn or back away, or clear the way",
+)
+LOW = Cause(code="battery_low", text="battery at 14 %", remedy="charge it soon")
 GATE = GateStatus(
     mode="enabled", causes=(ZONE,), estop_generation=2, commander="control", enables=3
 )
@@ -191,6 +197,9 @@ BRAIN: tuple[Message, ...] = (
 )  # fmt: skip
 
 SAFETY: tuple[Message, ...] = (
+    ButtonState(
+        stamp_ns=STAMP_NS, seq=40, boot=BOOT, tick=206, pressed=True, text="the contact is open"
+    ),
     SafetyState(
         stamp_ns=STAMP_NS, seq=103, boot=BOOT, tick=206, basis=205,
         verdict="slow",
@@ -222,10 +231,22 @@ SAFETY: tuple[Message, ...] = (
     ),
 )  # fmt: skip
 
+REFUSED = AuditRecord(
+    stamp_ns=STAMP_NS, seq=9, boot=BOOT, tick=206,
+    process="driver",
+    what="refused",
+    source="script-4711",
+    ok=False,
+    code="commander",
+    text="its commands are not obeyed (commander); control drives",
+    times=50,
+)  # fmt: skip
+AUDIT: tuple[Message, ...] = (REFUSED, AuditRequest(newest=20), AuditPage(records=(REFUSED,)))
+
 REQUESTS: tuple[Message, ...] = (
     EstopRequest(stamp_ns=STAMP_NS, seq=1, source="operator", reason="a child runs in"),
     ReleaseRequest(stamp_ns=STAMP_NS, seq=1, estop_generation=2, source="operator"),
-    EnableRequest(stamp_ns=STAMP_NS, seq=1, source="control", take=True),
+    EnableRequest(stamp_ns=STAMP_NS, seq=1, source="control", take=True, by="ann"),
     GateReply(
         stamp_ns=STAMP_NS, seq=1, boot=BOOT, tick=205,
         ok=True, text="control holds the body", robot_type="turtlebot3_waffle", gate=GATE,
@@ -248,7 +269,7 @@ REQUESTS: tuple[Message, ...] = (
 
 EXAMPLES: dict[str, Message] = {
     type(message).__name__: message
-    for message in (*SENSORS, *BODY, *BRAIN, *SAFETY, *REQUESTS)
+    for message in (*SENSORS, *BODY, *BRAIN, *SAFETY, *AUDIT, *REQUESTS)
 }  # fmt: skip
 
 

@@ -25,6 +25,7 @@ class EnableRequest(Message, frozen=True, kw_only=True):
 
     source: Name  # "control" for the robot's own brain
     take: bool = False  # even when somebody else holds the body
+    by: Name = ""  # the person who asks, where the source is the brain: it takes from nobody itself
 
 
 class GateReply(Message, frozen=True, kw_only=True):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
-from gigabrain_schemas import body, brain, requests, safety, sensors
+from gigabrain_schemas import audit, body, brain, button, requests, safety, sensors
 from gigabrain_schemas.base import Message
 
 M = TypeVar("M", bound=Message)
@@ -83,6 +83,11 @@ HEALTH = Topic(
     "robot/health", safety.Health, 1, priority="background", many=True, depth=32, max_bytes=16 * KB
 )
 LOG = Topic("robot/log", safety.LogRecord, 10, priority="background", depth=256, max_bytes=16 * KB)
+BUTTON = Topic(
+    "robot/button", button.ButtonState, 20, missed=4, priority="real_time", express=True,
+    max_bytes=KB,
+)  # fmt: skip
+AUDIT = Topic("robot/audit", audit.AuditRecord, 10, depth=256)
 
 
 def command_topic(of: body.BodyDescription) -> Topic[brain.CmdVel]:
@@ -92,7 +97,7 @@ def command_topic(of: body.BodyDescription) -> Topic[brain.CmdVel]:
 
 TOPICS: tuple[Topic[Any], ...] = (
     SCAN, IMU, STATE, BODY, IMAGE, WORLD, POSE, MAP, INTENT, TELEOP, CMD_VEL, JOINT_CMD, SAFETY,
-    HEALTH, LOG,
+    BUTTON, HEALTH, LOG, AUDIT,
 )  # fmt: skip
 
 ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time")
@@ -100,9 +105,21 @@ RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply)
 ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply)
 GOAL = Service("robot/goal", requests.GoalRequest, requests.GoalReply)
 MISSION = Service("robot/mission", requests.MissionRequest, requests.MissionReply)
+AUDIT_LOG = Service(
+    "robot/audit_log", audit.AuditRequest, audit.AuditPage, priority="background",
+    max_bytes=1024 * KB,
+)  # fmt: skip
 DESCRIBE = Service("robot/describe", requests.DescribeRequest, requests.Description, many=True)
 
-SERVICES: tuple[Service[Any, Any], ...] = (ESTOP, RELEASE, ENABLE, GOAL, MISSION, DESCRIBE)
+SERVICES: tuple[Service[Any, Any], ...] = (
+    ESTOP,
+    RELEASE,
+    ENABLE,
+    GOAL,
+    MISSION,
+    AUDIT_LOG,
+    DESCRIBE,
+)
 
 
 def messages() -> tuple[type[Message], ...]:

@@ -115,9 +115,12 @@ class Rig(Timeline):
         """A command as it is, header and all."""
         self.network.deliver(self.topic.at(), codec.encode(command))
 
-    async def drive(self, sign: float = 1.0) -> Velocity:
-        """Have the gate opened and the body moving; the velocity that is commanded from then on."""
-        wanted = Velocity(linear_x=sign * self.speed)
+    async def drive(self) -> Velocity:
+        """Have the gate opened and the body moving, to and fro in turn.
+
+        Returns the velocity that is commanded from then on.
+        """
+        wanted = Velocity(linear_x=self.subject.way() * self.speed)
         for _ in range(ATTEMPTS):
             self.wanted = ZERO
             await self._enable()
@@ -175,11 +178,11 @@ class Rig(Timeline):
         self.scan, self.scans = scan, self.scans + 1
 
 
-def stop_ticks(rig: Rig, reaction: int, body: int = 0) -> int:
+def stop_ticks(rig: Rig, reaction: int) -> int:
     """The most ticks from a cause to standstill: until it is seen, the ramp, and the body's own.
 
     What walks has to end its step, and to settle.
     """
     ramp = rig.speed / rig.robot.max_linear_deceleration / 0.02
     own = STEP_TICKS if rig.robot.drive_type == "quadruped" else SETTLE_TICKS
-    return reaction + round(ramp + 0.5) + (body or own)
+    return reaction + round(ramp + 0.5) + own

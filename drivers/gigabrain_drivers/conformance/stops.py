@@ -4,11 +4,13 @@ import asyncio
 import contextlib
 import math
 import sys
+from collections.abc import AsyncIterator
 
 import msgspec
 
 from gigabrain_drivers.conformance.result import Failed, Finding
-from gigabrain_drivers.conformance.rig import Rig, stop_ticks
+from gigabrain_drivers.conformance.rig import ATTEMPTS, Rig, stop_ticks
+from gigabrain_schemas.base import TICK_NS
 from gigabrain_zenoh.limits import ZERO
 
 SILENCE = 7  # ticks: 100 ms without a command, told in the next tick
@@ -26,7 +28,7 @@ async def silence(rig: Rig) -> Finding:
 
 async def not_a_number(rig: Rig) -> Finding:
     """The commander sends NaN: zero at once, without a ramp."""
-    await rig.drive(-1.0)
+    await rig.drive()
     rig.wanted = None
     last, calls = rig.last, len(rig.tap.calls)
     if last is None:
@@ -69,26 +71,31 @@ async def disorder(rig: Rig) -> Finding:
 
 async def killed(rig: Rig) -> Finding:
     """The commander is a process, and ends by SIGKILL."""
-    await rig.drive(-1.0)
-    wanted = rig.wanted
+    for _ in range(ATTEMPTS):
+        await rig.drive()
+        async with _commander(rig):
+            if await rig.until(lambda: rig.wanted is None, 250) is None:
+                raise Failed("the commander's process did not start")
+            await rig.go_on(15)
+            obeyed = rig.mode == "enabled"
+        if obeyed:
+            return await _stopped(rig, stop_ticks(rig, SILENCE))
+    raise Failed(f"the commander's process was not obeyed; gate {rig.mode}")
+
+
+@contextlib.asynccontextmanager
+async def _commander(rig: Rig) -> AsyncIterator[None]:
+    """A process that commands what the rig commanded; killed at the end."""
     commander = await asyncio.create_subprocess_exec(
         sys.executable, "-S", "-c", COMMANDER, stdout=asyncio.subprocess.PIPE
     )
+    relay = asyncio.create_task(_relay(rig, commander))
     try:
-        relay = asyncio.create_task(_relay(rig, commander))
-        if await rig.until(lambda: rig.wanted is None, 250) is None:
-            raise Failed("the commander's process did not start")
-        await rig.go_on(15)
-        if rig.mode != "enabled" or wanted is None:
-            raise Failed(f"the commander's process was not obeyed; gate {rig.mode}")
+        yield
     finally:
         commander.kill()
-        await commander.wait()
-    found = await _stopped(rig, stop_ticks(rig, SILENCE))
-    relay.cancel()
-    with contextlib.suppress(asyncio.CancelledError):
-        await relay
-    return found
+        relay.cancel()
+        await asyncio.gather(commander.wait(), relay, return_exceptions=True)
 
 
 async def _relay(rig: Rig, commander: asyncio.subprocess.Process) -> None:
@@ -104,4 +111,5 @@ async def _stopped(rig: Rig, most: int) -> Finding:
     ticks = await rig.until(lambda: rig.rests, most)
     if ticks is None:
         return Finding(False, f"still moving after {most} ticks")
-    return Finding(True, f"at rest after {ticks} ticks of at most {most}")
+    text = f"at rest after {ticks} ticks of at most {most}"
+    return Finding(True, text, {"at rest": ticks * TICK_NS / 1e6})

@@ -7,6 +7,7 @@ from typing import Self
 from gigabrain_drivers import catalog
 from gigabrain_drivers.base import Driver
 from gigabrain_drivers.conformance.result import NotApplicable
+from gigabrain_drivers.emulators.base import Device
 from gigabrain_drivers.emulators.emulator import BASE, Emulator
 from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.robot import Run
@@ -32,6 +33,7 @@ class Subject:
         self.run = Run(folder=folder, link=link, world=WORLD, emulator=str(folder / "ports"))
         self.robot, _, _, _ = catalog.load_link(name, self.run)
         self._emulator: Emulator | None = None
+        self._way = -1
 
     async def __aenter__(self) -> Self:
         if self.link == "emulated":
@@ -51,6 +53,11 @@ class Subject:
         """A new driver, not opened yet."""
         return catalog.make_driver(self.name, self.run)[1]
 
+    def way(self) -> int:
+        """1 or -1, the other one each time: who drives to and fro does not come to a wall."""
+        self._way = -self._way
+        return self._way
+
     @property
     def has_peer(self) -> bool:
         """Whether there is somebody at the other end of a line."""
@@ -66,6 +73,17 @@ class Subject:
     def faults(self, words: str) -> None:
         """Have these faults at the base's end of the line; none for an empty text."""
         self.peer.set(self.peer.faults_of(f"{BASE} {words}"))
+
+    @property
+    def promise(self) -> str:
+        """After how long without a command the body's own firmware stops its motors."""
+        device = type(self._emulator.stations[BASE].device) if self._emulator else Device
+        return f"{device.watchdog_ns / 1e6:.0f} ms ({device.promised_in})"
+
+    @property
+    def promised_ms(self) -> float:
+        """The same as a number [ms]."""
+        return self.peer.stations[BASE].device.watchdog_ns / 1e6
 
     def told(self, state: RobotState | None) -> tuple[float, float, float]:
         """What the motors are told now, as the peer knows it, or as the body moves without one."""

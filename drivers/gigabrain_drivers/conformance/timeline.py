@@ -2,7 +2,7 @@
 
 import abc
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from gigabrain_drivers.conformance.result import Failed
 
@@ -34,6 +34,22 @@ class Timeline(abc.ABC):
                 raise Failed(f"no tick for {PATIENCE_S:.0f} s")
             await asyncio.sleep(LOOK_S)
         return self.tick - begin
+
+    async def firsts(
+        self, conditions: Mapping[str, Callable[[], object]], ticks: int
+    ) -> dict[str, float]:
+        """After how long each condition first held [ms]; ends with the last, or after `ticks`."""
+        loop = asyncio.get_running_loop()
+        begin_s, found = loop.time(), dict[str, float]()
+
+        def look() -> bool:
+            for name, holds in conditions.items():
+                if name not in found and holds():
+                    found[name] = (loop.time() - begin_s) * 1e3
+            return len(found) == len(conditions)
+
+        await self.until(look, ticks)
+        return found
 
     async def go_on(self, ticks: int) -> None:
         """Let so many ticks pass."""

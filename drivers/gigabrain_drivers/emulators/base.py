@@ -14,11 +14,10 @@ from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.kinematics import Gait
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.sim.pace import Pace
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry, Simulation
 from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_zenoh.errors import BodyLost
-
-LATE_S = 0.25  # further behind than this, time is dropped instead of raced after
 
 
 class Snapshot(NamedTuple):
@@ -102,14 +101,9 @@ class EmulatedBody:
         }
 
     def _work(self) -> None:
-        start, done, began = time.perf_counter(), 0, time.thread_time()
+        pace, began = Pace(TICK_S), time.thread_time()
         while not self._halt.is_set():
-            done += 1
-            wait = start + done * TICK_S - time.perf_counter()
-            if wait > 0:
-                time.sleep(wait)
-            elif wait < -LATE_S:
-                start -= wait
+            pace.wait()
             try:
                 self._step()
             except BodyLost as error:
@@ -168,6 +162,8 @@ class Device(abc.ABC):
 
     Options: ClassVar[type[Struct]]  # those of the driver or scan source that it answers
     period_s: ClassVar[float] = 0.01  # between two steps
+    watchdog_ns: ClassVar[int] = 150_000_000  # without a command, until its motors are told zero
+    promised_in: ClassVar[str] = "the rule for firmware"  # where its makers say so
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         self.body, self.options, self.wire = body, options, wire

@@ -4,8 +4,9 @@ import functools
 import importlib
 from collections.abc import Mapping
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import msgspec
 
@@ -15,6 +16,7 @@ from gigabrain_drivers.emulators.base import Device, EmulatedBody
 from gigabrain_drivers.emulators.faults import NONE, Faults
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.emulators.station import Station
+from gigabrain_drivers.emulators.tcp import TcpPort
 from gigabrain_drivers.robot import LinkOptions, Run
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError, unknown
@@ -93,9 +95,22 @@ def device_class(driver: str) -> type[Device]:
     if driver not in DEVICES and driver in offered:
         return offered[driver].load()  # type: ignore[no-any-return]
     if driver not in DEVICES:
-        raise unknown("emulator for driver", driver, DEVICES)
+        raise unknown("emulator for driver", driver, [*DEVICES, *offered])
     module, _, attribute = DEVICES[driver].partition(":")
     return getattr(importlib.import_module(module), attribute)  # type: ignore[no-any-return]
+
+
+def wire_of(name: str) -> Literal["serial", "tcp", ""]:
+    """What an emulated robot's base is plugged into; nothing where it cannot be emulated.
+
+    Raises ConfigError, and UnknownName.
+    """
+    if "emulated" not in catalog.links_of(catalog.load_robot(name)):
+        return ""
+    run = Run(folder=Path(), link="emulated")
+    _, _, options, _ = catalog.load_link(name, run)
+    port = device_class(options.driver).port(options)
+    return "tcp" if isinstance(port, TcpPort) else "serial"
 
 
 def _parts(options: LinkOptions) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from gigabrain_drivers.protocols.line import LONGEST, Field
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.limits import clamp, limits_of
 
-SILENT_NS = 150_000_000  # after the last command, until the motors stop
 BOOT_NS = 300_000_000  # from power-on to the first state line
 BROWN_OUT_SHARE = 0.6  # of the battery's voltage; with less the board holds itself in reset
 BANNER = b"\x00\xf8firmware of a base on a text line\r\nready\r\n"
@@ -29,6 +28,8 @@ class LineBase(Device):
 
     Options = LineOptions
     period_s = 0.005
+    watchdog_ns = 150_000_000
+    promised_in = "firmware_line.md"
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         super().__init__(body, options, wire)
@@ -106,7 +107,7 @@ class LineBase(Device):
         """Whether the last command will be too old by the next step."""
         if self._obeyed_ns is None:
             return True
-        return self._now_ns + self.period_s * 1e9 - self._obeyed_ns > SILENT_NS
+        return self._now_ns + self.period_s * 1e9 - self._obeyed_ns > self.watchdog_ns
 
     def _browned_out(self) -> bool:
         voltage = self.body.snapshot.battery.voltage

@@ -11,7 +11,6 @@ from gigabrain_drivers.protocols.dynamixel import Packet
 
 FIRMWARE = 5
 BUFFER = 1024  # of the slave library; what does not fit into it is not answered
-HEARTBEAT_NS = 500_000_000  # after which the wheels stop
 CALIBRATION_NS = 5_000_000_000  # for which the board does nothing else
 BROWN_OUT_V = 7.0  # below which it is off
 MODELS = {"turtlebot3_burger": (1, 61), "turtlebot3_waffle": (2, 77)}  # number, greatest rpm
@@ -45,6 +44,8 @@ class OpenCr(Device):
 
     Options = OpenCrOptions
     period_s = 0.02  # both of the table's refresh and of the motors' control
+    watchdog_ns = 500_000_000  # after the heartbeat's last change
+    promised_in = "OpenCR's firmware"
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         super().__init__(body, options, wire)
@@ -133,7 +134,7 @@ class OpenCr(Device):
         if table[opencr.HEARTBEAT] != self._beat:
             self._beat, self._changed_ns = table[opencr.HEARTBEAT], now_ns
             table[HOST] = True
-        elif now_ns - self._changed_ns >= HEARTBEAT_NS:
+        elif now_ns - self._changed_ns >= self.watchdog_ns:
             table[HOST] = False
         if not table[HOST] and not table[DEBUG]:
             self._goal = (0.0, 0.0)

@@ -1,11 +1,8 @@
 """The emulator's process: beside a driver under a supervisor, or by itself for whoever likes."""
 
 import asyncio
-import contextlib
 import logging
-import os
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -14,13 +11,12 @@ from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.faults import Faults
 from gigabrain_drivers.robot import Run
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.child import Lines
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.settings import EmulatorConfig
+from gigabrain_zenoh.typed import typed_lines
 
 log = logging.getLogger(__name__)
 
-READ_BYTES = 4096
 LOOK_S = 0.05  # how often the file with the faults is looked at
 FAULTS_FILE = "faults.json"  # {STATION: {FAULT: VALUE}}, in the folder of the ports
 
@@ -40,7 +36,7 @@ async def emulate(config: EmulatorConfig, say: Callable[[str], None]) -> None:
             say(f"{config.body} in {config.world}: {name} at {where(port)}")
         say(f"faults, one line each: [{'|'.join(emulator.stations)}] "
             f"{' '.join(Faults.__struct_fields__)}; off ends them")  # fmt: skip
-        with _lines(lambda line: _told(emulator, line, say)):
+        with typed_lines(lambda line: _told(emulator, line, say)):
             await watch(emulator, Path(config.folder) / FAULTS_FILE)
 
 
@@ -97,26 +93,3 @@ def _told(emulator: Emulator, line: str, say: Callable[[str], None]) -> None:
         emulator.set(emulator.faults_of(line))
     except ConfigError as error:
         say(str(error))
-
-
-@contextlib.contextmanager
-def _lines(take: Callable[[str], None]) -> Iterator[None]:
-    """Call `take` with each line of standard input, where that can be waited for."""
-    loop, fd, lines = asyncio.get_running_loop(), sys.stdin.fileno(), Lines()
-
-    def readable() -> None:
-        data = os.read(fd, READ_BYTES)
-        for line in lines.feed(data):
-            take(line.decode(errors="replace"))
-        if not data:
-            loop.remove_reader(fd)
-
-    try:
-        loop.add_reader(fd, readable)
-    except OSError:  # a file
-        yield
-        return
-    try:
-        yield
-    finally:
-        loop.remove_reader(fd)

@@ -31,7 +31,8 @@ class LegOdometry:
     def update(self, senses: Senses, passed_s: float) -> None:
         """Take in a sample, `passed_s` after the one before."""
         passed_s = min(passed_s, LONGEST_S)
-        velocity = self._by_accelerometer(senses, passed_s)
+        tilt = senses.tilt()
+        velocity = self._by_accelerometer(senses, tilt, passed_s)
         firm = zip(senses.contacts, self._stood, strict=True)
         by_feet = [self._by_foot(senses, leg) for leg, both in enumerate(firm) if all(both)]
         if by_feet:
@@ -43,7 +44,7 @@ class LegOdometry:
                 velocity[2] + share * (z - velocity[2]),
             )
         self._velocity, self._stood = velocity, senses.contacts
-        self.velocity = Twist(*_level(senses, velocity), senses.angular_velocity[2])
+        self.velocity = Twist(*_level(tilt, velocity), senses.angular_velocity[2])
         x, y, turn = self.velocity
         self.pose = advanced(self.pose, Twist(x * passed_s, y * passed_s, turn * passed_s))
 
@@ -52,16 +53,19 @@ class LegOdometry:
         leg, joints = self._geometry.legs[number], senses.joints[number]
         rates, radius = senses.rates[number], self._geometry.foot
         x, y, z = leg.foot(joints)
-        by_joint = leg.jacobian(joints)
-        moved = [sum(c[i] * r for c, r in zip(by_joint, rates, strict=True)) for i in range(3)]
-        moved[0] -= radius * (rates[1] + rates[2]) * math.cos(joints[0])  # the ball rolls
-        moved[1] += radius * rates[0]
+        (ax, ay, az), (bx, by, bz), (cx, cy, cz) = leg.jacobian(joints)
+        a, b, c = rates
+        moved_x = ax * a + bx * b + cx * c - radius * (b + c) * math.cos(joints[0])
+        moved_y = ay * a + by * b + cy * c + radius * a  # the ball rolls
+        moved_z = az * a + bz * b + cz * c
         turned = _cross(senses.angular_velocity, (x, y, z - radius))
-        return -moved[0] - turned[0], -moved[1] - turned[1], -moved[2] - turned[2]
+        return -moved_x - turned[0], -moved_y - turned[1], -moved_z - turned[2]
 
-    def _by_accelerometer(self, senses: Senses, passed_s: float) -> Vector:
+    def _by_accelerometer(
+        self, senses: Senses, tilt: tuple[float, float], passed_s: float
+    ) -> Vector:
         """The velocity of the last sample, and what it has gained since [m/s]."""
-        roll, pitch = senses.tilt()
+        roll, pitch = tilt
         level = GRAVITY * math.cos(pitch)
         down = (-GRAVITY * math.sin(pitch), level * math.sin(roll), level * math.cos(roll))
         felt, before = senses.linear_acceleration, self._velocity
@@ -70,9 +74,9 @@ class LegOdometry:
         return before[0] + gained[0], before[1] + gained[1], before[2] + gained[2]
 
 
-def _level(senses: Senses, velocity: Vector) -> tuple[float, float]:
+def _level(tilt: tuple[float, float], velocity: Vector) -> tuple[float, float]:
     """The velocity along the floor, ahead and to the left [m/s]."""
-    roll, pitch = senses.tilt()
+    roll, pitch = tilt
     x, y, z = velocity
     sideways = math.cos(roll) * y - math.sin(roll) * z
     rising = math.sin(roll) * y + math.cos(roll) * z

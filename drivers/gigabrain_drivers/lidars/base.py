@@ -24,6 +24,7 @@ class ScanSource(abc.ABC):
     """
 
     Options: ClassVar[type[ScanOptions]] = ScanOptions  # its part of a robot's file
+    turns_hz: ClassVar[float | None] = None  # turns a second, where nobody can change them
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         self.options, self.lidar, self.clock = options, lidar, clock
@@ -55,6 +56,16 @@ def source_class(name: str) -> type[ScanSource]:
         raise unknown("lidar", name, SCAN_SOURCES)
     module, _, attribute = SCAN_SOURCES[name].partition(":")
     return cast("type[ScanSource]", getattr(importlib.import_module(module), attribute))
+
+
+def check_rate(name: str, lidar: Lidar | None) -> None:
+    """Raise ConfigError where the lidar called `name` does not turn as fast as `lidar` says."""
+    turns_hz = source_class(name).turns_hz
+    if lidar and turns_hz and lidar.rate_hz != turns_hz:
+        raise ConfigError(
+            f"its lidar has rate_hz {lidar.rate_hz:g}, but an {name} makes {turns_hz:g} turns a "
+            f"second; beside its `scan` write `lidar:` with rate_hz: {turns_hz:g}"
+        )
 
 
 def carry(driver: Driver, clock: Clock) -> ScanSource | None:

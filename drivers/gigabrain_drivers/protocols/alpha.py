@@ -16,22 +16,23 @@ from typing import NamedTuple
 
 from gigabrain_drivers.kinematics import Gait
 from gigabrain_drivers.legs.senses import Senses
+from gigabrain_drivers.protocols.frames import FrameDecoder
 
 PORT = 8080
 SILENCE_NS = 100_000_000  # without a sound command, after which the body stops
 STALE_MS = 150  # a command that rests on an older state than this is refused
 STATE_HZ = 100
 MAGIC, VERSION = b"\xa5\x5a", 1
-WALK, STOP, STATE = 0x01, 0x02, 0x81
+WALK, STOP, PARK, STATE = 0x01, 0x02, 0x03, 0x81
 SEQUENCES = 1 << 32
 
-WALKING, SILENT, FALLEN = 1, 2, 4  # flags: feet step; stopped by silence; lies on the floor
+WALKING, SILENT, FALLEN, PARKED = 1, 2, 4, 8  # flags: feet step; stopped by silence; fell; lies
 
 _HEADER = struct.Struct("<2sHBBI")
 _CRC = struct.Struct("<I")
 _GAIT = struct.Struct("<I10f")
 _STATE = struct.Struct("<III B B 3f 4f3f3f 36f 12h")
-_LENGTHS = {WALK: _GAIT.size, STOP: 0, STATE: _STATE.size}
+_LENGTHS = {WALK: _GAIT.size, STOP: 0, PARK: 0, STATE: _STATE.size}
 _FASTEST = 1e4  # beyond which, either way, no number in a state is a measurement
 
 
@@ -83,6 +84,11 @@ def walk(command: Walk, sequence: int) -> bytes:
 def stop(sequence: int) -> bytes:
     """A command to come to rest and stand."""
     return encode(Frame(STOP, sequence))
+
+
+def park(sequence: int) -> bytes:
+    """A command to come to rest and lie down, and to stay so until the next step is asked for."""
+    return encode(Frame(PARK, sequence))
 
 
 def walk_of(frame: Frame) -> Walk | None:
@@ -170,6 +176,8 @@ def describe(frame: Frame) -> str:
             f"turn {gait.turn:.4f} rad, frequency {gait.frequency:.2f} Hz, duty {gait.duty:.2f}, "
             f"height {gait.height:.3f} m; seen {command.seen} ms"
         )
+    if frame.type == PARK:
+        return f"{frame.sequence} park"
     if frame.type == STOP:
         return f"{frame.sequence} stop"
     if frame.type == STATE and (now := state_of(frame)):
@@ -181,60 +189,24 @@ def describe(frame: Frame) -> str:
     return f"{frame.sequence} unsound frame of type {frame.type:#04x}"
 
 
-class Decoder:
-    """Finds frames in whatever comes in. `errors` counts stretches of bytes that were no frame.
+class Decoder(FrameDecoder[Frame]):
+    """Finds frames in whatever comes in."""
 
-    A broken frame costs no more than itself: the search goes on right behind its magic.
-    """
+    HEADER = MAGIC
 
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self._lost = False  # inside a stretch that was counted
-        self.errors = 0
+    def _size(self, buffer: bytearray) -> int | None:
+        if len(buffer) < _HEADER.size:
+            return None
+        _, length, kind, version, _ = _HEADER.unpack_from(buffer)
+        right = version == VERSION and _LENGTHS.get(kind) == length
+        return _HEADER.size + int(length) + _CRC.size if right else 0
 
-    def clear(self) -> None:
-        """Forget what has begun to come in."""
-        self._buffer.clear()
-        self._lost = False
-
-    def feed(self, data: bytes) -> list[Frame]:
-        """The frames that `data` completes, in order."""
-        buffer, frames = self._buffer, []
-        buffer += data
-        while self._at_magic():
-            if len(buffer) < _HEADER.size:
-                break
-            _, length, kind, version, sequence = _HEADER.unpack_from(buffer)
-            size = _HEADER.size + length + _CRC.size
-            if version != VERSION or _LENGTHS.get(kind) != length:
-                self._skip(len(MAGIC))
-            elif len(buffer) < size:
-                break
-            elif (
-                zlib.crc32(buffer[: size - _CRC.size])
-                != _CRC.unpack_from(buffer, size - _CRC.size)[0]
-            ):
-                self._skip(len(MAGIC))
-            else:
-                payload = bytes(buffer[_HEADER.size : size - _CRC.size])
-                frames.append(Frame(kind, sequence, payload))
-                del buffer[:size]
-                self._lost = False
-        return frames
-
-    def _at_magic(self) -> bool:
-        """Drop what is before the next magic; whether there is one."""
-        at = self._buffer.find(MAGIC)
-        if at < 0:
-            at = len(self._buffer) - self._buffer.endswith(MAGIC[:1])
-        if at:
-            self._skip(at)
-        return len(self._buffer) >= len(MAGIC)
-
-    def _skip(self, count: int) -> None:
-        del self._buffer[:count]
-        self.errors += not self._lost
-        self._lost = True
+    def _frame(self, data: bytes) -> Frame | None:
+        body, (crc,) = data[: -_CRC.size], _CRC.unpack(data[-_CRC.size :])
+        if zlib.crc32(body) != crc:
+            return None
+        _, _, kind, _, sequence = _HEADER.unpack_from(body)
+        return Frame(kind, sequence, body[_HEADER.size :])
 
 
 def _by_leg(values: list[float]) -> tuple[tuple[float, float, float], ...]:

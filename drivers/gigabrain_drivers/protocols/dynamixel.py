@@ -6,6 +6,8 @@ Source: https://emanual.robotis.com/docs/en/dxl/protocol2/
 import struct
 from typing import NamedTuple
 
+from gigabrain_drivers.protocols.frames import FrameDecoder
+
 HEADER = b"\xff\xff\xfd\x00"
 PING, READ, WRITE, STATUS = 0x01, 0x02, 0x03, 0x55
 LONGEST = 1024  # of the length field; nothing here sends as much, so more is noise
@@ -36,7 +38,7 @@ def _crc_table() -> tuple[int, ...]:
 _TABLE = _crc_table()
 
 
-def crc16(data: bytes | bytearray) -> int:
+def crc16(data: bytes) -> int:
     """The check of `data`: polynomial 0x8005, from 0, nothing reflected."""
     crc = 0
     for byte in data:
@@ -72,74 +74,28 @@ def status(device: int, data: bytes = b"", error: int = 0) -> bytes:
     return encode(Packet(device, STATUS, bytes([error]) + data))
 
 
-class Decoder:
-    """Finds packets in whatever comes in. `errors` counts stretches of bytes that were no packet.
+class Decoder(FrameDecoder[Packet]):
+    """Finds packets in whatever comes in."""
 
-    A broken packet costs no more than itself: the search goes on right behind its header.
-    """
+    HEADER = HEADER
 
     def __init__(self, longest: int = LONGEST) -> None:
+        super().__init__()
         self._longest = longest
-        self._buffer = bytearray()
-        self._lost = False  # inside a stretch that was counted
-        self.errors = 0
 
-    def clear(self) -> None:
-        """Forget what has begun to come in."""
-        self._buffer.clear()
-        self._lost = False
-
-    def feed(self, data: bytes) -> list[Packet]:
-        """The packets that `data` completes, in order."""
-        buffer, packets = self._buffer, []
-        buffer += data
-        while self._at_header():
-            size = self._size()
-            if size is None:
-                break
-            if size == 0 or buffer.find(HEADER, len(HEADER), size - _CRC) > 0:
-                self._skip(len(HEADER))  # stuffing leaves no header inside a packet
-            elif len(buffer) < size:
-                break
-            elif crc16(buffer[: size - _CRC]) != int.from_bytes(
-                buffer[size - _CRC : size], "little"
-            ):
-                self._skip(len(HEADER))
-            else:
-                packets.append(_packet(bytes(buffer[:size])))
-                del buffer[:size]
-                self._lost = False
-        return packets
-
-    def _at_header(self) -> bool:
-        """Drop what is before the next header; whether there is one."""
-        at = self._buffer.find(HEADER)
-        if at < 0:
-            at = len(self._buffer) - _begun(self._buffer)
-        if at:
-            self._skip(at)
-        return len(self._buffer) >= len(HEADER)
-
-    def _size(self) -> int | None:
-        """Bytes of the packet that begins here; 0: it cannot be one, None: not known yet."""
-        if len(self._buffer) < _PREFIX:
+    def _size(self, buffer: bytearray) -> int | None:
+        if len(buffer) < _PREFIX:
             return None
-        length = int.from_bytes(self._buffer[_PREFIX - 2 : _PREFIX], "little")
-        return _PREFIX + length if 1 + _CRC <= length <= self._longest else 0
+        length = int.from_bytes(buffer[_PREFIX - 2 : _PREFIX], "little")
+        size = _PREFIX + length
+        if not 1 + _CRC <= length <= self._longest:
+            return 0
+        inside = buffer.find(HEADER, len(HEADER), size - _CRC)
+        return 0 if inside > 0 else size  # stuffing leaves no header inside a packet
 
-    def _skip(self, count: int) -> None:
-        del self._buffer[:count]
-        self.errors += not self._lost
-        self._lost = True
-
-
-def _begun(buffer: bytearray) -> int:
-    """How many bytes at the end may be the beginning of a header."""
-    return next((n for n in (3, 2, 1) if buffer.endswith(HEADER[:n])), 0)
-
-
-def _intact(frame: bytearray) -> bool:
-    return crc16(frame[:-_CRC]) == int.from_bytes(frame[-_CRC:], "little")
+    def _frame(self, data: bytes) -> Packet | None:
+        right = crc16(data[:-_CRC]) == int.from_bytes(data[-_CRC:], "little")
+        return _packet(data) if right else None
 
 
 def _packet(frame: bytes) -> Packet:

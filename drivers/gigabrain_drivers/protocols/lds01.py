@@ -7,6 +7,8 @@ published; so a packet is known by its structure, and counts when the next one f
 import struct
 from typing import NamedTuple
 
+from gigabrain_drivers.protocols.frames import FrameDecoder
+
 BAUD = 230_400
 START, STOP = b"b", b"e"
 PACKETS, SAMPLES = 60, 6  # per turn, per packet
@@ -47,36 +49,20 @@ def describe_command(command: bytes) -> str:
     return {START: "start", STOP: "stop"}.get(command, "unknown command")
 
 
-class Decoder:
-    """Finds packets in whatever comes in. `errors` counts stretches of other bytes."""
+class Decoder(FrameDecoder[Packet]):
+    """Finds packets in whatever comes in; each waits for the header of the next."""
 
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self._lost = False
-        self.errors = 0
+    HEADER = bytes([_SYNC])
 
-    def clear(self) -> None:
-        """Forget what has begun to come in."""
-        self._buffer.clear()
-        self._lost = False
+    def _size(self, buffer: bytearray) -> int | None:
+        if len(buffer) < SIZE + 2:
+            return None
+        number = buffer[1] - _FIRST
+        follows = buffer[SIZE] == _SYNC and buffer[SIZE + 1] == _FIRST + (number + 1) % PACKETS
+        return SIZE if 0 <= number < PACKETS and follows else 0
 
-    def feed(self, data: bytes) -> list[Packet]:
-        """The packets that `data` completes, in order; each waits for the header of the next."""
-        buffer, packets = self._buffer, []
-        buffer += data
-        while len(buffer) >= SIZE + 2:
-            number = buffer[1] - _FIRST
-            follows = buffer[SIZE] == _SYNC and buffer[SIZE + 1] == _FIRST + (number + 1) % PACKETS
-            if buffer[0] == _SYNC and 0 <= number < PACKETS and follows:
-                packets.append(_packet(bytes(buffer[:SIZE])))
-                del buffer[:SIZE]
-                self._lost = False
-            else:
-                at = buffer.find(_SYNC, 1)
-                del buffer[: at if at > 0 else len(buffer)]
-                self.errors += not self._lost
-                self._lost = True
-        return packets
+    def _frame(self, data: bytes) -> Packet:
+        return _packet(data)
 
 
 def _packet(frame: bytes) -> Packet:

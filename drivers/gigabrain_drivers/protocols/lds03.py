@@ -8,6 +8,8 @@ import struct
 from functools import reduce
 from typing import NamedTuple
 
+from gigabrain_drivers.protocols.frames import FrameDecoder
+
 BAUD = 230_400
 
 _HEADER = b"\xaa\x55"
@@ -80,63 +82,30 @@ def describe_command(command: bytes) -> str:
     return {START: "start", STOP: "stop"}.get(command, "unknown command")
 
 
-class Decoder:
-    """Finds packets in whatever comes in. `errors` counts stretches of other bytes."""
+class Decoder(FrameDecoder[Packet]):
+    """Finds packets in whatever comes in."""
 
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self._lost = False
-        self.errors = 0
+    HEADER = _HEADER
 
-    def clear(self) -> None:
-        """Forget what has begun to come in."""
-        self._buffer.clear()
-        self._lost = False
+    def _size(self, buffer: bytearray) -> int | None:
+        if len(buffer) < _PREFIX:
+            return None
+        count = buffer[3]
+        return _PREFIX + 3 * count if count and buffer[4] & buffer[6] & 1 else 0
 
-    def feed(self, data: bytes) -> list[Packet]:
-        """The packets that `data` completes, in order."""
-        buffer, packets = self._buffer, []
-        buffer += data
-        while self._at_header():
-            if len(buffer) < _PREFIX:
-                break
-            count = buffer[3]
-            size = _PREFIX + 3 * count
-            if count == 0 or not buffer[4] & buffer[6] & 1:
-                self._skip(len(_HEADER))
-            elif len(buffer) < size:
-                break
-            elif _check(buffer[2:8], buffer[_PREFIX:size]) != buffer[8] | buffer[9] << 8:
-                self._skip(len(_HEADER))
-            else:
-                packets.append(_packet(bytes(buffer[:size])))
-                del buffer[:size]
-                self._lost = False
-        return packets
-
-    def _at_header(self) -> bool:
-        """Drop what is before the next header; whether there is one."""
-        at = self._buffer.find(_HEADER)
-        if at < 0:
-            at = len(self._buffer) - self._buffer.endswith(_HEADER[:1])
-        if at:
-            self._skip(at)
-        return len(self._buffer) >= len(_HEADER)
-
-    def _skip(self, count: int) -> None:
-        del self._buffer[:count]
-        self.errors += not self._lost
-        self._lost = True
+    def _frame(self, data: bytes) -> Packet | None:
+        right = _check(data[2:8], data[_PREFIX:]) == int.from_bytes(data[8:10], "little")
+        return _packet(data) if right else None
 
 
-def _check(head: bytes | bytearray, body: bytes | bytearray) -> int:
+def _check(head: bytes, body: bytes) -> int:
     """The exclusive or of the packet's 16-bit words; of each sample its first byte by itself."""
     low = _xor(head[0::2]) ^ _xor(body[0::3]) ^ _xor(body[1::3])
     high = _xor(head[1::2]) ^ _xor(body[2::3])
     return 0x55AA ^ (low | high << 8)
 
 
-def _xor(data: bytes | bytearray) -> int:
+def _xor(data: bytes) -> int:
     return reduce(operator.xor, data, 0)
 
 

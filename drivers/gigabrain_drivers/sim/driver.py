@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeVar
 from gigabrain_drivers.base import Driver
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
+from gigabrain_drivers.sim.pace import Pace
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.tick import TICK_NS as STEP_NS
 from gigabrain_drivers.sim.worlds import load_world
@@ -33,7 +34,6 @@ T = TypeVar("T")
 STEPS = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
 STEP_S = STEP_NS / 1e9
 DEAD_MAN_NS = 150_000_000  # of simulated time: as long as a firmware would wait
-LATE_S = 0.25  # further behind than this, time is dropped instead of raced after
 SPEEDS = (0.1, 100.0)
 
 
@@ -92,6 +92,14 @@ class MujocoDriver(Driver):
     async def stop(self) -> None:
         """Come to rest."""
         self._simulation.command(0.0, 0.0)
+
+    async def park(self) -> None:
+        """As it stands: the physics ends with this process, and the body with it."""
+        await self.stop()
+
+    async def limp(self) -> None:
+        """As it stands, see `park`."""
+        await self.stop()
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
         """One tick per 20 ms of simulated time; ends when the run's seconds are over."""
@@ -161,7 +169,7 @@ class MujocoDriver(Driver):
 
     def _work(self) -> None:
         """The physics thread."""
-        start, done = time.perf_counter(), 0
+        pace = Pace(STEP_S / self.run.speed)
         while not self._halt.is_set():
             if self.lockstep:
                 self._permits.acquire()
@@ -172,8 +180,7 @@ class MujocoDriver(Driver):
             scans = self._ticks >= self._next_scan
             for step in range(STEPS):
                 # only a scan needs the thread between two states; waking it costs like a step
-                done += 1 if scans else STEPS * (step == 0)
-                start = self._keep_pace(start, done)
+                pace.wait(1 if scans else STEPS * (step == 0))
                 if self._halt.is_set():
                     return
                 try:
@@ -181,15 +188,6 @@ class MujocoDriver(Driver):
                 except BodyLost as error:
                     self._post(error)
                     return
-
-    def _keep_pace(self, start: float, done: int) -> float:
-        """Sleep until step `done` is due by absolute deadlines; returns where they count from."""
-        wait = start + done * STEP_S / self.run.speed - time.perf_counter()
-        if wait > 0:
-            time.sleep(wait)
-        elif wait < -LATE_S:
-            start -= wait
-        return start
 
     def _step(self, *, last: bool) -> Reading:
         if self._simulation.time_ns - self._commanded_ns >= DEAD_MAN_NS:

@@ -76,12 +76,12 @@ class Truth:
     def _touch(self) -> None:
         """Count contacts between the robot and obstacles that begin in this tick."""
         pairs = self._data.contact.geom
-        with_obstacle = self._is_obstacle[pairs].any(axis=1)
+        with_obstacle = self._is_obstacle[pairs]
         self.touching = bool(with_obstacle.any())
         if not self.touching:
             return
         self.min_clearance_m = 0.0
-        for pair in pairs[with_obstacle]:
+        for pair in pairs[with_obstacle.any(axis=1)]:
             thing = int(pair[self._is_obstacle[pair]][0])
             if self._ticks - self._last_touch.get(thing, -APART_TICKS) >= APART_TICKS:
                 self.contacts += 1

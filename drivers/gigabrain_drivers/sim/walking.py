@@ -3,6 +3,7 @@
 import math
 
 import mujoco
+import numpy as np
 
 from gigabrain_drivers.kinematics import Gait, Twist
 from gigabrain_drivers.legs.geometry import JOINT_NAMES, LEGS, Vector
@@ -24,9 +25,9 @@ class Walking(Locomotion):
     def __init__(self, body: SimQuadruped, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         self._body, self._data = body, data
         names = [f"{ROBOT}{name}" for name in JOINT_NAMES]
-        self._angles = [int(model.joint(name).qposadr[0]) for name in names]
-        self._motors = [int(model.actuator(name).id) for name in names]
-        self._touch = [int(model.sensor(f"{ROBOT}{leg}_contact").adr[0]) for leg in LEGS]
+        self._angles = np.array([model.joint(name).qposadr[0] for name in names])
+        self._motors = np.array([model.actuator(name).id for name in names])
+        self._touch = np.array([model.sensor(f"{ROBOT}{leg}_contact").adr[0] for leg in LEGS])
         self._heat = [MotorHeat(body.motor) for _ in names]
         self._radians = math.tau / body.encoder_ticks
         self._gait = body.walker.to_gait(REST)
@@ -59,9 +60,7 @@ class Walking(Locomotion):
         """Where the servos shall be at the end of the tick."""
         if self._senses:
             self._targets = self._trot.step(self._gait, self._senses, TICK_S)
-        control = self._data.ctrl
-        for motor, target in zip(self._motors, _flat(self._targets), strict=True):
-            control[motor] = target
+        self._data.ctrl[self._motors] = _flat(self._targets)
 
     def sense(self, imu: ImuSample) -> None:
         """Encoders, feet and inertial unit become one sample."""
@@ -84,12 +83,11 @@ class Walking(Locomotion):
 
     def wear(self) -> float:
         """Torque heats the windings; what the joints do to the world comes on top."""
-        effort, power = self._data.actuator_force.tolist(), 0.0
+        power, resistance = 0.0, self._body.motor.resistance_ohm
         rates = _flat(self._senses.rates) if self._senses else [0.0] * len(self._heat)
-        for heat, motor, rate in zip(self._heat, self._motors, rates, strict=True):
-            amperes = heat.warm(0.0, effort[motor])
-            power += amperes * amperes * self._body.motor.resistance_ohm
-            power += max(effort[motor] * rate, 0.0)
+        for heat, effort, rate in zip(self._heat, self._efforts(), rates, strict=True):
+            amperes = heat.warm(0.0, effort)
+            power += amperes * amperes * resistance + max(effort * rate, 0.0)
         return power / self._body.battery.nominal_voltage
 
     def odometry(self) -> Odometry:
@@ -103,17 +101,20 @@ class Walking(Locomotion):
 
     def motors(self) -> tuple[Motor, ...]:
         """The twelve joints, leg by leg."""
-        effort = self._data.actuator_force.tolist()
         rates = _flat(self._senses.rates) if self._senses else [0.0] * len(self._heat)
-        parts = zip(JOINT_NAMES, self._counts, rates, self._motors, self._heat, strict=True)
+        parts = zip(JOINT_NAMES, self._counts, rates, self._efforts(), self._heat, strict=True)
         return tuple(
-            Motor(name, count * self._radians, rate, effort[motor], heat.celsius)
-            for name, count, rate, motor, heat in parts
+            Motor(name, count * self._radians, rate, effort, heat.celsius)
+            for name, count, rate, effort, heat in parts
         )
 
     def contacts(self) -> tuple[bool, ...]:
         """In the order of LEGS."""
         return self._senses.contacts if self._senses else (False,) * len(LEGS)
+
+    def _efforts(self) -> list[float]:
+        """Each joint's torque [N m]."""
+        return self._data.actuator_force[self._motors].tolist()  # type: ignore[no-any-return]
 
 
 def _flat(legs: tuple[Vector, ...]) -> list[float]:

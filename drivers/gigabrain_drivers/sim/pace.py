@@ -1,0 +1,21 @@
+"""Keeps a thread in step with the wall clock."""
+
+import time
+
+LATE_S = 0.25  # further behind than this, time is dropped instead of raced after
+
+
+class Pace:
+    """Absolute deadlines, `step_s` [s] apart, counted from the making of this."""
+
+    def __init__(self, step_s: float) -> None:
+        self._step_s, self._start_s, self._done = step_s, time.perf_counter(), 0
+
+    def wait(self, steps: int = 1) -> None:
+        """Sleep until the deadline that lies so many steps behind the last one."""
+        self._done += steps
+        wait = self._start_s + self._done * self._step_s - time.perf_counter()
+        if wait > 0:
+            time.sleep(wait)
+        elif wait < -LATE_S:
+            self._start_s -= wait

@@ -1,0 +1,86 @@
+"""`gigabrain audit`: who did what to the robot, and what came of it."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from gigabrain_zenoh.errors import ConfigError
+
+
+def audit(
+    robot: str = "",
+    /,
+    *,
+    connect: str | None = None,
+    namespace: str = "",
+    newest: Annotated[int, Parameter(alias="-n")] = 20,
+    follow: bool = False,
+    json: bool = False,
+) -> int:
+    """Show who did what to the robot: e-stops, releases, who drove, what held it back.
+
+    Example: gigabrain audit --newest 50
+
+    Asks the robot that runs, or reads what a robot has left on this machine.
+
+    Parameters
+    ----------
+    robot
+        The folder of a robot that does not run, or its name; without it, the one that runs.
+    connect
+        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
+    namespace
+        The robot's own part of the key space.
+    newest
+        How many entries.
+    follow
+        Go on with what happens from now on, until Ctrl-C.
+    json
+        One JSON object per line.
+    """
+    import asyncio
+
+    from gigabrain_zenoh import audit_file, audit_text
+
+    if not 0 < newest <= 1000:
+        raise ConfigError(f"--newest: expected 1 to 1000, got {newest}")
+    show = audit_text.as_json if json else audit_text.readable
+    if robot:
+        if follow or connect:
+            raise ConfigError("leave out the name of a robot that runs")
+        _print(map(show, audit_file.read(_folder(robot), newest)))
+        return 0
+
+    async def run() -> None:
+        from gigabrain_zenoh.client import connect as connect_robot
+
+        async with connect_robot(connect, namespace=namespace, wait=False) as found:
+            following = found.topic("audit") if follow else None
+            _print(map(show, await found.audit(newest)))
+            if following:
+                async for record in following:
+                    _print([show(record)])
+
+    asyncio.run(run())
+    return 0
+
+
+def _folder(robot: str) -> Path:
+    """Where a robot has left its log. Raises ConfigError, and UnknownName."""
+    from gigabrain_zenoh.audit_file import FOLDER
+    from gigabrain_zenoh.errors import unknown
+    from gigabrain_zenoh.logs import state_dir
+
+    known = {path.parent.name: path.parent for path in (state_dir() / "robots").glob(f"*/{FOLDER}")}
+    if robot in known:
+        return known[robot]
+    if (Path(robot) / FOLDER).is_dir():
+        return Path(robot)
+    raise unknown("robot with an audit log", robot, known)
+
+
+def _print(lines: Iterable[str]) -> None:
+    for line in lines:
+        print(line, flush=True)

@@ -1,0 +1,121 @@
+"""`gigabrain faults`: break the robot in 44 ways, and see whether it stops."""
+
+import asyncio
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from gigabrain_zenoh.faults.fault import Fault, Result
+
+COLOURS = {"passed": "green", "FAILED": "bold red", "skipped": "yellow"}
+
+
+def faults(
+    *,
+    list_: Annotated[bool, Parameter(name="--list", negative=())] = False,
+    only: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
+    repeat: int = 1,
+    body: str = "",
+    world: str = "arena",
+    long: Annotated[bool, Parameter(negative=())] = False,
+    json: Path | None = None,
+) -> int:
+    """Break a running robot in all the ways of the table, and judge how it stops.
+
+    Example: gigabrain faults --only decision-killed 12 --repeat 3
+
+    Real processes, a simulated or emulated body; the robot's own time and the physics' truth
+    decide. Ends with 1 when any test failed.
+
+    Parameters
+    ----------
+    list_
+        Show the table, and run nothing.
+    only
+        Which tests, by name or number.
+    repeat
+        How often each; the worst of all runs is judged.
+    body
+        Which robot, instead of the one that each test has.
+    world
+        Where it drives.
+    long
+        The long forms, for a release: soak, load, all orders of deaths.
+    json
+        Write all results into this file.
+    """
+    import msgspec
+    from rich.console import Console
+
+    from gigabrain_zenoh.faults.rig import Options
+    from gigabrain_zenoh.faults.suite import failed, run_suite
+    from gigabrain_zenoh.faults.table import choose
+
+    chosen, console = choose(only), Console()
+    if list_:
+        console.print(_plan(chosen))
+        return 0
+    done: list[str] = []
+    with tempfile.TemporaryDirectory(prefix="gb-") as folder, console.status("") as status:
+
+        def begun(fault: "Fault") -> None:
+            status.update(f"{len(done) + 1} of {len(chosen)}: {fault.name}")
+
+        def ended(result: "Result") -> None:
+            done.append(result.name)
+            console.print(_line(result))
+
+        running = run_suite(
+            chosen, Options(body, world, long), Path(folder), repeat, begun, ended
+        )  # fmt: skip
+        results = asyncio.run(running)
+    if json:
+        json.write_bytes(msgspec.json.format(msgspec.json.encode(results)))
+    console.print(_table(results, chosen))
+    return 1 if failed(results) else 0
+
+
+def _line(result: "Result") -> str:
+    why = f": {result.reason}" if result.reason else ""
+    return f"{result.number:>2} {result.name}: {result.verdict}{why} ({result.seconds:g} s)"
+
+
+def _plan(chosen: "Sequence[Fault]") -> "Table":
+    from rich.table import Table
+
+    table = Table(title="fault tests")
+    for name in ("no.", "fault", "group", "criterion", "needs"):
+        table.add_column(name, overflow="fold")
+    for fault in chosen:
+        needs = ", ".join(fault.needs)
+        table.add_row(str(fault.number), fault.name, fault.group, fault.criterion, needs)
+    return table
+
+
+def _table(results: "Sequence[Result]", chosen: "Sequence[Fault]") -> "Table":
+    from rich.markup import escape
+    from rich.table import Table
+
+    from gigabrain_zenoh.faults.fault import in_words
+
+    rows = {fault.number: fault for fault in chosen}
+    passed = sum(result.verdict == "passed" for result in results)
+    table = Table(title=f"{passed} of {len(results)} passed")
+    for name in ("no.", "fault", "criterion", "worst", "runs", "verdict"):
+        table.add_column(name, overflow="fold")
+    for result in results:
+        told = f"[{COLOURS[result.verdict]}]{result.verdict}[/]"
+        if result.reason:
+            told += f": {escape(result.reason)}"
+        if result.stalls:
+            told += f" ({result.stalls} runs thrown away: this machine stood still)"
+        worst = in_words(rows[result.number], result.worst)
+        runs, number = str(result.runs), str(result.number)
+        table.add_row(number, result.name, result.criterion, worst, runs, told)
+    return table

@@ -1,0 +1,122 @@
+"""`gigabrain proxy`: a bad network, between a robot and its router."""
+
+import asyncio
+import re
+from contextlib import AbstractAsyncContextManager
+from pathlib import Path
+from typing import Protocol
+
+import msgspec
+
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.faults.call import Address
+from gigabrain_zenoh.faults.chaos import CALM, WAYS, Chaos, Told, Way, told
+from gigabrain_zenoh.faults.damage import Figures
+from gigabrain_zenoh.faults.proxy import TcpProxy
+from gigabrain_zenoh.process import find
+from gigabrain_zenoh.typed import typed_lines
+
+ENDPOINT = re.compile(r"(?:(?:tcp|tls|ws)/)?(?P<host>\[[^\]]+\]|[^/:\[\]]+):(?P<port>\d+)")
+
+
+def proxy(
+    to: str,
+    *,
+    listen: str = "tcp/127.0.0.1:0",
+    baud: int = 115200,
+    chaos: str = "",
+    seed: int = 0,
+) -> int:
+    """Stand in front of a router or of a body's port, and spoil the line, until Ctrl-C.
+
+    Example: gigabrain proxy tcp/127.0.0.1:7447 --listen tcp/127.0.0.1:7448
+
+    In another terminal: gigabrain control --connect tcp/127.0.0.1:7448
+
+    What goes wrong is typed in, one line each: `delay_ms=50 jitter_ms=20`, `down hole`,
+    `corrupt=0.001`, `cut=rst`, `figures`, `off`.
+
+    Parameters
+    ----------
+    to
+        What it stands in front of: a Zenoh endpoint, HOST:PORT, or the path of a serial port.
+    listen
+        Where it is instead; port 0 for any free one. For a serial port, the path of the new one.
+    baud
+        Of a serial port.
+    chaos
+        What goes wrong from the start, in the same words.
+    seed
+        For what is left to chance.
+    """
+    begin = told(chaos)
+    if to.startswith("/"):
+        line_proxy = find("gigabrain_drivers.links.line_proxy:LineProxy")
+        made: Spoiled = line_proxy(to, _path(listen), baud=baud, seed=seed)
+    else:
+        made = TcpProxy(_address(to), _address(listen), seed=seed)
+    asyncio.run(_stand(made, begin))
+    return 0
+
+
+class Spoiled(AbstractAsyncContextManager[object], Protocol):
+    """A proxy for any kind of line."""
+
+    figures: dict[Way, Figures]
+
+    def set(self, chaos: Chaos = CALM, *ways: Way) -> None:
+        """Have this go wrong."""
+
+    def cut(self, *, reset: bool = False) -> None:
+        """End what is open."""
+
+    async def plug(self) -> None:
+        """Be there."""
+
+    async def unplug(self) -> None:
+        """Be gone."""
+
+
+async def _stand(proxy: Spoiled, begin: Told) -> None:
+    async with proxy:
+        await obey(proxy, begin)
+        _say(f"{proxy} leads to what is spoiled")
+        _say(f"type [{'|'.join(WAYS)}] {' '.join(CALM.__struct_fields__)}; "
+             "cut[=rst] unplug plug figures; off ends it")  # fmt: skip
+        wishes: asyncio.Queue[str] = asyncio.Queue()
+        with typed_lines(wishes.put_nowait):
+            while True:
+                try:
+                    await obey(proxy, told(await wishes.get()))
+                except ConfigError as error:
+                    _say(str(error))
+
+
+async def obey(proxy: Spoiled, wish: Told) -> None:
+    """Do what a typed line asks for."""
+    if wish.cut:
+        proxy.cut(reset=wish.cut == "rst")
+    if wish.unplugged is not None:
+        await (proxy.unplug if wish.unplugged else proxy.plug)()
+    if wish.figures:
+        for way, figures in proxy.figures.items():
+            _say(f"{way}: {msgspec.json.encode(figures).decode()}")
+    if wish.ways:
+        proxy.set(wish.chaos, *wish.ways)
+
+
+def _path(listen: str) -> Path:
+    if "/" not in listen or listen.startswith("tcp/"):
+        raise ConfigError(f"--listen: expected the path of the new port, got {listen!r}")
+    return Path(listen)
+
+
+def _address(text: str) -> Address:
+    found = ENDPOINT.fullmatch(text)
+    if not found or int(found["port"]) > 65535:
+        raise ConfigError(f"expected an endpoint such as tcp/127.0.0.1:7447, got {text!r}")
+    return found["host"].strip("[]"), int(found["port"])
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)

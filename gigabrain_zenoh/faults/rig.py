@@ -1,0 +1,114 @@
+"""What fault tests run on: one robot at a time, used again by as many tests as it stands."""
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Literal, Self
+
+from gigabrain_zenoh.deployment import Deployment
+from gigabrain_zenoh.faults.fault import Skipped, Stage
+from gigabrain_zenoh.faults.subject import Change, Subject
+from gigabrain_zenoh.process import find
+from gigabrain_zenoh.settings import DecisionConfig, LinkName, Resume
+
+SPEED = 0.26  # [m/s], of all tests that do not say otherwise
+BODIES: dict[Stage, str] = {
+    "sim": "turtlebot3_waffle",
+    "auto": "turtlebot3_waffle",
+    "serial": "mycustombot",
+    "tcp": "alpha",
+}
+WIRES = "gigabrain_drivers.emulators.emulator:wire_of"
+
+
+@dataclass(frozen=True)
+class Options:
+    """How the suite is run."""
+
+    body: str = ""  # instead of the one that each stage has
+    world: str = "arena"
+    long: bool = False  # the forms for a release, instead of those for every change
+
+
+class Rig:
+    """Hands out running robots. Used as `async with`; nothing of it is left afterwards."""
+
+    def __init__(self, options: Options, folder: Path) -> None:
+        self.options, self.folder = options, folder
+        self._numbers = itertools.count(1)
+        self._kept: tuple[Stage, Subject] | None = None
+
+    @property
+    def long(self) -> bool:
+        """Whether there is time for the long forms."""
+        return self.options.long
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.give_up()
+
+    async def robot(self, stage: Stage) -> Subject:
+        """The robot of a stage: the one that runs if it is unharmed, else a new one.
+
+        Raises Skipped where the chosen body cannot play that part.
+        """
+        kept = self._kept
+        if kept and (kept[0] != stage or not kept[1].unharmed):
+            await self.give_up()
+        if self._kept is None:
+            subject = self.new(deployment_of(self.options, stage))
+            self._kept = stage, subject
+            await subject.__aenter__()
+        subject = self._kept[1] if self._kept else subject
+        await subject.settle()
+        return subject
+
+    def new(self, deployment: Deployment, change: Change | None = None) -> Subject:
+        """A robot of a test's own, not started yet; to be used as `async with`."""
+        return Subject(deployment, self.fresh_folder(), change)
+
+    async def alone(self) -> None:
+        """End the robot that other tests share, for a test that brings its own."""
+        await self.give_up()
+
+    def fresh_folder(self) -> Path:
+        """An empty folder of a test's own."""
+        folder = self.folder / str(next(self._numbers))
+        folder.mkdir(parents=True)
+        return folder
+
+    async def give_up(self) -> None:
+        """End the running robot. The next test gets a new one."""
+        kept, self._kept = self._kept, None
+        if kept:
+            await kept[1].close()
+
+    async def check(self) -> None:
+        """Raise Failed where a test has left contacts or a dead program behind."""
+        if self._kept:
+            await self._kept[1].check()
+
+
+def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> Deployment:
+    """What runs on a stage. Raises Skipped where the chosen body has no such link."""
+    body = options.body or BODIES[stage]
+    link: LinkName = "sim" if stage in ("sim", "auto") else "emulated"
+    wire: Literal["serial", "tcp", ""] = find(WIRES)(body) if link == "emulated" else ""
+    if link == "emulated" and wire != stage:
+        raise Skipped(f"{body} has no {stage} line")
+    return Deployment(
+        body=body,
+        link=link,
+        world=options.world,
+        resume="auto" if stage == "auto" else resume,
+        router="tcp/127.0.0.1:0",
+        decision=DecisionConfig(linear_speed=SPEED),
+    )

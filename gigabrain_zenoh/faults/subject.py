@@ -1,0 +1,211 @@
+"""The robot that is broken on purpose: all its processes, and whoever looks on."""
+
+import asyncio
+import os
+import signal
+from collections.abc import Callable, Mapping
+from contextlib import AsyncExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+
+from gigabrain_zenoh.backoff import Backoff
+from gigabrain_zenoh.client import Robot
+from gigabrain_zenoh.deployment import (
+    EMULATOR,
+    Deployment,
+    client_endpoint,
+    process_specs,
+    with_free_port,
+)
+from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.faults.fault import Failed
+from gigabrain_zenoh.faults.onlooker import Onlooker, looking_on
+from gigabrain_zenoh.faults.waiting import until
+from gigabrain_zenoh.keeper import ProcessSpec
+from gigabrain_zenoh.supervisor import Supervisor
+
+Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
+# what is killed all the time is started again each time: giving up has a test of its own
+TIRELESS = Backoff(factor=1.0, deaths=10_000)
+FAULTS_FILE = "faults.json"  # as the emulator's process reads it
+STOP_S = 1.5
+
+
+class Subject:
+    """One robot under test. Used as `async with`, or closed by hand."""
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        folder: Path,
+        change: Change | None = None,
+        backoff: Backoff = TIRELESS,
+    ) -> None:
+        self.deployment, self.folder = with_free_port(deployment), folder
+        specs = process_specs(self.deployment, "robot", folder / "run", folder / "state")
+        self.supervisor = Supervisor(change(specs) if change else specs, self._record, backoff)
+        self.records: list[Mapping[str, Any]] = []  # of all logs
+        self.harmed = False  # a test may say that nobody should use this robot again
+        self.onlooker: Onlooker
+        self.person: Robot
+        self._stack = AsyncExitStack()
+        self._frozen: set[int] = set()
+        self._faulty = False
+        self._contacts = 0
+        self._judged = 0  # records that have been looked at
+
+    async def __aenter__(self) -> Self:
+        try:
+            await self._stack.enter_async_context(self.supervisor)
+            self._running = asyncio.create_task(self.supervisor.run())
+            self._stack.push_async_callback(self._end)
+            where = client_endpoint(self.deployment)
+            self.onlooker = await self._stack.enter_async_context(looking_on(where, "suite"))
+            self.person = Robot(self.onlooker.bus)
+            await self.ready()
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """End all of it. Any number of times."""
+        self.thaw()
+        await self._stack.aclose()
+
+    async def _end(self) -> None:
+        await self.supervisor.stop(STOP_S)
+        await self._running
+
+    @property
+    def unharmed(self) -> bool:
+        """Whether it can be used for another test."""
+        return not (self.harmed or self.supervisor.given_up or self._running.done())
+
+    @property
+    def truth_of(self) -> str:
+        """The process whose report is the physics' truth."""
+        return EMULATOR if self.deployment.link == "emulated" else "driver"
+
+    def pid(self, name: str) -> int:
+        """The pid of a process that runs. Raises Failed."""
+        pid = self.supervisor.statuses[name].pid
+        if pid is None:
+            raise Failed(f"{name} does not run")
+        return pid
+
+    def send(self, name: str, number: signal.Signals) -> int:
+        """Send a signal to a process; its pid."""
+        pid = self.pid(name)
+        os.kill(pid, number)
+        return pid
+
+    def kill(self, name: str) -> int:
+        """SIGKILL; the pid that it had."""
+        return self.send(name, signal.SIGKILL)
+
+    def freeze(self, name: str) -> None:
+        """SIGSTOP, until `thaw` or the end of the test."""
+        self._frozen.add(self.send(name, signal.SIGSTOP))
+
+    def thaw(self) -> None:
+        """SIGCONT to all that were frozen and still run."""
+        alive = {status.pid for status in self.supervisor.statuses.values()}
+        for pid in self._frozen & alive:
+            if pid is not None:
+                os.kill(pid, signal.SIGCONT)
+        self._frozen.clear()
+
+    async def ready(self) -> None:
+        """Wait until every process is ready."""
+        statuses = self.supervisor.statuses.values()
+
+        def all_ready() -> bool:
+            if self.supervisor.given_up:
+                raise Failed(f"{', '.join(self.supervisor.given_up)} cannot be started")
+            return all(status.state == "ready" for status in statuses)
+
+        await until(all_ready, "all processes are ready")
+
+    async def restarted(self, name: str, pid: int) -> None:
+        """Wait until a process that had this pid is ready under another one."""
+        status = self.supervisor.statuses[name]
+        await until(lambda: status.state == "ready" and status.pid != pid, f"{name}'s restart")
+
+    async def break_body(self, **faults: Mapping[str, Any]) -> None:
+        """Have these faults of an emulated body, by station, and no others.
+
+        Returns once the emulator has taken them.
+        """
+        path = self.folder / "run" / "ports" / FAULTS_FILE
+        begin = len(self.records)
+        fresh = path.with_suffix(".new")
+        fresh.write_bytes(msgspec.json.encode(faults))
+        fresh.replace(path)
+        self._faulty = bool(faults)
+
+        def taken() -> bool:
+            said = self.records[begin:]
+            return any(str(r.get("text", "")).startswith("faults: ") for r in said)
+
+        await until(taken, "the emulator takes its faults")
+
+    async def truth(self) -> dict[str, Any]:
+        """What the physics knows: contacts, distance_m, true_speed and more."""
+        return dict((await self.onlooker.describe(self.truth_of)).report)
+
+    async def distance(self) -> float:
+        """How long the path of the body has been so far, by the physics [m]."""
+        return float((await self.truth())["distance_m"])
+
+    async def drive(self, room: float = 1.3) -> None:
+        """Have the brain drive straight on at full speed, as a person would: by hand."""
+        await self.release()
+        await self.onlooker.straight(room=room, by_hand=self.deployment.resume == "manual")
+
+    async def release(self) -> None:
+        """As a person: let go of a latched gate, as soon as that is possible."""
+        onlooker = self.onlooker
+        while onlooker.state.gate.mode == "latched":
+            try:
+                await self.person.release()
+            except Refused:
+                await onlooker.ticks(5)
+            else:
+                await until(lambda: onlooker.state.gate.mode != "latched", "released")
+
+    async def settle(self) -> None:
+        """All processes run, the body is whole and at rest or driven by its brain."""
+        self.thaw()
+        if self._faulty:
+            await self.break_body()
+        await self.ready()
+        boot = self.onlooker.state.boot
+        await until(lambda: self.onlooker.state.link.connected, "the body answers")
+        if self.onlooker.state.boot == boot:
+            await self.release()
+        self._contacts = int((await self.truth())["contacts"])
+        self._judged = len(self.records)
+
+    async def check(self) -> None:
+        """Raise Failed where something was touched, or a program has died of itself."""
+        contacts = int((await self.truth())["contacts"])
+        if contacts > self._contacts:
+            raise Failed(f"{contacts - self._contacts} contacts")
+        for record in self.records[self._judged :]:
+            if record.get("level") == "critical":
+                raise Failed(f"{record.get('process')}: {record.get('text')}")
+
+    def _record(self, _name: str, record: Mapping[str, Any]) -> None:
+        self.records.append(record)

@@ -1,0 +1,47 @@
+"""Writes files behind the event loop: a slow or full disk must not hold up a body."""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
+
+T = TypeVar("T")
+
+
+class Scribe(Generic[T]):
+    """Hands items to `write` in a thread, in order; those that wait meanwhile go as one batch.
+
+    `write` returns a problem in one line, or an empty text once all is on disk. When more than
+    `room` items wait, the oldest give way.
+    """
+
+    def __init__(self, write: Callable[[Sequence[T]], str], room: int) -> None:
+        self._write = write
+        self._items: deque[T] = deque(maxlen=room)
+        self._waiting: list[asyncio.Future[str]] = []
+        self._task: asyncio.Task[None] | None = None
+        self.lost = 0  # items that gave way
+
+    def put(self, item: T) -> asyncio.Future[str]:
+        """Have `item` written; ends with the problem, or an empty text, once that is known."""
+        self.lost += len(self._items) == self._items.maxlen
+        self._items.append(item)
+        done: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._waiting.append(done)
+        if self._task is None or self._task.done():
+            self._task = asyncio.create_task(self._work(), name="scribe")
+        return done
+
+    async def close(self) -> None:
+        """Wait until all is written."""
+        if self._task:
+            await self._task
+
+    async def _work(self) -> None:
+        while self._waiting:
+            items, self._items = tuple(self._items), deque(maxlen=self._items.maxlen)
+            waiting, self._waiting = self._waiting, []
+            problem = await asyncio.to_thread(self._write, items)
+            for done in waiting:
+                if not done.done():
+                    done.set_result(problem)

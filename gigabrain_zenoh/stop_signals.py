@@ -1,0 +1,25 @@
+"""The signals that mean: come to an end in good order."""
+
+import asyncio
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def stop_signals() -> Iterator[asyncio.Event]:
+    """An event that Ctrl-C, SIGTERM and the end of the terminal set; repeating them does no harm.
+
+    Where whoever started this process wants the end of the terminal ignored (nohup), it is.
+    """
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        numbers.append(signal.SIGHUP)
+    for number in numbers:
+        loop.add_signal_handler(number, stop.set)
+    try:
+        yield stop
+    finally:
+        for number in numbers:
+            loop.remove_signal_handler(number)

@@ -1,0 +1,160 @@
+"""The audit trail: on disk before long, never overwritten, bounded, and not to be flooded."""
+
+import asyncio
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from gigabrain_schemas.audit import AuditPage, AuditRecord, AuditRequest
+from gigabrain_schemas.topics import AUDIT, AUDIT_LOG
+from gigabrain_zenoh.audit import AuditTrail
+from gigabrain_zenoh.audit_file import AuditFile, in_order, read
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.scribe import Scribe
+from gigabrain_zenoh.transport import LocalNetwork
+
+
+def entry(number: int, stamp_ns: int = 0) -> AuditRecord:
+    return AuditRecord(
+        process="driver", what="estop", source="ann", text=str(number), stamp_ns=stamp_ns or number
+    )
+
+
+def texts(records: Sequence[AuditRecord]) -> list[str]:
+    return [record.text for record in records]
+
+
+class Rig:
+    """A trail on a fake clock, and what others hear of it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.clock, self.network = FakeClock(), LocalNetwork()
+        self.bus = Bus(self.network.transport(), self.clock, "driver")
+        self.other = Bus(self.network.transport(), self.clock, "other")
+        self.heard: list[AuditRecord] = []
+        self.other.subscribe(AUDIT, lambda _key, record: self.heard.append(record))
+        self.trail = AuditTrail(self.bus, folder)
+
+    async def after(self, seconds: float) -> None:
+        await self.clock.advance(round(seconds * 1e9))
+        self.trail.flush()
+
+
+def test_entries_survive_a_restart_and_are_appended_to(tmp_path: Path) -> None:
+    assert AuditFile(tmp_path, "driver").append([entry(1), entry(2)]) == ""
+    assert AuditFile(tmp_path, "driver").append([entry(3)]) == ""
+    assert texts(read(tmp_path, 10)) == ["1", "2", "3"]
+    assert texts(AuditFile(tmp_path, "driver").newest(2)) == ["2", "3"]
+    assert read(tmp_path / "nowhere", 10) == ()
+
+
+def test_a_full_file_is_followed_by_another_and_only_the_oldest_goes(tmp_path: Path) -> None:
+    file = AuditFile(tmp_path, "driver", max_bytes=1000, kept=3)
+    for number in range(1, 41):
+        file.append([entry(number)])
+    names = sorted(path.name for path in (tmp_path / "audit").iterdir())
+    assert len(names) == 3
+    assert all(path.stat().st_size <= 1000 for path in (tmp_path / "audit").iterdir())
+    found = texts(read(tmp_path, 1000))
+    assert found == [str(number) for number in range(41 - len(found), 41)]
+    assert len(found) >= 10
+
+
+def test_a_torn_line_costs_no_other(tmp_path: Path) -> None:
+    file = AuditFile(tmp_path, "driver")
+    file.append([entry(1)])
+    path = tmp_path / "audit" / "driver-000001.jsonl"
+    path.write_bytes(path.read_bytes() + msgspec.json.encode(entry(2))[:20])
+    file.append([entry(3)])
+    assert texts(read(tmp_path, 10)) == ["1", "3"]
+
+
+def test_logs_of_several_processes_become_one_and_keep_their_own_order(tmp_path: Path) -> None:
+    AuditFile(tmp_path, "driver").append([entry(1, 100), entry(2, 300)])
+    AuditFile(tmp_path, "router").append([entry(3, 200)])
+    assert texts(read(tmp_path, 10)) == ["1", "3", "2"]
+    assert texts(read(tmp_path, 1)) == ["2"]
+    assert texts(in_order([[entry(1, 300), entry(2, 100)], [entry(3, 400)]])) == ["1", "2", "3"]
+
+
+def test_a_place_that_cannot_be_written_is_told_and_does_not_raise(tmp_path: Path) -> None:
+    (tmp_path / "audit").write_text("")
+    problem = AuditFile(tmp_path, "driver").append([entry(1)])
+    assert problem == f"cannot write the audit log in {tmp_path / 'audit'}: File exists"
+
+
+async def test_an_entry_is_told_at_once_written_and_can_be_asked_for(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    rig.bus.time.boot, rig.bus.time.tick = 7, 205
+    rig.trail.note("take", "ann", "ann drives, taken over from control")
+    assert rig.heard == [
+        AuditRecord(
+            stamp_ns=1_000_000_000_000_000_000, seq=1, boot=7, tick=205,
+            process="driver", what="take", source="ann",
+            text="ann drives, taken over from control",
+        )
+    ]  # fmt: skip
+    await rig.trail.close()
+    assert read(tmp_path, 10) == tuple(rig.heard)
+    assert await rig.other.ask(AUDIT_LOG, AuditRequest()) == [AuditPage(records=tuple(rig.heard))]
+
+
+async def test_what_happens_again_within_a_second_is_counted(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    for _ in range(21):
+        rig.trail.note("estop", "ann", "stopped")
+    rig.trail.note("estop", "bob", "stopped")
+    assert [(r.source, r.times) for r in rig.heard] == [("ann", 1), ("bob", 1)]
+    await rig.after(0.9)
+    assert len(rig.heard) == 2
+    await rig.after(0.1)
+    assert [(r.source, r.times) for r in rig.heard[2:]] == [("ann", 20)]
+    await rig.after(1.0)
+    rig.trail.note("estop", "bob", "stopped")
+    assert [(r.source, r.times) for r in rig.heard[3:]] == [("bob", 1)]
+    await rig.trail.close()
+
+
+async def test_who_keeps_trying_is_told_once_a_minute(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    for _ in range(59):
+        rig.trail.note("refused", "script", "control drives", code="commander", ok=False)
+        await rig.after(1.0)
+    assert [(r.what, r.times) for r in rig.heard] == [("refused", 1)]
+    await rig.after(1.0)
+    assert [(r.what, r.times) for r in rig.heard] == [("refused", 1), ("refused", 58)]
+    await rig.trail.close()
+
+
+async def test_a_crowd_is_told_as_others(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    for number in range(10_000):
+        rig.trail.note("refused", f"source-{number}", ok=False)
+    assert len(rig.heard) == 101
+    assert rig.heard[-1].source == "others"
+    await rig.trail.close()
+    assert (rig.heard[-1].source, rig.heard[-1].times) == ("others", 9899)
+
+
+async def test_a_disk_that_hangs_holds_nobody_up_and_the_oldest_give_way() -> None:
+    goes_on, batches = threading.Event(), list[Sequence[int]]()
+
+    def write(items: Sequence[int]) -> str:
+        goes_on.wait(10)
+        batches.append(items)
+        return "the disk is full" if 5 in items else ""
+
+    scribe = Scribe(write, room=3)
+    first = scribe.put(1)
+    await asyncio.sleep(0)  # the first batch is on its way
+    others = [scribe.put(number) for number in (2, 3, 4, 5)]
+    assert not first.done()
+    goes_on.set()
+    assert await first == ""
+    assert [await other for other in others] == ["the disk is full"] * 4
+    assert batches == [(1,), (3, 4, 5)]
+    assert scribe.lost == 1
+    await scribe.close()

@@ -1,0 +1,60 @@
+"""A stop that is tried many times is judged by its worst, and told with its median."""
+
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.conformance import kit
+from gigabrain_drivers.conformance.result import Finding, summary
+from gigabrain_drivers.conformance.subject import Subject
+
+
+def test_the_worst_and_the_median_of_each_time_are_told() -> None:
+    found = [
+        Finding(True, "", {"known": known, "at rest": rest})
+        for known, rest in ((20.0, 160.0), (60.0, 140.0), (40.0, 150.0))
+    ]
+    assert summary(found) == (
+        "worst of 3: known after 60, median 40 ms; at rest after 160, median 150 ms"
+    )
+
+
+def test_one_failure_among_many_is_counted_and_named() -> None:
+    found = [Finding(True, "fine", {"known": 1.0}), Finding(False, "still moving")]
+    assert summary([*found, found[0]]) == (
+        "1 times not so: still moving; worst of 3: known after 1, median 1 ms"
+    )
+
+
+def test_a_single_try_says_what_it_measured() -> None:
+    assert summary([Finding(True, "at rest after 3 ticks", {"at rest": 60.0})]) == (
+        "at rest after 3 ticks"
+    )
+
+
+async def test_only_the_stops_are_repeated(tmp_path: Path) -> None:
+    told: list[str] = []
+    results = await kit.check("mock", "sim", tmp_path, told.append, repeat=2)
+    assert [result for result in results if result.verdict == "fail"] == []
+    assert [text for text in told if "2 of 2" in text] == [
+        "stops on silence, 2 of 2",
+        "stops on SIGKILL, 2 of 2",
+    ]
+    assert told.count("opens") == 1
+    silent = next(result for result in results if result.check == "stops on silence")
+    assert silent.measured.startswith("worst of 2: at rest after ")
+
+
+@pytest.mark.parametrize(
+    ("name", "promise"),
+    [
+        ("mycustombot", "150 ms (firmware_line.md)"),
+        ("turtlebot3_burger", "500 ms (OpenCR's firmware)"),
+        ("alpha", "100 ms (firmware_alpha.md)"),
+    ],
+)
+async def test_a_body_is_judged_by_what_its_firmware_promises(
+    name: str, promise: str, tmp_path: Path
+) -> None:
+    async with Subject(name, "emulated", tmp_path) as subject:
+        assert subject.promise == promise

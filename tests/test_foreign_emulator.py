@@ -1,0 +1,76 @@
+"""A package may bring the emulator of its driver: entry point `gigabrain.emulators`."""
+
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers import catalog
+from gigabrain_drivers.conformance.session import Session
+from gigabrain_drivers.conformance.subject import Subject
+from gigabrain_drivers.emulators.emulator import device_class
+from gigabrain_drivers.robot import Run
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.errors import UnknownName
+
+NAME = "foreign_base"
+DRIVER = '''"""Somebody's driver, and the board that it talks to."""
+
+from gigabrain_drivers.emulators.line_base import LineBase
+from gigabrain_drivers.line import LineDriver
+
+
+class ForeignDriver(LineDriver):
+    """A body on a line."""
+
+
+class ForeignBoard(LineBase):
+    """Its electronics."""
+
+    watchdog_ns = 80_000_000
+    promised_in = "its data sheet"
+'''
+ENTRY_POINTS = f"""[gigabrain.drivers]
+{NAME} = {NAME}_driver:ForeignDriver
+[gigabrain.emulators]
+{NAME} = {NAME}_driver:ForeignBoard
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What pip makes of such a package; its folder."""
+    folder = tmp_path / f"{NAME}_driver"
+    info = tmp_path / f"{NAME}-1.0.dist-info"
+    folder.mkdir()
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {NAME}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(ENTRY_POINTS)
+    (folder / "__init__.py").write_text(DRIVER)
+    ours = catalog.robot_path("mycustombot")
+    (folder / "model.xml").write_text((ours.parent / "model.xml").read_text())
+    text = ours.read_text().replace("robot_type: mycustombot", f"robot_type: {NAME}")
+    (folder / "robot.yaml").write_text(text.replace("driver: line", f"driver: {NAME}"))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    return folder
+
+
+async def test_a_packages_driver_drives_the_packages_emulator(package: Path) -> None:
+    async with Subject(NAME, "emulated", package / "run") as subject:
+        assert subject.promise == "80 ms (its data sheet)"
+        async with Session(subject) as session:
+            await session.connected()
+            session.wanted = Velocity(linear_x=0.2)
+            assert await session.until(lambda: subject.told(None)[0] == 0.2, 100) is not None
+
+
+def test_its_emulator_is_found_by_its_drivers_name(package: Path) -> None:
+    assert device_class(NAME).__name__ == "ForeignBoard"
+    robot, driver = catalog.make_driver(NAME, Run(folder=Path(), link="real"))
+    assert (robot.robot_type, type(driver).__name__) == (NAME, "ForeignDriver")
+
+
+def test_a_driver_without_an_emulator_is_named(package: Path) -> None:
+    with pytest.raises(
+        UnknownName, match="no emulator for driver 'forein_base'; did you mean 'foreign_base'"
+    ):
+        device_class("forein_base")

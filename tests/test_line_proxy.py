@@ -1,0 +1,105 @@
+"""The chaos proxy for bodies' lines: a pty in front of a pty, and a folder of ports."""
+
+import asyncio
+import os
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.emulators.pty import Pty
+from gigabrain_drivers.emulators.tcp import TcpPort
+from gigabrain_drivers.links.address import AddressLink
+from gigabrain_drivers.links.line_proxy import LineProxy, in_front_of
+from gigabrain_drivers.links.serial_link import SerialLink
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.faults.chaos import CALM, Chaos
+from tests.stack import until
+
+
+class Line:
+    """A device, the proxy in front of it, and a host that has opened the proxy."""
+
+    def __init__(self, folder: Path) -> None:
+        self.device = Pty(folder / "device")
+        self.proxy = LineProxy(str(self.device.path), folder / "proxy", seed=1)
+        self.host = SerialLink(str(folder / "proxy"), 115200, Clock())
+        self.up, self.down = bytearray(), bytearray()
+        self.device.on_bytes, self.host.on_bytes = self.up.extend, self.down.extend
+
+
+@pytest.fixture
+async def line(tmp_path: Path) -> AsyncIterator[Line]:
+    made = Line(tmp_path)
+    made.device.plug()
+    async with made.proxy:
+        made.host.open()
+        await until(lambda: made.host.connected and made.proxy.connected, "both are open")
+        yield made
+        await made.host.close()
+    made.device.unplug()
+
+
+async def test_a_calm_line_changes_no_byte(line: Line) -> None:
+    assert line.host.write(bytes(range(256)))
+    assert line.device.write(b"\x00\n\r\xff\x11\x13")
+    await until(lambda: len(line.up) == 256 and len(line.down) == 6, "all of it")
+    assert (bytes(line.up), bytes(line.down)) == (bytes(range(256)), b"\x00\n\r\xff\x11\x13")
+
+
+async def test_what_is_sent_into_a_hole_is_lost(line: Line) -> None:
+    line.proxy.set(Chaos(hole=True), "up")
+    line.host.write(b"lost")
+    line.device.write(b"heard")
+    await until(lambda: line.down == b"heard" and line.proxy.figures["up"].dropped == 4, "both")
+    line.proxy.set(CALM, "up")
+    line.host.write(b"found")
+    await until(lambda: line.up, "what comes after")
+    assert bytes(line.up) == b"found"
+
+
+async def test_bits_are_flipped_and_pieces_vanish_as_often_as_is_said(line: Line) -> None:
+    line.proxy.set(Chaos(corrupt=1.0), "down")
+    line.proxy.set(Chaos(drop=1.0), "up")
+    line.device.write(bytes(64))
+    line.host.write(bytes(64))
+    figures = line.proxy.figures
+    await until(lambda: len(line.down) == 64 and figures["up"].dropped == 64, "both ways")
+    assert all(byte.bit_count() == 1 for byte in line.down)
+    assert (figures["down"].flipped, bytes(line.up)) == (64, b"")
+
+
+async def test_a_port_that_is_unplugged_and_plugged_in_is_found_again(line: Line) -> None:
+    await line.proxy.unplug()
+    await until(lambda: not line.host.connected, "the loss")
+    assert "unplugged" in line.host.problem or line.host.problem
+    await line.proxy.plug()
+    await until(lambda: line.host.connected, "it is back")
+    line.host.write(b"back")
+    await until(lambda: line.up == b"back", "what comes after")
+    assert line.host.reconnects == 1
+
+
+async def test_every_port_of_an_emulator_has_its_proxy(tmp_path: Path) -> None:
+    before = len(os.listdir("/dev/fd"))
+    serial, tcp = Pty(tmp_path / "ports" / "scan"), TcpPort(tmp_path / "ports" / "base", 0)
+    (tmp_path / "ports").mkdir()
+    (tmp_path / "ports" / "faults.json").write_text("{}")
+    heard = bytearray()
+    tcp.on_bytes = heard.extend
+    serial.plug()
+    tcp.plug()
+    async with in_front_of(tmp_path / "ports", tmp_path / "spoiled") as proxies:
+        assert sorted(proxies) == ["base", "scan"]
+        link = AddressLink(str(tmp_path / "spoiled" / "base"), Clock())
+        link.quiet_ns = None
+        link.open()
+        await until(lambda: link.connected, "it is open")
+        link.write(b"to a body behind TCP")
+        await until(lambda: heard == b"to a body behind TCP", "it arrives")
+        await link.close()
+    serial.unplug()
+    tcp.unplug()
+    assert list((tmp_path / "spoiled").iterdir()) == []
+    await asyncio.sleep(0)
+    await until(lambda: len(os.listdir("/dev/fd")) <= before, "no descriptor is left")
