@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from gigabrain_zenoh.launch import stop_signals
 from gigabrain_zenoh.recording.joining import joined
 from gigabrain_zenoh.recording.node import listening, path_of, recover_others
 from gigabrain_zenoh.recording.play import Player, PlayOptions, check_nobody_drives
 from gigabrain_zenoh.recording.recorder import Recorder, Status
 from gigabrain_zenoh.recording.records import check_magic
 from gigabrain_zenoh.settings import RecorderConfig
+from gigabrain_zenoh.stop_signals import stop_signals
 
 LOOK_S = 0.5
 

@@ -18,8 +18,8 @@ class Header(msgspec.Struct, frozen=True):
     boot: int = 0
     tick: int = 0
     basis: int = 0
-    source: Any = ""  # on commands: several may send on one key
-    process: Any = ""  # on log records, likewise
+    process: Any = ""  # on log and audit records: several may send on one key
+    source: Any = ""  # on commands, likewise
 
 
 _msgpack = msgspec.msgpack.Decoder(Header)
@@ -58,7 +58,7 @@ class Gaps:
         """
         if header.seq == 0:  # from somebody who does not count
             return 0
-        sender = key, str(header.source or header.process)[:64]
+        sender = key, str(header.process or header.source)[:64]
         last, self._last[sender] = self._last.get(sender), header
         if last is None:
             return 0
