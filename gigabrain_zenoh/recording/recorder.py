@@ -19,7 +19,7 @@ from gigabrain_zenoh.settings import RecorderConfig
 log = logging.getLogger(__name__)
 
 MB = 1_000_000
-LOOK_S = 0.05  # how often the queue is emptied
+LOOK_S = 0.1  # how often the queue is emptied
 RETRY_S = 1.0  # how often a full disk is tried again
 Open = Callable[[Path], BagFile]
 
