@@ -45,6 +45,29 @@ LINK_LOST = Cause(
 )
 
 
+BUTTON_AWAITED = Cause(
+    code="button_lost",
+    text="the e-stop button has not been heard yet",
+    remedy="start its process, and see that its adapter is plugged in",
+)
+BUTTON_LOST = Cause(
+    code="button_lost",
+    text="the e-stop button is silent",
+    latching=True,
+    remedy="see that its process runs, then release the robot",
+)
+
+
+def button(text: str) -> Cause:
+    """The e-stop button is pressed, or cannot be believed."""
+    return Cause(
+        code="button",
+        text=f"e-stop button: {text}"[:500],
+        latching=True,
+        remedy="let the button go, or mend its wire or adapter, then release the robot",
+    )
+
+
 def estop(source: str) -> Cause:
     """An e-stop, by whom."""
     return Cause(

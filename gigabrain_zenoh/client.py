@@ -10,13 +10,12 @@ from gigabrain_schemas.audit import AuditRecord, AuditRequest
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import (
     AUDIT_LOG,
     BODY,
     CMD_VEL,
     ENABLE,
-    ESTOP,
     RELEASE,
     STATE,
     Service,
@@ -26,6 +25,7 @@ from gigabrain_zenoh.audit_file import in_order
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, BusError, Refused, Unsupported
+from gigabrain_zenoh.estop import press
 from gigabrain_zenoh.hold import Hold
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 from gigabrain_zenoh.listening import listen, topic_named
@@ -142,9 +142,12 @@ class Robot:
         return self._granted(await self._ask(RELEASE, request))
 
     async def estop(self, reason: str = "") -> GateReply:
-        """Stop at once and latch. Raises BodyLost when no body has confirmed it."""
-        request = EstopRequest(source=self._bus.process, reason=reason)
-        return await self._ask(ESTOP, request)
+        """Stop at once and latch; this script's own commands stop first.
+
+        Raises NotConfirmed when no body has confirmed it within two seconds.
+        """
+        self._target = None
+        return await press(self._bus, reason)
 
     async def audit(self, newest: int = 100) -> tuple[AuditRecord, ...]:
         """The newest entries of the audit log, oldest first. Raises BodyLost where nobody has one.
@@ -250,7 +253,7 @@ class Robot:
     async def _ask(self, service: Service[Q, GateReply], request: Q) -> GateReply:
         replies = await self._bus.ask(service, request, timeout_s=ANSWER_S)
         if not replies:
-            raise BodyLost(f"NOT CONFIRMED: no driver answers {service.key}")
+            raise BodyLost(f"no driver answers {service.key}; is it running?")
         return replies[0]
 
     @staticmethod

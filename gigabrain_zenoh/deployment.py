@@ -16,6 +16,7 @@ from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.keeper import ProcessSpec
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.settings import (
+    ButtonConfig,
     DecisionConfig,
     DriverConfig,
     EmulatorConfig,
@@ -28,7 +29,8 @@ from gigabrain_zenoh.settings import (
 )
 
 EMULATOR = "emulator"  # runs beside the driver where the link is `emulated`; not in `hosts`
-ProcessName = Literal["router", "driver", "perception", "decision", "control", "safety"]
+BUTTON = "button"  # runs beside the driver where there is one, unless `hosts` says where
+ProcessName = Literal["router", "driver", "perception", "decision", "control", "safety", "button"]
 ALL: tuple[ProcessName, ...] = (
     "router", "driver", "perception", "decision", "control", "safety",
 )  # fmt: skip
@@ -50,6 +52,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     hosts: dict[str, tuple[ProcessName, ...]] = msgspec.field(
         default_factory=lambda: {"robot": ALL}
     )
+    button: ButtonConfig | None = None  # an e-stop button; without its word nothing moves
     perception: PerceptionConfig = PerceptionConfig()
     decision: DecisionConfig = DecisionConfig()
 
@@ -62,6 +65,10 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         twice = sorted({name for name in placed if placed.count(name) > 1})
         if twice:
             raise ValueError(f"{', '.join(twice)} must run once, on one host")
+        if BUTTON in placed and self.button is None:
+            raise ValueError("hosts: a button runs nowhere unless `button: {port: …}` says which")
+        if self.button and self.speed != 1.0:
+            raise ValueError("button: a person presses it in real time, so leave out `speed`")
         address = self.router.partition("/")[2]
         if not self.insecure and not address.startswith(LOOPBACK):
             raise ValueError(
@@ -158,7 +165,10 @@ def process_specs(
     level: str = "info",
 ) -> list[ProcessSpec]:
     """What the supervisor of `host` has to run, in readiness order: the router first."""
-    names: list[str] = sorted(deployment.hosts[host], key=ALL.index)
+    names: list[str] = sorted(deployment.hosts[host], key=(*ALL, BUTTON).index)
+    placed = any(BUTTON in others for others in deployment.hosts.values())
+    if deployment.button and "driver" in names and not placed:
+        names.append(BUTTON)
     if deployment.link == "emulated" and "driver" in names:
         names.insert(names.index("driver"), EMULATOR)
     settings = _settings(deployment, run_dir, state_dir, seconds)
@@ -207,6 +217,7 @@ def _settings(
         resume=deployment.resume,
         state_dir=str(state_dir),
         emulator=ports,
+        button=deployment.button is not None,
     )
     emulator = EmulatorConfig(
         body=deployment.body, world=deployment.world, seed=deployment.seed, folder=ports
@@ -214,6 +225,7 @@ def _settings(
     return {
         "driver": msgspec.to_builtins(driver),
         EMULATOR: msgspec.to_builtins(emulator),
+        BUTTON: msgspec.to_builtins(deployment.button) if deployment.button else {},
         "perception": msgspec.to_builtins(deployment.perception),
         "decision": msgspec.to_builtins(deployment.decision),
     }

@@ -6,7 +6,8 @@ GigabrainError
 ├── BusError          the router is missing, or its port is taken
 ├── Refused           the robot said no, and why
 ├── Unsupported       the body has no such primitive
-└── BodyLost          the body no longer answers
+├── BodyLost          the body no longer answers
+└── NotConfirmed      no body has confirmed an e-stop (exit code 3)
 """
 
 import difflib
@@ -43,6 +44,12 @@ class Unsupported(GigabrainError):
 
 class BodyLost(GigabrainError):
     """The body no longer answers. The process ends; its supervisor starts it again."""
+
+
+class NotConfirmed(GigabrainError):
+    """An e-stop was pressed and no body has said that it stands: somebody has to act by hand."""
+
+    exit_code = 3
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownName:

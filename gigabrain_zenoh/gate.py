@@ -50,6 +50,7 @@ __all__ = [
 
 TICK_S = TICK_NS / 1e9
 STOPPING_TICKS = 15  # 300 ms, then idle
+CALM_TICKS = 5  # 100 ms at zero after an enable, however hard somebody holds a joystick
 STILL_TICKS = 25  # 0.5 s at rest before a release
 HEALTHY_TICKS = 25  # 0.5 s without a cause before an automatic resume
 NAN_STORM_COUNT, NAN_STORM_TICKS = 5, 50  # five in a second
@@ -134,6 +135,7 @@ def _enabled(state: GateState, source: str) -> GateState:
         by_hand=False,
         commander=source,
         enables=state.enables + 1,
+        enabled_tick=state.tick,
         command=None,
         command_tick=state.tick,
         next_seq=0,
@@ -146,7 +148,8 @@ def _output(config: GateConfig, state: GateState) -> Velocity:
     if state.mode in ("latched", "idle"):
         return ZERO
     target, asked = ZERO, state.command
-    if state.mode == "enabled" and asked and state.safety:
+    calm = state.tick - state.enabled_tick < CALM_TICKS
+    if state.mode == "enabled" and asked and state.safety and not calm:
         target = clamp(
             Velocity(linear_x=asked.linear_x, linear_y=asked.linear_y, angular_z=asked.angular_z),
             config.limits,

@@ -28,11 +28,13 @@ from gigabrain_zenoh.heartbeat import beat
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.stop_signals import stop_signals
+from gigabrain_zenoh.transport import Transport
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 log = logging.getLogger("gigabrain")
 
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
+MakeBus = Callable[[Transport, Clock, str], Bus]
 PATIENCE_S = 1.0  # how long the router may be missing before somebody is told
 
 # Zenoh's work in one thread, sending apart: a message wakes half as many threads on its way. A
@@ -54,6 +56,7 @@ PROGRAMS = {
     "emulator": Program(
         "gigabrain_drivers.emulators.process:run", "gigabrain_zenoh.settings:EmulatorConfig"
     ),
+    "button": Program("gigabrain_drivers.button:run", "gigabrain_zenoh.settings:ButtonConfig"),
     "perception": Program(
         "gigabrain_zenoh.perception:run", "gigabrain_zenoh.settings:PerceptionConfig"
     ),
@@ -88,7 +91,7 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
         return None
 
 
-def run(config: ProcessConfig) -> int:
+def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
     """Run one process to its end; the exit code."""
     gc.disable()  # until ready: what is imported and set up is no garbage
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
@@ -97,7 +100,7 @@ def run(config: ProcessConfig) -> int:
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
         node = node_of(config)
         with asyncio.Runner(loop_factory=loop_factory()) as runner:
-            runner.run(_run(config, node))
+            runner.run(_run(config, node, make_bus))
     except GigabrainError as error:
         log.error("%s", error, extra={"data": {"event": "failed"}})
         return error.exit_code
@@ -117,9 +120,9 @@ def _first(error: BaseException) -> BaseException:
     return error
 
 
-async def _run(config: ProcessConfig, node: Node) -> None:
+async def _run(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
     with stop_signals() as stop:
-        work = asyncio.ensure_future(_work(config, node))
+        work = asyncio.ensure_future(_work(config, node, make_bus))
         stopped = asyncio.ensure_future(stop.wait())
         await asyncio.wait((work, stopped), return_when=asyncio.FIRST_COMPLETED)
         work.cancel()
@@ -128,8 +131,8 @@ async def _run(config: ProcessConfig, node: Node) -> None:
             await work
 
 
-async def _work(config: ProcessConfig, node: Node) -> None:
-    bus = Bus(await _connect(config.endpoint), Clock(), config.name)
+async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
+    bus = make_bus(await _connect(config.endpoint), Clock(), config.name)
     handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
     logging.getLogger().addHandler(handler)
     try:

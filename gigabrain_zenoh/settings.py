@@ -52,6 +52,13 @@ class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     resume: Resume = "manual"
     state_dir: str  # where it remembers what latched it
     emulator: str = ""  # the folder of the emulator's ports, where the link is `emulated`
+    button: bool = False  # whether an e-stop button has to be there
+
+
+class ButtonConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The `button` part of a deployment file."""
+
+    port: str  # of the USB-serial adapter: a path, or usb:VID:PID[:SERIAL]
 
 
 class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

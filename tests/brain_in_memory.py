@@ -69,9 +69,11 @@ class Body(MockBody):
 class Robot:
     """Used as `async with Robot(folder) as robot:`. A tick is 20 ms."""
 
-    def __init__(self, folder: Path, *, resume: Resume = "auto") -> None:
+    def __init__(self, folder: Path, *, resume: Resume = "auto", button: bool = False) -> None:
         self.network, self.clock = LocalNetwork(), FakeClock()
-        self._config = DriverConfig(body="mock", resume=resume, state_dir=str(folder))
+        self._config = DriverConfig(
+            body="mock", resume=resume, state_dir=str(folder), button=button
+        )
         self._running: dict[str, tuple[asyncio.Future[None], Bus]] = {}
         self._ends: dict[str, Freezer] = {}
         self.state: RobotState | None = None

@@ -134,6 +134,18 @@ def enabled(source: str = "control", *, basis_ns: int = 250_000_000) -> Rig:
     return rig
 
 
+def calm(source: str = "control") -> Rig:
+    """`source` holds the body, and the 100 ms in which nobody moves it are over with this tick."""
+    rig = enabled(source)
+    for _ in range(4):
+        rig.tick()
+        rig.safety()
+        rig.send(source=source)
+    rig.tick()
+    rig.safety()
+    return rig
+
+
 def driving(linear_x: float = 0.2) -> Rig:
     """The brain drives at `linear_x` [m/s]."""
     rig = enabled()

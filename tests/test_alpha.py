@@ -341,3 +341,42 @@ def test_the_robot_has_all_three_links() -> None:
     assert catalog.links_of(robot) == ["sim", "emulated", "real"]
     run = Run(folder=Path(), link="emulated", emulator="/ports")
     assert catalog.load_link("alpha", run)[2].port == "/ports/base"  # type: ignore[attr-defined]
+
+
+def test_it_parks_through_silence_and_stands_up_before_it_walks() -> None:
+    firmware = Firmware()
+    firmware.walk(1)
+    firmware.device.feed(alpha.park(2))
+    assert firmware.gaits[-1].height == 0.13
+    assert firmware.step(200).flags == alpha.SILENT | alpha.PARKED
+    assert firmware.gaits[-1].height == 0.13
+    for sequence in range(3, 39):  # 1.8 s
+        firmware.walk(sequence)
+        assert firmware.gaits[-1] == REST
+        firmware.step(50)
+    firmware.walk(39)
+    assert WALKER.to_body(firmware.gaits[-1]) == pytest.approx((0.3, 0.0, 0.0), abs=1e-6)
+
+
+async def test_its_safe_state_is_to_lie_and_a_new_driver_leaves_it_lying(rig: Rig) -> None:
+    assert rig.driver.robot.safe_state == "park"
+    rig.streaming = (0.3, 0.0, 0.0)
+    truth = rig.body.simulation.truth
+    await until(lambda: truth.distance_m > 0.2)
+    rig.streaming = None
+    await rig.driver.make_safe()
+    standing = rig.body.snapshot.wheels
+    await rig.driver.stop()
+    await until(lambda: rig.device.parked)
+    await until(lambda: abs(rig.body.snapshot.wheels[2].position - standing[2].position) > 0.3)
+    await rig.driver.close()
+    await rig.driver.open()
+    await until(lambda: rig.connected[-1:] == [True])
+    rig.streaming = (0.0, 0.0, 0.0)
+    await asyncio.sleep(0.3)
+    assert rig.device.parked
+    assert not rig.body.snapshot.fallen
+    rig.streaming = (0.3, 0.0, 0.0)
+    start = truth.distance_m
+    await until(lambda: truth.distance_m > start + 0.2)
+    assert not rig.body.snapshot.fallen

@@ -128,7 +128,7 @@ async def test_message_schemas_are_exported(home: Home) -> None:
     assert refused.err == f"gigabrain: cannot write {home.folder / 'file'}: File exists\n"
 
 
-@pytest.mark.parametrize("command", ["estop", "release", "enable"])
+@pytest.mark.parametrize("command", ["release", "enable", "audit"])
 async def test_without_a_robot_it_says_so(home: Home, command: str) -> None:
     alone = await home.run(command)
     assert await alone.ended() == 1
@@ -140,5 +140,11 @@ async def test_without_a_robot_it_says_so(home: Home, command: str) -> None:
 async def test_an_e_stop_that_reaches_nobody_says_so(home: Home) -> None:
     where = f"tcp/127.0.0.1:{free_port()}"
     unreachable = await home.run("estop", "--connect", where)
-    assert await unreachable.ended() == 1
-    assert unreachable.err == (f"gigabrain: no router answers at {where}; is the robot running?\n")
+    assert await unreachable.ended() == 3
+    assert unreachable.err == (
+        f"gigabrain: NOT CONFIRMED: no router answers at {where}; is the robot running?; "
+        "press the hardware e-stop or cut the robot's power\n"
+    )
+    alone = await home.run("estop")
+    assert await alone.ended() == 3
+    assert alone.err.startswith("gigabrain: NOT CONFIRMED: no robot runs here; start one with")

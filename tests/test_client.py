@@ -12,7 +12,14 @@ from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.sensors import Imu, LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.client import Robot, connect
-from gigabrain_zenoh.errors import BodyLost, BusError, Refused, UnknownName, Unsupported
+from gigabrain_zenoh.errors import (
+    BodyLost,
+    BusError,
+    NotConfirmed,
+    Refused,
+    UnknownName,
+    Unsupported,
+)
 from tests.onlooker import Onlooker, looking_on
 from tests.stack import Command, Home, free_port, robot_of, until
 
@@ -165,7 +172,7 @@ async def test_no_robot_no_router_and_no_driver_are_told_apart(
     with pytest.raises(BodyLost, match="is the driver running"):
         async with connect(nowhere):
             pass
-    with pytest.raises(BodyLost, match="NOT CONFIRMED: no driver answers robot/estop"):
+    with pytest.raises(NotConfirmed, match=r"^NOT CONFIRMED: no driver answers; press the hard"):
         async with connect(nowhere, wait=False) as script:
             await script.estop()
 

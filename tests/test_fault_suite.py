@@ -1,11 +1,12 @@
-"""The fault suite's frame: the table, what is judged, and what a run says."""
+"""The fault suite: its frame, and every fault once, in its short form, on real processes."""
 
+import asyncio
 from pathlib import Path
 
 import pytest
 
 from gigabrain_zenoh.errors import UnknownName
-from gigabrain_zenoh.faults.fault import Fault, Limit, Skipped, judge
+from gigabrain_zenoh.faults.fault import Fault, Limit, Result, Skipped, judge
 from gigabrain_zenoh.faults.rig import Options, deployment_of
 from gigabrain_zenoh.faults.suite import find_test, run_suite
 from gigabrain_zenoh.faults.table import FAULTS, choose
@@ -70,3 +71,18 @@ async def test_what_cannot_run_is_skipped_and_says_why(tmp_path: Path) -> None:
     missing = Fault(2, "not-there", "process", "", "x <= 1")
     (result,) = await run_suite([missing], Options(), tmp_path)
     assert (result.verdict, result.reason, result.runs) == ("skipped", "not written yet", 0)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Result]:
+    """What came of each fault; they share robots, so they run in one go."""
+    running = run_suite(FAULTS, Options(), tmp_path_factory.mktemp("faults"))
+    return {result.number: result for result in asyncio.run(running)}
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_the_robot_stops_whatever_breaks(fault: Fault, results: dict[int, Result]) -> None:
+    result = results[fault.number]
+    if result.verdict == "skipped":
+        pytest.skip(result.reason)
+    assert result.verdict == "passed", f"{result.reason}; worst of all runs: {result.worst}"

@@ -63,8 +63,10 @@ def test_without_auto_resume_nothing_but_a_person_opens_it() -> None:
     rig.live(200, 0.2)
     assert (rig.mode, rig.state.output) == ("idle", ZERO)
     assert rig.feed(gate.Enable("control")) == gate.Outcome(text="control drives")
-    rig.live(2, 0.2)
-    assert (rig.mode, rig.state.output) == ("enabled", Velocity(linear_x=0.04))
+    rig.live(4, 0.2)  # for 100 ms it stands, however much somebody wants
+    assert (rig.mode, rig.state.output) == ("enabled", ZERO)
+    rig.live(1, 0.2)
+    assert (rig.mode, rig.state.output) == ("enabled", Velocity(linear_x=0.02))
 
 
 @pytest.mark.parametrize("generation", [0, 1, 3])

@@ -8,7 +8,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_zenoh import gate
 from gigabrain_zenoh.limits import ZERO
-from tests.gate_rig import BOOT, ZONE, Rig, driving, enabled, idle
+from tests.gate_rig import BOOT, ZONE, Rig, calm, driving, enabled, idle
 
 NAN, INF = float("nan"), float("inf")
 MS = 1_000_000
@@ -20,8 +20,7 @@ def refused(why: str) -> gate.Outcome:
 
 
 def test_a_good_command_counts_at_once_and_again_in_every_tick() -> None:
-    rig = enabled()
-    rig.tick()
+    rig = calm()
     assert rig.send(0.2, 0.1, -0.3) == GOOD
     assert rig.state.output == Velocity(linear_x=0.02, linear_y=0.02, angular_z=-0.06)
     rig.tick()
@@ -31,8 +30,7 @@ def test_a_good_command_counts_at_once_and_again_in_every_tick() -> None:
 
 
 def test_several_commands_in_one_tick_do_not_add_up() -> None:
-    rig = enabled()
-    rig.tick()
+    rig = calm()
     for _ in range(5):
         rig.send(0.2)
     assert rig.state.output == Velocity(linear_x=0.02)
@@ -44,9 +42,9 @@ def test_several_commands_in_one_tick_do_not_add_up() -> None:
 
 def test_a_command_is_cut_to_what_the_body_can_do() -> None:
     rig = enabled()
-    rig.live(14, 5.0, -50.0)
+    rig.live(18, 5.0, -50.0)
     assert rig.state.output.linear_x == 0.26
-    rig.live(16, 5.0, -50.0)
+    rig.live(17, 5.0, -50.0)
     assert rig.state.output == Velocity(linear_x=0.26, angular_z=-1.8)
 
 
@@ -75,8 +73,7 @@ def test_safetys_caps_count_at_once_and_the_body_brakes_to_them() -> None:
 
 
 def test_a_zone_ahead_leaves_turning_and_backing_away() -> None:
-    rig = enabled()
-    rig.tick()
+    rig = calm()
     rig.safety(ZONE, verdict="slow", caps=SpeedCaps(forward=0.0))
     rig.send(0.2, angular_z=1.0)
     assert rig.state.output == Velocity(angular_z=0.06)
@@ -216,7 +213,7 @@ def test_the_brain_may_stand_still_without_having_looked() -> None:
 
 
 def test_a_person_needs_no_scan_to_drive() -> None:
-    rig = enabled("alice")
+    rig = calm("alice")
     assert rig.send(0.2, source="alice", basis=None) == GOOD
     assert rig.state.output == Velocity(linear_x=0.02)
 

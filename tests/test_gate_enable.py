@@ -111,9 +111,11 @@ def test_whoever_takes_over_starts_anew() -> None:
     rig.feed(gate.Enable("bob", take=True))
     assert rig.state.output == ZERO  # alice's last command is forgotten
     rig.send(0.2, source="alice", seq=1001)
-    rig.tick()
-    assert rig.send(0.2, source="bob", seq=0).refused == ""
-    assert rig.state.output == Velocity(linear_x=0.02)
+    for told in (0.0, 0.0, 0.0, 0.0, 0.02):
+        rig.tick()
+        rig.safety()
+        assert rig.send(0.2, source="bob", seq=rig.state.tick).refused == ""
+        assert rig.state.output == Velocity(linear_x=told)
 
 
 def test_a_second_enable_is_counted_and_is_no_command() -> None:
@@ -146,3 +148,34 @@ def test_the_brain_takes_the_body_from_nobody_unless_a_person_hands_it_over() ->
     assert rig.feed(gate.Enable("control", take=True, by="bob")) == gate.Outcome(
         text="control drives"
     )
+
+
+def test_a_held_joystick_moves_nothing_in_the_first_100_ms() -> None:
+    rig = idle()
+    for _ in range(30):  # somebody holds it while the gate is shut
+        rig.tick()
+        rig.safety()
+        rig.send(0.26, source="alice")
+    assert rig.feed(gate.Enable("alice")).ok
+    told = []
+    for _ in range(6):
+        rig.send(0.26, source="alice")
+        told.append(rig.state.output.linear_x)
+        rig.tick()
+        rig.safety()
+    assert told == [0.0, 0.0, 0.0, 0.0, 0.0, 0.02]
+
+
+def test_a_release_under_a_held_joystick_moves_nothing_without_an_enable() -> None:
+    rig = enabled("alice")
+    rig.feed(gate.Estop("bob"))
+    for _ in range(40):
+        rig.tick()
+        rig.safety()
+        rig.send(0.26, source="alice")
+    assert rig.feed(gate.Release(1)).ok
+    for _ in range(40):
+        rig.tick()
+        rig.safety()
+        assert rig.send(0.26, source="alice").refused == "not_enabled"
+    assert (rig.mode, rig.state.commander, rig.state.output) == ("idle", "", ZERO)

@@ -162,9 +162,11 @@ class GateMachine(RuleBasedStateMachine):
     def release(self, wrong: int) -> None:
         self.feed(gate.Release(self.state.estop_generation + wrong))
 
-    @rule(source=sources, take=st.booleans())
-    def enable(self, source: str, take: bool) -> None:
-        self.feed(gate.Enable(source, take))
+    @rule(source=sources, take=st.booleans(), by=st.sampled_from(["", "control", "bob"]))
+    def enable(self, source: str, take: bool, by: str) -> None:
+        held = self.state.commander not in ("", source)
+        granted = self.feed(gate.Enable(source, take, by)).ok
+        assert not (granted and held and source == "control") or by == "bob"
 
     @rule(ticks=st.sampled_from([1, 4, 26]), x=speed, z=speed)
     def all_is_well(self, ticks: int, x: float, z: float) -> None:
@@ -177,8 +179,8 @@ class GateMachine(RuleBasedStateMachine):
     def a_person_sets_it_going(self, source: str, x: float, z: float) -> None:
         self.all_is_well(26, 0.0, 0.0)
         self.release(0)
-        self.enable(source, True)
-        self.all_is_well(4, x, z)
+        self.enable(source, True, "bob")
+        self.all_is_well(8, x, z)
 
     def send(self, command: CmdVel, wall_ns: int) -> None:
         before, good = self.state, self.good
@@ -250,7 +252,8 @@ class GateMachine(RuleBasedStateMachine):
 
     def check_output(self) -> None:
         """Never more than the body can do, nor a faster change; down to zero unless enabled."""
-        driven = self.state.mode == "enabled" and self.good is not None
+        calm = self.state.tick - self.opened < 5
+        driven = self.state.mode == "enabled" and self.good is not None and not calm
         allowed = self.said.caps if self.said else NO_CAPS
         forward = (allowed.forward, allowed.left, allowed.rotation)
         backward = (allowed.backward, allowed.right, allowed.rotation)

@@ -120,4 +120,6 @@ def test_nothing_jumps_when_it_is_enabled_within_the_tick_of_an_estop() -> None:
     rig.feed(gate.Release(1))
     rig.feed(gate.Enable("control"))
     rig.send(0.2)
+    assert (rig.mode, rig.state.output) == ("enabled", ZERO)
+    rig.live(5, 0.2)
     assert (rig.mode, rig.state.output) == ("enabled", Velocity(linear_x=0.02))

@@ -8,7 +8,7 @@ import pytest
 from gigabrain_drivers.opencr.driver import imu_of
 from gigabrain_drivers.protocols import dynamixel, opencr
 from gigabrain_schemas.sensors import Imu
-from gigabrain_zenoh.errors import Unsupported
+from gigabrain_zenoh.errors import BodyLost, Unsupported
 from tests.opencr_rig import MS, Rig, make_rig  # noqa: F401
 
 
@@ -130,3 +130,23 @@ def test_an_attitude_that_cannot_be_is_left_out(broken: tuple[float, ...]) -> No
     data = bytearray(172)
     data[86:102] = struct.pack("<4f", *broken)
     assert imu_of(opencr.readings(bytes(data))) is None
+
+
+async def test_its_motors_can_be_let_go_and_the_next_connection_holds_them_again(
+    rig: Rig,
+) -> None:
+    def torques() -> list[int]:
+        written = [p.params for p in rig.cable.sent if p.instruction == dynamixel.WRITE]
+        return [params[2] for params in written if params[:2] == b"\x95\x00"]
+
+    assert torques() == [1]
+    await rig.driver.limp()
+    await rig.drive(0.2, 0.0, 200)
+    await rig.driver.stop()
+    assert torques() == [1, 0]
+    rig.cable.drop("unplugged")
+    with pytest.raises(BodyLost, match="unplugged"):
+        await rig.driver.limp()
+    rig.cable.plug()
+    await rig.wait(100)
+    assert torques() == [1, 0, 1]

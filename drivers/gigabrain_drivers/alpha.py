@@ -65,7 +65,7 @@ class AlphaDriver(Driver):
         self._state: State | None = None
         self._hearing = Hearing(self.link, self._clock, SILENT_NS, SENSELESS, log)
         self._untold = False  # whether a loss has not been reported yet
-        self._open = False
+        self._open = self._parked = False
         self._fall = Fault(log)
         self._imu: Imu | None = None
         self._lidar: ScanSource | None = None
@@ -91,9 +91,17 @@ class AlphaDriver(Driver):
             await self._lidar.close()
 
     async def stop(self) -> None:
-        """Come to rest and stand."""
+        """Come to rest and stand; a body that lies goes on lying."""
         if self._hearing.heard:
-            self.link.write(alpha.stop(self._next()))
+            say = alpha.park if self._parked else alpha.stop
+            self.link.write(say(self._next()))
+
+    async def park(self) -> None:
+        """Lie down; only a step gets it up again."""
+        if not self._hearing.heard:
+            raise BodyLost(f"{self.link}: {self.link.problem or 'the body is silent'}")
+        self._parked = True
+        self.link.write(alpha.park(self._next()))
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
@@ -106,6 +114,10 @@ class AlphaDriver(Driver):
         to = self.bounded(linear_x, linear_y, angular_z)
         if self._untold or self._fallen:
             to = ZERO
+        if self._parked and to == ZERO:
+            self.link.write(alpha.park(self._next()))
+            return ZERO
+        self._parked = False
         gait = WALKER.to_gait(Twist(to.linear_x, to.linear_y, to.angular_z))
         seen = self._last[1] if self._last else 0
         if not self.link.write(alpha.walk(alpha.Walk(seen, gait), self._next())):
@@ -169,8 +181,10 @@ class AlphaDriver(Driver):
         if last:
             passed = (state.milliseconds - last[1]) % MILLISECONDS
             self._odometry.update(state.senses, passed / 1000)
-        if first:
-            self.link.write(alpha.stop(self._next()))
+        if first:  # what lies stays so until somebody wants it to walk
+            self._parked = bool(state.flags & alpha.PARKED)
+            say = alpha.park if self._parked else alpha.stop
+            self.link.write(say(self._next()))
         senses = state.senses
         self._imu = Imu(
             orientation=senses.orientation,

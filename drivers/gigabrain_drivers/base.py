@@ -1,6 +1,8 @@
 """The hardware abstraction layer: what every body offers."""
 
 import abc
+import asyncio
+import logging
 import math
 from collections.abc import AsyncIterator, Callable, Mapping
 from types import TracebackType
@@ -8,11 +10,16 @@ from typing import Any, ClassVar, Self
 
 from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
 from gigabrain_schemas.base import TICK_NS, Message, Velocity
-from gigabrain_schemas.body import Joint, RobotState
+from gigabrain_schemas.body import Joint, RobotState, SafeState
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import Unsupported
+from gigabrain_zenoh.errors import GigabrainError, Unsupported
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
+
+log = logging.getLogger(__name__)
+
+STILL = 0.02  # [m/s], [rad/s]
+REST_LOOKS = 40  # 0.8 s: a supervisor that ends this process waits little longer
 
 Emit = Callable[[Topic[Any], Message], None]
 
@@ -46,7 +53,7 @@ class Driver(abc.ABC):
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        await self.stop()
+        await self.make_safe()
         await self.close()
 
     @abc.abstractmethod
@@ -77,6 +84,38 @@ class Driver(abc.ABC):
     async def hold(self) -> None:
         """Keep the present position; an arm without brakes must not go limp."""
         await self.stop()
+
+    async def park(self) -> None:
+        """Take up a posture in which the body may be left alone. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} cannot park its body")
+
+    async def limp(self) -> None:
+        """Let go of all joints, so that a person can move them. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} cannot let go of its body's joints")
+
+    def can(self, state: SafeState) -> bool:
+        """Whether this driver can bring its body into a safe state."""
+        return getattr(type(self), state) is not getattr(Driver, state) or state == "hold"
+
+    async def make_safe(self) -> None:
+        """Come to rest, then take up the safe state that the robot's file names. Never raises."""
+        state = self.robot.safe_state
+        await (self.hold() if state == "hold" else self.stop())
+        if state in ("stop", "hold"):
+            return
+        try:
+            await self._rest()
+            await (self.park() if state == "park" else self.limp())
+        except GigabrainError as error:
+            log.error("the body has stopped, but %s could not be done: %s", state, error)
+
+    async def _rest(self) -> None:
+        """Wait until the body stands still, but no longer than it may take to brake."""
+        for _ in range(REST_LOOKS):
+            now = (await self.read_state()).velocity
+            if max(abs(now.linear_x), abs(now.linear_y), abs(now.angular_z)) < STILL:
+                return
+            await asyncio.sleep(TICK_NS / 1e9)
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float

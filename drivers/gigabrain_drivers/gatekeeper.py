@@ -121,6 +121,13 @@ class Gatekeeper:
         self._forgetful.begin(problem)
         return f"; but a restart would forget it: {problem}"
 
+    def press(self, text: str) -> None:
+        """The e-stop button of this robot is pressed."""
+        outcome = self.step(gate.Estop("button"))
+        self._output_changed()
+        log.warning("e-stop by button: %s", text)
+        self._audit("estop", "button", outcome, text)
+
     async def _on_estop(self, request: EstopRequest) -> GateReply:
         outcome = self.step(gate.Estop(request.source))
         await self._stop()  # before disk and log

@@ -4,12 +4,13 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 from msgspec.structs import replace
 
 from gigabrain_drivers.base import Driver
+from gigabrain_drivers.button_watch import ButtonWatch
 from gigabrain_drivers.catalog import make_driver, ports_folder
 from gigabrain_drivers.gatekeeper import Gatekeeper
 from gigabrain_drivers.links.wording import of_command
@@ -17,7 +18,7 @@ from gigabrain_drivers.lockstep import REPEAT_S, Lockstep
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.round_trip import RoundTrip
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.body import Body, RobotState
+from gigabrain_schemas.body import Body, RobotState, SafeState
 from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import (
@@ -68,6 +69,8 @@ class DriverProcess:
         self._gatekeeper = Gatekeeper(
             gate_config, robot.robot_type, bus, Path(config.state_dir), self._wake.set
         )
+        press = self._gatekeeper.press
+        self._button = ButtonWatch(bus, press) if config.button else None
         self._lockstep = Lockstep(robot.control.period_ticks) if driver.lockstep else None
         self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
         self._round_trip = RoundTrip()
@@ -122,7 +125,8 @@ class DriverProcess:
     async def _tick(self, passed: int) -> None:
         """20 ms of the body's time, or several where the process was held up."""
         state = await self._driver.read_state()
-        faults = () if state.link.connected else (why.LINK_LOST,)
+        button = self._button.faults() if self._button else ()
+        faults = button if state.link.connected else (why.LINK_LOST, *button)
         for _ in range(passed):
             self._gatekeeper.step(gate.Tick(state.velocity, self._wall_ns(), faults))
         self._bus.time.tick = self._gate.tick
@@ -255,4 +259,10 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
         emulator=config.emulator or str(ports_folder(config.body)),
     )
     robot, driver = make_driver(config.body, where)
+    if not driver.can(robot.safe_state):
+        known = ", ".join(name for name in get_args(SafeState) if driver.can(name))
+        raise ConfigError(
+            f"safe_state: {robot.safe_state} is more than {type(driver).__name__} can do; "
+            f"expected one of: {known}"
+        )
     await DriverProcess(config, robot, driver, bus).run(ready)

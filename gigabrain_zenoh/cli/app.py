@@ -24,6 +24,7 @@ COMMANDS = {
     "driver new": ("driver_kit:new", "Write the package of a new driver."),
     "driver test": ("driver_kit:test", "Check a driver against all that it must do."),
     "driver trace": ("driver_kit:trace", "Show the bytes on a body's line, decoded."),
+    "button": ("process:button", "Start an e-stop button on a serial adapter."),
     "emulate": ("emulate:emulate", "Be a robot's body on real ports, in MuJoCo."),
     "estop": ("operate:estop", "Stop the robot at once, and latch it."),
     "release": ("operate:release", "Let go of a latched gate."),

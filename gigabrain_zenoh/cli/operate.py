@@ -8,6 +8,8 @@ from collections.abc import Awaitable, Callable
 from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.client import Robot
 from gigabrain_zenoh.client import connect as connect_robot
+from gigabrain_zenoh.errors import BusError, NotConfirmed
+from gigabrain_zenoh.estop import BY_HAND
 from gigabrain_zenoh.gate import BRAIN
 
 
@@ -15,6 +17,9 @@ def estop(*, connect: str | None = None, namespace: str = "", reason: str = "") 
     """Stop the robot at once, and latch it.
 
     Example: gigabrain estop --reason "somebody is in the way"
+
+    Ends with 3, and NOT CONFIRMED, when no body has said that it stands: then somebody has to
+    press the hardware e-stop, or cut the power.
 
     Parameters
     ----------
@@ -25,7 +30,12 @@ def estop(*, connect: str | None = None, namespace: str = "", reason: str = "") 
     reason
         For the log.
     """
-    return _ask(connect, namespace, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False)
+    try:
+        return _ask(
+            connect, namespace, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False
+        )
+    except BusError as error:
+        raise NotConfirmed(f"NOT CONFIRMED: {error}; {BY_HAND}") from None
 
 
 def release(*, connect: str | None = None, namespace: str = "") -> int:

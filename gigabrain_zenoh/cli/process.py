@@ -144,6 +144,19 @@ def driver(
     return _run("driver", place, msgspec.to_builtins(settings))
 
 
+def button(*, port: str, place: Place = HERE) -> int:
+    """Start an e-stop button: a normally closed contact between TX and RX of a serial adapter.
+
+    Example: gigabrain button --port usb:0403:6001
+
+    Parameters
+    ----------
+    port
+        The adapter: a path, or usb:VID:PID[:SERIAL].
+    """
+    return _run("button", place, {"port": port})
+
+
 def _run(
     name: str, place: Place, settings: dict[str, Any], endpoint: Endpoint | None = None
 ) -> int:

@@ -5,6 +5,7 @@ import os
 import signal
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -25,6 +26,7 @@ from gigabrain_zenoh.faults.fault import Failed
 from gigabrain_zenoh.faults.onlooker import Onlooker, looking_on
 from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.keeper import ProcessSpec
+from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.supervisor import Supervisor
 
 Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
@@ -94,6 +96,11 @@ class Subject:
         return not (self.harmed or self.supervisor.given_up or self._running.done())
 
     @property
+    def ports(self) -> Path:
+        """The folder of an emulated body's ports."""
+        return self.folder / "run" / "ports"
+
+    @property
     def truth_of(self) -> str:
         """The process whose report is the physics' truth."""
         return EMULATOR if self.deployment.link == "emulated" else "driver"
@@ -148,7 +155,7 @@ class Subject:
 
         Returns once the emulator has taken them.
         """
-        path = self.folder / "run" / "ports" / FAULTS_FILE
+        path = self.ports / FAULTS_FILE
         begin = len(self.records)
         fresh = path.with_suffix(".new")
         fresh.write_bytes(msgspec.json.encode(faults))
@@ -168,6 +175,15 @@ class Subject:
     async def distance(self) -> float:
         """How long the path of the body has been so far, by the physics [m]."""
         return float((await self.truth())["distance_m"])
+
+    async def simulated(self, seconds: float) -> dict[str, Any]:
+        """Let an emulated body's own time go on, whoever else lives; the truth after that."""
+        truth = await self.truth()
+        end_s = float(truth["sim_seconds"]) + seconds
+        while float(truth["sim_seconds"]) < end_s:
+            await asyncio.sleep(0.02)
+            truth = await self.truth()
+        return truth
 
     async def drive(self, room: float = 1.3) -> None:
         """Have the brain drive straight on at full speed, as a person would: by hand."""
@@ -209,3 +225,10 @@ class Subject:
 
     def _record(self, _name: str, record: Mapping[str, Any]) -> None:
         self.records.append(record)
+
+
+def configured(spec: ProcessSpec, settings: Mapping[str, Any]) -> ProcessSpec:
+    """The same process with some of its settings replaced."""
+    config = msgspec.json.decode(spec.argv[-1], type=ProcessConfig)
+    config = msgspec.structs.replace(config, settings={**config.settings, **settings})
+    return replace(spec, argv=(*spec.argv[:-1], msgspec.json.encode(config).decode()))

@@ -13,7 +13,10 @@ from gigabrain_drivers.legs.senses import Senses
 from gigabrain_drivers.protocols import alpha
 from gigabrain_drivers.protocols.alpha import Decoder, Frame, State
 
+LYING_M = 0.13  # height of the hips of a body that lies
 REST = WALKER.to_gait(Twist(0.0, 0.0, 0.0))
+RISE_NS = 1_800_000_000  # from lying to standing
+LYING = REST._replace(height=LYING_M)
 BROWN_OUT_SHARE = 0.6  # of the battery's voltage, below which the firmware is off
 KEPT = 1000  # commands, for tests to look at
 
@@ -48,8 +51,13 @@ class Alpha(Device):
         self._now_ns = 0
         self._began_ns: int | None = None
         self._silent, self._on = True, True
-        self._gait = REST
+        self._gait, self._up_ns = REST, 0
         self.body.walk(REST)
+
+    @property
+    def parked(self) -> bool:
+        """Whether it lies, or is on its way down."""
+        return self._gait == LYING
 
     def feed(self, data: bytes) -> None:
         """Bytes from whoever is connected."""
@@ -78,7 +86,7 @@ class Alpha(Device):
         self._now_ns = now_ns
         if self._obeyed_ns is None or now_ns - self._obeyed_ns >= self.watchdog_ns:
             self._silent, self._last = True, None
-            self._walk(REST)
+            self._walk(LYING if self.parked else REST)
         self._sent += 1
         self.wire.write(alpha.state(self._report(), self._sent))
 
@@ -86,6 +94,8 @@ class Alpha(Device):
         """What a frame asks for, or None where it is not a sound, new and fresh command."""
         if frame.type == alpha.STOP:
             return REST
+        if frame.type == alpha.PARK:
+            return LYING
         command = alpha.walk_of(frame) if frame.type == alpha.WALK else None
         if command is None or not sound(command.gait):
             return None
@@ -105,6 +115,11 @@ class Alpha(Device):
         self._walk(gait)
 
     def _walk(self, gait: Gait) -> None:
+        """Have the legs do it; a body that lies stands up before the first step."""
+        if self.parked and gait != LYING:
+            self._up_ns = self._now_ns + RISE_NS
+        if gait != LYING and self._now_ns < self._up_ns:
+            gait = REST
         if gait != self._gait:
             self._gait = gait
             self.body.walk(gait)
@@ -112,6 +127,7 @@ class Alpha(Device):
     def _report(self) -> State:
         now = self.body.snapshot
         flags = alpha.SILENT if self._silent else 0
+        flags |= alpha.PARKED if self.parked else 0
         flags |= alpha.FALLEN if now.fallen else 0
         flags |= alpha.WALKING if max(map(abs, WALKER.to_body(self._gait))) > 0 else 0
         angles = iter([motor.position for motor in now.wheels])

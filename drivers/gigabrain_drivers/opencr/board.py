@@ -82,6 +82,10 @@ class Board:
         """Zero velocity, whoever may be listening."""
         return self.link.write(opencr.velocity(0.0, 0.0).frame)
 
+    def let_go(self) -> bool:
+        """Motors without torque, until the driver finds the board again."""
+        return self.link.write(opencr.torque(on=False))
+
     def drive(self, linear_x: float, angular_z: float) -> tuple[float, float]:
         """Send a velocity [m/s], [rad/s]; returns what was really sent."""
         sent = opencr.velocity(linear_x, angular_z)

@@ -25,7 +25,7 @@ from gigabrain_schemas.body import Battery, Joint, RobotState
 from gigabrain_schemas.sensors import Imu, ImuData, LaserScan
 from gigabrain_schemas.topics import IMU, SCAN
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import ConfigError, Unsupported
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
 GUARD_NS = 20_000_000  # how often the driver looks after itself
 SILENT_NS = 80_000_000  # without a command; zero is then out by 100 ms
@@ -110,6 +110,11 @@ class OpenCrDriver(Driver):
         """Zero velocity, at once."""
         self._commanded_ns = self._clock.now_ns()
         self._board.halt()
+
+    async def limp(self) -> None:
+        """Wheels that turn freely; the next start of a driver holds them again."""
+        if not self._board.let_go():
+            raise BodyLost(self.problem or f"{self.link} takes no commands")
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float

@@ -23,16 +23,16 @@ SILENCE_NS = 100_000_000  # without a sound command, after which the body stops
 STALE_MS = 150  # a command that rests on an older state than this is refused
 STATE_HZ = 100
 MAGIC, VERSION = b"\xa5\x5a", 1
-WALK, STOP, STATE = 0x01, 0x02, 0x81
+WALK, STOP, PARK, STATE = 0x01, 0x02, 0x03, 0x81
 SEQUENCES = 1 << 32
 
-WALKING, SILENT, FALLEN = 1, 2, 4  # flags: feet step; stopped by silence; lies on the floor
+WALKING, SILENT, FALLEN, PARKED = 1, 2, 4, 8  # flags: feet step; stopped by silence; fell; lies
 
 _HEADER = struct.Struct("<2sHBBI")
 _CRC = struct.Struct("<I")
 _GAIT = struct.Struct("<I10f")
 _STATE = struct.Struct("<III B B 3f 4f3f3f 36f 12h")
-_LENGTHS = {WALK: _GAIT.size, STOP: 0, STATE: _STATE.size}
+_LENGTHS = {WALK: _GAIT.size, STOP: 0, PARK: 0, STATE: _STATE.size}
 _FASTEST = 1e4  # beyond which, either way, no number in a state is a measurement
 
 
@@ -84,6 +84,11 @@ def walk(command: Walk, sequence: int) -> bytes:
 def stop(sequence: int) -> bytes:
     """A command to come to rest and stand."""
     return encode(Frame(STOP, sequence))
+
+
+def park(sequence: int) -> bytes:
+    """A command to come to rest and lie down, and to stay so until the next step is asked for."""
+    return encode(Frame(PARK, sequence))
 
 
 def walk_of(frame: Frame) -> Walk | None:
@@ -171,6 +176,8 @@ def describe(frame: Frame) -> str:
             f"turn {gait.turn:.4f} rad, frequency {gait.frequency:.2f} Hz, duty {gait.duty:.2f}, "
             f"height {gait.height:.3f} m; seen {command.seen} ms"
         )
+    if frame.type == PARK:
+        return f"{frame.sequence} park"
     if frame.type == STOP:
         return f"{frame.sequence} stop"
     if frame.type == STATE and (now := state_of(frame)):

@@ -93,6 +93,14 @@ class MujocoDriver(Driver):
         """Come to rest."""
         self._simulation.command(0.0, 0.0)
 
+    async def park(self) -> None:
+        """As it stands: the physics ends with this process, and the body with it."""
+        await self.stop()
+
+    async def limp(self) -> None:
+        """As it stands, see `park`."""
+        await self.stop()
+
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
         """One tick per 20 ms of simulated time; ends when the run's seconds are over."""
         self._bridge = Bridge()

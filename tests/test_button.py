@@ -1,0 +1,227 @@
+"""An e-stop button: the contact opens, the adapter goes, the echo is wrong, the process dies."""
+
+import asyncio
+import itertools
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.button import Button
+from gigabrain_drivers.button_watch import ButtonWatch
+from gigabrain_drivers.echo_loop import EchoLoop
+from gigabrain_drivers.emulators.pty import Pty
+from gigabrain_schemas.body import GateStatus
+from gigabrain_schemas.button import ButtonState
+from gigabrain_schemas.requests import EstopRequest, GateReply
+from gigabrain_schemas.topics import BUTTON, ESTOP
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.deployment import Deployment, process_specs
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.settings import ButtonConfig
+from gigabrain_zenoh.transport import LocalNetwork
+from tests.brain_in_memory import Robot
+from tests.bus_rig import Net
+
+MS = 1_000_000
+OPEN = "the contact is open, or its wire is broken"
+WRONG = "what comes back is not what was sent"
+
+
+def counting() -> Callable[[int], bytes]:
+    """Bytes that count up, in place of random ones."""
+    numbers = itertools.count()
+    return lambda size: bytes(next(numbers) % 256 for _ in range(size))
+
+
+def closed(loop: EchoLoop, begin_ms: int, end_ms: int) -> None:
+    """The contact is closed for a while."""
+    for now in range(begin_ms, end_ms, 20):
+        loop.heard(loop.question(now * MS), (now + 5) * MS)
+
+
+def test_a_closed_contact_gives_back_what_was_sent() -> None:
+    loop = EchoLoop(counting())
+    assert loop.problem(0) == OPEN
+    closed(loop, 0, 100)
+    assert loop.problem(100 * MS) == ""
+
+
+def test_an_open_contact_is_noticed_after_200_ms_and_not_before() -> None:
+    loop = EchoLoop(counting())
+    closed(loop, 0, 100)  # the last question left at 80 ms
+    for now in range(100, 281, 20):
+        loop.question(now * MS)
+    assert loop.problem(280 * MS) == ""
+    assert loop.problem(281 * MS) == OPEN
+
+
+def test_an_echo_that_comes_late_does_not_count() -> None:
+    loop = EchoLoop(counting())
+    loop.heard(loop.question(0), 201 * MS)
+    assert loop.problem(201 * MS) == OPEN
+
+
+def test_a_wrong_byte_counts_as_pressed_and_200_ms_must_pass_before_anything_is_believed() -> None:
+    loop = EchoLoop(counting())
+    closed(loop, 0, 100)
+    data = loop.question(100 * MS)
+    loop.heard(bytes([data[0] ^ 1, data[1]]), 105 * MS)
+    assert loop.problem(105 * MS) == WRONG
+    assert loop.question(120 * MS) == b""
+    assert loop.problem(304 * MS) == WRONG
+    assert loop.problem(305 * MS) == OPEN
+    closed(loop, 305, 330)
+    assert loop.problem(330 * MS) == ""
+
+
+def test_bytes_that_nobody_sent_count_as_pressed() -> None:
+    loop = EchoLoop(counting())
+    closed(loop, 0, 100)
+    loop.heard(b"\x00", 110 * MS)
+    assert loop.problem(110 * MS) == WRONG
+
+
+def test_a_new_line_has_to_be_closed_anew() -> None:
+    loop = EchoLoop(counting())
+    closed(loop, 0, 100)
+    loop.opened()
+    assert loop.problem(100 * MS) == OPEN
+
+
+def test_what_is_sent_cannot_be_guessed() -> None:
+    loop = EchoLoop()
+    assert len({loop.question(now) for now in range(100)}) > 90
+
+
+class Rig:
+    """A button on a pty whose contact the test moves, and a robot that may latch."""
+
+    def __init__(self, folder: Path) -> None:
+        network, clock = LocalNetwork(), Clock()
+        self.robot = Bus(network.transport(), clock, "driver")
+        self.heard: list[ButtonState] = []
+        self.asked: list[EstopRequest] = []
+        self.latches = True
+        self.robot.subscribe(BUTTON, lambda _key, state: self.heard.append(state))
+        self.robot.serve(ESTOP, self._stop)
+        self.pty = Pty(folder / "button")
+        self.closed = True
+        self.pty.on_bytes = self._contact
+        self.pty.plug()
+        bus = Bus(network.transport(), clock, "button")
+        button = Button(ButtonConfig(port=str(folder / "button")), bus)
+        self.task = asyncio.create_task(button.run(lambda: None))
+
+    def _contact(self, data: bytes) -> None:
+        if self.closed:
+            self.pty.write(data)
+
+    async def _stop(self, request: EstopRequest) -> GateReply:
+        self.asked.append(request)
+        mode = GateStatus(mode="latched" if self.latches else "enabled")
+        return GateReply(ok=True, text="", robot_type="mock", gate=mode)
+
+    async def until(self, condition: Callable[[], object]) -> None:
+        async with asyncio.timeout(20):
+            while not condition():  # noqa: ASYNC110
+                await asyncio.sleep(0.005)
+
+    async def says(self, text: str) -> None:
+        """Wait until it says this, and that it is pressed where there is a text."""
+        await self.until(lambda: self.heard and text in self.heard[-1].text)
+        await self.until(lambda: self.heard[-1].pressed == bool(text))
+
+
+@pytest.fixture
+async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
+    rig = Rig(tmp_path)
+    await rig.until(lambda: rig.heard and not rig.heard[-1].pressed)
+    rig.asked.clear()
+    yield rig
+    rig.task.cancel()
+    await asyncio.gather(rig.task, return_exceptions=True)
+    rig.pty.unplug()
+
+
+async def test_an_open_contact_stops_the_robot_and_a_closed_one_only_permits(rig: Rig) -> None:
+    rig.closed = False
+    await rig.says(OPEN)
+    await rig.until(lambda: rig.asked)
+    assert (rig.asked[0].source, rig.asked[0].reason) == ("button", OPEN)
+    rig.closed = True
+    await rig.until(lambda: not rig.heard[-1].pressed)
+
+
+async def test_it_asks_until_somebody_confirms(rig: Rig) -> None:
+    rig.latches = rig.closed = False
+    await rig.until(lambda: len(rig.asked) > 3)
+    rig.latches = True
+    await rig.says(OPEN)
+
+
+async def test_an_unplugged_adapter_is_a_press(rig: Rig) -> None:
+    rig.pty.unplug()
+    await rig.until(lambda: rig.heard[-1].pressed)
+    await rig.until(lambda: rig.asked)
+    rig.pty.plug()
+    await rig.until(lambda: not rig.heard[-1].pressed)
+
+
+async def test_something_else_on_the_line_is_a_press(rig: Rig) -> None:
+    rig.pty.write(b"Linux login:")
+    await rig.says(WRONG)
+    await rig.until(lambda: rig.asked)
+
+
+async def test_the_driver_takes_silence_for_a_latching_cause_once_it_was_heard() -> None:
+    net, pressed = Net(), list[str]()
+    watch = ButtonWatch(net.one, pressed.append)
+    assert [(c.code, c.latching) for c in watch.faults()] == [("button_lost", False)]
+    net.two.publish(BUTTON, ButtonState(pressed=False))
+    assert watch.faults() == ()
+    await net.clock.advance(200 * MS)
+    assert watch.faults() == ()
+    await net.clock.advance(1)
+    assert [(c.code, c.latching) for c in watch.faults()] == [("button_lost", True)]
+    net.two.publish(BUTTON, ButtonState(pressed=True, text="the contact is open"))
+    net.two.publish(BUTTON, ButtonState(pressed=True, text="the contact is open"))
+    assert [(c.code, c.latching) for c in watch.faults()] == [("button", True)]
+    assert pressed == ["the contact is open"]
+
+
+async def test_a_robot_with_a_button_does_not_move_without_its_word(tmp_path: Path) -> None:
+    async with Robot(tmp_path, button=True) as robot:
+
+        async def tell(ticks: int, pressed: bool) -> list[float]:
+            speeds: list[float] = []
+            for _ in range(ticks // 2):
+                robot.operator.publish(BUTTON, ButtonState(pressed=pressed))
+                speeds += await robot.go(2)
+            return speeds
+
+        assert set(await robot.go(100)) == {0.0}
+        assert robot.causes == ["boot", "button_lost"]
+        assert (await tell(200, False))[-1] == pytest.approx(0.26)
+        told = await robot.go(30)
+        assert told[-1] == 0.0
+        assert (robot.mode, "button_lost" in robot.causes) == ("latched", True)
+
+
+def test_a_deployment_runs_the_button_beside_the_driver(tmp_path: Path) -> None:
+    deployment = Deployment(button=ButtonConfig(port="/dev/ttyUSB0"))
+    specs = {spec.name: spec for spec in process_specs(deployment, "robot", tmp_path, tmp_path)}
+    assert '"settings":{"port":"/dev/ttyUSB0"}' in specs["button"].argv[-1]
+    assert '"button":true' in specs["driver"].argv[-1]
+    assert "button" not in {
+        spec.name for spec in process_specs(Deployment(), "robot", tmp_path, tmp_path)
+    }
+    elsewhere = Deployment(
+        button=ButtonConfig(port="auto"), hosts={"robot": ("driver",), "desk": ("button",)}
+    )
+    assert [s.name for s in process_specs(elsewhere, "robot", tmp_path, tmp_path)] == ["driver"]
+    assert [s.name for s in process_specs(elsewhere, "desk", tmp_path, tmp_path)] == ["button"]
+    for wrong in ({"hosts": {"desk": ("button",)}}, {"button": ButtonConfig(port=""), "speed": 2}):
+        with pytest.raises((ValueError, ConfigError)):
+            Deployment(**wrong)  # type: ignore[arg-type]
