@@ -41,6 +41,7 @@ async def two_commanders_across_a_partition(rig: Rig) -> Measured:
     """The first is cut off while it drives, the second takes over, the first comes back."""
     subject = await rig.robot("sim")
     onlooker, near = subject.onlooker, client_endpoint(subject.deployment)
+    await subject.drive()  # all is well, and somebody may take over
     async with (
         proxy_to(subject) as (proxy, far),
         connect(far.connect[0], source="first", take=True) as first,
