@@ -53,6 +53,7 @@ class Subject:
         self.supervisor = Supervisor(change(specs) if change else specs, self._record, backoff)
         self.records: list[Mapping[str, Any]] = []  # of all logs
         self.harmed = False  # a test may say that nobody should use this robot again
+        self.late_s = 0.0  # how long this machine has kept the body's firmware waiting
         self.onlooker: Onlooker
         self.person: Robot
         self._stack = AsyncExitStack()
@@ -176,7 +177,9 @@ class Subject:
 
     async def truth(self) -> dict[str, Any]:
         """What the physics knows: contacts, distance_m, true_speed and more."""
-        return dict((await self.onlooker.describe(self.truth_of)).report)
+        truth = dict((await self.onlooker.describe(self.truth_of)).report)
+        self.late_s = max(self.late_s, float(truth.get("firmware_late_s") or 0.0))
+        return truth
 
     async def distance(self) -> float:
         """How long the path of the body has been so far, by the physics [m]."""
@@ -223,7 +226,7 @@ class Subject:
         if self.onlooker.state.boot == boot:
             await self.release()
         self._contacts = int((await self.truth())["contacts"])
-        self._judged = len(self.records)
+        self._judged, self.late_s = len(self.records), 0.0
 
     async def check(self) -> None:
         """Raise Failed where something was touched, or a program has died of itself."""
