@@ -7,7 +7,6 @@ import itertools
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.faults.chaos import Chaos
 from gigabrain_zenoh.faults.crowd import (
-    bit_flips,
     duplicated_and_reordered,
     two_commanders_across_a_partition,
     viewer_frozen,
@@ -19,6 +18,7 @@ from gigabrain_zenoh.faults.spoiled import HOLE, behind_proxy
 from gigabrain_zenoh.faults.stopping import TICK_MS, creep, stop_by
 from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
+from gigabrain_zenoh.faults.with_keys import bit_flips
 
 __all__ = [
     "bit_flips",

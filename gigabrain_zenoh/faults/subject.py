@@ -67,7 +67,7 @@ class Subject:
             await self._stack.enter_async_context(self.supervisor)
             self._running = asyncio.create_task(self.supervisor.run())
             self._stack.push_async_callback(self._end)
-            where = client_endpoint(self.deployment)
+            where = client_endpoint(self.deployment, "operator")
             self.onlooker = await self._stack.enter_async_context(looking_on(where, "suite"))
             self.person = Robot(self.onlooker.bus)
             await self.ready()
