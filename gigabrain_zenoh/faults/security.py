@@ -23,6 +23,7 @@ from gigabrain_zenoh.client import connect
 from gigabrain_zenoh.deployment import client_endpoint
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.faults.fault import Measured, Skipped
+from gigabrain_zenoh.faults.intruders import unauthorised_publisher
 from gigabrain_zenoh.faults.rig import Rig
 from gigabrain_zenoh.faults.spoiled import address_of
 from gigabrain_zenoh.faults.stopping import TICK_MS
@@ -31,6 +32,8 @@ from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.percentile import percentile
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
+
+__all__ = ["idle_and_random_connections", "replayed_traffic", "unauthorised_publisher"]
 
 SPEED, MOVES = 0.15, 0.01  # [m/s]
 RECORDED = (SCAN, STATE, WORLD, INTENT, CMD_VEL, SAFETY, TELEOP)
@@ -45,11 +48,6 @@ BOMBS = (  # to a port that speaks Zenoh: a length of 64 kB and nothing, and wha
     bytes.fromhex("16030100ff010000fb0303") + bytes(244),
 )  # fmt: skip
 WATCH_S = 5.0
-
-
-async def unauthorised_publisher(rig: Rig) -> Measured:
-    """Nobody can be told from anybody without keys."""
-    raise Skipped("needs keys")
 
 
 async def replayed_traffic(rig: Rig) -> Measured:
