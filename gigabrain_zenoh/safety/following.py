@@ -20,6 +20,7 @@ WINDOW_TICKS = 15  # 0.3 s for the way to the body and back, and for its motors
 WATCHED_TICKS = 100  # after it was last enabled; later a person may well push it
 TICK_S = TICK_NS / 1e9
 
+Bands = tuple[tuple[float, float, float], ...]
 Telemetry = tuple[Pose, Velocity, tuple[Joint, ...], ImuData | None]
 
 
@@ -54,6 +55,7 @@ def look(
         return before
     told = ramp(before.told, _target(body, state, command, caps), limits_of(body), elapsed * TICK_S)
     recent = (*before.recent, told)[-WINDOW_TICKS:]
+    bands = _bands(body, recent)
     active = state.gate.mode in ("enabled", "stopping")
     watched = WATCHED_TICKS if active else max(0, before.watched_ticks - elapsed)
     telemetry = (state.pose, state.velocity, state.joints, state.imu)
@@ -65,11 +67,9 @@ def look(
         telemetry=telemetry,
         watched_ticks=watched,
         runaway_ticks=held(
-            before.runaway_ticks, bool(watched) and _too_fast(body, recent, state.velocity), elapsed
+            before.runaway_ticks, bool(watched) and _too_fast(bands, state.velocity), elapsed
         ),
-        slow_ticks=held(
-            before.slow_ticks, active and _too_slow(body, recent, state.velocity), elapsed
-        ),
+        slow_ticks=held(before.slow_ticks, active and _too_slow(bands, state.velocity), elapsed),
         stuck_ticks=held(before.stuck_ticks, active and still, elapsed),
         frozen_ticks=held(before.frozen_ticks, moving and telemetry == before.telemetry, elapsed),
     )
@@ -121,9 +121,7 @@ def _rests(body: BodyDescription, measured: Velocity) -> bool:
     return all(abs(value) < tolerance / 2 for value, tolerance in pairs)
 
 
-def _bands(
-    body: BodyDescription, recent: tuple[Velocity, ...]
-) -> tuple[tuple[float, float, float], ...]:
+def _bands(body: BodyDescription, recent: tuple[Velocity, ...]) -> Bands:
     """Per axis: the least and the most that it was told of late, and the tolerance round them.
 
     Control corrects a body that is too slow or too fast, so a share of the speed is no fault.
@@ -136,17 +134,17 @@ def _bands(
     )
 
 
-def _too_fast(body: BodyDescription, recent: tuple[Velocity, ...], measured: Velocity) -> bool:
+def _too_fast(bands: Bands, measured: Velocity) -> bool:
     """Whether it moves or turns farther from rest than it was told."""
     return any(
         value > max(most, 0.0) + margin or value < min(least, 0.0) - margin
-        for (least, most, margin), value in zip(_bands(body, recent), _axes(measured), strict=True)
+        for (least, most, margin), value in zip(bands, _axes(measured), strict=True)
     )
 
 
-def _too_slow(body: BodyDescription, recent: tuple[Velocity, ...], measured: Velocity) -> bool:
+def _too_slow(bands: Bands, measured: Velocity) -> bool:
     """Whether it moves or turns less than it was told all the while."""
     return any(
         0 <= value < least - margin or 0 >= value > most + margin
-        for (least, most, margin), value in zip(_bands(body, recent), _axes(measured), strict=True)
+        for (least, most, margin), value in zip(bands, _axes(measured), strict=True)
     )
