@@ -25,14 +25,17 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, unknown
 from gigabrain_zenoh.health import answer_to_name, publish_health
 from gigabrain_zenoh.heartbeat import beat
+from gigabrain_zenoh.keys.checks import identity_in
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.stop_signals import stop_signals
+from gigabrain_zenoh.transport import Transport
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 log = logging.getLogger("gigabrain")
 
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
+MakeBus = Callable[[Transport, Clock, str], Bus]
 PATIENCE_S = 1.0  # how long the router may be missing before somebody is told
 
 # Zenoh's work in one thread, sending apart: a message wakes half as many threads on its way. A
@@ -49,7 +52,7 @@ class Program:
 
 
 PROGRAMS = {
-    "router": Program("gigabrain_zenoh.router:run"),
+    "router": Program("gigabrain_zenoh.router:run", "gigabrain_zenoh.settings:RouterConfig"),
     "driver": Program("gigabrain_drivers.process:run", "gigabrain_zenoh.settings:DriverConfig"),
     "emulator": Program(
         "gigabrain_drivers.emulators.process:run", "gigabrain_zenoh.settings:EmulatorConfig"
@@ -89,7 +92,7 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
         return None
 
 
-def run(config: ProcessConfig) -> int:
+def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
     """Run one process to its end; the exit code."""
     gc.disable()  # until ready: what is imported and set up is no garbage
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
@@ -98,7 +101,7 @@ def run(config: ProcessConfig) -> int:
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
         node = node_of(config)
         with asyncio.Runner(loop_factory=loop_factory()) as runner:
-            runner.run(_run(config, node))
+            runner.run(_run(config, node, make_bus))
     except GigabrainError as error:
         log.error("%s", error, extra={"data": {"event": "failed"}})
         return error.exit_code
@@ -118,9 +121,9 @@ def _first(error: BaseException) -> BaseException:
     return error
 
 
-async def _run(config: ProcessConfig, node: Node) -> None:
+async def _run(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
     with stop_signals() as stop:
-        work = asyncio.ensure_future(_work(config, node))
+        work = asyncio.ensure_future(_work(config, node, make_bus))
         stopped = asyncio.ensure_future(stop.wait())
         await asyncio.wait((work, stopped), return_when=asyncio.FIRST_COMPLETED)
         work.cancel()
@@ -129,8 +132,8 @@ async def _run(config: ProcessConfig, node: Node) -> None:
             await work
 
 
-async def _work(config: ProcessConfig, node: Node) -> None:
-    bus = Bus(await _connect(config.endpoint), Clock(), config.name)
+async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
+    bus = make_bus(await _connect(config.endpoint), Clock(), config.name)
     handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
     logging.getLogger().addHandler(handler)
     try:
@@ -159,17 +162,22 @@ def _ready() -> None:
 
 
 async def _connect(endpoint: Endpoint) -> ZenohTransport:
-    """Open the session, and say so once when that takes longer than a person would wait."""
+    """Open the session, and say so once when that takes longer than a person would wait.
+
+    Raises ConfigError where our own keys are the reason.
+    """
     opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
-    done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
-    if not done:
-        where = ", ".join(endpoint.connect) or ", ".join(endpoint.listen)
-        log.warning(
-            "no router at %s yet; waiting for it (start one with: gigabrain router)",
-            where,
-            extra={"data": {"event": "waiting"}},
-        )
     try:
+        done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
+        if not done:
+            if endpoint.keys:  # a router turns bad ones away without a word
+                await asyncio.to_thread(identity_in, Path(endpoint.keys))
+            where = ", ".join(endpoint.connect) or ", ".join(endpoint.listen)
+            log.warning(
+                "no router at %s yet; waiting for it (start one with: gigabrain router)",
+                where,
+                extra={"data": {"event": "waiting"}},
+            )
         return await opening
     finally:
         opening.cancel()

@@ -44,7 +44,7 @@ class Fault:
 
     number: int
     name: str  # kebab-case
-    group: str  # process, body_link, network, data, clock, load, security or estop
+    group: str  # the module that holds it: process, deaths, body_link, network ...
     stage: Stage  # which running robot it needs; none for one that brings its own
     criterion: str  # `zero after <= 120 ms, travel <= 0.10 m`: what the test has to measure
     needs: tuple[str, ...] = ()  # root, netns, keys, recorder: what not every machine has

@@ -1,6 +1,7 @@
 """Looks on while a robot runs, and judges it by the robot's own clock."""
 
 import asyncio
+import itertools
 import math
 from collections import deque
 from collections.abc import AsyncIterator
@@ -44,12 +45,13 @@ class Onlooker:
         self.bus = bus
         self.states: deque[RobotState] = deque(maxlen=50_000)
         self.commands: deque[CmdVel] = deque(maxlen=10_000)  # of the brain
+        self.arrivals: deque[int] = deque(maxlen=10_000)  # the tick when each of them came
         self.health: dict[str, Health] = {}
         self.logs: list[LogRecord] = []
         self.safety, self.world = bus.latest(SAFETY), bus.latest(WORLD)
         self.intent = bus.latest(INTENT)
         bus.latest(STATE, self.states.append)
-        bus.latest(BODY, self._join)
+        self.bodies = bus.latest(BODY, self._join)
         bus.subscribe(HEALTH, self._hear)
         bus.subscribe(LOG, lambda _key, record: self.logs.append(record))
 
@@ -69,6 +71,7 @@ class Onlooker:
     def _obey(self, _key: str, command: CmdVel) -> None:
         if command.source == BRAIN:
             self.commands.append(command)
+            self.arrivals.append(self.bus.time.tick)
 
     async def describe(self, process: str) -> Description:
         """What a process says of itself; waits until it is there."""
@@ -131,20 +134,29 @@ class Onlooker:
             await self.ticks(5)
 
     async def still(self, ticks: int = 10) -> None:
-        """Wait until the body has been at rest for `ticks`."""
-        since = self.state.tick
+        """Wait until the body has been at rest for `ticks` of one boot."""
+        begin = self.state
 
         def resting() -> bool:
-            newest = self.state.tick
-            recent = [s for s in reversed(self.states) if s.tick > max(since, newest - ticks)]
-            return newest - since > ticks and all(map(at_rest, recent))
+            newest = self.state
+            since = begin.tick if newest.boot == begin.boot else 0
+            recent = itertools.takewhile(
+                lambda s: s.boot == newest.boot and s.tick > max(since, newest.tick - ticks),
+                reversed(self.states),
+            )
+            return newest.tick - since > ticks and all(map(at_rest, recent))
 
         await until(resting, f"at rest for {ticks} ticks")
 
     async def ticks(self, count: int) -> None:
-        """Let the robot's time go on."""
-        end = self.state.tick + count
-        await until(lambda: self.state.tick >= end, f"{count} more ticks")
+        """Let the robot's time go on; where the driver starts anew meanwhile, from then on."""
+        begin = self.state
+
+        def passed() -> bool:
+            since = begin.tick if self.state.boot == begin.boot else 0
+            return self.state.tick - since >= count
+
+        await until(passed, f"{count} more ticks")
 
     def moved(self, start: RobotState) -> float:
         """How far the body is now from where it was [m]."""

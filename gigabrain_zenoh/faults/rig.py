@@ -6,9 +6,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Literal, Self
 
+from gigabrain_zenoh.backoff import Backoff
 from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.faults.fault import Skipped, Stage
-from gigabrain_zenoh.faults.subject import Change, Subject
+from gigabrain_zenoh.faults.subject import TIRELESS, Change, Subject
 from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import DecisionConfig, LinkName, Resume
 
@@ -32,7 +33,7 @@ class Options:
 
 
 class Rig:
-    """Hands out running robots. Used as `async with`; nothing of it is left afterwards."""
+    """Hands out running robots. Used as `async with`; no process is left afterwards."""
 
     def __init__(self, options: Options, folder: Path) -> None:
         self.options, self.folder = options, folder
@@ -65,19 +66,19 @@ class Rig:
             await self.give_up()
         if self._kept is None:
             subject = self.new(deployment_of(self.options, stage))
-            self._kept = stage, subject
-            await subject.__aenter__()
-        subject = self._kept[1] if self._kept else subject
+            self._kept = stage, await subject.__aenter__()
+        _, subject = self._kept
         await subject.settle()
         return subject
 
-    def new(self, deployment: Deployment, change: Change | None = None) -> Subject:
-        """A robot of a test's own, not started yet; to be used as `async with`."""
-        return Subject(deployment, self.fresh_folder(), change)
+    def new(
+        self, deployment: Deployment, change: Change | None = None, backoff: Backoff = TIRELESS
+    ) -> Subject:
+        """A robot of a test's own, not started yet; to be used as `async with`.
 
-    async def alone(self) -> None:
-        """End the robot that other tests share, for a test that brings its own."""
-        await self.give_up()
+        Call `give_up` first, so that two robots do not share the machine.
+        """
+        return Subject(deployment, self.fresh_folder(), change, backoff)
 
     def fresh_folder(self) -> Path:
         """An empty folder of a test's own."""

@@ -1,10 +1,12 @@
 """The robot that is broken on purpose: all its processes, and whoever looks on."""
 
 import asyncio
+import contextlib
 import os
 import signal
 from collections.abc import Callable, Mapping
 from contextlib import AsyncExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -25,6 +27,7 @@ from gigabrain_zenoh.faults.fault import Failed
 from gigabrain_zenoh.faults.onlooker import Onlooker, looking_on
 from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.keeper import ProcessSpec
+from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.supervisor import Supervisor
 
 Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
@@ -32,6 +35,7 @@ Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
 TIRELESS = Backoff(factor=1.0, deaths=10_000)
 FAULTS_FILE = "faults.json"  # as the emulator's process reads it
 STOP_S = 1.5
+FULL_SHARE = 0.96  # of a speed counts as having reached it
 
 
 class Subject:
@@ -94,6 +98,11 @@ class Subject:
         return not (self.harmed or self.supervisor.given_up or self._running.done())
 
     @property
+    def ports(self) -> Path:
+        """The folder of an emulated body's ports."""
+        return self.folder / "run" / "ports"
+
+    @property
     def truth_of(self) -> str:
         """The process whose report is the physics' truth."""
         return EMULATOR if self.deployment.link == "emulated" else "driver"
@@ -106,9 +115,12 @@ class Subject:
         return pid
 
     def send(self, name: str, number: signal.Signals) -> int:
-        """Send a signal to a process; its pid."""
+        """Send a signal to a process; its pid. Raises Failed where it has died by itself."""
         pid = self.pid(name)
-        os.kill(pid, number)
+        try:
+            os.kill(pid, number)
+        except ProcessLookupError:
+            raise Failed(f"{name} has died by itself") from None
         return pid
 
     def kill(self, name: str) -> int:
@@ -124,7 +136,8 @@ class Subject:
         alive = {status.pid for status in self.supervisor.statuses.values()}
         for pid in self._frozen & alive:
             if pid is not None:
-                os.kill(pid, signal.SIGCONT)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGCONT)
         self._frozen.clear()
 
     async def ready(self) -> None:
@@ -148,7 +161,7 @@ class Subject:
 
         Returns once the emulator has taken them.
         """
-        path = self.folder / "run" / "ports" / FAULTS_FILE
+        path = self.ports / FAULTS_FILE
         begin = len(self.records)
         fresh = path.with_suffix(".new")
         fresh.write_bytes(msgspec.json.encode(faults))
@@ -169,10 +182,24 @@ class Subject:
         """How long the path of the body has been so far, by the physics [m]."""
         return float((await self.truth())["distance_m"])
 
+    async def simulated(self, seconds: float) -> dict[str, Any]:
+        """Let an emulated body's own time go on, whoever else lives; the truth after that."""
+        truth = await self.truth()
+        end_s = float(truth["sim_seconds"]) + seconds
+        while float(truth["sim_seconds"]) < end_s:
+            await asyncio.sleep(0.02)
+            truth = await self.truth()
+        return truth
+
     async def drive(self, room: float = 1.3) -> None:
-        """Have the brain drive straight on at full speed, as a person would: by hand."""
+        """Have the brain drive straight on as fast as it may, as a person would: by hand."""
+        onlooker = self.onlooker
         await self.release()
-        await self.onlooker.straight(room=room, by_hand=self.deployment.resume == "manual")
+        await until(lambda: onlooker.bodies.current, "the driver says what its body is")
+        body = onlooker.bodies.current
+        most = body.description.max_linear_speed if body else 0.0
+        speed = FULL_SHARE * min(self.deployment.decision.linear_speed, most)
+        await onlooker.straight(speed, room, by_hand=True)
 
     async def release(self) -> None:
         """As a person: let go of a latched gate, as soon as that is possible."""
@@ -209,3 +236,10 @@ class Subject:
 
     def _record(self, _name: str, record: Mapping[str, Any]) -> None:
         self.records.append(record)
+
+
+def configured(spec: ProcessSpec, settings: Mapping[str, Any]) -> ProcessSpec:
+    """The same process with some of its settings replaced."""
+    config = msgspec.json.decode(spec.argv[-1], type=ProcessConfig)
+    config = msgspec.structs.replace(config, settings={**config.settings, **settings})
+    return replace(spec, argv=(*spec.argv[:-1], msgspec.json.encode(config).decode()))

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 from gigabrain_zenoh.errors import unknown
 from gigabrain_zenoh.faults.fault import Fault
 
-PROCESS, LINK, NETWORK, DATA = "process", "body_link", "network", "data"
-CLOCK, LOAD, SECURITY, ESTOP = "clock", "load", "security", "estop"
+PROCESS, DEATHS, LINK, NETWORK = "process", "deaths", "body_link", "network"
+DATA, CLOCK, LOAD, SECURITY, ESTOP = "data", "clock", "load", "security", "estop"
 STOP = "zero after <= 120 ms, travel <= 0.1 m"
 STILL = "moved again <= 0.005 m"  # before a person has enabled it again
 STALE = "stale executed <= 0"  # commands that rest on data older than 250 ms
@@ -18,34 +18,34 @@ STALE = "stale executed <= 0"  # commands that rest on data older than 250 ms
 FAULTS: tuple[Fault, ...] = (
     Fault(1, "decision-killed", PROCESS, "sim", f"{STOP}, {STILL}"),
     Fault(2, "decision-frozen", PROCESS, "sim", f"{STOP}, {STILL}"),
-    Fault(3, "decision-thawed", PROCESS, "sim", f"{STALE}, {STILL}"),
+    Fault(3, "frozen-and-thawed", PROCESS, "sim", f"{STALE}, {STILL}"),
     Fault(4, "control-killed-or-frozen", PROCESS, "sim", f"{STOP}, {STALE}, {STILL}"),
     Fault(
-        5, "perception-killed", PROCESS, "sim",
+        5, "perception-killed-or-frozen", PROCESS, "sim",
         f"zero after <= 320 ms, travel <= 0.15 m, {STILL}",
     ),
     Fault(
-        6, "safety-killed", PROCESS, "sim",
+        6, "safety-killed-or-frozen", PROCESS, "sim",
         f"zero after <= 250 ms, travel <= 0.1 m, {STILL}, enabled without it <= 0",
     ),
     Fault(
-        7, "gate-killed", PROCESS, "serial",
-        f"motors zero after <= 150 ms, not latched at start <= 0, "
+        7, "gate-killed", DEATHS, "serial",
+        f"motors zero after <= 150 ms, not latched at start <= 0, enabled while latched <= 0, "
         f"commands of the old boot obeyed <= 0, {STILL}",
     ),
     Fault(
-        8, "driver-killed", PROCESS, "serial", "motors zero after <= 150 ms, travel <= 0.1 m",
+        8, "driver-killed", DEATHS, "serial", "motors zero after <= 150 ms, travel <= 0.1 m",
     ),
     Fault(
         9, "one-part-of-decision-hangs", PROCESS, "",
         "zero after <= 300 ms, travel <= 0.15 m",
     ),
     Fault(
-        10, "crash-loop", PROCESS, "",
-        "starts <= 5, wait too short <= 0 s, enabled without it <= 0, cpu after <= 5 %",
+        10, "crash-loop", DEATHS, "",
+        "starts <= 5, wait too short <= 0 s, enabled without it <= 0, cpu added <= 5 %",
     ),
     Fault(
-        11, "every-process-and-pair-killed", PROCESS, "serial",
+        11, "every-process-and-pair-killed", DEATHS, "serial",
         f"idle after <= 10 s, {STILL}",
     ),
     Fault(
@@ -55,7 +55,7 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         13, "serial-noise", LINK, "serial",
-        "wrong commands per million <= 0, bad frames before a good one <= 2, deaths <= 0",
+        "wrong commands per million <= 0, lines lost after garbage <= 2, deaths <= 0",
     ),
     Fault(
         14, "tcp-frozen", LINK, "tcp",
@@ -80,14 +80,14 @@ FAULTS: tuple[Fault, ...] = (
         20, "network-partition", NETWORK, "",
         f"stops in a gap of 100 ms <= 0, zero after <= 120 ms, {STALE}, {STILL}",
     ),
-    Fault(21, "two-commanders-across-a-partition", NETWORK, "", "executed of the first <= 0"),
+    Fault(21, "two-commanders-across-a-partition", NETWORK, "sim", "executed of the first <= 0"),
     Fault(
         22, "latency-jitter-loss", NETWORK, "",
         "stops at 100 ms round trip <= 0, moves above 150 ms <= 0, start-stop rate <= 1 Hz",
     ),
     Fault(
         23, "viewer-frozen", NETWORK, "sim",
-        "control period p99.9 <= 40 ms, longest put <= 20 ms",
+        "control period p99 above calm <= 20 ms, put p99 <= 20 ms",
     ),
     Fault(24, "bit-flips", NETWORK, "", "corrupt payloads accepted <= 0", ("keys",)),
     Fault(
@@ -147,8 +147,8 @@ FAULTS: tuple[Fault, ...] = (
         "wrongly released <= 0, moved while latched <= 0.005 m, speed after enabling <= 0.02 m/s",
     ),
     Fault(
-        45, "automatic-recovery", PROCESS, "auto",
-        "drives again after <= 10 s, stale executed <= 0, latches passed over <= 0",
+        45, "automatic-recovery", DEATHS, "auto",
+        "drives again after <= 3 s, stale executed <= 0, latches passed over <= 0",
     ),
 )  # fmt: skip
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 from msgspec import Struct
 
 from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.kinematics import Gait
+from gigabrain_drivers.kinematics import Gait, Twist, base_of
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.sim.pace import Pace
@@ -33,6 +33,14 @@ class Snapshot(NamedTuple):
     fallen: bool = False
 
 
+class Broken(NamedTuple):
+    """What is wrong with the body itself, whatever its electronics do."""
+
+    runaway: float = 0.0  # [m/s], what the wheels do whatever they are told
+    stuck_wheel: bool = False  # the first one does not turn
+    frozen_values: bool = False  # what it measures no longer changes
+
+
 class EmulatedBody:
     """Physics in a thread of its own, 10 ms a step; everything else may be called on the loop.
 
@@ -49,6 +57,9 @@ class EmulatedBody:
         self._commanded = (0.0, 0.0, 0.0)
         self._gait: Gait | None = None  # instead of a velocity
         self._cpu_s = 0.0
+        self._moved_ns = 0  # when the motors were last told to move
+        self._faulted_ns = 0  # when what is wrong with it last changed
+        self._broken = Broken()
         self.snapshot = self._look()
 
     def start(self) -> None:
@@ -80,6 +91,10 @@ class EmulatedBody:
         linear_x, linear_y, angular_z = WALKER.to_body(gait)
         return linear_x, linear_y, angular_z
 
+    def break_down(self, broken: "Broken") -> None:
+        """Have its motors or sensors fail from the next step on; `Broken()` mends them."""
+        self._broken, self._faulted_ns = broken, self._simulation.time_ns
+
     @property
     def simulation(self) -> Simulation:
         """The physics; to be touched in `on_step` only."""
@@ -97,6 +112,8 @@ class EmulatedBody:
             "contacts": truth.contacts,
             "min_clearance_m": round(truth.min_clearance_m, 3),
             "true_speed": round(truth.speed()[0], 4),
+            "motors_moved_s": round(self._moved_ns / 1e9, 2),
+            "faulted_s": round(self._faulted_ns / 1e9, 2),
             "physics_cpu_s": round(self._cpu_s, 3),
         }
 
@@ -112,14 +129,29 @@ class EmulatedBody:
             self._cpu_s = time.thread_time() - began
 
     def _step(self) -> None:
-        if self._gait:
+        commanded, broken = self.commanded, self._broken
+        if any(commanded):
+            self._moved_ns = self._simulation.time_ns
+        if broken.runaway or broken.stuck_wheel:
+            self._simulation.drive(*self._disobeyed(commanded))
+        elif self._gait:
             self._simulation.walk(self._gait)
         else:
-            self._simulation.drive(*self._commanded)
+            self._simulation.drive(*commanded)
         self._simulation.advance()
-        self.snapshot = snapshot = self._look()
+        snapshot = self._look()
+        if not broken.frozen_values:
+            self.snapshot = snapshot
         for tell in self.on_step:
             tell(snapshot)
+
+    def _disobeyed(self, commanded: tuple[float, float, float]) -> tuple[float, float, float]:
+        """What broken motors do when they are told this [m/s, m/s, rad/s]."""
+        base = base_of(self.robot)
+        if self._broken.runaway or base is None:
+            return self._broken.runaway, 0.0, 0.0
+        _, *others = base.to_wheels(Twist(*commanded))
+        return base.to_body((0.0, *others))
 
     def _look(self) -> Snapshot:
         simulation = self._simulation

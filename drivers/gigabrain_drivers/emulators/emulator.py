@@ -12,7 +12,7 @@ import msgspec
 
 from gigabrain_drivers import catalog
 from gigabrain_drivers.emulators import DEVICES
-from gigabrain_drivers.emulators.base import Device, EmulatedBody
+from gigabrain_drivers.emulators.base import Broken, Device, EmulatedBody
 from gigabrain_drivers.emulators.faults import NONE, Faults
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.emulators.station import Station
@@ -63,6 +63,8 @@ class Emulator:
             wanted = faults.get(name, NONE)
             if wanted != station.faults:
                 station.set(wanted)
+        body = faults.get(BASE, NONE)
+        self.body.break_down(Broken(body.runaway, body.stuck_wheel, body.frozen_values))
 
     def faults_of(self, words: str) -> dict[str, Faults]:
         """The faults in `[STATION] FAULT[=VALUE] ...`; for all stations where none is named.

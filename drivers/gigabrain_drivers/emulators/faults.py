@@ -6,7 +6,7 @@ from typing import Annotated
 from msgspec import Meta, Struct
 
 from gigabrain_drivers.emulators.base import Wire
-from gigabrain_schemas.base import NonNegative
+from gigabrain_schemas.base import Finite, NonNegative
 
 Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 
@@ -25,6 +25,9 @@ class Faults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     unplugged: bool = False  # the port is gone
     reboot: bool = False  # held in reset, motors off; afterwards it boots and says its banner
     brown_out: NonNegative = 0.0  # [V], by which its supply has fallen
+    frozen_values: bool = False  # it reports as ever, but what it measures no longer changes
+    runaway: Finite = 0.0  # [m/s], what the wheels do whatever they are told
+    stuck_wheel: bool = False  # the first one does not turn
 
 
 NONE = Faults()
