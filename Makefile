@@ -7,6 +7,7 @@ PYTHON ?= python3
 DONE := $(VENV)/.done
 
 .PHONY: setup demo test lint unit bench mutation fuzz golden pictures clean
+.PHONY: setup demo test lint unit bench mutation golden recordings pictures clean
 
 setup: $(DONE)
 
@@ -54,6 +55,9 @@ fuzz: setup
 
 golden: setup
 	$(BIN)/python -m gigabrain_schemas.golden
+
+recordings: setup
+	$(BIN)/python -m gigabrain_zenoh.recording.drives tests/recordings
 
 pictures: setup
 	$(BIN)/gigabrain view --png docs/pictures/waffle_in_house.png --world house --seed 1
