@@ -9,17 +9,19 @@ from gigabrain_schemas.topics import AUDIT_LOG, Service
 from gigabrain_zenoh.audit_file import in_order
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, Refused
+from gigabrain_zenoh.keys.checks import may_not_ask
 
 Q = TypeVar("Q", bound=Message)
 
 ANSWER_S = 1.0  # how long a robot may take to answer
 
 
-async def ask(bus: Bus, service: Service[Q, GateReply], request: Q) -> GateReply:
-    """The gate's answer. Raises BodyLost where there is none."""
+async def ask(bus: Bus, service: Service[Q, GateReply], request: Q, keys: str = "") -> GateReply:
+    """The gate's answer. Raises BodyLost where there is none, also for want of rights of `keys`."""
     replies = await bus.ask(service, request, timeout_s=ANSWER_S)
     if not replies:
-        raise BodyLost(f"no driver answers {service.key}; is it running?")
+        doubt = may_not_ask(keys) or "; is it running?"
+        raise BodyLost(f"no driver answers {service.key}{doubt}")
     return replies[0]
 
 

@@ -25,9 +25,10 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.asking import ANSWER_S, ask, audit_log, granted
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, BusError, Refused, Unsupported
+from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, Unsupported
 from gigabrain_zenoh.estop import press
 from gigabrain_zenoh.hold import Hold
+from gigabrain_zenoh.keys.checks import may_not_ask, no_router
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 from gigabrain_zenoh.listening import listen, topic_named
 from gigabrain_zenoh.running import find_endpoint
@@ -44,6 +45,7 @@ async def connect(
     connect: str | None = None,
     *,
     namespace: str = "",
+    keys: str = "",
     source: str = "",
     take: bool = False,
     wait: bool = True,
@@ -51,22 +53,22 @@ async def connect(
     """A robot to drive and to listen to.
 
     `connect` is its router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    `source` is the name under which the gate knows this script; with `take` it takes the body over
-    from whoever drives. With `wait` the body's first state is waited for: without, an e-stop can be
-    sent to a body that says nothing. Raises BusError when there is no router, BodyLost when there
-    is no driver.
+    `keys` is the folder of this script's identity, for a router that wants one. `source` is the
+    name under which the gate knows this script; with `take` it takes the body over from whoever
+    drives. With `wait` the body's first state is waited for: without, an e-stop can be sent to a
+    body that says nothing. Raises BusError when there is no router, ConfigError when the keys are
+    at fault, BodyLost when there is no driver.
     """
     from gigabrain_zenoh.zenoh_transport import ZenohTransport  # takes a while: only when used
 
-    endpoint = find_endpoint(connect, namespace)
+    endpoint = find_endpoint(connect, namespace, keys)
     try:
         transport = await asyncio.wait_for(ZenohTransport.open(endpoint), ROUTER_S)
     except TimeoutError:
-        where = endpoint.connect[0]
-        raise BusError(f"no router answers at {where}; is the robot running?") from None
+        raise no_router(endpoint) from None
     bus = Bus(transport, Clock(), source or f"script-{os.getpid()}")
     try:
-        robot = Robot(bus, take=take)
+        robot = Robot(bus, take=take, keys=endpoint.keys)
         if wait:
             await robot.read_state()
         yield robot
@@ -78,8 +80,8 @@ async def connect(
 class Robot:
     """One robot. Commands go out at 50 Hz with the echo that the gate asks for."""
 
-    def __init__(self, bus: Bus, *, take: bool = False) -> None:
-        self._bus, self._take = bus, take
+    def __init__(self, bus: Bus, *, take: bool = False, keys: str = "") -> None:
+        self._bus, self._take, self._keys = bus, take, keys
         self._states = bus.latest(STATE, self._repeat)
         self._bodies = bus.latest(BODY)
         self._target: Velocity | None = None
@@ -138,7 +140,7 @@ class Robot:
         """Ask the gate for the body, for this script or for `source`. Raises Refused, and why."""
         me = self._bus.process
         request = EnableRequest(source=source or me, take=take, by=me)
-        reply = granted(await ask(self._bus, ENABLE, request))
+        reply = granted(await ask(self._bus, ENABLE, request, self._keys))
         if request.source == self._bus.process:
             self._hold.granted(self._bus.time.boot, reply.gate)
         return reply
@@ -147,7 +149,7 @@ class Robot:
         """Let go of a latched gate; it takes an enable as well to move. Raises Refused."""
         generation = (await self.read_state()).gate.estop_generation
         request = ReleaseRequest(estop_generation=generation, source=self._bus.process)
-        return granted(await ask(self._bus, RELEASE, request))
+        return granted(await ask(self._bus, RELEASE, request, self._keys))
 
     async def estop(self, reason: str = "") -> GateReply:
         """Stop at once and latch; this script's own commands stop first.
@@ -155,7 +157,10 @@ class Robot:
         Raises NotConfirmed when no body has confirmed it within two seconds.
         """
         self._target = None
-        return await press(self._bus, reason)
+        try:
+            return await press(self._bus, reason)
+        except NotConfirmed as error:
+            raise NotConfirmed(f"{error}{may_not_ask(self._keys)}") from None
 
     async def audit(self, newest: int = 100) -> tuple[AuditRecord, ...]:
         """The newest entries of the audit log, oldest first. Raises BodyLost where nobody has one.
