@@ -4,15 +4,28 @@ import asyncio
 import contextlib
 from collections import deque
 from collections.abc import Awaitable, Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.errors import GigabrainError
 
 OnSample = Callable[[str, bytes], None]  # key, payload
+OnRaw = Callable[[str, str, bytes], None]  # key, encoding, payload
 Answer = Callable[[bytes], Awaitable[tuple[bytes, str]]]  # payload; payload and its encoding
 Close = Callable[[], None]  # may be called twice
 T = TypeVar("T")
+
+
+class Link(NamedTuple):
+    """Somebody at the other end of a link."""
+
+    zid: str  # Zenoh's name of the session
+    name: str  # the common name of its certificate; empty without one
+    address: str
+    there: bool  # False once it is gone
+
+
+OnLink = Callable[[Link], None]
 
 
 class Transport(Protocol):
@@ -26,6 +39,10 @@ class Transport(Protocol):
         """Call `on_sample` for what arrives on `key`; of what piles up the newest `depth` stay."""
         ...
 
+    def tap(self, pattern: str, on_raw: OnRaw) -> Close:
+        """Call `on_raw` at once, in whatever thread, for all that arrives on `pattern`."""
+        ...
+
     def serve(self, key: str, answer: Answer) -> Close:
         """Answer queries on `key`. A GigabrainError from `answer` travels back as its text."""
         ...
@@ -34,6 +51,10 @@ class Transport(Protocol):
         self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
     ) -> list[bytes | str]:
         """Ask all who serve `key`: a payload per answer that came in time, a text per error."""
+        ...
+
+    def links(self, on_link: OnLink) -> Close:
+        """Tell of everybody who is linked to this process, from now on and so far."""
         ...
 
     async def close(self) -> None:
@@ -100,6 +121,10 @@ class LocalTransport:
         self._closers.append(self._network.listen(key, on_sample))
         return self._closers[-1]
 
+    def tap(self, pattern: str, on_raw: OnRaw) -> Close:
+        """Register a listener; encodings are not known here."""
+        return self.subscribe(pattern, lambda key, payload: on_raw(key, "", payload), 1)
+
     def serve(self, key: str, answer: Answer) -> Close:
         """Register one who answers on `key`."""
         self._closers.append(self._network.serve(key, answer))
@@ -114,6 +139,10 @@ class LocalTransport:
             with contextlib.suppress(TimeoutError):
                 replies.append(await asyncio.wait_for(_text_or(answer, payload), timeout_s))
         return replies
+
+    def links(self, on_link: OnLink) -> Close:
+        """Inside one process nobody comes by a link."""
+        return lambda: None
 
     async def close(self) -> None:
         """Leave the network."""
@@ -139,6 +168,8 @@ def _added(entries: list[T], entry: T) -> Close:
 
 
 def _matches(pattern: str, key: str) -> bool:
-    """As Zenoh does, of a pattern whose last part may be a star."""
+    """As Zenoh does, of a pattern whose last part may be a star or two."""
     start, _, last = pattern.rpartition("/")
+    if last == "**":
+        return key == start or key.startswith(f"{start}/")
     return pattern == key or (last == "*" and key.rpartition("/")[0] == start)

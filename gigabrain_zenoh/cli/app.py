@@ -29,19 +29,39 @@ COMMANDS = {
     "estop": ("operate:estop", "Stop the robot at once, and latch it."),
     "release": ("operate:release", "Let go of a latched gate."),
     "enable": ("operate:enable", "Let the robot's brain drive."),
+    "keys new": ("keys:new", "Make a fleet's own authority, which issues identities."),
+    "keys issue": ("keys:issue", "Make an identity: a folder to copy to its host."),
+    "keys list": ("keys:identities", "List identities, and when they expire."),
+    "keys zenohd": ("keys:zenohd", "Print the configuration of a router for a larger site."),
+    "teleop": ("teleop:teleop", "Drive by keys or by a gamepad."),
     "audit": ("audit:audit", "Show who did what to the robot."),
     "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
     "worlds": ("names:worlds", "List the simulated worlds that there are."),
+    "record": ("record:record", "Record what a robot says into an MCAP file, until Ctrl-C."),
+    "bag info": ("bag:info", "What is in a recording."),
+    "bag check": ("bag:check", "Whether a recording is whole."),
+    "bag recover": ("bag:recover", "Write what can be read of a damaged recording anew."),
+    "bag play": ("bag:play", "Send a recording again."),
+    "bag plot": ("bag:plot", "Draw numbers of a recording over time, as a PNG."),
+    "bag convert": ("bag:convert", "A recording as tables."),
+    "replay": ("replay:replay", "Feed a recording to a process and compare what it sends."),
     "view": ("view:view", "Draw a robot in its world into a PNG file."),
     "bench chain": ("bench:chain", "From scan to command, timed."),
     "bench stack": ("bench:stack", "CPU, memory and time to start."),
     "faults": ("faults:faults", "Break the robot in 44 ways, and see whether it stops."),
+    "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
 }
-GROUPS = {"driver": "Drivers of bodies.", "bench": "Measure this machine.", "schema": "Messages."}
+GROUPS = {
+    "driver": "Drivers of bodies.",
+    "keys": "Who may do what.",
+    "bag": "Recordings.",
+    "bench": "Measure this machine.",
+    "schema": "Messages.",
+}
 
 
 def make_app(chosen: Sequence[str] = ()) -> App:

@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Literal
 
 from gigabrain_zenoh.cli.checked import checked
+from gigabrain_zenoh.config_places import located
 from gigabrain_zenoh.deployment import (
     Deployment,
     deployment_path,
     host_of,
     load_deployment,
-    located,
+    recorded,
 )
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.settings import LinkName, Resume
@@ -30,6 +31,7 @@ def demo(
     resume: Resume | None = None,
     headless: bool = False,
     report: Path | None = None,
+    record: Path | None = None,
 ) -> int:
     """Drive a simulated robot round a room, until Ctrl-C.
 
@@ -59,9 +61,13 @@ def demo(
         Progress in a line instead of the live view.
     report
         Write what the run came to, as JSON, into this file.
+    record
+        Record the run from its very start into this file, for `gigabrain replay`.
     """
     from gigabrain_zenoh.demo import Demo, DemoOptions
 
+    if record and record.exists():
+        raise ConfigError(f"{record} exists; choose another file")
     if seconds is not None and not 0 < seconds < 1e7:
         raise ConfigError(f"--seconds: expected a number above 0, got {seconds:g}")
     values = {
@@ -74,12 +80,16 @@ def demo(
         "router": "tcp/127.0.0.1:0",
         "decision": {"turn": turn},
     }
+    if record:
+        values |= recorded(record)
     deployment = checked(values, Deployment)
     options = DemoOptions(seconds=seconds, headless=headless, report=report)
     return asyncio.run(Demo(deployment, options).run())
 
 
-def up(deployment: str, *, host: str | None = None, level: str = "info") -> int:
+def up(
+    deployment: str, *, host: str | None = None, keys: Path | None = None, level: str = "info"
+) -> int:
     """Start what a deployment file puts on this host, and keep it running until Ctrl-C.
 
     Example: gigabrain up deploy/demo.yaml
@@ -90,13 +100,15 @@ def up(deployment: str, *, host: str | None = None, level: str = "info") -> int:
         A deployment file.
     host
         Which of the file's hosts this is; needed where it has several.
+    keys
+        The folder of this host's identity, in place of the one in the file.
     level
         The least level of what is logged: debug, info, warning or error.
     """
     from gigabrain_zenoh.launch import up as run
 
     path = deployment_path(deployment)
-    loaded = load_deployment(path)
+    loaded = load_deployment(path, str(keys.expanduser().absolute()) if keys else "")
     try:
         return asyncio.run(run(loaded, host_of(loaded, host), _printer(), level))
     except ConfigError as error:
