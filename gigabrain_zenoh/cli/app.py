@@ -38,6 +38,14 @@ COMMANDS = {
     "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
     "worlds": ("names:worlds", "List the simulated worlds that there are."),
+    "record": ("record:record", "Record what a robot says into an MCAP file, until Ctrl-C."),
+    "bag info": ("bag:info", "What is in a recording."),
+    "bag check": ("bag:check", "Whether a recording is whole."),
+    "bag recover": ("bag:recover", "Write what can be read of a damaged recording anew."),
+    "bag play": ("bag:play", "Send a recording again."),
+    "bag plot": ("bag:plot", "Draw numbers of a recording over time, as a PNG."),
+    "bag convert": ("bag:convert", "A recording as tables."),
+    "replay": ("replay:replay", "Feed a recording to a process and compare what it sends."),
     "view": ("view:view", "Draw a robot in its world into a PNG file."),
     "bench chain": ("bench:chain", "From scan to command, timed."),
     "bench stack": ("bench:stack", "CPU, memory and time to start."),
@@ -50,6 +58,7 @@ COMMANDS = {
 GROUPS = {
     "driver": "Drivers of bodies.",
     "keys": "Who may do what.",
+    "bag": "Recordings.",
     "bench": "Measure this machine.",
     "schema": "Messages.",
 }
