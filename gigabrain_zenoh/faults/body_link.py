@@ -234,7 +234,7 @@ async def _back(subject: Subject) -> tuple[float, dict[str, Any]]:
 
 async def _shut(subject: Subject) -> None:
     onlooker = subject.onlooker
-    await until(lambda: onlooker.state.gate.mode != "enabled", "the gate shuts", within_s=3.0)
+    await until(lambda: onlooker.state.gate.mode != "enabled", "the gate shuts", within_s=10.0)
 
 
 def _from(subject: Subject, start: RobotState) -> list[RobotState]:

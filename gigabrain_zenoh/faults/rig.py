@@ -41,6 +41,11 @@ class Rig:
         self._kept: tuple[Stage, Subject] | None = None
 
     @property
+    def late_s(self) -> float:
+        """How long this machine has kept a body's firmware waiting since the last test began."""
+        return self._kept[1].late_s if self._kept else 0.0
+
+    @property
     def long(self) -> bool:
         """Whether there is time for the long forms."""
         return self.options.long

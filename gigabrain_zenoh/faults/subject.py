@@ -35,6 +35,7 @@ Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
 TIRELESS = Backoff(factor=1.0, deaths=10_000)
 FAULTS_FILE = "faults.json"  # as the emulator's process reads it
 STOP_S = 1.5
+NEARLY_STRAIGHT = 0.1  # [rad/s]; legs sway
 FULL_SHARE = 0.96  # of a speed counts as having reached it
 
 
@@ -53,6 +54,7 @@ class Subject:
         self.supervisor = Supervisor(change(specs) if change else specs, self._record, backoff)
         self.records: list[Mapping[str, Any]] = []  # of all logs
         self.harmed = False  # a test may say that nobody should use this robot again
+        self.late_s = 0.0  # how long this machine has kept the body's firmware waiting
         self.onlooker: Onlooker
         self.person: Robot
         self._stack = AsyncExitStack()
@@ -176,7 +178,9 @@ class Subject:
 
     async def truth(self) -> dict[str, Any]:
         """What the physics knows: contacts, distance_m, true_speed and more."""
-        return dict((await self.onlooker.describe(self.truth_of)).report)
+        truth = dict((await self.onlooker.describe(self.truth_of)).report)
+        self.late_s = max(self.late_s, float(truth.get("firmware_late_s") or 0.0))
+        return truth
 
     async def distance(self) -> float:
         """How long the path of the body has been so far, by the physics [m]."""
@@ -199,7 +203,7 @@ class Subject:
         body = onlooker.bodies.current
         most = body.description.max_linear_speed if body else 0.0
         speed = FULL_SHARE * min(self.deployment.decision.linear_speed, most)
-        await onlooker.straight(speed, room, by_hand=True)
+        await onlooker.straight(speed, room, NEARLY_STRAIGHT, by_hand=True)
 
     async def release(self) -> None:
         """As a person: let go of a latched gate, as soon as that is possible."""
@@ -223,7 +227,7 @@ class Subject:
         if self.onlooker.state.boot == boot:
             await self.release()
         self._contacts = int((await self.truth())["contacts"])
-        self._judged = len(self.records)
+        self._judged, self.late_s = len(self.records), 0.0
 
     async def check(self) -> None:
         """Raise Failed where something was touched, or a program has died of itself."""

@@ -66,6 +66,11 @@ class Emulator:
         body = faults.get(BASE, NONE)
         self.body.break_down(Broken(body.runaway, body.stuck_wheel, body.frozen_values))
 
+    def report(self) -> Mapping[str, float | int | str | None]:
+        """The truth of the run so far, and whether this machine has kept the body waiting."""
+        late_s = max(station.late_s for station in self.stations.values())
+        return {**self.body.report(), "firmware_late_s": round(late_s, 4)}
+
     def faults_of(self, words: str) -> dict[str, Faults]:
         """The faults in `[STATION] FAULT[=VALUE] ...`; for all stations where none is named.
 

@@ -24,7 +24,7 @@ FAULTS_FILE = "faults.json"  # {STATION: {FAULT: VALUE}}, in the folder of the p
 async def run(config: EmulatorConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Be the body until the process ends; its truth is in `describe`."""
     async with emulator_of(config) as emulator:
-        bus.report = emulator.body.report
+        bus.report = emulator.report
         ready()
         await watch(emulator, Path(config.folder) / FAULTS_FILE)
 
