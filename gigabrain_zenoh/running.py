@@ -38,8 +38,8 @@ def local_socket() -> str:
 
 
 @contextmanager
-def announced(label: str, endpoint: Endpoint) -> Iterator[None]:
-    """Leave a note while the block runs."""
+def announced(label: str, endpoint: Endpoint) -> Iterator[Path]:
+    """Leave a note while the block runs; its path."""
     note = folder() / f"{os.getpid()}.json"
     robot = Running(pid=os.getpid(), label=label, endpoint=endpoint)
     try:
@@ -52,7 +52,7 @@ def announced(label: str, endpoint: Endpoint) -> Iterator[None]:
     except OSError as error:
         raise ConfigError(f"cannot write {note}: {error.strerror}; set XDG_RUNTIME_DIR") from None
     try:
-        yield
+        yield note
     finally:
         _forget(note)
 

@@ -9,6 +9,7 @@ from zenoh.handlers import Callback
 from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.bridge import Bridge
 from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.linger import close_in_background
 from gigabrain_zenoh.mailbox import Mailbox
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.transport import Answer, Close, Link, OnLink, OnSample
@@ -36,6 +37,11 @@ class ZenohTransport:
         self._tasks: set[asyncio.Task[None]] = set()
         self._asking: set[asyncio.Future[None]] = set()
         self._closed = False
+        self._declared.append(
+            session.info.declare_link_events_listener(
+                lambda _event: close_in_background(), history=True
+            )
+        )
 
     @classmethod
     async def open(cls, endpoint: Endpoint) -> "ZenohTransport":
