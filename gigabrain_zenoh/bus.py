@@ -16,7 +16,7 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.freshness import CLOCK_KEYS, Latest, RobotTime
 from gigabrain_zenoh.rejections import Rejections
-from gigabrain_zenoh.transport import Close, OnLink, OnSample, Transport
+from gigabrain_zenoh.transport import Close, OnLink, OnRaw, OnSample, Transport
 
 __all__ = ["Bus", "Latest", "RobotTime"]
 
@@ -120,6 +120,19 @@ class Bus:
 
         return close
 
+    def tap(self, pattern: str, on_raw: OnRaw) -> Close:
+        """Call `on_raw(key, encoding, payload)` for all on `pattern`, valid or not, in any thread.
+
+        Returns the function that ends it.
+        """
+        self.listens.append(pattern)
+        return self._transport.tap(pattern, on_raw)
+
+    async def kept(self, topic: Topic[Any]) -> list[bytes]:
+        """What those who keep the last value of `topic` hold now."""
+        replies = await self._transport.query(topic.key, b"", "", FETCH_S, topic.priority)
+        return [reply for reply in replies if not isinstance(reply, str)]
+
     def serve(
         self, service: Service[Q, R], answer: Callable[[Q], Awaitable[R]], *, name: str = ""
     ) -> None:
@@ -202,9 +215,8 @@ class Bus:
         """Ask for the kept value, for a subscriber that comes after it was sent."""
 
         async def fetch() -> None:
-            for reply in await self._transport.query(topic.key, b"", "", FETCH_S, topic.priority):
-                if not isinstance(reply, str):
-                    receive(topic.key, reply)
+            for payload in await self.kept(topic):
+                receive(topic.key, payload)
 
         task = asyncio.get_running_loop().create_task(fetch())
         self._fetching.add(task)

@@ -9,7 +9,7 @@ from typing import Any, TypeVar, overload
 from gigabrain_schemas.audit import AuditRecord, AuditRequest
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
-from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.brain import CmdVel, Twist
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import (
     AUDIT_LOG,
@@ -18,6 +18,7 @@ from gigabrain_schemas.topics import (
     ENABLE,
     RELEASE,
     STATE,
+    TELEOP,
     Service,
     Topic,
 )
@@ -116,6 +117,17 @@ class Robot:
             await self._ticks(min(left, HOLD_TICKS // 2))
         await self.stop()
 
+    def steer(self, wanted: Velocity) -> None:
+        """Tell the robot's own control what an operator wants; to be said twenty times a second.
+
+        Control obeys while the gate is open for the brain, and keeps the body until somebody
+        enables the brain again.
+        """
+        twist = Twist(
+            linear_x=wanted.linear_x, linear_y=wanted.linear_y, angular_z=wanted.angular_z
+        )
+        self._bus.publish(TELEOP, twist)
+
     async def stop(self) -> None:
         """Come to rest, if this script drives. It keeps the body."""
         if self._target is None:
@@ -172,6 +184,11 @@ class Robot:
         if state is None:
             raise BodyLost("no robot/state; is the driver running?")
         return state
+
+    @property
+    def state(self) -> RobotState | None:
+        """The newest state, or None when the robot is silent."""
+        return self._states.fresh()
 
     async def read_body(self) -> BodyDescription:
         """What the body is: its limits, its outline, its sensors. Raises BodyLost."""

@@ -25,6 +25,7 @@ from gigabrain_zenoh.settings import (
     Endpoint,
     LinkName,
     PerceptionConfig,
+    RecorderConfig,
     Resume,
     Seed,
     Speed,
@@ -33,10 +34,13 @@ from gigabrain_zenoh.zenoh_config import router_config, secured
 
 EMULATOR = "emulator"  # runs beside the driver where the link is `emulated`; not in `hosts`
 BUTTON = "button"  # runs beside the driver where there is one, unless `hosts` says where
-ProcessName = Literal["router", "driver", "perception", "decision", "control", "safety", "button"]
-ALL: tuple[ProcessName, ...] = (
+ProcessName = Literal[
+    "router", "driver", "perception", "decision", "control", "safety", "recorder", "button"
+]
+ROBOT: tuple[ProcessName, ...] = (
     "router", "driver", "perception", "decision", "control", "safety",
 )  # fmt: skip
+ALL: tuple[ProcessName, ...] = (*ROBOT, "recorder")
 LOOPBACK = ("127.", "localhost", "[::1]")
 
 
@@ -55,11 +59,12 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     fleet: tuple[str, ...] = ()  # namespaces of other robots that this one's router serves
     insecure: bool = False  # allow a router that other machines can reach, without keys
     hosts: dict[str, tuple[ProcessName, ...]] = msgspec.field(
-        default_factory=lambda: {"robot": ALL}
+        default_factory=lambda: {"robot": ROBOT}
     )
     button: ButtonConfig | None = None  # an e-stop button; without its word nothing moves
     perception: PerceptionConfig = PerceptionConfig()
     decision: DecisionConfig = DecisionConfig()
+    recorder: RecorderConfig = RecorderConfig()
 
     def __post_init__(self) -> None:
         if not self.hosts:
@@ -209,6 +214,8 @@ def process_specs(
             level=level,
         )
         first = ("router", EMULATOR) if name == "driver" else ("router",)
+        if name == "driver" and deployment.recorder.file:  # to be recorded from its first tick
+            first = (*first, "recorder")
         after = tuple(other for other in first if other in names and other != name)
         specs.append(
             ProcessSpec(
@@ -258,4 +265,21 @@ def _settings(
         BUTTON: msgspec.to_builtins(deployment.button) if deployment.button else {},
         "perception": msgspec.to_builtins(deployment.perception),
         "decision": msgspec.to_builtins(deployment.decision),
+        "recorder": msgspec.to_builtins(with_notes(deployment)),
     }
+
+
+def recorded(path: Path) -> dict[str, Any]:
+    """What makes a deployment record itself into one file, raw, for a replay."""
+    recorder = {"file": str(path.absolute()), "viewers": False}
+    return {"hosts": {"robot": ALL}, "recorder": recorder}
+
+
+def with_notes(deployment: Deployment) -> RecorderConfig:
+    """What to record, with what a replay has to know of the processes in the file."""
+    about = {"perception": deployment.perception, "decision": deployment.decision}
+    notes = {name: msgspec.json.encode(settings).decode() for name, settings in about.items()}
+    plain = {"body": deployment.body, "link": deployment.link, "world": deployment.world}
+    return msgspec.structs.replace(
+        deployment.recorder, notes=notes | plain | deployment.recorder.notes
+    )

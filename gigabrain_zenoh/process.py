@@ -64,6 +64,9 @@ PROGRAMS = {
     "decision": Program("gigabrain_zenoh.decision:run", "gigabrain_zenoh.settings:DecisionConfig"),
     "control": Program("gigabrain_zenoh.control:run"),
     "safety": Program("gigabrain_zenoh.safety:run"),
+    "recorder": Program(
+        "gigabrain_zenoh.recording.node:run", "gigabrain_zenoh.settings:RecorderConfig"
+    ),
 }
 
 

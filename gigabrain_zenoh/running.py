@@ -5,21 +5,25 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 
+from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_config import secured
 
 SOCKET = "unixsock-stream"
 
+Pid = Annotated[int, Meta(ge=1, le=2**31 - 1)]  # no group, and nobody's by default
+
 
 class Running(Struct, frozen=True, kw_only=True):
     """One robot on this machine."""
 
-    pid: int  # of its supervisor
+    pid: Pid  # of its supervisor
     label: str  # for people
     endpoint: Endpoint
 
@@ -70,7 +74,7 @@ def running() -> list[Running]:
         try:
             robot = msgspec.json.decode(note.read_bytes(), type=Running)
             os.kill(robot.pid, 0)
-        except (OSError, msgspec.MsgspecError):
+        except (OSError, *DECODE_ERRORS):
             _forget(note)
         else:
             found.append(robot)

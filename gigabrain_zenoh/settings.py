@@ -77,3 +77,18 @@ class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     world: str = "arena"
     seed: Seed = 0
     folder: str  # where its ports appear
+
+
+class RecorderConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The `recorder` part of a deployment file."""
+
+    folder: str = ""  # where the files go; the user's state folder without
+    file: str = ""  # one file by name instead
+    topics: tuple[str, ...] = ()  # names or key expressions; all without
+    viewers: bool = True  # also what Foxglove, Lichtblick and Rerun draw
+    split_mb: Annotated[float, Meta(gt=0)] | None = None  # begin a new file after so much
+    split_s: Annotated[float, Meta(gt=0)] | None = None  # or after so long [s]
+    flush_s: Annotated[float, Meta(gt=0, le=10)] = 0.25  # what dies with the process at most [s]
+    queue_mb: Annotated[float, Meta(gt=0)] = 32  # what waits for a slow disk before drops begin
+    keep_free_mb: Annotated[float, Meta(ge=0)] = 200  # of the disk, for all that is not a recording
+    notes: dict[str, str] = {}  # kept in the file, for replay

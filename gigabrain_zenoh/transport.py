@@ -10,6 +10,7 @@ from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.errors import GigabrainError
 
 OnSample = Callable[[str, bytes], None]  # key, payload
+OnRaw = Callable[[str, str, bytes], None]  # key, encoding, payload
 Answer = Callable[[bytes], Awaitable[tuple[bytes, str]]]  # payload; payload and its encoding
 Close = Callable[[], None]  # may be called twice
 T = TypeVar("T")
@@ -36,6 +37,10 @@ class Transport(Protocol):
 
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
         """Call `on_sample` for what arrives on `key`; of what piles up the newest `depth` stay."""
+        ...
+
+    def tap(self, pattern: str, on_raw: OnRaw) -> Close:
+        """Call `on_raw` at once, in whatever thread, for all that arrives on `pattern`."""
         ...
 
     def serve(self, key: str, answer: Answer) -> Close:
@@ -116,6 +121,10 @@ class LocalTransport:
         self._closers.append(self._network.listen(key, on_sample))
         return self._closers[-1]
 
+    def tap(self, pattern: str, on_raw: OnRaw) -> Close:
+        """Register a listener; encodings are not known here."""
+        return self.subscribe(pattern, lambda key, payload: on_raw(key, "", payload), 1)
+
     def serve(self, key: str, answer: Answer) -> Close:
         """Register one who answers on `key`."""
         self._closers.append(self._network.serve(key, answer))
@@ -159,6 +168,8 @@ def _added(entries: list[T], entry: T) -> Close:
 
 
 def _matches(pattern: str, key: str) -> bool:
-    """As Zenoh does, of a pattern whose last part may be a star."""
+    """As Zenoh does, of a pattern whose last part may be a star or two."""
     start, _, last = pattern.rpartition("/")
+    if last == "**":
+        return key == start or key.startswith(f"{start}/")
     return pattern == key or (last == "*" and key.rpartition("/")[0] == start)

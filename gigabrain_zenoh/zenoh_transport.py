@@ -12,7 +12,7 @@ from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.linger import close_in_background
 from gigabrain_zenoh.mailbox import Mailbox
 from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.transport import Answer, Close, Link, OnLink, OnSample
+from gigabrain_zenoh.transport import Answer, Close, Link, OnLink, OnRaw, OnSample
 from gigabrain_zenoh.zenoh_session import close_session, open_session
 
 PRIORITIES: dict[Priority, zenoh.Priority] = {
@@ -70,6 +70,14 @@ class ZenohTransport:
 
         mailbox = Mailbox(self._bridge, deliver, depth)
         return self._undeclare(self._session.declare_subscriber(key, mailbox.put))
+
+    def tap(self, pattern: str, on_raw: OnRaw) -> Close:
+        """Listen in Zenoh's own thread; nothing gives way to anything."""
+
+        def deliver(sample: zenoh.Sample) -> None:
+            on_raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes())
+
+        return self._undeclare(self._session.declare_subscriber(pattern, deliver))
 
     def serve(self, key: str, answer: Answer) -> Close:
         """Answer queries, each in a task of its own."""

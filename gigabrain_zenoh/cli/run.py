@@ -13,6 +13,7 @@ from gigabrain_zenoh.deployment import (
     deployment_path,
     host_of,
     load_deployment,
+    recorded,
 )
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.settings import LinkName, Resume
@@ -30,6 +31,7 @@ def demo(
     resume: Resume | None = None,
     headless: bool = False,
     report: Path | None = None,
+    record: Path | None = None,
 ) -> int:
     """Drive a simulated robot round a room, until Ctrl-C.
 
@@ -59,9 +61,13 @@ def demo(
         Progress in a line instead of the live view.
     report
         Write what the run came to, as JSON, into this file.
+    record
+        Record the run from its very start into this file, for `gigabrain replay`.
     """
     from gigabrain_zenoh.demo import Demo, DemoOptions
 
+    if record and record.exists():
+        raise ConfigError(f"{record} exists; choose another file")
     if seconds is not None and not 0 < seconds < 1e7:
         raise ConfigError(f"--seconds: expected a number above 0, got {seconds:g}")
     values = {
@@ -74,6 +80,8 @@ def demo(
         "router": "tcp/127.0.0.1:0",
         "decision": {"turn": turn},
     }
+    if record:
+        values |= recorded(record)
     deployment = checked(values, Deployment)
     options = DemoOptions(seconds=seconds, headless=headless, report=report)
     return asyncio.run(Demo(deployment, options).run())

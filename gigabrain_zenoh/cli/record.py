@@ -1,0 +1,73 @@
+"""`gigabrain record`: what a robot says, into a file."""
+
+import asyncio
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from gigabrain_zenoh.cli.checked import checked
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.settings import RecorderConfig
+
+
+def record(
+    *,
+    output: Annotated[Path | None, Parameter(alias="-o")] = None,
+    topics: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    connect: str | None = None,
+    namespace: str = "",
+    keys: Path | None = None,
+    seconds: float | None = None,
+    split_size: float | None = None,
+    split_time: float | None = None,
+    raw_only: bool = False,
+    keep_free: float = 200.0,
+) -> int:
+    """Record what a robot says into an MCAP file, until Ctrl-C.
+
+    Example: gigabrain record -o drive.mcap --topics scan state cmd_vel
+
+    Ends with 1 where messages were lost on the way to the disk.
+
+    Parameters
+    ----------
+    output
+        The file; without it, one named by the time, in this folder.
+    topics
+        Names, such as scan, or key expressions, such as "robot/image/*"; all without.
+    connect
+        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
+    namespace
+        The robot's own part of the key space.
+    keys
+        The folder of your identity, for a router that wants one.
+    seconds
+        End after this long [s].
+    split_size
+        Begin a new file after so much [MB].
+    split_time
+        Begin a new file after so long [s].
+    raw_only
+        Leave out what Foxglove, Lichtblick and Rerun draw: half the size.
+    keep_free
+        Stop writing while less than this is free on the disk [MB].
+    """
+    from gigabrain_zenoh.recording.command import record as run
+    from gigabrain_zenoh.recording.node import file_name
+
+    limits = {"seconds": seconds, "split-size": split_size, "split-time": split_time}
+    for name, value in limits.items():
+        if value is not None and not 0 < value < 1e9:
+            raise ConfigError(f"--{name}: expected a number above 0, got {value:g}")
+    values = {
+        "file": str(output or file_name()),
+        "topics": topics or (),
+        "viewers": not raw_only,
+        "split_mb": split_size,
+        "split_s": split_time,
+        "keep_free_mb": keep_free,
+    }
+    folder = str(keys) if keys else ""
+    config = checked(values, RecorderConfig)
+    return asyncio.run(run(config, connect, namespace, seconds, keys=folder))

@@ -1,0 +1,174 @@
+"""One MCAP file while it is being written: what came, byte for byte, and what viewers draw."""
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import CompressionType, IndexType, Writer
+
+from gigabrain_schemas.topics import TOPICS, Topic
+from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.recording.drawing import Drawer, Drawn
+from gigabrain_zenoh.recording.gaps import is_json
+from gigabrain_zenoh.recording.intake import Arrival
+from gigabrain_zenoh.recording.schema import flat_schema
+from gigabrain_zenoh.recording.tape import Tape
+
+CHUNK_BYTES = 1 << 20
+PROFILE = "gigabrain"
+RAW, VIEW = "raw", "view"  # what a channel is for, under the name "kind" in its metadata
+PLOTTED = ("robot/state", "robot/world", "robot/intent", "robot/cmd_vel", "robot/safety")
+BY_KEY = {topic.key: topic for topic in TOPICS}
+
+
+def topic_of(key: str) -> Topic[Any] | None:
+    """The topic of a key that came over the bus, if it is one of ours."""
+    if key in BY_KEY:
+        return BY_KEY[key]
+    topic = BY_KEY.get(key.rpartition("/")[0])
+    return topic if topic and topic.many else None
+
+
+class BagFile:
+    """Raises ConfigError when it cannot be created, OSError when the disk takes no more."""
+
+    def __init__(self, path: Path, *, viewers: bool, notes: Mapping[str, str]) -> None:
+        self._tape = Tape(path)
+        indexes = IndexType.ALL if viewers else IndexType.ALL & ~IndexType.MESSAGE
+        self._writer = Writer(self._tape, CHUNK_BYTES, CompressionType.ZSTD, indexes)  # type: ignore[arg-type]
+        try:
+            self._writer.start(PROFILE, "gigabrain-zenoh")
+            self._writer.add_metadata("gigabrain", dict(notes))
+            self._tape.sync()
+        except OSError as error:
+            self._tape.close()
+            path.unlink(missing_ok=True)
+            raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        self._drawer = Drawer() if viewers else None
+        self._decoders = {t.type: Codec(t.type, t.max_bytes).decode for t in TOPICS}
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+        self.pending: Counter[str] = Counter()  # per key, what is not on the disk yet
+        self.written = 0  # messages that are
+        self.first_ns = 0
+        self._settled = self._tape.size
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+        return self._tape.path
+
+    @property
+    def size(self) -> int:
+        """What is on the disk [bytes]."""
+        return self._tape.size
+
+    def free_bytes(self) -> int:
+        """Room on the disk."""
+        return self._tape.free_bytes()
+
+    def add(self, arrival: Arrival, *, again: bool = False) -> None:
+        """Append one message, and what viewers draw of it; `again` where it is in another file."""
+        count = 0 if again else 1
+        self.pending[arrival.key] += count
+        self.first_ns = self.first_ns or arrival.log_ns
+        channel = self._raw_channel(arrival)
+        self._settle(Counter({arrival.key: count}))
+        header = arrival.header
+        stamp_ns = header.stamp_ns or arrival.log_ns
+        self._writer.add_message(
+            channel, arrival.log_ns, arrival.payload, stamp_ns, header.seq & 0xFFFF_FFFF
+        )
+        if self._drawer:
+            self._draw(self._drawer, arrival)
+        self._settle(Counter())
+
+    def flush(self) -> None:
+        """Bring all that was added to the disk."""
+        self._writer.flush()
+        self._settle(Counter())
+        self._tape.sync()
+
+    def _settle(self, still: Counter[str]) -> None:
+        """Whenever the file has grown, all but `still` has been written."""
+        if self._tape.size == self._settled:
+            return
+        self._settled = self._tape.size
+        self.written += self.pending.total() - still.total()
+        self.pending = still
+
+    def note(self, name: str, values: Mapping[str, str]) -> None:
+        """Add a named set of words."""
+        self._writer.add_metadata(name, dict(values))
+
+    def finish(self) -> None:
+        """Write the index, without which most programs refuse to open it."""
+        self._writer.finish()
+        self._tape.sync()
+
+    def close(self) -> None:
+        """Let go of the file, finished or not."""
+        self._tape.close()
+
+    def _raw_channel(self, arrival: Arrival) -> int:
+        form = MessageEncoding.JSON if is_json(arrival.payload) else "msgpack"
+        known = self._channels.get((arrival.key, form + arrival.encoding))
+        if known:
+            return known
+        topic = topic_of(arrival.key)
+        notes = {"kind": RAW, "zenoh_encoding": arrival.encoding}
+        schema = self._schema(topic) if topic else 0
+        channel = self._writer.register_channel(arrival.key, form, schema, notes)
+        self._channels[arrival.key, form + arrival.encoding] = channel
+        return channel
+
+    def _schema(self, topic: Topic[Any]) -> int:
+        name = f"gigabrain.{topic.type.__name__}"
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(
+                name, SchemaEncoding.JSONSchema, flat_schema(topic.type)
+            )
+        return self._schemas[name]
+
+    def _draw(self, drawer: Drawer, arrival: Arrival) -> None:
+        topic = topic_of(arrival.key)
+        plotted = arrival.key in PLOTTED
+        if topic is None or not (plotted or drawer.draws(topic.type)):
+            return
+        try:
+            message = self._decoders[topic.type](arrival.payload)
+        except ValueError:  # not a valid message: kept as it came, but there is nothing to see
+            return
+        if drawer.draws(topic.type):
+            for drawn in drawer.draw(message, arrival.key.rpartition("/")[2]):
+                self._view(arrival, self._foxglove_channel(drawn), drawn.data)
+        if plotted:
+            self._view(arrival, self._json_channel(topic), msgspec.json.encode(message))
+
+    def _view(self, arrival: Arrival, channel: int, data: bytes) -> None:
+        stamp_ns = arrival.header.stamp_ns or arrival.log_ns
+        self._writer.add_message(channel, arrival.log_ns, data, stamp_ns)
+
+    def _foxglove_channel(self, drawn: Drawn) -> int:
+        place = f"/viz/{drawn.topic}", "protobuf"
+        if place not in self._channels:
+            schema = drawn.schema.get_schema()
+            if schema.name not in self._schemas:
+                self._schemas[schema.name] = self._writer.register_schema(
+                    schema.name, schema.encoding, schema.data
+                )
+            of_kind = self._schemas[schema.name]
+            self._channels[place] = self._writer.register_channel(*place, of_kind, {"kind": VIEW})
+        return self._channels[place]
+
+    def _json_channel(self, topic: Topic[Any]) -> int:
+        place = f"/viz/{topic.key.rpartition('/')[2]}_numbers", MessageEncoding.JSON
+        if place not in self._channels:
+            self._channels[place] = self._writer.register_channel(
+                *place, self._schema(topic), {"kind": VIEW}
+            )
+        return self._channels[place]

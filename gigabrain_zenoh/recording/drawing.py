@@ -1,0 +1,178 @@
+"""What Foxglove, Lichtblick and Rerun draw of our messages: one conversion per message type.
+
+Frames by REP-105: map → odom → base_link → the lidar's own.
+"""
+
+import math
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+from foxglove import messages as fox
+
+from gigabrain_schemas import arrays
+from gigabrain_schemas.base import Message, Pose
+from gigabrain_schemas.body import Body, RobotState
+from gigabrain_schemas.brain import Intent, OccupancyGrid, PoseInMap
+from gigabrain_schemas.safety import LogRecord
+from gigabrain_schemas.sensors import Image, LaserScan
+
+MAP, ODOM, BASE = "map", "odom", "base_link"
+LIDAR = "base_scan"  # as LaserScan has it
+GREY = np.array([*(round(254 - 2.54 * cell) for cell in range(101)), *[128] * 155], np.uint8)
+LEVELS = {
+    "debug": fox.LogLevel.Debug,
+    "info": fox.LogLevel.Info,
+    "warning": fox.LogLevel.Warning,
+    "error": fox.LogLevel.Error,
+    "critical": fox.LogLevel.Fatal,
+}
+
+
+class Drawn(NamedTuple):
+    """One message for a viewer."""
+
+    topic: str  # below /viz
+    schema: Any  # a message type of foxglove's, with get_schema
+    data: bytes  # Protocol Buffers
+
+
+def of(topic: str, message: Any) -> Drawn:
+    """A message of foxglove's, encoded."""
+    return Drawn(topic, type(message), message.encode())
+
+
+def stamp(message: Message) -> fox.Timestamp:
+    """When `message` was valid."""
+    return fox.Timestamp(message.stamp_ns // 1_000_000_000, message.stamp_ns % 1_000_000_000)
+
+
+def turn(yaw: float) -> fox.Quaternion:
+    """A heading [rad] as a quaternion."""
+    return fox.Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+
+
+def pose_of(x: float, y: float, yaw: float) -> fox.Pose:
+    """A planar pose [m, m, rad]."""
+    return fox.Pose(position=fox.Vector3(x=x, y=y), orientation=turn(yaw))
+
+
+class Drawer:
+    """Converts message after message; remembers how the frames lie to one another."""
+
+    def __init__(self) -> None:
+        self._odometry = Pose(x=0.0, y=0.0, yaw=0.0)
+        self._converters: dict[type[Message], Callable[[Any, str], Iterable[Drawn]]] = {
+            LaserScan: self._scan,
+            OccupancyGrid: self._map,
+            PoseInMap: self._pose,
+            Intent: self._path,
+            Image: self._image,
+            LogRecord: self._log,
+            RobotState: self._state,
+            Body: self._body,
+        }
+
+    def draws(self, kind: type[Message]) -> bool:
+        """Whether there is anything to see of this type of message."""
+        return kind in self._converters
+
+    def draw(self, message: Message, name: str = "") -> Iterable[Drawn]:
+        """What viewers show of `message`; `name` is the camera's, where there are several."""
+        return self._converters[type(message)](message, name)
+
+    def _scan(self, scan: LaserScan, _: str) -> Iterable[Drawn]:
+        ranges = arrays.ranges(scan)
+        last = scan.angle_min + scan.angle_increment * (len(ranges) - 1)
+        drawn = fox.LaserScan(
+            timestamp=stamp(scan),
+            frame_id=scan.frame_id,
+            start_angle=scan.angle_min,
+            end_angle=last,
+            ranges=cast(list[float], ranges.astype(np.float64)),
+        )
+        yield of("scan", drawn)
+
+    def _map(self, grid: OccupancyGrid, _: str) -> Iterable[Drawn]:
+        cells = np.frombuffer(grid.cells, np.uint8)
+        colours = np.empty((len(cells), 4), np.uint8)
+        colours[:, :3] = GREY[cells][:, None]
+        colours[:, 3] = np.where(cells == 255, 0, 255)  # what is unknown is not drawn
+        byte = fox.PackedElementFieldNumericType.Uint8
+        names = enumerate(("red", "green", "blue", "alpha"))
+        drawn = fox.Grid(
+            timestamp=stamp(grid),
+            frame_id=MAP,
+            pose=pose_of(grid.origin_x, grid.origin_y, 0.0),
+            column_count=grid.width,
+            cell_size=fox.Vector2(x=grid.resolution, y=grid.resolution),
+            row_stride=grid.width * 4,
+            cell_stride=4,
+            fields=[fox.PackedElementField(name=n, offset=i, type=byte) for i, n in names],
+            data=colours.tobytes(),
+        )
+        yield of("map", drawn)
+
+    def _pose(self, pose: PoseInMap, _: str) -> Iterable[Drawn]:
+        here = pose_of(pose.x, pose.y, pose.yaw)
+        yield of("pose", fox.PoseInFrame(timestamp=stamp(pose), frame_id=MAP, pose=here))
+        odom = self._odometry
+        yaw = pose.yaw - odom.yaw
+        x = pose.x - odom.x * math.cos(yaw) + odom.y * math.sin(yaw)
+        y = pose.y - odom.x * math.sin(yaw) - odom.y * math.cos(yaw)
+        yield self._frame(pose, MAP, ODOM, Pose(x=x, y=y, yaw=yaw))
+
+    def _path(self, intent: Intent, _: str) -> Iterable[Drawn]:
+        poses = [pose_of(point.x, point.y, point.yaw) for point in intent.trajectory]
+        if poses:
+            drawn = fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses)
+            yield of("path", drawn)
+
+    def _image(self, image: Image, name: str) -> Iterable[Drawn]:
+        when = stamp(image)
+        if image.encoding == "jpeg":
+            jpeg = fox.CompressedImage(
+                timestamp=when, frame_id=image.frame_id, data=image.data, format="jpeg"
+            )
+            yield of(f"image/{name}", jpeg)
+            return
+        raw = fox.RawImage(
+            timestamp=when,
+            frame_id=image.frame_id,
+            width=image.width,
+            height=image.height,
+            encoding={"depth16": "16UC1", "depth32f": "32FC1"}.get(image.encoding, image.encoding),
+            step=len(image.data) // max(image.height, 1),
+            data=image.data,
+        )
+        yield of(f"image/{name}", raw)
+
+    def _log(self, record: LogRecord, _: str) -> Iterable[Drawn]:
+        drawn = fox.Log(
+            timestamp=stamp(record),
+            level=LEVELS[record.level],
+            message=record.text,
+            name=record.process,
+        )
+        yield of("log", drawn)
+
+    def _state(self, state: RobotState, _: str) -> Iterable[Drawn]:
+        self._odometry = state.pose
+        yield self._frame(state, ODOM, BASE, state.pose)
+
+    def _body(self, body: Body, _: str) -> Iterable[Drawn]:
+        lidar = body.description.lidar
+        if lidar:
+            place = Pose(x=lidar.x, y=lidar.y, yaw=lidar.yaw)
+            yield self._frame(body, BASE, LIDAR, place)
+
+    @staticmethod
+    def _frame(at: Message, parent: str, child: str, pose: Pose) -> Drawn:
+        drawn = fox.FrameTransform(
+            timestamp=stamp(at),
+            parent_frame_id=parent,
+            child_frame_id=child,
+            translation=fox.Vector3(x=pose.x, y=pose.y),
+            rotation=turn(pose.yaw),
+        )
+        return of("tf", drawn)

@@ -1,0 +1,83 @@
+"""Recordings for tests, made without a robot."""
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from gigabrain_schemas.arrays import ranges_bytes
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.recording.bagfile import BagFile
+from gigabrain_zenoh.recording.gaps import header_of
+from gigabrain_zenoh.recording.intake import Arrival
+from gigabrain_zenoh.recording.reading import Bag
+
+BEGIN_NS = 1_767_225_600_000_000_000
+NOISE = np.random.default_rng(0)
+
+
+def state(seq: int, boot: int = 7) -> bytes:
+    """A RobotState as it goes over the bus; its speed is a hundredth of its number."""
+    message = RobotState(
+        stamp_ns=BEGIN_NS + seq * 20_000_000,
+        seq=seq,
+        boot=boot,
+        tick=seq,
+        basis=seq,
+        robot_type="mock",
+        pose=Pose(x=seq * 0.01, y=0.0, yaw=0.0),
+        velocity=Velocity(linear_x=seq * 0.01),
+    )
+    return msgspec.msgpack.encode(message)
+
+
+def scan(seq: int) -> bytes:
+    """A LaserScan of 360 beams that does not compress."""
+    ranges = ranges_bytes(NOISE.uniform(0.2, 3.4, 360))
+    message = LaserScan(
+        seq=seq, boot=7, tick=seq, basis=seq,
+        angle_min=0.0, angle_increment=0.01745, range_min=0.1, range_max=3.5, ranges=ranges,
+    )  # fmt: skip
+    return msgspec.msgpack.encode(message)
+
+
+def arrival(at_ns: int, key: str, payload: bytes) -> Arrival:
+    """What the recorder makes of a message."""
+    kind = {"robot/state": "RobotState", "robot/scan": "LaserScan"}.get(key, "")
+    encoding = f"application/msgpack;gigabrain.{kind}"
+    return Arrival(BEGIN_NS + at_ns, key, encoding, payload, header_of(payload))
+
+
+def drive(states: int) -> Iterator[Arrival]:
+    """States at 50 Hz, with a scan after every fifth."""
+    scans = itertools.count(1)
+    for seq in range(1, states + 1):
+        yield arrival(seq * 20_000_000, "robot/state", state(seq))
+        if seq % 5 == 0:
+            yield arrival(seq * 20_000_000 + 1_000_000, "robot/scan", scan(next(scans)))
+
+
+def write(
+    path: Path, arrivals: Iterator[Arrival], *, flush_every: int = 12, end: bool = True
+) -> int:
+    """A recording of `arrivals`, flushed after so many, finished or not; how many are in it."""
+    file, count = BagFile(path, viewers=False, notes={}), 0
+    for count, each in enumerate(arrivals, 1):
+        file.add(each)
+        if count % flush_every == 0:
+            file.flush()
+    if end:
+        file.finish()
+    else:
+        file.flush()
+    file.close()
+    return count
+
+
+def seqs(path: Path, key: str = "robot/state") -> list[int]:
+    """The numbers of the messages on `key` that can be read."""
+    return [sample.header.seq for sample in Bag(path) if sample.key == key]

@@ -1,0 +1,266 @@
+"""Recordings on disk: written, read back, damaged, cut off, recovered."""
+
+import json
+import random
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+from mcap.reader import make_reader
+
+from gigabrain_schemas.topics import TOPICS
+from gigabrain_zenoh.cli.app import make_app
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.recording.bagfile import BagFile
+from gigabrain_zenoh.recording.gaps import Gaps, Header, header_of
+from gigabrain_zenoh.recording.info import faults, info
+from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.recover import recover, recover_all, unfinished
+from gigabrain_zenoh.recording.schema import flat_schema
+from tests import bag_rig
+
+
+def call(*arguments: str) -> object:
+    return make_app(arguments)(
+        arguments, exit_on_error=False, print_error=False, result_action="return_value"
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("bag") / "whole.mcap"
+    assert bag_rig.write(path, bag_rig.drive(500)) == 600
+    return path
+
+
+def test_what_was_recorded_comes_out_byte_for_byte_with_its_key_encoding_and_schema(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "a.mcap"
+    told = [*bag_rig.drive(20), bag_rig.arrival(10**9, "strange/key", b"\xc1 no message")]
+    twist = bag_rig.arrival(10**9 + 1, "robot/teleop", b'{"linear_x": 0.2}')
+    told.append(twist._replace(encoding="application/json"))
+    bag_rig.write(path, iter(told))
+    read = list(Bag(path))
+    assert [(s.log_ns, s.key, s.encoding, s.payload) for s in read] == [
+        (a.log_ns, a.key, a.encoding, a.payload) for a in told
+    ]
+    assert [s.schema for s in read[-3:]] == ["gigabrain.LaserScan", "", "gigabrain.Twist"]
+
+
+def test_other_programs_read_it_by_its_index(whole: Path) -> None:
+    with whole.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary
+        assert summary.statistics
+        assert summary.statistics.message_count == 600
+        messages = list(reader.iter_messages(topics=["robot/scan"]))
+    assert len(messages) == 100
+    schema, channel, message = messages[0]
+    assert schema
+    assert (schema.name, schema.encoding) == ("gigabrain.LaserScan", "jsonschema")
+    assert (channel.message_encoding, message.sequence) == ("msgpack", 1)
+
+
+def test_it_says_what_is_in_it(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found = info(whole)
+    assert (found.messages, found.seconds, found.finished) == (600, 9.981, True)
+    scan, state = found.keys
+    assert (scan.key, scan.message, scan.messages, scan.hz) == (
+        "robot/scan", "LaserScan", 100, 10.0,
+    )  # fmt: skip
+    assert (state.messages, state.hz, state.missing, state.longest_gap_s) == (500, 50.0, 0, 0.02)
+    assert call("bag", "info", str(whole), "--json") == 0
+    assert json.loads(capsys.readouterr().out)["keys"][1]["hz"] == 50.0
+    assert call("bag", "check", str(whole)) == 0
+    assert "whole, 600 messages in 9.981 s" in capsys.readouterr().out
+
+
+def test_missing_messages_are_counted_and_make_the_check_fail(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "gap.mcap"
+    kept = [a for a in bag_rig.drive(100) if not 30 <= a.header.seq <= 39]
+    bag_rig.write(path, iter(kept))
+    assert {key.key: key.missing for key in info(path).keys} == {"robot/scan": 0, "robot/state": 10}
+    assert call("bag", "check", str(path)) == 1
+    assert "robot/state: 10 messages are missing" in capsys.readouterr().out
+
+
+def test_a_sender_that_starts_anew_is_told_from_a_gap() -> None:
+    gaps = Gaps()
+    for seq, boot in ((5, 1), (6, 1), (9, 1), (2, 2), (3, 2), (9, 3)):
+        gaps.see("robot/state", Header(seq=seq, boot=boot))
+    assert gaps.missing["robot/state"] == 2 + 1 + 8
+    assert gaps.restarts["robot/state"] == 2
+    for seq, boot in ((5, 1), (6, 2), (7, 2), (1, 2)):
+        gaps.see("robot/intent", Header(seq=seq, boot=boot))  # decision lives on
+    assert (gaps.missing["robot/intent"], gaps.restarts["robot/intent"]) == (0, 1)
+
+
+def test_two_senders_on_one_key_have_a_count_each() -> None:
+    gaps = Gaps()
+    for seq, source in ((100, "control"), (1, "script"), (101, "control"), (2, "script")):
+        gaps.see("robot/cmd_vel", Header(seq=seq, source=source))
+    assert gaps.missing.total() == 0
+    assert gaps.restarts.total() == 0
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xc1", b"{", b"\x81\xa3seq\xa1x", b"[]", b"{}" * 9])
+def test_what_is_no_message_has_an_empty_header(payload: bytes) -> None:
+    assert header_of(payload) == Header()
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"", "is empty"),
+        (b"PNG and so on", "is not a bag (MCAP)"),
+        (b"\x89MCAP1\r\n" + bytes(40), "is MCAP of version 1; version 0 can be read"),
+    ],
+)
+def test_a_file_that_is_no_bag_is_refused_in_one_line(
+    tmp_path: Path, content: bytes, complaint: str
+) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    for command in (["info"], ["check"], ["recover"], ["plot", "state.pose.x"]):
+        with pytest.raises(ConfigError, match=r"^[^\n]+$") as error:
+            call("bag", command[0], str(path), *command[1:])
+        assert str(error.value) == f"{path} {complaint}"
+    with pytest.raises(ConfigError, match=r"cannot read .*: No such file"):
+        call("bag", "info", str(tmp_path / "none.mcap"))
+
+
+def test_a_flipped_byte_costs_its_chunk_and_no_other(whole: Path, tmp_path: Path) -> None:
+    path = tmp_path / "flipped.mcap"
+    content = bytearray(whole.read_bytes())
+    content[len(content) // 2] ^= 0x10
+    path.write_bytes(content)
+    found = info(path)
+    assert found.messages == 600 - 12
+    assert len(found.damages) == 1
+    assert faults(found)
+    assert call("bag", "check", str(path)) == 1
+    mended = tmp_path / "mended.mcap"
+    assert recover(path, mended).messages == 588
+    assert bag_rig.seqs(mended) == bag_rig.seqs(path)
+    assert info(mended).finished
+
+
+def test_flipped_bytes_anywhere_never_break_the_reader(whole: Path, tmp_path: Path) -> None:
+    chance, content = random.Random(1), whole.read_bytes()
+    path = tmp_path / "flipped.mcap"
+    for _ in range(150):
+        damaged = bytearray(content)
+        at = chance.randrange(8, len(content))
+        damaged[at] ^= 1 << chance.randrange(8)
+        path.write_bytes(damaged)
+        assert len(list(Bag(path))) >= 588 - 12, at
+
+
+def test_cut_anywhere_all_that_is_earlier_can_be_read(tmp_path: Path) -> None:
+    path, cut = tmp_path / "open.mcap", tmp_path / "cut.mcap"
+    bag_rig.write(path, bag_rig.drive(200), end=False)
+    content = path.read_bytes()
+    everything = bag_rig.seqs(path)
+    assert everything == list(range(1, 201))
+    ends = sorted({*range(len(content) - 300, len(content)), *range(9, len(content), 499)})
+    before = 0
+    for end in ends:
+        cut.write_bytes(content[:end])
+        read = bag_rig.seqs(cut)
+        assert read == everything[: len(read)]
+        assert len(read) >= before - 12, end  # a torn chunk gives what is whole of it
+        before = max(before, len(read))
+    assert before > 185
+
+
+def test_a_cut_recording_is_recovered_into_one_with_an_index(tmp_path: Path) -> None:
+    path = tmp_path / "open.mcap"
+    bag_rig.write(path, bag_rig.drive(200), end=False)
+    path.write_bytes(path.read_bytes()[:-50])
+    left = bag_rig.seqs(path)
+    assert unfinished(path)
+    assert call("bag", "recover", str(path)) == 0
+    mended = tmp_path / "open_recovered.mcap"
+    assert bag_rig.seqs(mended) == left
+    with mended.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        assert len(list(reader.iter_messages(topics="robot/state"))) == len(left) > 180
+    with pytest.raises(ConfigError, match="exists; choose another file"):
+        call("bag", "recover", str(path))
+
+
+def test_the_next_start_mends_what_was_cut_off_and_leaves_the_rest_alone(
+    whole: Path, tmp_path: Path
+) -> None:
+    cut, good, other = (tmp_path / name for name in ("cut.mcap", "good.mcap", "text.mcap"))
+    bag_rig.write(cut, bag_rig.drive(100), end=False)
+    shutil.copy(whole, good)
+    other.write_text("no bag at all")
+    busy = BagFile(tmp_path / "busy.mcap", viewers=False, notes={})
+    before = {path: path.read_bytes() for path in (good, other, busy.path)}
+    recover_all(tmp_path)
+    assert info(cut).finished
+    assert bag_rig.seqs(cut) == list(range(1, 101))
+    assert {path: path.read_bytes() for path in before} == before
+    assert len(list(tmp_path.iterdir())) == 4
+    busy.close()
+
+
+@pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.key)
+def test_every_schema_is_flat_enough_for_the_viewers(topic: object) -> None:
+    def walk(part: object) -> None:
+        assert isinstance(part, dict)
+        assert not {"$ref", "$defs", "anyOf"} & part.keys()
+        assert "type" in part
+        for inner in part.get("properties", {}).values():
+            walk(inner)
+        if part["type"] == "array":
+            assert part["items"]["type"] != "array"
+            walk(part["items"])
+
+    schema = json.loads(flat_schema(topic.type))  # type: ignore[attr-defined]
+    assert schema["title"] == topic.type.__name__  # type: ignore[attr-defined]
+    walk(schema)
+
+
+def test_tables_have_a_row_per_message(whole: Path, tmp_path: Path) -> None:
+    assert call("bag", "convert", str(whole), "--csv", str(tmp_path / "csv")) == 0
+    rows = (tmp_path / "csv" / "robot_state.csv").read_text().splitlines()
+    assert len(rows) == 501
+    names, first = rows[0].split(","), rows[1].split(",")
+    assert first[names.index("velocity.linear_x")] == "0.01"
+    scans = (tmp_path / "csv" / "robot_scan.csv").read_text().splitlines()
+    assert scans[0].split(",")[-1] == "ranges.359"
+
+
+def test_a_plot_is_a_picture_and_an_unknown_field_names_the_nearest(
+    whole: Path, tmp_path: Path
+) -> None:
+    picture = tmp_path / "p.png"
+    assert call("bag", "plot", str(whole), "robot/state.velocity.linear_x", "-o", str(picture)) == 0
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(ConfigError, match=r"did you mean 'state.velocity.linear_y'\?"):
+        call("bag", "plot", str(whole), "state.velocity.linear_z")
+    with pytest.raises(ConfigError, match=r"no topic 'stat.pose.x'; did you mean 'state'\?"):
+        call("bag", "plot", str(whole), "stat.pose.x")
+
+
+def test_the_light_commands_do_not_need_the_recorder() -> None:
+    code = "import sys, gigabrain_zenoh.cli.app; print([m for m in sys.modules if 'mcap' in m])"
+    told = subprocess.run((sys.executable, "-c", code), capture_output=True, text=True, check=True)
+    assert told.stdout == "[]\n"
+
+
+def test_settings_are_kept_for_a_replay(tmp_path: Path) -> None:
+    notes = {"decision": msgspec.json.encode({"turn": "left"}).decode()}
+    BagFile(tmp_path / "n.mcap", viewers=False, notes=notes).close()
+    bag = Bag(tmp_path / "n.mcap")
+    assert list(bag) == []
+    assert bag.notes["gigabrain"] == notes

@@ -1,0 +1,72 @@
+"""The recorder beside a real robot: as a command, as a process of a deployment, and killed."""
+
+import os
+import signal
+from pathlib import Path
+
+from gigabrain_zenoh.recording.info import faults, info
+from tests.onlooker import looking_on
+from tests.stack import Home, endpoint_of, until
+
+ALL = ["router", "driver", "perception", "decision", "control", "safety", "recorder"]
+
+
+def sizes(folder: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_size for path in folder.glob("*.mcap")}
+
+
+async def test_a_recorder_that_is_killed_costs_the_robot_nothing_and_its_file_is_mended(
+    home: Home,
+) -> None:
+    folder = home.folder / "bags"
+    file = home.deployment(
+        resume="auto",
+        hosts={"robot": ALL},
+        recorder={"folder": str(folder), "keep_free_mb": 0},
+    )
+    up = home.start("up", str(file))
+    async with looking_on(endpoint_of(file)) as robot:
+        await robot.straight(speed=0.15)
+        await until(lambda: max(sizes(folder).values(), default=0) > 50_000, "a recording grows")
+        (first,) = sizes(folder)
+        before = robot.state
+        os.kill(await robot.pid("recorder"), signal.SIGKILL)
+        await until(lambda: len(sizes(folder)) == 2, "a second recording")
+        await until(lambda: info(folder / first).finished, "the first is mended")
+        assert robot.state.boot == before.boot
+        assert "recorder ended with signal 9" in up.out
+
+        by_hand = home.start(
+            "record", "-o", str(home.folder / "hand.mcap"), "--connect",
+            endpoint_of(file).connect[0], "--topics", "state", "scan",
+        )  # fmt: skip
+        await until(lambda: sizes(home.folder).get("hand.mcap", 0) > 20_000, "one by hand as well")
+        by_hand.send(signal.SIGINT)
+        assert await by_hand.ended() == 0
+        assert "missing 0  dropped 0" in by_hand.out
+        up.send(signal.SIGINT)
+        assert await up.ended() == 0
+    assert {key.key for key in info(home.folder / "hand.mcap").keys} == {
+        "robot/scan",
+        "robot/state",
+    }
+    for name in sizes(folder):
+        assert faults(info(folder / name)) == [], name
+    assert info(folder / first).notes["gigabrain"]["world"] == "arena"
+
+
+async def test_what_cannot_be_recorded_is_said_in_one_line(home: Home) -> None:
+    there = home.folder / "there.mcap"
+    there.write_text("mine")
+    lost = await home.run("record", "--connect", "tcp/127.0.0.1:9")
+    where = "tcp/127.0.0.1:9"
+    assert lost.err == (
+        f"gigabrain: no router answers at {where}; is the robot running, and without keys?\n"
+    )
+    assert await lost.ended() == 1
+    none = await home.run("record", "--split-time", "-1")
+    assert none.err.startswith("gigabrain: --split-time: expected a number above 0, got -1")
+    assert await none.ended() == 2
+    demo = await home.run("demo", "--record", str(there))
+    assert demo.err == f"gigabrain: {there} exists; choose another file\n"
+    assert await demo.ended() == 2
