@@ -21,11 +21,16 @@ LOOK_S = 0.5
 
 
 async def record(
-    config: RecorderConfig, connect: str | None, namespace: str, seconds: float | None
+    config: RecorderConfig,
+    connect: str | None,
+    namespace: str,
+    seconds: float | None,
+    *,
+    keys: str = "",
 ) -> int:
     """Record until Ctrl-C or for `seconds`; the exit code. Raises GigabrainError."""
     path = path_of(config)
-    async with joined(connect, namespace, "record") as (bus, _):
+    async with joined(connect, namespace, "record", keys) as (bus, _):
         recorder = Recorder(path, config)
         recorder.begin()
         recover_others(path.parent)
@@ -97,11 +102,12 @@ async def play(
     connect: str | None,
     namespace: str,
     *,
+    keys: str = "",
     beside_robot: bool,
 ) -> int:
     """Play to the end or until Ctrl-C; the exit code. Raises GigabrainError."""
     check_magic(path)
-    async with joined(connect, namespace, "play") as (bus, transport):
+    async with joined(connect, namespace, "play", keys) as (bus, transport):
         if not beside_robot:
             await check_nobody_drives(bus)
         player = Player(path, options, transport)
