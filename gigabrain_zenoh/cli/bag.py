@@ -165,8 +165,8 @@ def plot(
     return 0
 
 
-def convert(file: Path, *, csv: Path) -> int:
-    """Write a recording as tables, one per topic.
+def convert(file: Path, *, csv: Path | None = None, lerobot: Path | None = None) -> int:
+    """Write a recording as tables, one per topic, or as a LeRobot dataset.
 
     Example: gigabrain bag convert drive.mcap --csv tables
 
@@ -176,9 +176,16 @@ def convert(file: Path, *, csv: Path) -> int:
         The recording.
     csv
         The folder for the tables.
+    lerobot
+        A new folder for the dataset.
     """
+    from gigabrain_zenoh.recording.lerobot import convert as write_lerobot
     from gigabrain_zenoh.recording.tables import write_csv
 
-    for path in write_csv(file, csv):
+    if csv is None and lerobot is None:
+        raise ConfigError("say into what: --csv FOLDER or --lerobot FOLDER")
+    for path in write_csv(file, csv) if csv else ():
         print(path)
+    if lerobot:
+        print(write_lerobot(file, lerobot))
     return 0
