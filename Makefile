@@ -7,6 +7,7 @@ PYTHON ?= python3
 DONE := $(VENV)/.done
 
 .PHONY: setup demo test lint unit bench mutation golden recordings pictures clean
+.PHONY: setup demo test lint unit bench mutation fuzz golden pictures clean
 
 setup: $(DONE)
 
@@ -45,6 +46,13 @@ mutation: setup
 	$(BIN)/mutmut run
 	@test -z "$$($(BIN)/mutmut results)" || { $(BIN)/mutmut results; exit 1; }
 
+# coverage-guided; seconds for each of the four kinds of decoders
+FUZZ_S ?= 60
+fuzz: setup
+	@for target in tests/fuzz/fuzz_*.py; do \
+	  $(BIN)/python $$target -max_total_time=$(FUZZ_S) -verbosity=0 -print_final_stats=1 || exit 1; \
+	done
+
 golden: setup
 	$(BIN)/python -m gigabrain_schemas.golden
 
@@ -55,4 +63,4 @@ pictures: setup
 	$(BIN)/gigabrain view --png docs/pictures/waffle_in_house.png --world house --seed 1
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis mutants
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .fuzz .fuzz-* mutants

@@ -16,7 +16,7 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.freshness import CLOCK_KEYS, Latest, RobotTime
 from gigabrain_zenoh.rejections import Rejections
-from gigabrain_zenoh.transport import Close, OnRaw, OnSample, Transport
+from gigabrain_zenoh.transport import Close, OnLink, OnRaw, OnSample, Transport
 
 __all__ = ["Bus", "Latest", "RobotTime"]
 
@@ -175,6 +175,10 @@ class Bus:
             except ValueError as error:
                 self._rejections.reject(key, error)
         return answers
+
+    def links(self, on_link: OnLink) -> Close:
+        """Call `on_link` for everybody who is linked to this process, or is no more."""
+        return self._transport.links(on_link)
 
     async def close(self) -> None:
         """Leave the network."""

@@ -9,7 +9,7 @@ from typing import Any, TypeVar, overload
 from gigabrain_schemas.audit import AuditRecord, AuditRequest
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
-from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.brain import CmdVel, Twist
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import (
     AUDIT_LOG,
@@ -18,15 +18,17 @@ from gigabrain_schemas.topics import (
     ENABLE,
     RELEASE,
     STATE,
+    TELEOP,
     Service,
     Topic,
 )
 from gigabrain_zenoh.audit_file import in_order
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, BusError, Refused, Unsupported
+from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, Unsupported
 from gigabrain_zenoh.estop import press
 from gigabrain_zenoh.hold import Hold
+from gigabrain_zenoh.keys.checks import may_not_ask, no_router
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 from gigabrain_zenoh.listening import listen, topic_named
 from gigabrain_zenoh.running import find_endpoint
@@ -44,6 +46,7 @@ async def connect(
     connect: str | None = None,
     *,
     namespace: str = "",
+    keys: str = "",
     source: str = "",
     take: bool = False,
     wait: bool = True,
@@ -51,22 +54,22 @@ async def connect(
     """A robot to drive and to listen to.
 
     `connect` is its router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    `source` is the name under which the gate knows this script; with `take` it takes the body over
-    from whoever drives. With `wait` the body's first state is waited for: without, an e-stop can be
-    sent to a body that says nothing. Raises BusError when there is no router, BodyLost when there
-    is no driver.
+    `keys` is the folder of this script's identity, for a router that wants one. `source` is the
+    name under which the gate knows this script; with `take` it takes the body over from whoever
+    drives. With `wait` the body's first state is waited for: without, an e-stop can be sent to a
+    body that says nothing. Raises BusError when there is no router, ConfigError when the keys are
+    at fault, BodyLost when there is no driver.
     """
     from gigabrain_zenoh.zenoh_transport import ZenohTransport  # takes a while: only when used
 
-    endpoint = find_endpoint(connect, namespace)
+    endpoint = find_endpoint(connect, namespace, keys)
     try:
         transport = await asyncio.wait_for(ZenohTransport.open(endpoint), ROUTER_S)
     except TimeoutError:
-        where = endpoint.connect[0]
-        raise BusError(f"no router answers at {where}; is the robot running?") from None
+        raise no_router(endpoint) from None
     bus = Bus(transport, Clock(), source or f"script-{os.getpid()}")
     try:
-        robot = Robot(bus, take=take)
+        robot = Robot(bus, take=take, keys=endpoint.keys)
         if wait:
             await robot.read_state()
         yield robot
@@ -78,8 +81,8 @@ async def connect(
 class Robot:
     """One robot. Commands go out at 50 Hz with the echo that the gate asks for."""
 
-    def __init__(self, bus: Bus, *, take: bool = False) -> None:
-        self._bus, self._take = bus, take
+    def __init__(self, bus: Bus, *, take: bool = False, keys: str = "") -> None:
+        self._bus, self._take, self._keys = bus, take, keys
         self._states = bus.latest(STATE, self._repeat)
         self._bodies = bus.latest(BODY)
         self._target: Velocity | None = None
@@ -114,6 +117,17 @@ class Robot:
             await self._ticks(min(left, HOLD_TICKS // 2))
         await self.stop()
 
+    def steer(self, wanted: Velocity) -> None:
+        """Tell the robot's own control what an operator wants; to be said twenty times a second.
+
+        Control obeys while the gate is open for the brain, and keeps the body until somebody
+        enables the brain again.
+        """
+        twist = Twist(
+            linear_x=wanted.linear_x, linear_y=wanted.linear_y, angular_z=wanted.angular_z
+        )
+        self._bus.publish(TELEOP, twist)
+
     async def stop(self) -> None:
         """Come to rest, if this script drives. It keeps the body."""
         if self._target is None:
@@ -147,7 +161,10 @@ class Robot:
         Raises NotConfirmed when no body has confirmed it within two seconds.
         """
         self._target = None
-        return await press(self._bus, reason)
+        try:
+            return await press(self._bus, reason)
+        except NotConfirmed as error:
+            raise NotConfirmed(f"{error}{may_not_ask(self._keys)}") from None
 
     async def audit(self, newest: int = 100) -> tuple[AuditRecord, ...]:
         """The newest entries of the audit log, oldest first. Raises BodyLost where nobody has one.
@@ -167,6 +184,11 @@ class Robot:
         if state is None:
             raise BodyLost("no robot/state; is the driver running?")
         return state
+
+    @property
+    def state(self) -> RobotState | None:
+        """The newest state, or None when the robot is silent."""
+        return self._states.fresh()
 
     async def read_body(self) -> BodyDescription:
         """What the body is: its limits, its outline, its sensors. Raises BodyLost."""
@@ -253,7 +275,8 @@ class Robot:
     async def _ask(self, service: Service[Q, GateReply], request: Q) -> GateReply:
         replies = await self._bus.ask(service, request, timeout_s=ANSWER_S)
         if not replies:
-            raise BodyLost(f"no driver answers {service.key}; is it running?")
+            doubt = may_not_ask(self._keys) or "; is it running?"
+            raise BodyLost(f"no driver answers {service.key}{doubt}")
         return replies[0]
 
     @staticmethod

@@ -25,7 +25,7 @@ class Codec(Generic[M]):
     """Decodes one message type, from MessagePack or from JSON."""
 
     def __init__(self, message: type[M], max_bytes: int) -> None:
-        self._max_bytes = max_bytes
+        self.max_bytes = max_bytes
         self._msgpack: Callable[[bytes], M] = msgspec.msgpack.Decoder(message).decode
         self._json: Callable[[bytes], M] = msgspec.json.Decoder(message).decode
 
@@ -35,8 +35,8 @@ class Codec(Generic[M]):
         The first byte tells the two apart, since foreign clients rarely set a Zenoh encoding: JSON
         begins with ASCII, a MessagePack map never does.
         """
-        if len(payload) > self._max_bytes:
-            raise ValueError(f"{len(payload)} bytes, at most {self._max_bytes} are read")
+        if len(payload) > self.max_bytes:
+            raise ValueError(f"{len(payload)} bytes, at most {self.max_bytes} are read")
         try:
             return self._json(payload) if payload[:1] < b"\x80" else self._msgpack(payload)
         except DECODE_ERRORS as error:

@@ -11,6 +11,7 @@ from gigabrain_schemas.brain import CmdVel, Intent
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, TELEOP, command_topic
 from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.gate import BRAIN
 from gigabrain_zenoh.limits import NO_CAPS, ZERO, clamp, limits_of, ramp
 from gigabrain_zenoh.teleop import Teleop
@@ -156,21 +157,16 @@ class EarlierCaps:
     """
 
     def __init__(self) -> None:
-        self._newest = self._before = SafetyState(verdict="stop")
+        self._verdicts: Earlier[SafetyState] = Earlier()
 
     def receive(self, verdict: SafetyState) -> None:
         """Take one verdict."""
-        if (verdict.boot, verdict.tick) != (self._newest.boot, self._newest.tick):
-            self._before = self._newest
-        self._newest = verdict
+        self._verdicts.receive(verdict)
 
     def at(self, state: RobotState) -> SpeedCaps:
         """The caps that hold throughout the tick of `state`."""
-        for verdict in (self._newest, self._before):
-            age_ns = (state.tick - verdict.tick) * TICK_NS
-            if verdict.boot == state.boot and 0 < age_ns <= SAFETY.stale_after_ns:
-                return verdict.caps
-        return NO_CAPS  # without a verdict the gate lets nothing through
+        verdict = self._verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
+        return verdict.caps if verdict else NO_CAPS  # without one the gate lets nothing through
 
 
 async def run(bus: Bus, ready: Callable[[], None]) -> None:

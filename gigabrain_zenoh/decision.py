@@ -6,11 +6,13 @@ from collections.abc import Callable
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent, WorldModel
-from gigabrain_schemas.topics import BODY, INTENT, STATE, WORLD
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, WORLD
 from gigabrain_zenoh import behaviours
 from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.behaviours import Situation
 from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.settings import DecisionConfig
 
 log = logging.getLogger(__name__)
@@ -29,20 +31,23 @@ class Thinker:
         self.intent = Intent(behaviour=config.behaviour, reason="starting")
         self.basis = 0
 
-    def think(self, state: RobotState, world: WorldModel | None) -> None:
+    def think(
+        self, state: RobotState, world: WorldModel | None, *, must_charge: bool = False
+    ) -> None:
         """Form a new intent if there is anything new to go by."""
         if state.boot != self._boot:  # the driver has started anew, and with it the odometry
             self._behaviour, self._boot, self.basis = self._load(self._config), state.boot, 0
         if world is None:
-            self.intent = self._behaviour.step(Situation(None, state.pose))
+            self.intent = self._behaviour.step(Situation(None, state.pose, must_charge))
         elif world.basis != self.basis and world.basis <= state.tick:
-            self.intent = self._behaviour.step(Situation(world, state.pose))
+            self.intent = self._behaviour.step(Situation(world, state.pose, must_charge))
             self.basis = world.basis
 
 
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """An intent per world, as soon as it comes; repeated with the newest tick at each state."""
     thinker, said = Thinker(config), ""
+    verdicts: Earlier[SafetyState] = Earlier()
 
     def decide(_: Message) -> None:
         nonlocal said
@@ -50,7 +55,9 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
         if state is None:
             return
         body = bodies.current
-        thinker.think(state, worlds.fresh(scan_limit_ns(body.description) if body else None))
+        world = worlds.fresh(scan_limit_ns(body.description) if body else None)
+        verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
+        thinker.think(state, world, must_charge=_must_charge(verdict))
         intent = thinker.intent
         bus.publish(INTENT, intent, basis=thinker.basis)
         phrase = intent.reason.partition(":")[0]
@@ -66,5 +73,11 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
     bodies = bus.latest(BODY)
     states = bus.latest(STATE, decide)
     worlds = bus.latest(WORLD, see)
+    bus.latest(SAFETY, verdicts.receive)
     ready()
     await bus.failed
+
+
+def _must_charge(verdict: SafetyState | None) -> bool:
+    """Whether safety wants the robot to come to rest and be charged."""
+    return verdict is not None and any(w.code == "battery_return" for w in verdict.warnings)

@@ -1,9 +1,8 @@
 """A deployment file: which body on which link, and which process runs on which host."""
 
-import re
 import socket
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -11,10 +10,13 @@ from typing import Any, Literal
 import msgspec
 from msgspec import Struct
 
-from gigabrain_zenoh import config, config_yaml
+from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.keeper import ProcessSpec
+from gigabrain_zenoh.keys.checks import check_identity
+from gigabrain_zenoh.keys.files import identity_folder
 from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.running import local_socket
 from gigabrain_zenoh.settings import (
     ButtonConfig,
     DecisionConfig,
@@ -28,6 +30,7 @@ from gigabrain_zenoh.settings import (
     Seed,
     Speed,
 )
+from gigabrain_zenoh.zenoh_config import router_config, secured
 
 EMULATOR = "emulator"  # runs beside the driver where the link is `emulated`; not in `hosts`
 BUTTON = "button"  # runs beside the driver where there is one, unless `hosts` says where
@@ -52,7 +55,9 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     resume: Resume = "manual"
     namespace: str = ""  # the robot's own part of the key space, where one router serves several
     router: str = "tcp/127.0.0.1:7447"  # where it listens; port 0 for any, where all is on one host
-    insecure: bool = False  # allow a router that other machines can reach
+    keys: str = ""  # the folder of this host's identity, or of one for each host: TLS for all
+    fleet: tuple[str, ...] = ()  # namespaces of other robots that this one's router serves
+    insecure: bool = False  # allow a router that other machines can reach, without keys
     hosts: dict[str, tuple[ProcessName, ...]] = msgspec.field(
         default_factory=lambda: {"robot": ROBOT}
     )
@@ -75,11 +80,14 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         if self.button and self.speed != 1.0:
             raise ValueError("button: a person presses it in real time, so leave out `speed`")
         address = self.router.partition("/")[2]
-        if not self.insecure and not address.startswith(LOOPBACK):
+        if not (self.insecure or self.keys) and not address.startswith(LOOPBACK):
             raise ValueError(
                 f"router {self.router} can be reached by anybody on the network; "
-                "use a loopback address, or write `insecure: true`"
+                "name `keys:` that `gigabrain keys new` and `keys issue` made, use a loopback "
+                "address, or write `insecure: true`"
             )
+        if self.fleet and not self.namespace:
+            raise ValueError("fleet: this robot needs a namespace of its own as well")
         if self.resume == "auto" and self.link == "real":
             raise ValueError("resume: auto is for simulation; a real body is enabled by a person")
         if self.speed != 1.0 and self.link != "sim":
@@ -106,26 +114,15 @@ def deployment_path(name: str) -> Path:
     return path
 
 
-def load_deployment(path: Path) -> Deployment:
-    """Read a deployment file. Raises ConfigError with file, line and what was expected."""
-    return config.load(path, Deployment)
+def load_deployment(path: Path, keys: str = "") -> Deployment:
+    """Read a deployment file; its keys are found beside it, unless `keys` stand in for them.
 
-
-def located(path: Path, error: ConfigError) -> ConfigError:
-    """What a process says of a name that it was given, with that name's line in the file."""
-    if named := re.match(r"no \w+ ('.*?');", str(error)):
-        for node in _scalars(config_yaml.read(path.read_text(encoding="utf-8"))):
-            if repr(node.value) == named[1]:
-                return ConfigError(f"{path}:{node.line}: {error}")
-    return error
-
-
-def _scalars(node: config_yaml.Node) -> Iterator[config_yaml.Node]:
-    children = [entry.node for entry in node.entries or ()] + list(node.items or ())
-    if not children:
-        yield node
-    for child in children:
-        yield from _scalars(child)
+    Raises ConfigError with file, line and what was expected.
+    """
+    loaded = config.load(path, Deployment)
+    if loaded.keys and not keys:
+        keys = str(path.absolute().parent / Path(loaded.keys).expanduser())
+    return msgspec.structs.replace(loaded, keys=keys)
 
 
 def host_of(deployment: Deployment, name: str | None) -> str:
@@ -155,9 +152,34 @@ def with_free_port(deployment: Deployment) -> Deployment:
     return msgspec.structs.replace(deployment, router=f"{protocol}/{host}:{free}")
 
 
-def client_endpoint(deployment: Deployment) -> Endpoint:
-    """Where anybody meets this deployment."""
-    return Endpoint(connect=(deployment.router,), namespace=deployment.namespace)
+def client_endpoint(deployment: Deployment, host: str = "") -> Endpoint:
+    """Where the processes of `host` meet this deployment. Raises ConfigError."""
+    keys = str(identity_folder(deployment.keys, host)) if deployment.keys else ""
+    return secured(
+        Endpoint(connect=(deployment.router,), namespace=deployment.namespace, keys=keys)
+    )
+
+
+def local_endpoint(deployment: Deployment, host: str) -> Endpoint:
+    """Where `host` meets it itself: with keys by the Unix socket of its own router, if it has one.
+
+    Nobody on the network can be in the way there.
+    """
+    endpoint = client_endpoint(deployment, host)
+    if not endpoint.keys or "router" not in deployment.hosts[host]:
+        return endpoint
+    return msgspec.structs.replace(endpoint, connect=(local_socket(), *endpoint.connect))
+
+
+def check_keys(deployment: Deployment, host: str) -> None:
+    """Whether the identity of `host` is good for what it runs. Raises ConfigError."""
+    if deployment.keys:
+        check_identity(
+            identity_folder(deployment.keys, host),
+            deployment.hosts[host],
+            deployment.namespace,
+            deployment.router,
+        )
 
 
 def process_specs(
@@ -176,12 +198,13 @@ def process_specs(
         names.append(BUTTON)
     if deployment.link == "emulated" and "driver" in names:
         names.insert(names.index("driver"), EMULATOR)
-    settings = _settings(deployment, run_dir, state_dir, seconds)
+    settings = dict(_settings(deployment, run_dir, state_dir, seconds))
     specs = []
     for name in names:
-        endpoint = client_endpoint(deployment)
+        endpoint = local_endpoint(deployment, host)
         if name == "router":
-            endpoint = Endpoint(listen=(deployment.router,), namespace=deployment.namespace)
+            endpoint = _door(deployment, endpoint)
+            settings[name] = msgspec.to_builtins(router_config(endpoint, state_dir))
         process = ProcessConfig(
             name=name,
             endpoint=endpoint,
@@ -204,6 +227,13 @@ def process_specs(
             )
         )
     return specs
+
+
+def _door(deployment: Deployment, endpoint: Endpoint) -> Endpoint:
+    """The router's side of where others connect."""
+    return msgspec.structs.replace(
+        endpoint, listen=endpoint.connect[::-1], connect=(), fleet=deployment.fleet
+    )
 
 
 # -P: a folder that happens to be the current one must not stand in for an installed package

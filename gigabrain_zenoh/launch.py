@@ -2,13 +2,16 @@
 
 import asyncio
 import contextlib
+import os
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from gigabrain_zenoh import log_text
 from gigabrain_zenoh.deployment import (
     Deployment,
-    client_endpoint,
+    check_keys,
+    local_endpoint,
     process_specs,
     with_free_port,
 )
@@ -31,6 +34,7 @@ async def up(
     Raises ConfigError when what a process was given is wrong, or a folder cannot be written, and
     BusError when the router cannot run, without which nothing else can.
     """
+    check_keys(deployment, host)
     deployment = with_free_port(deployment)
     label = deployment.namespace or deployment.body.replace("/", "-")
     notifier = Notifier.from_environment()
@@ -49,11 +53,11 @@ async def up(
         say(log_text.readable(record, colour=False))
 
     say(f"{deployment.body} on {host}: {', '.join(spec.name for spec in specs)}; logs in {run_dir}")
-    with stop_signals() as stop, announced(label, client_endpoint(deployment)):
+    with stop_signals() as stop, announced(label, local_endpoint(deployment, host)) as note:
         async with Supervisor(specs, show) as supervisor:
             running = asyncio.ensure_future(supervisor.run())
             while not stop.is_set() and not running.done() and not _hopeless(supervisor):
-                _report(supervisor, notifier)
+                _report(supervisor, notifier, note)
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), LOOK_S)
             notifier.stopping()
@@ -71,8 +75,11 @@ def _hopeless(supervisor: Supervisor) -> bool:
     return bool(supervisor.misconfigured) or "router" in supervisor.given_up
 
 
-def _report(supervisor: Supervisor, notifier: Notifier) -> None:
-    """Tell the service manager how all are doing; what was given up is told, not waited for."""
+def _report(supervisor: Supervisor, notifier: Notifier, note: Path) -> None:
+    """Tell the service manager how all are doing; what was given up is told, not waited for.
+
+    The note of a robot that is well is touched: whoever has no service manager looks at its age.
+    """
     states = {name: status.state for name, status in supervisor.statuses.items()}
     not_yet = [name for name, state in states.items() if state not in ("ready", "given up")]
     problems = {
@@ -86,3 +93,6 @@ def _report(supervisor: Supervisor, notifier: Notifier) -> None:
         notifier.ready()
     if not supervisor.stuck:
         notifier.alive()
+    if not told:
+        with contextlib.suppress(OSError):  # somebody has tidied up
+            os.utime(note)

@@ -35,10 +35,12 @@ def limits_of(body: BodyDescription) -> Limits:
 
 def clamp(velocity: Velocity, limits: Limits, caps: SpeedCaps = NO_CAPS) -> Velocity:
     """`velocity` within the body's speeds and the caps of the moment, axis by axis."""
+    turning = limits.angular_speed if caps.rotation is None else caps.rotation
+    turning = min(turning, limits.angular_speed)
     return Velocity(
         linear_x=_within(velocity.linear_x, limits.linear_speed, caps.backward, caps.forward),
         linear_y=_within(velocity.linear_y, limits.lateral_speed, caps.right, caps.left),
-        angular_z=_within(velocity.angular_z, limits.angular_speed, caps.rotation, caps.rotation),
+        angular_z=_within(velocity.angular_z, turning, caps.turn_right, caps.turn_left),
     )
 
 

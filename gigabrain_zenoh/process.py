@@ -25,6 +25,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, unknown
 from gigabrain_zenoh.health import answer_to_name, publish_health
 from gigabrain_zenoh.heartbeat import beat
+from gigabrain_zenoh.keys.checks import identity_in
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.stop_signals import stop_signals
@@ -51,7 +52,7 @@ class Program:
 
 
 PROGRAMS = {
-    "router": Program("gigabrain_zenoh.router:run"),
+    "router": Program("gigabrain_zenoh.router:run", "gigabrain_zenoh.settings:RouterConfig"),
     "driver": Program("gigabrain_drivers.process:run", "gigabrain_zenoh.settings:DriverConfig"),
     "emulator": Program(
         "gigabrain_drivers.emulators.process:run", "gigabrain_zenoh.settings:EmulatorConfig"
@@ -164,17 +165,22 @@ def _ready() -> None:
 
 
 async def _connect(endpoint: Endpoint) -> ZenohTransport:
-    """Open the session, and say so once when that takes longer than a person would wait."""
+    """Open the session, and say so once when that takes longer than a person would wait.
+
+    Raises ConfigError where our own keys are the reason.
+    """
     opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
-    done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
-    if not done:
-        where = ", ".join(endpoint.connect) or ", ".join(endpoint.listen)
-        log.warning(
-            "no router at %s yet; waiting for it (start one with: gigabrain router)",
-            where,
-            extra={"data": {"event": "waiting"}},
-        )
     try:
+        done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
+        if not done:
+            if endpoint.keys:  # a router turns bad ones away without a word
+                await asyncio.to_thread(identity_in, Path(endpoint.keys))
+            where = ", ".join(endpoint.connect) or ", ".join(endpoint.listen)
+            log.warning(
+                "no router at %s yet; waiting for it (start one with: gigabrain router)",
+                where,
+                extra={"data": {"event": "waiting"}},
+            )
         return await opening
     finally:
         opening.cancel()

@@ -18,6 +18,15 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     connect: tuple[str, ...] = ()  # Zenoh endpoints, such as tcp/127.0.0.1:7447
     listen: tuple[str, ...] = ()  # of a router
     namespace: str = ""  # the robot's own part of the key space
+    keys: str = ""  # the folder of an identity; without one, nobody asks who anybody is
+    fleet: tuple[str, ...] = ()  # namespaces of other robots that a router serves
+
+
+class RouterConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The settings of the router process."""
+
+    state_dir: str = ""  # where it writes down who was not let in
+    knows: tuple[str, ...] = ()  # common names that have rights; without keys none is asked for
 
 
 class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -1,67 +1,80 @@
-"""How far ahead must be free: stopping distances, and what the lidar says of the room there is.
+"""How far ahead must be free, and how fast the body may go with the room that there is.
 
-`L(v) = v T + v² / 2a + margin`, where T is the time from scan to brake and a the deceleration.
+`L(v) = v T + v² / 2a + margin`, where T is the time from scan to brake and a the deceleration; for
+turning the same with angles.
 """
 
 import math
+from functools import lru_cache
+
+import msgspec
 
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.perception import hits
-
-SIDE_MARGIN = 0.03  # [m], kept free beside the body as it moves on
-RESUME_MARGIN = 0.10  # [m], more than the stop zone before the body may go on
-NEAREST = 0.1  # [m], nearer hits are the lidar's own housing
 
 
-def stopping_distance(body: BodyDescription, speed: float) -> float:
-    """L(v) = v T + v² / 2a + margin [m]: how far ahead must be free at `speed` [m/s]."""
-    t, a = body.thresholds.reaction_time, body.max_linear_deceleration
-    return speed * t + speed * speed / (2 * a) + body.thresholds.stop_margin
+class Brake(msgspec.Struct, frozen=True, kw_only=True):
+    """How a body comes to rest along one axis: in [m], or in [rad] for turning."""
+
+    reaction_time: float  # [s]
+    deceleration: float  # [m/s2]
+    margin: float  # [m], kept free in front of the body at rest
+    resume: float  # [m], more than the stop zone before it may go on
+    fastest: float  # [m/s], its limit
+
+    def distance(self, speed: float) -> float:
+        """L(v): how far must be free at `speed`."""
+        return speed * self.reaction_time + speed * speed / (2 * self.deceleration) + self.margin
+
+    def speed(self, free: float) -> float:
+        """The speed from which it stops within `free`: L(v) solved for v."""
+        t, a = self.reaction_time, self.deceleration
+        return -a * t + math.sqrt((a * t) ** 2 + 2 * a * max(0.0, free - self.margin))
+
+    @property
+    def reach(self) -> float:
+        """As far as it is worth looking: beyond that nothing is slowed and any zone opens."""
+        return self.distance(self.fastest) + self.resume
+
+    def in_zone(self, free: float | None, speed: float, stopped: bool) -> bool:
+        """Whether a body at `speed` towards what is `free` away must stop, or stay `stopped`.
+
+        Once stopped, only a clear margin opens the zone again.
+        """
+        if free is None:
+            return False
+        resume = self.resume if stopped else 0.0
+        return free < self.distance(max(0.0, speed)) + resume
+
+    def cap(self, free: float | None, stopped: bool) -> float | None:
+        """The speed allowed towards what is `free` away; None where nothing limits it."""
+        if stopped:
+            return 0.0
+        if free is None:
+            return None
+        allowed = self.speed(free)
+        return allowed if allowed < self.fastest else None
 
 
-def speed_within(body: BodyDescription, free: float) -> float:
-    """The speed [m/s] from which the body stops within `free` [m]: L(v) solved for v."""
-    t, a = body.thresholds.reaction_time, body.max_linear_deceleration
-    room = max(0.0, free - body.thresholds.stop_margin)
-    return -a * t + math.sqrt((a * t) ** 2 + 2 * a * room)
-
-
-def free_distances(body: BodyDescription, scan: LaserScan) -> tuple[float | None, float | None]:
-    """How far the footprint can go forwards and backwards until it touches a hit of `scan` [m].
-
-    None stands for nothing in the way.
-    """
-    if body.lidar is None:
-        return None, None
-    x, y = hits(body.lidar, scan, NEAREST)
-    half_width = max(abs(corner) for _, corner in body.footprint) + SIDE_MARGIN
-    front = max(corner for corner, _ in body.footprint)
-    rear = min(corner for corner, _ in body.footprint)
-    x = x[abs(y) <= half_width]
-    ahead, behind = x[x > 0], x[x < 0]
-    return (
-        max(0.0, float(ahead.min()) - front) if ahead.size else None,
-        max(0.0, rear - float(behind.max())) if behind.size else None,
+@lru_cache(maxsize=8)
+def brakes(body: BodyDescription) -> dict[str, Brake]:
+    """The brake for each direction of motion that the body has."""
+    limits = body.thresholds
+    along = Brake(
+        reaction_time=limits.reaction_time,
+        deceleration=body.max_linear_deceleration,
+        margin=limits.stop_margin,
+        resume=limits.resume_margin,
+        fastest=body.max_linear_speed,
     )
-
-
-def in_zone(body: BodyDescription, free: float | None, speed: float, stopped: bool) -> bool:
-    """Whether a body at `speed` towards what is `free` [m] away must stop, or stay `stopped`.
-
-    Once stopped, only a clear margin opens the zone again.
-    """
-    if free is None:
-        return False
-    margin = RESUME_MARGIN if stopped else 0.0
-    return free < stopping_distance(body, max(0.0, speed)) + margin
-
-
-def cap(body: BodyDescription, free: float | None, stopped: bool) -> float | None:
-    """The speed allowed towards what is `free` [m] away; None where nothing limits it [m/s]."""
-    if stopped:
-        return 0.0
-    if free is None:
-        return None
-    allowed = speed_within(body, free)
-    return allowed if allowed < body.max_linear_speed else None
+    across = msgspec.structs.replace(along, fastest=body.max_lateral_speed)
+    turning = Brake(
+        reaction_time=limits.reaction_time,
+        deceleration=body.max_angular_acceleration,
+        margin=0.0,  # the sweep keeps room round the footprint
+        resume=limits.resume_margin / max(math.hypot(x, y) for x, y in body.footprint),
+        fastest=body.max_angular_speed,
+    )
+    found = {"forward": along, "backward": along, "turn_left": turning, "turn_right": turning}
+    if body.max_lateral_speed > 0:
+        found.update(left=across, right=across)
+    return found

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections import deque
 from collections.abc import Awaitable, Callable
-from typing import Any, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.errors import GigabrainError
@@ -14,6 +14,18 @@ OnRaw = Callable[[str, str, bytes], None]  # key, encoding, payload
 Answer = Callable[[bytes], Awaitable[tuple[bytes, str]]]  # payload; payload and its encoding
 Close = Callable[[], None]  # may be called twice
 T = TypeVar("T")
+
+
+class Link(NamedTuple):
+    """Somebody at the other end of a link."""
+
+    zid: str  # Zenoh's name of the session
+    name: str  # the common name of its certificate; empty without one
+    address: str
+    there: bool  # False once it is gone
+
+
+OnLink = Callable[[Link], None]
 
 
 class Transport(Protocol):
@@ -39,6 +51,10 @@ class Transport(Protocol):
         self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
     ) -> list[bytes | str]:
         """Ask all who serve `key`: a payload per answer that came in time, a text per error."""
+        ...
+
+    def links(self, on_link: OnLink) -> Close:
+        """Tell of everybody who is linked to this process, from now on and so far."""
         ...
 
     async def close(self) -> None:
@@ -123,6 +139,10 @@ class LocalTransport:
             with contextlib.suppress(TimeoutError):
                 replies.append(await asyncio.wait_for(_text_or(answer, payload), timeout_s))
         return replies
+
+    def links(self, on_link: OnLink) -> Close:
+        """Inside one process nobody comes by a link."""
+        return lambda: None
 
     async def close(self) -> None:
         """Leave the network."""

@@ -1,11 +1,18 @@
 """How sessions are configured, and what a refusal means. Zenoh is not needed to read this."""
 
 import re
+from pathlib import Path
 from typing import Any
 
-from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.settings import Endpoint
+from msgspec import structs
 
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.keys.acl import access_control, known_names
+from gigabrain_zenoh.keys.files import CA, CERTIFICATE, KEY, check_files
+from gigabrain_zenoh.settings import Endpoint, RouterConfig
+
+SECURE, PLAIN = "tls/", "tcp/"
+PENDING = 1000  # links that may be on their way in; silent ones are dropped after a second
 IP_ENDPOINT = re.compile(r"(?:tcp|udp|tls|quic|ws)/[^/#?]+:(\d+)(?:[?#].*)?")
 LOCAL_ENDPOINT = re.compile(r"unixsock-stream/.+")
 
@@ -13,12 +20,23 @@ LOCAL_ENDPOINT = re.compile(r"unixsock-stream/.+")
 def session_config(endpoint: Endpoint) -> dict[str, Any]:
     """Client of a router, or the router itself; explicit endpoints, no multicast, short leases.
 
-    Raises ConfigError for an endpoint that Zenoh would wait for in vain.
+    With keys all that leaves the machine is TLS on both ends, and a router lets everybody do what
+    the certificate's role may. Raises ConfigError for an endpoint that Zenoh would wait for in
+    vain, and for keys that are not there.
     """
+    endpoint = secured(endpoint)
     if not endpoint.listen and not endpoint.connect:
         raise ConfigError("no router to connect to, and nowhere to listen")
     for text in (*endpoint.listen, *endpoint.connect):
         _check(text)
+    if not endpoint.keys:
+        return session_settings(endpoint)
+    check_files(Path(endpoint.keys))
+    return session_settings(endpoint) | security(endpoint)
+
+
+def session_settings(endpoint: Endpoint) -> dict[str, Any]:
+    """What all sessions have in common, with keys or without."""
     config: dict[str, Any] = {
         "mode": "router" if endpoint.listen else "client",
         "listen/endpoints": list(endpoint.listen),
@@ -34,6 +52,7 @@ def session_config(endpoint: Endpoint) -> dict[str, Any]:
         "scouting/delay": 0,  # a router would wait half a second for others to find it
         "transport/unicast/open_timeout": 1000,
         "transport/unicast/accept_timeout": 1000,
+        "transport/unicast/accept_pending": PENDING,
         "transport/link/tx/lease": 400,
         "transport/link/tx/keep_alive": 4,
         # small messages that are not batched take a place each
@@ -44,6 +63,58 @@ def session_config(endpoint: Endpoint) -> dict[str, Any]:
     if endpoint.namespace:
         config["namespace"] = endpoint.namespace
     return config
+
+
+def security(endpoint: Endpoint) -> dict[str, Any]:
+    """What keys add to a session: TLS in both directions, and in a router who may do what."""
+    folder, side = Path(endpoint.keys), "listen" if endpoint.listen else "connect"
+    config: dict[str, Any] = {
+        "transport/link/tls": {
+            "root_ca_certificate": str(folder / CA),
+            "enable_mtls": True,
+            "close_link_on_expiration": True,
+            f"{side}_private_key": str(folder / KEY),
+            f"{side}_certificate": str(folder / CERTIFICATE),
+        }
+    }
+    if endpoint.listen:
+        config["adminspace/enabled"] = False
+        config["access_control"] = access_control(robots_of(endpoint), endpoint.namespace)
+    return config
+
+
+def robots_of(endpoint: Endpoint) -> tuple[str, ...]:
+    """The namespaces of the robots that a router serves: its own, and the fleet's."""
+    own = (endpoint.namespace,) if endpoint.namespace or not endpoint.fleet else ()
+    return tuple(dict.fromkeys((*own, *endpoint.fleet)))
+
+
+def router_config(endpoint: Endpoint, state_dir: Path) -> RouterConfig:
+    """What the router process has to know of the rights that its session enforces."""
+    knows = known_names(robots_of(endpoint)) if endpoint.keys else ()
+    return RouterConfig(state_dir=str(state_dir), knows=knows)
+
+
+def secured(endpoint: Endpoint) -> Endpoint:
+    """The endpoint as its keys make it: TLS in place of TCP. Raises ConfigError."""
+    texts = (*endpoint.listen, *endpoint.connect)
+    if not endpoint.keys:
+        bare = [text for text in texts if text.startswith(SECURE)]
+        if bare:
+            raise ConfigError(f"{bare[0]} needs keys; name their folder, or use tcp/")
+        return endpoint
+    for text in texts:
+        if not text.startswith((SECURE, PLAIN)) and not LOCAL_ENDPOINT.fullmatch(text):
+            raise ConfigError(f"{text!r}: with keys, expected one like tls/192.168.1.10:7447")
+    return structs.replace(
+        endpoint,
+        connect=tuple(_secure(text) for text in endpoint.connect),
+        listen=tuple(_secure(text) for text in endpoint.listen),
+    )
+
+
+def _secure(text: str) -> str:
+    return SECURE + text.removeprefix(PLAIN) if text.startswith(PLAIN) else text
 
 
 def explain(endpoint: Endpoint, error: str) -> str:

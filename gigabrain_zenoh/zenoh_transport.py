@@ -1,12 +1,6 @@
-"""The bus over Zenoh: the only module that imports it."""
+"""The bus over Zenoh: with `zenoh_session` the only module that imports it."""
 
 import asyncio
-import contextlib
-import functools
-import json
-import logging
-import threading
-from collections.abc import Callable
 from typing import Any
 
 import zenoh
@@ -14,13 +8,12 @@ from zenoh.handlers import Callback
 
 from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.bridge import Bridge
-from gigabrain_zenoh.errors import BusError, ConfigError, GigabrainError
+from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.linger import close_in_background
 from gigabrain_zenoh.mailbox import Mailbox
 from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.transport import Answer, Close, OnRaw, OnSample
-from gigabrain_zenoh.zenoh_config import explain, plain, session_config
-
-log = logging.getLogger(__name__)
+from gigabrain_zenoh.transport import Answer, Close, Link, OnLink, OnRaw, OnSample
+from gigabrain_zenoh.zenoh_session import close_session, open_session
 
 PRIORITIES: dict[Priority, zenoh.Priority] = {
     "real_time": zenoh.Priority.REAL_TIME,
@@ -30,91 +23,6 @@ PRIORITIES: dict[Priority, zenoh.Priority] = {
     "background": zenoh.Priority.BACKGROUND,
 }
 CONGESTION = {"drop": zenoh.CongestionControl.DROP, "block": zenoh.CongestionControl.BLOCK}
-CLOSE_S = 0.5  # a session may take ten seconds to close on a link that loses packets
-
-
-def _config(endpoint: Endpoint) -> zenoh.Config:
-    config = zenoh.Config()
-    for key, value in session_config(endpoint).items():
-        try:
-            config.insert_json5(key, json.dumps(value))
-        except zenoh.ZError as error:
-            raise ConfigError(
-                f"{key} = {value!r} is refused by Zenoh: {plain(str(error))}"
-            ) from None
-    return config
-
-
-async def open_session(endpoint: Endpoint) -> zenoh.Session:
-    """Open a session, waiting for the router as long as it takes.
-
-    In a daemon thread, not in the loop's executor: the process must be able to end meanwhile.
-    Raises BusError when a router cannot listen, ConfigError for an endpoint that is none.
-    """
-    config = _config(endpoint)
-    loop = asyncio.get_running_loop()
-    opened: asyncio.Future[zenoh.Session] = loop.create_future()
-
-    def settle(session: zenoh.Session | None, error: zenoh.ZError | None) -> None:
-        if session:
-            opened.set_result(session)
-        elif error:
-            opened.set_exception(error)
-
-    def work() -> None:
-        session, fault = None, None
-        try:
-            session = zenoh.open(config)
-        except zenoh.ZError as error:
-            fault = error
-        try:
-            loop.call_soon_threadsafe(settle, session, fault)
-        except RuntimeError:  # the loop is gone
-            if session:
-                _close(session)
-
-    _in_thread(work)
-    try:
-        return await asyncio.shield(opened)
-    except zenoh.ZError as error:
-        raise BusError(explain(endpoint, str(error))) from None
-    except asyncio.CancelledError:
-        opened.add_done_callback(_discard)
-        raise
-
-
-def _discard(opened: asyncio.Future[zenoh.Session]) -> None:
-    """Close a session that nobody waits for any more."""
-    if opened.exception() is None:
-        _in_thread(functools.partial(_close, opened.result()))
-
-
-def _in_thread(work: Callable[[], None]) -> None:
-    threading.Thread(target=work, name="zenoh-session", daemon=True).start()
-
-
-def _close(session: zenoh.Session) -> None:
-    try:
-        session.close()
-    except zenoh.ZError as error:
-        log.debug("closing the session: %s", error)
-
-
-async def close_session(session: zenoh.Session) -> None:
-    """Close within half a second, or leave the rest to the end of the process."""
-    loop = asyncio.get_running_loop()
-    done = asyncio.Event()
-
-    def work() -> None:
-        _close(session)
-        with contextlib.suppress(RuntimeError):  # the loop did not wait
-            loop.call_soon_threadsafe(done.set)
-
-    _in_thread(work)
-    try:
-        await asyncio.wait_for(done.wait(), CLOSE_S)
-    except TimeoutError:
-        log.debug("the session did not close in %s s", CLOSE_S)
 
 
 class ZenohTransport:
@@ -129,6 +37,11 @@ class ZenohTransport:
         self._tasks: set[asyncio.Task[None]] = set()
         self._asking: set[asyncio.Future[None]] = set()
         self._closed = False
+        self._declared.append(
+            session.info.declare_link_events_listener(
+                lambda _event: close_in_background(), history=True
+            )
+        )
 
     @classmethod
     async def open(cls, endpoint: Endpoint) -> "ZenohTransport":
@@ -220,6 +133,20 @@ class ZenohTransport:
         finally:
             self._asking.discard(done)
         return [_unpack(reply) for reply in replies if not _timed_out(reply)]
+
+    def links(self, on_link: OnLink) -> Close:
+        """Tell of every link to somebody else, those that there are already first."""
+
+        def told(event: zenoh.LinkEvent) -> None:
+            link = event.link
+            name = link.auth_identifier or ""
+            there = event.kind == zenoh.SampleKind.PUT
+            on_link(Link(str(link.zid), name, str(link.dst), there))
+
+        listener = self._session.info.declare_link_events_listener(
+            lambda event: self._bridge.post(told, event), history=True
+        )
+        return self._undeclare(listener)
 
     async def close(self) -> None:
         """Close the session and stop delivering."""

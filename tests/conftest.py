@@ -27,3 +27,12 @@ def shared_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
     place = Home(tmp_path_factory.mktemp("home"))
     yield place
     place.close()
+
+
+@pytest.fixture(scope="session")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The keys of a fleet with the robots red and blue; nobody may change them."""
+    pytest.importorskip("cryptography")
+    from tests.keys_rig import make_fleet
+
+    return make_fleet(tmp_path_factory.mktemp("keys") / "home", "home")

@@ -39,11 +39,12 @@ class Command:
         environment: dict[str, str],
         arguments: tuple[str, ...],
         stdout: int | None = None,
+        inside: tuple[str, ...] = (),
     ) -> None:
         self._paths = out.with_suffix(".out"), out.with_suffix(".err")
         self._files: tuple[IO[bytes], ...] = tuple(path.open("wb") for path in self._paths)
         self._process = subprocess.Popen(
-            (*GIGABRAIN, *arguments),
+            (*inside, *GIGABRAIN, *arguments),
             stdin=subprocess.DEVNULL,
             stdout=self._files[0] if stdout is None else stdout,
             stderr=self._files[1],
@@ -90,10 +91,14 @@ class Command:
 
 
 class Home:
-    """A user's own folders, what is started with them, and what is left of it."""
+    """A user's own folders, what is started with them, and what is left of it.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    `inside` is a command that runs another one somewhere else, such as in a namespace.
+    """
+
+    def __init__(self, folder: Path, inside: tuple[str, ...] = ()) -> None:
+        self.folder, self._inside = folder, inside
+        folder.mkdir(exist_ok=True)
         self._commands: list[Command] = []
         self._numbers = itertools.count(1)
 
@@ -111,7 +116,7 @@ class Home:
     def start(self, *arguments: str, stdout: int | None = None) -> Command:
         """Start a `gigabrain` command; what it prints goes to `stdout`, or into `Command.out`."""
         out = self.folder / f"command-{next(self._numbers)}"
-        self._commands.append(Command(out, self.environment, arguments, stdout))
+        self._commands.append(Command(out, self.environment, arguments, stdout, self._inside))
         return self._commands[-1]
 
     async def run(self, *arguments: str) -> Command:

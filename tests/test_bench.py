@@ -1,3 +1,4 @@
+import io
 import json
 from pathlib import Path
 
@@ -12,11 +13,12 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, SCAN
 from gigabrain_zenoh.bench.chain import ChainResult, Compared
 from gigabrain_zenoh.bench.costs import Hop, Timed
+from gigabrain_zenoh.bench.estop import EstopResult, Presses
 from gigabrain_zenoh.bench.figures import Figures, figures, over_rounds
 from gigabrain_zenoh.bench.listening import Heard, median_ms
 from gigabrain_zenoh.bench.runs import relay_roles
 from gigabrain_zenoh.bench.stack import Process, StackResult, physics_share, targets
-from gigabrain_zenoh.bench.tables import chain_page, stack_page
+from gigabrain_zenoh.bench.tables import chain_page, estop_page, stack_page
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.percentile import Newest, percentile
 from gigabrain_zenoh.settings import Endpoint
@@ -262,3 +264,17 @@ async def test_what_cannot_be_measured_is_refused(
     command = await home.run("bench", *options)
     assert complaint in command.err
     assert await command.ended() == 2
+
+
+def test_the_page_of_the_e_stop_shows_each_figure_beside_its_target() -> None:
+    idle = Presses(name="idle", ms=(1.0, 2.0, 3.0, 49.0), travel_m=(0.031, 0.042))
+    flooded = Presses(name="flooded", ms=(60.0, 101.0), travel_m=())
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(estop_page(EstopResult(body="mock", rounds=(idle, flooded))))
+    rows = [line for line in console.export_text().splitlines() if "│" in line]
+    assert [cell.strip() for cell in rows[0].split("│")[1:-1]] == [
+        "idle", "4", "2.0", "49.0 (≤ 50)", "49.0 (≤ 100)", "0.042 (≤ 0.06)",
+    ]  # fmt: skip
+    assert [cell.strip() for cell in rows[1].split("│")[1:-1]] == [
+        "flooded", "2", "60.0", "101.0 (≤ 50)", "101.0 (≤ 100)", "0.000 (≤ 0.06)",
+    ]  # fmt: skip

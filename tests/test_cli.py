@@ -142,8 +142,8 @@ async def test_an_e_stop_that_reaches_nobody_says_so(home: Home) -> None:
     unreachable = await home.run("estop", "--connect", where)
     assert await unreachable.ended() == 3
     assert unreachable.err == (
-        f"gigabrain: NOT CONFIRMED: no router answers at {where}; is the robot running?; "
-        "press the hardware e-stop or cut the robot's power\n"
+        f"gigabrain: NOT CONFIRMED: no router answers at {where}; is the robot running, and "
+        "without keys?; press the hardware e-stop or cut the robot's power\n"
     )
     alone = await home.run("estop")
     assert await alone.ended() == 3

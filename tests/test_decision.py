@@ -7,9 +7,10 @@ import math
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.base import Cause, Pose, Velocity
 from gigabrain_schemas.brain import Intent, WorldModel
-from gigabrain_schemas.topics import BODY, INTENT, STATE, WORLD
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, WORLD
 from gigabrain_zenoh import behaviours, decision
 from gigabrain_zenoh.behaviours import Situation
 from gigabrain_zenoh.behaviours.avoid import Avoid, expected_trajectory
@@ -48,6 +49,15 @@ def test_it_turns_right_on_the_spot_while_something_is_ahead() -> None:
 
 def test_an_obstacle_at_an_unknown_distance_is_named_without_one() -> None:
     assert Avoid(CONFIG).step(at(blocked(None))).reason == "turning right: obstacle"
+
+
+def test_it_rests_while_the_battery_is_nearly_empty_and_says_why() -> None:
+    avoid = Avoid(CONFIG)
+    for world in (free(), blocked(0.5), None):
+        intent = avoid.step(replace(at(world), must_charge=True))
+        assert intent.twist == Velocity()
+        assert intent.reason == "resting: the battery is nearly empty; charge it"
+    assert avoid.step(at(free())).twist == Velocity(linear_x=0.2)
 
 
 def test_speeds_come_from_the_deployment_file() -> None:
@@ -291,3 +301,19 @@ async def test_without_a_state_it_says_nothing() -> None:
 async def test_an_unknown_behaviour_ends_the_process_before_it_begins() -> None:
     with pytest.raises(UnknownName, match="no behaviour 'fly'"):
         await decision.run(DecisionConfig(behaviour="fly"), None, lambda: None)  # type: ignore[arg-type]
+
+
+async def test_it_comes_to_rest_when_safety_warns_of_an_empty_battery() -> None:
+    low = Cause(code="battery_return", text="battery at 6 %")
+    async with Bench(functools.partial(decision.run, CONFIG)) as bench:
+        bench.send(BODY, body())
+        found = []
+        for tick in range(1, 5):
+            bench.send(STATE, state(tick))
+            bench.send(WORLD, replace(free(), boot=7, tick=tick, basis=tick))
+            warnings = (low,) if tick > 1 else ()
+            verdict = SafetyState(verdict="ok", warnings=warnings, boot=7, tick=tick)
+            bench.send(SAFETY, verdict)
+            found.append(bench.sent(INTENT)[-1].reason.partition(":")[0])
+    # what is said within a tick counts from the next
+    assert found == ["forward 0.20 m/s", "forward 0.20 m/s", "resting", "resting"]

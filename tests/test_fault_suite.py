@@ -1,15 +1,26 @@
 """The fault suite: its frame, and every fault once, in its short form, on real processes."""
 
 import asyncio
+import threading
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
+from gigabrain_schemas.brain import Intent, WorldModel
+from gigabrain_schemas.topics import INTENT, WORLD
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.errors import UnknownName
-from gigabrain_zenoh.faults.fault import Fault, Limit, Result, Skipped, judge
-from gigabrain_zenoh.faults.rig import Options, deployment_of
-from gigabrain_zenoh.faults.suite import find_test, run_suite
+from gigabrain_zenoh.faults import suite
+from gigabrain_zenoh.faults.fault import Failed, Fault, Limit, Result, Skipped, judge
+from gigabrain_zenoh.faults.hanging import HangingBus
+from gigabrain_zenoh.faults.rig import Options, Rig, deployment_of
+from gigabrain_zenoh.faults.suite import failed, find_test, run_suite
 from gigabrain_zenoh.faults.table import FAULTS, choose
+from gigabrain_zenoh.transport import LocalNetwork
+from tests.bus_rig import settle
 
 FAULT = Fault(1, "decision-killed", "process", "", "zero after <= 120 ms, travel <= 0.1 m")
 
@@ -71,6 +82,92 @@ async def test_what_cannot_run_is_skipped_and_says_why(tmp_path: Path) -> None:
     missing = Fault(2, "not-there", "process", "", "x <= 1")
     (result,) = await run_suite([missing], Options(), tmp_path)
     assert (result.verdict, result.reason, result.runs) == ("skipped", "not written yet", 0)
+
+
+async def results_of(
+    runs: Sequence[Callable[[], dict[str, float]]], repeat: int, monkeypatch: pytest.MonkeyPatch
+) -> Result:
+    """What the suite makes of a test whose runs do these things, one after the other."""
+    left = iter(runs)
+
+    async def test(_: Rig) -> dict[str, float]:
+        await asyncio.sleep(0)
+        return next(left)()
+
+    monkeypatch.setattr(suite, "find_test", lambda fault: test)
+    (result,) = await run_suite([FAULT], Options(), Path(), repeat)
+    return result
+
+
+def well() -> dict[str, float]:
+    return {"zero after": 100.0, "travel": 0.05}
+
+
+def badly() -> dict[str, float]:
+    raise Failed("it drove on")
+
+
+def slowly() -> dict[str, float]:
+    time.sleep(suite.STALL_S + 0.1)
+    return {"zero after": 300.0, "travel": 0.05}
+
+
+def stalled() -> dict[str, float]:
+    time.sleep(suite.STALL_S + 0.1)  # as a machine does that stands still
+    raise Failed("it drove on")
+
+
+async def test_the_worst_of_n_runs_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    worse = {"zero after": 120.0, "travel": 0.04}
+    result = await results_of([well, lambda: worse, well], 3, monkeypatch)
+    assert (result.verdict, result.runs) == ("passed", 3)
+    assert result.worst == {"zero after": 120.0, "travel": 0.05}
+
+
+async def test_one_run_that_fails_fails_the_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = await results_of([well, badly], 3, monkeypatch)
+    assert (result.verdict, result.reason, result.stalls) == ("FAILED", "it drove on", 0)
+    assert failed([result])
+
+
+@pytest.mark.parametrize("first", [stalled, slowly])
+async def test_a_run_that_fails_while_the_machine_stands_still_is_run_again_and_told(
+    first: Callable[[], dict[str, float]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = await results_of([first, well], 1, monkeypatch)
+    assert (result.verdict, result.stalls, result.runs) == ("passed", 1, 1)
+    assert result.worst == {"zero after": 100.0, "travel": 0.05}
+
+
+async def test_a_run_that_misses_its_limit_fails_and_shows_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    result = await results_of([lambda: {"zero after": 140.0, "travel": 0.05}], 2, monkeypatch)
+    assert (result.verdict, result.reason) == ("FAILED", "zero after is 140 ms")
+    assert result.worst == {"zero after": 140.0, "travel": 0.05}
+
+
+async def test_a_machine_that_always_stands_still_passes_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    result = await results_of([stalled, stalled, stalled], 1, monkeypatch)
+    assert (result.verdict, result.stalls) == ("FAILED", 2)
+    assert result.stall_ms > 100
+
+
+async def test_a_part_that_hangs_leaves_the_rest_of_its_process_running() -> None:
+    network, hangs = LocalNetwork(), threading.Event()
+    bus = HangingBus(WORLD, hangs, network.transport(), FakeClock(), "decision")
+    speaker = Bus(network.transport(), FakeClock(), "perception")
+    heard: list[str] = []
+    bus.latest(WORLD, lambda _: heard.append("world"))
+    bus.latest(INTENT, lambda _: heard.append("intent"))
+    for _ in range(2):
+        speaker.publish(WORLD, WorldModel(scan_ok=True, obstacle_ahead=False))
+        speaker.publish(INTENT, Intent(behaviour="avoid", reason="free"))
+        await settle()
+        hangs.set()
+    assert heard == ["world", "intent", "intent"]
 
 
 @pytest.fixture(scope="module")

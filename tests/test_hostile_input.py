@@ -26,11 +26,12 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.faults.hostile import replaced
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.onlooker import SYSTEMS, Onlooker, looking_on
 from tests.stack import Home, endpoint_of, robot_of, until
-from tests.wire_rig import as_map, numbers, refuses, replaced
+from tests.wire_rig import as_map, numbers, refuses
 
 LISTENERS = {
     "robot/scan": ("perception", "safety"),

@@ -10,7 +10,8 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.topics import TOPICS, Topic
 from gigabrain_zenoh.codec import Codec
-from tests.wire_rig import as_map, at, codec, dotted, leaves, maps, numbers, refuses, replaced
+from gigabrain_zenoh.faults.hostile import leaves, replaced
+from tests.wire_rig import as_map, at, codec, dotted, maps, numbers, refuses
 
 # numbers that may be null: nothing measured, nothing in the way, no limit, any yaw
 NULLABLE = {

@@ -15,7 +15,11 @@ PACKAGES = {
     "drivers/gigabrain_drivers": {"gigabrain_schemas", "gigabrain_zenoh", "gigabrain_drivers"},
 }
 ONLY_IN = {
-    "zenoh": ("gigabrain_zenoh/zenoh_transport.py", "gigabrain_zenoh/bench/relay.py"),
+    "zenoh": (
+        "gigabrain_zenoh/zenoh_session.py",
+        "gigabrain_zenoh/zenoh_transport.py",
+        "gigabrain_zenoh/bench/relay.py",
+    ),
     "mujoco": ("drivers/gigabrain_drivers/sim/",),
 }
 

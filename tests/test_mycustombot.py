@@ -196,6 +196,25 @@ async def test_no_old_bytes_are_obeyed_after_a_freeze(pair: Pair) -> None:
     assert device.executed[0].linear_x == 0.0
 
 
+async def test_a_broken_body_does_not_do_what_it_is_told(pair: Pair) -> None:
+    await connected(pair)
+    body = pair.emulator.body
+    pair.emulator.set({"base": Faults(runaway=0.1)})
+    await until(lambda: body.snapshot.odometry.linear_x > 0.05)
+    assert body.commanded == (0.0, 0.0, 0.0)
+    pair.emulator.set({"base": Faults(stuck_wheel=True)})
+    await drive(pair, 0.2)
+    await until(lambda: body.snapshot.odometry.angular_z > 0.2)
+    assert body.report()["motors_moved_s"] > body.report()["faulted_s"]
+    pair.emulator.set({"base": Faults(frozen_values=True)})
+    step = body.report()["sim_seconds"]
+    await until(lambda: body.report()["sim_seconds"] > step)
+    frozen = body.snapshot
+    step = body.report()["sim_seconds"]
+    await until(lambda: body.report()["sim_seconds"] > step)
+    assert body.snapshot is frozen
+
+
 def test_faults_are_words(tmp_path: Path) -> None:
     emulator = Emulator("mycustombot", Run(folder=Path(), link="emulated", emulator=str(tmp_path)))
     both = emulator.faults_of("silence bit_errors=0.01")

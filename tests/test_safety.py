@@ -9,12 +9,18 @@ from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.safety import Inputs, Memory, step
+from gigabrain_zenoh.safety.zones import Field
 from tests.brain_rig import DRIVING, LIDAR, WAFFLE, open_space, scan, state
 from tests.gate_rig import plain
 
 MS = 1_000_000
 BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.32, stop_margin=0.08))
 ALL = ("perception", "decision", "control")
+
+
+def begun(boot: int = 7) -> Memory:
+    """It has looked at one scan already."""
+    return Memory(boot=boot, field=Field(scans=1))
 
 
 def judge(
@@ -34,7 +40,7 @@ def judge(
         scan_age_ns=None if age_ms is None else round(age_ms * MS),
         silent=silent,
     )
-    return step(body, memory or Memory(boot=now.boot, scans=1), inputs)[1]
+    return step(body, memory or begun(now.boot), inputs)[1]
 
 
 def codes(verdict: SafetyState) -> list[str]:
@@ -45,7 +51,7 @@ class Watch:
     """Safety over time: a tick and a fresh scan at each call, free space unless it is said."""
 
     def __init__(self) -> None:
-        self.memory, self.tick = Memory(boot=7, scans=1), 0
+        self.memory, self.tick = begun(), 0
 
     def sees(
         self, ahead: float | None = None, behind: float | None = None, v: float = 0.0
@@ -60,18 +66,6 @@ class Watch:
         return self._judge(
             Inputs(state=state(self.tick, v=v), scan=scan(values, self.tick), scan_age_ns=0)
         )
-
-    def feels(
-        self, *, ticks: int = 1, battery: float = 100.0, motor: float | None = 30.0
-    ) -> SafetyState:
-        """The verdict after so many ticks with a battery and a motor like this."""
-        for _ in range(ticks):
-            self.tick += 1
-            now = state(self.tick, battery=battery, motor=motor)
-            verdict = self._judge(
-                Inputs(state=now, scan=scan(open_space(), self.tick), scan_age_ns=0)
-            )
-        return verdict
 
     def _judge(self, inputs: Inputs) -> SafetyState:
         self.memory, verdict = step(BODY, self.memory, inputs)
@@ -188,22 +182,18 @@ def test_a_zone_goes_by_the_speed_towards_it() -> None:
 
 def test_a_scan_waits_for_the_state_of_its_tick() -> None:
     near = open_space(deg_0=0.2)
-    memory, verdict = step(
-        BODY, Memory(boot=7, scans=1), Inputs(state=state(4), scan=scan(near, 5), scan_age_ns=0)
-    )
-    assert (memory.basis, memory.free_ahead, codes(verdict)) == (0, None, ["starting"])
+    memory, verdict = step(BODY, begun(), Inputs(state=state(4), scan=scan(near, 5), scan_age_ns=0))
+    assert (memory.field.basis, memory.field.free, codes(verdict)) == (0, {}, ["starting"])
     memory, verdict = step(
         BODY, memory, Inputs(state=state(5, v=0.2), scan=scan(near, 5), scan_age_ns=0)
     )
-    assert memory.basis == 5
+    assert memory.field.basis == 5
     assert codes(verdict) == ["zone_ahead"]
 
 
 def test_a_scan_is_judged_once_by_the_speed_of_its_own_time() -> None:
     seen = scan(open_space(deg_0=0.255), 1)  # 0.18 m free
-    memory, first = step(
-        BODY, Memory(boot=7, scans=1), Inputs(state=state(1, v=0.2), scan=seen, scan_age_ns=0)
-    )
+    memory, first = step(BODY, begun(), Inputs(state=state(1, v=0.2), scan=seen, scan_age_ns=0))
     _, later = step(BODY, memory, Inputs(state=state(3, v=0.26), scan=seen, scan_age_ns=0))
     assert codes(first) == codes(later) == []
     assert first.caps == later.caps  # which keep it from becoming faster than the zone allows
@@ -217,87 +207,17 @@ def test_a_blind_scan_says_nothing_of_the_room_ahead() -> None:
         state=state(watch.tick), scan=scan(np.full(360, np.nan), watch.tick), scan_age_ns=0
     )
     memory, verdict = step(BODY, watch.memory, inputs)
-    assert (memory.free_ahead, memory.stopped_ahead) == (None, False)
+    assert (memory.field.free, memory.field.stopped) == ({}, frozenset())
     assert codes(verdict) == ["scan_blind"]
-
-
-@pytest.mark.parametrize(("percentage", "warned"), [(15.1, []), (15.0, ["battery_low"])])
-def test_a_low_battery_is_a_warning(percentage: float, warned: list[str]) -> None:
-    verdict = Watch().feels(battery=percentage, ticks=100)
-    assert [warning.code for warning in verdict.warnings] == warned
-    assert verdict.verdict == "ok"
-
-
-def test_an_empty_battery_stops_the_body_for_good_after_half_a_second() -> None:
-    watch = Watch()
-    watch.feels(ticks=10)
-    assert watch.feels(battery=5.0, ticks=24).verdict == "ok"
-    verdict = watch.feels(battery=5.0)
-    text = "battery at or below 5 %"
-    assert verdict.verdict == "stop"
-    assert plain(verdict.causes) == [("battery_empty", text)]
-    assert verdict.causes[0].latching
-    assert watch.feels(battery=5.1).verdict == "ok"  # whether it stays stopped is the gate's affair
-
-
-@pytest.mark.parametrize(("degrees", "warned"), [(59.9, []), (60.0, ["motor_warm"])])
-def test_a_warm_motor_is_a_warning(degrees: float, warned: list[str]) -> None:
-    verdict = Watch().feels(motor=degrees, ticks=100)
-    assert [warning.code for warning in verdict.warnings] == warned
-    assert verdict.verdict == "ok"
-
-
-def test_a_hot_motor_stops_the_body_for_good_after_half_a_second() -> None:
-    watch = Watch()
-    watch.feels(ticks=10)
-    assert watch.feels(motor=70.0, ticks=24).verdict == "ok"
-    verdict = watch.feels(motor=70.0)
-    text = "a motor has 70 °C or more"
-    assert plain(verdict.causes) == [("motor_hot", text)]
-    assert verdict.causes[0].latching
-    assert plain(verdict.warnings) == [("motor_warm", "left_wheel has 70 °C")]
-
-
-def test_a_sag_or_a_spike_does_not_add_up_with_the_next() -> None:
-    watch = Watch()
-    for _ in range(20):
-        assert watch.feels(battery=1.0, motor=90.0, ticks=20).verdict == "ok"
-        watch.feels()
-
-
-def test_one_sample_after_a_long_gap_does_not_count_as_half_a_second() -> None:
-    watch = Watch()
-    watch.feels()
-    watch.tick += 1000  # this process, or the network, was frozen
-    assert watch.feels(battery=1.0).verdict == "ok"
-    fresh = Watch()
-    fresh.tick = 100_000  # this process has just been started
-    assert fresh.feels(battery=1.0).verdict == "ok"
-
-
-def test_asked_again_within_a_tick_nothing_counts_twice() -> None:
-    memory = Memory(boot=7, scans=1)
-    low = Inputs(state=state(1, battery=1.0), scan=scan(open_space()), scan_age_ns=0)
-    for _ in range(100):
-        memory, verdict = step(BODY, memory, low)
-    assert verdict.verdict == "ok"
-    assert memory.low_ticks == 1
-
-
-def test_a_body_that_measures_neither_battery_nor_motors_is_not_stopped_for_it() -> None:
-    bare = replace(state(1), battery=None, joints=())
-    assert judge(at=bare) == SafetyState(verdict="ok")
-    assert judge(at=state(1, motor=None)) == SafetyState(verdict="ok")
 
 
 def test_a_new_start_of_the_driver_is_judged_afresh() -> None:
     watch = Watch()
-    watch.feels(battery=1.0, ticks=24)
     watch.sees(ahead=0.1, v=0.2)
     now = state(1, boot=8, battery=1.0)
     memory, verdict = step(BODY, watch.memory, Inputs(state=now, scan_age_ns=None))
-    assert memory == Memory(boot=8, tick=1)
-    assert codes(verdict) == ["scan_lost", "starting"]
+    assert (memory.boot, memory.tick, memory.field) == (8, 1, Field())
+    assert codes(verdict)[:2] == ["scan_lost", "starting"]
 
 
 def test_nothing_moves_before_the_second_scan() -> None:

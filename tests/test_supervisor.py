@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from gigabrain_zenoh.child import Child, Lines, as_record
+from gigabrain_zenoh.deployment import COMMAND
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.supervisor import Backoff, ProcessSpec, Supervisor
 
@@ -156,6 +157,23 @@ async def test_five_deaths_are_enough_and_a_sentence_says_so() -> None:
             "0.04 s",
             "0.04 s",
         ]
+
+
+async def test_a_crash_loop_at_start_costs_less_than_a_twentieth_of_a_core() -> None:
+    """With the real times, and a real process that gets as far as reading its configuration."""
+    crasher = ProcessSpec("control", (*COMMAND, "{"))
+    before = os.times()
+    async with running(crasher, backoff=Backoff()) as (supervisor, records):
+        await until(lambda: supervisor.statuses["control"].state == "given up")
+        assert [text.rsplit(" in ")[1] for text in records.texts("died")] == [
+            "0.2 s",
+            "0.4 s",
+            "0.8 s",
+            "1.6 s",
+        ]
+    after = os.times()
+    used_s = sum(after[:4]) - sum(before[:4])  # ours and the children's, of the user and the system
+    assert used_s <= 0.05 * Backoff().window_s
 
 
 async def test_a_bad_configuration_is_not_tried_twice() -> None:

@@ -1,10 +1,14 @@
 """`gigabrain up` and the single processes: starting, restarting, giving up, leaving nothing."""
 
+import asyncio
 import os
 import re
 import signal
 import socket
+import subprocess
+from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -75,6 +79,61 @@ async def test_it_goes_on_when_nobody_reads_what_it_says(home: Home) -> None:
         await robot.ticks(25)
         up.send(signal.SIGINT)
         assert await up.ended() == 0
+    assert up.err == ""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+async def test_it_ends_cleanly_when_asked_or_when_its_terminal_has_gone(
+    home: Home, number: signal.Signals
+) -> None:
+    terminal, side = os.openpty()
+    up = home.start("up", str(home.deployment()), stdout=side)
+    os.close(side)
+    async with looking_on(await robot_of(home, up)) as robot:
+        await robot.pids()
+    os.close(terminal)  # what it says from now on meets an error
+    up.send(number)
+    assert await up.ended() == 0
+    assert (up.err, home.processes()) == ("", [])
+
+
+async def test_impatience_does_not_disturb_its_end(home: Home) -> None:
+    up = home.start("up", str(home.deployment()))
+    await until(lambda: len(ready(up)) == 6, "six processes are ready")
+    for _ in range(5):
+        up.send(signal.SIGINT)
+        await asyncio.sleep(0.02)
+    assert await up.ended() == 0
+    assert (up.err, home.processes()) == ("", [])
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Home]:
+    """A home with 256 kB of disk, which goes with the last process that sees it."""
+    script = f'mount -t tmpfs -o size=256k none {tmp_path}/home/state && exec "$@"'
+    inside = ("unshare", "--mount", "--", "sh", "-c", script, "sh")
+    (tmp_path / "home" / "state").mkdir(parents=True)
+    if subprocess.run((*inside, "true"), capture_output=True).returncode:
+        pytest.skip("no disk of its own here; mounting one needs root")
+    home = Home(tmp_path / "home", inside)
+    yield home
+    home.close()
+
+
+async def test_a_full_disk_is_told_once_and_stops_nobody(small_disk: Home) -> None:
+    file = small_disk.deployment(resume="auto")
+    up = small_disk.start("up", str(file), "--level", "debug")
+    async with looking_on(endpoint_of(file)) as robot:
+        await robot.straight(0.15, room=0.0)
+        full = re.compile(
+            r"^\S+ driver +warning +cannot write \S+/driver.jsonl: .*No space left.*$", re.M
+        )
+        await until(lambda: full.search(up.out), "it says that the disk is full")
+        await robot.ticks(100)
+        assert robot.state.gate.mode == "enabled"
+        assert len(full.findall(up.out)) == 1
+    up.send(signal.SIGINT)
+    assert await up.ended() == 0
     assert up.err == ""
 
 

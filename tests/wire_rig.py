@@ -3,39 +3,20 @@
 from collections.abc import Iterator
 from typing import Any
 
-import msgspec
-
 from gigabrain_schemas.examples import EXAMPLES
-from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.codec import Codec
-
-Path = tuple[str | int, ...]  # fields and places on the way to a value
+from gigabrain_zenoh.faults import hostile
+from gigabrain_zenoh.faults.hostile import Path, codec_of, leaves
 
 
 def codec(name: str) -> Codec[Any]:
     """What the bus would decode message `name` with."""
-    limits = {topic.type: topic.max_bytes for topic in TOPICS}
-    message = type(EXAMPLES[name])
-    return Codec(message, limits.get(message, 64 * 1024))
+    return codec_of(type(EXAMPLES[name]))
 
 
 def as_map(name: str) -> dict[str, Any]:
     """The example as plain maps, lists and values."""
-    plain = msgspec.msgpack.decode(msgspec.msgpack.encode(EXAMPLES[name]))
-    assert isinstance(plain, dict)
-    return plain
-
-
-def leaves(value: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
-    """Every value that is neither map nor list, with the way to it."""
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield from leaves(inner, (*path, key))
-    elif isinstance(value, list):
-        for index, inner in enumerate(value):
-            yield from leaves(inner, (*path, index))
-    else:
-        yield path, value
+    return hostile.as_map(type(EXAMPLES[name]))
 
 
 def maps(value: Any, path: Path = ()) -> Iterator[Path]:
@@ -56,15 +37,6 @@ def numbers(name: str) -> list[Path]:
         for path, value in leaves(as_map(name))
         if isinstance(value, int | float) and not isinstance(value, bool)
     ]
-
-
-def replaced(plain: Any, path: Path, value: Any) -> Any:
-    """A copy of `plain` with `value` at `path`."""
-    if not path:
-        return value
-    copy: Any = dict(plain) if isinstance(plain, dict) else list(plain)
-    copy[path[0]] = replaced(plain[path[0]], path[1:], value)
-    return copy
 
 
 def at(plain: Any, path: Path) -> Any:

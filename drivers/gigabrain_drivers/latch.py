@@ -2,10 +2,13 @@
 
 import os
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
+from msgspec import Meta
 
 from gigabrain_schemas.base import Cause
+from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
 
 UNREADABLE = Cause(
@@ -20,7 +23,7 @@ class Latched(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     """The content of the file."""
 
     causes: tuple[Cause, ...] = ()
-    estop_generation: int = 0
+    estop_generation: Annotated[int, Meta(ge=0, le=2**62)] = 0  # and it can still count on
 
 
 class LatchFile:
@@ -40,7 +43,7 @@ class LatchFile:
             found = msgspec.json.decode(self._path.read_bytes(), type=Latched)
         except FileNotFoundError:
             found = Latched()
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        except DECODE_ERRORS:
             found = Latched(causes=(UNREADABLE,))
         except OSError as error:
             raise ConfigError(_unwritable(self._folder, error)) from None

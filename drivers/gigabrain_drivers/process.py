@@ -32,10 +32,10 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh import causes as why
 from gigabrain_zenoh import gate
+from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.limits import ZERO, limits_of
-from gigabrain_zenoh.safety import scan_limit_ns
 from gigabrain_zenoh.settings import DriverConfig
 
 log = logging.getLogger(__name__)

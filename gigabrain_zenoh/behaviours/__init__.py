@@ -16,6 +16,7 @@ class Situation(msgspec.Struct, frozen=True):
 
     world: WorldModel | None  # None while perception is silent
     pose: Pose  # odometry of the same tick
+    must_charge: bool = False  # safety says that the battery is nearly empty
 
 
 class Behaviour(Protocol):

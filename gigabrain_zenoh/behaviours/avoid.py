@@ -26,6 +26,8 @@ class Avoid:
     def step(self, situation: Situation) -> Intent:
         """What to do now, with the reason in words."""
         world = situation.world
+        if situation.must_charge:
+            return self._wait("resting: the battery is nearly empty; charge it")
         if world is None:
             return self._wait("waiting: perception is silent")
         if not world.scan_ok:

@@ -6,6 +6,7 @@ from rich.text import Text
 
 from gigabrain_zenoh.bench.chain import TARGET_P50, TARGET_P99, ChainResult, Compared
 from gigabrain_zenoh.bench.costs import Hop
+from gigabrain_zenoh.bench.estop import MAX_MS, P99_MS, TRAVEL_M, EstopResult
 from gigabrain_zenoh.bench.figures import Figures, over_rounds
 from gigabrain_zenoh.bench.stack import StackResult, Target, targets
 
@@ -75,6 +76,32 @@ def stack_page(result: StackResult) -> Group:
     for target in targets(result):
         held.add_row(*_target(target))
     return Group(_title(title), table, _title("Targets (CPU of one core)"), held)
+
+
+def estop_page(result: EstopResult) -> Group:
+    """What `gigabrain bench estop` prints."""
+    table = _table("network", "presses", "p50 [ms]", "p99 [ms]", "max [ms]", "travel [m]")
+    for one in result.rounds:
+        travel = max(one.travel_m, default=0.0)
+        table.add_row(
+            one.name,
+            f"{len(one.ms)}",
+            f"{one.p(0.5):.1f}",
+            _within(one.p(0.99), P99_MS, 1),
+            _within(max(one.ms), MAX_MS, 1),
+            _within(travel, TRAVEL_M, 3),
+        )
+    title = f"E-stop of {result.body}: from the press to the answer that it stands"
+    flood = (
+        "flooded: a hundred pictures of 1 MB and a thousand commands of a stranger's a second. "
+        "The travel is by odometry, of the presses at 0.26 m/s; half of the way is braking."
+    )
+    return Group(_title(title), table, Text(flood, style="dim"))
+
+
+def _within(value: float, limit: float, digits: int) -> Text:
+    style = "green" if value <= limit else "yellow"
+    return Text(f"{value:.{digits}f} (≤ {limit:g})", style=style)
 
 
 def _target(target: Target) -> tuple[str, str, str, Text]:

@@ -29,6 +29,11 @@ COMMANDS = {
     "estop": ("operate:estop", "Stop the robot at once, and latch it."),
     "release": ("operate:release", "Let go of a latched gate."),
     "enable": ("operate:enable", "Let the robot's brain drive."),
+    "keys new": ("keys:new", "Make a fleet's own authority, which issues identities."),
+    "keys issue": ("keys:issue", "Make an identity: a folder to copy to its host."),
+    "keys list": ("keys:identities", "List identities, and when they expire."),
+    "keys zenohd": ("keys:zenohd", "Print the configuration of a router for a larger site."),
+    "teleop": ("teleop:teleop", "Drive by keys or by a gamepad."),
     "audit": ("audit:audit", "Show who did what to the robot."),
     "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
@@ -45,6 +50,7 @@ COMMANDS = {
     "bench chain": ("bench:chain", "From scan to command, timed."),
     "bench stack": ("bench:stack", "CPU, memory and time to start."),
     "faults": ("faults:faults", "Break the robot in 44 ways, and see whether it stops."),
+    "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
@@ -52,6 +58,7 @@ COMMANDS = {
 GROUPS = {
     "driver": "Drivers of bodies.",
     "bag": "Recordings.",
+    "keys": "Who may do what.",
     "bench": "Measure this machine.",
     "schema": "Messages.",
 }

@@ -15,6 +15,7 @@ def audit(
     *,
     connect: str | None = None,
     namespace: str = "",
+    keys: Path | None = None,
     newest: Annotated[int, Parameter(alias="-n")] = 20,
     follow: bool = False,
     json: bool = False,
@@ -33,6 +34,8 @@ def audit(
         The router's Zenoh endpoint; without it, the only robot that runs on this machine.
     namespace
         The robot's own part of the key space.
+    keys
+        The folder of your identity, for a router that wants one.
     newest
         How many entries.
     follow
@@ -56,7 +59,8 @@ def audit(
     async def run() -> None:
         from gigabrain_zenoh.client import connect as connect_robot
 
-        async with connect_robot(connect, namespace=namespace, wait=False) as found:
+        folder = str(keys) if keys else ""
+        async with connect_robot(connect, namespace=namespace, keys=folder, wait=False) as found:
             following = found.topic("audit") if follow else None
             _print(map(show, await found.audit(newest)))
             if following:

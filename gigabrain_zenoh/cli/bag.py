@@ -92,6 +92,7 @@ def play(
     beside_robot: bool = False,
     connect: str | None = None,
     namespace: str = "",
+    keys: str = "",
 ) -> int:
     """Send a recording again, the last map first.
 
@@ -117,8 +118,11 @@ def play(
         The router's Zenoh endpoint; without it, the only robot that runs on this machine.
     namespace
         The robot's own part of the key space.
+    keys
+        The folder of your identity, for a router that wants one.
     """
     from gigabrain_zenoh.recording.command import play as run
+    from gigabrain_zenoh.recording.joining import Where
     from gigabrain_zenoh.recording.play import PlayOptions
 
     if not 0.01 <= rate <= 100:
@@ -128,7 +132,8 @@ def play(
     options = PlayOptions(
         rate=rate, start_s=start, loop=loop, topics=tuple(topics or ()), remap=_pairs(remap or [])
     )
-    return asyncio.run(run(file, options, connect, namespace, beside_robot=beside_robot))
+    where = Where(connect=connect, namespace=namespace, keys=keys)
+    return asyncio.run(run(file, options, where, beside_robot=beside_robot))
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:

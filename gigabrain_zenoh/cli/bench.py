@@ -1,4 +1,4 @@
-"""`gigabrain bench chain` and `gigabrain bench stack`: what this machine makes of it."""
+"""`gigabrain bench chain`, `stack` and `estop`: what this machine makes of it."""
 
 import asyncio
 import sys
@@ -77,6 +77,38 @@ def stack(
     _above_zero("seconds", seconds)
     result = asyncio.run(measure_stack(body, world, seconds, _progress))
     _finish(stack_page(result), result, json)
+    return 0
+
+
+def estop(
+    *,
+    body: str = "turtlebot3_waffle",
+    driving: int = 10,
+    latched: int = 200,
+    json: Path | None = None,
+) -> int:
+    """Time the e-stop, from the press to the gate's zero, idle and while the network is flooded.
+
+    Example: gigabrain bench estop --driving 10 --latched 200
+
+    Parameters
+    ----------
+    body
+        Which robot; see `gigabrain robots`.
+    driving
+        How often to press while it drives.
+    latched
+        How often to press after that, while it is latched.
+    json
+        Write all figures into this file.
+    """
+    from gigabrain_zenoh.bench.estop import measure_estop
+    from gigabrain_zenoh.bench.tables import estop_page
+
+    _above_zero("driving", driving)
+    _above_zero("latched", latched)
+    result = asyncio.run(measure_estop(body, driving, latched, _progress))
+    _finish(estop_page(result), result, json)
     return 0
 
 

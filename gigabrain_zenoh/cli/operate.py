@@ -4,6 +4,7 @@ import asyncio
 import getpass
 import time
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 
 from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.client import Robot
@@ -13,7 +14,9 @@ from gigabrain_zenoh.estop import BY_HAND
 from gigabrain_zenoh.gate import BRAIN
 
 
-def estop(*, connect: str | None = None, namespace: str = "", reason: str = "") -> int:
+def estop(
+    *, connect: str | None = None, namespace: str = "", keys: Path | None = None, reason: str = ""
+) -> int:
     """Stop the robot at once, and latch it.
 
     Example: gigabrain estop --reason "somebody is in the way"
@@ -27,18 +30,20 @@ def estop(*, connect: str | None = None, namespace: str = "", reason: str = "") 
         The router's Zenoh endpoint; without it, the only robot that runs on this machine.
     namespace
         The robot's own part of the key space.
+    keys
+        The folder of your identity, for a router that wants one.
     reason
         For the log.
     """
     try:
         return _ask(
-            connect, namespace, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False
+            connect, namespace, keys, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False
         )
     except BusError as error:
         raise NotConfirmed(f"NOT CONFIRMED: {error}; {BY_HAND}") from None
 
 
-def release(*, connect: str | None = None, namespace: str = "") -> int:
+def release(*, connect: str | None = None, namespace: str = "", keys: Path | None = None) -> int:
     """Let go of a latched gate. It takes an enable as well to move.
 
     Example: gigabrain release
@@ -49,11 +54,15 @@ def release(*, connect: str | None = None, namespace: str = "") -> int:
         The router's Zenoh endpoint; without it, the only robot that runs on this machine.
     namespace
         The robot's own part of the key space.
+    keys
+        The folder of your identity, for a router that wants one.
     """
-    return _ask(connect, namespace, lambda robot: robot.release())
+    return _ask(connect, namespace, keys, lambda robot: robot.release())
 
 
-def enable(*, connect: str | None = None, namespace: str = "", take: bool = False) -> int:
+def enable(
+    *, connect: str | None = None, namespace: str = "", keys: Path | None = None, take: bool = False
+) -> int:
     """Let the robot's brain drive.
 
     Example: gigabrain enable
@@ -64,15 +73,18 @@ def enable(*, connect: str | None = None, namespace: str = "", take: bool = Fals
         The router's Zenoh endpoint; without it, the only robot that runs on this machine.
     namespace
         The robot's own part of the key space.
+    keys
+        The folder of your identity, for a router that wants one.
     take
         Even when somebody else drives.
     """
-    return _ask(connect, namespace, lambda robot: robot.enable(BRAIN, take=take))
+    return _ask(connect, namespace, keys, lambda robot: robot.enable(BRAIN, take=take))
 
 
 def _ask(
     connect: str | None,
     namespace: str,
+    keys: Path | None,
     ask: Callable[[Robot], Awaitable[GateReply]],
     prefix: str = "",
     *,
@@ -80,7 +92,10 @@ def _ask(
 ) -> int:
     async def run() -> None:
         source = f"{getpass.getuser()}-cli"
-        async with connect_robot(connect, namespace=namespace, source=source, wait=wait) as robot:
+        folder = str(keys) if keys else ""
+        async with connect_robot(
+            connect, namespace=namespace, keys=folder, source=source, wait=wait
+        ) as robot:
             began = time.perf_counter()
             reply = await ask(robot)
             took_ms = (time.perf_counter() - began) * 1e3

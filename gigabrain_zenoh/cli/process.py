@@ -9,10 +9,13 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh import behaviours
 from gigabrain_zenoh.cli.checked import checked
+from gigabrain_zenoh.keys.checks import identity_in
 from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.process import find, run
 from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.running import find_endpoint
 from gigabrain_zenoh.settings import DriverConfig, Endpoint, LinkName, Resume
+from gigabrain_zenoh.zenoh_config import router_config, secured
 
 ROUTER = "tcp/127.0.0.1:7447"
 
@@ -26,6 +29,8 @@ class Place:
     "The router's Zenoh endpoint."
     namespace: str = ""
     "The robot's own part of the key space, where one router serves several robots."
+    keys: Path | None = None
+    "The folder of this host's identity, for a router that wants one."
     run_dir: Path | None = None
     "Write a log file into this folder."
     level: Literal["debug", "info", "warning", "error"] = "info"
@@ -35,7 +40,12 @@ class Place:
 HERE = Place()
 
 
-def router(*, listen: str = ROUTER, place: Annotated[Place, Parameter(show=False)] = HERE) -> int:
+def router(
+    *,
+    listen: tuple[str, ...] = (ROUTER,),
+    fleet: tuple[str, ...] = (),
+    place: Annotated[Place, Parameter(show=False)] = HERE,
+) -> int:
     """Start the router that joins the other processes.
 
     Example: gigabrain router --listen tcp/127.0.0.1:7447
@@ -43,9 +53,16 @@ def router(*, listen: str = ROUTER, place: Annotated[Place, Parameter(show=False
     Parameters
     ----------
     listen
-        The Zenoh endpoint to listen on.
+        The Zenoh endpoints to listen on.
+    fleet
+        The namespaces of the robots that it serves, where it has keys.
     """
-    return _run("router", place, {}, Endpoint(listen=(listen,), namespace=place.namespace))
+    keys = _keys(place)
+    if keys:
+        identity_in(Path(keys))
+    endpoint = Endpoint(listen=listen, namespace=place.namespace, keys=keys, fleet=fleet)
+    settings = router_config(endpoint, state_dir() / "robots" / (place.namespace or "router"))
+    return _run("router", place, msgspec.to_builtins(settings), secured(endpoint))
 
 
 def perception(*, place: Place = HERE) -> int:
@@ -157,13 +174,17 @@ def button(*, port: str, place: Place = HERE) -> int:
     return _run("button", place, {"port": port})
 
 
+def _keys(place: Place) -> str:
+    return str(place.keys.expanduser().absolute()) if place.keys else ""
+
+
 def _run(
     name: str, place: Place, settings: dict[str, Any], endpoint: Endpoint | None = None
 ) -> int:
     return run(
         ProcessConfig(
             name=name,
-            endpoint=endpoint or Endpoint(connect=(place.connect,), namespace=place.namespace),
+            endpoint=endpoint or find_endpoint(place.connect, place.namespace, _keys(place)),
             settings=settings,
             run_dir=str(place.run_dir) if place.run_dir else None,
             level=place.level,

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Literal
 
 from gigabrain_zenoh.cli.checked import checked
+from gigabrain_zenoh.config_places import located
 from gigabrain_zenoh.deployment import (
     Deployment,
     deployment_path,
     host_of,
     load_deployment,
-    located,
     recorded,
 )
 from gigabrain_zenoh.errors import ConfigError
@@ -87,7 +87,9 @@ def demo(
     return asyncio.run(Demo(deployment, options).run())
 
 
-def up(deployment: str, *, host: str | None = None, level: str = "info") -> int:
+def up(
+    deployment: str, *, host: str | None = None, keys: Path | None = None, level: str = "info"
+) -> int:
     """Start what a deployment file puts on this host, and keep it running until Ctrl-C.
 
     Example: gigabrain up deploy/demo.yaml
@@ -98,13 +100,15 @@ def up(deployment: str, *, host: str | None = None, level: str = "info") -> int:
         A deployment file.
     host
         Which of the file's hosts this is; needed where it has several.
+    keys
+        The folder of this host's identity, in place of the one in the file.
     level
         The least level of what is logged: debug, info, warning or error.
     """
     from gigabrain_zenoh.launch import up as run
 
     path = deployment_path(deployment)
-    loaded = load_deployment(path)
+    loaded = load_deployment(path, str(keys.expanduser().absolute()) if keys else "")
     try:
         return asyncio.run(run(loaded, host_of(loaded, host), _printer(), level))
     except ConfigError as error:

@@ -197,6 +197,7 @@ async def release_and_re_enable(rig: Rig) -> Measured:
         await onlooker.hand_to_brain()
         speed = await _first_speed(subject)
     await onlooker.ticks(20)  # what a joystick says is trusted for a moment after it ends
+    await onlooker.hand_to_brain()
     return {
         "wrongly released": wrong,
         "moved while latched": moved_m,

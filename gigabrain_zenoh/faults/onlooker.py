@@ -45,12 +45,13 @@ class Onlooker:
         self.bus = bus
         self.states: deque[RobotState] = deque(maxlen=50_000)
         self.commands: deque[CmdVel] = deque(maxlen=10_000)  # of the brain
+        self.arrivals: deque[int] = deque(maxlen=10_000)  # the tick when each of them came
         self.health: dict[str, Health] = {}
         self.logs: list[LogRecord] = []
         self.safety, self.world = bus.latest(SAFETY), bus.latest(WORLD)
         self.intent = bus.latest(INTENT)
         bus.latest(STATE, self.states.append)
-        bus.latest(BODY, self._join)
+        self.bodies = bus.latest(BODY, self._join)
         bus.subscribe(HEALTH, self._hear)
         bus.subscribe(LOG, lambda _key, record: self.logs.append(record))
 
@@ -70,6 +71,7 @@ class Onlooker:
     def _obey(self, _key: str, command: CmdVel) -> None:
         if command.source == BRAIN:
             self.commands.append(command)
+            self.arrivals.append(self.bus.time.tick)
 
     async def describe(self, process: str) -> Description:
         """What a process says of itself; waits until it is there."""

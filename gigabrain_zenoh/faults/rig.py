@@ -33,7 +33,7 @@ class Options:
 
 
 class Rig:
-    """Hands out running robots. Used as `async with`; nothing of it is left afterwards."""
+    """Hands out running robots. Used as `async with`; no process is left afterwards."""
 
     def __init__(self, options: Options, folder: Path) -> None:
         self.options, self.folder = options, folder
@@ -66,9 +66,8 @@ class Rig:
             await self.give_up()
         if self._kept is None:
             subject = self.new(deployment_of(self.options, stage))
-            self._kept = stage, subject
-            await subject.__aenter__()
-        subject = self._kept[1] if self._kept else subject
+            self._kept = stage, await subject.__aenter__()
+        _, subject = self._kept
         await subject.settle()
         return subject
 

@@ -36,7 +36,7 @@ async def stop_by(subject: Subject, fault: Callable[[], object], victim: str = "
     await onlooker.ticks(SETTLE_TICKS)
     begin = max(start.tick, _last_word(onlooker, victim, start))
     await until(lambda: onlooker.state.gate.mode in ("idle", "latched"), "the gate shuts")
-    if not onlooker.state.gate.causes:
+    if not any(s.gate.causes for s in onlooker.states if s.tick > start.tick):
         raise Failed("the gate does not say why it is shut")
     await onlooker.still()
     distance_m = await subject.distance()

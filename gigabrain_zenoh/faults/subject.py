@@ -1,6 +1,7 @@
 """The robot that is broken on purpose: all its processes, and whoever looks on."""
 
 import asyncio
+import contextlib
 import os
 import signal
 from collections.abc import Callable, Mapping
@@ -34,6 +35,7 @@ Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
 TIRELESS = Backoff(factor=1.0, deaths=10_000)
 FAULTS_FILE = "faults.json"  # as the emulator's process reads it
 STOP_S = 1.5
+FULL_SHARE = 0.96  # of a speed counts as having reached it
 
 
 class Subject:
@@ -113,9 +115,12 @@ class Subject:
         return pid
 
     def send(self, name: str, number: signal.Signals) -> int:
-        """Send a signal to a process; its pid."""
+        """Send a signal to a process; its pid. Raises Failed where it has died by itself."""
         pid = self.pid(name)
-        os.kill(pid, number)
+        try:
+            os.kill(pid, number)
+        except ProcessLookupError:
+            raise Failed(f"{name} has died by itself") from None
         return pid
 
     def kill(self, name: str) -> int:
@@ -131,7 +136,8 @@ class Subject:
         alive = {status.pid for status in self.supervisor.statuses.values()}
         for pid in self._frozen & alive:
             if pid is not None:
-                os.kill(pid, signal.SIGCONT)
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGCONT)
         self._frozen.clear()
 
     async def ready(self) -> None:
@@ -186,9 +192,14 @@ class Subject:
         return truth
 
     async def drive(self, room: float = 1.3) -> None:
-        """Have the brain drive straight on at full speed, as a person would: by hand."""
+        """Have the brain drive straight on as fast as it may, as a person would: by hand."""
+        onlooker = self.onlooker
         await self.release()
-        await self.onlooker.straight(room=room, by_hand=self.deployment.resume == "manual")
+        await until(lambda: onlooker.bodies.current, "the driver says what its body is")
+        body = onlooker.bodies.current
+        most = body.description.max_linear_speed if body else 0.0
+        speed = FULL_SHARE * min(self.deployment.decision.linear_speed, most)
+        await onlooker.straight(speed, room, by_hand=True)
 
     async def release(self) -> None:
         """As a person: let go of a latched gate, as soon as that is possible."""

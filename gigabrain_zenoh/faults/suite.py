@@ -1,17 +1,17 @@
 """Runs fault tests, one after the other, those that share a robot together."""
 
 import asyncio
-import itertools
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.faults.fault import Fault, Measured, Result, Skipped, Test, judge
+from gigabrain_zenoh.faults.fault import Fault, Measured, Result, Skipped, Test, Verdict, judge
 from gigabrain_zenoh.faults.rig import Options, Rig
 from gigabrain_zenoh.faults.waiting import StallWatch
 from gigabrain_zenoh.process import find
 
-STALL_S = 0.25  # standing still for longer, this machine and not the robot is to blame
+STALL_S = 0.1  # standing still for longer, this machine and not the robot is to blame
 TRIES = 3  # runs that end in such a stall are run again so often
 LIMIT_S = 300.0  # for one run of one test in its short form
 STAGES = ("sim", "auto", "serial", "tcp", "")
@@ -51,40 +51,60 @@ async def run_suite(
     return sorted(results, key=lambda result: result.number)
 
 
+@dataclass
+class Run:
+    """What came of one run, after all that were thrown away."""
+
+    measured: Measured | None = None
+    verdict: Verdict = "passed"
+    reason: str = ""
+    stall_s: float = 0.0
+    thrown: int = 0
+
+
 async def _repeated(fault: Fault, rig: Rig, stalls: StallWatch, repeat: int) -> Result:
-    """All runs of one fault; the first that fails is the last."""
-    loop = asyncio.get_running_loop()
-    began_s, runs, thrown, longest_s = loop.time(), list[Measured](), 0, 0.0
-    reason, skipped = "", False
-    for _ in range(repeat):
-        for attempt in itertools.count(1):
-            stalls.reset()
-            try:
-                runs.append(await _run(fault, rig))
-            except Skipped as error:
-                reason, skipped = str(error), True
-            except (GigabrainError, TimeoutError) as error:
-                reason = str(error) or f"not over after {LIMIT_S:g} s"
-                await rig.give_up()
-            if not reason or skipped or stalls.longest_s < STALL_S or attempt == TRIES:
-                break
-            thrown, reason = thrown + 1, ""
-        longest_s = max(longest_s, stalls.longest_s)
-        if reason:
-            break
-    verdict, missed, worst = judge(fault, runs) if runs else ("skipped", "", {})
+    """All runs of one fault; the first that does not pass is the last."""
+    loop, runs = asyncio.get_running_loop(), list[Run]()
+    began_s = loop.time()
+    while len(runs) < repeat and (not runs or runs[-1].verdict == "passed"):
+        runs.append(await _patiently(fault, rig, stalls))
+    measured = [run.measured for run in runs if run.measured is not None]
     return Result(
         number=fault.number,
         name=fault.name,
         criterion=fault.criterion,
-        verdict="skipped" if skipped else "FAILED" if reason else verdict,
-        reason=reason or missed,
-        worst=worst,
-        runs=len(runs),
+        verdict=runs[-1].verdict,
+        reason=runs[-1].reason,
+        worst=judge(fault, measured)[2] if measured else {},
+        runs=len(measured),
         seconds=round(loop.time() - began_s, 1),
-        stalls=thrown,
-        stall_ms=round(longest_s * 1e3),
+        stalls=sum(run.thrown for run in runs),
+        stall_ms=round(max(run.stall_s for run in runs) * 1e3),
     )
+
+
+async def _patiently(fault: Fault, rig: Rig, stalls: StallWatch) -> Run:
+    """One run that passed, or was skipped, or failed although this machine did not stand still."""
+    for thrown in range(TRIES):
+        stalls.reset()
+        run = await _judged(fault, rig)
+        run.stall_s, run.thrown = await stalls.longest_s(), thrown
+        if run.verdict != "FAILED" or run.stall_s < STALL_S:
+            break
+    return run
+
+
+async def _judged(fault: Fault, rig: Rig) -> Run:
+    """One run. The robot of one that failed is used no more."""
+    try:
+        measured = await _run(fault, rig)
+    except Skipped as error:
+        return Run(verdict="skipped", reason=str(error))
+    except (GigabrainError, TimeoutError) as error:
+        await rig.give_up()
+        return Run(verdict="FAILED", reason=str(error) or f"not over after {LIMIT_S:g} s")
+    verdict, reason, _ = judge(fault, [measured])
+    return Run(measured, verdict, reason)
 
 
 async def _run(fault: Fault, rig: Rig) -> Measured:

@@ -80,14 +80,14 @@ FAULTS: tuple[Fault, ...] = (
         20, "network-partition", NETWORK, "",
         f"stops in a gap of 100 ms <= 0, zero after <= 120 ms, {STALE}, {STILL}",
     ),
-    Fault(21, "two-commanders-across-a-partition", NETWORK, "", "executed of the first <= 0"),
+    Fault(21, "two-commanders-across-a-partition", NETWORK, "sim", "executed of the first <= 0"),
     Fault(
         22, "latency-jitter-loss", NETWORK, "",
         "stops at 100 ms round trip <= 0, moves above 150 ms <= 0, start-stop rate <= 1 Hz",
     ),
     Fault(
         23, "viewer-frozen", NETWORK, "sim",
-        "control period p99.9 <= 40 ms, longest put <= 20 ms",
+        "control period p99 above calm <= 20 ms, put p99 <= 20 ms",
     ),
     Fault(24, "bit-flips", NETWORK, "", "corrupt payloads accepted <= 0", ("keys",)),
     Fault(

@@ -23,7 +23,7 @@ class StallWatch:
     """Notices when this machine stands still, so that no robot is blamed for it."""
 
     def __init__(self) -> None:
-        self.longest_s = 0.0  # since the last `reset`
+        self._longest_s = 0.0
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
@@ -37,11 +37,16 @@ class StallWatch:
 
     def reset(self) -> None:
         """Forget what was."""
-        self.longest_s = 0.0
+        self._longest_s = 0.0
+
+    async def longest_s(self) -> float:
+        """How long it stood still at most since the last `reset`, a moment ago included."""
+        await asyncio.sleep(2 * LOOK_S)
+        return self._longest_s
 
     async def _watch(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
             due_s = loop.time() + LOOK_S
             await asyncio.sleep(LOOK_S)
-            self.longest_s = max(self.longest_s, loop.time() - due_s)
+            self._longest_s = max(self._longest_s, loop.time() - due_s)

@@ -22,7 +22,12 @@ from gigabrain_schemas.sensors import ImuData
 GateMode = Literal["latched", "idle", "enabled", "stopping"]
 DriveType = Literal["differential", "omni", "mecanum", "ackermann", "quadruped", "arm"]
 SafeState = Literal["stop", "hold", "park", "limp"]
+PositivePercentage = Annotated[float, Meta(gt=0.0, le=100.0)]
+Sustain = Annotated[float, Meta(gt=0.0, le=60.0)]  # [s]; 0, which would switch it off, is refused
 Key = Annotated[str, Meta(pattern=r"^\w+(/\w+)*$", max_length=128)]
+
+
+LEAST_AREA = 1e-4  # [m2]
 
 
 class Joint(Record, frozen=True, kw_only=True):
@@ -104,18 +109,38 @@ class ControlGains(Record, frozen=True, kw_only=True):
 
 
 class Thresholds(Record, frozen=True, kw_only=True):
-    """When safety speaks up."""
+    """When safety speaks up. None of them can be switched off."""
 
-    battery_warn: Percentage = 15.0  # [%]
-    battery_stop: Percentage = 5.0  # [%]
+    battery_warn: PositivePercentage = 15.0  # [%], charge it soon
+    battery_return: PositivePercentage = 7.0  # [%], decision comes to rest
+    battery_stop: PositivePercentage = 5.0  # [%], it stops and latches
+    battery_sustain: Sustain = 2.0  # [s], how long it must be so low; sags do not count
     motor_warn: Finite = 60.0  # [deg C]
-    motor_stop: Finite = 70.0  # [deg C]
-    reaction_time: Positive = 0.22  # [s], scan period + bus + gate + drive
-    stop_margin: NonNegative = 0.08  # [m], kept free in front of a stopped robot
+    motor_stop: Finite = 70.0  # [deg C], it stops and latches
+    motor_sustain: Sustain = 0.5  # [s]
+    missing_after: Sustain = 2.0  # [s] without a value that the body has shown to measure
+    scan_age: Sustain = 0.25  # [s], or 1.5 scans where that is longer
+    heartbeat: Sustain = 0.15  # [s] without an answer from one of the three systems
+    round_trip: Sustain = 0.1  # [s], 99 of 100 commands echo a tick younger than this
+    round_trip_sustain: Sustain = 1.0  # [s]
+    follow_linear: Positive = 0.05  # [m/s], measured speed off what was commanded
+    follow_angular: Positive = 0.3  # [rad/s]
+    follow_sustain: Sustain = 0.3  # [s]
+    stuck_sustain: Sustain = 2.0  # [s] without moving at all
+    frozen_sustain: Sustain = 0.4  # [s] of values that do not change while it should move
+    tilt_stop: Annotated[float, Meta(gt=0.0, le=90.0)] = 30.0  # [deg], it stops and latches
+    shock_stop: Positive = 40.0  # [m/s2], horizontally; it stops and latches
+    disk_warn: Positive = 500.0  # [MB] left where safety runs
+    cpu_warn: PositivePercentage = 95.0  # [%] of all cores, over ten seconds
+    memory_warn: PositivePercentage = 95.0  # [%] in use
+    reaction_time: Sustain = 0.22  # [s], scan period + bus + gate + drive
+    stop_margin: Positive = 0.08  # [m], kept free in front of a stopped robot
+    resume_margin: Positive = 0.10  # [m], more than the stop zone before the body may go on
+    side_margin: Positive = 0.03  # [m], kept free beside the body as it moves on
 
     def __post_init__(self) -> None:
-        if self.battery_stop > self.battery_warn:
-            raise ValueError("battery_stop must not be above battery_warn")
+        if not self.battery_stop <= self.battery_return <= self.battery_warn:
+            raise ValueError("battery_stop, battery_return and battery_warn must ascend")
         if self.motor_stop < self.motor_warn:
             raise ValueError("motor_stop must not be below motor_warn")
 
@@ -138,6 +163,31 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     control: ControlGains = ControlGains()
     safe_state: SafeState = "stop"
     control_topic: Key = "robot/cmd_vel"  # the key that its driver obeys
+
+    def __post_init__(self) -> None:
+        if _area(self.footprint) < LEAST_AREA:
+            raise ValueError("footprint: it must enclose an area, its corners in order")
+        if self.lidar is None:
+            return
+        needs = self.stopping_distance(self.max_linear_speed)
+        if needs > self.lidar.range_max:
+            raise ValueError(
+                f"max_linear_speed: it takes {needs:.2f} m to stop from it, "
+                f"and the lidar sees no farther than {self.lidar.range_max:g} m"
+            )
+
+    def stopping_distance(self, speed: float) -> float:
+        """L(v) = v T + v² / 2a + margin [m]: how far ahead must be free at `speed` [m/s]."""
+        t, a = self.thresholds.reaction_time, self.max_linear_deceleration
+        return speed * t + speed * speed / (2 * a) + self.thresholds.stop_margin
+
+
+def _area(corners: tuple[tuple[float, float], ...]) -> float:
+    """The area that `corners` enclose [m2], by Gauss's formula."""
+    return (
+        abs(sum(x * corners[i - 1][1] - corners[i - 1][0] * y for i, (x, y) in enumerate(corners)))
+        / 2
+    )
 
 
 class Body(Message, frozen=True, kw_only=True):

@@ -203,7 +203,10 @@ SAFETY: tuple[Message, ...] = (
     SafetyState(
         stamp_ns=STAMP_NS, seq=103, boot=BOOT, tick=206, basis=205,
         verdict="slow",
-        caps=SpeedCaps(forward=0.0, backward=0.26, left=0.1, right=0.1, rotation=1.0),
+        caps=SpeedCaps(
+            forward=0.0, backward=0.26, left=0.1, right=0.1,
+            rotation=1.0, turn_left=0.5, turn_right=0.7,
+        ),
         causes=(ZONE,),
         warnings=(LOW,),
     ),

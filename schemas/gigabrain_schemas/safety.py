@@ -14,7 +14,9 @@ class SpeedCaps(Record, frozen=True, kw_only=True):
     backward: NonNegative | None = None  # [m/s]
     left: NonNegative | None = None  # [m/s]
     right: NonNegative | None = None  # [m/s]
-    rotation: NonNegative | None = None  # [rad/s]
+    rotation: NonNegative | None = None  # [rad/s], either way
+    turn_left: NonNegative | None = None  # [rad/s], where turning one way is the danger
+    turn_right: NonNegative | None = None  # [rad/s]
 
 
 class SafetyState(Message, frozen=True, kw_only=True):

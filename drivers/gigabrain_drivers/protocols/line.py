@@ -22,6 +22,7 @@ from gigabrain_drivers.protocols.line_fields import (
 from gigabrain_zenoh.errors import unknown
 
 LONGEST = 256  # bytes of a line
+MOST = 1e8  # in SI units; beyond, either way, no number is a measurement. Counters may count on.
 _FIELD = re.compile(r"\{([^{}|:]*)(?:\|([^{}|:]*))?(?::([^{}]*))?\}")
 _FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.([0-9]))?f|d|[xX])")
 _ANY_NUMBER = r" *[-+]?[0-9]{1,12}(?:\.[0-9]{0,9})?"
@@ -36,6 +37,11 @@ class Field:
     factor: float  # wire * factor is in SI units
     format: str  # of Python's format(); whole numbers and hexadecimals are rounded first
     pattern: str  # of a regular expression
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is a counter or a set of flags, which may be as large as they like."""
+        return self.unit.endswith("tick") or self.format[-1] in "xX"
 
     def write(self, value: float) -> str:
         """The text for a value in SI units; zero has no sign."""
@@ -102,7 +108,10 @@ class Template:
             if text[-digits:].upper() != self._sum(text[:-digits]):
                 return None
         pairs = zip(self.fields, match.groups(), strict=True)
-        return {f.name: f.read(number) for f, number in pairs if f.name != IGNORED}
+        read = [(f, f.read(number)) for f, number in pairs if f.name != IGNORED]
+        if any(abs(value) > MOST and not f.counts for f, value in read):
+            return None
+        return {f.name: value for f, value in read}
 
     def sent(self, name: str, value: float) -> float:
         """What is left of a value [SI] after it was rounded to the line's digits."""

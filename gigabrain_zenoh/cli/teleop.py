@@ -1,0 +1,42 @@
+"""`gigabrain teleop`: drive by keys or by a gamepad."""
+
+
+def teleop(*, connect: str | None = None, namespace: str = "", take: bool = False) -> int:
+    """Drive the robot by keys or by a gamepad.
+
+    Example: gigabrain teleop --take
+
+    Speeds stay within what safety allows. Letting go of a key stops the robot; the space bar is the
+    e-stop. At the end the body goes back to the robot's brain.
+
+    Parameters
+    ----------
+    connect
+        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
+    namespace
+        The robot's own part of the key space.
+    take
+        Even when somebody else drives, the robot's own brain included.
+    """
+    import asyncio
+    import getpass
+    import sys
+
+    from gigabrain_zenoh.client import connect as connect_robot
+    from gigabrain_zenoh.errors import ConfigError
+    from gigabrain_zenoh.gamepad import Gamepad
+    from gigabrain_zenoh.teleop_station import Station
+
+    async def run() -> None:
+        pad = Gamepad()
+        try:
+            if not sys.stdin.isatty() and pad.pad is None:
+                raise ConfigError("teleop needs a terminal to type in, or a gamepad")
+            source = f"{getpass.getuser()}-teleop"
+            async with connect_robot(connect, namespace=namespace, source=source) as robot:
+                await Station(robot, pad).drive(take)
+        finally:
+            pad.close()
+
+    asyncio.run(run())
+    return 0

@@ -1,0 +1,1 @@
+"""Who may do what: a fleet's own authority, identities for its hosts, and the router's rules."""

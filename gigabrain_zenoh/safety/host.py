@@ -1,0 +1,87 @@
+"""The computer that safety runs on: disk, processors and memory."""
+
+import os
+import shutil
+from pathlib import Path
+
+import msgspec
+
+from gigabrain_schemas.base import Cause
+from gigabrain_schemas.body import Thresholds
+from gigabrain_zenoh.safety.words import say
+
+PERIOD_NS = 1_000_000_000
+LOOKS = 10  # the processors' share is taken over so many, ten seconds
+
+
+class Host(msgspec.Struct, frozen=True, kw_only=True):
+    """What the computer has left; None where it does not say."""
+
+    disk_mb: float | None = None  # [MB]
+    cpu: float | None = None  # [%] of all cores that is in use
+    memory: float | None = None  # [%] that is in use
+
+
+def warnings(limits: Thresholds, host: Host) -> tuple[Cause, ...]:
+    """What will hurt if nobody acts; none of it stops the body."""
+    found = []
+    if host.disk_mb is not None and host.disk_mb < limits.disk_warn:
+        found.append(say("disk_low", f"{host.disk_mb:.0f} MB left on the disk"))
+    if host.cpu is not None and host.cpu > limits.cpu_warn:
+        found.append(say("cpu_busy"))
+    if host.memory is not None and host.memory > limits.memory_warn:
+        found.append(say("memory_low"))
+    return tuple(found)
+
+
+class HostWatch:
+    """Looks at the computer once a second at most; about 0.2 ms each time."""
+
+    def __init__(self) -> None:
+        self._next_ns = 0
+        self._times: list[tuple[int, int]] = []  # idle and all [jiffies], newest last
+        self._host = Host()
+
+    def now(self, now_ns: int) -> Host:
+        """What it has left at this time of the monotonic clock."""
+        if now_ns >= self._next_ns:
+            self._next_ns = now_ns + PERIOD_NS
+            self._host = Host(disk_mb=_disk_mb(), cpu=self._cpu(), memory=_memory())
+        return self._host
+
+    def _cpu(self) -> float | None:
+        times = _processor_times()
+        if times is None:
+            return None
+        self._times = [*self._times, times][-LOOKS - 1 :]
+        if len(self._times) <= LOOKS:
+            return None
+        idle, total = (times[i] - self._times[0][i] for i in (0, 1))
+        return 100.0 * (1.0 - idle / total) if total else None
+
+
+def _disk_mb() -> float | None:
+    try:
+        return shutil.disk_usage(os.getcwd()).free / 1e6
+    except OSError:
+        return None
+
+
+def _processor_times() -> tuple[int, int] | None:
+    """Idle and all, from /proc/stat (proc(5)); None where there is none."""
+    try:
+        with Path("/proc/stat").open() as file:
+            times = [int(value) for value in file.readline().split()[1:9]]
+    except (OSError, ValueError):
+        return None
+    return (times[3] + times[4], sum(times)) if len(times) == 8 else None  # idle and iowait
+
+
+def _memory() -> float | None:
+    """From /proc/meminfo; None where there is none."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()[:8]
+        kb = {name: int(rest.split()[0]) for name, rest in (line.split(":") for line in lines)}
+        return 100.0 * (1.0 - kb["MemAvailable"] / kb["MemTotal"])
+    except (OSError, KeyError, ValueError, ZeroDivisionError):
+        return None

@@ -1,0 +1,179 @@
+"""How far a footprint can go, straight, turning or along an arc, until it touches something.
+
+Points (n, 2) [m] are in the body's frame. A footprint counts as its convex hull.
+"""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Corners = tuple[tuple[float, float], ...]
+
+STEP = 0.02  # [m], how far any part of the body moves between two looks
+NEARER = 0.005  # [m]: what is nearer than the margin from the start must not come nearer by this
+
+
+class Edges(NamedTuple):
+    """The hull's edges: outward normals (e, 2), and their distances from the origin (e,) [m]."""
+
+    normals: Floats
+    offsets: Floats
+
+
+class Box(NamedTuple):
+    """The footprint's extent [m]."""
+
+    front: float
+    rear: float
+    left: float
+    right: float
+
+
+@lru_cache(maxsize=8)
+def box(footprint: Corners) -> Box:
+    """The extent of `footprint`."""
+    xs, ys = [x for x, _ in footprint], [y for _, y in footprint]
+    return Box(max(xs), min(xs), max(ys), min(ys))
+
+
+@lru_cache(maxsize=8)
+def radius(footprint: Corners) -> float:
+    """How far it reaches when it turns on the spot [m]."""
+    return max(math.hypot(x, y) for x, y in footprint)
+
+
+@lru_cache(maxsize=8)
+def edges(footprint: Corners) -> Edges:
+    """The edges of the convex hull, by Andrew's monotone chain."""
+    corners = sorted(set(footprint))
+    hull = _chain(corners)[:-1] + _chain(corners[::-1])[:-1]
+    here = np.array(hull)
+    along = np.roll(here, -1, axis=0) - here
+    normals = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Edges(normals, np.einsum("ij,ij->i", normals, here))
+
+
+def _chain(corners: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    chain: list[tuple[float, float]] = []
+    for corner in corners:
+        while len(chain) > 1 and _right_turn(chain[-2], chain[-1], corner):
+            chain.pop()
+        chain.append(corner)
+    return chain
+
+
+def _right_turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
+    return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])
+
+
+def depth(hull: Edges, points: Floats) -> Floats:
+    """How far `points` (..., 2) are outside the hull at least [m]; below 0 inside."""
+    found: Floats = (points @ hull.normals.T - hull.offsets).max(axis=-1)
+    return found
+
+
+def straight(footprint: Corners, points: Floats, margin: float) -> tuple[float | None, ...]:
+    """Free distances forwards, backwards, to the left and to the right [m]; None: nothing there.
+
+    `margin` [m] is kept free beside the body; what it passes already within that is no obstacle.
+    """
+    front, rear, left, right = box(footprint)
+    x, y = points[:, 0], points[:, 1]
+    return (
+        _along(x, y, front, rear, right, left, margin),
+        _along(-x, y, -rear, -front, right, left, margin),
+        _along(y, x, left, right, rear, front, margin),
+        _along(-y, x, -right, -left, rear, front, margin),
+    )
+
+
+def _along(
+    ahead: Floats, across: Floats, front: float, rear: float, low: float, high: float, margin: float
+) -> float | None:
+    """The least way from `front` to what is in the strip from `low` to `high`.
+
+    What is inside the footprint counts as ahead or behind by which half it is in.
+    """
+    strip = (across >= low - margin) & (across <= high + margin)
+    inside = (ahead > 0) & (ahead <= front) & (across >= low) & (across <= high)
+    inside &= ahead >= rear
+    way = ahead[(strip & (ahead > front)) | inside] - front
+    return max(0.0, float(way.min())) if way.size else None
+
+
+def turning(
+    footprint: Corners, points: Floats, margin: float, reach: float
+) -> tuple[float | None, float | None]:
+    """Free angles to the left and to the right [rad] within `reach` [rad]; None: nothing there."""
+    outer = radius(footprint)
+    near = points[np.hypot(points[:, 0], points[:, 1]) <= outer + margin]
+    if not len(near):
+        return None, None
+    angles = _steps(reach, STEP / outer)
+    still = np.zeros_like(angles)
+    return (
+        _free(footprint, near, margin, angles, still, still, angles),
+        _free(footprint, near, margin, angles, still, still, -angles),
+    )
+
+
+def arc(
+    footprint: Corners,
+    points: Floats,
+    margin: float,
+    reach: float,
+    twist: tuple[float, float, float],
+) -> float | None:
+    """Free way [m] within `reach` [m] along the arc of a twist (vx, vy, w) that is no mere turn."""
+    vx, vy, w = twist
+    speed = math.hypot(vx, vy)
+    outer = radius(footprint)
+    near = points[np.hypot(points[:, 0], points[:, 1]) <= outer + margin + reach]
+    if not len(near):
+        return None
+    quickest = speed + abs(w) * outer  # of the corner that moves most
+    ways = _steps(reach, STEP * speed / quickest)
+    yaw = ways * (w / speed)
+    if abs(w) < 1e-6:
+        sine, cosine = ways / speed, np.zeros_like(ways)
+    else:
+        sine, cosine = np.sin(yaw) / w, (1.0 - np.cos(yaw)) / w
+    x, y = vx * sine - vy * cosine, vx * cosine + vy * sine
+    return _free(footprint, near, margin, ways, x, y, yaw)
+
+
+def _steps(reach: float, step: float) -> Floats:
+    return np.arange(0.0, reach + step, step)
+
+
+def _free(
+    footprint: Corners,
+    points: Floats,
+    margin: float,
+    ways: Floats,
+    x: Floats,
+    y: Floats,
+    yaw: Floats,
+) -> float | None:
+    """The last of `ways` (k,) before the footprint at pose (x, y, yaw) (k,) touches a point.
+
+    What is inside the margin from the start is touched when the body comes nearer to it; what is
+    inside the footprint itself is left to the straight directions, or the body could never turn
+    away from it.
+    """
+    hull = edges(footprint)
+    begin = depth(hull, points)
+    points, begin = points[begin > NEARER], begin[begin > NEARER]
+    if not len(points):
+        return None
+    allowed = np.minimum(margin, begin - NEARER)
+    dx, dy = points[:, 0] - x[:, None], points[:, 1] - y[:, None]
+    cosine, sine = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    seen = np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx], axis=-1)
+    touched = np.flatnonzero((depth(hull, seen) < allowed).any(axis=1))
+    return float(ways[max(0, touched[0] - 1)]) if touched.size else None

@@ -1,0 +1,114 @@
+"""Zenoh sessions: opened and closed beside the event loop, which neither may hold up."""
+
+import asyncio
+import contextlib
+import functools
+import json
+import logging
+import os
+import threading
+from collections.abc import Callable
+
+import zenoh
+
+from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.zenoh_config import explain, plain, session_config
+
+log = logging.getLogger(__name__)
+
+CLOSE_S = 0.5  # a session may take ten seconds to close on a link that loses packets
+
+
+def _config(endpoint: Endpoint) -> zenoh.Config:
+    config = zenoh.Config()
+    for key, value in session_config(endpoint).items():
+        try:
+            config.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise ConfigError(
+                f"{key} = {value!r} is refused by Zenoh: {plain(str(error))}"
+            ) from None
+    return config
+
+
+async def open_session(endpoint: Endpoint) -> zenoh.Session:
+    """Open a session, waiting for the router as long as it takes.
+
+    In a daemon thread, not in the loop's executor: the process must be able to end meanwhile.
+    Raises BusError when a router cannot listen, ConfigError for an endpoint that is none.
+    """
+    config = _config(endpoint)
+    loop = asyncio.get_running_loop()
+    opened: asyncio.Future[zenoh.Session] = loop.create_future()
+
+    def settle(session: zenoh.Session | None, error: zenoh.ZError | None) -> None:
+        if session:
+            opened.set_result(session)
+        elif error:
+            opened.set_exception(error)
+
+    def work() -> None:
+        session, fault = None, None
+        try:
+            session = zenoh.open(config)
+        except zenoh.ZError as error:
+            fault = error
+        try:
+            loop.call_soon_threadsafe(settle, session, fault)
+        except RuntimeError:  # the loop is gone
+            if session:
+                _close(session)
+
+    _in_thread(work)
+    try:
+        return await asyncio.shield(opened)
+    except zenoh.ZError as error:
+        raise BusError(explain(endpoint, str(error))) from None
+    except asyncio.CancelledError:
+        opened.add_done_callback(_discard)
+        raise
+
+
+def _discard(opened: asyncio.Future[zenoh.Session]) -> None:
+    """Close a session that nobody waits for any more."""
+    if opened.exception() is None:
+        _in_thread(functools.partial(_close, opened.result()))
+
+
+def _in_thread(work: Callable[[], None]) -> None:
+    threading.Thread(target=work, name="zenoh-session", daemon=True).start()
+
+
+def _close(session: zenoh.Session) -> None:
+    try:
+        session.close()
+    except zenoh.ZError as error:
+        log.debug("closing the session: %s", error)
+
+
+async def close_session(session: zenoh.Session) -> None:
+    """Close within half a second, or leave the rest to the end of the process."""
+    loop = asyncio.get_running_loop()
+    done = asyncio.Event()
+
+    def work() -> None:
+        _close(session)
+        with contextlib.suppress(RuntimeError):  # the loop did not wait
+            loop.call_soon_threadsafe(done.set)
+
+    _in_thread(work)
+    try:
+        await asyncio.wait_for(done.wait(), CLOSE_S)
+    except TimeoutError:
+        log.debug("the session did not close in %s s", CLOSE_S)
+
+
+def log_to_stdout(directives: str) -> None:
+    """Have Zenoh write its own log to standard output, once and for all of this process.
+
+    `directives` are those of RUST_LOG, and are added to those that a user has set there.
+    """
+    ours = os.environ.get("RUST_LOG", "")
+    os.environ["RUST_LOG"] = f"{ours},{directives}" if ours else directives
+    zenoh.try_init_log_from_env()

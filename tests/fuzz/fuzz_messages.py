@@ -1,0 +1,6 @@
+"""python tests/fuzz/fuzz_messages.py -runs=100000"""
+
+from harness import fuzz
+
+if __name__ == "__main__":
+    fuzz("messages")

@@ -1,0 +1,76 @@
+"""What must hold for whatever stands in a robot's file or in a deployment file."""
+
+import functools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import yaml
+
+from gigabrain_drivers.catalog import driver_class, link_options, robot_files
+from gigabrain_drivers.robot import LINKS, RobotFile
+from gigabrain_zenoh.config import loads
+from gigabrain_zenoh.deployment import Deployment
+from gigabrain_zenoh.errors import ConfigError
+from tests.fuzz.harness import ROOT, split
+
+KINDS = ("deployment", "robot")
+LONGEST_LINE = 2000  # characters of a complaint
+
+
+def check(data: bytes) -> None:
+    """Refused in one line that names the line, or a value that is the same when written again."""
+    kind, rest = split(data, list(KINDS))
+    try:
+        text = rest.decode()
+    except UnicodeDecodeError:  # which `load` refuses before anything else
+        return
+    read = deployment if kind == "deployment" else robot
+    try:
+        value = read(text)
+    except ConfigError as error:
+        told(str(error))
+        return
+    plain = msgspec.to_builtins(value)
+    assert msgspec.to_builtins(read(yaml.safe_dump(plain, allow_unicode=True))) == plain
+
+
+def told(complaint: str) -> None:
+    """One line, and where it is not about a driver's name, which line of the file it is."""
+    assert complaint.startswith(("x.yaml:", "no driver", "no lidar"))
+    assert "\n" not in complaint
+    assert len(complaint) < LONGEST_LINE
+
+
+def deployment(text: str) -> Deployment:
+    """As `gigabrain up` reads it."""
+    return loads(text, Deployment, "x.yaml")
+
+
+def robot(text: str) -> RobotFile:
+    """As the driver's process reads it, down to the options of its links."""
+    found = loads(text, RobotFile, "x.yaml")
+    for name in LINKS:
+        link = getattr(found, name)
+        if link is not None:
+            options = link_options(driver_class(str(link.get("driver"))), link)
+            found = loads(text, exact(name, options), "x.yaml")
+    return found
+
+
+@functools.cache
+def exact(link: str, options: Any) -> type[RobotFile]:
+    """A robot's file with the options of one link."""
+    return msgspec.defstruct(
+        "RobotFile", [(link, options)], bases=(RobotFile,),
+        frozen=True, kw_only=True, forbid_unknown_fields=True,
+    )  # fmt: skip
+
+
+def seeds() -> Iterator[bytes]:
+    """The files that there are."""
+    for path in robot_files().values():
+        yield b"robot\n" + path.read_bytes()
+    for path in sorted(Path(ROOT / "deploy").glob("*.yaml")):
+        yield b"deployment\n" + path.read_bytes()

@@ -1,0 +1,145 @@
+"""Who drives, who is told, and what is written down: a whole robot in memory."""
+
+import asyncio
+import threading
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gigabrain_drivers.latch import LatchFile
+from gigabrain_schemas.audit import AuditRecord
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, RELEASE
+from gigabrain_zenoh.audit_file import read
+from tests.brain_in_memory import Robot
+
+
+class Log:
+    """The audit log of a robot, as others hear it."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._records: list[AuditRecord] = []
+        robot.operator.subscribe(AUDIT, lambda _key, record: self._records.append(record))
+
+    def of(self, *what: str) -> list[tuple[str, str, bool, str]]:
+        return [(r.what, r.source, r.ok, r.text) for r in self._records if r.what in what]
+
+
+async def enable(robot: Robot, source: str, take: bool = False, by: str = "") -> GateReply:
+    [reply] = await robot.operator.ask(ENABLE, EnableRequest(source=source, take=take, by=by))
+    return reply
+
+
+async def driving(robot: Robot) -> None:
+    for _ in range(20):
+        if (await robot.go(10))[-1] == pytest.approx(0.26):
+            return
+    raise AssertionError(robot.causes)
+
+
+async def test_whoever_just_publishes_commands_is_not_obeyed_counted_and_named(
+    tmp_path: Path,
+) -> None:
+    async with Robot(tmp_path) as robot:
+        log = Log(robot)
+        await driving(robot)
+        for _ in range(50):
+            robot.operator.publish(CMD_VEL, CmdVel(linear_x=-0.2, source="stranger"))
+            assert await robot.go(1) == pytest.approx([0.26])
+        assert log.of("refused") == [
+            (
+                "refused", "stranger", False,
+                "its commands are not obeyed (commander); control drives",
+            )
+        ]  # fmt: skip
+        assert robot.counters["refused_commander"] == 50
+        assert robot.state
+        assert robot.state.gate.commander == "control"
+
+
+async def test_a_second_commander_is_told_who_drives_and_a_take_over_names_both(
+    tmp_path: Path,
+) -> None:
+    async with Robot(tmp_path) as robot:
+        log = Log(robot)
+        await driving(robot)
+        reply = await enable(robot, "ann")
+        assert (reply.ok, reply.text) == (False, "control drives; take it over with take=true")
+        assert (await enable(robot, "ann", take=True)).ok
+        reply = await enable(robot, "control", take=True)
+        assert (reply.ok, reply.text) == (False, "ann drives; only a person hands it to the brain")
+        assert (await enable(robot, "control", take=True, by="bob")).ok
+        assert log.of("enable", "take") == [
+            ("enable", "ann", False, "control drives; take it over with take=true"),
+            ("take", "ann", True, "ann drives, taken over from control"),
+            ("enable", "control", False, "ann drives; only a person hands it to the brain"),
+            ("take", "bob", True, "control drives, taken over from ann"),
+        ]
+
+
+async def test_an_e_stop_is_on_disk_when_it_is_confirmed(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        [reply] = await robot.operator.ask(ESTOP, EstopRequest(source="ann", reason="a child"))
+        assert reply.text == "stopped and latched; e-stop number 1"
+        on_disk = LatchFile(tmp_path).read()
+        assert (on_disk.estop_generation, on_disk.causes[0].code) == (1, "estop")
+        assert await robot.go(1) == [0.0]
+    entries = read(tmp_path, 1000)
+    assert [(e.what, e.source, e.text) for e in entries if e.what == "estop"] == [
+        ("estop", "ann", "stopped and latched; e-stop number 1, a child")
+    ]
+    assert (entries[0].what, entries[-1].what) == ("boot", "end")
+
+
+async def test_a_disk_that_hangs_holds_up_the_confirmation_and_no_tick(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        wakes = threading.Event()
+        monkeypatch.setattr("os.fsync", lambda _fd: wakes.wait(10.0))
+        asking = asyncio.create_task(robot.operator.ask(ESTOP, EstopRequest(source="ann")))
+        assert (await robot.go(50))[1:] == [0.0] * 49
+        assert robot.mode == "latched"
+        assert not asking.done()
+        wakes.set()
+        [reply] = await asking
+        assert reply.text == "stopped and latched; e-stop number 1"
+
+
+async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        (tmp_path / "latch.new").mkdir()  # where the file would be written first
+        [reply] = await robot.operator.ask(ESTOP, EstopRequest(source="ann"))
+        assert reply.gate.mode == "latched"
+        assert "; but a restart would forget it: cannot write" in reply.text
+        assert await robot.go(100) == [0.0] * 100
+        (tmp_path / "latch.new").rmdir()
+        await robot.go(100)  # tried again once a second
+        request = ReleaseRequest(estop_generation=1, source="ann")
+        [reply] = await robot.operator.ask(RELEASE, request)
+        assert reply.text == "released; enable it to move"
+        assert LatchFile(tmp_path).read().estop_generation == 1
+
+
+async def test_causes_are_written_down_when_they_come_and_go_with_who_raised_them(
+    tmp_path: Path,
+) -> None:
+    async with Robot(tmp_path) as robot:
+        log = Log(robot)
+        await driving(robot)
+        robot.freeze("control")
+        await robot.go(30)
+        robot.thaw("control")
+        await driving(robot)
+        seen = [(what, source) for what, source, _, text in log.of("raised", "cleared")]
+        assert ("raised", "gate") in seen
+        assert ("cleared", "gate") in seen
+        assert [text for _, _, _, text in log.of("mode")][-3:-1][0].startswith(
+            "enabled -> stopping"
+        )
+    assert msgspec.json.decode((tmp_path / "latch.json").read_bytes())["causes"] == []

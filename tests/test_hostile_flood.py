@@ -1,0 +1,99 @@
+"""Hostile payloads on every key of a whole robot in memory: its wheels do not notice."""
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE, TOPICS, Service
+from gigabrain_zenoh.faults.hostile import codec_of, hostile_payloads, hostile_values
+from gigabrain_zenoh.settings import Resume
+from tests.brain_in_memory import Robot
+
+TICKS = 200
+PER_TICK = 100  # 20000 payloads in all
+
+
+async def speeds(folder: Path, resume: Resume, per_tick: int) -> list[float]:
+    """What the body did in each tick while so many payloads came in each."""
+    payloads = flood(seed=3)
+    async with Robot(folder, resume=resume) as robot:
+        for _ in range(TICKS):
+            for key, payload in itertools.islice(payloads, per_tick):
+                robot.network.deliver(key, payload)
+            await robot.go(1)
+        return robot.body.speeds
+
+
+def flood(seed: int) -> Iterator[tuple[str, bytes]]:
+    """Without end: one for each key in turn, mostly for the key that the body obeys."""
+    endless = [(topic.at("x"), hostile_payloads(topic.type, seed)) for topic in TOPICS]
+    commands = hostile_payloads(CmdVel, seed + 1)
+    while True:
+        for key, payloads in endless:
+            yield CMD_VEL.key, next(commands)
+            yield key, next(payloads)
+
+
+async def test_a_driving_robot_drives_on_as_if_nothing_had_come(tmp_path: Path) -> None:
+    calm = await speeds(tmp_path / "calm", "auto", 0)
+    assert max(calm) > 0.25
+    assert await speeds(tmp_path / "flooded", "auto", PER_TICK) == calm
+
+
+async def test_a_robot_that_nobody_has_enabled_stands_still(tmp_path: Path) -> None:
+    assert set(await speeds(tmp_path, "manual", PER_TICK)) == {0.0}
+
+
+async def test_values_that_are_valid_all_the_same_move_nothing(tmp_path: Path) -> None:
+    """-0.0, an empty name, 1.5 m/s: they decode, but echo no tick of this robot.
+
+    In the name of control they make safety think that control has fallen silent: that stops.
+    """
+    values, valid = hostile_values(CmdVel, 5), 0
+    async with Robot(tmp_path, resume="auto") as robot:
+        await robot.go(100)
+        assert robot.body.speeds[-1] == pytest.approx(0.26)
+        for _ in range(100):
+            for value in itertools.islice(values, 50):
+                payload = msgspec.msgpack.encode(value)
+                valid += is_valid(payload)
+                robot.network.deliver(CMD_VEL.key, payload)
+            await robot.go(1)
+        assert valid > 500
+        assert robot.counters["refused_boot"] == valid
+        assert robot.state
+        assert (robot.state.pose.y, robot.state.pose.yaw) == (0.0, 0.0)
+        assert min(robot.body.speeds) == 0.0
+        assert max(robot.body.speeds) == pytest.approx(0.26)
+
+
+def is_valid(payload: bytes) -> bool:
+    try:
+        codec_of(CmdVel).decode(payload)
+    except ValueError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("service", [ESTOP, RELEASE, ENABLE], ids=lambda service: service.key)
+async def test_hostile_requests_are_refused_with_a_reason(
+    tmp_path: Path, service: Service[Any, Any]
+) -> None:
+    async with Robot(tmp_path, resume="manual") as robot:
+        await robot.go(30)
+        stranger = robot.network.transport()
+        for payload in itertools.islice(hostile_payloads(service.request, 7), 500):
+            if not payload:  # an empty request has nothing but defaults
+                continue
+            replies = await stranger.query(service.key, payload, "", 1.0, service.priority)
+            assert replies
+            assert all(isinstance(reply, str) and "not a valid" in reply for reply in replies)
+        await robot.go(1)
+        assert robot.mode == "latched"
+        assert robot.state
+        assert robot.state.gate.estop_generation == 0

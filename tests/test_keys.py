@@ -1,0 +1,218 @@
+"""Keys on disk: how they are made, what is refused, and what the refusal says."""
+
+import datetime
+import os
+import shutil
+import stat
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
+from gigabrain_zenoh.deployment import (
+    Deployment,
+    check_keys,
+    client_endpoint,
+    load_deployment,
+    process_specs,
+)
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.keys.authority import issue, new_fleet
+from gigabrain_zenoh.keys.identity import load
+from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.zenoh_config import session_config
+from tests.stack import Home
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def copied(fleet: Path, tmp_path: Path) -> Path:
+    """A fleet's folder that a test may spoil."""
+    return Path(shutil.copytree(fleet, tmp_path / "fleet"))
+
+
+def mode(path: Path) -> int:
+    return stat.S_IMODE(path.stat().st_mode)
+
+
+def test_private_keys_are_their_owners_alone(tmp_path: Path) -> None:
+    old = os.umask(0)
+    try:
+        new_fleet("home", tmp_path / "home")
+        folder = issue(tmp_path / "home", "brain")
+    finally:
+        os.umask(old)
+    assert mode(tmp_path / "home") == mode(folder) == 0o700
+    assert mode(tmp_path / "home" / "ca.key") == mode(folder / "identity.key") == 0o600
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "ca.crt",
+        "identity.crt",
+        "identity.key",
+    ]
+
+
+def test_nothing_is_overwritten(copied: Path) -> None:
+    before = (copied / "ca.key").read_bytes()
+    with pytest.raises(ConfigError, match=r"fleet exists already; keys are never overwritten"):
+        new_fleet("home", copied)
+    with pytest.raises(ConfigError, match=r"operator exists already; keys are never overwritten"):
+        issue(copied, "operator")
+    assert (copied / "ca.key").read_bytes() == before
+    assert not list(copied.glob(".*"))
+
+
+def test_only_who_may_be_a_router_can_pass_for_one(fleet: Path) -> None:
+    may_serve = set()
+    for folder in fleet.iterdir():
+        if folder.is_dir():
+            certificate = x509.load_pem_x509_certificate((folder / "identity.crt").read_bytes())
+            usage = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+            if ExtendedKeyUsageOID.SERVER_AUTH in usage:
+                may_serve.add(folder.name)
+    assert may_serve == {"robot@red", "robot@blue", "robot@green", "router"}
+
+
+def test_an_identity_says_who_it_is_and_for_how_long(fleet: Path) -> None:
+    identity = load(fleet / "robot@red")
+    assert (identity.name, identity.role, identity.robot) == ("robot@red", "robot", "red")
+    assert (identity.fleet, identity.hosts) == ("home", ("localhost", "127.0.0.1", "::1"))
+    days = identity.days_left(datetime.datetime.now(datetime.UTC))
+    assert 364 < days < 365
+
+
+def test_what_is_wrong_with_keys_is_said_with_what_to_do(copied: Path) -> None:
+    def refused(folder: Path, now: datetime.datetime | None = None) -> str:
+        with pytest.raises(ConfigError) as error:
+            load(folder, now)
+        return str(error.value).replace(str(copied), "F")
+
+    soon = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=366)
+    day = f"{load(copied / 'operator').expires:%Y-%m-%d}"
+    assert refused(copied / "operator", soon) == (
+        f"F/operator/identity.crt expired on {day}; make a new identity with "
+        "`gigabrain keys issue operator` and copy its folder here"
+    )
+    early = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+    assert refused(copied / "operator", early).endswith("; is this machine's clock right?")
+    assert refused(copied / "nobody") == (
+        "F/nobody: no folder with keys; make an identity with `gigabrain keys issue ROLE` "
+        "and copy its folder here"
+    )
+    (copied / "viewer@red" / "identity.key").chmod(0o640)
+    key = "F/viewer@red/identity.key"
+    assert refused(copied / "viewer@red") == f"{key} is open to others (mode 0640); chmod 600 {key}"
+    (copied / "brain@red" / "identity.key").unlink()
+    remedy = "copy the whole folder that `gigabrain keys issue` made"
+    assert refused(copied / "brain@red") == f"F/brain@red: identity.key is missing; {remedy}"
+    other = copied / "other"
+    new_fleet("other", other)
+    foreign = copied / "robot@red"
+    shutil.copy(other / "ca.crt", foreign / "ca.crt")
+    assert refused(foreign) == (
+        f"F/robot@red/identity.crt was not issued by the fleet of ca.crt; {remedy}"
+    )
+    shutil.copy(copied / "operator" / "identity.key", copied / "router" / "identity.key")
+    assert refused(copied / "router") == (
+        f"F/router/identity.key does not belong to identity.crt; {remedy}"
+    )
+    (copied / "operator" / "identity.crt").write_text("-----BEGIN")
+    assert refused(copied / "operator") == f"F/operator/identity.crt is no certificate; {remedy}"
+
+
+def test_a_session_does_not_begin_with_a_key_that_others_may_read(copied: Path) -> None:
+    (copied / "operator" / "identity.key").chmod(0o644)
+    endpoint = Endpoint(connect=("tcp/127.0.0.1:7447",), keys=str(copied / "operator"))
+    with pytest.raises(ConfigError, match="is open to others"):
+        session_config(endpoint)
+
+
+def test_with_keys_everything_is_tls_and_without_nothing_is(fleet: Path) -> None:
+    keys = str(fleet / "robot@red")
+    config = session_config(Endpoint(connect=("tcp/10.0.0.1:7447",), keys=keys))
+    assert config["connect/endpoints"] == ["tls/10.0.0.1:7447"]
+    assert config["transport/link/tls"]["enable_mtls"] is True
+    with pytest.raises(ConfigError, match=r"'udp/10\.0\.0\.1:1': with keys, expected one like tls"):
+        session_config(Endpoint(connect=("udp/10.0.0.1:1",), keys=keys))
+    with pytest.raises(ConfigError, match=r"tls/10\.0\.0\.1:1 needs keys"):
+        session_config(Endpoint(connect=("tls/10.0.0.1:1",)))
+
+
+def test_beyond_loopback_a_router_wants_keys_or_to_be_called_insecure() -> None:
+    at = "tcp/192.168.1.10:7447"
+    with pytest.raises(ValueError, match="`gigabrain keys new`"):
+        Deployment(router=at)
+    assert Deployment(router=at, insecure=True).router == at
+    assert Deployment(router=at, keys="keys").router == at
+
+
+def test_keys_lie_beside_their_file_one_folder_for_all_hosts_or_one_each(
+    fleet: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "site.yaml"
+    path.write_text("keys: home\nnamespace: red\nhosts:\n  robot@red: [router, driver]\n")
+    shutil.copytree(fleet, tmp_path / "home")
+    deployment = load_deployment(path)
+    assert client_endpoint(deployment, "robot@red").keys == str(tmp_path / "home" / "robot@red")
+    of_one = load_deployment(path, keys=str(fleet / "brain@red"))
+    assert client_endpoint(of_one, "robot@red").keys == str(fleet / "brain@red")
+
+
+def test_a_host_is_refused_an_identity_that_is_not_for_it(fleet: Path) -> None:
+    def refused(name: str, *processes: str, **values: str) -> str:
+        deployment = Deployment(
+            keys=str(fleet / name), hosts={"h": processes}, **{"namespace": "red", **values}
+        )
+        with pytest.raises(ConfigError) as error:
+            check_keys(deployment, "h")
+        return str(error.value).replace(str(fleet), "F")
+
+    assert refused("brain@red", "perception", "control") == (
+        "F/brain@red is the identity of brain@red; control needs that of robot@red"
+    )
+    assert refused("robot@blue", "control") == (
+        "F/robot@blue is the identity of robot@blue; expected robot@red"
+    )
+    assert refused("robot@red", "router", router="tcp/10.0.0.5:7447") == (
+        "F/robot@red is for a router at localhost, 127.0.0.1, ::1, not at 10.0.0.5; "
+        "issue one with --host 10.0.0.5"
+    )
+    fits = Deployment(keys=str(fleet / "brain@red"), hosts={"h": ("decision",)}, namespace="red")
+    check_keys(fits, "h")
+
+
+def test_the_router_listens_where_it_is_told_and_on_a_socket_of_its_user(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    deployment = Deployment(keys=str(fleet / "robot@red"), namespace="red", fleet=("blue",))
+    router = process_specs(deployment, "robot", tmp_path, tmp_path)[0].argv[-1]
+    assert '"listen":["tls/127.0.0.1:7447","unixsock-stream/' in router
+    assert '"robot@blue"' in router
+
+
+def test_the_committed_router_of_a_larger_site_is_what_the_command_prints() -> None:
+    from gigabrain_zenoh.keys.zenohd import configuration
+
+    committed = (ROOT / "deploy" / "zenohd" / "zenohd.json5").read_text()
+    made = configuration(("red", "blue"), "/etc/gigabrain/keys", "tls/0.0.0.0:7447")
+    assert committed == made
+
+
+async def test_keys_are_made_and_listed_by_command(home: Home) -> None:
+    folder = str(home.folder / "fleet")
+    new = await home.run("keys", "new", "home", "--dir", folder)
+    assert new.out.splitlines()[-1] == (
+        f"next: gigabrain keys issue robot --host ADDRESS --dir {folder}"
+    )
+    issued = await home.run("keys", "issue", "viewer", "--days", "3", "--dir", folder)
+    assert issued.out.startswith(f"{folder}/viewer: copy it to its host")
+    listed = await home.run("keys", "list", "--dir", folder)
+    assert listed.out.startswith("viewer               viewer of home  ")
+    assert listed.out.endswith("in 3 days  SOON\n")
+    (home.folder / "fleet" / "viewer" / "identity.key").chmod(0o644)
+    assert await home.start("keys", "list", "--dir", folder).ended() == 1
+    again = await home.run("keys", "new", "home", "--dir", folder)
+    assert await again.ended() == 2
+    assert "keys are never overwritten" in again.err

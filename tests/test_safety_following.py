@@ -1,0 +1,102 @@
+"""Odometry that does not follow the command: runaway, too slow, stuck, frozen."""
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import GateStatus, RobotState
+from tests.brain_rig import DRIVING, state
+from tests.safety_rig import Patrol
+
+REST, AHEAD, TURN = Velocity(), Velocity(linear_x=0.2), Velocity(angular_z=1.0)
+IDLE = GateStatus(mode="idle")
+
+
+def under_way(told: Velocity = AHEAD) -> Patrol:
+    """A body that follows its command; it was given time to get up to speed."""
+    patrol = Patrol()
+    for tick in range(60):
+        share = min(1.0, (tick + 1) / 20)
+        moves = Velocity(linear_x=told.linear_x * share, angular_z=told.angular_z * share)
+        assert patrol.go(told=told, moves=moves) == []
+    return patrol
+
+
+@pytest.mark.parametrize("told", [AHEAD, TURN, Velocity(linear_x=-0.2, angular_z=0.5)])
+def test_a_body_that_follows_is_left_alone(told: Velocity) -> None:
+    patrol = under_way(told)
+    assert patrol.go(100, told=told) == []
+
+
+@pytest.mark.parametrize("share", [0.8, 1.25])
+def test_a_body_that_control_can_correct_is_left_alone(share: float) -> None:
+    moves = Velocity(linear_x=0.2 * share)
+    assert under_way().go(200, told=AHEAD, moves=moves) == []
+
+
+@pytest.mark.parametrize(
+    "moves", [Velocity(linear_x=0.06), Velocity(linear_x=-0.06), Velocity(angular_z=0.4)]
+)
+def test_what_moves_or_turns_at_command_zero_runs_away(moves: Velocity) -> None:
+    patrol = under_way(REST)
+    assert patrol.go(14, moves=moves) == []
+    assert patrol.go(moves=moves) == ["runaway"]
+    assert patrol.verdict.causes[0].latching
+
+
+def test_a_body_that_goes_on_when_told_to_stop_runs_away() -> None:
+    patrol = under_way()
+    ticks = patrol.ticks_until("runaway", 60, told=REST, moves=AHEAD)
+    assert ticks <= 40  # the ramp of 0.2 s, the 0.3 s that explain it, and 0.3 s of patience
+
+
+def test_one_wheel_that_is_stuck_turns_the_body_and_is_found() -> None:
+    moves = Velocity(linear_x=0.1, angular_z=0.7)
+    assert under_way().ticks_until("runaway", 20, told=AHEAD, moves=moves) == 15
+
+
+def test_a_body_that_coasts_to_rest_as_it_can_is_left_alone() -> None:
+    patrol = under_way()
+    for tick in range(20):
+        assert patrol.go(told=REST, moves=Velocity(linear_x=max(0.0, 0.2 - 0.012 * tick))) == []
+
+
+def test_a_body_that_is_much_slower_than_told_is_found() -> None:
+    patrol = under_way()
+    assert patrol.ticks_until("not_following", 40, told=AHEAD, moves=Velocity(linear_x=0.08)) == 15
+    assert not patrol.verdict.causes[0].latching
+
+
+def test_a_body_that_creeps_does_not_move_for_two_seconds_and_is_stuck() -> None:
+    slowly = Velocity(linear_x=0.06)
+    patrol = under_way(slowly)
+    assert patrol.ticks_until("stuck", 120, told=slowly, moves=Velocity(linear_x=0.001)) == 100
+
+
+def test_frozen_telemetry_is_found_within_half_a_second() -> None:
+    patrol = under_way()
+    assert patrol.ticks_until("telemetry_frozen", 30, told=AHEAD, frozen=True) == 20
+
+
+def test_a_body_at_rest_may_repeat_itself() -> None:
+    assert under_way(REST).go(300, frozen=True) == []
+
+
+def test_a_person_may_push_a_body_that_is_off_duty() -> None:
+    patrol = under_way(REST)
+    patrol.go(100, gate=IDLE)
+    assert patrol.go(100, gate=IDLE, moves=AHEAD) == []
+
+
+def test_a_body_that_runs_away_as_the_gate_closes_is_still_found() -> None:
+    patrol = under_way()
+    ticks = patrol.ticks_until("runaway", 60, told=AHEAD, moves=AHEAD, gate=IDLE)
+    assert ticks <= 40
+
+
+def test_safety_that_starts_late_takes_a_moving_body_as_it_is() -> None:
+    class Late(Patrol):
+        def _state(self, *args: object) -> RobotState:
+            return replace(state(1), velocity=AHEAD)
+
+    assert "runaway" not in Late().go(5, told=AHEAD, gate=DRIVING)

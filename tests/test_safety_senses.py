@@ -1,0 +1,95 @@
+"""Tilt, knocks, slow commands, and the computer itself."""
+
+import math
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.body import Thresholds
+from gigabrain_zenoh.safety.attitude import tilt_deg
+from gigabrain_zenoh.safety.host import Host, HostWatch, warnings
+from tests.safety_rig import BODY, Patrol, imu
+
+
+def rolled(degrees: float, axis: int = 0) -> tuple[float, float, float, float]:
+    half = math.radians(degrees) / 2
+    parts = [0.0, 0.0, 0.0, math.cos(half)]
+    parts[axis] = math.sin(half)
+    return parts[0], parts[1], parts[2], parts[3]
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_tilted_body_stops_for_good_after_200_ms(axis: int) -> None:
+    patrol = Patrol()
+    assert patrol.go(50, imu=imu(rolled(29.0, axis))) == []
+    assert patrol.go(9, imu=imu(rolled(31.0, axis))) == []
+    assert patrol.go(imu=imu(rolled(31.0, axis))) == ["tilted"]
+    assert patrol.verdict.causes[0].latching
+
+
+def test_turning_is_no_tilt() -> None:
+    assert tilt_deg(rolled(90.0, 2)) == pytest.approx(0.0)
+    assert tilt_deg(rolled(180.0, 0)) == pytest.approx(180.0)
+
+
+def test_what_is_no_attitude_says_nothing_of_tilt() -> None:
+    assert tilt_deg((0.0, 0.0, 0.0, 0.0)) is None
+    assert Patrol().go(50, imu=imu((0.0, 0.0, 0.0, 0.0))) == []
+
+
+def test_a_body_may_be_allowed_to_lean_farther() -> None:
+    legs = Patrol(replace(BODY, thresholds=Thresholds(tilt_stop=45.0)))
+    assert legs.go(50, imu=imu(rolled(44.0))) == []
+
+
+def test_a_bumper_stops_the_body_for_good_at_once() -> None:
+    patrol = Patrol()
+    assert patrol.go(bumpers=(False, True)) == ["collision"]
+    assert patrol.verdict.causes[0].latching
+    assert patrol.go(bumpers=(False, False)) == []  # the gate stays latched
+
+
+@pytest.mark.parametrize(("push", "stopped"), [(39.0, []), (-41.0, ["collision"])])
+def test_a_hard_knock_is_a_collision(push: float, stopped: list[str]) -> None:
+    assert Patrol().go(imu=imu(push=push)) == stopped
+    assert Patrol().go(imu=imu(), shock=abs(push)) == stopped
+
+
+def test_slow_commands_halve_the_speed_after_a_second() -> None:
+    patrol = Patrol()
+    assert patrol.go(200, echo_ages=(5,)) == []  # 100 ms
+    ticks = patrol.ticks_until("round_trip", 60, echo_ages=(6,))
+    assert ticks == 51  # two of a hundred are more than one in a hundred, then a second
+    assert patrol.verdict.verdict == "slow"
+    caps = patrol.verdict.caps
+    assert (caps.forward, caps.backward, caps.rotation) == (0.13, 0.13, 0.91)
+    patrol.go(100, echo_ages=(1,))
+    assert patrol.verdict.verdict == "ok"
+
+
+def test_a_single_slow_command_does_nothing() -> None:
+    patrol = Patrol()
+    patrol.go(100, echo_ages=(1,))
+    for _ in range(5):
+        patrol.go(echo_ages=(20,))
+        assert patrol.go(120, echo_ages=(1,)) == []
+
+
+def test_a_host_without_room_is_a_warning_and_no_more() -> None:
+    patrol = Patrol()
+    patrol.go(host=Host(disk_mb=499.0, cpu=95.1, memory=95.1))
+    assert patrol.warnings == ["disk_low", "cpu_busy", "memory_low"]
+    assert patrol.verdict.verdict == "ok"
+    assert warnings(Thresholds(), Host(disk_mb=500.0, cpu=95.0, memory=95.0)) == ()
+    assert warnings(Thresholds(), Host()) == ()
+
+
+def test_the_host_is_looked_at_once_a_second() -> None:
+    watch = HostWatch()
+    first = watch.now(1)
+    assert watch.now(900_000_000) is first
+    assert first.disk_mb is None or first.disk_mb > 0
+    assert first.memory is None or 0 < first.memory <= 100
+    for second in range(1, 12):
+        last = watch.now(second * 1_100_000_000)
+    assert last.cpu is None or 0 <= last.cpu <= 100

@@ -1,0 +1,146 @@
+"""The protective field: every direction, curves, what is unknown, and no flicker."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import Thresholds
+from gigabrain_schemas.safety import SpeedCaps
+from gigabrain_zenoh.safety.unknown import SECTORS
+from tests.brain_rig import LIDAR, WAFFLE, open_space
+from tests.safety_rig import BODY, Patrol
+
+AHEAD = Velocity(linear_x=0.2)
+OMNI = replace(BODY, drive_type="omni", max_lateral_speed=0.2)
+
+
+def near(degrees: int, distance: float) -> np.ndarray:
+    return open_space(**{f"deg_{degrees % 360}": distance})
+
+
+@pytest.mark.parametrize(
+    ("degrees", "distance", "moves", "code", "cap"),
+    [
+        (0, 0.22, Velocity(linear_x=0.2), "zone_ahead", "forward"),
+        (180, 0.34, Velocity(linear_x=-0.2), "zone_behind", "backward"),
+        (90, 0.30, Velocity(linear_y=0.2), "zone_left", "left"),
+        (270, 0.30, Velocity(linear_y=-0.2), "zone_right", "right"),
+    ],
+)
+def test_each_way_has_its_zone(
+    degrees: int, distance: float, moves: Velocity, code: str, cap: str
+) -> None:
+    patrol = Patrol(OMNI)
+    patrol.go(20, told=moves)
+    assert patrol.go(5, told=moves, values=near(degrees, distance)) == [code]
+    assert getattr(patrol.verdict.caps, cap) == 0.0
+    assert patrol.verdict.verdict == "slow"
+    others = {"forward", "backward", "left", "right"} - {cap}
+    assert {getattr(patrol.verdict.caps, other) for other in others} == {None}
+
+
+def test_a_body_that_cannot_go_sideways_has_no_caps_for_it() -> None:
+    patrol = Patrol()
+    patrol.go(5, values=near(90, 0.17))
+    assert (patrol.verdict.caps.left, patrol.verdict.caps.right) == (None, None)
+
+
+def test_a_turn_is_stopped_before_a_corner_swings_into_something() -> None:
+    turn = Velocity(angular_z=1.0)
+    values = near(-125, 0.244)
+    patrol = Patrol()
+    patrol.go(20, told=turn)
+    assert patrol.go(5, told=turn, values=values) == ["zone_turn_left"]
+    assert patrol.verdict.caps == SpeedCaps(turn_left=0.0)  # ahead, back and the other way are free
+
+
+def test_a_curve_is_capped_by_what_it_leads_to() -> None:
+    """A circle of 0.2 m to the left, and (0.26, 0.05): 0.185 m straight on, 0.13 m by the arc."""
+    curve = Velocity(linear_x=0.2, angular_z=1.0)
+    values = near(11, 0.265)
+    straight, curving = Patrol(), Patrol()
+    straight.go(60, told=AHEAD)
+    curving.go(60, told=curve)
+    assert straight.go(5, told=AHEAD, values=values) == []
+    assert curving.go(5, told=curve, values=values) == ["zone_ahead"]
+
+
+def test_the_zone_goes_by_the_larger_of_measured_and_told() -> None:
+    values = near(0, 0.22)  # 0.145 m free: enough at rest, not at 0.2 m/s
+    at_rest, coasting, starting = Patrol(), Patrol(), Patrol()
+    assert at_rest.go(5, values=values) == []
+    coasting.go(60, told=AHEAD)
+    coasting.go(10, moves=AHEAD)  # told to stop, and still moving
+    assert coasting.go(5, moves=AHEAD, values=values) == ["zone_ahead"]
+    starting.go(10, told=AHEAD, moves=Velocity())  # told to go, and not moving yet
+    assert starting.go(5, told=AHEAD, moves=Velocity(), values=values) == ["zone_ahead"]
+
+
+def test_in_front_of_a_wall_it_does_not_flicker() -> None:
+    """The wall at 0.15 m with a noise of 1 cm: once closed the way stays closed."""
+    patrol, rng, found = Patrol(), np.random.default_rng(1), []
+    patrol.go(60, told=AHEAD)
+    for _ in range(60):
+        values = near(0, 0.075 + 0.15 + rng.normal(0.0, 0.01))
+        obeyed = patrol.memory.following.told
+        found.append(tuple(patrol.go(5, told=AHEAD, moves=obeyed, values=values)))
+    closed = found.index(("zone_ahead",))
+    assert set(found[closed:]) == {("zone_ahead",)}
+
+
+def test_a_sector_that_goes_dark_is_an_obstacle_where_it_was_last_seen() -> None:
+    patrol = Patrol()
+    wall = np.full(360, np.inf)
+    wall[80:91] = 0.5
+    patrol.go(5, values=wall)
+    wall[80:91] = np.nan
+    patrol.go(5, values=wall)
+    sector = 80 * SECTORS // 360
+    assert patrol.memory.field.sectors[sector] == pytest.approx(0.5)
+
+
+def test_what_is_dark_comes_nearer_as_the_body_moves() -> None:
+    patrol = Patrol()
+    values = np.full(360, np.inf)
+    values[-12:] = values[:12] = 1.0  # a wall ahead
+    patrol.go(60, told=AHEAD, values=values)
+    values[0:10] = np.nan  # a sector of it is not seen any more
+    found = patrol.ticks_until("zone_ahead", 300, told=AHEAD, values=values)
+    assert found * 0.02 * 0.2 == pytest.approx(1.0 - 0.075 - 0.144, abs=0.05)
+
+
+def test_a_dark_sector_keeps_its_direction_while_the_body_turns() -> None:
+    patrol = Patrol()
+    values = np.full(360, np.inf)
+    values[80:91] = 0.30
+    patrol.go(5, values=values)
+    dark = np.full(360, np.inf)
+    dark[20:32] = np.nan  # the same direction, after a turn of 60 degrees to the left
+    patrol.pose = replace(patrol.pose, yaw=np.pi / 3)
+    patrol.go(5, values=dark)
+    assert patrol.memory.field.sectors[8] == pytest.approx(0.30)
+    forward = patrol.verdict.caps.forward
+    assert forward is not None
+    assert forward < 0.26
+
+
+def test_a_lidar_that_cannot_tell_nothing_from_unknown_keeps_what_it_saw() -> None:
+    body = replace(WAFFLE, lidar=replace(LIDAR, no_return="unknown"), thresholds=Thresholds())
+    room = np.linspace(1.0, 2.0, 360)
+    patrol = Patrol(body, room)
+    room[30:41] = np.inf
+    patrol.go(5, values=room)
+    assert patrol.memory.field.sectors[3] == pytest.approx(1.083, abs=0.001)
+    free = Patrol()
+    free.go(5, values=room)
+    assert free.memory.field.sectors[3] == np.inf
+
+
+def test_what_was_never_seen_closes_the_way() -> None:
+    masked = np.full(360, np.inf)
+    masked[0:10] = np.nan
+    patrol = Patrol(values=masked)
+    assert patrol.verdict.caps.forward == 0.0
+    assert patrol.verdict.caps.turn_left is None
+    assert patrol.verdict.caps.turn_right is None

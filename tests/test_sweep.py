@@ -1,0 +1,130 @@
+"""How far a footprint can go: straight, turning and along arcs."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gigabrain_zenoh.sweep import arc, depth, edges, radius, straight, turning
+
+WAFFLE = ((0.075, 0.155), (-0.200, 0.155), (-0.200, -0.155), (0.075, -0.155))
+ROUND = tuple(
+    (0.2 * math.cos(i * math.tau / 32), 0.2 * math.sin(i * math.tau / 32)) for i in range(32)
+)
+
+
+def at(*points: tuple[float, float]) -> np.ndarray:
+    return np.array(points).reshape(-1, 2)
+
+
+def ways(x: float, y: float) -> tuple[float | None, ...]:
+    return straight(WAFFLE, at((x, y)), 0.03)
+
+
+def test_the_room_is_measured_from_the_edges_of_the_footprint() -> None:
+    assert ways(0.575, 0.0) == pytest.approx((0.5, None, None, None))
+    assert ways(-0.5, 0.0) == pytest.approx((None, 0.3, None, None))
+    assert ways(0.0, 0.555) == pytest.approx((None, None, 0.4, None))
+    assert ways(0.0, -0.555) == pytest.approx((None, None, None, 0.4))
+    assert straight(WAFFLE, at(), 0.03) == (None, None, None, None)
+
+
+@pytest.mark.parametrize(("y", "counts"), [(0.18, True), (-0.18, True), (0.19, False)])
+def test_what_the_body_would_pass_with_three_centimetres_to_spare_does_not_count(
+    y: float, counts: bool
+) -> None:
+    assert (ways(0.5, y)[0] is not None) is counts
+
+
+def test_what_is_beside_the_body_does_not_keep_it_from_going_on() -> None:
+    assert ways(0.0, 0.17)[:2] == (None, None)
+    assert ways(0.0, 0.17)[2:] == pytest.approx((0.015, None))
+
+
+def test_what_is_within_the_footprint_leaves_no_room_on_its_side() -> None:
+    assert ways(0.05, 0.10)[:2] == (0.0, None)
+    assert ways(-0.15, 0.05)[:2] == (None, 0.0)
+
+
+def test_the_hull_of_a_footprint_knows_inside_from_outside() -> None:
+    hull = edges(((1.0, 1.0), (-1.0, 1.0), (0.0, 0.0), (-1.0, -1.0), (1.0, -1.0)))  # a notch
+    assert len(hull.offsets) == 4
+    assert depth(hull, at((0.0, 0.0), (2.0, 0.0), (0.0, -1.5))) == pytest.approx([-1.0, 1.0, 0.5])
+    assert radius(WAFFLE) == pytest.approx(0.253, abs=0.001)
+
+
+def test_the_rear_corner_swings_into_what_is_beside_it() -> None:
+    """Turning left takes the right rear corner there; turning right takes no corner so far out."""
+    beside = at((-0.14, -0.20))  # at 0.244 m, 4.5 cm from the right side
+    left, right = turning(WAFFLE, beside, 0.02, 2.0)
+    corner, point = math.atan2(-0.155, -0.200), math.atan2(-0.20, -0.14)
+    assert left is not None
+    assert 0.0 <= left < point - corner  # 0.30 rad, less what its thickness and the margin take
+    assert right is None
+
+
+def test_nothing_within_its_circle_is_in_the_way_of_turning() -> None:
+    assert turning(WAFFLE, at((0.28, 0.0), (0.0, -0.28)), 0.02, 2.0) == (None, None)
+    assert turning(ROUND, at((0.23, 0.0)), 0.02, 2.0) == (None, None)  # a round body sweeps nothing
+
+
+def test_a_wall_that_is_too_near_may_be_turned_away_from() -> None:
+    """1 cm in front of the right front corner: turning left takes the corner into it."""
+    left, right = turning(WAFFLE, at((0.085, -0.14)), 0.02, 0.5)
+    assert left is not None
+    assert left < 0.1
+    assert right is None
+
+
+def test_what_is_inside_the_footprint_does_not_forbid_to_turn() -> None:
+    assert turning(WAFFLE, at((0.0, 0.0)), 0.02, 2.0) == (None, None)
+
+
+def test_an_arc_reaches_what_is_beside_the_straight_way() -> None:
+    """On a circle of 0.5 m to the left; at its quarter the body's middle is at (0.5, 0.5)."""
+    quarter = 0.5 * math.pi / 2
+    ahead = at((0.5, 0.75))  # on the left side, and turned a quarter 0.25 m in front of the middle
+    way = arc(WAFFLE, ahead, 0.03, 2.0, (0.25, 0.0, 0.5))
+    assert way == pytest.approx(quarter + 0.25 - 0.075 - 0.03, abs=0.05)
+    assert straight(WAFFLE, ahead, 0.03)[0] is None
+    assert arc(WAFFLE, ahead, 0.03, 2.0, (0.25, 0.0, -0.5)) is None
+
+
+def test_backwards_an_arc_sweeps_what_is_behind() -> None:
+    assert arc(WAFFLE, at((-0.5, -0.25)), 0.03, 1.0, (-0.2, 0.0, 0.5)) is not None
+    assert arc(WAFFLE, at((-0.5, 0.45)), 0.03, 1.0, (-0.2, 0.0, 0.5)) is None
+
+
+def test_without_a_turn_an_arc_is_straight() -> None:
+    way = arc(WAFFLE, at((0.575, 0.0)), 0.03, 1.0, (0.2, 0.0, 0.0))
+    assert way == pytest.approx(0.47, abs=0.021)
+    across = arc(WAFFLE, at((0.0, 0.555)), 0.03, 1.0, (0.0, 0.2, 0.0))
+    assert across == pytest.approx(0.37, abs=0.021)
+
+
+@settings(deadline=None, max_examples=200)
+@given(
+    st.floats(-0.6, 0.6),
+    st.floats(-0.6, 0.6),
+    st.floats(0.05, 0.3),
+    st.floats(-1.8, 1.8),
+)
+def test_before_the_free_way_is_over_nothing_is_inside_the_body(
+    x: float, y: float, v: float, w: float
+) -> None:
+    """Followed in steps of a millimetre, by another formula."""
+    hull = edges(WAFFLE)
+    if depth(hull, at((x, y)))[0] <= 0.005:
+        return
+    way = arc(WAFFLE, at((x, y)), 0.03, 0.5, (v, 0.0, w))
+    px, py, yaw = 0.0, 0.0, 0.0
+    for _ in range(round((0.5 if way is None else way) / 0.001)):
+        dt = 0.001 / v
+        px += v * math.cos(yaw) * dt
+        py += v * math.sin(yaw) * dt
+        yaw += w * dt
+        c, s = math.cos(yaw), math.sin(yaw)
+        seen = at((c * (x - px) + s * (y - py), c * (y - py) - s * (x - px)))
+        assert depth(hull, seen)[0] > 0.0

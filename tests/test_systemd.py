@@ -1,0 +1,118 @@
+"""The files for service managers and containers, as far as they can be checked without either."""
+
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+import yaml
+
+from gigabrain_zenoh.deployment import load_deployment
+from tests.onlooker import looking_on
+from tests.stack import ROOT, Home, endpoint_of, until
+
+UNIT = ROOT / "deploy" / "systemd" / "gigabrain@.service"
+DOCKER = ROOT / "deploy" / "docker"
+
+
+@pytest.fixture(scope="module")
+def unit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The unit of the host `robot`, with a program that is there."""
+    if not shutil.which("systemd-analyze"):
+        pytest.skip("no systemd-analyze here")
+    path = tmp_path_factory.mktemp("units") / "gigabrain@robot.service"
+    path.write_text(UNIT.read_text().replace("/opt/gigabrain/bin/gigabrain", "/bin/true"))
+    return path
+
+
+def analyze(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(("systemd-analyze", *words), capture_output=True, text=True)
+
+
+def test_systemd_finds_nothing_wrong_with_the_unit(unit: Path) -> None:
+    verified = analyze("verify", "--man=no", str(unit))
+    assert (verified.returncode, verified.stdout, verified.stderr) == (0, "", "")
+
+
+def test_the_unit_is_exposed_to_2_of_10_at_most(unit: Path) -> None:
+    judged = analyze("security", "--offline=true", "--threshold=20", "--no-pager", str(unit))
+    if "unrecognized option" in judged.stderr:
+        pytest.skip("this systemd-analyze cannot judge a unit that does not run")
+    assert judged.returncode == 0, judged.stdout
+
+
+BARE = """
+mount --bind {folder} {folder} && mount -o remount,bind,ro / &&
+exec setpriv --no-new-privs --bounding-set=-all --inh-caps=-all -- "$@"
+"""
+
+
+@pytest.fixture
+def bare(tmp_path: Path) -> Iterator[Home]:
+    """A home on a system that is read-only but for it, for processes that may do nothing else."""
+    inside = ("unshare", "--mount", "--", "sh", "-c", BARE.format(folder=tmp_path), "sh")
+    if not all(map(shutil.which, ("unshare", "setpriv", "mount"))):
+        pytest.skip("no unshare, setpriv and mount here")
+    if subprocess.run((*inside, "true"), capture_output=True).returncode:
+        pytest.skip("no mount namespace here; it needs root")
+    refused = subprocess.run((*inside, "touch", str(ROOT / "written")), capture_output=True)
+    assert b"Read-only" in refused.stderr
+    home = Home(tmp_path / "home", inside)
+    yield home
+    home.close()
+
+
+async def test_it_runs_without_capabilities_on_a_read_only_system(bare: Home) -> None:
+    file = bare.deployment(resume="auto")
+    up = bare.start("up", str(file))
+    async with looking_on(endpoint_of(file)) as robot:
+        await robot.straight(0.15, room=0.0)
+    (note,) = bare.folder.glob("run/gigabrain/*.json")
+    before = note.stat().st_mtime_ns
+    await until(lambda: note.stat().st_mtime_ns > before, "the note of a robot that is well")
+    assert up.err == ""
+
+
+def loaded(name: str) -> Any:
+    return yaml.safe_load((DOCKER / name).read_text())
+
+
+def test_the_compose_file_keeps_to_its_schema() -> None:
+    schema = yaml.safe_load((ROOT / "tests" / "data" / "compose_spec.json").read_text())
+    check = jsonschema.Draft201909Validator(schema)
+    document = loaded("compose.yaml")
+    check.validate(document)
+    document["services"]["robot"]["read_olny"] = True
+    with pytest.raises(jsonschema.ValidationError, match="read_olny"):
+        check.validate(document)
+
+
+def test_every_container_is_locked_up() -> None:
+    services = loaded("compose.yaml")["services"]
+    assert sorted(services) == ["brain", "robot"] == sorted(load_hosts())
+    for name, service in services.items():
+        assert service["read_only"] is True, name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        assert not {"privileged", "cap_add", "ports", "network_mode"} & set(service), name
+        assert service["command"][-1] == name
+    assert loaded("compose.yaml")["networks"] == {"robot": {"internal": True}}
+
+
+def load_hosts() -> list[str]:
+    return list(load_deployment(DOCKER / "deployment.yaml").hosts)
+
+
+def test_the_image_has_no_root_and_no_build_tools_and_copies_what_there_is() -> None:
+    text = (DOCKER / "Dockerfile").read_text()
+    build, final = re.split(r"^FROM .*\n", text, flags=re.MULTILINE)[1:]
+    assert re.findall(r"^USER (.*)$", final, re.MULTILINE) == ["10001:10001"]
+    assert "pip install" not in final
+    assert "apt-get" not in text
+    for line in re.findall(r"^COPY (?!--from)(.*) \S+$", build, re.MULTILINE):
+        for source in line.split():
+            assert (ROOT / source).exists(), source

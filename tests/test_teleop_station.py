@@ -1,0 +1,116 @@
+"""What keys and a gamepad mean, and that letting go of either stops the robot."""
+
+import os
+import struct
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.catalog import load_robot
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import GateStatus, RobotState
+from gigabrain_schemas.examples import example
+from gigabrain_zenoh.causes import estop
+from gigabrain_zenoh.gamepad import Gamepad, Pad
+from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.teleop_keys import HeldKeys, keys_of
+from gigabrain_zenoh.teleop_station import readout
+from tests.bus_rig import until
+
+WAFFLE = load_robot("turtlebot3_waffle")  # 0.26 m/s, 1.82 rad/s
+ALPHA = load_robot("alpha")  # goes sideways as well, 0.2 m/s
+
+
+def test_keys_are_told_from_arrows_and_from_what_else_a_terminal_sends() -> None:
+    assert keys_of("wW\x1b[A\x1bOD +\x1b[1;5C\x1b[15~\x03") == [
+        "w", "w", "up", "left", " ", "+", "right", "\x03",
+    ]  # fmt: skip
+    assert keys_of("\x1b\x1b[") == ["["]
+
+
+def test_a_press_lasts_400_ms_and_a_repeat_150() -> None:
+    keys = HeldKeys()
+    assert keys.press("w", 10.0)
+    assert keys.velocity(WAFFLE, 10.39) == Velocity(linear_x=0.065)
+    assert keys.velocity(WAFFLE, 10.40) == ZERO
+    keys.press("w", 20.0)
+    keys.press("w", 20.3)
+    assert keys.velocity(WAFFLE, 20.44) == Velocity(linear_x=0.065)
+    assert keys.velocity(WAFFLE, 20.46) == ZERO
+
+
+def test_several_keys_add_up_and_opposite_ones_cancel() -> None:
+    keys = HeldKeys()
+    keys.press("up", 0.0)
+    keys.press("a", 0.0)
+    assert keys.velocity(WAFFLE, 0.1) == Velocity(linear_x=0.065, angular_z=0.455)
+    keys.press("s", 0.0)
+    assert keys.velocity(WAFFLE, 0.1) == Velocity(angular_z=0.455)
+    keys.let_go()
+    assert keys.velocity(WAFFLE, 0.1) == ZERO
+
+
+def test_the_operator_chooses_how_fast_within_what_the_body_can() -> None:
+    keys = HeldKeys()
+    assert not keys.press("k", 0.0)
+    for _ in range(9):
+        keys.press("+", 0.0)
+    keys.press("q", 0.0)
+    keys.press("s", 0.0)
+    assert keys.velocity(ALPHA, 0.1) == Velocity(linear_x=-0.5, linear_y=0.2)
+    for _ in range(9):
+        keys.press("-", 0.0)
+    assert keys.share == 0.25
+
+
+def event(value: int, kind: int, number: int) -> bytes:
+    return struct.pack("<IhBB", 0, value, kind, number)
+
+
+def test_a_gamepad_moves_nothing_unless_a_dead_man_button_is_held() -> None:
+    pad = Pad()
+    pad.feed(event(-32767, 2, 1) + event(-32767, 2, 3))
+    assert pad.velocity(WAFFLE, 1.0) == ZERO
+    pad.feed(event(1, 1, 5))
+    assert pad.velocity(WAFFLE, 0.5) == Velocity(linear_x=0.13, angular_z=0.91)
+    pad.feed(event(0, 1, 5))
+    assert pad.velocity(WAFFLE, 0.5) == ZERO
+
+
+def test_events_may_come_in_pieces_and_a_stick_near_its_middle_is_let_go() -> None:
+    pad = Pad()
+    data = event(1, 1, 4) + event(-3200, 2, 1) + event(-16384, 2, 3)
+    for at in range(0, len(data), 3):
+        pad.feed(data[at : at + 3])
+    assert pad.velocity(WAFFLE, 1.0) == Velocity(angular_z=pytest.approx(0.91, abs=0.001))
+
+
+def test_its_stop_button_counts_when_it_is_pressed_and_not_as_it_was_found() -> None:
+    pad = Pad()
+    assert not pad.feed(event(1, 1 | 0x80, 1))
+    assert not pad.feed(event(0, 1, 1))
+    assert pad.feed(event(1, 1, 1))
+
+
+async def test_a_gamepad_that_is_unplugged_holds_no_button(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "js0")
+    pad = Gamepad(tmp_path)
+    with (tmp_path / "js0").open("wb", buffering=0) as kernel:
+        kernel.write(event(1, 1, 4) + event(-32767, 2, 1) + event(1, 1, 1))
+        await pad.stop.wait()
+        assert pad.pad
+        assert pad.pad.velocity(WAFFLE, 1.0) == Velocity(linear_x=0.26)
+    await until(lambda: pad.pad is None)
+    pad.close()
+    assert Gamepad(tmp_path / "nowhere").pad is None
+
+
+def test_the_display_says_who_drives_and_what_to_do_about_what_holds_it_back() -> None:
+    gate = GateStatus(mode="latched", causes=(estop("ann"),), commander="")
+    state = example(RobotState)
+    state = type(state)(robot_type="mock", pose=state.pose, velocity=state.velocity, gate=gate)
+    assert readout(state, Velocity(linear_x=0.1), 0.25) == [
+        "mock: latched, driven by nobody",
+        "speed +0.20 m/s -0.50 rad/s, wanted +0.10 +0.00 (25% of its limits)",
+        "  e-stop pressed by ann: find out why it was pressed",
+    ]
