@@ -6,8 +6,8 @@ BIN := $(VENV)/bin
 PYTHON ?= python3
 DONE := $(VENV)/.done
 
-.PHONY: setup demo test lint unit bench mutation golden recordings pictures clean
 .PHONY: setup demo test lint unit bench mutation fuzz golden pictures clean
+.PHONY: setup demo test lint unit bench mutation golden recordings pictures clean
 
 setup: $(DONE)
 

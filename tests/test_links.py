@@ -214,7 +214,7 @@ def test_a_usb_port_is_named_by_its_numbers() -> None:
 
 
 def test_what_is_wrong_with_a_port_says_what_to_do() -> None:
-    assert ports.missing("usb:0483:5740") == "no USB device 0483:5740: is it plugged in?"
+    assert ports.missing("usb:0483:5740") == "no USB device usb:0483:5740: is it plugged in?"
     assert 'KERNEL=="ttyACM9", MODE="0666"' in ports.refused(
         "/dev/ttyACM9", PermissionError(13, "Permission denied")
     )
@@ -280,7 +280,7 @@ async def test_a_tcp_peer_that_takes_nothing_is_dropped_in_the_middle_of_a_frame
 
 
 @pytest.mark.parametrize(
-    ("host", "complaint"), [("127.0.0.1", "refused"), ("no.such.host.invalid", "no host")]
+    ("host", "complaint"), [("127.0.0.1", "nobody listens"), ("no.such.host.invalid", "no host")]
 )
 async def test_a_tcp_port_that_cannot_be_reached_says_so(host: str, complaint: str) -> None:
     with server() as listening:
@@ -288,4 +288,12 @@ async def test_a_tcp_port_that_cannot_be_reached_says_so(host: str, complaint: s
     link = TcpLink(host, port, Clock())
     link.open()
     await until(lambda: complaint in link.problem)
+    await link.close()
+
+
+@pytest.mark.parametrize("path", ["/dev/null", "/tmp"])
+async def test_what_is_no_serial_port_is_called_so(path: str) -> None:
+    link = SerialLink(path, 115200, Clock())
+    link.open()
+    await until(lambda: link.problem == f"{path} is no serial port")
     await link.close()

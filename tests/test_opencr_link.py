@@ -107,7 +107,7 @@ async def test_a_port_on_which_nobody_answers_is_knocked_at_and_opened_anew(rig:
     pings = [p for p in rig.cable.sent[before:] if p.instruction == dynamixel.PING]
     assert 6 <= len(pings) <= 10
     await rig.wait(200)
-    assert rig.cable.drops[-1].endswith("is open, but no OpenCR answers: is its power on?")
+    assert rig.cable.drops[-1].endswith("is open, but no OpenCR answers: right port, power on?")
 
 
 async def test_silent_motors_and_debug_mode_count_as_a_body_that_does_not_answer(

@@ -15,6 +15,7 @@ from gigabrain_drivers.legs.geometry import JOINT_NAMES, LegGeometry
 from gigabrain_drivers.legs.odometry import LegOdometry
 from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_drivers.links.address import AddressLink
+from gigabrain_drivers.links.hearing import Hearing
 from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_drivers.protocols import alpha
 from gigabrain_drivers.protocols.alpha import Decoder, Frame, State
@@ -30,7 +31,7 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
-PATIENCE_NS = 500_000_000  # without a state, before something is said
+SENSELESS = "nothing that makes sense comes: is this the right port?"
 SILENT_NS = 100_000_000  # without a state, and the body counts as lost
 LAST_WORD_NS = 10_000_000  # for the last command to arrive before the connection is closed
 MILLISECONDS = 1 << 32  # after which the firmware's clock begins anew
@@ -62,11 +63,10 @@ class AlphaDriver(Driver):
         self._unsound = 0  # whole frames without sense
         self._last: tuple[int, int] | None = None  # sequence and milliseconds of the newest state
         self._state: State | None = None
-        self._heard_ns: int | None = None  # when the newest state came; none since it opened
-        self._hoping_ns = self._clock.now_ns()  # since when there is none
+        self._hearing = Hearing(self.link, self._clock, SILENT_NS, SENSELESS, log)
         self._untold = False  # whether a loss has not been reported yet
         self._open = self._parked = False
-        self._silence, self._fall = Fault(log), Fault(log)
+        self._fall = Fault(log)
         self._imu: Imu | None = None
         self._lidar: ScanSource | None = None
         self._scan: LaserScan | None = None
@@ -92,13 +92,13 @@ class AlphaDriver(Driver):
 
     async def stop(self) -> None:
         """Come to rest and stand; a body that lies goes on lying."""
-        if self._heard_ns is not None:
+        if self._hearing.heard:
             say = alpha.park if self._parked else alpha.stop
             self.link.write(say(self._next()))
 
     async def park(self) -> None:
         """Lie down; only a step gets it up again."""
-        if self._heard_ns is None:
+        if not self._hearing.heard:
             raise BodyLost(f"{self.link}: {self.link.problem or 'the body is silent'}")
         self._parked = True
         self.link.write(alpha.park(self._next()))
@@ -109,7 +109,7 @@ class AlphaDriver(Driver):
         """Walk; a value that is not a number is zero for all, and so is all while it is lost."""
         if not self._open:
             raise BodyLost("the connection is not open")
-        if self._heard_ns is None:  # it may still be starting
+        if not self._hearing.heard:  # it may still be starting
             return ZERO
         to = self.bounded(linear_x, linear_y, angular_z)
         if self._untold or self._fallen:
@@ -126,7 +126,7 @@ class AlphaDriver(Driver):
 
     async def read_state(self) -> RobotState:
         """What the body said last; `link` says whether that is still so."""
-        velocity = self._odometry.velocity if self._heard_ns is not None else Twist(0.0, 0.0, 0.0)
+        velocity = self._odometry.velocity if self._hearing.heard else Twist(0.0, 0.0, 0.0)
         state = RobotState(
             robot_type=self.robot.robot_type,
             pose=self._odometry.pose,
@@ -155,11 +155,12 @@ class AlphaDriver(Driver):
     def _opened(self) -> None:
         """A new connection: nothing from before counts."""
         self._decoder.clear()
-        self._heard_ns = self._last = None
+        self._hearing.forget()
+        self._last = None
 
     def _lost(self, why: str) -> None:
-        self._untold = self._untold or self._heard_ns is not None
-        self._heard_ns, self._hoping_ns = None, self._clock.now_ns()
+        self._untold = self._untold or self._hearing.heard
+        self._hearing.forget()
 
     def _received(self, data: bytes) -> None:
         for frame in self._decoder.feed(data):
@@ -176,8 +177,7 @@ class AlphaDriver(Driver):
         if last and not alpha.newer(frame.sequence, last[0]):
             self._last = last
             return
-        first, self._heard_ns = self._heard_ns is None, self._clock.now_ns()
-        self._state = state
+        first, self._state = self._hearing.hear(), state
         if last:
             passed = (state.milliseconds - last[1]) % MILLISECONDS
             self._odometry.update(state.senses, passed / 1000)
@@ -202,14 +202,7 @@ class AlphaDriver(Driver):
 
         A loss is told at least once, however soon the body is back.
         """
-        now_ns = self._clock.now_ns()
-        silent_ns = now_ns - (self._heard_ns or self._hoping_ns)
-        alive = self._heard_ns is not None and silent_ns <= SILENT_NS
-        if alive:
-            self._silence.end(f"{self.link}: heard again")
-        elif silent_ns > PATIENCE_NS:
-            senseless = "nothing that makes sense comes: is this the right port?"
-            self._silence.begin(f"{self.link}: {self.link.problem or senseless}")
+        alive = self._hearing.alive()
         told, self._untold = not self._untold, False
         return replace(self.link.health, connected=alive and told)
 

@@ -15,12 +15,13 @@ from gigabrain_drivers.kinematics import Twist, base_of
 from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_drivers.line_options import BITS_PER_BYTE, LineOptions, check_wheels
 from gigabrain_drivers.line_report import LineReport
+from gigabrain_drivers.links.hearing import Hearing
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_drivers.protocols.line import Decoder, describe
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_schemas.base import Message, Velocity
-from gigabrain_schemas.body import LinkHealth, RobotState
+from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.clock import Clock
@@ -33,7 +34,7 @@ log = logging.getLogger(__name__)
 MISSED = 3  # state lines in a row, and the body counts as lost
 LEAST_SILENT_NS = 100_000_000
 REPEAT_SHARE = 0.9  # of the repetition's period: ticks are not that even
-PATIENCE_NS = 500_000_000  # without a good line, before something is said
+SENSELESS = "no line that makes sense comes: firmware, baud rate, wiring?"
 BUMPER = "bumper"  # flags of such names are bumpers
 PROBE_S = 2.5  # an Arduino that opening has reset takes two seconds to say anything
 LAST_WORD_NS = 10_000_000  # and the time of one line, before a port is closed
@@ -61,15 +62,13 @@ class LineDriver(Driver):
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
         self._report = LineReport(options, robot, self._base)
-        self._silent_ns = max(round(MISSED / options.state_hz * 1e9), LEAST_SILENT_NS)
+        silent_ns = max(round(MISSED / options.state_hz * 1e9), LEAST_SILENT_NS)
+        self._hearing = Hearing(self.link, self._clock, silent_ns, SENSELESS, log)
         self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
-        self._heard_ns: int | None = None  # when the newest good line came; none since it opened
-        self._hoping_ns = self._clock.now_ns()  # since when there is none
         self._started = False  # whether the firmware has had its start string
         self._sent = ZERO
         self._sent_ns = self._seq = 0
         self._open = False
-        self._silence = Fault(log)
         self._told_flags = 0
         self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
         self._lidar: ScanSource | None = None
@@ -120,7 +119,7 @@ class LineDriver(Driver):
             joints=report.joints(),
             battery=report.battery(),
             bumpers=self._bumpers(),
-            link=self._health(),
+            link=replace(self.link.health, connected=self._hearing.alive()),
         )
 
     async def get_sensor_data(self, sensor_name: str) -> Message | None:
@@ -131,7 +130,7 @@ class LineDriver(Driver):
 
     def _send(self, wanted: Velocity) -> None:
         """Write a command that is new, or due again; `_sent` is what the body then goes by."""
-        if self._heard_ns is None:  # it may still be booting: nothing that could disturb it
+        if not self._hearing.heard:  # it may still be booting: nothing that could disturb it
             self._sent = ZERO
             return
         now_ns = self._clock.now_ns()
@@ -174,38 +173,24 @@ class LineDriver(Driver):
         """A new line: nothing from before counts. Some firmware speaks only when it is asked to."""
         self._decoder.clear()
         self._report.restart()
-        self._heard_ns, self._started = None, False
+        self._hearing.forget()
+        self._started = False
         if self.options.start:
             self._start()
 
     def _lost(self, why: str) -> None:
-        self._heard_ns, self._hoping_ns, self._sent = None, self._clock.now_ns(), ZERO
+        self._hearing.forget()
+        self._sent = ZERO
 
     def _received(self, data: bytes) -> None:
         now_ns = self._clock.now_ns()
         for values in self._decoder.feed(data):
             self._report.take(values, now_ns)
-            first, self._heard_ns = self._heard_ns is None, now_ns
-            if first:  # it has booted: what it was told before is forgotten
+            if self._hearing.hear():  # it has booted: what it was told before is forgotten
                 self._sent_ns, self._started = 0, False
                 self._send(ZERO)
             self._tell_flags()
         self.link.errors = self._decoder.errors
-
-    def _health(self) -> LinkHealth:
-        """The line's; connected means that the body has been heard lately. Says so when it has not.
-
-        What is wrong for a moment only, the gate says.
-        """
-        now_ns = self._clock.now_ns()
-        silent_ns = now_ns - (self._heard_ns or self._hoping_ns)
-        alive = self._heard_ns is not None and silent_ns <= self._silent_ns
-        if alive:
-            self._silence.end(f"{self.link}: heard again")
-        elif silent_ns > PATIENCE_NS:
-            senseless = "no line that makes sense comes: firmware, baud rate, wiring?"
-            self._silence.begin(f"{self.link}: {self.link.problem or senseless}")
-        return replace(self.link.health, connected=alive)
 
     def _bumpers(self) -> tuple[bool, ...]:
         """The flags whose names begin with `bumper`."""

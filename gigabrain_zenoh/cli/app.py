@@ -57,8 +57,8 @@ COMMANDS = {
 }
 GROUPS = {
     "driver": "Drivers of bodies.",
-    "bag": "Recordings.",
     "keys": "Who may do what.",
+    "bag": "Recordings.",
     "bench": "Measure this machine.",
     "schema": "Messages.",
 }

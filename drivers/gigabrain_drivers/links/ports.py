@@ -2,12 +2,14 @@
 
 import errno
 import os
+import termios
 from pathlib import Path
 
 from serial.tools import list_ports
 
 AUTO = "auto"
 USB = "usb:"
+NO_PORT = (errno.ENOTTY, errno.EINVAL, errno.EISDIR)  # a file, a folder, another device
 
 
 def candidates(port: str) -> list[str]:
@@ -40,8 +42,8 @@ def missing(port: str) -> str:
     """What to say when there is no such device."""
     if port == AUTO:
         return "no serial port at all: is it plugged in?"
-    what = f"USB device {port.removeprefix(USB)}" if port.startswith(USB) else port
-    return f"no {what}: is it plugged in?"
+    what = "USB device " if port.startswith(USB) else ""
+    return f"no {what}{port}: is it plugged in?"
 
 
 def refused(path: str, error: OSError) -> str:
@@ -54,6 +56,10 @@ def refused(path: str, error: OSError) -> str:
     if error.errno in (errno.EAGAIN, errno.EBUSY):
         holders = ", ".join(map(str, _holders(path)))
         return f"{path} is in use{f' by pid {holders}' if holders else ''}"
+    cause = error.__context__  # of pyserial's errors without a number
+    number = cause.args[0] if isinstance(cause, termios.error) else error.errno
+    if number in NO_PORT:
+        return f"{path} is no serial port"
     return f"{path}: {error.strerror or error}"
 
 

@@ -43,6 +43,9 @@ class TcpLink(Link):
         except socket.gaierror as error:
             self._shut()
             raise LinkProblem(f"no host {self._host!r}: {error.strerror}") from None
+        except ConnectionRefusedError:
+            self._shut()
+            raise LinkProblem(f"nobody listens at {self}: is its program running?") from None
         except OSError as error:
             self._shut()
             raise LinkProblem(f"{self}: {why(error)}") from None

@@ -75,7 +75,7 @@ class Board:
         if self.link.problem:
             return self.link.problem
         if not self.ready:
-            return f"{self.link} is open, but no OpenCR answers: is its power on?"
+            return f"{self.link} is open, but no OpenCR answers: right port, power on?"
         return self._fault()
 
     def halt(self) -> bool:

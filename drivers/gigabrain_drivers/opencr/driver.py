@@ -121,13 +121,8 @@ class OpenCrDriver(Driver):
     ) -> Velocity:
         """Drive, in hundredths; where one value is not a number, all are zero."""
         self._commanded_ns = self._clock.now_ns()
-        if not (math.isfinite(linear_x) and math.isfinite(angular_z)):
-            linear_x = angular_z = 0.0
-        wanted = Twist(
-            _within(linear_x, self.robot.max_linear_speed),
-            0.0,
-            _within(angular_z, self.robot.max_angular_speed),
-        )
+        to = self.bounded(linear_x, linear_y, angular_z)
+        wanted = Twist(to.linear_x, 0.0, to.angular_z)
         # the board slows down the faster wheel alone, which would bend the way
         too_fast = max(1.0, *(abs(w) / opencr.FASTEST_WHEEL for w in self._base.to_wheels(wanted)))
         forward, turn = self._board.drive(wanted.linear_x / too_fast, wanted.angular_z / too_fast)
@@ -199,7 +194,3 @@ def imu_of(now: Readings) -> ImuData | None:
         angular_velocity=now.angular_velocity,
         linear_acceleration=now.linear_acceleration,
     )
-
-
-def _within(value: float, most: float) -> float:
-    return max(-most, min(most, value))

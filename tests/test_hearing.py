@@ -1,0 +1,66 @@
+"""A body that reports by itself is heard or not, and what is wrong is said once."""
+
+import logging
+
+import pytest
+
+from gigabrain_drivers.links.hearing import Hearing
+from gigabrain_drivers.links.serial_link import SerialLink
+from gigabrain_zenoh.clock import FakeClock
+
+MS = 1_000_000
+LOG = logging.getLogger("body")
+
+
+class Body:
+    """Something on a port that is not there, with time by hand."""
+
+    def __init__(self, port: str = "usb:0483:5740") -> None:
+        self.clock = FakeClock()
+        self.link = SerialLink(port, 115_200, self.clock)
+        self.link.problem = ""  # it is open
+        self.hearing = Hearing(self.link, self.clock, 100 * MS, "it talks nonsense", LOG)
+
+    async def alive_after(self, milliseconds: int) -> bool:
+        await self.clock.advance(milliseconds * MS)
+        return self.hearing.alive()
+
+
+async def test_it_is_alive_for_as_long_as_its_word_is_fresh() -> None:
+    body = Body()
+    assert not await body.alive_after(0)
+    assert body.hearing.hear()
+    assert not body.hearing.hear()
+    assert await body.alive_after(100)
+    assert not await body.alive_after(1)
+    assert body.hearing.heard
+    body.hearing.forget()
+    assert not body.hearing.heard
+
+
+async def test_a_line_that_opens_and_is_dropped_again_and_again_is_told_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    body = Body()
+    for _ in range(10):
+        body.hearing.forget()
+        assert not await body.alive_after(200)
+    assert [record.message for record in caplog.records] == ["usb:0483:5740: it talks nonsense"]
+
+
+async def test_what_the_line_says_is_not_prefixed_with_its_own_name(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    body = Body()
+    body.link.problem = "no USB device usb:0483:5740: is it plugged in?"
+    await body.alive_after(501)
+    assert caplog.messages == ["no USB device usb:0483:5740: is it plugged in?"]
+
+
+async def test_the_end_of_a_silence_is_told_as_well(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    body = Body("/dev/ttyUSB9")
+    await body.alive_after(501)
+    body.hearing.hear()
+    assert body.hearing.alive()
+    assert caplog.messages == ["/dev/ttyUSB9: it talks nonsense", "/dev/ttyUSB9: heard again"]
