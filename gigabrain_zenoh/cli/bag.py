@@ -122,6 +122,7 @@ def play(
         The folder of your identity, for a router that wants one.
     """
     from gigabrain_zenoh.recording.command import play as run
+    from gigabrain_zenoh.recording.joining import Where
     from gigabrain_zenoh.recording.play import PlayOptions
 
     if not 0.01 <= rate <= 100:
@@ -131,10 +132,8 @@ def play(
     options = PlayOptions(
         rate=rate, start_s=start, loop=loop, topics=tuple(topics or ()), remap=_pairs(remap or [])
     )
-    folder = str(keys) if keys else ""
-    return asyncio.run(
-        run(file, options, connect, namespace, keys=folder, beside_robot=beside_robot)
-    )
+    where = Where(connect=connect, namespace=namespace, keys=str(keys or ""))
+    return asyncio.run(run(file, options, where, beside_robot=beside_robot))
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:
@@ -171,8 +170,8 @@ def plot(
     return 0
 
 
-def convert(file: Path, *, csv: Path) -> int:
-    """Write a recording as tables, one per topic.
+def convert(file: Path, *, csv: Path | None = None, lerobot: Path | None = None) -> int:
+    """Write a recording as tables, one per topic, or as a LeRobot dataset.
 
     Example: gigabrain bag convert drive.mcap --csv tables
 
@@ -182,9 +181,16 @@ def convert(file: Path, *, csv: Path) -> int:
         The recording.
     csv
         The folder for the tables.
+    lerobot
+        A new folder for the dataset.
     """
+    from gigabrain_zenoh.recording.lerobot import convert as write_lerobot
     from gigabrain_zenoh.recording.tables import write_csv
 
-    for path in write_csv(file, csv):
+    if csv is None and lerobot is None:
+        raise ConfigError("say into what: --csv FOLDER or --lerobot FOLDER")
+    for path in write_csv(file, csv) if csv else ():
         print(path)
+    if lerobot:
+        print(write_lerobot(file, lerobot))
     return 0

@@ -54,6 +54,7 @@ def record(
         Stop writing while less than this is free on the disk [MB].
     """
     from gigabrain_zenoh.recording.command import record as run
+    from gigabrain_zenoh.recording.joining import Where
     from gigabrain_zenoh.recording.node import file_name
 
     limits = {"seconds": seconds, "split-size": split_size, "split-time": split_time}
@@ -68,6 +69,5 @@ def record(
         "split_s": split_time,
         "keep_free_mb": keep_free,
     }
-    folder = str(keys) if keys else ""
-    config = checked(values, RecorderConfig)
-    return asyncio.run(run(config, connect, namespace, seconds, keys=folder))
+    where = Where(connect=connect, namespace=namespace, keys=str(keys or ""))
+    return asyncio.run(run(checked(values, RecorderConfig), where, seconds))

@@ -5,6 +5,8 @@ import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+from msgspec import Struct
+
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.keys.checks import no_router
@@ -15,12 +17,18 @@ from gigabrain_zenoh.zenoh_transport import ZenohTransport
 ROUTER_S = 3.0  # how long a router may take to answer
 
 
+class Where(Struct, frozen=True, kw_only=True):
+    """Which robot, as people say it."""
+
+    connect: str | None = None  # its router; without it, the only robot that runs here
+    namespace: str = ""
+    keys: str = ""  # the folder of an identity
+
+
 @asynccontextmanager
-async def joined(
-    connect: str | None, namespace: str, name: str, keys: str = ""
-) -> AsyncIterator[tuple[Bus, ZenohTransport]]:
+async def joined(where: Where, name: str) -> AsyncIterator[tuple[Bus, ZenohTransport]]:
     """A bus of a robot, and the transport below it. Raises BusError where there is none."""
-    endpoint = find_endpoint(connect, namespace, keys)
+    endpoint = find_endpoint(where.connect, where.namespace, where.keys)
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
     try:
         transport = await asyncio.wait_for(ZenohTransport.open(endpoint), ROUTER_S)
