@@ -98,9 +98,16 @@ class Onlooker:
         return dict((await self.describe("driver")).report)
 
     async def straight(
-        self, speed: float = 0.25, room: float = 1.3, *, by_hand: bool = False
+        self,
+        speed: float = 0.25,
+        room: float = 1.3,
+        turning: float = STRAIGHT,
+        *,
+        by_hand: bool = False,
     ) -> None:
         """Wait until the robot drives straight on at `speed` [m/s] with `room` [m] ahead.
+
+        It counts as straight while it turns by less than `turning` [rad/s].
 
         `by_hand` enables it as a person would, again and again where a busy machine stops it.
         """
@@ -109,9 +116,11 @@ class Onlooker:
             world = self.world.fresh()
             if not (self.states and world and world.sectors):
                 return False
+            if self.state.gate.mode != "enabled":
+                return False  # what it measures may be from before
             velocity, ahead = self.state.velocity, world.sectors[0]
             roomy = ahead is None or ahead > room
-            return roomy and velocity.linear_x > speed and abs(velocity.angular_z) < STRAIGHT
+            return roomy and velocity.linear_x > speed and abs(velocity.angular_z) < turning
 
         async def enable() -> None:
             while True:

@@ -35,6 +35,7 @@ Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
 TIRELESS = Backoff(factor=1.0, deaths=10_000)
 FAULTS_FILE = "faults.json"  # as the emulator's process reads it
 STOP_S = 1.5
+NEARLY_STRAIGHT = 0.1  # [rad/s]; legs sway
 FULL_SHARE = 0.96  # of a speed counts as having reached it
 
 
@@ -202,7 +203,7 @@ class Subject:
         body = onlooker.bodies.current
         most = body.description.max_linear_speed if body else 0.0
         speed = FULL_SHARE * min(self.deployment.decision.linear_speed, most)
-        await onlooker.straight(speed, room, by_hand=True)
+        await onlooker.straight(speed, room, NEARLY_STRAIGHT, by_hand=True)
 
     async def release(self) -> None:
         """As a person: let go of a latched gate, as soon as that is possible."""
