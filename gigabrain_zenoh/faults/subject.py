@@ -171,8 +171,9 @@ class Subject:
         self._faulty = bool(faults)
 
         def taken() -> bool:
-            said = self.records[begin:]
-            return any(str(r.get("text", "")).startswith("faults: ") for r in said)
+            texts = (str(record.get("text", "")) for record in self.records[begin:])
+            told = [text for text in texts if text.startswith("faults: ")]
+            return bool(told) and (told[-1] == "faults: none") != bool(faults)
 
         await until(taken, "the emulator takes its faults")
 
