@@ -6,23 +6,23 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any, TypeVar, overload
 
-from gigabrain_schemas.audit import AuditRecord, AuditRequest
+from msgspec.structs import asdict
+
+from gigabrain_schemas.audit import AuditRecord
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel, Twist
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import (
-    AUDIT_LOG,
     BODY,
     CMD_VEL,
     ENABLE,
     RELEASE,
     STATE,
     TELEOP,
-    Service,
     Topic,
 )
-from gigabrain_zenoh.audit_file import in_order
+from gigabrain_zenoh.asking import ANSWER_S, ask, audit_log, granted
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, Unsupported
@@ -34,10 +34,9 @@ from gigabrain_zenoh.listening import listen, topic_named
 from gigabrain_zenoh.running import find_endpoint
 
 M = TypeVar("M", bound=Message)
-Q = TypeVar("Q", bound=Message)
 
 HOLD_TICKS = 50  # a velocity lasts one second of the robot's time unless it is asked for again
-ROUTER_S, ANSWER_S = 3.0, 1.0  # how long a router, and a robot, may take to answer
+ROUTER_S = 3.0  # how long a router may take to answer
 BODY_TICKS = 100  # the driver says twice in that time what the body is
 
 
@@ -123,10 +122,7 @@ class Robot:
         Control obeys while the gate is open for the brain, and keeps the body until somebody
         enables the brain again.
         """
-        twist = Twist(
-            linear_x=wanted.linear_x, linear_y=wanted.linear_y, angular_z=wanted.angular_z
-        )
-        self._bus.publish(TELEOP, twist)
+        self._bus.publish(TELEOP, Twist(**asdict(wanted)))
 
     async def stop(self) -> None:
         """Come to rest, if this script drives. It keeps the body."""
@@ -144,7 +140,7 @@ class Robot:
         """Ask the gate for the body, for this script or for `source`. Raises Refused, and why."""
         me = self._bus.process
         request = EnableRequest(source=source or me, take=take, by=me)
-        reply = self._granted(await self._ask(ENABLE, request))
+        reply = granted(await ask(self._bus, ENABLE, request, self._keys))
         if request.source == self._bus.process:
             self._hold.granted(self._bus.time.boot, reply.gate)
         return reply
@@ -153,7 +149,7 @@ class Robot:
         """Let go of a latched gate; it takes an enable as well to move. Raises Refused."""
         generation = (await self.read_state()).gate.estop_generation
         request = ReleaseRequest(estop_generation=generation, source=self._bus.process)
-        return self._granted(await self._ask(RELEASE, request))
+        return granted(await ask(self._bus, RELEASE, request, self._keys))
 
     async def estop(self, reason: str = "") -> GateReply:
         """Stop at once and latch; this script's own commands stop first.
@@ -171,10 +167,7 @@ class Robot:
 
         They are those of every process that keeps one, within a second.
         """
-        pages = await self._bus.ask(AUDIT_LOG, AuditRequest(newest=newest), timeout_s=ANSWER_S)
-        if not pages:
-            raise BodyLost("nobody here keeps an audit log; is the driver running?")
-        return in_order([page.records for page in pages])[-newest:]
+        return await audit_log(self._bus, newest)
 
     async def read_state(self) -> RobotState:
         """What the body measures. Raises BodyLost when it is silent for a second."""
@@ -255,13 +248,7 @@ class Robot:
             return
         if self._bus.time.tick > self._until_tick:
             target = ZERO
-        command = CmdVel(
-            linear_x=target.linear_x,
-            linear_y=target.linear_y,
-            angular_z=target.angular_z,
-            source=self._bus.process,
-        )
-        self._bus.publish(CMD_VEL, command)
+        self._bus.publish(CMD_VEL, CmdVel(**asdict(target), source=self._bus.process))
 
     async def _ticks(self, count: int) -> None:
         """Let the robot's time go on by `count` states, or a second of ours."""
@@ -271,16 +258,3 @@ class Robot:
                 await asyncio.wait_for(self._arrived.wait(), ANSWER_S)
             except TimeoutError:
                 raise BodyLost("robot/state has stopped; is the driver running?") from None
-
-    async def _ask(self, service: Service[Q, GateReply], request: Q) -> GateReply:
-        replies = await self._bus.ask(service, request, timeout_s=ANSWER_S)
-        if not replies:
-            doubt = may_not_ask(self._keys) or "; is it running?"
-            raise BodyLost(f"no driver answers {service.key}{doubt}")
-        return replies[0]
-
-    @staticmethod
-    def _granted(reply: GateReply) -> GateReply:
-        if not reply.ok:
-            raise Refused(f"{reply.robot_type}: {reply.text}")
-        return reply

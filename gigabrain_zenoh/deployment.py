@@ -280,6 +280,7 @@ def with_notes(deployment: Deployment) -> RecorderConfig:
     about = {"perception": deployment.perception, "decision": deployment.decision}
     notes = {name: msgspec.json.encode(settings).decode() for name, settings in about.items()}
     plain = {"body": deployment.body, "link": deployment.link, "world": deployment.world}
+    plain["speed"] = f"{deployment.speed:g}"
     return msgspec.structs.replace(
         deployment.recorder, notes=notes | plain | deployment.recorder.notes
     )

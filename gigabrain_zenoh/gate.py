@@ -13,6 +13,7 @@ from gigabrain_schemas.base import TICK_NS, Cause, Velocity
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh import causes as why
 from gigabrain_zenoh.gate_checks import ISSUED_TICKS, against, age_ns, at_rest, is_finite, refusal
+from gigabrain_zenoh.gate_requests import estop, no, release
 from gigabrain_zenoh.gate_state import (
     BRAIN,
     Command,
@@ -51,7 +52,6 @@ __all__ = [
 TICK_S = TICK_NS / 1e9
 STOPPING_TICKS = 15  # 300 ms, then idle
 CALM_TICKS = 5  # 100 ms at zero after an enable, however hard somebody holds a joystick
-STILL_TICKS = 25  # 0.5 s at rest before a release
 HEALTHY_TICKS = 25  # 0.5 s without a cause before an automatic resume
 NAN_STORM_COUNT, NAN_STORM_TICKS = 5, 50  # five in a second
 
@@ -76,11 +76,11 @@ def _take(config: GateConfig, state: GateState, event: Event) -> tuple[GateState
         case Safety():
             return _safety(state, event.state), Outcome()
         case Release():
-            return _release(state, event)
+            return release(state, event)
         case Enable():
             return _enable(config, state, event)
         case _:
-            return _estop(state, event)
+            return estop(state, event)
 
 
 def _tick(config: GateConfig, state: GateState, event: Tick) -> GateState:
@@ -197,57 +197,22 @@ def _safety(state: GateState, said: SafetyState) -> GateState:
     return replace(state, safety=said)
 
 
-def _estop(state: GateState, event: Estop) -> tuple[GateState, Outcome]:
-    generation = state.estop_generation + 1
-    state = replace(
-        state,
-        mode="latched",
-        causes=why.merge(why.latching(state.causes), (why.estop(event.source),)),
-        estop_generation=generation,
-        commander="",
-        before=ZERO,
-    )
-    return state, Outcome(text=f"stopped and latched; e-stop number {generation}")
-
-
-def _release(state: GateState, event: Release) -> tuple[GateState, Outcome]:
-    if state.mode == "stopping":
-        return _no(state, "still stopping; try again when the body is at rest")
-    if state.mode != "latched":
-        return state, Outcome(text="not latched, nothing to release")
-    if event.estop_generation != state.estop_generation:
-        newest = state.estop_generation
-        return _no(state, f"e-stop number {newest} is the newest; look at it before you release")
-    if state.still_ticks < STILL_TICKS:
-        return _no(state, "the body is not at rest yet; wait half a second")
-    held = why.latching(state.faults + (state.safety.causes if state.safety else ()))
-    if held:
-        return _no(state, f"what latched it still holds: {why.in_words(held)}")
-    by_hand = bool(why.latching(state.causes))
-    state = replace(state, mode="idle", causes=(), by_hand=by_hand)
-    return state, Outcome(text="released; enable it to move")
-
-
 def _enable(config: GateConfig, state: GateState, event: Enable) -> tuple[GateState, Outcome]:
     if not event.source:
-        return _no(state, "say who asks: the source must not be empty")
+        return no(state, "say who asks: the source must not be empty")
     if state.mode == "latched":
-        return _no(state, f"latched: {why.in_words(state.causes)}; release it first")
+        return no(state, f"latched: {why.in_words(state.causes)}; release it first")
     if state.mode == "stopping":
-        return _no(state, "still stopping; try again when it is idle")
+        return no(state, "still stopping; try again when it is idle")
     if state.commander not in ("", event.source):
         if not event.take:
-            return _no(state, f"{state.commander} drives; take it over with take=true")
+            return no(state, f"{state.commander} drives; take it over with take=true")
         if event.source == BRAIN and event.by in ("", BRAIN):
-            return _no(state, f"{state.commander} drives; only a person hands it to the brain")
+            return no(state, f"{state.commander} drives; only a person hands it to the brain")
     found = against(config, state, event.source)
     if found:
-        return _no(state, f"not now: {why.in_words(found)}")
+        return no(state, f"not now: {why.in_words(found)}")
     granted = Outcome(text=f"{event.source} drives")
     if state.commander == event.source:  # it goes on: a second enable is no command
         return replace(state, enables=state.enables + 1), granted
     return _enabled(state, event.source), granted
-
-
-def _no(state: GateState, text: str) -> tuple[GateState, Outcome]:
-    return state, Outcome(ok=False, text=text)

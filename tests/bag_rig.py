@@ -11,7 +11,7 @@ from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.recording.bagfile import BagFile
+from gigabrain_zenoh.recording.bagfile import BagFile, topic_of
 from gigabrain_zenoh.recording.gaps import header_of
 from gigabrain_zenoh.recording.intake import Arrival
 from gigabrain_zenoh.recording.reading import Bag
@@ -47,7 +47,8 @@ def scan(seq: int) -> bytes:
 
 def arrival(at_ns: int, key: str, payload: bytes) -> Arrival:
     """What the recorder makes of a message."""
-    kind = {"robot/state": "RobotState", "robot/scan": "LaserScan"}.get(key, "")
+    topic = topic_of(key)
+    kind = topic.type.__name__ if topic else ""
     encoding = f"application/msgpack;gigabrain.{kind}"
     return Arrival(BEGIN_NS + at_ns, key, encoding, payload, header_of(payload))
 

@@ -40,3 +40,13 @@ def test_what_to_do_about_a_cause_follows_it() -> None:
     lost = Cause(code="link_lost", text="the body does not answer", remedy="look at its cable")
     words = "the body does not answer (look at its cable); a motor is hot"
     assert causes.in_words((lost, HOT)) == words
+
+
+def test_a_button_latches_and_says_why_and_what_to_do() -> None:
+    assert causes.button("the contact is open") == Cause(
+        code="button",
+        text="e-stop button: the contact is open",
+        latching=True,
+        remedy="let the button go, or mend its wire or adapter, then release the robot",
+    )
+    assert len(causes.button("x" * 1000).text) == 500

@@ -86,7 +86,7 @@ async def test_the_command_says_who_has_confirmed_it(
     assert "released; enable it to move" in release.out
     assert "control drives" in (await shared_home.run("enable")).out
     await robot.straight()
-    assert robot.state.gate.enables == start.gate.enables + 1
+    assert robot.state.gate.enables > start.gate.enables
 
 
 async def test_it_survives_the_death_of_the_driver(robot: Onlooker) -> None:

@@ -63,6 +63,9 @@ def test_what_is_beyond_them_is_cut_axis_by_axis(sign: int) -> None:
         (SpeedCaps(left=0.1), (0.5, 0.1, 2.0), (-0.5, -0.25, -2.0)),
         (SpeedCaps(right=0.1), (0.5, 0.25, 2.0), (-0.5, -0.1, -2.0)),
         (SpeedCaps(rotation=0.1), (0.5, 0.25, 0.1), (-0.5, -0.25, -0.1)),
+        (SpeedCaps(turn_left=0.1), (0.5, 0.25, 0.1), (-0.5, -0.25, -2.0)),
+        (SpeedCaps(turn_right=0.1), (0.5, 0.25, 2.0), (-0.5, -0.25, -0.1)),
+        (SpeedCaps(rotation=0.2, turn_left=0.1), (0.5, 0.25, 0.1), (-0.5, -0.25, -0.2)),
         (SpeedCaps(forward=0.0, rotation=0.0), (0.0, 0.25, 0.0), (-0.5, -0.25, 0.0)),
     ],
 )

@@ -59,7 +59,7 @@ async def test_what_cannot_be_recorded_is_said_in_one_line(home: Home) -> None:
     there = home.folder / "there.mcap"
     there.write_text("mine")
     lost = await home.run("record", "--connect", "tcp/127.0.0.1:9")
-    assert lost.err == "gigabrain: no router answers at tcp/127.0.0.1:9; is the robot running?\n"
+    assert lost.err.startswith("gigabrain: no router answers at tcp/127.0.0.1:9; is the robot")
     assert await lost.ended() == 1
     none = await home.run("record", "--split-time", "-1")
     assert none.err.startswith("gigabrain: --split-time: expected a number above 0, got -1")

@@ -1,6 +1,5 @@
 """Causes, thresholds, and the tables of the safety page: the same words everywhere."""
 
-import re
 from pathlib import Path
 
 from msgspec.structs import fields
@@ -20,33 +19,33 @@ OTHERS = (
 )
 
 
-def rows() -> list[list[str]]:
-    """The cells of every row of every table on the page."""
-    lines = PAGE.read_text().splitlines()
-    return [[cell.strip() for cell in line[1:-1].split("|")] for line in lines if line[:1] == "|"]
+def rows(begin: str, end: str) -> list[list[str]]:
+    """The cells of every row of the tables between two headings, code or name first."""
+    part = PAGE.read_text().partition(begin)[2].partition(end)[0]
+    found = [[cell.strip() for cell in line[1:-1].split("|")] for line in part.splitlines()]
+    return [cells for cells in found if cells[0].startswith("`")]
+
+
+def causes_told() -> list[list[str]]:
+    return rows("### Causes that stop", "## What stops a robot")
 
 
 def test_the_page_has_every_cause_with_its_sentence_and_its_remedy() -> None:
     for cause in (*CAUSES.values(), *OTHERS):
         latches = "yes" if cause.latching else ""
-        assert [f"`{cause.code}`", cause.text, cause.remedy, latches] in rows()
+        assert [f"`{cause.code}`", cause.text, cause.remedy, latches] in causes_told()
     for warning in WARNINGS.values():
-        assert [f"`{warning.code}`", warning.text, warning.remedy] in rows()
+        assert [f"`{warning.code}`", warning.text, warning.remedy] in causes_told()
 
 
 def test_the_page_has_no_cause_that_there_is_not() -> None:
     known = {cause.code for cause in (*CAUSES.values(), *WARNINGS.values(), *OTHERS)}
-    told = {row[0].strip("`") for row in rows() if len(row) in (3, 4) and row[0].startswith("`")}
-    assert told - known <= {field.name for field in fields(Thresholds)}  # some share a name
-    assert known <= told
+    assert {row[0].strip("`") for row in causes_told()} == known
 
 
 def test_the_page_has_every_threshold_with_its_default() -> None:
-    told = {
-        row[0].strip("`"): float(match[0])
-        for row in rows()
-        if len(row) == 3 and (match := re.match(r"[\d.]+", row[1]))
-    }
+    table = rows("### Thresholds", "### Causes that stop")
+    told = {row[0].strip("`"): float(row[1].split()[0]) for row in table}
     assert told == {field.name: field.default for field in fields(Thresholds)}
 
 

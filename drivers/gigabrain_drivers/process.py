@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, get_args
 
-import msgspec
 from msgspec.structs import replace
 
 from gigabrain_drivers.base import Driver
@@ -15,6 +14,7 @@ from gigabrain_drivers.catalog import make_driver, ports_folder
 from gigabrain_drivers.gatekeeper import Gatekeeper
 from gigabrain_drivers.links.wording import of_command
 from gigabrain_drivers.lockstep import REPEAT_S, Lockstep
+from gigabrain_drivers.raw_speeds import not_finite
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.round_trip import RoundTrip
 from gigabrain_schemas.base import Message
@@ -42,16 +42,6 @@ log = logging.getLogger(__name__)
 
 BODY_EVERY_TICKS = 50  # once a second
 STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
-
-
-class RawSpeeds(msgspec.Struct):
-    """A command before its numbers are looked at."""
-
-    linear_x: float = 0.0
-    linear_y: float = 0.0
-    angular_z: float = 0.0
-    source: str = ""
-    boot: int = 0
 
 
 class DriverProcess:
@@ -215,14 +205,8 @@ class DriverProcess:
 
     def _on_bad_command(self, payload: bytes) -> None:
         """Not a valid command: was it the commander, with a value that is not a number?"""
-        try:
-            raw = msgspec.msgpack.decode(payload, type=RawSpeeds)
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-            return
-        speeds = (raw.linear_x, raw.linear_y, raw.angular_z)
-        if all(abs(speed) < float("inf") for speed in speeds):
-            return
-        self._gatekeeper.step(gate.NotFinite(raw.source, raw.boot))
+        if sender := not_finite(payload):
+            self._gatekeeper.step(gate.NotFinite(*sender))
 
     def _on_safety(self, said: SafetyState) -> None:
         self._gatekeeper.step(gate.Safety(said))

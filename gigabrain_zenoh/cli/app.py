@@ -44,7 +44,7 @@ COMMANDS = {
     "bag recover": ("bag:recover", "Write what can be read of a damaged recording anew."),
     "bag play": ("bag:play", "Send a recording again."),
     "bag plot": ("bag:plot", "Draw numbers of a recording over time, as a PNG."),
-    "bag convert": ("bag:convert", "A recording as tables."),
+    "bag convert": ("bag:convert", "A recording as tables, or as a LeRobot dataset."),
     "replay": ("replay:replay", "Feed a recording to a process and compare what it sends."),
     "view": ("view:view", "Draw a robot in its world into a PNG file."),
     "bench chain": ("bench:chain", "From scan to command, timed."),

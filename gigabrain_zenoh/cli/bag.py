@@ -92,6 +92,7 @@ def play(
     beside_robot: bool = False,
     connect: str | None = None,
     namespace: str = "",
+    keys: Path | None = None,
 ) -> int:
     """Send a recording again, the last map first.
 
@@ -117,8 +118,11 @@ def play(
         The router's Zenoh endpoint; without it, the only robot that runs on this machine.
     namespace
         The robot's own part of the key space.
+    keys
+        The folder of your identity, for a router that wants one.
     """
     from gigabrain_zenoh.recording.command import play as run
+    from gigabrain_zenoh.recording.joining import Where
     from gigabrain_zenoh.recording.play import PlayOptions
 
     if not 0.01 <= rate <= 100:
@@ -128,7 +132,8 @@ def play(
     options = PlayOptions(
         rate=rate, start_s=start, loop=loop, topics=tuple(topics or ()), remap=_pairs(remap or [])
     )
-    return asyncio.run(run(file, options, connect, namespace, beside_robot=beside_robot))
+    where = Where(connect=connect, namespace=namespace, keys=str(keys or ""))
+    return asyncio.run(run(file, options, where, beside_robot=beside_robot))
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:
@@ -165,8 +170,8 @@ def plot(
     return 0
 
 
-def convert(file: Path, *, csv: Path) -> int:
-    """Write a recording as tables, one per topic.
+def convert(file: Path, *, csv: Path | None = None, lerobot: Path | None = None) -> int:
+    """Write a recording as tables, one per topic, or as a LeRobot dataset.
 
     Example: gigabrain bag convert drive.mcap --csv tables
 
@@ -176,9 +181,16 @@ def convert(file: Path, *, csv: Path) -> int:
         The recording.
     csv
         The folder for the tables.
+    lerobot
+        A new folder for the dataset.
     """
+    from gigabrain_zenoh.recording.lerobot import convert as write_lerobot
     from gigabrain_zenoh.recording.tables import write_csv
 
-    for path in write_csv(file, csv):
+    if csv is None and lerobot is None:
+        raise ConfigError("say into what: --csv FOLDER or --lerobot FOLDER")
+    for path in write_csv(file, csv) if csv else ():
         print(path)
+    if lerobot:
+        print(write_lerobot(file, lerobot))
     return 0

@@ -17,6 +17,7 @@ def record(
     topics: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     connect: str | None = None,
     namespace: str = "",
+    keys: Path | None = None,
     seconds: float | None = None,
     split_size: float | None = None,
     split_time: float | None = None,
@@ -39,6 +40,8 @@ def record(
         The router's Zenoh endpoint; without it, the only robot that runs on this machine.
     namespace
         The robot's own part of the key space.
+    keys
+        The folder of your identity, for a router that wants one.
     seconds
         End after this long [s].
     split_size
@@ -51,6 +54,7 @@ def record(
         Stop writing while less than this is free on the disk [MB].
     """
     from gigabrain_zenoh.recording.command import record as run
+    from gigabrain_zenoh.recording.joining import Where
     from gigabrain_zenoh.recording.node import file_name
 
     limits = {"seconds": seconds, "split-size": split_size, "split-time": split_time}
@@ -65,4 +69,5 @@ def record(
         "split_s": split_time,
         "keep_free_mb": keep_free,
     }
-    return asyncio.run(run(checked(values, RecorderConfig), connect, namespace, seconds))
+    where = Where(connect=connect, namespace=namespace, keys=str(keys or ""))
+    return asyncio.run(run(checked(values, RecorderConfig), where, seconds))

@@ -1,7 +1,15 @@
 """`gigabrain teleop`: drive by keys or by a gamepad."""
 
+from pathlib import Path
 
-def teleop(*, connect: str | None = None, namespace: str = "", take: bool = False) -> int:
+
+def teleop(
+    *,
+    connect: str | None = None,
+    namespace: str = "",
+    keys: Path | None = None,
+    take: bool = False,
+) -> int:
     """Drive the robot by keys or by a gamepad.
 
     Example: gigabrain teleop --take
@@ -15,6 +23,8 @@ def teleop(*, connect: str | None = None, namespace: str = "", take: bool = Fals
         The router's Zenoh endpoint; without it, the only robot that runs on this machine.
     namespace
         The robot's own part of the key space.
+    keys
+        The folder of your identity, for a router that wants one.
     take
         Even when somebody else drives, the robot's own brain included.
     """
@@ -33,7 +43,10 @@ def teleop(*, connect: str | None = None, namespace: str = "", take: bool = Fals
             if not sys.stdin.isatty() and pad.pad is None:
                 raise ConfigError("teleop needs a terminal to type in, or a gamepad")
             source = f"{getpass.getuser()}-teleop"
-            async with connect_robot(connect, namespace=namespace, source=source) as robot:
+            folder = str(keys) if keys else ""
+            async with connect_robot(
+                connect, namespace=namespace, keys=folder, source=source
+            ) as robot:
                 await Station(robot, pad).drive(take)
         finally:
             pad.close()

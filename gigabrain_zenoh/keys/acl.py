@@ -57,7 +57,7 @@ OPERATOR = Rights(
     says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG),
     asks=(DESCRIBE, AUDIT_LOG, ESTOP, RELEASE, ENABLE, GOAL, MISSION),
     answers=(DESCRIBE,),
-    names=("page", "recorder"),
+    names=("page", "recorder", "button"),
 )
 FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer")  # where no robot is named
 Rule = dict[str, Any]

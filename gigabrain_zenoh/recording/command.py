@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from gigabrain_zenoh.recording.joining import joined
+from gigabrain_zenoh.recording.joining import Where, joined
 from gigabrain_zenoh.recording.node import listening, path_of, recover_others
 from gigabrain_zenoh.recording.play import Player, PlayOptions, check_nobody_drives
 from gigabrain_zenoh.recording.recorder import Recorder, Status
@@ -20,12 +20,10 @@ from gigabrain_zenoh.stop_signals import stop_signals
 LOOK_S = 0.5
 
 
-async def record(
-    config: RecorderConfig, connect: str | None, namespace: str, seconds: float | None
-) -> int:
+async def record(config: RecorderConfig, where: Where, seconds: float | None) -> int:
     """Record until Ctrl-C or for `seconds`; the exit code. Raises GigabrainError."""
     path = path_of(config)
-    async with joined(connect, namespace, "record") as (bus, _):
+    async with joined(where, "record") as (bus, _):
         recorder = Recorder(path, config)
         recorder.begin()
         recover_others(path.parent)
@@ -94,14 +92,13 @@ def _of_key(recorder: Recorder, key: str) -> str:
 async def play(
     path: Path,
     options: PlayOptions,
-    connect: str | None,
-    namespace: str,
+    where: Where,
     *,
     beside_robot: bool,
 ) -> int:
     """Play to the end or until Ctrl-C; the exit code. Raises GigabrainError."""
     check_magic(path)
-    async with joined(connect, namespace, "play") as (bus, transport):
+    async with joined(where, "play") as (bus, transport):
         if not beside_robot:
             await check_nobody_drives(bus)
         player = Player(path, options, transport)

@@ -5,9 +5,11 @@ import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
+from msgspec import Struct
+
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BusError
+from gigabrain_zenoh.keys.checks import no_router
 from gigabrain_zenoh.process import ZENOH_RUNTIME
 from gigabrain_zenoh.running import find_endpoint
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
@@ -15,19 +17,23 @@ from gigabrain_zenoh.zenoh_transport import ZenohTransport
 ROUTER_S = 3.0  # how long a router may take to answer
 
 
+class Where(Struct, frozen=True, kw_only=True):
+    """Which robot, as people say it."""
+
+    connect: str | None = None  # its router; without it, the only robot that runs here
+    namespace: str = ""
+    keys: str = ""  # the folder of an identity
+
+
 @asynccontextmanager
-async def joined(
-    connect: str | None, namespace: str, name: str
-) -> AsyncIterator[tuple[Bus, ZenohTransport]]:
+async def joined(where: Where, name: str) -> AsyncIterator[tuple[Bus, ZenohTransport]]:
     """A bus of a robot, and the transport below it. Raises BusError where there is none."""
-    endpoint = find_endpoint(connect, namespace)
+    endpoint = find_endpoint(where.connect, where.namespace, where.keys)
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
     try:
         transport = await asyncio.wait_for(ZenohTransport.open(endpoint), ROUTER_S)
     except TimeoutError:
-        raise BusError(
-            f"no router answers at {endpoint.connect[0]}; is the robot running?"
-        ) from None
+        raise no_router(endpoint) from None
     bus = Bus(transport, Clock(), name)
     try:
         yield bus, transport

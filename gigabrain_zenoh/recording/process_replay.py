@@ -60,6 +60,7 @@ class Outcome(Struct, frozen=True, kw_only=True):
     only_now: int
     difference: Difference | None
     begun_late: bool  # the process had spoken before the recording began
+    real_time: bool = False  # not in lock-step, where the order within a tick does not matter
 
     @property
     def same(self) -> bool:
@@ -126,7 +127,17 @@ async def replay_process(path: Path, process: str, settings: dict[str, Any]) -> 
     node = node_of(ProcessConfig(name=process, endpoint=Endpoint(), settings=settings))
     kinds = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in SAYS[process]}
     sent = await replay(node, heard)
-    return compare(then, _words((key, kinds[key](data)) for key, data in sent if key in kinds))
+    outcome = compare(then, _words((key, kinds[key](data)) for key, data in sent if key in kinds))
+    speed = notes(path).get("speed", "1")
+    return msgspec.structs.replace(outcome, real_time=speed == "1")
+
+
+def notes(path: Path) -> Mapping[str, str]:
+    """What a recording says of itself at its head."""
+    bag = Bag(path)
+    for _ in bag:
+        break
+    return bag.notes.get("gigabrain", {})
 
 
 def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, Any]:
@@ -135,11 +146,7 @@ def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, 
         loaded = load_deployment(deployment_path(deployment))
         told = {"perception": loaded.perception, "decision": loaded.decision}
         return dict(msgspec.to_builtins(told.get(process, {})))
-    bag = Bag(path)
-    for _ in bag:
-        break
-    noted = bag.notes.get("gigabrain", {}).get(process, "{}")
-    return dict(msgspec.json.decode(noted))
+    return dict(msgspec.json.decode(notes(path).get(process, "{}")))
 
 
 async def replay_file(path: Path, process: str, deployment: str | None) -> int:
@@ -165,5 +172,7 @@ def in_words(path: Path, process: str, outcome: Outcome) -> Iterator[str]:
         yield f"{path}: {process} speaks at other times: {said}"
     else:
         yield f"{path}: {process} does what it did: {said}"
+    if not outcome.same and outcome.real_time:
+        yield "it was recorded in real time: two messages within a tick may have changed places"
     if not outcome.same and outcome.begun_late:
         yield "the recording begins in the middle of a run, whose earlier part may be the reason"

@@ -1,0 +1,83 @@
+"""A recording as a LeRobot dataset. That lerobot itself loads it was tried by hand: it is heavy."""
+
+import importlib.util
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from gigabrain_schemas.body import GateStatus, RobotState
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.recording.drives import file_of
+from gigabrain_zenoh.recording.intake import Arrival
+from gigabrain_zenoh.recording.lerobot import columns, convert, episodes, frames
+from tests import bag_rig
+from tests.test_record_replay import RECORDINGS
+
+
+def enabled(states: range) -> Iterator[Arrival]:
+    """States with the gate open, each after a command of a thousandth of its number."""
+    for seq in states:
+        at_ns = seq * 20_000_000
+        command = codec.encode(CmdVel(linear_x=seq / 1000, source="control"))
+        yield bag_rig.arrival(at_ns - 2, "robot/cmd_vel", command)
+        state = msgspec.msgpack.decode(bag_rig.state(seq), type=RobotState)
+        state = msgspec.structs.replace(state, gate=GateStatus(mode="enabled"))
+        yield bag_rig.arrival(at_ns, "robot/state", codec.encode(state))
+
+
+def test_a_frame_is_every_fifth_state_with_the_command_of_then(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    bag_rig.write(path, enabled(range(1, 22)))
+    found = list(frames(path))
+    assert [frame.tick for frame in found] == [5, 10, 15, 20]
+    assert found[1].state == pytest.approx([0.1, 0.0, 0.0, 0.1, 0.0, 0.0])
+    assert found[1].action == pytest.approx([0.010, 0.0, 0.0])
+
+
+def test_an_episode_ends_where_the_states_break_off_or_the_gate_shuts(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    shut = (a for a in bag_rig.drive(80) if a.header.seq > 60)
+    told = [*enabled(range(1, 22)), *enabled(range(31, 61)), *shut, *enabled(range(81, 86))]
+    bag_rig.write(path, iter(told))
+    assert [[frame.tick for frame in row] for row in episodes(path)] == [
+        [5, 10, 15, 20],
+        [35, 40, 45, 50, 55, 60],
+    ]
+
+
+def test_a_column_has_a_row_per_frame() -> None:
+    (row,) = episodes(file_of(RECORDINGS, "arena"))
+    table = columns(row, episode=2, first=7)
+    assert table["observation.environment_state"].shape == (len(row), 360)
+    assert np.isfinite(table["observation.environment_state"]).all()
+    assert table["index"][:3].tolist() == [7, 8, 9]
+    assert table["timestamp"][:3] == pytest.approx([0.0, 0.1, 0.2])
+    assert set(table["episode_index"].tolist()) == {2}
+
+
+@pytest.mark.skipif(not importlib.util.find_spec("pyarrow"), reason="pyarrow is not installed")
+def test_the_dataset_has_the_folders_of_the_format(tmp_path: Path) -> None:
+    folder = tmp_path / "dataset"
+    assert convert(file_of(RECORDINGS, "house"), folder).startswith(f"{folder}: 1 episodes, ")
+    info = json.loads((folder / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"]) == ("v3.0", 10)
+    from pyarrow import parquet
+
+    table = parquet.read_table(folder / "data/chunk-000/file-000.parquet")
+    assert table.num_rows == info["total_frames"]
+    assert set(table.column_names) == set(info["features"])
+    (episode,) = parquet.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert (episode["dataset_to_index"], episode["tasks"]) == (info["total_frames"], ["drive"])
+
+
+def test_a_recording_in_which_nobody_drives_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    bag_rig.write(path, bag_rig.drive(20))
+    with pytest.raises(ConfigError, match="holds no time in which the gate was enabled"):
+        episodes(path)
