@@ -187,7 +187,7 @@ def _activity(name: str, watch: Watch) -> str:
     """One process's work, as its messages show it."""
     health = watch.health.get(name)
     sent = health.sent_hz if health else {}
-    if name == "router":
+    if name in ("router", "relay"):
         return "joins the others"
     if name == "driver":
         return f"state {sent.get('robot/state', 0):.0f} Hz, scan {sent.get('robot/scan', 0):.0f} Hz"
