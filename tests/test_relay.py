@@ -83,7 +83,7 @@ async def relay_lost(robot: Onlooker, *, killed: bool) -> None:
     assert (truth["stale_commands_executed"], truth["contacts"]) == (0, 0)
 
 
-@pytest.mark.parametrize("secure", [False, True], ids=["bare", "keys"])
+@pytest.mark.parametrize("secure", [False, True], ids=["bare", "with keys in a fleet"])
 async def test_a_robot_whose_brain_loses_its_relay_stops_and_drives_again_and_nobody_is_refused(
     secure: bool, tmp_path: Path
 ) -> None:
@@ -92,20 +92,21 @@ async def test_a_robot_whose_brain_loses_its_relay_stops_and_drives_again_and_no
         "resume": "auto",
         "hosts": {"robot": ROBOT, "brain": BRAIN},
     }
-    operator = ""
+    operator, namespace = "", "red" if secure else ""
     if secure:
         fleet = tmp_path / "keys"
         new_fleet("home", fleet)
-        for role in ("robot", "brain", "operator"):
-            issue(fleet, role)
-        values["keys"], operator = str(fleet), str(fleet / "operator")
+        issue(fleet, "robot", robot="red", name="robot")
+        issue(fleet, "brain", robot="red", name="brain")
+        operator = str(issue(fleet, "operator"))
+        values |= {"keys": str(fleet), "namespace": "red", "fleet": ["blue"]}
     robots, brains = Home(tmp_path / "robot"), Home(tmp_path / "brain")
     try:
         file = str(robots.deployment(**values))
         brain = brains.start("up", file, "--host", "brain")
         await until(lambda: "waiting for it" in brain.out, "it says what it waits for")
         robots.start("up", file, "--host", "robot")
-        where = Endpoint(connect=(str(values["router"]),), keys=operator)
+        where = Endpoint(connect=(str(values["router"]),), keys=operator, namespace=namespace)
         async with looking_on(where) as robot:
             await relay_lost(robot, killed=False)
             await relay_lost(robot, killed=True)
@@ -116,7 +117,8 @@ async def test_a_robot_whose_brain_loses_its_relay_stops_and_drives_again_and_no
             assert "NOT CONFIRMED" not in pressed.out
             assert "CONFIRMED" in pressed.out
             await robot.ticks(75)  # the router's audit is on the disk by then
-        folder = robots.folder / "state" / "gigabrain" / "robots" / "turtlebot3_waffle"
+        folder = robots.folder / "state" / "gigabrain" / "robots"
+        folder /= namespace or "turtlebot3_waffle"
         audited = {record.what for record in audit_file.read(folder, 1000)}
         assert "estop" in audited
         assert not audited & {"refused", "stranger"}
