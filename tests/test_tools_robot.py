@@ -5,7 +5,6 @@ import json
 import os
 import re
 import signal
-from collections.abc import AsyncIterator
 
 import pytest
 
@@ -14,13 +13,13 @@ from tests.stack import Command, Home, free_port, robot_of, until
 
 
 @pytest.fixture
-async def demo(shared_home: Home) -> AsyncIterator[Home]:
+async def demo(shared_home: Home) -> Home:
     """A robot that drives: the mock, the same one for all tests."""
     if not shared_home.processes():
         command = shared_home.start("demo", "--headless", "--body", "mock", "--seconds", "3000")
         await robot_of(shared_home, command)
         await until_why(shared_home, 0)
-    yield shared_home
+    return shared_home
 
 
 async def until_why(home: Home, code: int) -> Command:
@@ -41,7 +40,7 @@ async def printed(home: Home, *arguments: str) -> str:
 
 async def test_topics_are_listed_shown_measured_and_sent(demo: Home) -> None:
     table = await printed(demo, "topic", "list")
-    assert re.search(r"^scan +LaserScan +\d+\.\d +10 +1608 .* driver +perception", table, re.M)
+    assert re.search(r"^scan +LaserScan +\d+\.\d +10 +\d{4} .* driver +perception", table, re.M)
     told = await printed(demo, "topic", "echo", "scan", "-n", "1")
     assert re.search(r"^ranges: 360 values, min ", told, re.M)
     lines = (await printed(demo, "topic", "echo", "state", "--json", "-n", "3")).splitlines()
@@ -82,10 +81,8 @@ async def test_a_velocity_asks_for_the_body_and_gives_it_back(demo: Home) -> Non
     told = await printed(demo, "topic", "pub", "cmd_vel", "linear_x=0.1", "--take")
     assert re.fullmatch(r"driven for \d\.\d s; control drives\n", told)
     driving = demo.start("topic", "pub", "cmd_vel", "linear_x=0.1", "--take", "--rate", "20")
-    status = "gate.commander"
-    while "-pub" not in await printed(
-        demo, "topic", "echo", "state", "-n", "1", "--fields", status
-    ):
+    ask = ("topic", "echo", "state", "-n", "1", "--fields", "gate.commander")
+    while "-pub" not in await printed(demo, *ask):
         assert driving.running, driving.err
     driving.send(signal.SIGINT)
     assert await driving.ended() == 0
@@ -125,9 +122,6 @@ async def test_the_log_tells_who_changed_a_parameter(demo: Home) -> None:
     ("process", "code", "words"),
     [
         ("perception", 14, "world: perception does not answer"),
-        ("decision", 15, "intent: decision does not answer"),
-        ("control", 16, "control: control does not answer"),
-        ("safety", 17, "safety: safety does not answer"),
         ("driver", 11, "driver: driver does not answer"),
         ("router", 10, "router: no router answers"),
     ],

@@ -11,7 +11,7 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.tools.keyexpr import matches
 from gigabrain_zenoh.tools.names import topic_of
 
-ASK_S = 0.6  # how long a process may take to say who it is
+ASK_S = 1.2  # how long a process may take to say who it is
 
 
 class Flow(Struct, frozen=True, order=True):

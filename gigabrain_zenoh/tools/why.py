@@ -9,6 +9,7 @@ from gigabrain_schemas.base import Cause
 from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, STATE, WORLD
 from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.gate import BRAIN
+from gigabrain_zenoh.limits import NO_CAPS
 from gigabrain_zenoh.tools.standing import leaves_nothing, stands
 from gigabrain_zenoh.tools.why_facts import Facts
 
@@ -153,9 +154,8 @@ def _control(facts: Facts) -> Finding:
     open_to_it = gate is not None and gate.mode == "enabled"
     free = facts.safety is not None and facts.safety.verdict != "stop"
     wants = intent.twist if intent else None
-    held = (
-        wants is not None and facts.safety is not None and leaves_nothing(wants, facts.safety.caps)
-    )
+    caps = facts.safety.caps if facts.safety else NO_CAPS
+    held = wants is not None and leaves_nothing(wants, caps)
     if open_to_it and free and wants and not held and stands(facts.fastest):
         remedy = "hand the body back to decision with `gigabrain enable`"
         text = "control sends zero although decision wants to move: an operator's seat has it"
