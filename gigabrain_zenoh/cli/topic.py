@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
+from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.cli.live_names import topics
 from gigabrain_zenoh.cli.where import HERE, Which, say, show
-from gigabrain_zenoh.errors import ConfigError
 
 if TYPE_CHECKING:
     from gigabrain_schemas.brain import CmdVel
@@ -81,8 +81,8 @@ def echo(
     from gigabrain_zenoh.tools.topic_watch import Shown
     from gigabrain_zenoh.tools.topic_watch import echo as run_echo
 
-    _positive("count", count)
-    _positive("within", within)
+    above_zero("count", count)
+    above_zero("within", within)
     chosen = tuple(field.strip() for field in fields.split(",") if field.strip())
     how = Shown(json=json, fields=chosen, count=count, within_s=within)
 
@@ -142,7 +142,7 @@ def _measure(what: Literal["hz", "bw", "delay"], topic: str, at: Which, count: i
     from gigabrain_zenoh.tools.hearing import aimed
     from gigabrain_zenoh.tools.topic_watch import measure
 
-    _positive("count", count)
+    above_zero("count", count)
 
     async def run() -> int:
         async with aimed(at.where(), topic) as (bus, aim):
@@ -209,8 +209,8 @@ def pub(
     from gigabrain_zenoh.tools.names import not_found, target
     from gigabrain_zenoh.tools.publishing import send, typed_in
 
-    _positive("rate", rate)
-    _positive("count", count)
+    above_zero("rate", rate)
+    above_zero("count", count)
     aim = target(name)
     if aim is None or aim.topic is None or "*" in aim.pattern:
         raise not_found(name, ())
@@ -244,8 +244,3 @@ async def _drive(where: "Where", message: "CmdVel", seconds: float | None, take:
         take=take,
     ) as robot:
         say(await drive(robot, message, seconds, take=take))
-
-
-def _positive(name: str, value: float | None) -> None:
-    if value is not None and not 0 < value < 1e9:
-        raise ConfigError(f"--{name}: expected a number above 0, got {value:g}")

@@ -48,9 +48,8 @@ class Stream:
         self.encoding = ""
         self.newest = b""
 
-    def hear(self, encoding: str, payload: bytes, at_ns: int, unix_ns: int) -> None:
-        """Take one message."""
-        stamp_ns = header_of(payload).stamp_ns
+    def hear(self, encoding: str, payload: bytes, stamp_ns: int, at_ns: int, unix_ns: int) -> None:
+        """Take one message, stamped by its sender or with 0."""
         delay_ns = unix_ns - stamp_ns if stamp_ns else None
         self.arrivals.append(Arrival(at_ns, len(payload), delay_ns))
         self.count += 1
@@ -99,10 +98,11 @@ class Tally:
 
     def hear(self, key: str, encoding: str, payload: bytes) -> None:
         """Take one message."""
+        header = header_of(payload)
         with self._lock:
-            stream = self._streams.setdefault(key, Stream())
-            stream.hear(encoding, payload, self._now_ns(), self._unix_ns())
-            self._gaps.see(key, header_of(payload))
+            stream = self._streams.get(key) or self._streams.setdefault(key, Stream())
+            stream.hear(encoding, payload, header.stamp_ns, self._now_ns(), self._unix_ns())
+            self._gaps.see(key, header)
 
     def streams(self) -> dict[str, Stream]:
         """What came so far, by key."""

@@ -97,9 +97,14 @@ class Top(App[None]):
         table = self.query_one(f"#{name}", DataTable)
         column, down = self._sorted[name]
         at = table.cursor_row
-        table.clear(columns=True)
-        for i, label in enumerate(self._columns(name)):
-            table.add_column(label + (DOWN if down else UP) if i == column else label)
+        labels = [
+            label + (DOWN if down else UP) if i == column else label
+            for i, label in enumerate(self._columns(name))
+        ]
+        same = labels == [str(known.label) for known in table.ordered_columns]
+        table.clear(columns=not same)
+        if not same:
+            table.add_columns(*labels)
         for key, cells in in_order(self._rows[name], column, down=down):
             made = [
                 Text(shown(c), justify="left" if isinstance(c, str) else "right") for c in cells

@@ -188,8 +188,8 @@ def _gate(facts: Facts) -> Finding:
     gate = facts.state.gate
     text, remedy = _told(gate.causes)
     if gate.mode == "latched":
-        act = "then `gigabrain release` and `gigabrain enable`"
-        return _no("gate", f"it is latched: {text}", f"{remedy}; {act}" if remedy else act)
+        act = "`gigabrain release`, then `gigabrain enable`"
+        return _no("gate", f"it is latched: {text}", f"{remedy}: {act}" if remedy else act)
     if gate.mode != "enabled":
         why = text or "nobody has enabled it"
         act = "enable it with `gigabrain enable`"
@@ -203,6 +203,8 @@ def _gate(facts: Facts) -> Finding:
 def _body(facts: Facts) -> Finding:
     assert facts.state
     now, told = facts.state.velocity, facts.fastest
+    if not facts.state.link.connected:
+        return _no("body", "how fast it moves is not known", "mend its link first")
     speed = f"{now.linear_x:+.2f} m/s {now.angular_z:+.2f} rad/s"
     if stands(now) and not stands(told):
         remedy = "see whether something holds it, at its motors, and whether its power is on"
