@@ -78,16 +78,21 @@ async def test_a_velocity_asks_for_the_body_and_gives_it_back(demo: Home) -> Non
     refused = await demo.run("topic", "pub", "cmd_vel", "linear_x=0.1")
     assert await refused.ended() == 1
     assert refused.err == "gigabrain: control drives; take it over with --take\n"
-    told = await printed(demo, "topic", "pub", "cmd_vel", "linear_x=0.1", "--take")
-    assert re.fullmatch(r"driven for \d\.\d s; control drives\n", told)
+    for _ in range(5):  # a process that is starved for 150 ms closes the gate meanwhile
+        driven = await demo.run("topic", "pub", "cmd_vel", "linear_x=0.1", "--take")
+        if re.fullmatch(r"driven for \d\.\d s; control drives\n", driven.out):
+            break
+        await until_moving(demo)
+    else:
+        raise AssertionError(driven.out + driven.err)
     driving = demo.start("topic", "pub", "cmd_vel", "linear_x=0.1", "--take", "--rate", "20")
     ask = ("topic", "echo", "state", "-n", "1", "--fields", "gate.commander")
     while "-pub" not in await printed(demo, *ask):
         assert driving.running, driving.err
     driving.send(signal.SIGINT)
     assert await driving.ended() == 0
-    assert driving.out.endswith("; control drives\n")
-    await until_why(demo, 0)
+    assert re.search(r"; (control drives|the brain has not got it back: .*)\n$", driving.out)
+    await until_moving(demo)
 
 
 async def test_processes_and_who_talks_to_whom_are_shown(demo: Home) -> None:
@@ -162,13 +167,12 @@ def pid_of(home: Home, process: str) -> int:
 async def test_an_e_stop_is_named_with_the_way_out(demo: Home) -> None:
     await until_why(demo, 0)
     assert await (await demo.run("estop")).ended() == 0
-    why = await demo.run("why", "--json")
-    told = json.loads(why.out)
-    assert (await why.ended(), told["broken"]) == (18, "gate")
+    await until_why(demo, 18)
+    told = json.loads((await demo.run("why", "--json")).out)
+    assert "latched" in {one["link"]: one["text"] for one in told["findings"]}["gate"]
     assert await (await demo.run("release")).ended() == 0
     assert "it is idle: nobody has enabled it" in (await until_why(demo, 18)).out
-    assert await (await demo.run("enable")).ended() == 0
-    await until_why(demo, 0)
+    await until_moving(demo)
 
 
 async def test_the_doctor_finds_a_process_that_is_gone(demo: Home) -> None:
