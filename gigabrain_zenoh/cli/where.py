@@ -1,4 +1,4 @@
-"""The options of every tool that looks at a running robot."""
+"""The options of every command that is for a running robot."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,12 +27,16 @@ class Which:
         Parameter(help="The folder of your identity, for a router that wants one."),
     ] = None
 
+    @property
+    def folder(self) -> str:
+        """The folder of the identity; empty for none."""
+        return str(self.keys) if self.keys else ""
+
     def where(self) -> "Where":
         """As the tools take it."""
         from gigabrain_zenoh.recording.joining import Where
 
-        folder = str(self.keys) if self.keys else ""
-        return Where(connect=self.connect, namespace=self.namespace, keys=folder)
+        return Where(connect=self.connect, namespace=self.namespace, keys=self.folder)
 
 
 HERE = Which()  # the only robot of this machine
