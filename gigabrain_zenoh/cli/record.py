@@ -6,8 +6,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.checked import checked
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.cli.checked import above_zero, checked
 from gigabrain_zenoh.settings import RecorderConfig
 
 
@@ -59,8 +58,7 @@ def record(
 
     limits = {"seconds": seconds, "split-size": split_size, "split-time": split_time}
     for name, value in limits.items():
-        if value is not None and not 0 < value < 1e9:
-            raise ConfigError(f"--{name}: expected a number above 0, got {value:g}")
+        above_zero(name, value)
     values = {
         "file": str(output or file_name()),
         "topics": topics or (),

@@ -29,7 +29,8 @@ APART_TICKS, LONG_APART_TICKS = 250, 3000
 WRONG_TICKS = ("future", "past")
 WRONG_STAMPS = ("of-1970", "of-2100")
 STAMPED_TICKS = 100
-COMMANDS = 200
+RESTING, COMMANDS = 30, 12  # good ones, and those with each of these; safety would stop it soon
+OFF_TICKS = (-100, -9, 20, 1000)  # from the newest tick
 SPEED, MOVES = 0.1, 0.005  # [m/s], [m]
 SEQUENCES, LONG_SEQUENCES = 20_000, 1_000_000
 EDGES = (0, 1, 2**15, 2**16, 2**31, 2**32, 2**53, 2**63 - 3)  # where counters wrap
@@ -86,28 +87,41 @@ async def stamps_of_other_times(rig: Rig) -> Measured:
 
 
 async def _commands_of_other_times(subject: Subject) -> int:
-    """How many ticks the body moved in, commanded by who holds it but at other ticks."""
-    onlooker = subject.onlooker
-    await subject.person.enable(onlooker.bus.process, take=True)
-    await onlooker.still()
-    before_m = await subject.distance()
+    """For how many wrong ticks the body moved, told to by who holds it and asks for rest besides.
+
+    All else of these commands is right; the good ones keep the gate open.
+    """
+    onlooker, fresh = subject.onlooker, 0
     async with forging(client_endpoint(subject.deployment)) as forger:
-        for number in range(COMMANDS):
-            time = onlooker.bus.time
-            off = (-100, -9, 3, 1000)[number % 4]
-            command = CmdVel(
-                linear_x=SPEED,
-                source=onlooker.bus.process,
-                stamp_ns=onlooker.bus.clock.unix_ns(),
-                boot=time.boot,
-                tick=max(0, time.tick + off),
-                basis=max(0, time.tick + off),
-                seq=1_000_000 + number,
-            )
-            forger.send(CMD_VEL, command)
-            if number % 4 == 3:
+        for off in OFF_TICKS:
+            await subject.drive(0.8)  # so that nothing speaks against moving
+            await subject.person.enable(onlooker.bus.process, take=True)
+            for _ in range(RESTING):
+                forger.send(CMD_VEL, _command(subject, 0.0, 0))
                 await onlooker.ticks(1)
-    return int(await subject.distance() - before_m > MOVES)
+            rest = onlooker.state
+            if rest.gate.mode != "enabled":
+                raise Failed("the gate did not stay open for good commands")
+            for _ in range(COMMANDS):
+                forger.send(CMD_VEL, _command(subject, 0.0, 0))
+                forger.send(CMD_VEL, _command(subject, SPEED, off))
+                await onlooker.ticks(1)
+            fresh += onlooker.moved(rest) > MOVES
+    return fresh
+
+
+def _command(subject: Subject, speed: float, off: int) -> CmdVel:
+    """One that echoes a tick `off` the newest; of two in a tick the moving one counts as newer."""
+    time = subject.onlooker.bus.time
+    return CmdVel(
+        linear_x=speed,
+        source=subject.onlooker.bus.process,
+        stamp_ns=subject.onlooker.bus.clock.unix_ns(),
+        boot=time.boot,
+        tick=time.tick + off,
+        basis=time.tick,
+        seq=2 * time.tick + (speed > 0),
+    )
 
 
 async def hosts_with_other_clocks(rig: Rig) -> Measured:
