@@ -20,8 +20,8 @@ from gigabrain_zenoh.faults.forger import Forger, forging
 from gigabrain_zenoh.faults.hostile import codec_of, hostile_payloads
 from gigabrain_zenoh.faults.hostile import hostile_values as damaged
 from gigabrain_zenoh.faults.open_gate import COMMANDER, OpenGate
-from gigabrain_zenoh.faults.rig import Rig
-from gigabrain_zenoh.faults.smooth import stops_in_time
+from gigabrain_zenoh.faults.rig import Rig, deployment_of
+from gigabrain_zenoh.faults.smooth import stops
 from gigabrain_zenoh.faults.stopping import TICK_MS
 from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
@@ -36,6 +36,7 @@ SENSED, LONG_SENSED = 1000, 100_000  # scans, and states with battery and temper
 PER_TICK = 3  # of each key, on a running robot
 FLOOD_TICKS, LONG_FLOOD_TICKS = 100, 3000
 SPEEDS = (math.nan, math.inf, -math.inf)
+LOCKSTEP = 2.0  # of real time
 ROUNDING = 1e-9
 AXES = ("linear_x", "linear_y", "angular_z")
 COMMAND = codec_of(CmdVel)
@@ -47,9 +48,10 @@ async def hostile_values(rig: Rig) -> Measured:
     body, wrong = description_of(rig), 0
     wrong += await asyncio.to_thread(at_gate, body, LONG_COMMANDS if rig.long else COMMANDS)
     await asyncio.to_thread(sensed, body, LONG_SENSED if rig.long else SENSED)
+    wrong += await _flooded(rig, LONG_FLOOD_TICKS if rig.long else FLOOD_TICKS)
     subject = await rig.robot("sim")
     pids = await subject.onlooker.pids()
-    wrong += await _flooded(subject, LONG_FLOOD_TICKS if rig.long else FLOOD_TICKS)
+    await _pour(subject, FLOOD_TICKS)
     zero_ms = [await _nan_of_commander(subject, speed) for speed in SPEEDS]
     after = await subject.onlooker.pids()
     return {
@@ -132,23 +134,37 @@ def sensed(body: BodyDescription, count: int) -> None:
             raise Failed(f"{error!r} of {plain_scan} and {plain_state}") from error
 
 
-async def _flooded(subject: Subject, ticks: int) -> int:
-    """Stops of a driving robot, and speeds beyond its limits, while nonsense comes on each key."""
-    onlooker = subject.onlooker
-    endless = [(topic, hostile_payloads(topic.type, number)) for number, topic in enumerate(TOPICS)]
-    await subject.drive()
-    body = onlooker.bodies.current
-    assert body
-    start, most = onlooker.state, 1.2 * body.description.max_linear_speed
+async def _flooded(rig: Rig, ticks: int) -> int:
+    """Stops of a driving robot, and speeds beyond its limits, while nonsense comes on each key.
+
+    In lock-step, where time waits for the brain: a stop is the flood's, and not the machine's.
+    """
+    await rig.give_up()
+    deployment = msgspec.structs.replace(deployment_of(rig.options, "sim"), speed=LOCKSTEP)
+    async with rig.new(deployment) as subject:
+        await subject.settle()
+        onlooker = subject.onlooker
+        await subject.drive()
+        body = onlooker.bodies.current
+        assert body
+        start, most = onlooker.state, 1.2 * body.description.max_linear_speed
+        await _pour(subject, ticks)
+        states = [s for s in onlooker.states if s.boot == start.boot and s.tick > start.tick]
+        await subject.check()
+    fast = sum(not abs(s.velocity.linear_x) <= most for s in states)
+    return fast + len(stops(onlooker, start))
+
+
+async def _pour(subject: Subject, ticks: int) -> None:
+    """Nonsense on each key, for so long."""
+    onlooker, start = subject.onlooker, subject.onlooker.state
+    endless = [(topic, hostile_payloads(topic.type, n)) for n, topic in enumerate(TOPICS)]
     async with forging(client_endpoint(subject.deployment)) as forger:
         while onlooker.state.tick - start.tick < ticks:
             for topic, payloads in endless:
                 for payload in itertools.islice(payloads, PER_TICK):
                     forger.send_bytes(topic, payload)
             await onlooker.ticks(1)
-    states = [s for s in onlooker.states if s.boot == start.boot and s.tick > start.tick]
-    fast = sum(not abs(s.velocity.linear_x) <= most for s in states)
-    return fast + stops_in_time(onlooker, start)
 
 
 async def _nan_of_commander(subject: Subject, speed: float) -> float:
