@@ -67,6 +67,7 @@ PROGRAMS = {
     "recorder": Program(
         "gigabrain_zenoh.recording.node:run", "gigabrain_zenoh.settings:RecorderConfig"
     ),
+    "page": Program("gigabrain_zenoh.page.node:run", "gigabrain_zenoh.settings:PageConfig"),
 }
 
 

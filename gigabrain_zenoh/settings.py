@@ -70,6 +70,18 @@ class ButtonConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     port: str  # of the USB-serial adapter: a path, or usb:VID:PID[:SERIAL]
 
 
+class PageConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The `page` part of a deployment file."""
+
+    listen: str = "127.0.0.1"  # an address of this host; beyond loopback it wants TLS and a login
+    port: Annotated[int, Meta(ge=0, le=65535)] = 8080
+    names: tuple[str, ...] = ()  # by which browsers ask for it, beside `listen`
+    certificate: str = ""  # a PEM file
+    certificate_key: str = ""
+    login: bool = False  # want a token on loopback as well
+    tokens: str = ""  # the file that keeps them; one in the user's state folder without
+
+
 class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The settings of the emulator process."""
 
