@@ -17,6 +17,12 @@ from gigabrain_zenoh.settings import DecisionConfig
 
 log = logging.getLogger(__name__)
 
+CHANGEABLE = {  # while it runs, and what is expected
+    "linear_speed": "a number above 0, up to 10 [m/s]; the body's own limit holds as well",
+    "angular_speed": "a number above 0, up to 10 [rad/s]; the body's own limit holds as well",
+    "turn": "one of: right, left, clearer",
+}
+
 
 class Thinker:
     """Thinks once per world, and stands by its word in between.
@@ -30,6 +36,15 @@ class Thinker:
         self._behaviour, self._boot = self._load(config), 0
         self.intent = Intent(behaviour=config.behaviour, reason="starting")
         self.basis = 0
+
+    @property
+    def config(self) -> DecisionConfig:
+        """The settings that it goes by."""
+        return self._config
+
+    def configure(self, config: DecisionConfig) -> None:
+        """Go by other settings from now on. The behaviour begins anew."""
+        self._config, self._behaviour = config, self._load(config)
 
     def think(
         self, state: RobotState, world: WorldModel | None, *, must_charge: bool = False
@@ -47,6 +62,8 @@ class Thinker:
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """An intent per world, as soon as it comes; repeated with the newest tick at each state."""
     thinker, said = Thinker(config), ""
+    for name, expected in CHANGEABLE.items():
+        bus.params.add_field(name, expected, lambda: thinker.config, thinker.configure)
     verdicts: Earlier[SafetyState] = Earlier()
 
     def decide(_: Message) -> None:

@@ -232,7 +232,7 @@ def process_specs(
                 name=name,
                 argv=(*COMMAND, msgspec.json.encode(process).decode()),
                 after=after,
-                stop_last=name == "router",
+                stop_last=name in ("router", EMULATOR),
                 ready_timeout_s=30.0 if after else 3600.0,  # elsewhere, the router may come later
             )
         )

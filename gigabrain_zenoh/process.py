@@ -26,6 +26,7 @@ from gigabrain_zenoh.errors import GigabrainError, unknown
 from gigabrain_zenoh.health import answer_to_name, publish_health
 from gigabrain_zenoh.heartbeat import beat
 from gigabrain_zenoh.keys.checks import identity_in
+from gigabrain_zenoh.param_service import serve_params
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.stop_signals import stop_signals
@@ -142,6 +143,7 @@ async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
     logging.getLogger().addHandler(handler)
     try:
         await answer_to_name(bus)
+        serve_params(bus)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(publish_health(bus))
             if config.json_console:

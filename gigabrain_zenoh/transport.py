@@ -171,5 +171,5 @@ def _matches(pattern: str, key: str) -> bool:
     """As Zenoh does, of a pattern whose last part may be a star or two."""
     start, _, last = pattern.rpartition("/")
     if last == "**":
-        return key == start or key.startswith(f"{start}/")
+        return not start or key == start or key.startswith(f"{start}/")
     return pattern == key or (last == "*" and key.rpartition("/")[0] == start)

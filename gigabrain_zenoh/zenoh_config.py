@@ -12,7 +12,7 @@ from gigabrain_zenoh.keys.files import CA, CERTIFICATE, KEY, check_files
 from gigabrain_zenoh.settings import Endpoint, RouterConfig
 
 SECURE, PLAIN = "tls/", "tcp/"
-PENDING = 1000  # links that may be on their way in; silent ones are dropped after a second
+PENDING = 4000  # links that may be on their way in; silent ones are dropped after a second
 IP_ENDPOINT = re.compile(r"(?:tcp|udp|tls|quic|ws)/[^/#?]+:(\d+)(?:[?#].*)?")
 LOCAL_ENDPOINT = re.compile(r"unixsock-stream/.+")
 

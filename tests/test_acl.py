@@ -21,9 +21,9 @@ SAYS = {
     "viewer": "",
 }
 ASKS = {
-    "brain": "estop describe",
-    "operator": "estop release enable goal mission audit_log describe",
-    "viewer": "audit_log describe",
+    "brain": "estop describe/driver",
+    "operator": "estop release enable goal mission audit_log param/driver describe/driver",
+    "viewer": "audit_log describe/driver",
 }
 SAID = [topic.at("perception") for topic in TOPICS]
 ASKED = [service.at("driver") for service in SERVICES]
@@ -81,10 +81,7 @@ async def test_each_role_may_ask_its_own_questions_and_no_others(net: Site) -> N
         session = net.raw(f"{role}@red")
         await asked_until_answered(session, "red/robot/describe/driver")  # declared last of all
         answered = {key for key in ASKED if await ask(session, f"red/{key}")}
-        assert answered == {
-            f"robot/{name}" if name != "describe" else "robot/describe/driver"
-            for name in expected.split()
-        }
+        assert answered == {f"robot/{name}" for name in expected.split()}
 
 
 async def test_nobody_but_the_robot_answers_for_its_gate(net: Site) -> None:

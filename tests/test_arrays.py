@@ -47,7 +47,10 @@ def image(encoding: Any, height: int, width: int, data: bytes) -> Image:
         (lambda: JointCommand(name=("a", "b"), position=(0.0,)), "2 names"),
         (lambda: JointCommand(name=("a",), position=(0.0,), velocity=(0.0,)), "1 names"),
         (lambda: JointCommand(name=("a",)), "1 names"),
-        (lambda: Thresholds(battery_warn=4.0), "battery_stop must not be above battery_warn"),
+        (
+            lambda: Thresholds(battery_warn=4.0),
+            "battery_stop, battery_return and battery_warn must ascend",
+        ),
         (lambda: Thresholds(motor_warn=71.0), "motor_stop must not be below motor_warn"),
     ],
 )

@@ -70,6 +70,8 @@ async def test_the_version_is_that_of_the_package(home: Home) -> None:
         ("demo --seed -3", "--seed: expected `int` >= 0"),
         ("demo --speed 1000", "--speed: expected `float` <= 100.0"),
         ("demo --seconds nan", "--seconds: expected a number above 0, got nan"),
+        ("bench bodies --seconds 0", "--seconds: expected a number above 0, got 0"),
+        ("faults --repeat 0", 'Invalid value "0" for --repeat'),
         ("demo --resume auto --link real", "resume: auto is for simulation"),
         ("demo --body wafle", "no robot 'wafle'; did you mean 'turtlebot3_waffle'? known: alpha,"),
         ("demo --body turtlebot3_wafle", "did you mean 'turtlebot3_waffle'?"),

@@ -324,7 +324,7 @@ config = RecorderConfig(viewers=False, keep_free_mb=0, flush_s=0.02)
 with Recorder(Path(sys.argv[1]), config) as recorder:
     for seq in range(1, 101):
         recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
-        time.sleep(0.002)
+        time.sleep(0.01)
 now = recorder.status()
 print(now.seen, now.written, now.dropped)
 """

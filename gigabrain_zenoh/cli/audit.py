@@ -6,6 +6,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
+from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.errors import ConfigError
 
 
@@ -13,9 +14,7 @@ def audit(
     robot: str = "",
     /,
     *,
-    connect: str | None = None,
-    namespace: str = "",
-    keys: Path | None = None,
+    at: Which = HERE,
     newest: Annotated[int, Parameter(alias="-n")] = 20,
     follow: bool = False,
     json: bool = False,
@@ -30,12 +29,6 @@ def audit(
     ----------
     robot
         The folder of a robot that does not run, or its name; without it, the one that runs.
-    connect
-        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    namespace
-        The robot's own part of the key space.
-    keys
-        The folder of your identity, for a router that wants one.
     newest
         How many entries.
     follow
@@ -51,7 +44,7 @@ def audit(
         raise ConfigError(f"--newest: expected 1 to 1000, got {newest}")
     show = audit_text.as_json if json else audit_text.readable
     if robot:
-        if follow or connect:
+        if follow or at.connect:
             raise ConfigError("leave out the name of a robot that runs")
         _print(map(show, audit_file.read(_folder(robot), newest)))
         return 0
@@ -59,8 +52,9 @@ def audit(
     async def run() -> None:
         from gigabrain_zenoh.client import connect as connect_robot
 
-        folder = str(keys) if keys else ""
-        async with connect_robot(connect, namespace=namespace, keys=folder, wait=False) as found:
+        async with connect_robot(
+            at.connect, namespace=at.namespace, keys=at.folder, wait=False
+        ) as found:
             following = found.topic("audit") if follow else None
             _print(map(show, await found.audit(newest)))
             if following:

@@ -8,6 +8,7 @@ from typing import Annotated
 import msgspec
 from cyclopts import Parameter
 
+from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.errors import ConfigError
 
 
@@ -90,9 +91,7 @@ def play(
     topics: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     remap: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     beside_robot: bool = False,
-    connect: str | None = None,
-    namespace: str = "",
-    keys: Path | None = None,
+    at: Which = HERE,
 ) -> int:
     """Send a recording again, the last map first.
 
@@ -114,15 +113,8 @@ def play(
         Send a key on another: robot/scan=old/scan.
     beside_robot
         Even where a driver runs. Its gate refuses recorded commands; its brain is confused.
-    connect
-        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    namespace
-        The robot's own part of the key space.
-    keys
-        The folder of your identity, for a router that wants one.
     """
     from gigabrain_zenoh.recording.command import play as run
-    from gigabrain_zenoh.recording.joining import Where
     from gigabrain_zenoh.recording.play import PlayOptions
 
     if not 0.01 <= rate <= 100:
@@ -132,8 +124,7 @@ def play(
     options = PlayOptions(
         rate=rate, start_s=start, loop=loop, topics=tuple(topics or ()), remap=_pairs(remap or [])
     )
-    where = Where(connect=connect, namespace=namespace, keys=str(keys or ""))
-    return asyncio.run(run(file, options, where, beside_robot=beside_robot))
+    return asyncio.run(run(file, options, at.where(), beside_robot=beside_robot))
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:

@@ -9,6 +9,7 @@ import msgspec
 from cyclopts import Parameter
 from rich.console import Console, RenderableType
 
+from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.errors import ConfigError
 
 FASTEST_HZ = 50.0  # one scan per tick of the robot's clock
@@ -39,8 +40,8 @@ def chain(
     from gigabrain_zenoh.bench.chain import measure_chain
     from gigabrain_zenoh.bench.tables import chain_page
 
-    _above_zero("seconds", seconds)
-    _above_zero("rounds", rounds)
+    above_zero("seconds", seconds)
+    above_zero("rounds", rounds)
     for rate in rates:
         if not 0 < rate <= FASTEST_HZ:
             raise ConfigError(f"--rates: expected above 0, at most {FASTEST_HZ:g}, got {rate:g}")
@@ -74,7 +75,7 @@ def stack(
     from gigabrain_zenoh.bench.stack import measure_stack
     from gigabrain_zenoh.bench.tables import stack_page
 
-    _above_zero("seconds", seconds)
+    above_zero("seconds", seconds)
     result = asyncio.run(measure_stack(body, world, seconds, _progress))
     _finish(stack_page(result), result, json)
     return 0
@@ -105,16 +106,11 @@ def estop(
     from gigabrain_zenoh.bench.estop import measure_estop
     from gigabrain_zenoh.bench.tables import estop_page
 
-    _above_zero("driving", driving)
-    _above_zero("latched", latched)
+    above_zero("driving", driving)
+    above_zero("latched", latched)
     result = asyncio.run(measure_estop(body, driving, latched, _progress))
     _finish(estop_page(result), result, json)
     return 0
-
-
-def _above_zero(name: str, value: float) -> None:
-    if not 0 < value < 1e6:
-        raise ConfigError(f"--{name}: expected a number above 0, got {value:g}")
 
 
 def _progress(text: str) -> None:

@@ -5,6 +5,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.process import find
 
@@ -48,6 +49,7 @@ def bodies(
 
     from gigabrain_zenoh.bench.bodies import measure_bodies
 
+    above_zero("seconds", seconds)
     chosen = names or find("gigabrain_drivers.catalog:simulated")(link)
     deployment = Deployment(
         link=link, world=world, seed=seed, resume="auto", router="tcp/127.0.0.1:0"

@@ -18,3 +18,9 @@ def checked(values: Mapping[str, object], type: type[T]) -> T:
         text, _, path = str(error).partition(" - at `$.")
         name = path.rstrip("`").replace("_", "-")
         raise ConfigError(f"--{name}: {text[0].lower()}{text[1:]}" if name else text) from None
+
+
+def above_zero(name: str, value: float | None) -> None:
+    """Raises ConfigError where the option `name` is no number above 0; None is none given."""
+    if value is not None and not 0 < value < 1e9:
+        raise ConfigError(f"--{name}: expected a number above 0, got {value:g}")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+from cyclopts.validators import Number
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -20,7 +21,7 @@ def faults(
     *,
     list_: Annotated[bool, Parameter(name="--list", negative=())] = False,
     only: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
-    repeat: int = 1,
+    repeat: Annotated[int, Parameter(validator=Number(gte=1))] = 1,
     body: str = "",
     world: str = "arena",
     long: Annotated[bool, Parameter(negative=())] = False,

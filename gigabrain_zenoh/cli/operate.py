@@ -4,9 +4,9 @@ import asyncio
 import getpass
 import time
 from collections.abc import Awaitable, Callable
-from pathlib import Path
 
 from gigabrain_schemas.requests import GateReply
+from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.client import Robot
 from gigabrain_zenoh.client import connect as connect_robot
 from gigabrain_zenoh.errors import BusError, NotConfirmed
@@ -14,9 +14,7 @@ from gigabrain_zenoh.estop import BY_HAND
 from gigabrain_zenoh.gate import BRAIN
 
 
-def estop(
-    *, connect: str | None = None, namespace: str = "", keys: Path | None = None, reason: str = ""
-) -> int:
+def estop(*, at: Which = HERE, reason: str = "") -> int:
     """Stop the robot at once, and latch it.
 
     Example: gigabrain estop --reason "somebody is in the way"
@@ -26,65 +24,38 @@ def estop(
 
     Parameters
     ----------
-    connect
-        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    namespace
-        The robot's own part of the key space.
-    keys
-        The folder of your identity, for a router that wants one.
     reason
         For the log.
     """
     try:
-        return _ask(
-            connect, namespace, keys, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False
-        )
+        return _ask(at, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False)
     except BusError as error:
         raise NotConfirmed(f"NOT CONFIRMED: {error}; {BY_HAND}") from None
 
 
-def release(*, connect: str | None = None, namespace: str = "", keys: Path | None = None) -> int:
+def release(*, at: Which = HERE) -> int:
     """Let go of a latched gate. It takes an enable as well to move.
 
     Example: gigabrain release
-
-    Parameters
-    ----------
-    connect
-        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    namespace
-        The robot's own part of the key space.
-    keys
-        The folder of your identity, for a router that wants one.
     """
-    return _ask(connect, namespace, keys, lambda robot: robot.release())
+    return _ask(at, lambda robot: robot.release())
 
 
-def enable(
-    *, connect: str | None = None, namespace: str = "", keys: Path | None = None, take: bool = False
-) -> int:
+def enable(*, at: Which = HERE, take: bool = False) -> int:
     """Let the robot's brain drive.
 
     Example: gigabrain enable
 
     Parameters
     ----------
-    connect
-        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    namespace
-        The robot's own part of the key space.
-    keys
-        The folder of your identity, for a router that wants one.
     take
         Even when somebody else drives.
     """
-    return _ask(connect, namespace, keys, lambda robot: robot.enable(BRAIN, take=take))
+    return _ask(at, lambda robot: robot.enable(BRAIN, take=take))
 
 
 def _ask(
-    connect: str | None,
-    namespace: str,
-    keys: Path | None,
+    at: Which,
     ask: Callable[[Robot], Awaitable[GateReply]],
     prefix: str = "",
     *,
@@ -92,9 +63,8 @@ def _ask(
 ) -> int:
     async def run() -> None:
         source = f"{getpass.getuser()}-cli"
-        folder = str(keys) if keys else ""
         async with connect_robot(
-            connect, namespace=namespace, keys=folder, source=source, wait=wait
+            at.connect, namespace=at.namespace, keys=at.folder, source=source, wait=wait
         ) as robot:
             began = time.perf_counter()
             reply = await ask(robot)

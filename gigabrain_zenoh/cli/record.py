@@ -6,8 +6,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.checked import checked
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.cli.checked import above_zero, checked
+from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.settings import RecorderConfig
 
 
@@ -15,9 +15,7 @@ def record(
     *,
     output: Annotated[Path | None, Parameter(alias="-o")] = None,
     topics: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
-    connect: str | None = None,
-    namespace: str = "",
-    keys: Path | None = None,
+    at: Which = HERE,
     seconds: float | None = None,
     split_size: float | None = None,
     split_time: float | None = None,
@@ -36,12 +34,6 @@ def record(
         The file; without it, one named by the time, in this folder.
     topics
         Names, such as scan, or key expressions, such as "robot/image/*"; all without.
-    connect
-        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    namespace
-        The robot's own part of the key space.
-    keys
-        The folder of your identity, for a router that wants one.
     seconds
         End after this long [s].
     split_size
@@ -54,13 +46,11 @@ def record(
         Stop writing while less than this is free on the disk [MB].
     """
     from gigabrain_zenoh.recording.command import record as run
-    from gigabrain_zenoh.recording.joining import Where
     from gigabrain_zenoh.recording.node import file_name
 
     limits = {"seconds": seconds, "split-size": split_size, "split-time": split_time}
     for name, value in limits.items():
-        if value is not None and not 0 < value < 1e9:
-            raise ConfigError(f"--{name}: expected a number above 0, got {value:g}")
+        above_zero(name, value)
     values = {
         "file": str(output or file_name()),
         "topics": topics or (),
@@ -69,5 +59,4 @@ def record(
         "split_s": split_time,
         "keep_free_mb": keep_free,
     }
-    where = Where(connect=connect, namespace=namespace, keys=str(keys or ""))
-    return asyncio.run(run(checked(values, RecorderConfig), where, seconds))
+    return asyncio.run(run(checked(values, RecorderConfig), at.where(), seconds))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-from gigabrain_zenoh.cli.checked import checked
+from gigabrain_zenoh.cli.checked import above_zero, checked
 from gigabrain_zenoh.config_places import located
 from gigabrain_zenoh.deployment import (
     Deployment,
@@ -75,8 +75,7 @@ def demo(
 
     if record and record.exists():
         raise ConfigError(f"{record} exists; choose another file")
-    if seconds is not None and not 0 < seconds < 1e7:
-        raise ConfigError(f"--seconds: expected a number above 0, got {seconds:g}")
+    above_zero("seconds", seconds)
     values = {
         "body": body,
         "link": link,

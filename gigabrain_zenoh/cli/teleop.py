@@ -1,13 +1,11 @@
 """`gigabrain teleop`: drive by keys or by a gamepad."""
 
-from pathlib import Path
+from gigabrain_zenoh.cli.where import HERE, Which
 
 
 def teleop(
     *,
-    connect: str | None = None,
-    namespace: str = "",
-    keys: Path | None = None,
+    at: Which = HERE,
     take: bool = False,
 ) -> int:
     """Drive the robot by keys or by a gamepad.
@@ -19,12 +17,6 @@ def teleop(
 
     Parameters
     ----------
-    connect
-        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    namespace
-        The robot's own part of the key space.
-    keys
-        The folder of your identity, for a router that wants one.
     take
         Even when somebody else drives, the robot's own brain included.
     """
@@ -43,9 +35,8 @@ def teleop(
             if not sys.stdin.isatty() and pad.pad is None:
                 raise ConfigError("teleop needs a terminal to type in, or a gamepad")
             source = f"{getpass.getuser()}-teleop"
-            folder = str(keys) if keys else ""
             async with connect_robot(
-                connect, namespace=namespace, keys=folder, source=source
+                at.connect, namespace=at.namespace, keys=at.folder, source=source
             ) as robot:
                 await Station(robot, pad).drive(take)
         finally:

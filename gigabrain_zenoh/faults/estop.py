@@ -20,7 +20,7 @@ from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
-PRESSES, LONG_PRESSES = 30, 300  # from each endpoint
+PRESSES, LONG_PRESSES = 100, 300  # from each endpoint
 DRIVES, LONG_DRIVES = 2, 20  # presses while it drives
 CALM_TICKS = 5  # the first 100 ms after an enable
 HELD_S = 0.05  # between two messages of a joystick

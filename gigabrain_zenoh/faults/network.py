@@ -7,7 +7,6 @@ import itertools
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.faults.chaos import Chaos
 from gigabrain_zenoh.faults.crowd import (
-    bit_flips,
     duplicated_and_reordered,
     two_commanders_across_a_partition,
     viewer_frozen,
@@ -19,6 +18,7 @@ from gigabrain_zenoh.faults.spoiled import HOLE, behind_proxy
 from gigabrain_zenoh.faults.stopping import TICK_MS, creep, stop_by
 from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
+from gigabrain_zenoh.faults.with_keys import bit_flips
 
 __all__ = [
     "bit_flips",
@@ -36,7 +36,7 @@ FREEZE_S = 2.4  # longer, and the supervisor replaces it
 SHORT_HOLE_S, SHORT_HOLES = 0.06, 5  # with 20 ms between commands, a gap of at most 80 ms
 HOLES_S, LONG_HOLES_S = (0.3, 1.0, 3.0), (0.15, 0.3, 1.0, 3.0, 30.0)
 NO_GAP_TICKS = 5  # up to which the gate waits for a command
-DRIVE_TICKS = 100  # with each kind of bad line
+DRIVE_TICKS = 150  # with each kind of bad line
 ROUND_TRIPS_MS = (20.0, 50.0, 100.0)
 TOO_LONG_MS = 200.0
 BAD = (  # on a line that takes 50 ms; each way has half of it

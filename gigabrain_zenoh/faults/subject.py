@@ -22,7 +22,7 @@ from gigabrain_zenoh.deployment import (
     process_specs,
     with_free_port,
 )
-from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.faults.fault import Failed
 from gigabrain_zenoh.faults.onlooker import Onlooker, looking_on
 from gigabrain_zenoh.faults.waiting import until
@@ -68,10 +68,10 @@ class Subject:
             await self._stack.enter_async_context(self.supervisor)
             self._running = asyncio.create_task(self.supervisor.run())
             self._stack.push_async_callback(self._end)
-            where = client_endpoint(self.deployment)
+            await self.ready()
+            where = client_endpoint(self.deployment, "operator")
             self.onlooker = await self._stack.enter_async_context(looking_on(where, "suite"))
             self.person = Robot(self.onlooker.bus)
-            await self.ready()
         except BaseException:
             await self.close()
             raise
@@ -143,15 +143,21 @@ class Subject:
         self._frozen.clear()
 
     async def ready(self) -> None:
-        """Wait until every process is ready."""
+        """Wait until every process is ready. Raises ConfigError for a robot that cannot be."""
         statuses = self.supervisor.statuses.values()
 
         def all_ready() -> bool:
+            if self.supervisor.misconfigured:
+                raise ConfigError(self._refusal())
             if self.supervisor.given_up:
                 raise Failed(f"{', '.join(self.supervisor.given_up)} cannot be started")
             return all(status.state == "ready" for status in statuses)
 
         await until(all_ready, "all processes are ready")
+
+    def _refusal(self) -> str:
+        said = [r for r in self.records if r.get("event") == "failed"]
+        return str(said[-1]["text"]) if said else "a process refuses what it is told"
 
     async def restarted(self, name: str, pid: int) -> None:
         """Wait until a process that had this pid is ready under another one."""
@@ -171,8 +177,9 @@ class Subject:
         self._faulty = bool(faults)
 
         def taken() -> bool:
-            said = self.records[begin:]
-            return any(str(r.get("text", "")).startswith("faults: ") for r in said)
+            texts = (str(record.get("text", "")) for record in self.records[begin:])
+            told = [text for text in texts if text.startswith("faults: ")]
+            return bool(told) and (told[-1] == "faults: none") != bool(faults)
 
         await until(taken, "the emulator takes its faults")
 

@@ -22,6 +22,7 @@ from gigabrain_schemas.topics import (
     LOG,
     MAP,
     MISSION,
+    PARAM,
     POSE,
     RELEASE,
     TELEOP,
@@ -50,13 +51,13 @@ class Rights:
 BRAIN = Rights(
     says=(WORLD, POSE, MAP, INTENT, HEALTH, LOG),
     asks=(DESCRIBE, ESTOP),
-    answers=(GOAL, MISSION, DESCRIBE),
+    answers=(GOAL, MISSION, PARAM, DESCRIBE),
     names=("perception", "decision"),
 )
 OPERATOR = Rights(
     says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG),
-    asks=(DESCRIBE, AUDIT_LOG, ESTOP, RELEASE, ENABLE, GOAL, MISSION),
-    answers=(DESCRIBE,),
+    asks=(DESCRIBE, AUDIT_LOG, PARAM, ESTOP, RELEASE, ENABLE, GOAL, MISSION),
+    answers=(PARAM, DESCRIBE),
     names=("page", "recorder", "button"),
 )
 FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer")  # where no robot is named

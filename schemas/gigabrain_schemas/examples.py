@@ -40,6 +40,9 @@ from gigabrain_schemas.requests import (
     GoalRequest,
     MissionReply,
     MissionRequest,
+    Param,
+    ParamReply,
+    ParamRequest,
     ReleaseRequest,
 )
 from gigabrain_schemas.safety import Health, LogRecord, SafetyState, SpeedCaps
@@ -258,6 +261,13 @@ REQUESTS: tuple[Message, ...] = (
     GoalReply(ok=True, text="on the way, 4.2 m", goal="goal-1"),
     MissionRequest(mission="- go: kitchen\n- wait: 5 s\n", source="operator"),
     MissionReply(ok=False, text="there is no place 'kitchen'"),
+    ParamRequest(stamp_ns=STAMP_NS, seq=1, name="linear_speed", value="0.15", source="ann"),
+    ParamReply(
+        stamp_ns=STAMP_NS, seq=1, boot=BOOT, tick=205,
+        ok=True,
+        text="linear_speed is 0.15 now, it was 0.2",
+        params=(Param(name="linear_speed", value="0.15", expected="above 0, up to 10 m/s"),),
+    ),
     DescribeRequest(),
     Description(
         process="driver",

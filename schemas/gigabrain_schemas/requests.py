@@ -2,7 +2,7 @@
 
 from msgspec import field
 
-from gigabrain_schemas.base import Count, Finite, Message, Name, Text
+from gigabrain_schemas.base import Count, Finite, Message, Name, Record, Text
 from gigabrain_schemas.body import GateStatus
 
 
@@ -82,3 +82,27 @@ class Description(Message, frozen=True, kw_only=True):
     subscribes: tuple[str, ...] = ()
     report: dict[str, Finite | int | str | None] = field(default_factory=dict)
     # of a simulation: its truth, for reports only
+
+
+class ParamRequest(Message, frozen=True, kw_only=True):
+    """Change what a process does while it runs. An empty request only shows what there is."""
+
+    name: Name = ""  # of the parameter to change
+    value: Text = ""  # as people type it
+    source: Name = "anonymous"
+
+
+class Param(Record, frozen=True, kw_only=True):
+    """Something that may be changed while a process runs."""
+
+    name: Name
+    value: Text  # as it is now
+    expected: Text  # what it may be, in words
+
+
+class ParamReply(Message, frozen=True, kw_only=True):
+    """Whether it was changed, and all that there is."""
+
+    ok: bool
+    text: Text  # a sentence for people
+    params: tuple[Param, ...] = ()

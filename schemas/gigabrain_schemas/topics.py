@@ -109,6 +109,7 @@ AUDIT_LOG = Service(
     "robot/audit_log", audit.AuditRequest, audit.AuditPage, priority="background",
     max_bytes=1024 * KB,
 )  # fmt: skip
+PARAM = Service("robot/param", requests.ParamRequest, requests.ParamReply, many=True)
 DESCRIBE = Service("robot/describe", requests.DescribeRequest, requests.Description, many=True)
 
 SERVICES: tuple[Service[Any, Any], ...] = (
@@ -118,6 +119,7 @@ SERVICES: tuple[Service[Any, Any], ...] = (
     GOAL,
     MISSION,
     AUDIT_LOG,
+    PARAM,
     DESCRIBE,
 )
 

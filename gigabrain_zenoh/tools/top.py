@@ -1,0 +1,113 @@
+"""`gigabrain top`: processes and topics in the terminal, live."""
+
+from typing import ClassVar
+
+from rich.text import Text
+from textual.app import App, ComposeResult
+from textual.binding import BindingType
+from textual.widgets import DataTable, Footer, Header
+
+from gigabrain_zenoh.tools.top_feed import Feed, Rows
+from gigabrain_zenoh.tools.top_rows import PROCESS_COLUMNS, TOPIC_COLUMNS, in_order, shown
+
+PERIOD_S = 1.0
+DOWN, UP = " ▼", " ▲"
+
+
+class Top(App[None]):
+    """Two tables. Left and right choose the column that a table is sorted by."""
+
+    CSS = """
+    DataTable { height: auto; max-height: 50%; margin: 0 1; }
+    #topics { max-height: 1fr; }
+    """
+    TITLE = "gigabrain top"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        ("q", "quit", "Quit"),
+        ("tab", "app.focus_next", "Other table"),
+        ("less_than_sign,comma", "column(-1)", "Sort left"),
+        ("greater_than_sign,full_stop", "column(1)", "Sort right"),
+        ("r", "turn", "Reverse"),
+        ("space", "hold", "Hold still"),
+    ]
+    ENABLE_COMMAND_PALETTE = False
+
+    def __init__(self, feed: Feed, about: str) -> None:
+        super().__init__()
+        self._feed, self.sub_title = feed, about
+        self._sorted: dict[str, tuple[int, bool]] = {"processes": (0, False), "topics": (0, False)}
+        self._rows: dict[str, Rows] = {"processes": {}, "topics": {}}
+        self._holds = False
+
+    def compose(self) -> ComposeResult:
+        """The two tables."""
+        yield Header()
+        for name in self._sorted:
+            yield DataTable(id=name, cursor_type="row", zebra_stripes=True)
+        yield Footer()
+
+    def on_mount(self) -> None:
+        """Begin to look."""
+        self.query_one("#processes").focus()
+        self._refresh()
+        self.set_interval(PERIOD_S, self._refresh)
+
+    def on_data_table_header_selected(self, event: "DataTable.HeaderSelected") -> None:
+        """A click on a column sorts by it; another turns the order round."""
+        name = event.data_table.id or "topics"
+        column, down = self._sorted[name]
+        self._sorted[name] = event.column_index, not down if column == event.column_index else down
+        self._draw(name)
+
+    def action_column(self, step: int) -> None:
+        """Sort by the next column."""
+        name = self._chosen()
+        column, down = self._sorted[name]
+        self._sorted[name] = (column + step) % len(self._columns(name)), down
+        self._draw(name)
+
+    def action_turn(self) -> None:
+        """Turn the order round."""
+        name = self._chosen()
+        column, down = self._sorted[name]
+        self._sorted[name] = column, not down
+        self._draw(name)
+
+    def action_hold(self) -> None:
+        """Hold still, or go on."""
+        self._holds = not self._holds
+        self.title = "gigabrain top (held)" if self._holds else "gigabrain top"
+
+    def _chosen(self) -> str:
+        return "topics" if self.focused is self.query_one("#topics") else "processes"
+
+    @staticmethod
+    def _columns(name: str) -> tuple[str, ...]:
+        return PROCESS_COLUMNS if name == "processes" else TOPIC_COLUMNS
+
+    def _refresh(self) -> None:
+        if self._holds:
+            return
+        self._rows["processes"], self._rows["topics"] = self._feed.refresh()
+        for name in self._sorted:
+            self._draw(name)
+
+    def _draw(self, name: str) -> None:
+        """Anew, with the cursor on the row where it was."""
+        table = self.query_one(f"#{name}", DataTable)
+        column, down = self._sorted[name]
+        at = table.cursor_row
+        labels = [
+            label + (DOWN if down else UP) if i == column else label
+            for i, label in enumerate(self._columns(name))
+        ]
+        same = labels == [str(known.label) for known in table.ordered_columns]
+        table.clear(columns=not same)
+        if not same:
+            table.add_columns(*labels)
+        for key, cells in in_order(self._rows[name], column, down=down):
+            made = [
+                Text(shown(c), justify="left" if isinstance(c, str) else "right") for c in cells
+            ]
+            table.add_row(*made, key=key)
+        table.move_cursor(row=min(at, max(0, len(self._rows[name]) - 1)))

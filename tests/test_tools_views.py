@@ -1,0 +1,276 @@
+"""`top`, `graph`, `node`, `log` and `param`, without a robot beside them."""
+
+import asyncio
+import json
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+from textual.widgets import DataTable
+
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.requests import Description, ParamReply, ParamRequest
+from gigabrain_schemas.safety import Health, LogRecord
+from gigabrain_schemas.topics import PARAM
+from gigabrain_zenoh import decision
+from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
+from gigabrain_zenoh.param_service import serve_params
+from gigabrain_zenoh.settings import DecisionConfig
+from gigabrain_zenoh.tools.graph import as_dot, as_mermaid, as_text, chain, positions, write_png
+from gigabrain_zenoh.tools.log_reading import Wanted, ago_ns, as_line, read, run_folder
+from gigabrain_zenoh.tools.nodes import Nodes, about
+from gigabrain_zenoh.tools.roll_call import Flow
+from gigabrain_zenoh.tools.top import Top
+from gigabrain_zenoh.tools.top_feed import Rows
+from gigabrain_zenoh.tools.top_rows import (
+    PROCESS_COLUMNS,
+    TOPIC_COLUMNS,
+    Past,
+    in_order,
+    process_cells,
+    process_row,
+    shown,
+    sparkline,
+    topic_cells,
+    topic_row,
+)
+from tests.bus_rig import Net
+
+FLOWS = [
+    Flow("control", "robot/cmd_vel", "driver", 50.0),
+    Flow("driver", "robot/health/driver", "safety", 1.0),
+    Flow("driver", "robot/scan", "perception", 10.0),
+    Flow("driver", "robot/scan", "safety", 10.0),
+]
+
+
+def test_the_graph_is_drawn_as_text_for_graphviz_and_for_mermaid() -> None:
+    found = chain(FLOWS)
+    assert list(as_text(found)) == [
+        "control",
+        "  cmd_vel       50.0 Hz  -> driver",
+        "driver",
+        "  scan          10.0 Hz  -> perception, safety",
+    ]
+    assert '  "control" -> "driver" [label="cmd_vel 50 Hz"];' in as_dot(found)
+    assert '  control["control"] -->|"cmd_vel 50 Hz"| driver["driver"]' in as_mermaid(found)
+    assert len(chain(FLOWS, everything=True)) == 4
+
+
+def test_the_graph_is_drawn_into_a_picture(tmp_path: Path) -> None:
+    write_png(FLOWS, tmp_path / "graph.png")
+    assert (tmp_path / "graph.png").read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(ConfigError, match="No such file"):
+        write_png(FLOWS, tmp_path / "nowhere" / "graph.png")
+    assert list(positions(["safety", "tool", "driver"])) == ["driver", "safety", "tool"]
+
+
+def test_a_node_is_described_with_what_it_sends_and_counts() -> None:
+    nodes = Nodes(
+        {"driver": example(Description)}, {"driver": replace(example(Health), process="driver")}
+    )
+    text = "\n".join(about(nodes, "driver"))
+    assert text.startswith("driver: version 0.1.0, pid 4710 on waffle")
+    assert "scan_to_world_p50" in text
+    with pytest.raises(UnknownName, match="did you mean 'driver'"):
+        list(about(nodes, "drivr"))
+
+
+class Feed:
+    """Two processes and two topics."""
+
+    def refresh(self) -> tuple[Rows, Rows]:
+        calm = process_row(replace(example(Health), process="calm", cpu=0.01), 0.5)
+        busy = process_row(replace(example(Health), process="busy", cpu=0.9), 9.0)
+        processes = {row.name: process_cells(row, Past()) for row in (calm, busy)}
+        scan = topic_row("robot/scan", None, 0.5, 0)
+        pose = topic_row("robot/pose", None, 1.5, 3)
+        topics = {row.name: topic_cells(row, Past()) for row in (scan, pose)}
+        return processes, topics
+
+
+def column(table: DataTable[object], index: int) -> list[str]:
+    return [str(table.get_row_at(i)[index]) for i in range(table.row_count)]
+
+
+async def test_top_shows_both_tables_and_sorts_them_by_keys() -> None:
+    app = Top(Feed(), "")
+    async with app.run_test(size=(120, 40)) as pilot:
+        processes, topics = (
+            app.query_one(f"#{name}", DataTable) for name in ("processes", "topics")
+        )
+        assert column(processes, 0) == ["busy", "calm"]
+        assert column(processes, 1) == ["silent", "ok"]
+        assert column(topics, 0) == ["pose", "scan"]
+        await pilot.press("greater_than_sign", "greater_than_sign")
+        assert column(processes, 2) == ["1.0", "90.0"]
+        await pilot.press("r")
+        assert column(processes, 2) == ["90.0", "1.0"]
+        await pilot.press("tab", "less_than_sign", "r")
+        assert column(topics, 9) == ["3", "0"]
+        await pilot.press("space")
+        assert app.title == "gigabrain top (held)"
+        await pilot.press("q")
+    assert app.return_code == 0
+
+
+def test_rows_without_a_value_come_last_whichever_way_they_are_sorted() -> None:
+    rows: Rows = {"a": (1.0,), "b": ("",), "c": (2.0,)}
+    assert [key for key, _ in in_order(rows, 0, down=False)] == ["a", "c", "b"]
+    assert [key for key, _ in in_order(rows, 0, down=True)] == ["c", "a", "b"]
+    assert (len(PROCESS_COLUMNS), len(TOPIC_COLUMNS)) == (10, 10)
+    assert [shown(cell) for cell in ("x", 3, 3.14)] == ["x", "3", "3.1"]
+
+
+def test_a_sparkline_goes_from_zero_to_the_largest() -> None:
+    assert sparkline([0.0, 5.0, 10.0]) == "▁▅█"
+    assert (sparkline([]), sparkline([0.0])) == ("", "▁")
+
+
+def line(t: int, process: str = "driver", level: str = "info", **more: object) -> str:
+    return json.dumps({"t": t, "level": level, "process": process, "event": "log", **more}) + "\n"
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A state folder with an old run and a new one."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    base = tmp_path / "gigabrain" / "runs"
+    for name in ("20260101T000000Z-demo-1", "20260102T000000Z-red-2"):
+        (base / name).mkdir(parents=True)
+    new = base / "20260102T000000Z-red-2"
+    (new / "driver.jsonl").write_text(
+        line(10, text="one") + "not json\n" + '{"t": 3}\n' + line(30, level="error") + '{"t": 4'
+    )
+    (new / "control.jsonl").write_text(line(20, "control", "warning"))
+    return base
+
+
+def test_the_log_of_the_newest_run_is_read_in_the_order_of_time(runs: Path) -> None:
+    folder = run_folder()
+    assert folder.name == "20260102T000000Z-red-2"
+    assert [entry["t"] for entry in read(folder, Wanted(), 100)] == [10, 20, 30]
+    assert [entry["t"] for entry in read(folder, Wanted(), 1)] == [30]
+    assert [e["t"] for e in read(folder, Wanted(process="driver"), 9)] == [10, 30]
+    assert [e["t"] for e in read(folder, Wanted(level="warning"), 9)] == [20, 30]
+    assert [e["t"] for e in read(folder, Wanted(since_ns=20), 9)] == [20, 30]
+    assert run_folder("demo") == runs / "20260101T000000Z-demo-1"
+
+
+def test_what_is_not_there_to_be_read_is_answered_with_what_is(runs: Path) -> None:
+    with pytest.raises(UnknownName, match="no run 'blue'"):
+        run_folder("blue")
+    with pytest.raises(UnknownName, match="did you mean 'driver'"):
+        read(run_folder(), Wanted(process="drivr"), 9)
+    with pytest.raises(UnknownName, match="did you mean 'warning'"):
+        Wanted(level="warnin")
+    with pytest.raises(ConfigError, match="expected a time such as 90s, 10m, 2h or 1d"):
+        ago_ns("soon", 0)
+    assert ago_ns("10m", 10**12) == 400 * 10**9
+
+
+def test_without_any_run_one_line_says_how_to_get_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    with pytest.raises(ConfigError, match="start one with `gigabrain demo`"):
+        run_folder()
+
+
+def test_a_record_from_the_bus_is_shown_like_one_from_a_file() -> None:
+    told = as_line(example(LogRecord))
+    assert (told["process"], told["reason"]) == ("decision", "obstacle ahead")
+    assert Wanted(process="decision").has(told)
+    assert not Wanted(level="error").has(told)
+
+
+@pytest.fixture
+def root_level() -> Iterator[None]:
+    before = logging.getLogger().level
+    yield
+    logging.getLogger().setLevel(before)
+
+
+@pytest.fixture
+async def net() -> Net:
+    return Net()
+
+
+async def told(net: Net, name: str = "", value: str = "") -> ParamReply:
+    request = ParamRequest(name=name, value=value, source="ann")
+    (reply,) = await net.two.ask(PARAM, request, name="one")
+    return reply
+
+
+async def thinking(net: Net) -> "asyncio.Task[None]":
+    """A decision process in memory."""
+    serve_params(net.one)
+    running = asyncio.create_task(decision.run(DecisionConfig(), net.one, lambda: None))
+    await asyncio.sleep(0)
+    return running
+
+
+async def test_parameters_are_listed_with_what_they_may_be(net: Net) -> None:
+    running = await thinking(net)
+    reply = await told(net)
+    running.cancel()
+    assert {one.name: one.value for one in reply.params} == {
+        "log_level": logging.getLevelName(logging.getLogger().level).lower(),
+        "linear_speed": "0.2",
+        "angular_speed": "0.5",
+        "turn": "right",
+    }
+    assert all(one.expected for one in reply.params)
+
+
+async def test_a_parameter_is_changed_and_that_is_logged(
+    net: Net, root_level: None, caplog: pytest.LogCaptureFixture
+) -> None:
+    running = await thinking(net)
+    assert (await told(net, "log_level", "info")).ok
+    reply = await told(net, "linear_speed", "0.15")
+    assert (await told(net, "turn", "clearer")).ok
+    after = {one.name: one.value for one in (await told(net)).params}
+    running.cancel()
+    assert (reply.ok, reply.text) == (True, "linear_speed is 0.15 now, it was 0.2")
+    assert (after["linear_speed"], after["turn"], after["angular_speed"]) == (
+        "0.15",
+        "clearer",
+        "0.5",
+    )
+    assert "param by ann: linear_speed is 0.15 now, it was 0.2" in caplog.messages
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "complaint"),
+    [
+        ("linear_speed", "nan", "linear_speed: expected a number above 0, up to 10 [m/s]"),
+        ("linear_speed", "inf", "linear_speed: expected a number above 0"),
+        ("linear_speed", "0", "linear_speed: expected a number above 0"),
+        ("linear_speed", "-1", "linear_speed: expected a number above 0"),
+        ("linear_speed", "11", "linear_speed: expected a number above 0"),
+        ("linear_speed", "", "linear_speed: expected a number above 0"),
+        ("turn", "lft", "turn: expected one of: right, left, clearer, got 'lft'"),
+        ("log_level", "loud", "log_level: expected one of: debug, info, warning"),
+        ("linear_sped", "1", "no parameter 'linear_sped'; did you mean 'linear_speed'?"),
+    ],
+)
+async def test_a_value_that_cannot_be_is_refused_with_what_was_expected(
+    net: Net, name: str, value: str, complaint: str
+) -> None:
+    running = await thinking(net)
+    before = (await told(net)).params
+    reply = await told(net, name, value)
+    running.cancel()
+    assert not reply.ok
+    assert reply.text.startswith(complaint)
+    assert reply.params == before
+
+
+async def test_a_process_without_settings_still_has_its_log_level(net: Net) -> None:
+    serve_params(net.one)
+    assert [one.name for one in (await told(net)).params] == ["log_level"]
+    with pytest.raises(Refused, match="no parameter 'x'"):
+        net.one.params.change("x", "1")

@@ -1,0 +1,290 @@
+"""`gigabrain why`: every link of a robot in memory is broken on purpose, and must be named."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.arrays import ranges_bytes
+from gigabrain_schemas.body import Battery, Joint, LinkHealth, RobotState
+from gigabrain_schemas.brain import CmdVel, Twist
+from gigabrain_schemas.requests import EnableRequest, EstopRequest, ReleaseRequest
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE, STATE, TELEOP
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.health import answer_to_name
+from gigabrain_zenoh.tools.why import LINKS, Verdict, judge
+from gigabrain_zenoh.tools.why_facts import Facts, Watcher
+from tests.brain_in_memory import Robot
+
+Break = Callable[[Robot], Awaitable[None]]
+
+
+async def asked(robot: Robot, command: CmdVel | None = None) -> Verdict:
+    """What `why` says of the next second and a half, in which somebody may send a command."""
+    bus = Bus(robot.network.transport(), robot.clock, "why")
+    look = asyncio.ensure_future(Watcher(bus).look())
+    if command:
+        robot.operator.publish(CMD_VEL, command)
+    await robot.go(80)
+    verdict = judge(await look)
+    await bus.close()
+    return verdict
+
+
+async def broken(folder: Path, do: Break, *, wait: int = 60) -> tuple[str, int, str, str]:
+    """The broken link once `do` has been done: its exit code, what is said, what to do."""
+    async with Robot(folder) as robot:
+        await robot.go(100)
+        await do(robot)
+        await robot.go(wait)
+        verdict = await asked(robot)
+    found = verdict.broken
+    assert found, verdict
+    return found.link, verdict.exit_code, found.text, found.remedy
+
+
+async def test_a_robot_that_moves_is_said_to_move_with_figures_for_each_link(
+    tmp_path: Path,
+) -> None:
+    async with Robot(tmp_path) as robot:
+        await robot.go(100)
+        verdict = await asked(robot)
+    assert (verdict.broken, verdict.exit_code, verdict.notes) == (None, 0, ())
+    assert tuple(found.link for found in verdict.findings) == LINKS
+    said = {found.link: found.text for found in verdict.findings}
+    assert said["driver"].startswith("mock, state 50")
+    assert "Hz" in said["scan"]
+    assert "0.0 ms after the scan" in said["world"]
+    assert said["control"] == "+0.26 m/s +0.00 rad/s, 0.0 ms after the intent"
+    assert said["gate"] == "open for control"
+    assert said["body"] == "it moves: +0.26 m/s +0.00 rad/s"
+
+
+def test_without_a_router_nothing_else_is_judged() -> None:
+    verdict = judge(Facts(router="no router answers at tcp/127.0.0.1:1"))
+    assert [found.link for found in verdict.findings] == ["router"]
+    assert verdict.exit_code == 10
+    assert verdict.broken
+    assert verdict.broken.text == "no router answers at tcp/127.0.0.1:1"
+
+
+@pytest.mark.parametrize("how", ["kill", "freeze"])
+@pytest.mark.parametrize(
+    ("process", "link", "code", "what"),
+    [
+        ("perception", "world", 14, "world"),
+        ("decision", "intent", 15, "intent"),
+        ("control", "control", 16, "command"),
+        ("safety", "safety", 17, "verdict"),
+    ],
+)
+async def test_a_process_that_is_dead_or_hangs_is_named(
+    how: str, process: str, link: str, code: int, what: str, tmp_path: Path
+) -> None:
+    async def do(robot: Robot) -> None:
+        if how == "kill":
+            await robot.kill(process)
+        else:
+            robot.freeze(process)
+
+    found = await broken(tmp_path, do)
+    assert found[:3] == (link, code, f"{process} does not answer, and no {what} comes from it")
+    assert f"gigabrain log --process {process}" in found[3]
+
+
+async def test_a_process_that_answers_and_says_nothing_is_told_from_one_that_is_gone(
+    tmp_path: Path,
+) -> None:
+    async def do(robot: Robot) -> None:
+        await robot.kill("perception")
+        answering = asyncio.ensure_future(
+            answer_to_name(Bus(robot.network.transport(), robot.clock, "perception"))
+        )
+        await robot.go(1)
+        await answering
+
+    found = await broken(tmp_path, do)
+    assert found[:3] == ("world", 14, "perception runs, but no world comes from it")
+
+
+async def test_a_driver_that_is_gone_is_named_and_nothing_behind_it_is_judged(
+    tmp_path: Path,
+) -> None:
+    async with Robot(tmp_path) as robot:
+        await robot.go(100)
+        await robot.kill("driver")
+        await robot.go(60)
+        verdict = await asked(robot)
+    assert [found.link for found in verdict.findings] == ["router", "driver"]
+    assert verdict.exit_code == 11
+
+
+def telling(robot: Robot, change: Callable[[RobotState], RobotState]) -> None:
+    """From now on the body says something else of itself."""
+    read = robot.body.read_state
+
+    async def changed() -> RobotState:
+        return change(await read())
+
+    robot.body.read_state = changed  # type: ignore[method-assign]
+
+
+async def test_an_unplugged_body_is_named_before_all_that_follows_from_it(tmp_path: Path) -> None:
+    gone = LinkHealth(connected=False, age_ms=2400)
+
+    async def do(robot: Robot) -> None:
+        robot.body._look = lambda: None  # type: ignore[method-assign]
+        telling(robot, lambda state: replace(state, link=gone))
+
+    found = await broken(tmp_path, do)
+    assert found[:3] == ("link", 12, "the body has not answered for 2.4 s")
+    assert "power" in found[3]
+
+
+def seeing(robot: Robot, ranges: float) -> None:
+    """From now on the lidar sees nothing but this distance [m], about."""
+    look = robot.body._look
+
+    def other() -> LaserScan | None:
+        scan = look()
+        noise = np.linspace(0.0, 0.005, robot.body.robot.lidar.beams)  # type: ignore[union-attr]
+        return scan and replace(scan, ranges=ranges_bytes(ranges + noise))
+
+    robot.body._look = other  # type: ignore[method-assign]
+
+
+async def test_a_blind_lidar_is_named(tmp_path: Path) -> None:
+    async def do(robot: Robot) -> None:
+        seeing(robot, float("nan"))
+
+    found = await broken(tmp_path, do)
+    assert found[:3] == ("scan", 13, "it cannot be believed: the lidar sees nothing at all")
+
+
+async def test_a_lidar_that_sends_nothing_is_named(tmp_path: Path) -> None:
+    async def do(robot: Robot) -> None:
+        robot.body._look = lambda: None  # type: ignore[method-assign]
+
+    found = await broken(tmp_path, do)
+    assert found[:3] == ("scan", 13, "no scan has come")
+
+
+async def test_a_scan_that_is_too_old_is_named(tmp_path: Path) -> None:
+    verdict = judge(replace(await facts_of(tmp_path), scan_age_ms=900.0))
+    assert verdict.broken
+    assert (verdict.broken.link, verdict.broken.text) == ("scan", "the newest scan is 0.9 s old")
+
+
+async def test_walls_all_round_are_named(tmp_path: Path) -> None:
+    async def do(robot: Robot) -> None:
+        seeing(robot, 0.16)
+
+    found = await broken(tmp_path, do)
+    assert found[:2] == ("safety", 17)
+    assert "obstacle" in found[2]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda s: replace(s, joints=(Joint(name="left", position=0.0, temperature=90.0),)),
+            "a motor has 70",
+        ),
+        (lambda s: replace(s, battery=Battery(voltage=9.0, percentage=1.0)), "battery"),
+    ],
+)
+async def test_a_hot_motor_and_an_empty_battery_are_named(
+    change: Callable[[RobotState], RobotState], words: str, tmp_path: Path
+) -> None:
+    async def do(robot: Robot) -> None:
+        telling(robot, change)
+
+    link, code, text, remedy = await broken(tmp_path, do, wait=150)
+    assert code in (15, 17)  # with an empty battery decision comes to rest before safety stops it
+    assert link in ("intent", "safety")
+    assert words in text
+    assert remedy
+
+
+async def test_a_latched_gate_is_named_with_the_way_out(tmp_path: Path) -> None:
+    async def do(robot: Robot) -> None:
+        await robot.operator.ask(ESTOP, EstopRequest(source="ann"))
+
+    found = await broken(tmp_path, do)
+    assert found[:3] == ("gate", 18, "it is latched: e-stop pressed by ann")
+    assert found[3] == "find out why it was pressed: `gigabrain release`, then `gigabrain enable`"
+
+
+async def test_a_gate_that_nobody_enables_is_named(tmp_path: Path) -> None:
+    async def do(robot: Robot) -> None:
+        await robot.operator.ask(ESTOP, EstopRequest(source="ann"))
+        await robot.go(40)
+        await robot.operator.ask(RELEASE, ReleaseRequest(estop_generation=1, source="ann"))
+
+    found = await broken(tmp_path, do)
+    assert found == (
+        "gate", 18, "it is idle: nobody has enabled it", "enable it with `gigabrain enable`",
+    )  # fmt: skip
+
+
+async def test_a_second_commander_that_has_the_body_is_named(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await robot.go(100)
+        await robot.operator.ask(ENABLE, EnableRequest(source="bob", take=True, by="bob"))
+        sending = Bus(robot.network.transport(), robot.clock, "bob")
+        sending.latest(
+            STATE, lambda _: sending.publish(CMD_VEL, CmdVel(linear_x=0.0, source="bob"))
+        )
+        await robot.go(60)
+        verdict = await asked(robot)
+    assert verdict.broken
+    assert (verdict.broken.link, verdict.exit_code) == ("gate", 18)
+    assert verdict.broken.text == "bob has the body, and stands still"
+    assert "`gigabrain enable --take`" in verdict.broken.remedy
+
+
+async def test_a_second_commander_in_vain_is_noted(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await robot.go(100)
+        verdict = await asked(robot, CmdVel(linear_x=0.1, source="eve"))
+    assert verdict.broken is None
+    assert verdict.notes == ("eve sends commands as well, which the gate does not obey",)
+
+
+async def test_an_operator_s_seat_that_holds_still_is_named(tmp_path: Path) -> None:
+    async def do(robot: Robot) -> None:
+        for _ in range(40):  # half a second of it is not believed
+            robot.operator.publish(TELEOP, Twist(linear_x=0.0))
+            await robot.go(2)
+
+    found = await broken(tmp_path, do)
+    assert found[:2] == ("control", 16)
+    assert found[3] == "hand the body back to decision with `gigabrain enable`"
+
+
+async def test_a_body_that_does_not_follow_is_named(tmp_path: Path) -> None:
+    facts = await facts_of(tmp_path)
+    assert facts.state
+    assert judge(facts).broken is None
+    still = replace(facts.state, velocity=replace(facts.state.velocity, linear_x=0.0))
+    stuck = judge(replace(facts, state=still))
+    assert stuck.broken
+    assert (stuck.broken.link, stuck.exit_code) == ("body", 19)
+    assert stuck.broken.text == "the body stands although it is told +0.26 m/s +0.00 rad/s"
+
+
+async def facts_of(folder: Path) -> Facts:
+    """One look at a robot that drives."""
+    async with Robot(folder) as robot:
+        await robot.go(100)
+        bus = Bus(robot.network.transport(), robot.clock, "why")
+        look = asyncio.ensure_future(Watcher(bus).look())
+        await robot.go(80)
+        facts = await look
+        await bus.close()
+    return facts
