@@ -33,6 +33,7 @@ from gigabrain_zenoh.page import wire
 
 M = TypeVar("M", bound=Message)
 
+SHOWN_NS = 500_000_000  # how old a message may be; the page gets fewer than others (process.py)
 CAMERAS = 4  # whose pictures are shown
 KEPT_LINES = 30  # of the log, for a viewer who comes later
 
@@ -66,9 +67,9 @@ class Sampled(Generic[M]):
         return message if self._latest.take(message) else None
 
     def fresh(self) -> M | None:
-        """The newest message, while it counts."""
+        """The newest message, while it is worth showing."""
         self.look()
-        return self._latest.fresh()
+        return self._latest.fresh(SHOWN_NS)
 
 
 class Scene:
