@@ -61,6 +61,7 @@ recordings: setup
 
 pictures: setup
 	$(BIN)/gigabrain view --png docs/pictures/waffle_in_house.png --world house --seed 1
+	$(BIN)/python -m tests.pictures docs/pictures
 
 clean:
 	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .fuzz .fuzz-* mutants

@@ -36,6 +36,7 @@ class DemoOptions(Struct, frozen=True, kw_only=True):
     seconds: float | None = None  # of the robot's time; None for until Ctrl-C
     headless: bool = False
     report: Path | None = None
+    page: str = ""  # where the operator page is, or how to get it
 
 
 class Demo:
@@ -66,6 +67,8 @@ class Demo:
         """
         label = f"{self._deployment.body} in {self._deployment.world}"
         endpoint = client_endpoint(self._deployment)
+        if self._options.page:
+            print(f"operator page: {self._options.page}", file=sys.stderr)
         with stop_signals() as stop, announced(label, endpoint):
             async with self._supervisor:
                 running = asyncio.ensure_future(self._supervisor.run())
@@ -116,7 +119,8 @@ class Demo:
         seconds = self._options.seconds
         if self._options.headless or not sys.stdout.isatty():
             return HeadlessView(watch, seconds)
-        return LiveView(watch, self._supervisor, self._deployment, self._faults, seconds)
+        faults, page = self._faults, self._options.page
+        return LiveView(watch, self._supervisor, self._deployment, faults, seconds, page)
 
     async def _ask_for_truth(self, watch: Watch, within_s: float) -> Report | None:
         statuses = self._supervisor.statuses

@@ -25,6 +25,7 @@ from gigabrain_zenoh.settings import (
     EmulatorConfig,
     Endpoint,
     LinkName,
+    PageConfig,
     PerceptionConfig,
     RecorderConfig,
     Resume,
@@ -36,12 +37,20 @@ from gigabrain_zenoh.zenoh_config import router_config, secured
 EMULATOR = "emulator"  # runs beside the driver where the link is `emulated`; not in `hosts`
 BUTTON = "button"  # runs beside the driver where there is one, unless `hosts` says where
 ProcessName = Literal[
-    "router", "driver", "perception", "decision", "control", "safety", "recorder", "button"
+    "router",
+    "driver",
+    "perception",
+    "decision",
+    "control",
+    "safety",
+    "recorder",
+    "page",
+    "button",
 ]
 ROBOT: tuple[ProcessName, ...] = (
     "router", "driver", "perception", "decision", "control", "safety",
 )  # fmt: skip
-ALL: tuple[ProcessName, ...] = (*ROBOT, "recorder")
+ALL: tuple[ProcessName, ...] = (*ROBOT, "recorder", "page")
 LOOPBACK = ("127.", "localhost", "[::1]")
 
 
@@ -66,6 +75,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     perception: PerceptionConfig = PerceptionConfig()
     decision: DecisionConfig = DecisionConfig()
     recorder: RecorderConfig = RecorderConfig()
+    page: PageConfig = PageConfig()
 
     def __post_init__(self) -> None:
         if not self.hosts:
@@ -275,13 +285,14 @@ def _settings(
         "perception": msgspec.to_builtins(deployment.perception),
         "decision": msgspec.to_builtins(deployment.decision),
         "recorder": msgspec.to_builtins(with_notes(deployment)),
+        "page": msgspec.to_builtins(deployment.page),
     }
 
 
 def recorded(path: Path) -> dict[str, Any]:
     """What makes a deployment record itself into one file, raw, for a replay."""
     recorder = {"file": str(path.absolute()), "viewers": False}
-    return {"hosts": {"robot": ALL}, "recorder": recorder}
+    return {"hosts": {"robot": (*ROBOT, "recorder")}, "recorder": recorder}
 
 
 def with_notes(deployment: Deployment) -> RecorderConfig:

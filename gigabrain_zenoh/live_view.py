@@ -78,7 +78,9 @@ class LiveView:
         deployment: Deployment,
         faults: Sequence[tuple[float, str]],
         seconds: float | None,
+        page: str = "",
     ) -> None:
+        self._subtitle = f"{page} · Ctrl-C ends it" if page else "Ctrl-C ends it"
         self._watch, self._supervisor, self._deployment = watch, supervisor, deployment
         self._faults, self._seconds = faults, seconds
         # drawn on the loop's thread, from one moment's values; its own screen survives resizing
@@ -115,7 +117,7 @@ class LiveView:
         ]
         now_s = time.monotonic()
         parts += [_line(text, "yellow") for at_s, text in self._faults if now_s - at_s < FAULT_S]
-        return Panel(Group(*parts), title=title, subtitle="Ctrl-C ends it", padding=(1, 2))
+        return Panel(Group(*parts), title=title, subtitle=self._subtitle, padding=(1, 2))
 
     def _figures(self) -> Table:
         watch, state = self._watch, self._watch.state.newest
@@ -189,6 +191,10 @@ def _activity(name: str, watch: Watch) -> str:
     sent = health.sent_hz if health else {}
     if name in ("router", "relay"):
         return "joins the others"
+    if name == "page":
+        return "shows it in a browser"
+    if name == "recorder":
+        return f"recorded {health.counters.get('recorded', 0) if health else 0} messages"
     if name == "driver":
         return f"state {sent.get('robot/state', 0):.0f} Hz, scan {sent.get('robot/scan', 0):.0f} Hz"
     if name == "perception":

@@ -11,14 +11,14 @@ import importlib
 import logging
 import os
 import sys
-from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from gigabrain_schemas.topics import LOG
+from gigabrain_schemas.topics import INTENT, LOG, SAFETY, STATE
 from gigabrain_zenoh import lifeline, logs
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
@@ -50,6 +50,7 @@ class Program:
 
     run: str
     settings: str = ""
+    at_most_hz: Mapping[str, float] = field(default_factory=dict)  # of what it only shows
 
 
 PROGRAMS = {
@@ -68,6 +69,11 @@ PROGRAMS = {
     "safety": Program("gigabrain_zenoh.safety:run"),
     "recorder": Program(
         "gigabrain_zenoh.recording.node:run", "gigabrain_zenoh.settings:RecorderConfig"
+    ),
+    "page": Program(
+        "gigabrain_zenoh.page.node:run",
+        "gigabrain_zenoh.settings:PageConfig",
+        {STATE.key: 20.0, INTENT.key: 6.0, SAFETY.key: 11.0},
     ),
 }
 
@@ -138,7 +144,9 @@ async def _run(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
 
 
 async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
-    bus = make_bus(await _connect(config.endpoint), Clock(), config.name)
+    shown = PROGRAMS[config.name].at_most_hz
+    endpoint = msgspec.structs.replace(config.endpoint, at_most_hz=dict(shown))
+    bus = make_bus(await _connect(endpoint), Clock(), config.name)
     handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
     logging.getLogger().addHandler(handler)
     try:

@@ -20,6 +20,7 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     namespace: str = ""  # the robot's own part of the key space
     keys: str = ""  # the folder of an identity; without one, nobody asks who anybody is
     fleet: tuple[str, ...] = ()  # namespaces of other robots that a router serves
+    at_most_hz: dict[str, float] = {}  # of these keys the session hands on no more
 
 
 class RouterConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -75,6 +76,18 @@ class ButtonConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """The `button` part of a deployment file."""
 
     port: str  # of the USB-serial adapter: a path, or usb:VID:PID[:SERIAL]
+
+
+class PageConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The `page` part of a deployment file."""
+
+    listen: str = "127.0.0.1"  # an address of this host; beyond loopback it wants TLS and a login
+    port: Annotated[int, Meta(ge=0, le=65535)] = 8080
+    names: tuple[str, ...] = ()  # by which browsers ask for it, beside `listen`
+    certificate: str = ""  # a PEM file
+    certificate_key: str = ""
+    login: bool = False  # want a token on loopback as well
+    tokens: str = ""  # the file that keeps them; one in the user's state folder without
 
 
 class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

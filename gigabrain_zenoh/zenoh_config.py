@@ -1,6 +1,7 @@
 """How sessions are configured, and what a refusal means. Zenoh is not needed to read this."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -64,9 +65,17 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
     }
     if endpoint.listen and (endpoint.keys or endpoint.connect):
         config["adminspace/enabled"] = False
+    if endpoint.at_most_hz:
+        config["downsampling"] = [_thinned(endpoint.at_most_hz)]
     if endpoint.namespace:
         config["namespace"] = endpoint.namespace
     return config
+
+
+def _thinned(at_most_hz: Mapping[str, float]) -> dict[str, Any]:
+    """Zenoh's downsampling: what comes too fast is left out before Python hears of it."""
+    rules = [{"key_expr": f"**/{key}", "freq": hz} for key, hz in at_most_hz.items()]
+    return {"id": "thinned", "messages": ["put"], "flows": ["ingress"], "rules": rules}
 
 
 def security(endpoint: Endpoint) -> dict[str, Any]:

@@ -72,12 +72,16 @@ class ZenohTransport:
         return self._undeclare(self._session.declare_subscriber(key, mailbox.put))
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
-        """Listen in Zenoh's own thread; nothing gives way to anything."""
+        """Listen in Zenoh's own thread; nothing gives way to anything.
+
+        A direct callback: an indirect one wakes a thread of its own for each message.
+        """
 
         def deliver(sample: zenoh.Sample) -> None:
             on_raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes())
 
-        return self._undeclare(self._session.declare_subscriber(pattern, deliver))
+        direct = Callback(deliver, indirect=False)
+        return self._undeclare(self._session.declare_subscriber(pattern, direct))
 
     def serve(self, key: str, answer: Answer) -> Close:
         """Answer queries, each in a task of its own."""

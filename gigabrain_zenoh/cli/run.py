@@ -32,6 +32,8 @@ def demo(
     headless: bool = False,
     report: Path | None = None,
     record: Path | None = None,
+    page: bool | None = None,
+    port: int = 8080,
 ) -> int:
     """Drive a simulated robot round a room, until Ctrl-C.
 
@@ -63,8 +65,13 @@ def demo(
         Write what the run came to, as JSON, into this file.
     record
         Record the run from its very start into this file, for `gigabrain replay`.
+    page
+        Serve the operator page; as a rule where there is a live view too.
+    port
+        Where the page is; another free one where that is taken.
     """
     from gigabrain_zenoh.demo import Demo, DemoOptions
+    from gigabrain_zenoh.page.beside import with_page
 
     if record and record.exists():
         raise ConfigError(f"{record} exists; choose another file")
@@ -81,8 +88,10 @@ def demo(
     }
     if record:
         values |= recorded(record)
-    deployment = checked(values, Deployment)
-    options = DemoOptions(seconds=seconds, headless=headless, report=report)
+    deployment, where = checked(values, Deployment), ""
+    if page or (page is None and not headless):
+        deployment, where = with_page(deployment, port)
+    options = DemoOptions(seconds=seconds, headless=headless, report=report, page=where)
     return asyncio.run(Demo(deployment, options).run())
 
 

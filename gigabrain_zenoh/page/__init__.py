@@ -1,0 +1,1 @@
+"""The operator page: a robot in a browser, seen and steered."""

@@ -1,0 +1,293 @@
+// The map: what is known of the place, the robot in it, and where it means to go. Drawn when there is news.
+const CELL_M = 0.05, SIDE = 1200 // of what the scan has left behind, where there is no map
+const HEADING_M = 0.1 // a shorter drag gives a place and no heading
+const TAU = 2 * Math.PI
+const COLOURS = ['floor', 'grid', 'wall', 'scan', 'plan', 'zone', 'trail', 'seen', 'robot', 'ink']
+
+export class MapView {
+  #scale = 90 // pixels per metre
+  #centre = [0, 0]
+  #drag = null
+  #due = false
+  #pointers = new Map()
+
+  constructor(canvas, onGoal) {
+    this.canvas = canvas
+    this.onGoal = onGoal
+    this.follow = true
+    this.grab = false
+    this.clear()
+    this.recolour()
+    new ResizeObserver(() => this.draw()).observe(canvas)
+    this.#listen()
+  }
+
+  clear() {
+    this.seen = new OffscreenCanvas(SIDE, SIDE)
+    this.trail = []
+    this.scan = this.map = this.goal = this.moment = null
+  }
+
+  recolour() {
+    const style = getComputedStyle(document.documentElement)
+    this.colour = Object.fromEntries(COLOURS.map((name) => [name, style.getPropertyValue(`--${name}`).trim()]))
+    this.#paintMap()
+    this.draw()
+  }
+
+  setMoment(moment) {
+    if (this.moment?.state && moment.state && moment.state.boot !== this.moment.state.boot) this.clear()
+    if (this.moment?.frame !== moment.frame) this.trail = []
+    this.moment = moment
+    const pose = moment.pose
+    if (pose) {
+      const last = this.trail.at(-1)
+      if (!last || Math.hypot(pose.x - last[0], pose.y - last[1]) > 0.03) this.trail.push([pose.x, pose.y])
+      if (this.trail.length > 4000) this.trail.splice(0, 1000)
+      if (this.follow) this.#centre = [pose.x, pose.y]
+    }
+    this.draw()
+  }
+
+  /** Head: robot x, y, yaw; lidar x, y, yaw; first angle, increment, longest range. */
+  setScan(head, ranges) {
+    const [x, y, yaw, mx, my, myaw, first, step, longest] = head
+    const points = []
+    const lx = x + mx * Math.cos(yaw) - my * Math.sin(yaw), ly = y + mx * Math.sin(yaw) + my * Math.cos(yaw)
+    ranges.forEach((range, i) => {
+      if (!(range > 0 && range <= longest)) return
+      const angle = yaw + myaw + first + i * step
+      points.push([lx + range * Math.cos(angle), ly + range * Math.sin(angle)])
+    })
+    this.scan = points
+    if (!this.map) this.#remember(points)
+  }
+
+  setMap(head, cells) {
+    const [resolution, x, y] = [0, 4, 8].map((at) => head.getFloat32(at, true))
+    const [width, height] = [12, 16].map((at) => head.getUint32(at, true))
+    this.map = { resolution, x, y, width, height, cells: cells.slice() }
+    this.#paintMap()
+    this.draw()
+  }
+
+  zoom(factor) {
+    this.#scale = Math.min(600, Math.max(8, this.#scale * factor))
+    this.draw()
+  }
+
+  draw() {
+    if (this.#due) return
+    this.#due = true
+    requestAnimationFrame(() => { this.#due = false; this.#paint() })
+  }
+
+  #remember(points) {
+    const pen = this.seen.getContext('2d')
+    pen.fillStyle = this.colour.seen
+    for (const [x, y] of points) pen.fillRect(Math.round(SIDE / 2 + x / CELL_M), Math.round(SIDE / 2 - y / CELL_M), 1, 1)
+  }
+
+  #paintMap() {
+    if (!this.map) return
+    const { width, height, cells } = this.map
+    this.picture = new OffscreenCanvas(width, height)
+    const pen = this.picture.getContext('2d'), image = pen.createImageData(width, height)
+    const dark = this.colour.floor < '#8'
+    for (let i = 0; i < cells.length; i++) {
+      const cell = cells[i], at = 4 * ((height - 1 - Math.floor(i / width)) * width + (i % width))
+      const grey = dark ? 30 + cell * 2 : 255 - cell * 2.4
+      image.data.set([grey, grey, grey, cell < 0 ? 0 : 255], at)
+    }
+    pen.putImageData(image, 0, 0)
+  }
+
+  #paint() {
+    const ratio = devicePixelRatio || 1, { clientWidth: w, clientHeight: h } = this.canvas
+    if (this.canvas.width !== Math.round(w * ratio) || this.canvas.height !== Math.round(h * ratio)) {
+      this.canvas.width = Math.round(w * ratio)
+      this.canvas.height = Math.round(h * ratio)
+    }
+    const pen = this.canvas.getContext('2d')
+    pen.setTransform(1, 0, 0, 1, 0, 0)
+    pen.clearRect(0, 0, this.canvas.width, this.canvas.height)
+    const k = this.#scale * ratio
+    pen.setTransform(k, 0, 0, -k, (w * ratio) / 2 - this.#centre[0] * k, (h * ratio) / 2 + this.#centre[1] * k)
+    this.pixel = 1 / this.#scale
+    this.#paintGrid(pen, w, h)
+    this.#paintPlace(pen)
+    const { moment } = this
+    if (moment?.pose) {
+      pen.save()
+      pen.translate(moment.pose.x, moment.pose.y)
+      pen.rotate(moment.pose.yaw)
+      this.#paintFree(pen)
+      this.#paintZones(pen)
+      this.#paintPlan(pen)
+      this.#paintRobot(pen)
+      pen.restore()
+    }
+    this.#paintGoal(pen)
+  }
+
+  #paintGrid(pen, w, h) {
+    const [cx, cy] = this.#centre, half = [w / 2 / this.#scale, h / 2 / this.#scale]
+    const step = this.#scale > 25 ? 1 : 5
+    pen.beginPath()
+    for (let x = Math.ceil((cx - half[0]) / step) * step; x < cx + half[0]; x += step) { pen.moveTo(x, cy - half[1]); pen.lineTo(x, cy + half[1]) }
+    for (let y = Math.ceil((cy - half[1]) / step) * step; y < cy + half[1]; y += step) { pen.moveTo(cx - half[0], y); pen.lineTo(cx + half[0], y) }
+    this.#stroke(pen, this.colour.grid, 1)
+  }
+
+  #paintPlace(pen) {
+    pen.imageSmoothingEnabled = false
+    const put = (picture, x, y, cell) => {
+      pen.save()
+      pen.translate(x, y)
+      pen.scale(cell, -cell)
+      pen.drawImage(picture, 0, -picture.height)
+      pen.restore()
+    }
+    if (this.map) put(this.picture, this.map.x, this.map.y, this.map.resolution)
+    else put(this.seen, (-SIDE / 2) * CELL_M, (-SIDE / 2) * CELL_M, CELL_M)
+    pen.beginPath()
+    this.trail.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)))
+    this.#stroke(pen, this.colour.trail, 2)
+    pen.fillStyle = this.colour.scan
+    const size = 3.5 * this.pixel
+    for (const [x, y] of this.scan ?? []) pen.fillRect(x - size / 2, y - size / 2, size, size)
+  }
+
+  /** The nearest thing in each sector, as perception sees it. */
+  #paintFree(pen) {
+    const sectors = this.moment.world?.sectors ?? []
+    pen.beginPath()
+    sectors.forEach((distance, i) => {
+      if (distance === null) return
+      const middle = (i * TAU) / sectors.length, half = (0.42 * TAU) / sectors.length
+      pen.moveTo(distance * Math.cos(middle - half), distance * Math.sin(middle - half))
+      pen.arc(0, 0, distance, middle - half, middle + half)
+    })
+    pen.globalAlpha = 0.5
+    this.#stroke(pen, this.colour.zone, 1.5)
+    pen.globalAlpha = 1
+  }
+
+  /** What must be free for the body to stop at its present speed. */
+  #paintZones(pen) {
+    const { body, moment: { state } } = this
+    if (!body || !state) return
+    const v = state.velocity.linear_x, t = body.thresholds
+    const reach = Math.abs(v) * t.reaction_time + (v * v) / (2 * body.max_linear_deceleration) + t.stop_margin
+    const xs = body.footprint.map((p) => p[0]), ys = body.footprint.map((p) => p[1])
+    const left = Math.max(...ys), right = Math.min(...ys)
+    pen.globalAlpha = 0.45
+    pen.fillStyle = this.colour.zone
+    if (v >= 0) pen.fillRect(Math.max(...xs), right, reach, left - right)
+    else pen.fillRect(Math.min(...xs) - reach, right, reach, left - right)
+    pen.globalAlpha = 1
+  }
+
+  #paintPlan(pen) {
+    const points = this.moment.intent?.trajectory ?? []
+    pen.beginPath()
+    pen.moveTo(0, 0)
+    for (const [, x, y] of points) pen.lineTo(x, y)
+    this.#stroke(pen, this.colour.plan, 3)
+  }
+
+  #paintRobot(pen) {
+    const outline = this.body?.footprint ?? []
+    pen.beginPath()
+    outline.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)))
+    pen.closePath()
+    pen.fillStyle = this.colour.robot
+    pen.fill()
+    this.#stroke(pen, this.colour.ink, 2)
+    const size = Math.max(0.07, 7 * this.pixel)
+    pen.beginPath()
+    pen.moveTo(size, 0)
+    pen.lineTo(-size * 0.7, size * 0.7)
+    pen.lineTo(-size * 0.7, -size * 0.7)
+    pen.fillStyle = this.colour.plan
+    pen.fill()
+  }
+
+  #paintGoal(pen) {
+    const goal = this.#drag?.goal ?? this.goal
+    if (!goal) return
+    const size = 9 * this.pixel
+    pen.beginPath()
+    pen.arc(goal.x, goal.y, size, 0, TAU)
+    if (goal.yaw != null) {
+      pen.moveTo(goal.x, goal.y)
+      pen.lineTo(goal.x + 3.5 * size * Math.cos(goal.yaw), goal.y + 3.5 * size * Math.sin(goal.yaw))
+    }
+    this.#stroke(pen, this.colour.plan, 3)
+  }
+
+  #stroke(pen, colour, pixels) {
+    pen.strokeStyle = colour
+    pen.lineWidth = pixels * this.pixel
+    pen.stroke()
+  }
+
+  #at(event) {
+    const box = this.canvas.getBoundingClientRect()
+    return [
+      this.#centre[0] + (event.clientX - box.left - box.width / 2) / this.#scale,
+      this.#centre[1] - (event.clientY - box.top - box.height / 2) / this.#scale,
+    ]
+  }
+
+  #listen() {
+    const canvas = this.canvas
+    canvas.addEventListener('contextmenu', (event) => event.preventDefault())
+    canvas.addEventListener('wheel', (event) => { event.preventDefault(); this.zoom(event.deltaY < 0 ? 1.15 : 1 / 1.15) }, { passive: false })
+    canvas.addEventListener('pointerdown', (event) => this.#down(event))
+    canvas.addEventListener('pointermove', (event) => this.#move(event))
+    canvas.addEventListener('pointerup', (event) => this.#up(event, true))
+    canvas.addEventListener('pointercancel', (event) => this.#up(event, false))
+  }
+
+  #down(event) {
+    this.canvas.setPointerCapture(event.pointerId)
+    this.#pointers.set(event.pointerId, [event.clientX, event.clientY])
+    const moving = this.grab || event.shiftKey || event.button > 0 || this.#pointers.size > 1
+    const [x, y] = this.#at(event)
+    this.#drag = moving ? { last: [event.clientX, event.clientY] } : { goal: { x, y, yaw: null } }
+    this.draw()
+  }
+
+  #move(event) {
+    const before = this.#pointers.get(event.pointerId)
+    if (!before || !this.#drag) return
+    const now = [event.clientX, event.clientY], others = [...this.#pointers].filter(([id]) => id !== event.pointerId)
+    if (others.length) {
+      const far = (p) => Math.hypot(p[0] - others[0][1][0], p[1] - others[0][1][1])
+      this.zoom(far(now) / Math.max(1, far(before)))
+    } else if (this.#drag.last) {
+      this.#setFollow(false)
+      this.#centre = [this.#centre[0] - (now[0] - before[0]) / this.#scale, this.#centre[1] + (now[1] - before[1]) / this.#scale]
+    } else {
+      const [x, y] = this.#at(event), goal = this.#drag.goal
+      const dx = x - goal.x, dy = y - goal.y
+      goal.yaw = Math.hypot(dx, dy) > HEADING_M ? Math.atan2(dy, dx) : null
+    }
+    this.#pointers.set(event.pointerId, now)
+    this.draw()
+  }
+
+  #up(event, done) {
+    this.#pointers.delete(event.pointerId)
+    const goal = this.#drag?.goal
+    this.#drag = null
+    if (goal && done) this.onGoal(goal)
+    this.draw()
+  }
+
+  #setFollow(follow) {
+    this.follow = follow
+    document.getElementById('follow').setAttribute('aria-pressed', follow)
+  }
+}

@@ -1,0 +1,95 @@
+"""A robot with an operator page, a browser that looks at it, and a client that misbehaves."""
+
+import contextlib
+import shutil
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from playwright.async_api import BrowserContext, Page, async_playwright
+from websockets.asyncio.client import ClientConnection, connect
+
+from gigabrain_zenoh.deployment import ROBOT
+from gigabrain_zenoh.page import wire
+from gigabrain_zenoh.settings import Endpoint
+from tests.stack import Command, Home, endpoint_of, free_port
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+# the first four as its sandbox, GPU and network are none of ours; the rest keep it from the network
+FLAGS = [
+    "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
+    "--disable-background-networking", "--disable-component-update",
+]  # fmt: skip
+OPERATOR, VIEWER = "operator-token-of-the-tests", "viewer-token-of-the-tests"
+TIMEOUT_MS = 60_000
+
+needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+
+
+class Robot:
+    """A simulated robot whose page wants a token."""
+
+    def __init__(self, home: Home, **values: object) -> None:
+        tokens = home.folder / "tokens.json"
+        tokens.touch(0o600)
+        tokens.write_text(f'{{"operator": "{OPERATOR}", "viewer": "{VIEWER}"}}')
+        self.port, self.home = free_port(), home
+        page = {"port": self.port, "login": True, "tokens": str(tokens)}
+        hosts = {"robot": [*ROBOT, "page"]}
+        self.file = home.deployment(resume="auto", hosts=hosts, page=page, **values)
+        self.command: Command = home.start("up", str(self.file))
+
+    @property
+    def endpoint(self) -> Endpoint:
+        return endpoint_of(self.file)
+
+    @property
+    def origin(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+
+class Browser:
+    """One Chromium; nothing that its pages do may fail, nor leave this machine."""
+
+    def __init__(self, context: BrowserContext, robot: Robot) -> None:
+        self._context, self._robot = context, robot
+        self.faults: list[str] = []
+
+    async def open(self, token: str = OPERATOR, *, width: int = 1280, height: int = 800) -> Page:
+        page = await self._context.new_page()
+        page.set_default_timeout(TIMEOUT_MS)
+        await page.set_viewport_size({"width": width, "height": height})
+        page.on("pageerror", lambda error: self.faults.append(str(error)))
+        page.on("request", lambda request: self._check(request.url))
+        await page.goto(f"{self._robot.origin}/#{token}")
+        await page.wait_for_selector("#link.live")
+        return page
+
+    def _check(self, url: str) -> None:
+        if not url.startswith((self._robot.origin, "blob:", "data:")):
+            self.faults.append(f"asked for {url}")
+
+
+@contextlib.asynccontextmanager
+async def browser(robot: Robot, folder: Path) -> AsyncIterator[Browser]:
+    async with async_playwright() as playwright:
+        context = await playwright.chromium.launch_persistent_context(
+            folder, executable_path=CHROMIUM, headless=True, args=FLAGS
+        )
+        try:
+            made = Browser(context, robot)
+            yield made
+            assert made.faults == []
+        finally:
+            await context.close()
+
+
+@contextlib.asynccontextmanager
+async def client(
+    robot: Robot, token: str = OPERATOR, origin: str | None = None
+) -> AsyncIterator[ClientConnection]:
+    """A WebSocket of no browser."""
+    url = f"ws://127.0.0.1:{robot.port}/ws"
+    async with connect(url, origin=origin or robot.origin, max_queue=None) as socket:  # type: ignore[arg-type]
+        await socket.send(wire.as_json(wire.LOGIN, wire.Login(token=token)))
+        yield socket

@@ -1,0 +1,204 @@
+"""The operator page in a real browser: what it shows is so, and what is pressed happens."""
+
+import os
+import re
+import signal
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import pytest
+from playwright.async_api import Page
+
+from tests.onlooker import Onlooker, at_rest, looking_on
+from tests.page_rig import VIEWER, Browser, Robot, browser, needs_browser
+from tests.stack import Home, until
+
+pytestmark = needs_browser
+
+ENABLED, LIVE = "#gate[data-mode=enabled]", "#link.live"
+
+
+@pytest.fixture(scope="module")
+def robot(shared_home: Home) -> Iterator[Robot]:
+    made = Robot(shared_home)
+    yield made
+    made.command.close()
+
+
+@pytest.fixture
+async def seen(robot: Robot) -> AsyncIterator[Onlooker]:
+    async with looking_on(robot.endpoint) as onlooker:
+        yield onlooker
+
+
+@pytest.fixture
+async def chromium(robot: Robot, tmp_path: Path, seen: Onlooker) -> AsyncIterator[Browser]:
+    await until(lambda: "page" in seen.health, "the page is served")
+    async with browser(robot, tmp_path / "profile") as made:
+        yield made
+
+
+async def text(page: Page, name: str) -> str:
+    return await page.inner_text(f"#{name}")
+
+
+async def told(page: Page, name: str, part: str) -> None:
+    await page.wait_for_selector(f'#{name}:has-text("{part}")')
+
+
+async def ready_to_drive(page: Page) -> None:
+    """Whatever state an earlier test has left the robot in, a person brings it back to driving."""
+    await page.wait_for_selector("#gate:not([data-mode=stopping])")
+    if await page.is_enabled("#release"):
+        await page.wait_for_timeout(600)
+        await page.click("#release")
+        await told(page, "said", "released")
+    await page.wait_for_selector("#enable:enabled")
+    await page.click("#enable")
+    await page.wait_for_selector(ENABLED)
+
+
+async def turning(seen: Onlooker, sign: int) -> None:
+    await until(lambda: seen.state.velocity.angular_z * sign > 0.3, "turning as told")
+
+
+async def test_a_held_key_drives_and_letting_go_stops(chromium: Browser, seen: Onlooker) -> None:
+    page = await chromium.open()
+    await ready_to_drive(page)
+    await page.keyboard.down("a")
+    await turning(seen, 1)
+    await told(page, "wanted", "0.00 m/s  0.91 rad/s")
+    await page.keyboard.up("a")
+    await seen.still()
+    assert (seen.state.gate.mode, seen.state.gate.commander) == ("enabled", "control")
+    assert "viewer" not in await text(page, "doing")
+
+
+async def test_a_window_that_loses_the_focus_lets_all_keys_go(
+    chromium: Browser, seen: Onlooker
+) -> None:
+    page = await chromium.open()
+    await ready_to_drive(page)
+    await page.keyboard.down("d")
+    await turning(seen, -1)
+    await page.evaluate("window.dispatchEvent(new Event('blur'))")
+    await seen.still()
+    await page.keyboard.up("d")
+
+
+async def test_the_e_stop_stops_a_driving_robot_and_names_who_confirmed_it(
+    chromium: Browser, seen: Onlooker
+) -> None:
+    page = await chromium.open()
+    await ready_to_drive(page)
+    await page.keyboard.down("a")
+    await turning(seen, 1)
+    before = seen.state.gate.estop_generation
+    await page.keyboard.press("Space")
+    await told(page, "confirmed", "CONFIRMED by turtlebot3_waffle in ")
+    assert re.search(
+        r"in \d+ ms: stopped and latched; e-stop number \d+", await text(page, "confirmed")
+    )
+    await until(lambda: seen.state.gate.mode == "latched", "latched")
+    await seen.still()
+    assert seen.state.gate.estop_generation == before + 1
+    assert [cause.text for cause in seen.state.gate.causes] == ["e-stop pressed by page"]
+    await told(page, "causes", "find out why it was pressed")
+    await page.keyboard.up("a")
+    await page.keyboard.down("a")  # nothing goes out while the gate is shut
+    await seen.ticks(50)
+    assert at_rest(seen.state)
+    await page.keyboard.up("a")
+    await ready_to_drive(page)
+    assert await text(page, "confirmed") == ""
+
+
+async def test_a_goal_that_nobody_serves_is_refused_in_words(chromium: Browser) -> None:
+    page = await chromium.open()
+    await page.click("#map", position={"x": 300, "y": 200})
+    await told(page, "goal", "nobody serves goals")
+
+
+async def test_tables_and_log_show_every_process(chromium: Browser) -> None:
+    page = await chromium.open()
+    for name in ("driver", "perception", "decision", "control", "safety", "page"):
+        await told(page, "processes", name)
+    await page.click("#tab-topics")
+    await told(page, "topics", "robot/cmd_vel")
+    assert re.search(r"robot/scan\s+\d+\.\d Hz\s+driver", await text(page, "topics"))
+    await page.keyboard.press("ArrowRight")
+    assert await page.get_attribute("#tab-log", "aria-selected") == "true"
+
+
+async def test_of_two_viewers_one_steers_and_both_see_it(chromium: Browser, seen: Onlooker) -> None:
+    one, two = await chromium.open(), await chromium.open()
+    await told(two, "link", "2 viewers")
+    await ready_to_drive(one)
+    await one.keyboard.down("a")
+    await turning(seen, 1)
+    await told(two, "doing", "steered by viewer")
+    await two.keyboard.down("d")
+    await told(two, "said", "somebody else steers")
+    await seen.ticks(25)
+    assert seen.state.velocity.angular_z > 0.3
+    await two.keyboard.up("d")
+    await one.keyboard.up("a")
+    await seen.still()
+
+
+async def test_a_viewers_token_looks_and_does_not_drive(chromium: Browser, seen: Onlooker) -> None:
+    page = await chromium.open(VIEWER)
+    assert await page.is_disabled("#estop")
+    assert not await page.is_visible("#stick")
+    assert not await page.is_visible("#enable")
+    count = seen.bus.received["robot/teleop"]
+    await page.keyboard.down("w")
+    await page.keyboard.press("Space")
+    await seen.ticks(25)
+    assert seen.bus.received["robot/teleop"] == count
+    assert await page.inner_text("#confirmed") == ""
+
+
+async def test_on_a_phone_nothing_is_cut_off_and_the_joystick_drives(
+    chromium: Browser, seen: Onlooker
+) -> None:
+    page = await chromium.open(width=390, height=844)
+    assert await page.evaluate("document.documentElement.scrollWidth") == 390
+    box = await page.locator("#estop").bounding_box()
+    assert box
+    assert box["y"] + box["height"] <= 844
+    assert box["width"] > 340
+    await ready_to_drive(page)
+    await page.locator("#stick").scroll_into_view_if_needed()
+    await page.evaluate("scrollBy(0, 150)")
+    stick = await page.locator("#stick").bounding_box()
+    assert stick
+    x, y = stick["x"] + stick["width"] / 2, stick["y"] + stick["height"] / 2
+    await page.mouse.move(x, y)
+    await page.mouse.down()
+    await page.mouse.move(x - stick["width"] / 2, y)
+    await turning(seen, 1)
+    await page.mouse.up()
+    await seen.still()
+
+
+async def test_the_page_comes_back_by_itself_after_its_server_and_drives_again(
+    chromium: Browser, seen: Onlooker
+) -> None:
+    page = await chromium.open()
+    await ready_to_drive(page)
+    await page.keyboard.down("a")
+    await turning(seen, 1)
+    os.kill(await seen.pid("page"), signal.SIGKILL)
+    await page.wait_for_selector("#link:not(.live)")
+    assert await page.inner_text("#mode") == "Silent"
+    await seen.still()
+    await page.keyboard.press("Space")
+    await told(page, "confirmed", "NOT CONFIRMED: ")
+    await page.wait_for_selector(LIVE)
+    await page.keyboard.up("a")
+    await ready_to_drive(page)
+    await page.keyboard.down("d")
+    await turning(seen, -1)
+    await page.keyboard.up("d")
+    await seen.still()

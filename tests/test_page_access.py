@@ -1,0 +1,150 @@
+"""Who may open the operator page, who steers, and what a slow browser gets."""
+
+import stat
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.catalog import load_robot
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import Body
+from gigabrain_schemas.brain import Twist
+from gigabrain_schemas.topics import BODY, TELEOP
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.page.access import Access, check, tokens
+from gigabrain_zenoh.page.beside import free_port
+from gigabrain_zenoh.page.operator import Operator, Seat
+from gigabrain_zenoh.page.scene import Scene
+from gigabrain_zenoh.page.viewer import Viewer
+from gigabrain_zenoh.page.wire import Ask, GoalRequest
+from gigabrain_zenoh.settings import PageConfig
+from tests.bus_rig import Net, settle
+
+
+def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
+    path = tmp_path / "page" / "tokens.json"
+    made, new = tokens(path)
+    assert new
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert tokens(path) == (made, False)
+    path.chmod(0o644)
+    with pytest.raises(ConfigError, match="open to others"):
+        tokens(path)
+    path.chmod(0o600)
+    path.write_text('{"operator": "short", "viewer": "short"}')
+    with pytest.raises(ConfigError, match="two tokens of 16 characters"):
+        tokens(path)
+
+
+def test_beyond_loopback_it_wants_tls_and_a_token(tmp_path: Path) -> None:
+    check(PageConfig())
+    for listen in ("0.0.0.0", "192.168.1.10", "::"):
+        with pytest.raises(ConfigError, match="can be reached from the network"):
+            check(PageConfig(listen=listen))
+    with pytest.raises(ConfigError, match="belong together"):
+        check(PageConfig(certificate="cert.pem"))
+    with pytest.raises(ConfigError, match="cannot read"):
+        check(PageConfig(certificate="none.pem", certificate_key="none.key"))
+    path = tmp_path / "tokens.json"
+    access = Access(PageConfig(listen="192.168.1.10", tokens=str(path)), 8080)
+    made, _ = tokens(path)
+    assert [access.role(token) for token in (made.operator, made.viewer, "", "é")] == [
+        "operator", "viewer", None, None,
+    ]  # fmt: skip
+    assert Access(PageConfig(), 8080).role("") == "operator"
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "named", "own"),
+    [
+        ("127.0.0.1:8080", "http://127.0.0.1:8080", True, True),
+        ("LOCALHOST:8080", "http://localhost:8080", True, True),
+        ("robot.lan:8080", "http://robot.lan:8080", True, True),
+        ("127.0.0.1:8080", "http://localhost:8080", True, False),
+        ("127.0.0.1:8080", "https://127.0.0.1:8080", True, False),
+        ("127.0.0.1:8080", "null", True, False),
+        ("127.0.0.1:8080", "", True, False),
+        ("127.0.0.1:9090", "http://127.0.0.1:9090", False, False),
+        ("evil.example:8080", "http://evil.example:8080", False, False),
+        ("", "", False, False),
+    ],
+)
+def test_it_answers_to_its_own_names_and_to_its_own_pages(
+    host: str, origin: str, named: bool, own: bool
+) -> None:
+    access = Access(PageConfig(names=("robot.lan",)), 8080)
+    headers = {"host": host, "origin": origin}
+    assert (access.named(headers), access.own_page(headers)) == (named, own)
+
+
+async def test_a_slow_browser_gets_the_newest_and_never_more_than_64_frames() -> None:
+    viewer = Viewer(1, "viewer")
+    for n in range(5):
+        viewer.put("moment", b"%d" % n)
+    viewer.put("scan", b"scan")
+    assert [await viewer.next(), await viewer.next()] == [b"4", b"scan"]
+    for n in range(1000):
+        viewer.put(f"log/{n}", b"%d" % n)
+    assert await viewer.next() == b"936"
+
+
+def test_120_frames_a_second_are_heard_and_no_more() -> None:
+    viewer = Viewer(1, "operator")
+    assert not any(viewer.floods(10.0 + n / 200) for n in range(120))
+    assert viewer.floods(10.7)
+    assert not viewer.floods(11.1)
+
+
+class Seated:
+    """A page of two viewers beside a Waffle, on a clock that the test moves."""
+
+    def __init__(self, tell: Callable[[str, bytes], None] = lambda _slot, _frame: None) -> None:
+        self.net, self.steered = Net(), list[Twist]()
+        self.scene = Scene(self.net.one, tell)
+        self.net.two.subscribe(TELEOP, lambda _key, twist: self.steered.append(twist))
+        self.net.two.publish(
+            BODY, Body(description=load_robot("turtlebot3_waffle").description(), link="sim")
+        )
+        self.seat = Seat(self.scene)
+        self.one, self.two = Viewer(1, "operator"), Viewer(2, "operator")
+
+    @property
+    def speeds(self) -> list[float]:
+        return [twist.linear_x for twist in self.steered]
+
+
+async def test_one_viewer_steers_until_it_lets_go_or_falls_silent() -> None:
+    page = Seated()
+    await settle()
+    fast, slow = Velocity(linear_x=9.0), Velocity(linear_x=0.1)
+    assert page.seat.drive(page.one, fast, 0.0)
+    assert not page.seat.drive(page.two, slow, 0.4)
+    assert page.seat.drive(page.two, ZERO, 0.4)  # says nothing, and does not end the other's
+    assert page.seat.drive(page.two, slow, 0.6)
+    page.seat.leave(page.one)
+    assert page.seat.driving(0.7) == 2
+    assert page.seat.drive(page.two, ZERO, 0.7)
+    assert page.seat.driving(0.7) == 0
+    assert page.seat.drive(page.one, slow, 0.8)
+    page.seat.leave(page.one)
+    await settle()
+    assert page.speeds == [0.26, 0.1, 0.0, 0.1, 0.0]
+
+
+async def test_a_goal_that_nobody_serves_is_said_to_be_so() -> None:
+    page = Seated()
+    goal = Ask(id=7, what="goal", goal=GoalRequest(x=1.0, y=2.0))
+    reply = await Operator(page.net.one).answer(goal)
+    assert (reply.id, reply.ok) == (7, False)
+    assert reply.text == "nobody serves goals: this robot has no navigation running"
+
+
+def test_a_port_that_is_taken_is_stepped_aside_from() -> None:
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert free_port(port) not in (0, port)
+    assert free_port(port) == port
