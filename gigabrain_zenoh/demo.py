@@ -13,13 +13,14 @@ from msgspec import Struct
 
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.deployment import Deployment, client_endpoint, process_specs, with_free_port
+from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.launch import STOP_S
 from gigabrain_zenoh.live_view import HeadlessView, LiveView, View
 from gigabrain_zenoh.logs import new_run_dir
 from gigabrain_zenoh.report import Observed, Report, check_place, make_report, summary, write_report
 from gigabrain_zenoh.running import announced
+from gigabrain_zenoh.specs import process_specs
 from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.supervisor import Supervisor
 from gigabrain_zenoh.watch import Watch

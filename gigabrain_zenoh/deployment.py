@@ -1,8 +1,6 @@
 """A deployment file: which body on which link, and which process runs on which host."""
 
 import socket
-import sys
-from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -12,17 +10,12 @@ from msgspec import Struct
 
 from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError, unknown
-from gigabrain_zenoh.keeper import ProcessSpec
 from gigabrain_zenoh.keys.checks import check_identity
 from gigabrain_zenoh.keys.files import identity_folder
-from gigabrain_zenoh.process_config import ProcessConfig
-from gigabrain_zenoh.relay_place import RELAY, behind, between, has_relay, relay_config
 from gigabrain_zenoh.running import local_socket
 from gigabrain_zenoh.settings import (
     ButtonConfig,
     DecisionConfig,
-    DriverConfig,
-    EmulatorConfig,
     Endpoint,
     LinkName,
     PageConfig,
@@ -32,7 +25,7 @@ from gigabrain_zenoh.settings import (
     Seed,
     Speed,
 )
-from gigabrain_zenoh.zenoh_config import router_config, secured
+from gigabrain_zenoh.zenoh_config import secured
 
 EMULATOR = "emulator"  # runs beside the driver where the link is `emulated`; not in `hosts`
 BUTTON = "button"  # runs beside the driver where there is one, unless `hosts` says where
@@ -193,114 +186,7 @@ def check_keys(deployment: Deployment, host: str) -> None:
         )
 
 
-def process_specs(
-    deployment: Deployment,
-    host: str,
-    run_dir: Path,
-    state_dir: Path,
-    *,
-    seconds: float | None = None,
-    level: str = "info",
-) -> list[ProcessSpec]:
-    """What the supervisor of `host` has to run, in readiness order: the router or relay first."""
-    names: list[str] = sorted(deployment.hosts[host], key=(*ALL, BUTTON).index)
-    placed = any(BUTTON in others for others in deployment.hosts.values())
-    if deployment.button and "driver" in names and not placed:
-        names.append(BUTTON)
-    if deployment.link == "emulated" and "driver" in names:
-        names.insert(names.index("driver"), EMULATOR)
-    relayed = has_relay(names)
-    if relayed:
-        names.insert(0, RELAY)
-    settings = dict(_settings(deployment, run_dir, state_dir, seconds))
-    specs = []
-    for name in names:
-        endpoint = local_endpoint(deployment, host)
-        if name == "router":
-            endpoint = _door(deployment, endpoint)
-            settings[name] = msgspec.to_builtins(router_config(endpoint, state_dir))
-        elif name == RELAY:
-            settings[name] = msgspec.to_builtins(relay_config(endpoint))
-            endpoint = between(endpoint)
-        elif relayed:
-            endpoint = behind(endpoint)
-        process = ProcessConfig(
-            name=name,
-            endpoint=endpoint,
-            settings=settings.get(name, {}),
-            run_dir=str(run_dir),
-            json_console=True,
-            level=level,
-        )
-        first: tuple[str, ...] = ("router", EMULATOR) if name == "driver" else ("router", RELAY)
-        if name == "driver" and deployment.recorder.file:  # to be recorded from its first tick
-            first = (*first, "recorder")
-        after = tuple(other for other in first if other in names and other != name)
-        specs.append(
-            ProcessSpec(
-                name=name,
-                argv=(*COMMAND, msgspec.json.encode(process).decode()),
-                after=after,
-                stop_last=name in ("router", RELAY, EMULATOR),
-                ready_timeout_s=30.0 if after else 3600.0,  # elsewhere, the router may come later
-            )
-        )
-    return specs
-
-
-def _door(deployment: Deployment, endpoint: Endpoint) -> Endpoint:
-    """The router's side of where others connect."""
-    return msgspec.structs.replace(
-        endpoint, listen=endpoint.connect[::-1], connect=(), fleet=deployment.fleet
-    )
-
-
-# -P: a folder that happens to be the current one must not stand in for an installed package
-COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.process")
-
-
-def _settings(
-    deployment: Deployment, run_dir: Path, state_dir: Path, seconds: float | None
-) -> Mapping[str, dict[str, Any]]:
-    ports = str(run_dir / "ports") if deployment.link == "emulated" else ""
-    driver = DriverConfig(
-        body=deployment.body,
-        link=deployment.link,
-        world=deployment.world,
-        seed=deployment.seed,
-        speed=deployment.speed,
-        seconds=seconds,
-        resume=deployment.resume,
-        state_dir=str(state_dir),
-        emulator=ports,
-        button=deployment.button is not None,
-    )
-    emulator = EmulatorConfig(
-        body=deployment.body, world=deployment.world, seed=deployment.seed, folder=ports
-    )
-    return {
-        "driver": msgspec.to_builtins(driver),
-        EMULATOR: msgspec.to_builtins(emulator),
-        BUTTON: msgspec.to_builtins(deployment.button) if deployment.button else {},
-        "perception": msgspec.to_builtins(deployment.perception),
-        "decision": msgspec.to_builtins(deployment.decision),
-        "recorder": msgspec.to_builtins(with_notes(deployment)),
-        "page": msgspec.to_builtins(deployment.page),
-    }
-
-
 def recorded(path: Path) -> dict[str, Any]:
     """What makes a deployment record itself into one file, raw, for a replay."""
     recorder = {"file": str(path.absolute()), "viewers": False}
     return {"hosts": {"robot": (*ROBOT, "recorder")}, "recorder": recorder}
-
-
-def with_notes(deployment: Deployment) -> RecorderConfig:
-    """What to record, with what a replay has to know of the processes in the file."""
-    about = {"perception": deployment.perception, "decision": deployment.decision}
-    notes = {name: msgspec.json.encode(settings).decode() for name, settings in about.items()}
-    plain = {"body": deployment.body, "link": deployment.link, "world": deployment.world}
-    plain["speed"] = f"{deployment.speed:g}"
-    return msgspec.structs.replace(
-        deployment.recorder, notes=notes | plain | deployment.recorder.notes
-    )

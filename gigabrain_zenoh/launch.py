@@ -8,18 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from gigabrain_zenoh import log_text
-from gigabrain_zenoh.deployment import (
-    Deployment,
-    check_keys,
-    local_endpoint,
-    process_specs,
-    with_free_port,
-)
+from gigabrain_zenoh.deployment import Deployment, check_keys, local_endpoint, with_free_port
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.logs import new_run_dir, state_dir
 from gigabrain_zenoh.relay_place import RELAY
 from gigabrain_zenoh.running import announced
 from gigabrain_zenoh.sd_notify import Notifier
+from gigabrain_zenoh.specs import process_specs
 from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.supervisor import Supervisor
 

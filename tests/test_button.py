@@ -17,9 +17,10 @@ from gigabrain_schemas.requests import EstopRequest, GateReply
 from gigabrain_schemas.topics import BUTTON, ESTOP
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.deployment import Deployment, process_specs
+from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.settings import ButtonConfig
+from gigabrain_zenoh.specs import process_specs
 from gigabrain_zenoh.transport import LocalNetwork
 from tests.brain_in_memory import Robot
 from tests.bus_rig import Net

@@ -10,17 +10,12 @@ import pytest
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from gigabrain_zenoh.deployment import (
-    Deployment,
-    check_keys,
-    client_endpoint,
-    load_deployment,
-    process_specs,
-)
+from gigabrain_zenoh.deployment import Deployment, check_keys, client_endpoint, load_deployment
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.authority import issue, new_fleet
 from gigabrain_zenoh.keys.identity import load
 from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.specs import process_specs
 from gigabrain_zenoh.zenoh_config import session_config
 from tests.stack import Home
 

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from gigabrain_zenoh.child import Child, Lines, as_record
-from gigabrain_zenoh.deployment import COMMAND
 from gigabrain_zenoh.errors import ConfigError, UnknownName
+from gigabrain_zenoh.specs import COMMAND
 from gigabrain_zenoh.supervisor import Backoff, ProcessSpec, Supervisor
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts")

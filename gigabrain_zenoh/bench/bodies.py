@@ -14,15 +14,11 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, STATE
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.deployment import (
-    Deployment,
-    client_endpoint,
-    process_specs,
-    with_free_port,
-)
+from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.keeper import ProcessSpec
 from gigabrain_zenoh.settings import LinkName
+from gigabrain_zenoh.specs import process_specs
 from gigabrain_zenoh.supervisor import Supervisor
 from gigabrain_zenoh.watch import Watch
 from gigabrain_zenoh.zenoh_transport import ZenohTransport

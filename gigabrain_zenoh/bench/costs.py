@@ -23,8 +23,9 @@ from gigabrain_zenoh.bridge import Bridge
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.decision import Thinker
-from gigabrain_zenoh.deployment import Deployment, client_endpoint, process_specs, with_free_port
+from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.specs import process_specs
 
 T = TypeVar("T")
 TURNS = 100

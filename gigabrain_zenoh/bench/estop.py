@@ -18,13 +18,14 @@ from gigabrain_schemas.topics import ENABLE, RELEASE, STATE
 from gigabrain_zenoh.bench.group import Group, client, running
 from gigabrain_zenoh.bench.runs import LOOPBACK
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.deployment import Deployment, client_endpoint, process_specs, with_free_port
+from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.estop import press
 from gigabrain_zenoh.gate import BRAIN
 from gigabrain_zenoh.keeper import ProcessSpec
 from gigabrain_zenoh.percentile import percentile
 from gigabrain_zenoh.settings import DecisionConfig
+from gigabrain_zenoh.specs import process_specs
 
 SPEED = 0.26  # [m/s]
 FAST = 0.9  # share of it, from which on the robot counts as driving

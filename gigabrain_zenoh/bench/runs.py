@@ -13,10 +13,11 @@ from gigabrain_zenoh.bench.group import Group, client, driver_report, running
 from gigabrain_zenoh.bench.listening import Heard, listen
 from gigabrain_zenoh.bench.relay import Role
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.deployment import Deployment, client_endpoint, process_specs, with_free_port
+from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.keeper import ProcessSpec
 from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.specs import process_specs
 
 LOOPBACK = "tcp/127.0.0.1:0"
 SETTLE_S = 1.0  # of the relay; the chain counts from when the gate opens

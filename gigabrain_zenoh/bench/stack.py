@@ -12,7 +12,8 @@ from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import HEALTH
 from gigabrain_zenoh.bench.group import client, driver_report, running
 from gigabrain_zenoh.bench.runs import LOOPBACK
-from gigabrain_zenoh.deployment import Deployment, client_endpoint, process_specs, with_free_port
+from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
+from gigabrain_zenoh.specs import process_specs
 
 SETTLE_S = 2.0  # imports and first calls are no part of what a running robot costs
 PERIOD_S = 1.0  # of the health messages

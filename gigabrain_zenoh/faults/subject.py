@@ -15,19 +15,14 @@ import msgspec
 
 from gigabrain_zenoh.backoff import Backoff
 from gigabrain_zenoh.client import Robot
-from gigabrain_zenoh.deployment import (
-    EMULATOR,
-    Deployment,
-    client_endpoint,
-    process_specs,
-    with_free_port,
-)
+from gigabrain_zenoh.deployment import EMULATOR, Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.faults.fault import Failed
 from gigabrain_zenoh.faults.onlooker import Onlooker, looking_on
 from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.keeper import ProcessSpec
 from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.specs import process_specs
 from gigabrain_zenoh.supervisor import Supervisor
 
 Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]

@@ -1,0 +1,132 @@
+"""What a supervisor has to run: a deployment's processes on one host, and what each is told."""
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gigabrain_zenoh.deployment import ALL, BUTTON, EMULATOR, Deployment, local_endpoint
+from gigabrain_zenoh.keeper import ProcessSpec
+from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.relay_place import RELAY, behind, between, has_relay, relay_config
+from gigabrain_zenoh.settings import DriverConfig, EmulatorConfig, Endpoint, RecorderConfig
+from gigabrain_zenoh.zenoh_config import router_config
+
+# -P: a folder that happens to be the current one must not stand in for an installed package
+COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.process")
+LATER_S, SOON_S = 3600.0, 30.0  # where the router is elsewhere, it may come later
+
+
+def process_specs(
+    deployment: Deployment,
+    host: str,
+    run_dir: Path,
+    state_dir: Path,
+    *,
+    seconds: float | None = None,
+    level: str = "info",
+) -> list[ProcessSpec]:
+    """What the supervisor of `host` has to run, in readiness order: the router or relay first."""
+    names = _names(deployment, host)
+    settings = dict(_settings(deployment, run_dir, state_dir, seconds))
+    specs = []
+    for name in names:
+        endpoint, more = _place(deployment, host, name, names, state_dir)
+        process = ProcessConfig(
+            name=name,
+            endpoint=endpoint,
+            settings=settings.get(name, {}) | more,
+            run_dir=str(run_dir),
+            json_console=True,
+            level=level,
+        )
+        after = _after(deployment, name, names)
+        specs.append(
+            ProcessSpec(
+                name=name,
+                argv=(*COMMAND, msgspec.json.encode(process).decode()),
+                after=after,
+                stop_last=name in ("router", RELAY, EMULATOR),
+                ready_timeout_s=SOON_S if after else LATER_S,
+            )
+        )
+    return specs
+
+
+def _names(deployment: Deployment, host: str) -> list[str]:
+    """The processes of `host`, with those that no file has to name."""
+    names: list[str] = sorted(deployment.hosts[host], key=(*ALL, BUTTON).index)
+    placed = any(BUTTON in others for others in deployment.hosts.values())
+    if deployment.button and "driver" in names and not placed:
+        names.append(BUTTON)
+    if deployment.link == "emulated" and "driver" in names:
+        names.insert(names.index("driver"), EMULATOR)
+    if has_relay(names):
+        names.insert(0, RELAY)
+    return names
+
+
+def _place(
+    deployment: Deployment, host: str, name: str, names: list[str], state_dir: Path
+) -> tuple[Endpoint, dict[str, Any]]:
+    """Where a process meets the others, and what a router or a relay is told of that."""
+    endpoint = local_endpoint(deployment, host)
+    if name == "router":
+        door = msgspec.structs.replace(
+            endpoint, listen=endpoint.connect[::-1], connect=(), fleet=deployment.fleet
+        )
+        return door, msgspec.to_builtins(router_config(door, state_dir))
+    if name == RELAY:
+        return between(endpoint), msgspec.to_builtins(relay_config(endpoint))
+    return (behind(endpoint) if RELAY in names else endpoint), {}
+
+
+def _after(deployment: Deployment, name: str, names: list[str]) -> tuple[str, ...]:
+    """Which processes have to be ready before this one starts."""
+    first: tuple[str, ...] = ("router", EMULATOR) if name == "driver" else ("router", RELAY)
+    if name == "driver" and deployment.recorder.file:  # to be recorded from its first tick
+        first = (*first, "recorder")
+    return tuple(other for other in first if other in names and other != name)
+
+
+def _settings(
+    deployment: Deployment, run_dir: Path, state_dir: Path, seconds: float | None
+) -> Mapping[str, dict[str, Any]]:
+    ports = str(run_dir / "ports") if deployment.link == "emulated" else ""
+    driver = DriverConfig(
+        body=deployment.body,
+        link=deployment.link,
+        world=deployment.world,
+        seed=deployment.seed,
+        speed=deployment.speed,
+        seconds=seconds,
+        resume=deployment.resume,
+        state_dir=str(state_dir),
+        emulator=ports,
+        button=deployment.button is not None,
+    )
+    emulator = EmulatorConfig(
+        body=deployment.body, world=deployment.world, seed=deployment.seed, folder=ports
+    )
+    return {
+        "driver": msgspec.to_builtins(driver),
+        EMULATOR: msgspec.to_builtins(emulator),
+        BUTTON: msgspec.to_builtins(deployment.button) if deployment.button else {},
+        "perception": msgspec.to_builtins(deployment.perception),
+        "decision": msgspec.to_builtins(deployment.decision),
+        "recorder": msgspec.to_builtins(with_notes(deployment)),
+        "page": msgspec.to_builtins(deployment.page),
+    }
+
+
+def with_notes(deployment: Deployment) -> RecorderConfig:
+    """What to record, with what a replay has to know of the processes in the file."""
+    about = {"perception": deployment.perception, "decision": deployment.decision}
+    notes = {name: msgspec.json.encode(settings).decode() for name, settings in about.items()}
+    plain = {"body": deployment.body, "link": deployment.link, "world": deployment.world}
+    plain["speed"] = f"{deployment.speed:g}"
+    return msgspec.structs.replace(
+        deployment.recorder, notes=notes | plain | deployment.recorder.notes
+    )
