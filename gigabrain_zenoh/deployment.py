@@ -16,6 +16,7 @@ from gigabrain_zenoh.keeper import ProcessSpec
 from gigabrain_zenoh.keys.checks import check_identity
 from gigabrain_zenoh.keys.files import identity_folder
 from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.relay_place import RELAY, behind, between, has_relay, relay_config
 from gigabrain_zenoh.running import local_socket
 from gigabrain_zenoh.settings import (
     ButtonConfig,
@@ -201,13 +202,16 @@ def process_specs(
     seconds: float | None = None,
     level: str = "info",
 ) -> list[ProcessSpec]:
-    """What the supervisor of `host` has to run, in readiness order: the router first."""
+    """What the supervisor of `host` has to run, in readiness order: the router or relay first."""
     names: list[str] = sorted(deployment.hosts[host], key=(*ALL, BUTTON).index)
     placed = any(BUTTON in others for others in deployment.hosts.values())
     if deployment.button and "driver" in names and not placed:
         names.append(BUTTON)
     if deployment.link == "emulated" and "driver" in names:
         names.insert(names.index("driver"), EMULATOR)
+    relayed = has_relay(names)
+    if relayed:
+        names.insert(0, RELAY)
     settings = dict(_settings(deployment, run_dir, state_dir, seconds))
     specs = []
     for name in names:
@@ -215,6 +219,11 @@ def process_specs(
         if name == "router":
             endpoint = _door(deployment, endpoint)
             settings[name] = msgspec.to_builtins(router_config(endpoint, state_dir))
+        elif name == RELAY:
+            settings[name] = msgspec.to_builtins(relay_config(endpoint))
+            endpoint = between(endpoint)
+        elif relayed:
+            endpoint = behind(endpoint)
         process = ProcessConfig(
             name=name,
             endpoint=endpoint,
@@ -223,7 +232,7 @@ def process_specs(
             json_console=True,
             level=level,
         )
-        first = ("router", EMULATOR) if name == "driver" else ("router",)
+        first: tuple[str, ...] = ("router", EMULATOR) if name == "driver" else ("router", RELAY)
         if name == "driver" and deployment.recorder.file:  # to be recorded from its first tick
             first = (*first, "recorder")
         after = tuple(other for other in first if other in names and other != name)
@@ -232,7 +241,7 @@ def process_specs(
                 name=name,
                 argv=(*COMMAND, msgspec.json.encode(process).decode()),
                 after=after,
-                stop_last=name in ("router", EMULATOR),
+                stop_last=name in ("router", RELAY, EMULATOR),
                 ready_timeout_s=30.0 if after else 3600.0,  # elsewhere, the router may come later
             )
         )

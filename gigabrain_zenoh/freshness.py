@@ -73,17 +73,24 @@ class Latest(Generic[M]):
         None when there is none, or when it belongs to another start of the driver.
         """
         message = self.current
-        if message is None:
-            return None
-        age = (self._time.tick - self._arrived_tick) * TICK_NS
-        if message.boot:
-            age = max(age, (self._time.tick - message.tick) * TICK_NS)
+        return None if message is None else max(self._silent_ns(message), self._echo_ns(message), 0)
+
+    def _silent_ns(self, message: M) -> int:
+        """How long ago the newest message came [ns]."""
+        silent = (self._time.tick - self._arrived_tick) * TICK_NS
         if self._by_wall or not message.boot:
-            age = max(age, self._clock.now_ns() - self._arrived_ns)
-        return max(age, 0)
+            silent = max(silent, self._clock.now_ns() - self._arrived_ns)
+        return silent
+
+    def _echo_ns(self, message: M) -> int:
+        """How old the tick is that its sender had seen [ns]."""
+        return (self._time.tick - message.tick) * TICK_NS if message.boot else 0
 
     def fresh(self, within_ns: int | None = None) -> M | None:
         """The newest message, or None once it is older than its promised rate allows."""
-        age = self.age_ns()
+        message = self.current
+        if message is None:
+            return None
         limit = self._topic.stale_after_ns if within_ns is None else within_ns
-        return self.newest if age is not None and age <= limit else None
+        in_time = self._echo_ns(message) <= max(limit, self._topic.echo_ns)
+        return message if in_time and self._silent_ns(message) <= limit else None

@@ -17,6 +17,7 @@ from gigabrain_zenoh.deployment import (
 )
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.logs import new_run_dir, state_dir
+from gigabrain_zenoh.relay_place import RELAY
 from gigabrain_zenoh.running import announced
 from gigabrain_zenoh.sd_notify import Notifier
 from gigabrain_zenoh.stop_signals import stop_signals
@@ -24,6 +25,7 @@ from gigabrain_zenoh.supervisor import Supervisor
 
 STOP_S = 1.5
 LOOK_S = 0.1
+ROUTERS = {"router", RELAY}  # without the one or the other nobody on the host hears anything
 
 
 async def up(
@@ -65,14 +67,14 @@ async def up(
             await running
             if supervisor.misconfigured:
                 raise ConfigError(refusal)
-            if "router" in supervisor.given_up:
-                raise BusError(refusal or "the router keeps dying")
+            if lost := ROUTERS & set(supervisor.given_up):
+                raise BusError(refusal or f"the {lost.pop()} keeps dying")
             return 1 if supervisor.given_up else 0
 
 
 def _hopeless(supervisor: Supervisor) -> bool:
     """Whether what has been given up leaves nothing to keep running."""
-    return bool(supervisor.misconfigured) or "router" in supervisor.given_up
+    return bool(supervisor.misconfigured) or bool(ROUTERS & set(supervisor.given_up))
 
 
 def _report(supervisor: Supervisor, notifier: Notifier, note: Path) -> None:

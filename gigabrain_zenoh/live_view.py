@@ -192,7 +192,7 @@ def _activity(name: str, watch: Watch) -> str:
     """One process's work, as its messages show it."""
     health = watch.health.get(name)
     sent = health.sent_hz if health else {}
-    if name == "router":
+    if name in ("router", "relay"):
         return "joins the others"
     if name == "page":
         return "shows it in a browser"

@@ -55,6 +55,7 @@ class Program:
 
 PROGRAMS = {
     "router": Program("gigabrain_zenoh.router:run", "gigabrain_zenoh.settings:RouterConfig"),
+    "relay": Program("gigabrain_zenoh.relay:run", "gigabrain_zenoh.settings:RelayConfig"),
     "driver": Program("gigabrain_drivers.process:run", "gigabrain_zenoh.settings:DriverConfig"),
     "emulator": Program(
         "gigabrain_drivers.emulators.process:run", "gigabrain_zenoh.settings:EmulatorConfig"

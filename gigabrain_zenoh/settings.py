@@ -30,6 +30,13 @@ class RouterConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     knows: tuple[str, ...] = ()  # common names that have rights; without keys none is asked for
 
 
+class RelayConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The settings of the relay process."""
+
+    router: str  # the robot's, for people to read
+    keys: str = ""  # the folder of the host's identity
+
+
 class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The `perception` part of a deployment file."""
 

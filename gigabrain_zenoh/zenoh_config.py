@@ -19,7 +19,9 @@ LOCAL_ENDPOINT = re.compile(r"unixsock-stream/.+")
 
 
 def session_config(endpoint: Endpoint) -> dict[str, Any]:
-    """Client of a router, or the router itself; explicit endpoints, no multicast, short leases.
+    """Client of a router, the router itself, or a relay, which both listens and connects.
+
+    Explicit endpoints, no multicast, short leases.
 
     With keys all that leaves the machine is TLS on both ends, and a router lets everybody do what
     the certificate's role may. Raises ConfigError for an endpoint that Zenoh would wait for in
@@ -61,6 +63,8 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
         "transport/link/rx/max_message_size": 16 << 20,
         "transport/shared_memory/enabled": False,
     }
+    if endpoint.listen and (endpoint.keys or endpoint.connect):
+        config["adminspace/enabled"] = False
     if endpoint.at_most_hz:
         config["downsampling"] = [_thinned(endpoint.at_most_hz)]
     if endpoint.namespace:
@@ -76,7 +80,7 @@ def _thinned(at_most_hz: Mapping[str, float]) -> dict[str, Any]:
 
 def security(endpoint: Endpoint) -> dict[str, Any]:
     """What keys add to a session: TLS in both directions, and in a router who may do what."""
-    folder, side = Path(endpoint.keys), "listen" if endpoint.listen else "connect"
+    folder, side = Path(endpoint.keys), "connect" if endpoint.connect else "listen"
     config: dict[str, Any] = {
         "transport/link/tls": {
             "root_ca_certificate": str(folder / CA),
@@ -86,8 +90,7 @@ def security(endpoint: Endpoint) -> dict[str, Any]:
             f"{side}_certificate": str(folder / CERTIFICATE),
         }
     }
-    if endpoint.listen:
-        config["adminspace/enabled"] = False
+    if endpoint.listen and not endpoint.connect:  # a relay is itself judged where it connects
         config["access_control"] = access_control(robots_of(endpoint), endpoint.namespace)
     return config
 

@@ -2,8 +2,8 @@ import pytest
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.brain import Twist, WorldModel
-from gigabrain_schemas.topics import STATE, TELEOP, WORLD
+from gigabrain_schemas.brain import Intent, Twist, WorldModel
+from gigabrain_schemas.topics import INTENT, STATE, TELEOP, WORLD
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.freshness import Latest, RobotTime
 
@@ -164,3 +164,19 @@ def test_a_state_without_boot_does_not_move_the_robots_time(reader: Reader) -> N
     reader.see(100)
     reader.see(3000, boot=0)
     assert (reader.time.boot, reader.time.tick) == (7, 100)
+
+
+def test_an_intent_may_have_been_on_its_way_for_150_ms_but_not_silent_for_more_than_100(
+    reader: Reader,
+) -> None:
+    intents = Latest(INTENT, reader.clock, reader.time)
+    reader.see(107)
+    intents.take(Intent(boot=7, tick=100, behaviour="avoid", reason="free"))
+    assert intents.fresh() is not None  # 140 ms there and back
+    reader.see(108)
+    assert intents.fresh() is None
+    intents.take(Intent(boot=7, tick=108, behaviour="avoid", reason="free"))
+    reader.see(113)
+    assert intents.fresh() is not None
+    reader.see(114)
+    assert intents.fresh() is None  # nothing came for 120 ms

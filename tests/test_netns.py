@@ -180,6 +180,7 @@ async def stands_until_enabled(robot: Onlooker) -> None:
 LINKS = [
     ("20 ms there and back", Chaos(delay_ms=10), True),
     ("50 ms there and back", Chaos(delay_ms=25), None),
+    ("100 ms there and back", Chaos(delay_ms=50), True),
     ("200 ms there and back", Chaos(delay_ms=100), False),
     ("50 ms and up to 50 ms more each way", Chaos(delay_ms=25, jitter_ms=50), None),
     ("5 % comes 200 ms late", Chaos(loss=0.05), None),

@@ -155,8 +155,8 @@ async def test_the_hosts_of_a_deployment_make_one_robot(home: Home) -> None:
     brain = home.start("up", str(file), "--host", "brain")
     body = home.start("up", str(file), "--host", "robot")
     async with looking_on(Endpoint(connect=(where,))) as robot:
-        await until(lambda: len(ready(brain)) == 2 and len(ready(body)) == 4, "all are ready")
-        assert sorted(ready(brain)) == ["decision", "perception"]
+        await until(lambda: len(ready(brain)) == 3 and len(ready(body)) == 4, "all are ready")
+        assert sorted(ready(brain)) == ["decision", "perception", "relay"]
         person = Robot(robot.bus)
         await robot.ticks(30)
         await person.release()

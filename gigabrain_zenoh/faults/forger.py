@@ -23,7 +23,7 @@ class Forger:
 
     def send_bytes(self, topic: Topic[Any], payload: bytes, encoding: str = "") -> None:
         """Anything at all."""
-        self._transport.publish(topic, topic.at(), payload, encoding)
+        self._transport.publish(topic, topic.at("forger"), payload, encoding)
 
 
 @asynccontextmanager

@@ -14,6 +14,7 @@ from gigabrain_zenoh.faults.crowd import (
 from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.proxy import TcpProxy
 from gigabrain_zenoh.faults.rig import Rig
+from gigabrain_zenoh.faults.smooth import NO_GAP_TICKS, stops, stops_in_time
 from gigabrain_zenoh.faults.spoiled import HOLE, behind_proxy
 from gigabrain_zenoh.faults.stopping import TICK_MS, creep, stop_by
 from gigabrain_zenoh.faults.subject import Subject
@@ -35,7 +36,6 @@ RESTED_TICKS = 50
 FREEZE_S = 2.4  # longer, and the supervisor replaces it
 SHORT_HOLE_S, SHORT_HOLES = 0.06, 5  # with 20 ms between commands, a gap of at most 80 ms
 HOLES_S, LONG_HOLES_S = (0.3, 1.0, 3.0), (0.15, 0.3, 1.0, 3.0, 30.0)
-NO_GAP_TICKS = 5  # up to which the gate waits for a command
 DRIVE_TICKS = 150  # with each kind of bad line
 ROUND_TRIPS_MS = (20.0, 50.0, 100.0)
 TOO_LONG_MS = 200.0
@@ -45,7 +45,6 @@ BAD = (  # on a line that takes 50 ms; each way has half of it
     Chaos(delay_ms=25, loss=0.05),
     Chaos(delay_ms=25, loss=0.2),
 )
-FRESH_TICKS = 6  # echoes that are older than 120 ms are this machine's doing at 100 ms
 
 
 async def router_killed(rig: Rig) -> Measured:
@@ -107,7 +106,7 @@ async def _stale(subject: Subject) -> float:
 async def network_partition(rig: Rig) -> Measured:
     """A hole between the whole brain and the body, shorter and longer than the gate waits."""
     async with behind_proxy(rig, "perception", "decision", "control") as (subject, proxy):
-        stops = [await _short_hole(subject, proxy) for _ in range(SHORT_HOLES)]
+        stopped = [await _short_hole(subject, proxy) for _ in range(SHORT_HOLES)]
         worst_ms = again_m = 0.0
         for hole_s in LONG_HOLES_S if rig.long else HOLES_S:
             stop = await stop_by(subject, functools.partial(_hole, proxy, hole_s), "control")
@@ -117,7 +116,7 @@ async def network_partition(rig: Rig) -> Measured:
             again_m = max(again_m, await subject.distance() - stop.distance_m)
         stale = await _stale(subject)
     return {
-        "stops in a gap of 100 ms": sum(stops),
+        "stops in a gap of 100 ms": sum(stopped),
         "zero after": worst_ms,
         "stale executed": stale,
         "moved again": again_m,
@@ -137,14 +136,7 @@ async def _short_hole(subject: Subject, proxy: TcpProxy) -> bool:
     _hole(proxy, SHORT_HOLE_S)
     await onlooker.ticks(2 * NO_GAP_TICKS)
     gap = max(b - a for a, b in itertools.pairwise(t for t in onlooker.arrivals if t >= start.tick))
-    return gap <= NO_GAP_TICKS and bool(_stops(subject, start))
-
-
-def _stops(subject: Subject, start: RobotState) -> list[int]:
-    """The ticks since in which the gate has left `enabled`."""
-    states = (s for s in subject.onlooker.states if s.boot == start.boot and s.tick >= start.tick)
-    pairs = itertools.pairwise(states)
-    return [b.tick for a, b in pairs if a.gate.mode == "enabled" != b.gate.mode]
+    return gap <= NO_GAP_TICKS and bool(stops(onlooker, start))
 
 
 async def latency_jitter_loss(rig: Rig) -> Measured:
@@ -174,20 +166,11 @@ async def _stops_in_time(subject: Subject) -> int:
     await subject.drive()
     start = onlooker.state
     await onlooker.ticks(DRIVE_TICKS)
-    heard = list(zip(onlooker.arrivals, (c.tick for c in onlooker.commands), strict=True))
-    return sum(_in_time(heard, tick) for tick in _stops(subject, start))
-
-
-def _in_time(heard: list[tuple[int, int]], stop: int) -> bool:
-    """Whether the commands before a stop had no gap, and none echoed an old tick."""
-    recent = [(came, echo) for came, echo in heard if stop - 3 * NO_GAP_TICKS <= came <= stop]
-    gaps = [b - a for (a, _), (b, _) in itertools.pairwise([*recent, (stop, stop)])]
-    old = any(came - echo > FRESH_TICKS for came, echo in recent)
-    return bool(recent) and max(gaps) <= NO_GAP_TICKS and not old
+    return stops_in_time(onlooker, start)
 
 
 async def _stop_rate_hz(subject: Subject) -> float:
     """How often it stopped in a second of its time."""
     start = subject.onlooker.state
     await subject.onlooker.ticks(DRIVE_TICKS)
-    return len(_stops(subject, start)) / (DRIVE_TICKS * TICK_MS / 1e3)
+    return len(stops(subject.onlooker, start)) / (DRIVE_TICKS * TICK_MS / 1e3)

@@ -31,6 +31,7 @@ from gigabrain_zenoh.faults.fault import Failed
 from gigabrain_zenoh.faults.waiting import PATIENCE_S, until
 from gigabrain_zenoh.gate import BRAIN
 from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.transport import Close
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 AT_REST = 0.005  # [m/s], [rad/s]
@@ -46,6 +47,8 @@ class Onlooker:
         self.states: deque[RobotState] = deque(maxlen=50_000)
         self.commands: deque[CmdVel] = deque(maxlen=10_000)  # of the brain
         self.arrivals: deque[int] = deque(maxlen=10_000)  # the tick when each of them came
+        self._deaf = False
+        self._end_hearing: Close | None = None
         self.health: dict[str, Health] = {}
         self.logs: list[LogRecord] = []
         self.safety, self.world = bus.latest(SAFETY), bus.latest(WORLD)
@@ -65,8 +68,17 @@ class Onlooker:
 
     def _join(self, body: Body) -> None:
         topic = command_topic(body.description)
-        if topic.key not in self.bus.listens:
-            self.bus.subscribe(topic, self._obey)
+        if topic.key not in self.bus.listens and not self._deaf:
+            self._end_hearing = self.bus.subscribe(topic, self._obey)
+
+    def deafen(self, deaf: bool) -> None:
+        """Whether to leave commands unheard, however many come; they are heard again in a second.
+
+        One who looks on would need the time of the machine that the robot runs on.
+        """
+        self._deaf = deaf
+        if deaf and self._end_hearing:
+            self._end_hearing()
 
     def _obey(self, _key: str, command: CmdVel) -> None:
         if command.source == BRAIN:

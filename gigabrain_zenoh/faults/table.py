@@ -98,7 +98,7 @@ FAULTS: tuple[Fault, ...] = (
         "wheel effects <= 0, deaths <= 0, zero after NaN <= 20 ms",
     ),
     Fault(27, "full-reversals", DATA, "sim", "acceleration over its limit <= 1 %"),
-    Fault(28, "blind-lidar", DATA, "sim", "zero after <= 300 ms"),
+    Fault(28, "blind-lidar", DATA, "", "zero after <= 300 ms"),
     Fault(29, "thin-obstacles", DATA, "", "contacts <= 0"),
     Fault(
         30, "obstacle-at-stopping-distance", DATA, "",
@@ -106,11 +106,11 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(31, "battery-and-temperature", DATA, "", "wrong actions <= 0"),
     Fault(
-        32, "recorder-killed", DATA, "sim",
+        32, "recorder-killed", DATA, "",
         "lost <= 0.5 s, earlier messages unreadable <= 0, control delayed <= 20 ms", ("recorder",),
     ),
-    Fault(33, "wall-clock-jumps", CLOCK, "sim", "stops <= 0"),
-    Fault(34, "stamps-of-other-times", CLOCK, "sim", "taken for fresh <= 0"),
+    Fault(33, "wall-clock-jumps", CLOCK, "", "stops <= 0"),
+    Fault(34, "stamps-of-other-times", CLOCK, "", "taken for fresh <= 0"),
     Fault(35, "hosts-with-other-clocks", CLOCK, "", "stops <= 0, tick age error <= 1 ms"),
     Fault(36, "counters-wrap", CLOCK, "", "falsely accepted <= 0"),
     Fault(

@@ -52,7 +52,7 @@ BRAIN = Rights(
     says=(WORLD, POSE, MAP, INTENT, HEALTH, LOG),
     asks=(DESCRIBE, ESTOP),
     answers=(GOAL, MISSION, PARAM, DESCRIBE),
-    names=("perception", "decision"),
+    names=("perception", "decision", "relay"),
 )
 OPERATOR = Rights(
     says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG),

@@ -22,6 +22,7 @@ class Topic(Generic[M]):
     type: type[M]
     hz: float  # promised rate, which decides how long a value counts
     missed: float = 5.0  # periods without a message after which the last one no longer counts
+    echo_ns: int = 0  # age up to which a tick may be echoed, where the way is longer than `missed`
     priority: Priority = "data"
     congestion: Literal["drop", "block"] = "drop"
     express: bool = False  # not batched: for small messages that must not wait
@@ -67,7 +68,7 @@ IMAGE = Topic("robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True, 
 WORLD = Topic("robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB)
 POSE = Topic("robot/pose", brain.PoseInMap, 10)
 MAP = Topic("robot/map", brain.OccupancyGrid, 1, keep=True, max_bytes=1024 * KB)
-INTENT = Topic("robot/intent", brain.Intent, 50, max_bytes=16 * KB)
+INTENT = Topic("robot/intent", brain.Intent, 50, echo_ns=150_000_000, max_bytes=16 * KB)
 TELEOP = Topic("robot/teleop", brain.Twist, 20, priority="interactive_high", max_bytes=KB)
 CMD_VEL = Topic(
     "robot/cmd_vel", brain.CmdVel, 50, priority="real_time", express=True, depth=16, max_bytes=KB

@@ -13,17 +13,12 @@ from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_drivers.sim.pace import Pace
 from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.readings import scan_of, state_of
 from gigabrain_drivers.sim.tick import TICK_NS as STEP_NS
 from gigabrain_drivers.sim.worlds import load_world
-from gigabrain_schemas.arrays import ranges_bytes
-from gigabrain_schemas.base import (
-    TICK_NS,
-    Message,
-    Pose,
-    Velocity,
-)
-from gigabrain_schemas.body import Battery, Joint, RobotState
-from gigabrain_schemas.sensors import Imu, ImuData, LaserScan
+from gigabrain_schemas.base import TICK_NS, Message, Velocity
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.sensors import Imu, LaserScan
 from gigabrain_schemas.topics import IMU, SCAN
 from gigabrain_zenoh.bridge import Bridge
 from gigabrain_zenoh.clock import Clock
@@ -217,24 +212,7 @@ class MujocoDriver(Driver):
                 bridge.post(self._readings.put_nowait, reading)
 
     def _look(self) -> RobotState:
-        simulation = self._simulation
-        odometry, charge = simulation.odometry(), simulation.battery()
-        imu = simulation.imu()
-        return RobotState(
-            robot_type=self.robot.robot_type,
-            pose=Pose(x=odometry.x, y=odometry.y, yaw=math.remainder(odometry.yaw, math.tau)),
-            velocity=Velocity(**simulation.velocity()._asdict()),
-            joints=tuple(Joint(**motor._asdict()) for motor in simulation.motors()),
-            battery=Battery(
-                voltage=charge.voltage, percentage=charge.percentage, current=charge.current
-            ),
-            imu=ImuData(
-                orientation=imu.orientation,
-                angular_velocity=imu.angular_velocity,
-                linear_acceleration=imu.linear_acceleration,
-            ),
-            bumpers=(simulation.bumper(),),
-        )
+        return state_of(self._simulation, self.robot.robot_type)
 
     def _imu(self) -> Imu:
         return Imu(**self._simulation.imu()._asdict())
@@ -242,10 +220,4 @@ class MujocoDriver(Driver):
     def _scan(self) -> LaserScan:
         lidar = self.robot.lidar
         assert lidar is not None
-        return LaserScan(
-            angle_min=0.0,
-            angle_increment=math.tau / lidar.beams,
-            range_min=lidar.range_min,
-            range_max=lidar.range_max,
-            ranges=ranges_bytes(self._timed(self._simulation.scan)),
-        )
+        return scan_of(lidar, self._timed(self._simulation.scan))

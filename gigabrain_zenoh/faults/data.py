@@ -1,0 +1,32 @@
+"""Faults of data: nonsense, tearing, blindness, obstacles, batteries, recordings."""
+
+from gigabrain_zenoh.faults.blind import blind_lidar
+from gigabrain_zenoh.faults.charge import battery_and_temperature
+from gigabrain_zenoh.faults.fault import Measured, Skipped
+from gigabrain_zenoh.faults.nonsense import hostile_values
+from gigabrain_zenoh.faults.obstacles import obstacle_at_stopping_distance, thin_obstacles
+from gigabrain_zenoh.faults.reversals import full_reversals
+from gigabrain_zenoh.faults.rig import Rig
+from gigabrain_zenoh.process import find
+
+__all__ = [
+    "battery_and_temperature",
+    "blind_lidar",
+    "full_reversals",
+    "hostile_values",
+    "obstacle_at_stopping_distance",
+    "recorder_killed",
+    "thin_obstacles",
+]
+
+TAPING = "gigabrain_zenoh.faults.taping:recorder_killed"
+
+
+async def recorder_killed(rig: Rig) -> Measured:
+    """Where a recorder is installed."""
+    try:
+        test = find(TAPING)
+    except ModuleNotFoundError as error:
+        raise Skipped(f"needs gigabrain-zenoh[record]: {error.name} is missing") from None
+    measured: Measured = await test(rig)
+    return measured

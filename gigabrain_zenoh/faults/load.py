@@ -1,0 +1,183 @@
+"""Faults of load: a machine that is busy with other things, a flood, a long time."""
+
+import asyncio
+import os
+import statistics
+from collections import deque
+
+import msgspec
+
+from gigabrain_schemas.audit import AuditRequest
+from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.topics import AUDIT_LOG, CMD_VEL, SAFETY, SCAN, STATE, WORLD
+from gigabrain_zenoh.deployment import client_endpoint
+from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.faults.estop import Presses
+from gigabrain_zenoh.faults.fault import Failed, Measured
+from gigabrain_zenoh.faults.flooder import NAME
+from gigabrain_zenoh.faults.helpers import helper, helpers, open_files, rss_mb
+from gigabrain_zenoh.faults.rig import Rig
+from gigabrain_zenoh.faults.smooth import stops_in_time
+from gigabrain_zenoh.faults.stopping import stop_by
+from gigabrain_zenoh.faults.subject import Subject
+from gigabrain_zenoh.percentile import percentile
+from gigabrain_zenoh.recording.gaps import Gaps, header_of
+
+HOGS = 4  # for each core
+OTHERS = ["fill", "litter", "parse"]
+HOGGED_S, LONG_HOGGED_S = 10.0, 600.0
+SETTLE_S = 3.0  # until the hogs are at work
+ESTOPS = 10  # after each death
+PRESSES, LONG_PRESSES = 100, 300
+RECENT = 250  # ticks within which the promptest says when the others were due
+FLOODED_S, LONG_FLOODED_S = 8.0, 60.0
+RATE_HZ, LONG_RATE_HZ = 2000, 10_000  # of its commands
+LARGE_BYTES, LONG_LARGE_BYTES = 1_000_000, 10_000_000  # of a message twice a second
+LEAST_SHARE = 0.5  # of that rate, else it was no flood
+SOAK_S, LONG_SOAK_S, WARM_S = 20.0, 8 * 3600.0, 5.0
+COUNTED = (STATE, SCAN, WORLD, CMD_VEL, SAFETY)
+
+
+class Lateness:
+    """How late the driver ticks, by its own stamps: against the promptest of late."""
+
+    def __init__(self, subject: Subject) -> None:
+        self._recent: deque[int] = deque(maxlen=RECENT)
+        self._late_ms: list[float] = []
+        self._boot = 0
+        self.close = subject.onlooker.bus.tap(STATE.key, self._hear)
+
+    def _hear(self, _key: str, _encoding: str, payload: bytes) -> None:
+        header = header_of(payload)
+        if header.boot != self._boot:
+            self._recent.clear()
+            self._boot = header.boot
+        offset = header.stamp_ns - header.tick * TICK_NS
+        self._recent.append(offset)
+        self._late_ms.append((offset - min(self._recent)) / 1e6)
+
+    @property
+    def p999_ms(self) -> float:
+        """What one tick in a thousand exceeds."""
+        return percentile(sorted(self._late_ms), 0.999) or float("nan")
+
+
+async def cpu_hogs(rig: Rig) -> Measured:
+    """Four busy processes for each core, and others that eat memory, litter, and parse."""
+    subject = await rig.robot("sim")
+    zero_ms, missed = 0.0, 0
+    hogs = ["spin"] * (HOGS * (os.cpu_count() or 1)) + OTHERS
+    async with helpers("hogs", hogs):
+        await asyncio.sleep(SETTLE_S)
+        late = Lateness(subject)
+        end_s = asyncio.get_running_loop().time() + (LONG_HOGGED_S if rig.long else HOGGED_S)
+        while not zero_ms or asyncio.get_running_loop().time() < end_s:
+            pid = subject.pid("decision")
+            stop = await stop_by(subject, lambda: subject.kill("decision"), "decision")
+            zero_ms = max(zero_ms, stop.zero_ms)
+            await subject.restarted("decision", pid)
+            missed += await _missed(subject, ESTOPS)
+        late.close()
+    return {
+        "gate tick late p99.9": late.p999_ms,
+        "zero after": zero_ms,
+        "missed e-stops": missed,
+    }
+
+
+async def _missed(subject: Subject, count: int) -> int:
+    """How many of so many e-stops were not confirmed, or have not latched the gate."""
+    missed, onlooker = 0, subject.onlooker
+    for _ in range(count):
+        generation = onlooker.state.gate.estop_generation
+        try:
+            await subject.person.estop("fault suite")
+        except Refused:
+            missed += 1
+            continue
+        await onlooker.ticks(2)
+        newest = onlooker.state.gate
+        missed += newest.mode != "latched" or newest.estop_generation <= generation
+    return missed
+
+
+async def flood(rig: Rig) -> Measured:
+    """2 kHz of commands and 1 MB at a time; in the long form 10 kHz and 10 MB."""
+    subject = await rig.robot("sim")
+    endpoint = msgspec.json.encode(client_endpoint(subject.deployment)).decode()
+    pid, seconds = subject.pid("driver"), LONG_FLOODED_S if rig.long else FLOODED_S
+    rate_hz = LONG_RATE_HZ if rig.long else RATE_HZ
+    presses = Presses(subject)
+    large = LONG_LARGE_BYTES if rig.long else LARGE_BYTES
+    await subject.drive()
+    before_mb, most_mb, cpu = rss_mb(pid), 0.0, list[float]()
+    subject.onlooker.deafen(True)
+    async with helper("flooder", str(rate_hz), str(large), endpoint) as flooder:
+        counting = asyncio.create_task(_sent(flooder))
+        for _ in range(round(seconds)):
+            await asyncio.sleep(1.0)
+            cpu.append(subject.onlooker.health["driver"].cpu)
+            most_mb = max(most_mb, rss_mb(pid))
+        named = await _named(subject)
+        for _ in range(LONG_PRESSES if rig.long else PRESSES):
+            await presses.press(lambda: subject.person.estop("fault suite"))
+    subject.onlooker.deafen(False)
+    sent = await counting
+    if sent < LEAST_SHARE * rate_hz * seconds:
+        raise Failed(f"only {sent} commands were sent")
+    return {
+        "cpu of the driver": 100.0 * statistics.median(cpu),
+        "memory grown": most_mb - before_mb,
+        "e-stop p99": presses.p99_ms,
+        "flooder unnamed": float(not named),
+    }
+
+
+async def _sent(flooder: asyncio.subprocess.Process) -> int:
+    """How many commands it has sent, in the end."""
+    sent = 0
+    assert flooder.stdout
+    async for line in flooder.stdout:
+        sent = int(line) if line.strip().isdigit() else sent
+    return sent
+
+
+async def _named(subject: Subject) -> bool:
+    """Whether the audit log says whose commands are not obeyed."""
+    pages = await subject.onlooker.bus.ask(AUDIT_LOG, AuditRequest(newest=100), timeout_s=5.0)
+    records = [record for page in pages for record in page.records]
+    return any(record.what == "refused" and record.source == NAME for record in records)
+
+
+async def soak(rig: Rig) -> Measured:
+    """It drives for a long time. In less than an hour nothing may grow by what it may in one."""
+    subject = await rig.robot("sim")
+    onlooker, gaps = subject.onlooker, Gaps()
+    await subject.drive()
+    await asyncio.sleep(WARM_S)
+    pids = [subject.pid(name) for name in subject.supervisor.statuses]
+    memory, files = [rss_mb(pid) for pid in pids], [open_files(pid) for pid in pids]
+
+    def see(key: str, _encoding: str, payload: bytes) -> None:
+        gaps.see(key, header_of(payload))
+
+    closes = [onlooker.bus.tap(topic.key, see) for topic in COUNTED]
+    seconds, stopped = LONG_SOAK_S if rig.long else SOAK_S, 0
+    end_s = asyncio.get_running_loop().time() + seconds
+    while asyncio.get_running_loop().time() < end_s:
+        await subject.drive(0.3)
+        start = onlooker.state
+        await asyncio.sleep(min(SOAK_S, seconds))
+        stopped += stops_in_time(onlooker, start)
+    for close in closes:
+        close()
+    if pids != [subject.pid(name) for name in subject.supervisor.statuses]:
+        raise Failed("a process has died")
+    grown = max(rss_mb(pid) - before for pid, before in zip(pids, memory, strict=True))
+    more = max(open_files(pid) - before for pid, before in zip(pids, files, strict=True))
+    return {
+        "unexplained stops": stopped,
+        "memory grown": max(0.0, grown) / max(1.0, seconds / 3600.0),
+        "open files grown": max(0, more),
+        "lost": gaps.missing.total(),
+    }

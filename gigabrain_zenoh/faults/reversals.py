@@ -1,0 +1,92 @@
+"""Commands that tear at the body: full speed one way, and at once full speed the other."""
+
+import asyncio
+import random
+
+from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.topics import CMD_VEL
+from gigabrain_zenoh import gate
+from gigabrain_zenoh.deployment import client_endpoint
+from gigabrain_zenoh.faults.bodies import description_of
+from gigabrain_zenoh.faults.fault import Failed, Measured
+from gigabrain_zenoh.faults.forger import Forger, forging
+from gigabrain_zenoh.faults.open_gate import OpenGate
+from gigabrain_zenoh.faults.rig import Rig
+from gigabrain_zenoh.faults.subject import Subject
+
+COMMANDS, LONG_COMMANDS = 20_000, 1_000_000
+WINDOW_TICKS = 12  # 240 ms
+TICK_S = TICK_NS / 1e9
+HOLDS = (1, 2, 50)  # half-ticks for which one way is asked for: 100 Hz, 50 Hz, 1 Hz
+HELD_TICKS = 150  # of each, on the robot
+
+
+async def full_reversals(rig: Rig) -> Measured:
+    """At the gate by the million, and with a simulated body by its own wheels."""
+    body = description_of(rig)
+    share = await asyncio.to_thread(_at_gate, body, LONG_COMMANDS if rig.long else COMMANDS)
+    subject = await rig.robot("sim")
+    return {"acceleration over its limit": max(share, await _at_wheels(subject))}
+
+
+def _at_gate(body: BodyDescription, count: int) -> float:
+    """Up to how much what the gate lets through exceeds the limits of acceleration [%].
+
+    Over one tick, and over a quarter of a second; at up to ten commands a tick.
+    """
+    opened, chance, told = OpenGate(body), random.Random(0), [0.0]
+    fast, most, seq = body.max_linear_speed, 0.0, 0
+    while seq < count:
+        opened.tick()
+        for _ in range(chance.choice((1, 2, 10))):
+            seq += 1
+            speed = chance.choice((-fast, fast))
+            opened.feed(gate.Command(opened.command(speed, seq, 10 * speed)))
+            told.append(opened.state.output.linear_x)
+            if abs(told[-1] - opened.state.before.linear_x) > _limit(body) * TICK_S + 1e-9:
+                most = 100.0
+    return most
+
+
+def _limit(body: BodyDescription) -> float:
+    return max(body.max_linear_acceleration, body.max_linear_deceleration)
+
+
+async def _at_wheels(subject: Subject) -> float:
+    """The same of the measured speed, over windows of a quarter of a second [%]."""
+    onlooker = subject.onlooker
+    await subject.drive()
+    body = onlooker.bodies.current
+    assert body
+    await subject.person.enable(onlooker.bus.process, take=True)
+    start = onlooker.state
+    async with forging(client_endpoint(subject.deployment)) as forger:
+        for hold in HOLDS:
+            await _shake(subject, forger, hold, body.description.max_linear_speed)
+    speeds = [s.velocity.linear_x for s in onlooker.states if s.tick > start.tick]
+    if max(map(abs, speeds)) < 0.5 * body.description.max_linear_speed:
+        raise Failed(f"it has not obeyed: {max(map(abs, speeds)):.2f} m/s at most")
+    change = max(abs(b - a) for a, b in zip(speeds, speeds[WINDOW_TICKS:], strict=False))
+    await onlooker.ticks(50)
+    return 100.0 * max(0.0, change / (_limit(body.description) * WINDOW_TICKS * TICK_S) - 1.0)
+
+
+async def _shake(subject: Subject, forger: Forger, hold: int, speed: float) -> None:
+    """Full speed one way and the other, two commands a tick."""
+    onlooker, time = subject.onlooker, subject.onlooker.bus.time
+    start = onlooker.state.tick
+    while onlooker.state.tick - start < HELD_TICKS:
+        for half in range(2):
+            seq = 2 * time.tick + half
+            command = CmdVel(
+                linear_x=speed if seq // hold % 2 else -speed,
+                source=onlooker.bus.process,
+                boot=time.boot,
+                tick=time.tick,
+                basis=time.tick,
+                seq=seq,
+            )
+            forger.send(CMD_VEL, command)
+        await onlooker.ticks(1)

@@ -1,0 +1,127 @@
+"""A host's own router: who has one, and that the robot is as safe with it as without."""
+
+import os
+import signal
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gigabrain_schemas.requests import DescribeRequest
+from gigabrain_schemas.topics import DESCRIBE
+from gigabrain_zenoh import audit_file
+from gigabrain_zenoh.deployment import Deployment, ProcessName, process_specs
+from gigabrain_zenoh.keys.authority import issue, new_fleet
+from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.settings import Endpoint
+from tests.onlooker import Onlooker, at_rest, looking_on
+from tests.stack import Home, free_port, until
+from tests.test_netns import REST_TICKS, STOP_TICKS, Ears
+
+ROBOT: tuple[ProcessName, ...] = ("router", "driver", "control", "safety")
+BRAIN: tuple[ProcessName, ...] = ("perception", "decision")
+
+
+def configs(deployment: Deployment, host: str, folder: Path) -> dict[str, ProcessConfig]:
+    specs = process_specs(deployment, host, folder, folder)
+    return {s.name: msgspec.json.decode(s.argv[-1], type=ProcessConfig) for s in specs}
+
+
+@pytest.mark.parametrize(
+    ("processes", "relayed"),
+    [
+        (("perception", "decision"), True),
+        (("perception", "decision", "control"), True),
+        (("perception", "decision", "recorder"), True),
+        (("perception",), False),
+        (("recorder", "safety"), False),
+        (("driver", "control", "safety", "perception", "decision"), False),
+        (("router", "perception", "decision"), False),
+    ],
+)
+def test_a_host_with_perception_and_decision_and_neither_router_nor_body_has_a_relay(
+    processes: tuple[ProcessName, ...], relayed: bool, tmp_path: Path
+) -> None:
+    made = configs(Deployment(hosts={"here": processes}), "here", tmp_path)
+    assert set(made) == {*processes, "relay"} if relayed else set(processes)
+
+
+def test_its_processes_meet_at_a_socket_and_it_alone_connects_to_the_router(
+    tmp_path: Path,
+) -> None:
+    deployment = Deployment(
+        router="tcp/192.168.1.10:7447", insecure=True, hosts={"robot": ROBOT, "brain": BRAIN}
+    )
+    made = configs(deployment, "brain", tmp_path)
+    (socket,) = made["relay"].endpoint.listen
+    assert socket.startswith("unixsock-stream/")
+    assert made["relay"].endpoint.connect == ("tcp/192.168.1.10:7447",)
+    for name in BRAIN:
+        assert (made[name].endpoint.connect, made[name].endpoint.listen) == ((socket,), ())
+    assert list(made) == ["relay", "perception", "decision"]
+
+
+async def relay_lost(robot: Onlooker, *, killed: bool) -> None:
+    """With it the brain is lost, which stops the robot; and it comes back by itself."""
+    (told,) = await robot.bus.ask(DESCRIBE, DescribeRequest(), name="relay", timeout_s=20)
+    ears = Ears(robot)
+    await robot.straight(0.19)
+    start = robot.state
+    os.kill(told.pid, signal.SIGKILL if killed else signal.SIGSTOP)
+    await robot.ticks(REST_TICKS)
+    if not killed:
+        os.kill(told.pid, signal.SIGCONT)
+    await robot.straight(0.15, room=0.0)
+    last, first = ears.silence(start.tick)
+    assert first - last > STOP_TICKS
+    late = [c.linear_x for c in ears.commands if last + STOP_TICKS <= c.tick < first]
+    assert late
+    assert all(speed < 0.19 for speed in late)  # slower than it drove, from the first one on
+    stood = [s for s in robot.states if last + REST_TICKS <= s.tick < first]
+    assert all(map(at_rest, stood))
+    truth = await robot.truth()
+    assert (truth["stale_commands_executed"], truth["contacts"]) == (0, 0)
+
+
+@pytest.mark.parametrize("secure", [False, True], ids=["bare", "with keys in a fleet"])
+async def test_a_robot_whose_brain_loses_its_relay_stops_and_drives_again_and_nobody_is_refused(
+    secure: bool, tmp_path: Path
+) -> None:
+    values: dict[str, object] = {
+        "router": f"tcp/127.0.0.1:{free_port()}",
+        "resume": "auto",
+        "hosts": {"robot": ROBOT, "brain": BRAIN},
+    }
+    operator, namespace = "", "red" if secure else ""
+    if secure:
+        fleet = tmp_path / "keys"
+        new_fleet("home", fleet)
+        issue(fleet, "robot", robot="red", name="robot")
+        issue(fleet, "brain", robot="red", name="brain")
+        operator = str(issue(fleet, "operator"))
+        values |= {"keys": str(fleet), "namespace": "red", "fleet": ["blue"]}
+    robots, brains = Home(tmp_path / "robot"), Home(tmp_path / "brain")
+    try:
+        file = str(robots.deployment(**values))
+        brain = brains.start("up", file, "--host", "brain")
+        await until(lambda: "waiting for it" in brain.out, "it says what it waits for")
+        robots.start("up", file, "--host", "robot")
+        where = Endpoint(connect=(str(values["router"]),), keys=operator, namespace=namespace)
+        async with looking_on(where) as robot:
+            await relay_lost(robot, killed=False)
+            await relay_lost(robot, killed=True)
+            for name in ("relay", *BRAIN):
+                answers = await robot.bus.ask(DESCRIBE, DescribeRequest(), name=name, timeout_s=20)
+                assert len(answers) == 1, name
+            pressed = await brains.run("estop")
+            assert "NOT CONFIRMED" not in pressed.out
+            assert "CONFIRMED" in pressed.out
+            await robot.ticks(75)  # the router's audit is on the disk by then
+        folder = robots.folder / "state" / "gigabrain" / "robots"
+        folder /= namespace or "turtlebot3_waffle"
+        audited = {record.what for record in audit_file.read(folder, 1000)}
+        assert "estop" in audited
+        assert not audited & {"refused", "stranger"}
+    finally:
+        brains.close()
+        robots.close()
