@@ -68,8 +68,6 @@ class Demo:
         """
         label = f"{self._deployment.body} in {self._deployment.world}"
         endpoint = client_endpoint(self._deployment)
-        if self._options.page:
-            print(f"operator page: {self._options.page}", file=sys.stderr)
         with stop_signals() as stop, announced(label, endpoint):
             async with self._supervisor:
                 running = asyncio.ensure_future(self._supervisor.run())
@@ -117,10 +115,10 @@ class Demo:
         return seconds is not None and watch.seconds >= seconds - 1e-6
 
     def _view(self, watch: Watch) -> View:
-        seconds = self._options.seconds
+        seconds, page = self._options.seconds, self._options.page
         if self._options.headless or not sys.stdout.isatty():
-            return HeadlessView(watch, seconds)
-        faults, page = self._faults, self._options.page
+            return HeadlessView(watch, seconds, page)
+        faults = self._faults
         return LiveView(watch, self._supervisor, self._deployment, faults, seconds, page)
 
     async def _ask_for_truth(self, watch: Watch, within_s: float) -> Report | None:

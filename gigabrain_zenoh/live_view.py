@@ -42,8 +42,8 @@ class View(Protocol):
 class HeadlessView:
     """A progress line on stderr: redrawn in place on a terminal, every ten seconds elsewhere."""
 
-    def __init__(self, watch: Watch, seconds: float | None) -> None:
-        self._watch, self._seconds = watch, seconds
+    def __init__(self, watch: Watch, seconds: float | None, page: str = "") -> None:
+        self._watch, self._seconds, self._page = watch, seconds, page
         self._next = LINE_S
         self._in_place = sys.stderr.isatty()
 
@@ -57,6 +57,9 @@ class HeadlessView:
     def show(self) -> None:
         """Bring it up to date."""
         watch = self._watch
+        if self._page and watch.state.newest:  # a robot that cannot be started has no page either
+            print(f"operator page: {self._page}", file=sys.stderr, flush=True)
+            self._page = ""
         if not self._in_place and watch.seconds < self._next:
             return
         self._next = watch.seconds + LINE_S

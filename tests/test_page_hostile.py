@@ -1,6 +1,9 @@
 """What a WebSocket client may send to the page's server, and what becomes of it."""
 
 import asyncio
+import re
+import signal
+import socket
 import struct
 from collections.abc import Iterator
 
@@ -135,3 +138,21 @@ async def test_a_viewer_who_never_reads_slows_neither_robot_nor_others(robot: Ro
         assert seen.state.boot != 0
         assert seen.state.tick - begin >= 200  # five seconds of moments, and of the robot's time
     writer.close()
+
+
+async def test_a_demo_says_where_its_page_is_and_steps_aside_from_a_taken_port(
+    home: Home,
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        demo = home.start("demo", "--headless", "--page", "--port", str(port))
+        await until(lambda: "operator page: http://127.0.0.1:" in demo.err, "it says where")
+        said = re.search(r"http://127\.0\.0\.1:(\d+)\n", demo.err)
+        assert said
+        assert int(said[1]) != port
+        reader, writer = await asyncio.open_connection("127.0.0.1", int(said[1]))
+        writer.write(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{said[1]}\r\n\r\n".encode())
+        assert b" 200 " in await reader.readline()
+        writer.close()
+        demo.send(signal.SIGINT)
+        assert await demo.ended() == 0
