@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from gigabrain_drivers import catalog
 from gigabrain_drivers.alpha import AlphaDriver, AlphaOptions
@@ -358,8 +359,8 @@ def test_it_parks_through_silence_and_stands_up_before_it_walks() -> None:
     assert WALKER.to_body(firmware.gaits[-1]) == pytest.approx((0.3, 0.0, 0.0), abs=1e-6)
 
 
-async def test_its_safe_state_is_to_lie_and_a_new_driver_leaves_it_lying(rig: Rig) -> None:
-    assert rig.driver.robot.safe_state == "park"
+async def test_parked_it_lies_and_a_new_driver_leaves_it_lying(rig: Rig) -> None:
+    rig.driver.robot = replace(rig.driver.robot, safe_state="park")
     rig.streaming = (0.3, 0.0, 0.0)
     truth = rig.body.simulation.truth
     await until(lambda: truth.distance_m > 0.2)

@@ -43,6 +43,14 @@ class Tap(Driver):
         """Keep the present position."""
         await self.inner.hold()
 
+    async def park(self) -> None:
+        """Take up the inner one's posture for being left alone."""
+        await self.inner.park()
+
+    async def limp(self) -> None:
+        """Let go of the inner one's joints."""
+        await self.inner.limp()
+
     async def read_state(self) -> RobotState:
         """What the body measures."""
         return await self.inner.read_state()
