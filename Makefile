@@ -35,7 +35,7 @@ lint: setup
 	$(BIN)/mypy
 
 unit: setup
-	$(BIN)/pytest $(ARGS)
+	$(BIN)/pytest -n 2 --dist loadfile $(ARGS)  # a file stays in one process: its robots are shared
 
 bench: setup
 	$(BIN)/gigabrain bench chain
