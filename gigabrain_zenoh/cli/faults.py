@@ -1,6 +1,7 @@
 """`gigabrain faults`: break the robot in 44 ways, and see whether it stops."""
 
 import asyncio
+import logging
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -58,6 +59,8 @@ def faults(
     from gigabrain_zenoh.faults.suite import failed, run_suite
     from gigabrain_zenoh.faults.table import choose
 
+    # the suite hears what it forges itself; nobody has to read that
+    logging.getLogger("gigabrain_zenoh").addHandler(logging.NullHandler())
     chosen, console = choose(only), Console()
     if list_:
         console.print(_plan(chosen))
