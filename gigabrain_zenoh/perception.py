@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.arrays import hits_bytes, ranges
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.sensors import LaserScan
@@ -39,6 +39,7 @@ def step(config: PerceptionConfig, body: BodyDescription, scan: LaserScan) -> Wo
         obstacle_ahead=ahead.size > 0,
         distance_ahead=math.sqrt(ahead.min()) if ahead.size else None,
         sectors=_nearest_per_sector(config.sectors, squares, bearings),
+        hits=b"" if config.mapping == "off" else hits_bytes(x, y),
     )
 
 

@@ -46,6 +46,8 @@ class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     corridor: NonNegative = 0.45  # [m], length of the strip ahead that must be free to turn in
     turning_room: NonNegative = 0.04  # [m], kept free round the circle that a turning body sweeps
     sectors: Annotated[int, Meta(ge=4, le=360)] = 12  # all round, the first centred ahead
+    mapping: Literal["off", "slam", "localize"] = "off"  # make a map, or find its way in one
+    map: str = ""  # a saved map's YAML file: to be found in, or with `slam` to go on with
 
 
 class DecisionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -9,7 +9,13 @@ import pytest
 
 from gigabrain_schemas import arrays
 from gigabrain_schemas.body import Thresholds
-from gigabrain_schemas.brain import JointCommand, Obstacle, OccupancyGrid, TrajectoryPoint
+from gigabrain_schemas.brain import (
+    JointCommand,
+    Obstacle,
+    OccupancyGrid,
+    TrajectoryPoint,
+    WorldModel,
+)
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import Image, LaserScan
 
@@ -87,6 +93,14 @@ def test_json_carries_arrays_in_base64() -> None:
 
 
 def test_a_trajectory_point_is_a_short_array_on_the_wire() -> None:
-    assert (
-        msgspec.json.encode(TrajectoryPoint(t=0.5, x=1.0, y=0.0, yaw=0.0)) == b"[0.5,1.0,0.0,0.0]"
-    )
+    point = TrajectoryPoint(t=0.5, x=1.0, y=0.0, yaw=0.0, linear_x=0.25)
+    assert msgspec.json.encode(point) == b"[0.5,1.0,0.0,0.0,0.25,0.0,0.0]"
+    assert msgspec.json.decode(b"[0.5,1.0,0.0,0.0]", type=TrajectoryPoint).linear_x == 0.0
+
+
+def test_hits_travel_as_pairs() -> None:
+    x, y = np.array([0.5, -1.25]), np.array([2.0, 0.25])
+    world = WorldModel(scan_ok=True, obstacle_ahead=False, hits=arrays.hits_bytes(x, y))
+    assert arrays.hits(world).tolist() == [[0.5, 2.0], [-1.25, 0.25]]
+    with pytest.raises(ValueError, match="pairs of float32"):
+        WorldModel(scan_ok=True, obstacle_ahead=False, hits=bytes(4))

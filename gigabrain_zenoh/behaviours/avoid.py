@@ -91,5 +91,5 @@ def expected_trajectory(twist: Velocity) -> tuple[TrajectoryPoint, ...]:
         yaw = w * t
         x = v * t if abs(w) < 1e-6 else v / w * math.sin(yaw)
         y = 0.0 if abs(w) < 1e-6 else v / w * (1 - math.cos(yaw))
-        points.append(TrajectoryPoint(t=t, x=x, y=y, yaw=yaw))
+        points.append(TrajectoryPoint(t=t, x=x, y=y, yaw=yaw, linear_x=v, angular_z=w))
     return tuple(points)

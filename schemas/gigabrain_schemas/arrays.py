@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.brain import OccupancyGrid, WorldModel
 from gigabrain_schemas.sensors import Image, LaserScan
 
 DTYPES = {"mono8": "u1", "rgb8": "u1", "bgr8": "u1", "depth16": "<u2", "depth32f": "<f4"}
@@ -17,6 +17,16 @@ def ranges(scan: LaserScan) -> NDArray[np.float32]:
 def ranges_bytes(values: NDArray[np.floating]) -> bytes:
     """`values` [m], (n,), as LaserScan carries them."""
     return values.astype("<f4").tobytes()
+
+
+def hits(world: WorldModel) -> NDArray[np.float32]:
+    """Where beams hit something [m], (n, 2) in the body's frame, as a read-only view."""
+    return np.frombuffer(world.hits, "<f4").reshape(-1, 2)
+
+
+def hits_bytes(x: NDArray[np.floating], y: NDArray[np.floating]) -> bytes:
+    """The points (`x`, `y`) [m], (n,) each, as WorldModel carries them."""
+    return np.column_stack((x, y)).astype("<f4").tobytes()
 
 
 def cells(grid: OccupancyGrid) -> NDArray[np.int8]:

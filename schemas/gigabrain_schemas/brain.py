@@ -45,6 +45,11 @@ class WorldModel(Message, frozen=True, kw_only=True):
     sectors: tuple[NonNegative | None, ...] = ()
     # [m], nearest hit per equal sector, counter-clockwise, the first centred ahead; None for none
     obstacles: tuple[Obstacle, ...] = ()
+    hits: bytes = b""  # float32 little-endian [m], (n, 2): where beams hit; only for navigation
+
+    def __post_init__(self) -> None:
+        if len(self.hits) % 8:
+            raise ValueError(f"hits must be pairs of float32, got {len(self.hits)} bytes")
 
 
 class PoseInMap(Message, frozen=True, kw_only=True):
@@ -78,12 +83,22 @@ class OccupancyGrid(Message, frozen=True, kw_only=True):
 
 
 class TrajectoryPoint(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A pose that decision expects the body to have, in the body's frame of now."""
+    """What decision expects of the body, in the body's frame at the tick of the intent's basis."""
 
-    t: NonNegative  # [s] from now
+    t: NonNegative  # [s] from that tick
     x: Finite  # [m]
     y: Finite  # [m]
     yaw: Finite  # [rad]
+    linear_x: Finite = 0.0  # [m/s], in the body's frame of then
+    linear_y: Finite = 0.0  # [m/s]
+    angular_z: Finite = 0.0  # [rad/s]
+
+
+class Response(Record, frozen=True, kw_only=True):
+    """How a body answers a commanded velocity: nothing at first, then as a first-order lag."""
+
+    delay: NonNegative = 0.0  # [s]
+    lag: NonNegative = 0.0  # [s], time constant
 
 
 class JointTarget(Record, frozen=True, kw_only=True):
@@ -99,6 +114,8 @@ class Intent(Message, frozen=True, kw_only=True):
     twist: Velocity | None = None
     joints: tuple[JointTarget, ...] = ()
     trajectory: Annotated[tuple[TrajectoryPoint, ...], Meta(max_length=256)] = ()
+    follow: bool = False  # control keeps to the trajectory; without, it gives the body the twist
+    response: Response = Response()  # what the trajectory counts on
     progress: Fraction = 0.0  # how far the present step has come, as expected against as measured
     behaviour: Name
     reason: Text  # in words, for people

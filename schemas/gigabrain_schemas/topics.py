@@ -67,7 +67,7 @@ BODY = Topic("robot/body", body.Body, 1, keep=True, max_bytes=16 * KB)
 IMAGE = Topic("robot/image", sensors.Image, 10, max_bytes=1024 * KB, many=True, depth=8)
 WORLD = Topic("robot/world", brain.WorldModel, 10, missed=2.5, max_bytes=64 * KB)
 POSE = Topic("robot/pose", brain.PoseInMap, 10)
-MAP = Topic("robot/map", brain.OccupancyGrid, 1, keep=True, max_bytes=1024 * KB)
+MAP = Topic("robot/map", brain.OccupancyGrid, 1, keep=True, max_bytes=8 * 1024 * KB)
 INTENT = Topic("robot/intent", brain.Intent, 50, echo_ns=150_000_000, max_bytes=16 * KB)
 TELEOP = Topic("robot/teleop", brain.Twist, 20, priority="interactive_high", max_bytes=KB)
 CMD_VEL = Topic(
