@@ -21,6 +21,7 @@ from gigabrain_schemas.topics import (
     JOINT_CMD,
     LOG,
     MAP,
+    MAP_SAVE,
     MISSION,
     PARAM,
     POSE,
@@ -51,12 +52,12 @@ class Rights:
 BRAIN = Rights(
     says=(WORLD, POSE, MAP, INTENT, HEALTH, LOG),
     asks=(DESCRIBE, ESTOP),
-    answers=(GOAL, MISSION, PARAM, DESCRIBE),
+    answers=(GOAL, MISSION, MAP_SAVE, PARAM, DESCRIBE),
     names=("perception", "decision", "relay"),
 )
 OPERATOR = Rights(
     says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG),
-    asks=(DESCRIBE, AUDIT_LOG, PARAM, ESTOP, RELEASE, ENABLE, GOAL, MISSION),
+    asks=(DESCRIBE, AUDIT_LOG, PARAM, ESTOP, RELEASE, ENABLE, GOAL, MISSION, MAP_SAVE),
     answers=(PARAM, DESCRIBE),
     names=("page", "recorder", "button"),
 )

@@ -39,6 +39,8 @@ from gigabrain_schemas.requests import (
     GateReply,
     GoalReply,
     GoalRequest,
+    MapReply,
+    MapRequest,
     MissionReply,
     MissionRequest,
     Param,
@@ -265,6 +267,8 @@ REQUESTS: tuple[Message, ...] = (
     GoalReply(ok=True, text="on the way, 4.2 m", goal="goal-1"),
     MissionRequest(mission="- go: kitchen\n- wait: 5 s\n", source="operator"),
     MissionReply(ok=False, text="there is no place 'kitchen'"),
+    MapRequest(name="office", replace=True, source="ann"),
+    MapReply(ok=True, text="office.yaml is saved: 9.6 x 7.2 m, 41 m² free"),
     ParamRequest(stamp_ns=STAMP_NS, seq=1, name="linear_speed", value="0.15", source="ann"),
     ParamReply(
         stamp_ns=STAMP_NS, seq=1, boot=BOOT, tick=205,

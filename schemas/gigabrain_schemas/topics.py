@@ -106,6 +106,7 @@ RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply)
 ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply)
 GOAL = Service("robot/goal", requests.GoalRequest, requests.GoalReply)
 MISSION = Service("robot/mission", requests.MissionRequest, requests.MissionReply)
+MAP_SAVE = Service("robot/map_save", requests.MapRequest, requests.MapReply)
 AUDIT_LOG = Service(
     "robot/audit_log", audit.AuditRequest, audit.AuditPage, priority="background",
     max_bytes=1024 * KB,
@@ -119,6 +120,7 @@ SERVICES: tuple[Service[Any, Any], ...] = (
     ENABLE,
     GOAL,
     MISSION,
+    MAP_SAVE,
     AUDIT_LOG,
     PARAM,
     DESCRIBE,
