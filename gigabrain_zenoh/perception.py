@@ -142,11 +142,24 @@ def _unknown(problem: str) -> WorldModel:
 async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """A world per scan, as soon as it comes; until the process ends."""
     body = bus.latest(BODY)
+    mapper = None
+    if config.mapping != "off":
+        from gigabrain_zenoh.mapper import Mapper  # numba and gtsam: only who makes maps pays
+
+        mapper = Mapper(config, bus, body)
 
     def see(scan: LaserScan) -> None:
-        if body.current:
-            bus.publish(WORLD, step(config, body.current.description, scan), basis=scan.basis)
+        if body.current is None:
+            return
+        world = step(config, body.current.description, scan)
+        bus.publish(WORLD, world, basis=scan.basis)
+        if mapper:
+            mapper.see(scan, world.scan_problem)
 
     bus.latest(SCAN, see)
     ready()
-    await bus.failed
+    try:
+        await bus.failed
+    finally:
+        if mapper:
+            mapper.close()
