@@ -53,6 +53,8 @@ COMMANDS = {
     "param list": ("param:list_", "List what may be changed while the robot runs."),
     "param get": ("param:get", "Show one value."),
     "param set": ("param:set_", "Change one value."),
+    "map save": ("map:save", "Save the map that a robot makes."),
+    "map info": ("map:info", "Check a saved map, and tell its size."),
     "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
     "worlds": ("names:worlds", "List the simulated worlds that there are."),
@@ -80,6 +82,7 @@ GROUPS = {
     "topic": "What goes over the bus.",
     "node": "The processes of a robot.",
     "param": "What may be changed at run time.",
+    "map": "Maps that a robot has made.",
     "bench": "Measure this machine.",
     "schema": "Messages.",
 }
