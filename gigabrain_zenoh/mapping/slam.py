@@ -83,6 +83,11 @@ class Slam:
         """Where the keyframes are in the map, (n, 3)."""
         return np.array(self._poses).reshape(-1, 3)
 
+    @property
+    def smooth(self) -> Floats:
+        """Where the robot is in the front end's own frame, which drifts and never jumps."""
+        return self._front.pose
+
     def add(self, scan: Scan, delta: Floats) -> Estimate:
         """Where the robot is, odometry having moved by `delta` (x, y, yaw) since the last scan."""
         if not np.isfinite(delta).all():
