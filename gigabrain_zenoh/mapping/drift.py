@@ -13,7 +13,7 @@ from gigabrain_zenoh.mapping.keyframe import Edge
 from gigabrain_zenoh.mapping.se2 import Floats, between
 
 AWAY = 0.05  # [m] per square root of a metre driven
-TURN = 0.03  # [rad] per square root of a metre driven
+TURN = 0.01  # [rad] per square root of a metre driven
 JOINT = 0.03  # [m] and [rad], of every loop
 GATE = 16.3  # 99.9 % of chi-square with three degrees of freedom
 
@@ -24,14 +24,16 @@ class Drift:
     def __init__(self) -> None:
         self._ways: dict[int, list[tuple[int, float, float]]] = defaultdict(list)
 
-    def driven(self, link: Edge) -> None:
-        """Add a link that scans were matched along."""
-        away = float(np.hypot(*link.relative[:2]))
-        self._add(link, TURN**2 * away, AWAY**2 * away)
-
-    def broken(self, link: Edge) -> None:
-        """Add a link across which nothing was matched."""
-        self._add(link, float(link.covariance[2, 2]), float(link.covariance[:2, :2].trace()) / 2)
+    def linked(self, link: Edge) -> None:
+        """Add the link of a keyframe, unless it is the first."""
+        if link.first == link.second:
+            return
+        if link.doubtful:
+            away = float(link.covariance[:2, :2].trace()) / 2
+            self._add(link, float(link.covariance[2, 2]), away)
+        else:
+            driven = float(np.hypot(*link.relative[:2]))
+            self._add(link, TURN**2 * driven, AWAY**2 * driven)
 
     def closed(self, loop: Edge) -> None:
         """Add a loop that is beyond doubt."""
