@@ -50,16 +50,6 @@ class LoopSearch:
         self.waiting: list[Edge] = []  # loops without a second witness
         self.searched = -SPACING  # [m] of travel
 
-    def drive(self, keyframes: Sequence[Keyframe], here: int) -> None:
-        """Take in the link of keyframe `here`."""
-        link = keyframes[here].link
-        if link.first == here:
-            return
-        if keyframes[link.first].segment == keyframes[here].segment:
-            self.drift.driven(link)
-        else:
-            self.drift.broken(link)
-
     def find(self, keyframes: Sequence[Keyframe], poses: Floats) -> list[Edge]:
         """Loops that end at the last keyframe and are beyond doubt, and those that they confirm."""
         travel = np.array([keyframe.travel for keyframe in keyframes])
@@ -130,7 +120,7 @@ def _attempt(
         return None
     pose = wrapped(fit.pose)
     covariance = LOOP + turned(inverse_of(fit.information + OPEN), -float(pose[2]))
-    return Edge(there, here, pose, covariance)
+    return Edge(there, here, pose, covariance, doubtful=True)
 
 
 def _small(loop: Edge, poses: Floats) -> bool:
