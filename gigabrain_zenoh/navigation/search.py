@@ -135,7 +135,7 @@ def _search(
             aside, above = flat[row * width + right], flat[down * width + column]
             if way >= 4 and not (_may(source, aside) and _may(source, above)):
                 continue  # it would cut a corner
-            found = g[cell] + LENGTH[way] * 0.5 * (source + into)
+            found = g[cell] + LENGTH[way] * (0.5 * source + 0.5 * into)
             if seen[other] != turn or found < g[other]:
                 g[other], came[other], seen[other] = found, way, turn
                 key = found + _least(down, right, target, width)
