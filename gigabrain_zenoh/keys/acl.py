@@ -58,7 +58,7 @@ OPERATOR = Rights(
     says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG),
     asks=(DESCRIBE, AUDIT_LOG, PARAM, ESTOP, RELEASE, ENABLE, GOAL, MISSION),
     answers=(PARAM, DESCRIBE),
-    names=("page", "recorder", "button"),
+    names=("page", "foxglove", "recorder", "button"),
 )
 FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer")  # where no robot is named
 Rule = dict[str, Any]
