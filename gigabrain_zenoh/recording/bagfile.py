@@ -75,7 +75,8 @@ class BagFile:
         self.pending[arrival.key] += count
         self.first_ns = self.first_ns or arrival.log_ns
         channel = self._raw_channel(arrival)
-        self._settle(Counter({arrival.key: count}))
+        if self._tape.size != self._settled:
+            self._settle(Counter({arrival.key: count}))
         header = arrival.header
         stamp_ns = header.stamp_ns or arrival.log_ns
         self._writer.add_message(
@@ -83,18 +84,18 @@ class BagFile:
         )
         if self._drawer:
             self._draw(self._drawer, arrival)
-        self._settle(Counter())
+        if self._tape.size != self._settled:
+            self._settle(Counter())
 
     def flush(self) -> None:
         """Bring all that was added to the disk."""
         self._writer.flush()
-        self._settle(Counter())
+        if self._tape.size != self._settled:
+            self._settle(Counter())
         self._tape.sync()
 
     def _settle(self, still: Counter[str]) -> None:
-        """Whenever the file has grown, all but `still` has been written."""
-        if self._tape.size == self._settled:
-            return
+        """The file has grown: all but `still` has been written."""
         self._settled = self._tape.size
         self.written += self.pending.total() - still.total()
         self.pending = still

@@ -112,10 +112,17 @@ class Drawer:
 
     def draw(self, topic: Topic[Any], message: Message, name: str = "") -> Iterable[Drawn]:
         """What viewers show of `message`; `name` is the camera's, where there are several."""
+        if isinstance(message, Intent) and not self._thought_again(message):
+            return
         if topic.type in self._converters:
             yield from self._converters[topic.type](message, name)
         if topic.key in PLOTTED:
             yield numbers(topic, message)
+
+    def _thought_again(self, intent: Intent) -> bool:
+        """Whether it is new: it is said again with every tick, and drawn once."""
+        before, self._thought = self._thought, (intent.boot, intent.basis)
+        return before != self._thought
 
     def _scan(self, scan: LaserScan, _: str) -> Iterable[Drawn]:
         ranges = arrays.ranges(scan)
@@ -159,10 +166,6 @@ class Drawer:
         yield self._frame(pose, MAP, ODOM, Pose(x=x, y=y, yaw=yaw))
 
     def _path(self, intent: Intent, _: str) -> Iterable[Drawn]:
-        thought = intent.boot, intent.basis
-        if thought == self._thought:  # it is said again with every tick, and drawn once
-            return
-        self._thought = thought
         poses = [pose_of(point.x, point.y, point.yaw) for point in intent.trajectory]
         yield of("path", fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses))
 
