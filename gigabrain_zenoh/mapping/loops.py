@@ -39,7 +39,7 @@ SMALL = np.array((0.3, 0.3, 0.1))  # [m], [m], [rad]: a loop that changes less n
 AGREE = np.array((0.2, 0.2, 0.05))  # [m], [m], [rad], between two witnesses
 MEMORY = 10.0  # [m] of travel, a witness is heard so long
 LOOP = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance beside that of ICP
-OPEN = 1e-3 * np.eye(3)  # information, so that open directions can be inverted
+OPEN = 0.02  # of what holds the best direction: a place that holds another less is an aisle
 
 
 class LoopSearch:
@@ -118,8 +118,11 @@ def _attempt(
     slid = float(np.hypot(*(fit.pose - found.pose)[:2]))
     if fit.inliers < INLIERS or fit.rms > RMS or slid > MOVED:
         return None
+    least, most = np.linalg.eigvalsh(fit.information[:2, :2])
+    if least < OPEN * most:
+        return None
     pose = wrapped(fit.pose)
-    covariance = LOOP + turned(inverse_of(fit.information + OPEN), -float(pose[2]))
+    covariance = LOOP + turned(inverse_of(fit.information), -float(pose[2]))
     return Edge(there, here, pose, covariance, doubtful=True)
 
 
