@@ -4,11 +4,11 @@ import itertools
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
-from msgspec.structs import asdict
+from msgspec.structs import asdict, replace
 
 from gigabrain_schemas.base import Message, Pose, Velocity
 from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import OccupancyGrid, Twist
+from gigabrain_schemas.brain import OccupancyGrid, Twist, WorldModel
 from gigabrain_schemas.safety import Health, LogRecord
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import (
@@ -110,7 +110,7 @@ class Scene:
                 frame="map" if in_map else "odom",
                 intent=self._intent.fresh(),
                 safety=self._safety.fresh(),
-                world=self._world.fresh(),
+                world=_without_hits(self._world.fresh()),
                 driving=driving,
                 viewers=viewers,
             ),
@@ -164,3 +164,8 @@ class Scene:
         if camera in self._images or len(self._images) < CAMERAS:
             sampled = self._images.setdefault(camera, Sampled(self._bus, IMAGE))
             sampled.take(key, encoding, payload)
+
+
+def _without_hits(world: WorldModel | None) -> WorldModel | None:
+    """The page has the scan."""
+    return replace(world, hits=b"") if world else None
