@@ -72,13 +72,18 @@ class Plant:
     """A body that answers after a delay, by and by; control, and its gate at rest at first."""
 
     def __init__(
-        self, body: BodyDescription = AGILE, response: Response = SLOW, *, gain: float = 1.0
+        self,
+        body: BodyDescription = AGILE,
+        response: Response = SLOW,
+        *,
+        gain: float = 1.0,
+        slip: float = 1.0,
     ) -> None:
         self.body, self.memory, self.tick = body, Memory(), 0
         self.pose, self.velocity = Pose(x=0.0, y=0.0, yaw=0.0), Velocity()
         self._late = deque([CmdVel(linear_x=0.0)] * round(response.delay / 0.02))
         self._follows = 1 - math.exp(-0.02 / response.lag) if response.lag else 1.0
-        self._gain = gain
+        self._gain, self._slip = gain, slip
 
     def go(self, intent: Intent | None, caps: SpeedCaps | None = None) -> CmdVel:
         """One tick."""
@@ -92,7 +97,8 @@ class Plant:
         self.velocity = v = Velocity(
             linear_x=v.linear_x + share * (self._gain * acts.linear_x - v.linear_x),
             linear_y=v.linear_y + share * (self._gain * acts.linear_y - v.linear_y),
-            angular_z=v.angular_z + share * (self._gain * acts.angular_z - v.angular_z),
+            angular_z=v.angular_z
+            + share * (self._slip * self._gain * acts.angular_z - v.angular_z),
         )
         turned = v.angular_z * 0.02
         middle = replace(pose, yaw=pose.yaw + turned / 2)
@@ -177,6 +183,13 @@ def test_turning_on_the_spot_it_keeps_to_the_heading() -> None:
 @pytest.mark.parametrize("gain", [0.8, 1.2])
 def test_a_body_that_goes_slower_or_faster_than_told_is_corrected(gain: float) -> None:
     assert max(errors(Course(ess, 11.0), Plant(gain=gain), 8.0)) < 0.07
+
+
+@pytest.mark.parametrize("slip", [0.6, 0.8, 1.1])
+def test_a_body_that_slips_as_it_turns_is_told_to_turn_more(slip: float) -> None:
+    response, course = replace(SLOW, turn_gain=slip), Course(ess, 11.0)
+    assert max(errors(course, Plant(slip=slip), 8.0, response=response)) < 0.02
+    assert max(errors(course, Plant(slip=slip), 8.0, response=SLOW)) < 0.12
 
 
 @pytest.mark.parametrize(
@@ -302,6 +315,15 @@ def test_asked_again_within_a_tick_it_answers_the_same() -> None:
     assert step(plant.body, once[0], inputs) == once
     without = replace(inputs, intent=None)
     assert step(plant.body, step(plant.body, plant.memory, without)[0], inputs) == once
+
+
+def test_a_response_beyond_reason_makes_no_command_beyond_reason() -> None:
+    plant, course = Plant(), Course(ess, 11.0)
+    errors(course, plant, 2.0)
+    mad = Response(delay=1e9, lag=1e9, turn_gain=1e-310)
+    still = replace(course.intent(plant.tick, mad), trajectory=(TrajectoryPoint(60.0, 0, 0, 0),))
+    assert max(abs(plant.go(still).linear_x) for _ in range(5)) <= 0.52
+    assert all(math.isfinite(plant.go(still).angular_z) for _ in range(5))
 
 
 def test_points_at_one_time_and_out_of_order_make_no_command_that_is_not_a_number() -> None:
