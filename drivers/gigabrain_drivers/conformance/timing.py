@@ -42,7 +42,7 @@ async def reports(rig: Rig) -> Finding:
         rate = scans / (ticks * 0.02)
         beams = len(rig.scan.ranges) // 4
         good = good and abs(rate / lidar.rate_hz - 1) <= SCAN_SLACK and beams == lidar.beams
-        missing = (1 - SCAN_SLACK) * lidar.rate_hz / max(rate, 0.1) - 1  # in time, of what passed
+        missing = 1 - rate / ((1 - SCAN_SLACK) * lidar.rate_hz)  # of the time
         late_ms = max(late_ms, missing * ticks * TICK_NS / 1e6)
         text += f"; scans of {beams} beams at {rate:.1f} Hz of {lidar.rate_hz:g}"
     return Finding(good, text, late_ms=late_ms)
