@@ -85,4 +85,5 @@ def test_where_the_system_does_not_say_nothing_was_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(machine, "TASKS", tmp_path / "none")
-    assert machine.waited_ms() == 0.0
+    monkeypatch.setattr(machine, "OWN", tmp_path / "none")
+    assert (machine.waited_ms(), machine.own_waited_ms()) == (0.0, 0.0)
