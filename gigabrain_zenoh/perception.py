@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import hits_bytes, ranges
-from gigabrain_schemas.body import BodyDescription, Lidar
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import Body, BodyDescription, Lidar
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.topics import BODY, SCAN, WORLD
-from gigabrain_zenoh.bus import Bus
+from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
+from gigabrain_zenoh.bus import Bus, Latest
+from gigabrain_zenoh.obstacles.surroundings import Surroundings
+from gigabrain_zenoh.placed_scans import PlacedScans
 from gigabrain_zenoh.settings import PerceptionConfig
 
 Floats = NDArray[np.float64]
@@ -147,6 +150,25 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         if body.current:
             bus.publish(WORLD, step(config, body.current.description, scan), basis=scan.basis)
 
-    bus.latest(SCAN, see)
+    if config.mapping == "off":
+        bus.latest(SCAN, see)
+    else:
+        _follow(config, bus, body)
     ready()
     await bus.failed
+
+
+def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body]) -> None:
+    """Worlds with the obstacles in them, each in its place by the odometry."""
+    surroundings = Surroundings()
+
+    def see(scan: LaserScan, pose: Pose | None) -> None:
+        if body.current:
+            description = body.current.description
+            world = step(config, description, scan)
+            world = surroundings.add(world, description.lidar, scan, pose)
+            bus.publish(WORLD, world, basis=scan.basis)
+
+    placed = PlacedScans(see)
+    bus.latest(STATE, placed.state)
+    bus.latest(SCAN, placed.scan)

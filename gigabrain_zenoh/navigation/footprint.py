@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.kernels import kernel
 from gigabrain_zenoh.sweep import Corners, box
 
-SPACING = 0.04  # [m], between points on the outline at most
+SPACING = 0.05  # [m], between points on the outline at most
+STRETCH = 6  # points between two that are always looked at
+ROOM = 0.4  # [m], more than that round the body makes no difference
 FAR = 3.0  # [m], what is farther away, or beyond the window, does not matter
 
 
@@ -60,9 +62,9 @@ def distance_at(grid: Grid, x: float, y: float) -> float:
     """The distance [m] from (x, y) to the nearest obstacle."""
     rows, columns = grid.distance.shape
     u, v = (x - grid.x) / grid.cell - 0.5, (y - grid.y) / grid.cell - 0.5
-    i, j = int(math.floor(v)), int(math.floor(u))
-    if i < 0 or j < 0 or i >= rows - 1 or j >= columns - 1:
+    if u < 0.0 or v < 0.0 or u >= columns - 1 or v >= rows - 1:
         return FAR
+    i, j = int(v), int(u)
     a, b = v - i, u - j
     d = grid.distance
     low = d[i, j] + b * (d[i, j + 1] - d[i, j])
@@ -76,23 +78,39 @@ def clearance(
 ) -> float:
     """How far the outline at a pose is from the nearest obstacle [m]; below 0 with one inside.
 
-    The distance changes by no more than the way along the outline, so that points which cannot be
-    the nearest are left out.
+    More than ROOM counts as ROOM. The distance changes by no more than the way along the outline,
+    so that whole stretches of it can be left out.
     """
     center_x = x + cosine * outline.center_x - sine * outline.center_y
     center_y = y + sine * outline.center_x + cosine * outline.center_y
     middle = distance_at(grid, center_x, center_y)
-    if middle > outline.outer + 0.4:
-        return middle - outline.outer
-    nearest = middle - outline.inner if middle < outline.inner else FAR
-    i, count = 0, outline.points.shape[0]
-    while i < count:
-        px, py = outline.points[i, 0], outline.points[i, 1]
-        d = distance_at(grid, x + cosine * px - sine * py, y + sine * px + cosine * py)
-        if d < nearest:
-            nearest, i = d, i + 1
-        else:
-            i += 1 + int((d - nearest) / outline.spacing)
+    if middle >= outline.outer + ROOM:
+        return ROOM
+    nearest = min(ROOM, middle - outline.inner) if middle < outline.inner else ROOM
+    points, spacing = outline.points, outline.spacing
+    count = points.shape[0]
+    first = distance_at(
+        grid,
+        x + cosine * points[0, 0] - sine * points[0, 1],
+        y + sine * points[0, 0] + cosine * points[0, 1],
+    )
+    begin, begins = 0, first
+    while begin < count:
+        end = min(begin + STRETCH, count)
+        ends = first
+        if end < count:
+            px, py = points[end, 0], points[end, 1]
+            ends = distance_at(grid, x + cosine * px - sine * py, y + sine * px + cosine * py)
+        nearest = min(nearest, begins)
+        i = begin + 1
+        if (begins + ends - (end - begin) * spacing) * 0.5 >= nearest:
+            i = end
+        while i < end:
+            px, py = points[i, 0], points[i, 1]
+            d = distance_at(grid, x + cosine * px - sine * py, y + sine * px + cosine * py)
+            i += 1 + int(max(0.0, d - nearest) / spacing)
+            nearest = min(nearest, d)
+        begin, begins = end, ends
     return nearest
 
 

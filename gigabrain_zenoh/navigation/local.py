@@ -11,7 +11,7 @@ from gigabrain_schemas.brain import Obstacle, TrajectoryPoint
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import clearance, outline_of
 from gigabrain_zenoh.navigation.manner import kind_of, reason_of
-from gigabrain_zenoh.navigation.models import model_of
+from gigabrain_zenoh.navigation.models import lag_of, model_of
 from gigabrain_zenoh.navigation.moment import Goal, LocalPlan, LocalSettings, Moment, Sent
 from gigabrain_zenoh.navigation.mppi import Planned, Sampler, past_of, step_of
 from gigabrain_zenoh.navigation.rollout import TOUCHED, Scene, Start, Weights, distance_in
@@ -87,7 +87,8 @@ class LocalPlanner:
         rows = np.array([row for row in times if row[0] <= 0.0]).reshape(-1, 4)
         before = tuple(rows[-1, 1:].tolist()) if len(rows) else _axes(v)
         past, share = past_of(rows, _axes(v), moment.response.delay, dt)
-        return Start(*place, *_axes(v), before, past, share, moment.response.lag, 1.0)
+        lag = lag_of(moment.response.lag, dt)
+        return Start(*place, *_axes(v), before, past, share, lag, moment.turn_gain)
 
     def _answer(self, moment: Moment, scene: Scene, planned: Planned) -> LocalPlan:
         place = moment.pose

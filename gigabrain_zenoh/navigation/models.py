@@ -78,12 +78,23 @@ def feasible(
     return vx, vy, w
 
 
+class Lag(NamedTuple):
+    """A first-order lag over one step."""
+
+    decay: float  # what is left of a difference after it
+    glide: float  # [s], what a difference of 1 m/s adds to the way [m]
+
+
+def lag_of(seconds: float, dt: float) -> Lag:
+    """The lag of a time constant of so many seconds, for steps of `dt` [s]."""
+    if seconds < 1e-3:
+        return Lag(0.0, 0.0)
+    decay = math.exp(-dt / seconds)
+    return Lag(decay, seconds * (1.0 - decay))
+
+
 @kernel
-def answer(velocity: float, command: float, lag: float, dt: float) -> tuple[float, float]:
-    """A first-order lag after `dt` [s] of a command: its velocity, and the way it has made."""
-    if lag < 1e-3:
-        return command, command * dt
-    decay = math.exp(-dt / lag)
-    return command + (velocity - command) * decay, command * dt + (velocity - command) * lag * (
-        1.0 - decay
-    )
+def answer(velocity: float, command: float, lag: Lag, dt: float) -> tuple[float, float]:
+    """A body's velocity after a step with `command`, and the way that it has made."""
+    off = velocity - command
+    return command + off * lag.decay, command * dt + off * lag.glide

@@ -5,6 +5,7 @@ Where neighbours are farther apart than they could be on a surface that the beam
 """
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -15,6 +16,7 @@ from gigabrain_schemas.body import Lidar
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
+S = TypeVar("S", bound=np.generic)
 
 FARTHEST_M = 10.0  # things beyond are left alone
 FEWEST = 3  # hits; fewer may be chance
@@ -49,8 +51,8 @@ def find_clusters(hits: Floats, lidar: Lidar, spacing: float) -> list[Cluster]:
     if not breaks.any():
         return []
     begin = int(np.flatnonzero(breaks)[0]) + 1  # cut the turn where one thing ends
-    points, ranges = np.roll(points, -begin, axis=0), np.roll(ranges, -begin)
-    breaks, empty = np.roll(breaks, -begin), np.roll(empty, -begin)
+    points, ranges = _from(begin, points), _from(begin, ranges)
+    breaks, empty = _from(begin, breaks), _from(begin, empty)
     bearings = np.concatenate((bearings[begin:], bearings[:begin] + math.tau))
     last = np.flatnonzero(breaks)
     first = np.concatenate(([0], last[:-1] + 1))
@@ -62,15 +64,20 @@ def find_clusters(hits: Floats, lidar: Lidar, spacing: float) -> list[Cluster]:
     ]
 
 
+def _from(begin: int, values: NDArray[S]) -> NDArray[S]:
+    """All `values` in turn, from one of them on. numpy's roll takes four times as long."""
+    return np.concatenate((values[begin:], values[:begin]))
+
+
 def _breaks(
     points: Floats, bearings: Floats, ranges: Floats, spacing: float
 ) -> tuple[Bools, Bools]:
     """After which hits one thing ends, and after which of them beams hit nothing; (n,) each."""
-    following = np.roll(points, -1, axis=0)
-    turned = np.roll(bearings, -1) - bearings
+    following = _from(1, points)
+    turned = _from(1, bearings) - bearings
     turned[-1:] += math.tau
     apart = np.hypot(following[:, 0] - points[:, 0], following[:, 1] - points[:, 1])
-    nearer = np.minimum(ranges, np.roll(ranges, -1))
+    nearer = np.minimum(ranges, _from(1, ranges))
     steps = np.minimum(turned, GRAZING_RAD / 2)
     most = nearer * np.sin(steps) / np.sin(GRAZING_RAD - steps)
     empty = turned > MISSING_BEAMS * spacing
