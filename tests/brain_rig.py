@@ -121,12 +121,21 @@ class Bench:
     def __init__(self, node: Node) -> None:
         self.clock, self.network = FakeClock(), LocalNetwork()
         self._node, self._read = node, 0
+        self._ready = asyncio.Event()
 
     async def __aenter__(self) -> Self:
         self.bus = Bus(self.network.transport(), self.clock, "node")
-        self._running = asyncio.ensure_future(self._node(self.bus, lambda: None))
+        self._running = asyncio.ensure_future(self._node(self.bus, self._ready.set))
         await self.clock.advance(0)
         return self
+
+    async def ready(self) -> None:
+        """Wait until the node says that it is; some compile first."""
+        waiting = asyncio.ensure_future(self._ready.wait())
+        await asyncio.wait((waiting, self._running), return_when=asyncio.FIRST_COMPLETED)
+        waiting.cancel()
+        if self._running.done():
+            self._running.result()
 
     async def __aexit__(
         self,

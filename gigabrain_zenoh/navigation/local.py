@@ -14,7 +14,7 @@ from gigabrain_zenoh.navigation.manner import kind_of, reason_of
 from gigabrain_zenoh.navigation.models import lag_of, model_of
 from gigabrain_zenoh.navigation.moment import Goal, LocalPlan, LocalSettings, Moment, Sent
 from gigabrain_zenoh.navigation.mppi import Planned, Sampler, past_of, step_of
-from gigabrain_zenoh.navigation.rollout import TOUCHED, Scene, Start, Weights, distance_in
+from gigabrain_zenoh.navigation.rollout import SECOND, TOUCHED, Scene, Start, Weights, distance_in
 from gigabrain_zenoh.navigation.window import Place, Window
 
 __all__ = ["Goal", "LocalPlan", "LocalPlanner", "LocalSettings", "Moment", "Sent", "warm_up"]
@@ -96,7 +96,8 @@ class LocalPlanner:
         room = clearance(scene.grid, self._outline, place.x, place.y, cosine, sine)
         left = distance_in(scene.field, place.x, place.y)
         blocked = self._stuck(moment)
-        if planned.cost > TOUCHED * 0.3:  # all ways end in a contact: brake
+        rest = SECOND * left / self._model.forward  # what a far goal costs without any contact
+        if planned.cost > TOUCHED * 0.22 + rest:  # all ways end in a contact: brake
             self._sampler.forget()
             return _standing(
                 f"waiting: no way without a contact, {room:.2f} m of room", blocked=blocked

@@ -4,12 +4,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from msgspec import Struct
 
 from gigabrain_zenoh import config, config_yaml
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.tasks import conditions
-from gigabrain_zenoh.tasks.mission import Mission, PatrolFile, Place, Step
+from gigabrain_zenoh.tasks.mission import Mission, Patrol, PatrolFile, Place, Step
 
 MOST_STEPS = 2000  # with every `tree` written out
 Way = tuple[str | int, ...]  # keys and numbers, from the top of the file
@@ -37,6 +38,12 @@ def load_patrol(path: Path) -> PatrolFile:
         if problem := _unknown_place(place, patrol.places):
             raise ConfigError(f"{path}:{_line(text, ('points', i))}: points[{i}]: {problem}")
     return patrol
+
+
+def round_of(patrol: PatrolFile, loops: int | None) -> str:
+    """The mission that a patrol is, as text."""
+    step = Step(patrol=Patrol(points=patrol.points, loops=loops, wait=patrol.wait))
+    return msgspec.json.encode(Mission(places=patrol.places, do=(step,))).decode()
 
 
 def scripts(mission: Mission) -> Iterator[str]:

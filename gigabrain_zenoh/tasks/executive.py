@@ -101,6 +101,11 @@ class Executive:
         return None
 
     @property
+    def idle(self) -> bool:
+        """Whether there is nothing to do."""
+        return not self._jobs
+
+    @property
     def saved(self) -> Saved:
         """What survives a restart."""
         jobs = tuple(job.saved for job in self._jobs)

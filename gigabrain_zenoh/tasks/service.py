@@ -20,6 +20,7 @@ from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.scribe import Scribe
 from gigabrain_zenoh.tasks import checks
 from gigabrain_zenoh.tasks.executive import Executive, Saved
+from gigabrain_zenoh.tasks.mission import Mission
 from gigabrain_zenoh.tasks.orders import Order, Outcome
 from gigabrain_zenoh.tasks.scripts import Scripts
 from gigabrain_zenoh.tasks.store import TaskFile
@@ -73,6 +74,11 @@ class TaskService:
         if not 0 <= state.tick - self._told_tick < TOLD_TICKS or self._ended():
             self._tell()
         return order
+
+    def begin(self, mission: Mission, label: str) -> None:
+        """Something to do where nobody wants anything yet."""
+        if self._tasks.idle:
+            self._tasks.carry_out(mission, label, "queue", "itself")
 
     async def close(self) -> None:
         """Once all is written down."""
