@@ -78,6 +78,7 @@ COMMANDS = {
     "faults": ("faults:faults", "Break the robot in 44 ways, and see whether it stops."),
     "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
+    "bench plan": ("bench_plan:plan", "Global planning, timed and checked."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
 }
