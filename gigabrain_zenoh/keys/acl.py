@@ -70,7 +70,7 @@ OPERATOR = Rights(
         MISSION,
         TASK_CHANGE,
         MAP_SAVE,
-    ),  # fmt: skip
+    ),
     answers=(PARAM, DESCRIBE),
     names=("page", "recorder", "button"),
 )
