@@ -25,7 +25,7 @@ from gigabrain_zenoh.planar import compose, inverse
 from gigabrain_zenoh.pose_history import PoseHistory
 from gigabrain_zenoh.response import ResponseEstimator
 from gigabrain_zenoh.settings import DecisionConfig
-from gigabrain_zenoh.tasks.mission import Explore, Mission, Step
+from gigabrain_zenoh.tasks.mission import roaming
 from gigabrain_zenoh.tasks.orders import Order, Outcome
 from gigabrain_zenoh.tasks.service import TaskService
 
@@ -87,8 +87,8 @@ class Navigating:
         self, state: RobotState, world: WorldModel | None, must_charge: bool
     ) -> Situation:
         """Where the robot is, what it is to do, and which way."""
-        if self._config.begin == "explore" and not self._begun:
-            self._service.begin(Mission(do=(Step(explore=Explore()),)), "exploring")
+        if self._config.begin == "roam" and not self._begun:
+            self._service.begin(roaming(), "roaming")
         self._begun = True
         order = self._service.step(state, self._outcome)
         self._outcome = None

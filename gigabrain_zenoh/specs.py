@@ -115,7 +115,7 @@ def _settings(
         EMULATOR: msgspec.to_builtins(emulator),
         BUTTON: msgspec.to_builtins(deployment.button) if deployment.button else {},
         "perception": msgspec.to_builtins(deployment.perception),
-        "decision": msgspec.to_builtins(deployment.decision),
+        "decision": msgspec.to_builtins(deployment.decision) | {"state_dir": str(state_dir)},
         "recorder": msgspec.to_builtins(with_notes(deployment)),
         "page": msgspec.to_builtins(deployment.page),
     }

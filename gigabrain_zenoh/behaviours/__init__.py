@@ -85,10 +85,15 @@ BEHAVIOURS = {
 SENSES = {"navigate": "gigabrain_zenoh.navigating:Navigating"}  # of those that need more
 
 
-def load(name: str) -> type[Behaviour]:
-    """The behaviour called `name`. Raises UnknownName listing the known ones, and ConfigError."""
+def check(name: str) -> None:
+    """Raises UnknownName where there is no behaviour called `name`, listing the known ones."""
     if name not in BEHAVIOURS:
         raise unknown("behaviour", name, BEHAVIOURS)
+
+
+def load(name: str) -> type[Behaviour]:
+    """The behaviour called `name`. Raises UnknownName listing the known ones, and ConfigError."""
+    check(name)
     return cast("type[Behaviour]", _find(name, BEHAVIOURS[name]))
 
 

@@ -14,13 +14,14 @@ from gigabrain_zenoh.behaviours.bearings import Driven, Floats, Route
 from gigabrain_zenoh.navigation.costmap import Costmap, costmap, inflation
 from gigabrain_zenoh.navigation.frontiers import frontiers
 from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable
-from gigabrain_zenoh.tasks.orders import GoTo, Order
+from gigabrain_zenoh.tasks.orders import GoTo, Order, Visit
 
 GIVE_UP_TICKS = 1500  # 30 s of driving without coming any nearer
 LEAVE_TICKS = 500  # 10 s, for a place that is only to be looked at
 NEARER_M = 0.3  # what counts as nearer
 REMEMBERED_TICKS = 500  # 10 s, that what was in the way stays in the plans
 MUCH_BETTER_M = 1.5  # so much better has another frontier to be, or it goes to and fro
+OPEN, FAR_M = 2.0, 1.5  # cost of a place worth visiting, and the way there at least [m]
 SAME_M = 0.6  # a frontier so near is the same one: it moves as the map grows
 
 
@@ -58,6 +59,8 @@ class Guide:
         chart = self._chart(asked)
         if isinstance(asked.order, GoTo):
             return self._to(asked.order.goal, asked, chart)
+        if isinstance(asked.order, Visit):
+            return self._to(self._goal or self._anywhere(asked, chart), asked, chart)
         return self._onward(asked, chart)
 
     def check(self, grid: OccupancyGrid, body: BodyDescription, here: Pose, goal: Goal) -> str:
@@ -110,6 +113,18 @@ class Guide:
             left = f"{found.remaining[0]:.1f} m before the goal"
             return self._ended("failed", f"no nearer for 30 s, {left}: something is in the way")
         return self._going(goal, found)
+
+    def _anywhere(self, asked: Asked, chart: Costmap) -> Goal:
+        """A place in the open that can be reached; where it is, if there is no other."""
+        start, here = chart.cell(asked.here.x, asked.here.y), asked.here
+        if start is not None:
+            way = self._planner.search.field(chart.cost, start, "from") * chart.resolution
+            rows, columns = np.nonzero((chart.cost < OPEN) & (way > FAR_M) & np.isfinite(way))
+            if len(rows):
+                one = int(np.random.default_rng(asked.order.number).integers(len(rows)))
+                x, y = chart.points(rows[one : one + 1], columns[one : one + 1])[0].tolist()
+                return Goal(x=x, y=y)
+        return Goal(x=here.x, y=here.y)
 
     def _onward(self, asked: Asked, chart: Costmap) -> Route:
         """To the next place from which something new can be seen."""

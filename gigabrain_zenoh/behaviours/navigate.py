@@ -13,7 +13,7 @@ from gigabrain_zenoh.behaviours.bearings import Bearings, Driven, Floats, Route
 from gigabrain_zenoh.navigation import local
 from gigabrain_zenoh.planar import compose, inverse
 from gigabrain_zenoh.settings import DecisionConfig
-from gigabrain_zenoh.tasks.orders import GoTo, Order, Outcome, where
+from gigabrain_zenoh.tasks.orders import Explore, Order, Outcome, where
 
 TOO_LATE_TICKS = 10  # a scan so old is not to be driven by
 
@@ -91,7 +91,7 @@ class Navigate:
         distance = float(np.hypot(*np.diff(left, axis=0).T).sum())
         self._longest = max(self._longest, distance, 1e-6)
         self.driven = Driven(version=route.version, arrived=plan.arrived, blocked=plan.blocked)
-        arrived = plan.arrived and isinstance(order, GoTo)
+        arrived = plan.arrived and not isinstance(order, Explore)
         speed = min(self._config.speed_limit or math.inf, bearings.body.max_linear_speed)
         self.outcome = Outcome(
             number=order.number,
@@ -134,7 +134,7 @@ def _why_not(situation: Situation) -> str:
 
 def _headline(order: Order | None, goal: Goal) -> str:
     """What it is at: the same for as long as that does not change."""
-    return f"going to {where(goal)}" if isinstance(order, GoTo) else "exploring"
+    return "exploring" if isinstance(order, Explore) else f"going to {where(goal)}"
 
 
 def _stand(reason: str) -> Intent:

@@ -55,7 +55,9 @@ def scripts(mission: Mission) -> Iterator[str]:
 
 def drives(mission: Mission) -> bool:
     """Whether a mission wants the robot to be anywhere."""
-    wanted = (s.explore or s.patrol or s.battery_below or s.goto for _, s in _steps(mission))
+    wanted = (
+        s.explore or s.visit or s.patrol or s.battery_below or s.goto for _, s in _steps(mission)
+    )
     return any(one is not None for one in wanted)
 
 

@@ -50,6 +50,8 @@ class Grower:
             return self._go_to(step.goto)
         if step.explore:
             return nodes.explore(moment)
+        if step.visit:
+            return nodes.visit(moment)
         if step.wait is not None:
             return nodes.Wait(step.wait, moment)
         if step.wait_until is not None:

@@ -13,8 +13,8 @@ Steps = Annotated[tuple["Step", ...], Meta(min_length=1)]
 Seconds = Annotated[float, Meta(gt=0, le=1e7)]
 Times = Annotated[int, Meta(ge=1, le=1_000_000)]
 KINDS = (
-    "goto", "patrol", "explore", "wait", "wait_until", "check", "script", "tree", "sequence",
-    "fallback", "retry", "repeat", "timeout", "guard", "battery_below",
+    "goto", "patrol", "explore", "visit", "wait", "wait_until", "check", "script", "tree",
+    "sequence", "fallback", "retry", "repeat", "timeout", "guard", "battery_below",
 )  # fmt: skip
 
 
@@ -32,6 +32,10 @@ class Patrol(Part, frozen=True, kw_only=True):
 
 class Explore(Part, frozen=True, kw_only=True):
     """Drive until nothing is left to be seen."""
+
+
+class Visit(Part, frozen=True, kw_only=True):
+    """Drive to a place that can be reached, chosen at random."""
 
 
 class Script(Part, frozen=True, kw_only=True):
@@ -86,6 +90,7 @@ class Step(Part, frozen=True, kw_only=True):
     goto: Place | None = None
     patrol: Patrol | None = None
     explore: Explore | None = None
+    visit: Visit | None = None
     wait: Seconds | None = None
     wait_until: str | None = None  # a condition
     check: str | None = None  # a condition: fails where it does not hold
@@ -131,6 +136,12 @@ class PatrolFile(Part, frozen=True, kw_only=True):
     places: dict[Name, Point] = {}
     points: Annotated[tuple[Place, ...], Meta(min_length=1, max_length=1000)]
     wait: Annotated[float, Meta(ge=0, le=1e7)] = 0.0  # [s] at each
+
+
+def roaming() -> Mission:
+    """The mission that is to explore, and then to visit one place after the other."""
+    visit = Step(fallback=(Step(visit=Visit()), Step(wait=5.0)))
+    return Mission(do=(Step(explore=Explore()), Step(repeat=Repeat(do=(visit,)))))
 
 
 def goal_mission(goal: Goal) -> Mission:

@@ -7,7 +7,7 @@ from py_trees.behaviour import Behaviour
 from py_trees.common import Status
 from py_trees.decorators import Decorator
 
-from gigabrain_zenoh.tasks.orders import Explore, GoTo, Order, where
+from gigabrain_zenoh.tasks.orders import Explore, GoTo, Order, Visit, where
 
 if TYPE_CHECKING:
     from gigabrain_schemas.tasks import Goal
@@ -58,6 +58,11 @@ def go_to(goal: "Goal", name: str, moment: "Moment") -> Drive:
 def explore(moment: "Moment") -> Drive:
     """See all that there is."""
     return Drive("exploring", moment, Explore)
+
+
+def visit(moment: "Moment") -> Drive:
+    """Be somewhere else."""
+    return Drive("visiting a place", moment, Visit)
 
 
 class Wait(Leaf):

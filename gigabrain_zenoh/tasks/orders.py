@@ -20,7 +20,13 @@ class Explore(Struct, frozen=True):
     number: int
 
 
-Order = GoTo | Explore
+class Visit(Struct, frozen=True):
+    """Be at some place that can be reached, chosen at random."""
+
+    number: int
+
+
+Order = GoTo | Explore | Visit
 
 
 class Outcome(Struct, frozen=True, kw_only=True):
