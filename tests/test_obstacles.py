@@ -138,6 +138,43 @@ def test_walls_do_not_move_while_the_robot_turns_and_drives() -> None:
         assert all(speed(one) < 0.05 for one in obstacles), (i, obstacles)
 
 
+def box(x: float, y: float, half_x: float, half_y: float) -> tuple[Wall, ...]:
+    left, right, low, high = x - half_x, x + half_x, y - half_y, y + half_y
+    return (
+        (left, low, right, low),
+        (right, low, right, high),
+        (right, high, left, high),
+        (left, high, left, low),
+    )
+
+
+def test_what_only_shows_another_side_to_a_robot_that_drives_past_does_not_move() -> None:
+    things = (*box(0.0, 0.8, 0.35, 0.2), *box(1.2, -0.9, 0.1, 0.4), *box(2.4, 0.9, 0.3, 0.3))
+    stub: tuple[Wall, ...] = ((0.6, 3, 0.6, 2.0), (-1.5, -3, -1.5, -1.9))
+    watch, told = Watch(walls=(*ROOM, *things, *stub)), 0
+    for i in range(150):
+        pose = Pose(x=-2.0 + 0.03 * i, y=0.0, yaw=0.3 * math.sin(0.1 * i))
+        obstacles = watch.scan(pose=pose)
+        told += len(obstacles)
+        assert all(speed(one) == 0.0 for one in obstacles), (i, obstacles)
+    assert told > 100
+
+
+def test_whoever_moves_in_the_open_is_seen_to_move_though_no_wall_is_behind() -> None:
+    for lidar, fov in ((WIDE, math.tau), (JACKAL, math.radians(270))):
+        watch = Watch(lidar, (), fov=fov)
+        *_, obstacles = watch.walk(lambda t: (2.0, -0.8 + 0.6 * t), 15)
+        assert nearest(obstacles, 2.0, 0.1).velocity_y == pytest.approx(0.6, abs=0.1)
+
+
+def test_what_comes_into_view_as_the_robot_turns_does_not_move() -> None:
+    watch = Watch(JACKAL, ROOM, fov=math.radians(270))
+    for i in range(80):
+        pose = Pose(x=0.0, y=0.0, yaw=0.1 * i)
+        obstacles = watch.scan((1.5, 0.4, 0.4), (-1.5, 1.0, 0.3), (0.4, -2.0, 0.4), pose=pose)
+        assert all(speed(one) == 0.0 for one in obstacles), (i, obstacles)
+
+
 def test_a_wall_is_no_obstacle_but_a_person_in_front_of_it_is() -> None:
     watch = Watch()
     for _ in range(5):

@@ -43,6 +43,7 @@ COMMANDS = {
     "keys zenohd": ("keys:zenohd", "Print the configuration of a router for a larger site."),
     "teleop": ("teleop:teleop", "Drive by keys or by a gamepad."),
     "page": ("page:page", "Serve the operator page: the robot in a browser."),
+    "foxglove": ("foxglove:foxglove", "Show the robot in Foxglove or Lichtblick, live."),
     "audit": ("audit:audit", "Show who did what to the robot."),
     "topic list": ("topic:list_", "List topics, their rates, and who talks to whom."),
     "topic echo": ("topic:echo", "Show messages as they come."),

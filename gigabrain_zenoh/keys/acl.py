@@ -72,7 +72,7 @@ OPERATOR = Rights(
         MAP_SAVE,
     ),
     answers=(PARAM, DESCRIBE),
-    names=("page", "recorder", "button"),
+    names=("page", "foxglove", "recorder", "button"),
 )
 FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer")  # where no robot is named
 Rule = dict[str, Any]

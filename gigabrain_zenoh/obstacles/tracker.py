@@ -9,6 +9,7 @@ from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle
 from gigabrain_zenoh.obstacles.clusters import Cluster, find_clusters
+from gigabrain_zenoh.obstacles.free_space import FreeSpace, Seen
 from gigabrain_zenoh.obstacles.track import Track
 
 Floats = NDArray[np.float64]
@@ -28,6 +29,7 @@ class ObstacleTracker:
 
     def __init__(self) -> None:
         self._tracks: list[Track] = []
+        self._space = FreeSpace()
         self._boot = self._tick = self._ids = 0
 
     def update(
@@ -41,6 +43,7 @@ class ObstacleTracker:
         dt = (tick - self._tick) * TICK_S
         if boot != self._boot or dt > LONGEST_GAP_S:
             self._tracks.clear()
+            self._space.clear()
         elif dt <= 0:
             return self._told(pose)
         self._boot, self._tick = boot, tick
@@ -52,6 +55,7 @@ class ObstacleTracker:
         for i, j in taken.items():
             self._correct(self._tracks[i], clusters[j], lidar, pose)
         self._tracks = [track for track in self._tracks if _lives(track)]
+        self._judge(Seen(tick, _placed(hits, pose), lidar, abs(spacing), pose))
         for j in set(range(len(clusters))) - set(taken.values()):
             if clusters[j].whole:
                 self._begin(clusters[j], places[j])
@@ -86,6 +90,13 @@ class ObstacleTracker:
             x, y = _place(cluster, lidar, pose, track.radius)
             track.correct(x, y, track.radius, PARTLY * cluster.noise)
 
+    def _judge(self, scan: Seen) -> None:
+        """Which things move: what only turns another side to the robot does not."""
+        self._space.see(scan)
+        for t in self._tracks:
+            if t.seems_to_move():
+                t.moving = self._space.shows_motion(t.x, t.y, t.velocity_x, t.velocity_y, t.radius)
+
     def _begin(self, cluster: Cluster, place: tuple[float, float]) -> None:
         self._ids += 1
         x, y = place
@@ -101,6 +112,14 @@ class ObstacleTracker:
 
 def _lives(track: Track) -> bool:
     return track.unseen_s < (FORGET_S if track.seen >= SEEN + 1 else FORGET_NEW_S)
+
+
+def _placed(hits: Floats, pose: Pose) -> Floats:
+    """`hits` (n, 2) of the body's frame in that of `pose`."""
+    cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
+    x = pose.x + cosine * hits[:, 0] - sine * hits[:, 1]
+    y = pose.y + sine * hits[:, 0] + cosine * hits[:, 1]
+    return np.column_stack((x, y))
 
 
 def _place(cluster: Cluster, lidar: Lidar, pose: Pose, radius: float) -> tuple[float, float]:
