@@ -150,25 +150,37 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         if body.current:
             bus.publish(WORLD, step(config, body.current.description, scan), basis=scan.basis)
 
-    if config.mapping == "off":
-        bus.latest(SCAN, see)
-    else:
-        _follow(config, bus, body)
+    if config.mapping != "off":
+        await _follow(config, bus, body, ready)
+        return
+    bus.latest(SCAN, see)
     ready()
     await bus.failed
 
 
-def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body]) -> None:
-    """Worlds with the obstacles in them, each in its place by the odometry."""
-    surroundings = Surroundings()
+async def _follow(
+    config: PerceptionConfig, bus: Bus, body: Latest[Body], ready: Callable[[], None]
+) -> None:
+    """Worlds with the obstacles in them, each in its place by the odometry; then the map."""
+    from gigabrain_zenoh.mapper import Mapper  # numba and gtsam: only who makes maps pays
+
+    surroundings, mapper = Surroundings(), Mapper(config, bus, body)
 
     def see(scan: LaserScan, pose: Pose | None) -> None:
-        if body.current:
-            description = body.current.description
-            world = step(config, description, scan)
-            world = surroundings.add(world, description.lidar, scan, pose)
-            bus.publish(WORLD, world, basis=scan.basis)
+        if body.current is None:
+            return
+        description = body.current.description
+        world = step(config, description, scan)
+        bus.publish(
+            WORLD, surroundings.add(world, description.lidar, scan, pose), basis=scan.basis
+        )
+        mapper.see(scan, world.scan_problem)
 
     placed = PlacedScans(see)
     bus.latest(STATE, placed.state)
     bus.latest(SCAN, placed.scan)
+    ready()
+    try:
+        await bus.failed
+    finally:
+        mapper.close()

@@ -145,7 +145,8 @@ def moved(frame: Pose, points: Floats) -> Floats:
     """Points (n, 2) given in `frame`, in the frame that `frame` is given in."""
     cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
     turned: Floats = points @ np.array(((cosine, sine), (-sine, cosine)))
-    return turned + np.array((frame.x, frame.y))
+    there: Floats = turned + np.array((frame.x, frame.y))
+    return there
 
 
 def _ahead(points: Floats, here: Pose) -> Floats:

@@ -62,6 +62,8 @@ COMMANDS = {
     "param list": ("param:list_", "List what may be changed while the robot runs."),
     "param get": ("param:get", "Show one value."),
     "param set": ("param:set_", "Change one value."),
+    "map save": ("map:save", "Save the map that a robot makes."),
+    "map info": ("map:info", "Check a saved map, and tell its size."),
     "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
     "worlds": ("names:worlds", "List the simulated worlds that there are."),
@@ -80,6 +82,7 @@ COMMANDS = {
     "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
     "bench plan": ("bench_plan:plan", "Global planning, timed and checked."),
+    "bench slam": ("bench_slam:slam", "Maps from recorded laser logs, and their errors."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
 }
@@ -91,6 +94,7 @@ GROUPS = {
     "node": "The processes of a robot.",
     "task": "What the robot was sent to do.",
     "param": "What may be changed at run time.",
+    "map": "Maps that a robot has made.",
     "bench": "Measure this machine.",
     "schema": "Messages.",
 }

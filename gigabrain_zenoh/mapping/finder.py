@@ -3,7 +3,6 @@
 from gigabrain_zenoh.mapping.background import Background, Take
 from gigabrain_zenoh.mapping.field import Field
 from gigabrain_zenoh.mapping.localizer import Localizer, Place, View
-from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.relocalize import search
 from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, compose
 
@@ -13,16 +12,15 @@ SEARCH_SCANS = 8  # after which what a search has found is taken
 class Finder:
     """Where the robot is in a map that does not change."""
 
-    def __init__(self, field: Field, sensor: Floats, why: str, background: Background) -> None:
-        self._localizer, self._sensor = Localizer(field, why), sensor
+    def __init__(self, field: Field, why: str, background: Background) -> None:
+        self._localizer = Localizer(field, why)
         self._background = background
         self._moved = IDENTITY  # since the scan that a search goes by
         self._lost = 0  # how often
 
-    def step(self, scan: Scan, motion: Floats, noise: Floats) -> Place:
+    def step(self, view: View, motion: Floats, noise: Floats) -> Place:
         """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
         self._moved = compose(self._moved, motion)
-        view = View(scan.points, scan.free, self._sensor)
         place = self._localizer.step(view, motion, noise)
         if self._localizer.wants_search and self._background.idle:
             self._search(view)
@@ -39,7 +37,7 @@ class Finder:
         self._moved = IDENTITY
 
         def work() -> Take:
-            found = search(localizer.map, view.hits, view.free, view.sensor)
+            found = search(localizer.map, view.scan.points, view.scan.free, view.sensor)
 
             def take() -> None:
                 if number == self._lost:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from gigabrain_zenoh.mapping.local_map import Buckets, Image, buckets, gather, image
+from gigabrain_zenoh.mapping.local_map import LocalMap, build
 from gigabrain_zenoh.mapping.matching import Fit, Found, Window, icp, search, thinned
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.se2 import Floats, between, compose, inverse_of, wrapped
@@ -56,12 +56,6 @@ class Match:
     inliers: float  # share of the points that ICP laid onto lines
 
 
-@dataclass(frozen=True, slots=True)
-class _Local:
-    buckets: Buckets
-    image: Image
-
-
 class FrontEnd:
     """Tracks the robot from scan to scan. The first scan lies at `pose`."""
 
@@ -69,7 +63,7 @@ class FrontEnd:
         self._spacing = spacing
         self._scans: list[Scan] = []
         self._poses: list[Floats] = []
-        self._local: _Local | None = None
+        self._local: LocalMap | None = None
         self._adrift = _Adrift()
         self.pose = pose
 
@@ -96,15 +90,14 @@ class FrontEnd:
         """Match to these scans from now on, the nearest of them last."""
         first = _first(np.array(poses), self._spacing)
         self._scans, self._poses = list(scans[first:]), list(poses[first:])
-        points, normals = gather(self._scans, np.array(self._poses), self.pose)
-        self._local = _Local(buckets(points, normals), image(points, CELL, SIGMA, GATE))
+        self._local = build(self._scans, np.array(self._poses), self.pose, CELL, SIGMA)
 
     @property
     def held(self) -> tuple[list[Scan], list[Floats]]:
         """The scans of the local map, and where they are in the front end's frame."""
         return self._scans, self._poses
 
-    def _match(self, local: _Local, scan: Scan, guess: Floats) -> Match:
+    def _match(self, local: LocalMap, scan: Scan, guess: Floats) -> Match:
         if len(scan.points) < FEW:
             return Match(guess, self._adrift.covariance, "odometry", 0.0, 0.0)
         covariance = self._adrift.covariance
@@ -122,7 +115,7 @@ class FrontEnd:
             fit.inliers,
         )
 
-    def _recover(self, local: _Local, scan: Scan, guess: Floats) -> Match | None:
+    def _recover(self, local: LocalMap, scan: Scan, guess: Floats) -> Match | None:
         """Where the scan fits beyond doubt, wide round the guess or round where it was before."""
         for start in (guess, self.pose):
             found = search(local.image, scan.points, start, WIDE)
@@ -175,7 +168,7 @@ def _window(adrift: _Adrift) -> Window:
     return Window(0.15 + 0.2 * effort, 0.12 + 0.23 * effort)
 
 
-def _fit(local: _Local, scan: Scan, found: Found, guess: Floats, covariance: Floats) -> Fit:
+def _fit(local: LocalMap, scan: Scan, found: Found, guess: Floats, covariance: Floats) -> Fit:
     points = thinned(scan.points, POINTS)
     return icp(local.buckets, points, found.pose, GATE, inverse_of(covariance), guess)
 

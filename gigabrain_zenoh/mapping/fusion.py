@@ -16,7 +16,7 @@ from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_zenoh.mapping.se2 import Floats, between, compose
 
 KEPT = 250  # states, so 5 s
-GAP_TICKS = 10  # no pose is made up between states that lie farther apart
+GAP_TICKS = 25  # no pose is made up between states that lie farther apart
 
 REST_TICKS = 25  # without a turn of a wheel, then what the gyro says is its bias
 REST_RATE = 0.02  # [rad/s], faster is no bias: somebody turns the robot

@@ -7,16 +7,15 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.mapping.background import PATIENCE_S, Background
 from gigabrain_zenoh.mapping.field import field_of
 from gigabrain_zenoh.mapping.finder import Finder
-from gigabrain_zenoh.mapping.localizer import Place
+from gigabrain_zenoh.mapping.localizer import Place, View
 from gigabrain_zenoh.mapping.map_file import Arrays, SavedMap
-from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.se2 import Floats
 
 
 class Chart(Protocol):
     """A map, and where the robot is in it."""
 
-    def step(self, scan: Scan, motion: Floats, noise: Floats) -> Place:
+    def step(self, view: View, motion: Floats, noise: Floats) -> Place:
         """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
 
     def lose(self, why: str) -> None:
@@ -24,6 +23,9 @@ class Chart(Protocol):
 
     def grid(self) -> OccupancyGrid:
         """The map as others see it."""
+
+    def settle(self) -> bool:
+        """Begin nothing new beside, until `to_save`; whether nothing is under way there."""
 
     def to_save(self) -> tuple[SavedMap, Arrays]:
         """What there is to save. Raises Refused."""
@@ -38,15 +40,15 @@ class Chart(Protocol):
 class KnownMap:
     """A saved map, which stays as it is."""
 
-    def __init__(self, saved: SavedMap, sensor: Floats, patience_s: float = PATIENCE_S) -> None:
+    def __init__(self, saved: SavedMap, patience_s: float = PATIENCE_S) -> None:
         self._saved, self._background = saved, Background(patience_s)
         field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
-        self._finder = Finder(field, sensor, "looking for the robot in the map", self._background)
+        self._finder = Finder(field, "looking for the robot in the map", self._background)
 
-    def step(self, scan: Scan, motion: Floats, noise: Floats) -> Place:
+    def step(self, view: View, motion: Floats, noise: Floats) -> Place:
         """See Chart."""
         self._background.at_scan()
-        return self._finder.step(scan, motion, noise)
+        return self._finder.step(view, motion, noise)
 
     def lose(self, why: str) -> None:
         """See Chart."""
@@ -63,6 +65,10 @@ class KnownMap:
             origin_y=self._saved.origin_y,
             cells=self._saved.cells.tobytes(),
         )
+
+    def settle(self) -> bool:
+        """See Chart."""
+        return True
 
     def to_save(self) -> tuple[SavedMap, Arrays]:
         """Never: it is saved already."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import kernel
 from gigabrain_zenoh.mapping.points import Points, Scan
-from gigabrain_zenoh.mapping.se2 import Floats, transform
+from gigabrain_zenoh.mapping.se2 import Floats
 
 BUCKET = 0.15  # [m]
 REACH = 30.0  # [m], points farther from the centre are left out
@@ -36,20 +36,61 @@ class Image:
     cell: float  # [m]
 
 
-def gather(scans: Sequence[Scan], poses: Floats, centre: Floats) -> tuple[Points, Points]:
-    """The points of `scans` at `poses` (m, 3) within reach of `centre`, and their normals."""
-    placed = zip(scans, poses, strict=True)
-    points = np.concatenate([transform(pose, scan.points) for scan, pose in placed])
-    placed = zip(scans, poses, strict=True)
-    turned = [transform(pose * (0, 0, 1), scan.normals) for scan, pose in placed]
+@dataclass(frozen=True, slots=True)
+class LocalMap:
+    """What scans are searched in, and laid onto."""
+
+    image: Image
+    buckets: Buckets
+
+
+def build(
+    scans: Sequence[Scan], poses: Floats, centre: Floats, cell: float, sigma: float
+) -> LocalMap:
+    """The map of `scans` at `poses` (m, 3) within reach of `centre`.
+
+    The likelihood of a hit is exp(-d²/2s²): d to the nearest point, s `sigma`. Where several points
+    share a cell, the last is laid onto.
+    """
+    points, normals = _placed(
+        np.concatenate([scan.points for scan in scans]),
+        np.concatenate([scan.normals for scan in scans]),
+        np.array([len(scan.points) for scan in scans]),
+        poses,
+    )
     near = (np.abs(points - centre[:2]) < REACH).all(axis=1)
-    return points[near].astype(np.float32), np.concatenate(turned)[near].astype(np.float32)
+    points, normals = points[near], normals[near]
+    if not len(points):
+        empty = Image(np.zeros((1, 1), np.float32), np.zeros(2), cell)
+        return LocalMap(empty, _buckets(points, normals))
+    blob = _blob(cell, sigma)
+    origin = points.min(axis=0).astype(np.float64) - len(blob) * cell
+    width, height = ((points.max(axis=0) - origin) / cell).astype(int) + len(blob)
+    cells = np.zeros((height, width), np.float32)
+    last = _stamp(cells, points, origin, cell, blob)
+    kept = last & normals.any(axis=1)
+    return LocalMap(Image(cells, origin, cell), _buckets(points[kept], normals[kept]))
 
 
-def buckets(points: Points, normals: Points) -> Buckets:
-    """Those of the points that have a normal, in buckets."""
-    useful = normals.any(axis=1)
-    points, normals = points[useful], normals[useful]
+@kernel
+def _placed(
+    points: Points, normals: Points, counts: NDArray[np.int64], poses: Floats
+) -> tuple[Points, Points]:
+    """Points and normals of scans, so many of each, at their poses."""
+    moved, turned = np.empty_like(points), np.empty_like(normals)
+    k = 0
+    for s in range(len(counts)):
+        cos, sin = np.cos(poses[s, 2]), np.sin(poses[s, 2])
+        for _ in range(counts[s]):
+            moved[k, 0] = poses[s, 0] + cos * points[k, 0] - sin * points[k, 1]
+            moved[k, 1] = poses[s, 1] + sin * points[k, 0] + cos * points[k, 1]
+            turned[k, 0] = cos * normals[k, 0] - sin * normals[k, 1]
+            turned[k, 1] = sin * normals[k, 0] + cos * normals[k, 1]
+            k += 1
+    return moved, turned
+
+
+def _buckets(points: Points, normals: Points) -> Buckets:
     if not len(points):
         return Buckets(points, normals, np.zeros(2, np.int32), 1, np.zeros(2))
     origin = points.min(axis=0).astype(np.float64)
@@ -81,20 +122,6 @@ def _sorted(
     return starts, order
 
 
-def image(points: Points, cell: float, sigma: float, margin: float) -> Image:
-    """The likelihood exp(-d²/2s²) of a hit: d to the nearest of `points`, s `sigma`.
-
-    Ends `margin` [m] beyond the points.
-    """
-    if not len(points):
-        return Image(np.zeros((1, 1), np.float32), np.zeros(2), cell)
-    origin = points.min(axis=0).astype(np.float64) - margin
-    width, height = ((points.max(axis=0) + margin - origin) / cell).astype(int) + 1
-    cells = np.zeros((height, width), np.float32)
-    _stamp(cells, points, origin, cell, _blob(cell, sigma))
-    return Image(cells, origin, cell)
-
-
 def _blob(cell: float, sigma: float) -> NDArray[np.float32]:
     reach = int(np.ceil(2.5 * sigma / cell))
     along = np.arange(-reach, reach + 1) * cell
@@ -108,17 +135,18 @@ def _stamp(
     origin: Floats,
     cell: float,
     blob: NDArray[np.float32],
-) -> None:
-    """Put the blob on every cell that holds a point; where blobs meet, the likelier counts."""
-    height, width = cells.shape
-    reach = len(blob) // 2
-    for k in range(len(points)):
+) -> NDArray[np.bool_]:
+    """Put the blob on every cell that holds a point, the likelier counts; who is last in a cell."""
+    side = len(blob)
+    last = np.zeros(len(points), np.bool_)
+    for k in range(len(points) - 1, -1, -1):
         column = int((points[k, 0] - origin[0]) / cell)
         row = int((points[k, 1] - origin[1]) / cell)
-        inside = reach <= column < width - reach and reach <= row < height - reach
-        if not inside or cells[row, column] >= 1.0:  # outside, or stamped before
+        if cells[row, column] >= 1.0:  # stamped before
             continue
-        for i in range(2 * reach + 1):
-            for j in range(2 * reach + 1):
-                y, x = row - reach + i, column - reach + j
-                cells[y, x] = max(cells[y, x], blob[i, j])
+        last[k] = True
+        left, top = column - side // 2, row - side // 2
+        for i in range(side):
+            for j in range(side):
+                cells[top + i, left + j] = max(cells[top + i, left + j], blob[i, j])
+    return last

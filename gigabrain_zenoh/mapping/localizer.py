@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gigabrain_zenoh.mapping.field import Field, fit
-from gigabrain_zenoh.mapping.points import Points
+from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.relocalize import FEWEST_POINTS, Candidate, apart
 from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, compose, turned
 
@@ -27,11 +27,10 @@ NOWHERE = np.diag((1e3, 1e3, math.pi)) ** 2  # the covariance of what is not kno
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One scan in the body's frame [m]."""
+    """One scan in the body's frame."""
 
-    hits: Points  # (n, 2), where beams ended
-    free: Points  # (m, 2), how far others were seen to go
-    sensor: Floats  # (2,), where the beams start
+    scan: Scan
+    sensor: Floats  # (2,) [m], where the beams start
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +109,7 @@ class Localizer:
         """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
         self._unsearched += 1
         self._moved = compose(self._moved, motion)
-        seen = len(view.hits) >= FEWEST_POINTS
+        seen = len(view.scan.points) >= FEWEST_POINTS
         self._places = [
             _followed(self.map, _predicted(one, motion, noise), view if seen else None)
             for one in self._places
@@ -163,7 +162,7 @@ def _followed(into: Field, one: Hypothesis, view: View | None) -> Hypothesis:
     if view is None:
         return one
     prior = _inverse(one.covariance)
-    found = fit(into, view.hits, view.free, view.sensor, one.pose, prior)
+    found = fit(into, view.scan.points, view.scan.free, view.sensor, one.pose, prior)
     if found.score < LOST_SCORE:
         return replace(one, score=found.score, good=0, bad=one.bad + 1)
     return replace(

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gigabrain_zenoh.mapping.drift import Drift
+from gigabrain_zenoh.mapping.drift import Drift, Rates
 from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
-from gigabrain_zenoh.mapping.local_map import buckets, gather, image
+from gigabrain_zenoh.mapping.local_map import build
 from gigabrain_zenoh.mapping.matching import Window, icp, search, thinned
 from gigabrain_zenoh.mapping.se2 import (
     IDENTITY,
@@ -45,8 +45,8 @@ OPEN = 1e-3 * np.eye(3)  # information, so that open directions can be inverted
 class LoopSearch:
     """Looks for loops from each keyframe in turn. One thread at a time."""
 
-    def __init__(self) -> None:
-        self.drift = Drift()
+    def __init__(self, rates: Rates) -> None:
+        self.drift = Drift(rates)
         self.waiting: list[Edge] = []  # loops without a second witness
         self.searched = -SPACING  # [m] of travel
 
@@ -118,13 +118,13 @@ def _attempt(
     """The loop from `there` to `here`, if the scan of the one fits into the place of the other."""
     place = around(travel, there, here)
     scans = [keyframe.scan for keyframe in keyframes[place]]
-    points, normals = gather(scans, between(poses[there], poses[place]), IDENTITY)
+    local = build(scans, between(poses[there], poses[place]), IDENTITY, CELL, SIGMA)
     guess, scan = between(poses[there], poses[here]), keyframes[here].scan.points
-    found = search(image(points, CELL, SIGMA, GATE), scan, guess, WINDOW)
+    found = search(local.image, scan, guess, WINDOW)
     if found.score < SCORE:
         return None
     free = np.zeros((3, 3))
-    fit = icp(buckets(points, normals), thinned(scan, POINTS), found.pose, GATE, free, found.pose)
+    fit = icp(local.buckets, thinned(scan, POINTS), found.pose, GATE, free, found.pose)
     slid = float(np.hypot(*(fit.pose - found.pose)[:2]))
     if fit.inliers < INLIERS or fit.rms > RMS or slid > MOVED:
         return None

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import Finite, Fraction, Positive
 from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.logs import state_dir
 
 Cells = NDArray[np.int8]
 Arrays = Mapping[str, NDArray[Any]]
@@ -54,6 +55,20 @@ class SavedMap:
     resolution: float  # [m]
     origin_x: float  # [m], of the corner of cell (0, 0)
     origin_y: float  # [m]
+
+
+def path_of(name: str) -> Path:
+    """The YAML file of a map by its name, or by its path if it looks like one."""
+    if "/" in name or name.endswith((".yaml", ".yml")):
+        return Path(name)
+    return state_dir() / "maps" / f"{name}.yaml"
+
+
+def in_words(found: SavedMap) -> str:
+    """How large a map is, for people."""
+    height, width = (cells * found.resolution for cells in found.cells.shape)
+    area = np.count_nonzero(_free(found)) * found.resolution**2
+    return f"{width:.1f} x {height:.1f} m, {area:.1f} m² of it free"
 
 
 def load(path: Path) -> SavedMap:
@@ -106,8 +121,7 @@ def save(path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False) -
 
 def what_is_wrong(found: SavedMap) -> str:
     """Why this is no map worth keeping, or an empty text."""
-    free = np.count_nonzero((found.cells >= 0) & (found.cells <= FREE_PERCENT))
-    area = free * found.resolution**2
+    area = np.count_nonzero(_free(found)) * found.resolution**2
     if area < LEAST_FREE_M2:
         return f"the map is empty: {area:.2f} m² of it are free"
     length = np.count_nonzero(found.cells >= OCCUPIED_PERCENT) * found.resolution
@@ -116,12 +130,16 @@ def what_is_wrong(found: SavedMap) -> str:
     return ""
 
 
+def _free(found: SavedMap) -> NDArray[np.bool_]:
+    return (found.cells >= 0) & (found.cells <= FREE_PERCENT)
+
+
 def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
     """What to write, by name."""
     height, width = found.cells.shape
     grey = np.full((height, width), UNKNOWN, np.uint8)
     grey[found.cells >= OCCUPIED_PERCENT] = OCCUPIED
-    grey[(found.cells >= 0) & (found.cells <= FREE_PERCENT)] = FREE
+    grey[_free(found)] = FREE
     image = path.with_suffix(".pgm").name
     arrays = io.BytesIO()
     np.savez_compressed(arrays, allow_pickle=False, **graph)

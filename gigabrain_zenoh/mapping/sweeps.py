@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.mapping.grid import Grid
-from gigabrain_zenoh.mapping.points import Points, Scan
+from gigabrain_zenoh.mapping.localizer import View
+from gigabrain_zenoh.mapping.points import Points
 from gigabrain_zenoh.mapping.se2 import Floats, between, compose
 
 APART_M, APART_RAD = 0.1, math.radians(10)  # nearer ones replace one another
@@ -23,12 +24,13 @@ class Sweep:
     relative: Floats  # (3,), of the body in that keyframe's frame
     hits: Points  # (n, 2), in the body's frame [m]
     free: Points  # (m, 2)
+    sensor: Floats  # (2,), where the beams start
 
-    def draw(self, into: Grid, keyframe: Floats, sensor: Floats) -> None:
-        """Draw it, `keyframe` (3,) being in the map now and `sensor` (2,) on the body."""
+    def draw(self, into: Grid, keyframe: Floats) -> None:
+        """Draw it, `keyframe` (3,) being in the map now."""
         pose = compose(keyframe, self.relative)
-        beam = compose(pose, np.array((sensor[0], sensor[1], 0.0)))
-        offset = sensor.astype(np.float32)
+        beam = compose(pose, np.array((self.sensor[0], self.sensor[1], 0.0)))
+        offset = self.sensor.astype(np.float32)
         into.draw(beam, self.hits - offset, self.free - offset)
 
 
@@ -47,9 +49,9 @@ class Sweeps:
         """As they are now."""
         return list(self._kept)
 
-    def add(self, scan: Scan, keyframe: int, relative: Floats, pose: Floats) -> Sweep:
+    def add(self, view: View, keyframe: int, relative: Floats, pose: Floats) -> Sweep:
         """One more, seen from `pose` in the map; while the robot stands, the newest is enough."""
-        sweep = Sweep(keyframe, relative, scan.points, scan.free)
+        sweep = Sweep(keyframe, relative, view.scan.points, view.scan.free, view.sensor)
         if self._standing:
             self._kept.pop()
         self._kept.append(sweep)
@@ -64,6 +66,7 @@ class Sweeps:
         return {
             "sweep_keyframes": np.array([one.keyframe for one in self._kept], np.int32),
             "sweep_relative": np.array([one.relative for one in self._kept]).reshape(-1, 3),
+            "sweep_sensor": np.array([one.sensor for one in self._kept]).reshape(-1, 2),
             "sweep_hits": np.concatenate([empty, *(one.hits for one in self._kept)]),
             "sweep_hits_each": np.array([len(one.hits) for one in self._kept], np.int32),
             "sweep_free": np.concatenate([empty, *(one.free for one in self._kept)]),
@@ -77,12 +80,14 @@ class Sweeps:
         relative = arrays["sweep_relative"].astype(np.float64)
         if len(on) and not 0 <= on.min() <= on.max() < keyframes:
             raise ValueError(f"a sweep hangs on keyframe {on.max()} of {keyframes}")
-        if relative.shape != (len(on), 3) or not np.isfinite(relative).all():
-            raise ValueError(f"{len(on)} sweeps, but poses of shape {relative.shape}")
+        sensor = arrays["sweep_sensor"].astype(np.float64)
+        for name, values, columns in (("poses", relative, 3), ("sensors", sensor, 2)):
+            if values.shape != (len(on), columns) or not np.isfinite(values).all():
+                raise ValueError(f"{len(on)} sweeps, but {name} of shape {values.shape}")
         hits = _split(arrays["sweep_hits"], arrays["sweep_hits_each"])
         free = _split(arrays["sweep_free"], arrays["sweep_free_each"])
-        rows = zip(on, relative, hits, free, strict=True)
-        return cls(Sweep(int(k), r, h, f) for k, r, h, f in rows)
+        rows = zip(on, relative, hits, free, sensor, strict=True)
+        return cls(Sweep(int(k), r, h, f, s) for k, r, h, f, s in rows)
 
 
 def _split(rows: NDArray[Any], each: NDArray[Any]) -> list[Points]:

@@ -13,6 +13,7 @@ from gigabrain_zenoh.tasks import conditions
 from gigabrain_zenoh.tasks.mission import Mission, Patrol, PatrolFile, Place, Step
 
 MOST_STEPS = 2000  # with every `tree` written out
+DRIVING = ("goto", "patrol", "explore", "visit", "battery_below")
 Way = tuple[str | int, ...]  # keys and numbers, from the top of the file
 
 
@@ -55,10 +56,7 @@ def scripts(mission: Mission) -> Iterator[str]:
 
 def drives(mission: Mission) -> bool:
     """Whether a mission wants the robot to be anywhere."""
-    wanted = (
-        s.explore or s.visit or s.patrol or s.battery_below or s.goto for _, s in _steps(mission)
-    )
-    return any(one is not None for one in wanted)
+    return any(step.kind in DRIVING for _, step in _steps(mission))
 
 
 def _problems(mission: Mission) -> Iterator[tuple[Way, str]]:
