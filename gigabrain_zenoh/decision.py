@@ -65,6 +65,7 @@ class Thinker:
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """An intent per world, as soon as it comes; repeated with the newest tick at each state."""
     senses = behaviours.senses(config, bus)
+    await senses.warm_up()
     thinker, said = Thinker(config, senses), ""
     for name, expected in CHANGEABLE.items():
         bus.params.add_field(name, expected, lambda: thinker.config, thinker.configure)
@@ -96,7 +97,6 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
     states = bus.latest(STATE, decide)
     worlds = bus.latest(WORLD, see)
     bus.latest(SAFETY, verdicts.receive)
-    await senses.warm_up()
     ready()
     await bus.failed
 

@@ -38,6 +38,7 @@ SMALL = 250_000  # cells; plans in larger maps are made in a thread
 AGAIN_TICKS = 25  # a route is looked at twice a second, whatever happens
 NO_MAP = "nobody says where in a map the robot is; set perception: {mapping: slam} in its file"
 PATIENCE_NS, LOOK_NS = 700_000_000, 50_000_000  # for the first word of the place, when asked
+QUIET_S = 5.0  # of compiling, before people are told
 
 ANY_BODY = BodyDescription(
     robot_type="any", drive_type="differential",
@@ -71,7 +72,12 @@ class Navigating:
 
     async def warm_up(self) -> None:
         """Compile all that a driving robot calls."""
-        await asyncio.to_thread(_warm_up)
+        compiling = asyncio.ensure_future(asyncio.to_thread(_warm_up))
+        done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
+        if not done:
+            told = {"event": "compiling"}
+            log.info("compiling: the first start takes about a minute", extra={"data": told})
+        await compiling
 
     def see(self, state: RobotState) -> None:
         """Take note of each state."""
