@@ -32,7 +32,7 @@ class Executive:
 
     def __init__(self, read: Read, start: Start, saved: Saved) -> None:
         self._read, self._start, self._numbers = read, start, itertools.count(1)
-        self._count, self._boot, self._from_disk = saved.count, saved.boot, True
+        self._count, self._boot = saved.count, saved.boot
         self._jobs: list[Job] = []
         self._done: list[Task] = []
         self._outcome: Outcome | None = None
@@ -43,13 +43,14 @@ class Executive:
                 self._done.insert(0, _unreadable(one, error))
                 continue
             self._jobs.append(Job(one, mission, self._moment()))
+        self._from_disk = list(self._jobs)
 
     def meet(self, boot: int) -> None:
         """Take note of the driver's start: what the disk has of another one waits for a person."""
-        if self._from_disk and self._boot != boot:
-            for job in self._jobs:
+        if self._boot != boot:
+            for job in self._from_disk:
                 job.held, job.why_held = True, AFTER_A_RESTART
-        self._boot, self._from_disk = boot, False
+        self._boot, self._from_disk = boot, []
 
     def go_to(self, goal: Goal, how: How, source: str) -> str:
         """A new goal; its name. Raises Refused where too many wait."""
