@@ -137,12 +137,21 @@ class Bench:
         if self._running.done():
             self._running.result()
 
+    async def restart(self) -> None:
+        """End the node, and start it anew."""
+        await self._end()
+        self._ready.clear()
+        await self.__aenter__()
+
     async def __aexit__(
         self,
         kind: type[BaseException] | None,
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        await self._end()
+
+    async def _end(self) -> None:
         self._running.cancel()
         result = (await asyncio.gather(self._running, return_exceptions=True))[0]
         await self.bus.close()

@@ -115,6 +115,15 @@ class Plane:
             await asyncio.sleep(0.001)
         return asking.result()[0]
 
+    async def ask_at_once(self, service: Service[Q, R], request: Q) -> R:
+        """The same, while time stands still."""
+        return (await self.operator.ask(service, request, timeout_s=30.0))[0]
+
+    async def restart(self) -> None:
+        """End the node, and start it again."""
+        await self.bench.restart()
+        await self.bench.ready()
+
     async def _tick(self) -> None:
         self.tick += 1
         self._move()

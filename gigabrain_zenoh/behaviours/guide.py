@@ -22,6 +22,7 @@ NEARER_M = 0.3  # what counts as nearer
 REMEMBERED_TICKS = 500  # 10 s, that what was in the way stays in the plans
 MUCH_BETTER_M = 1.5  # so much better has another frontier to be, or it goes to and fro
 OPEN, FAR_M = 2.0, 1.5  # cost of a place worth visiting, and the way there at least [m]
+SURE_TICKS = 125  # 2.5 s: the map comes once a second
 SAME_M = 0.6  # a frontier so near is the same one: it moves as the map grows
 
 
@@ -77,6 +78,7 @@ class Guide:
         self._goal: Goal | None = None
         self._been: list[tuple[float, float]] = []
         self._nearest, self._nearest_tick, self._last_tick = math.inf, tick, tick
+        self._open_tick = tick  # when there was something left to be seen
         self._version += 1
 
     def _note(self, asked: Asked) -> None:
@@ -136,7 +138,8 @@ class Guide:
         for _ in range(len(self._been) + 10):
             goal = self._frontier(chart, here)
             if goal is None:
-                return self._ended("done", "all is mapped that can be reached")
+                return self._mapped(asked, chart)
+            self._open_tick = asked.tick
             if self._goal and math.hypot(goal.x - self._goal.x, goal.y - self._goal.y) > SAME_M:
                 self._leave(asked.tick)
             found = self._plan(goal, asked.here, chart)
@@ -145,6 +148,15 @@ class Guide:
                 return self._going(goal, found)
             self._been.append((goal.x, goal.y))
         return self._waiting("no way leads to what is still unknown")
+
+    def _mapped(self, asked: Asked, chart: Costmap) -> Route:
+        """Nothing is left to be seen, if that is still so once the map has caught up."""
+        cell = chart.cell(asked.here.x, asked.here.y)
+        if cell is None or chart.cells[cell] < 0:
+            return self._waiting("the map does not reach here yet")
+        if asked.tick - self._open_tick < SURE_TICKS:
+            return self._waiting("nothing new in sight; looking once more")
+        return self._ended("done", "all is mapped that can be reached")
 
     def _frontier(self, chart: Costmap, here: tuple[float, float]) -> Goal | None:
         """The best frontier; the present one, unless another is much better."""
