@@ -15,10 +15,11 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.limits import ZERO
 from gigabrain_zenoh.page.access import Access, check, tokens
 from gigabrain_zenoh.page.beside import free_port
-from gigabrain_zenoh.page.operator import Operator, Seat
+from gigabrain_zenoh.page.operator import Operator
 from gigabrain_zenoh.page.scene import Scene
 from gigabrain_zenoh.page.viewer import Viewer
 from gigabrain_zenoh.page.wire import Ask, GoalRequest
+from gigabrain_zenoh.seat import Seat
 from gigabrain_zenoh.settings import PageConfig
 from tests.bus_rig import Net, settle
 
@@ -108,7 +109,7 @@ class Seated:
             BODY, Body(description=load_robot("turtlebot3_waffle").description(), link="sim")
         )
         self.seat = Seat(self.scene)
-        self.one, self.two = Viewer(1, "operator"), Viewer(2, "operator")
+        self.one, self.two = 1, 2
 
     @property
     def speeds(self) -> list[float]:

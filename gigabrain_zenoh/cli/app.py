@@ -35,6 +35,7 @@ COMMANDS = {
     "keys zenohd": ("keys:zenohd", "Print the configuration of a router for a larger site."),
     "teleop": ("teleop:teleop", "Drive by keys or by a gamepad."),
     "page": ("page:page", "Serve the operator page: the robot in a browser."),
+    "foxglove": ("foxglove:foxglove", "Show the robot in Foxglove or Lichtblick, live."),
     "audit": ("audit:audit", "Show who did what to the robot."),
     "topic list": ("topic:list_", "List topics, their rates, and who talks to whom."),
     "topic echo": ("topic:echo", "Show messages as they come."),
@@ -70,6 +71,7 @@ COMMANDS = {
     "faults": ("faults:faults", "Break the robot in 44 ways, and see whether it stops."),
     "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
+    "bench plan": ("bench_plan:plan", "Global planning, timed and checked."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
 }

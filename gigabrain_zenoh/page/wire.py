@@ -9,9 +9,9 @@ from msgspec import Meta, Struct
 from gigabrain_schemas.base import Count, Finite, Pose, Text, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, OccupancyGrid, WorldModel
-from gigabrain_schemas.requests import GoalRequest
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import Image, LaserScan
+from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_zenoh.codec import DECODE_ERRORS
 
 ABOUT, MOMENT, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE = range(1, 9)  # to the browser

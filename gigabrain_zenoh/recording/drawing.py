@@ -1,21 +1,27 @@
 """What Foxglove, Lichtblick and Rerun draw of our messages: one conversion per message type.
 
-Frames by REP-105: map → odom → base_link → the lidar's own.
+The recorder and the live bridge have this table in common. Frames by REP-105: map → odom →
+base_link → the lidar's own.
 """
 
+import functools
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, cast
 
+import msgspec
 import numpy as np
+from foxglove import Schema
 from foxglove import messages as fox
 
 from gigabrain_schemas import arrays
 from gigabrain_schemas.base import Message, Pose
 from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import Intent, OccupancyGrid, PoseInMap
+from gigabrain_schemas.brain import Intent, Obstacle, OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.safety import LogRecord
 from gigabrain_schemas.sensors import Image, LaserScan
+from gigabrain_schemas.topics import CMD_VEL, INTENT, SAFETY, STATE, WORLD, Topic
+from gigabrain_zenoh.recording.schema import flat_schema
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
 LIDAR = "base_scan"  # as LaserScan has it
@@ -29,17 +35,42 @@ LEVELS = {
 }
 
 
+PLOTTED = {topic.key for topic in (STATE, WORLD, INTENT, CMD_VEL, SAFETY)}
+AMBER = fox.Color(r=0.96, g=0.62, b=0.04, a=0.6)
+TALL = 0.3  # [m], how high an obstacle is drawn
+AHEAD_S = 1.0  # how far its arrow reaches
+SLOW = 0.05  # [m/s], below it no arrow is drawn
+GONE = fox.Duration(sec=1)  # after so long without news an obstacle is no longer drawn
+
+
 class Drawn(NamedTuple):
     """One message for a viewer."""
 
-    topic: str  # below /viz
-    schema: Any  # a message type of foxglove's, with get_schema
-    data: bytes  # Protocol Buffers
+    topic: str
+    encoding: str  # protobuf or json
+    schema: Callable[[], Schema]
+    data: bytes
 
 
 def of(topic: str, message: Any) -> Drawn:
     """A message of foxglove's, encoded."""
-    return Drawn(topic, type(message), message.encode())
+    return Drawn(f"/viz/{topic}", "protobuf", type(message).get_schema, message.encode())
+
+
+def numbers(topic: Topic[Any], message: Message) -> Drawn:
+    """The numbers of a message, for plots; what is drawn anyway is left out."""
+    if isinstance(message, WorldModel):
+        message = msgspec.structs.replace(message, hits=b"", obstacles=())
+    elif isinstance(message, Intent):
+        message = msgspec.structs.replace(message, trajectory=())
+    schema = functools.partial(json_schema, topic.type)
+    name = f"/viz/{topic.key.rpartition('/')[2]}_numbers"
+    return Drawn(name, "json", schema, msgspec.json.encode(message))
+
+
+def json_schema(kind: type[Message]) -> Schema:
+    """The schema of one of our messages, as viewers accept it."""
+    return Schema(name=f"gigabrain.{kind.__name__}", encoding="jsonschema", data=flat_schema(kind))
 
 
 def stamp(message: Message) -> fox.Timestamp:
@@ -62,24 +93,36 @@ class Drawer:
 
     def __init__(self) -> None:
         self._odometry = Pose(x=0.0, y=0.0, yaw=0.0)
+        self._thought = (0, -1)  # boot and basis of the intent whose path was drawn last
         self._converters: dict[type[Message], Callable[[Any, str], Iterable[Drawn]]] = {
             LaserScan: self._scan,
             OccupancyGrid: self._map,
             PoseInMap: self._pose,
             Intent: self._path,
+            WorldModel: self._obstacles,
             Image: self._image,
             LogRecord: self._log,
             RobotState: self._state,
             Body: self._body,
         }
 
-    def draws(self, kind: type[Message]) -> bool:
-        """Whether there is anything to see of this type of message."""
-        return kind in self._converters
+    def draws(self, topic: Topic[Any]) -> bool:
+        """Whether there is anything to see of a topic."""
+        return topic.key in PLOTTED or topic.type in self._converters
 
-    def draw(self, message: Message, name: str = "") -> Iterable[Drawn]:
+    def draw(self, topic: Topic[Any], message: Message, name: str = "") -> Iterable[Drawn]:
         """What viewers show of `message`; `name` is the camera's, where there are several."""
-        return self._converters[type(message)](message, name)
+        if isinstance(message, Intent) and not self._thought_again(message):
+            return
+        if topic.type in self._converters:
+            yield from self._converters[topic.type](message, name)
+        if topic.key in PLOTTED:
+            yield numbers(topic, message)
+
+    def _thought_again(self, intent: Intent) -> bool:
+        """Whether it is new: it is said again with every tick, and drawn once."""
+        before, self._thought = self._thought, (intent.boot, intent.basis)
+        return before != self._thought
 
     def _scan(self, scan: LaserScan, _: str) -> Iterable[Drawn]:
         ranges = arrays.ranges(scan)
@@ -124,9 +167,31 @@ class Drawer:
 
     def _path(self, intent: Intent, _: str) -> Iterable[Drawn]:
         poses = [pose_of(point.x, point.y, point.yaw) for point in intent.trajectory]
-        if poses:
-            drawn = fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses)
-            yield of("path", drawn)
+        yield of("path", fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses))
+
+    def _obstacles(self, world: WorldModel, _: str) -> Iterable[Drawn]:
+        entities = [self._obstacle(world, one) for one in world.obstacles]
+        yield of("obstacles", fox.SceneUpdate(entities=entities))
+
+    @staticmethod
+    def _obstacle(world: WorldModel, one: Obstacle) -> fox.SceneEntity:
+        """A cylinder, and an arrow to where it will be."""
+        here = pose_of(one.x, one.y, 0.0)
+        wide = 2 * max(one.radius, 0.01)
+        body = fox.CylinderPrimitive(
+            pose=here, size=fox.Vector3(x=wide, y=wide, z=TALL), color=AMBER,
+            top_scale=1.0, bottom_scale=1.0,
+        )  # fmt: skip
+        speed = math.hypot(one.velocity_x, one.velocity_y)
+        arrow = fox.ArrowPrimitive(
+            pose=pose_of(one.x, one.y, math.atan2(one.velocity_y, one.velocity_x)),
+            shaft_length=AHEAD_S * speed, shaft_diameter=0.03,
+            head_length=0.08, head_diameter=0.08, color=AMBER,
+        )  # fmt: skip
+        return fox.SceneEntity(
+            timestamp=stamp(world), frame_id=ODOM, id=str(one.id), lifetime=GONE,
+            cylinders=[body], arrows=[arrow] if speed > SLOW else [],
+        )  # fmt: skip
 
     def _image(self, image: Image, name: str) -> Iterable[Drawn]:
         when = stamp(image)

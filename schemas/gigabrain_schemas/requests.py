@@ -37,36 +37,6 @@ class GateReply(Message, frozen=True, kw_only=True):
     gate: GateStatus
 
 
-class GoalRequest(Message, frozen=True, kw_only=True):
-    """Go there."""
-
-    x: Finite  # [m], in the map
-    y: Finite  # [m]
-    yaw: Finite | None = None  # [rad]; None for any
-
-
-class GoalReply(Message, frozen=True, kw_only=True):
-    """Whether the robot will go there."""
-
-    ok: bool
-    text: Text
-    goal: Name = ""  # the goal's name, to cancel it by
-
-
-class MissionRequest(Message, frozen=True, kw_only=True):
-    """Carry out a mission."""
-
-    mission: str  # the YAML text
-    source: Name = "anonymous"
-
-
-class MissionReply(Message, frozen=True, kw_only=True):
-    """Whether the robot will carry it out."""
-
-    ok: bool
-    text: Text
-
-
 class DescribeRequest(Message, frozen=True, kw_only=True):
     """Who are you? An empty request will do."""
 
