@@ -3,11 +3,11 @@
 import itertools
 from collections.abc import Callable, Iterator
 
-from msgspec.structs import asdict
+from msgspec.structs import asdict, replace
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import OccupancyGrid, Twist
+from gigabrain_schemas.brain import OccupancyGrid, Twist, WorldModel
 from gigabrain_schemas.safety import Health, LogRecord
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import (
@@ -70,7 +70,7 @@ class Scene:
                 frame="map" if in_map else "odom",
                 intent=self._intent.fresh(),
                 safety=self._safety.fresh(),
-                world=self._world.fresh(),
+                world=_without_hits(self._world.fresh()),
                 driving=driving,
                 viewers=viewers,
             ),
@@ -124,3 +124,8 @@ class Scene:
         if camera in self._images or len(self._images) < CAMERAS:
             sampled = self._images.setdefault(camera, Sampled(self._bus, IMAGE))
             sampled.take(key, encoding, payload)
+
+
+def _without_hits(world: WorldModel | None) -> WorldModel | None:
+    """The page has the scan."""
+    return replace(world, hits=b"") if world else None

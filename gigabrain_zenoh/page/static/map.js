@@ -123,6 +123,7 @@ export class MapView {
       pen.rotate(moment.pose.yaw)
       this.#paintFree(pen)
       this.#paintZones(pen)
+      this.#paintObstacles(pen)
       this.#paintPlan(pen)
       this.#paintRobot(pen)
       pen.restore()
@@ -186,6 +187,24 @@ export class MapView {
     if (v >= 0) pen.fillRect(Math.max(...xs), right, reach, left - right)
     else pen.fillRect(Math.min(...xs) - reach, right, reach, left - right)
     pen.globalAlpha = 1
+  }
+
+  /** What perception follows, and where it will be in a second; in the frame of the odometry. */
+  #paintObstacles(pen) {
+    const { world, state } = this.moment
+    if (!world || !state) return
+    pen.save()
+    pen.rotate(-state.pose.yaw)
+    pen.translate(-state.pose.x, -state.pose.y)
+    pen.beginPath()
+    for (const { x, y, radius, velocity_x: vx, velocity_y: vy } of world.obstacles) {
+      pen.moveTo(x + radius, y)
+      pen.arc(x, y, radius, 0, TAU)
+      pen.moveTo(x, y)
+      pen.lineTo(x + vx, y + vy)
+    }
+    this.#stroke(pen, this.colour.scan, 2)
+    pen.restore()
   }
 
   #paintPlan(pen) {
