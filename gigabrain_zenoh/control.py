@@ -17,7 +17,7 @@ from gigabrain_zenoh.gate import BRAIN
 from gigabrain_zenoh.limits import NO_CAPS, ZERO, clamp, limits_of, ramp
 from gigabrain_zenoh.pose_history import PoseHistory
 from gigabrain_zenoh.teleop import Teleop
-from gigabrain_zenoh.tracking_control import LONGEST_DELAY_TICKS, wanted
+from gigabrain_zenoh.tracking_control import LONGEST_DELAY_TICKS, undone, wanted
 
 log = logging.getLogger(__name__)
 
@@ -74,15 +74,18 @@ def step(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Memory,
         memory = replace(memory, holding=True, basis=state.tick)  # resting on the operator's eyes
     memory = replace(memory, opened=memory.opened or state.tick)
     limits = limits_of(body)
-    memory, wish = _wish(body, memory, inputs.state, intent, inputs.teleop)
+    memory, wish = _wish(body, memory, inputs, intent)
     target = clamp(wish, limits, inputs.caps)
     setpoint = ramp(memory.before, target, limits, TICK_S * memory.elapsed_ticks)
     if memory.opened == state.tick:  # the first command after enabling is zero
         setpoint = ZERO
+    gain_z = memory.gain_z
+    if intent and _follows(memory, intent, inputs.teleop):  # decision knows how the body turns
+        gain_z, memory = undone(intent.response.turn_gain), replace(memory, steady_ticks=0)
     needed = replace(
         setpoint,
         linear_x=setpoint.linear_x * memory.gain_x,
-        angular_z=setpoint.angular_z * memory.gain_z,
+        angular_z=setpoint.angular_z * gain_z,
     )
     allowed = clamp(needed, limits, inputs.caps)
     memory = replace(memory, setpoint=setpoint, wanted=needed, allowed=allowed)
@@ -146,16 +149,16 @@ def _at_rest(memory: Memory) -> Memory:
     )
 
 
+def _follows(memory: Memory, intent: Intent, teleop: Velocity | None) -> bool:
+    return intent.follow and not teleop and not memory.holding
+
+
 def _wish(
-    body: BodyDescription,
-    memory: Memory,
-    state: RobotState,
-    intent: Intent | None,
-    teleop: Velocity | None,
+    body: BodyDescription, memory: Memory, inputs: Inputs, intent: Intent | None
 ) -> tuple[Memory, Velocity]:
     """Where to: what the operator wants, else what decision wants, else nowhere."""
-    on_its_own = not teleop and not memory.holding
-    if intent and intent.follow and on_its_own:
+    state, teleop = inputs.state, inputs.teleop
+    if intent and _follows(memory, intent, teleop):
         start = memory.history.at(state.boot, intent.basis)
         if start is None:
             return memory, ZERO
@@ -165,8 +168,9 @@ def _wish(
     memory = replace(memory, off_track=False)
     if teleop:
         return memory, teleop
-    twist = intent.twist if intent and on_its_own else None
-    return memory, twist or ZERO
+    if memory.holding or intent is None or intent.twist is None:
+        return memory, ZERO
+    return memory, intent.twist
 
 
 def _command(velocity: Velocity) -> CmdVel:

@@ -19,7 +19,8 @@ FARTHEST_OFF_M, FARTHEST_OFF_RAD = 0.3, 0.8  # a body so far off is not driving 
 DAMPING, STIFFNESS = 0.7, 10.0  # of the feedback; [1/m2]
 SLOWEST, QUICKEST = 0.8, 2.5  # [1/s], bounds of the feedback's bandwidth
 LATERAL_GAIN = 1.5  # [1/s], of bodies that can go sideways
-SHORTEST_LAG_S = 1e-3
+SHORTEST_LAG_S, LONGEST_LAG_S = 1e-3, 0.5
+MOST_GAIN = 2.0  # by which a slipping body is told to turn more, at most
 
 
 def wanted(
@@ -54,11 +55,16 @@ def wanted(
     return _tightest(body, _unicycle(planned, error))
 
 
+def undone(turn_gain: float) -> float:
+    """By how much a turn rate has to be multiplied for a body that has this gain."""
+    return max(1.0 / MOST_GAIN, min(MOST_GAIN, 1.0 / turn_gain))
+
+
 def predicted(
     here: Pose, velocity: Velocity, told: tuple[Velocity, ...], ticks: int, response: Response
 ) -> Pose:
     """Where the body will be in so many ticks, for which its commands are given already."""
-    follows = 1.0 - math.exp(-TICK_S / max(response.lag, SHORTEST_LAG_S))
+    follows = 1.0 - math.exp(-TICK_S / _lag(response))
     vx, vy, w = velocity.linear_x, velocity.linear_y, velocity.angular_z
     pose = here
     for command in told[-ticks:] if ticks else ():
@@ -69,6 +75,10 @@ def predicted(
         gone = compose(middle, Pose(x=vx * TICK_S, y=vy * TICK_S, yaw=w * TICK_S / 2))
         pose = gone
     return pose
+
+
+def _lag(response: Response) -> float:
+    return max(SHORTEST_LAG_S, min(LONGEST_LAG_S, response.lag))
 
 
 def _pose(point: TrajectoryPoint) -> Pose:
@@ -82,7 +92,7 @@ def _share(before: TrajectoryPoint, after: TrajectoryPoint, t: float) -> float:
 
 def _without_lag(before: TrajectoryPoint, after: TrajectoryPoint, response: Response) -> Velocity:
     """The steady command that takes a body with this lag from one point's velocity to the next."""
-    left = math.exp(-max(after.t - before.t, TICK_S) / max(response.lag, SHORTEST_LAG_S))
+    left = math.exp(-max(after.t - before.t, TICK_S) / _lag(response))
     return Velocity(
         linear_x=(after.linear_x - left * before.linear_x) / (1.0 - left),
         linear_y=(after.linear_y - left * before.linear_y) / (1.0 - left),

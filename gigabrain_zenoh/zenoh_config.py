@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import structs
 
-from gigabrain_schemas.topics import CMD_VEL, JOINT_CMD, TOPICS
+from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.acl import access_control, known_names
 from gigabrain_zenoh.keys.files import CA, CERTIFICATE, KEY, check_files
@@ -16,7 +16,6 @@ from gigabrain_zenoh.settings import Endpoint, RouterConfig
 SECURE, PLAIN = "tls/", "tcp/"
 PENDING = 4000  # links that may be on their way in; silent ones are dropped after a second
 FAR_TOO_LARGE = 4  # times a topic's bound
-COMMANDS_HZ = {CMD_VEL.key: 2000.0, JOINT_CMD.key: 2000.0}  # of each sender; 50 to 200 are meant
 IP_ENDPOINT = re.compile(r"(?:tcp|udp|tls|quic|ws)/[^/#?]+:(\d+)(?:[?#].*)?")
 LOCAL_ENDPOINT = re.compile(r"unixsock-stream/.+")
 
@@ -72,9 +71,8 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
         config["low_pass_filter"] = [
             _small(size) for size in sorted({topic.max_bytes for topic in TOPICS})
         ]
-    at_most_hz = COMMANDS_HZ if endpoint.listen else endpoint.at_most_hz
-    if at_most_hz:
-        config["downsampling"] = [_thinned(at_most_hz)]
+    if endpoint.at_most_hz:
+        config["downsampling"] = [_thinned(endpoint.at_most_hz)]
     if endpoint.namespace:
         config["namespace"] = endpoint.namespace
     return config

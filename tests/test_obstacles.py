@@ -218,13 +218,20 @@ def test_whoever_walks_behind_a_post_is_still_the_same() -> None:
     assert len(ids) == 1
 
 
-def test_whoever_is_gone_is_forgotten_within_a_second() -> None:
+def test_whoever_is_gone_is_forgotten_within_half_a_second() -> None:
     watch = Watch()
     *_, obstacles = watch.walk(lambda t: (1.5, 0.0), 8)
     assert len(obstacles) == 1
-    for _ in range(11):
-        obstacles = watch.scan()
-    assert obstacles == ()
+    told = [len(watch.scan()) for _ in range(6)]
+    assert told == [1, 1, 1, 1, 0, 0]
+
+
+def test_whoever_is_hidden_for_longer_is_forgotten_within_a_second() -> None:
+    watch = Watch()
+    watch.walk(lambda t: (2.5, 0.0), 8)
+    screen = [[one.id for one in watch.scan((1.2, 0.0, 0.5))] for _ in range(11)]
+    assert all(1 in ids for ids in screen[:9])
+    assert 1 not in screen[10]
 
 
 def test_whoever_stops_stands() -> None:

@@ -11,16 +11,18 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import CmdVel, Intent, Response, TrajectoryPoint
 from gigabrain_schemas.safety import SpeedCaps
+from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, STATE
+from gigabrain_zenoh import control
 from gigabrain_zenoh.control import Inputs, Memory, step
 from gigabrain_zenoh.planar import compose, relative
 from gigabrain_zenoh.tracking_control import predicted
-from tests.brain_rig import WAFFLE, state
+from tests.brain_rig import WAFFLE, Bench, body, state
 
-BODY = replace(
+AGILE = replace(
     WAFFLE, max_linear_speed=1.0, max_linear_acceleration=2.0, max_angular_acceleration=6
 )
-SIDEWAYS = replace(BODY, drive_type="omni", max_lateral_speed=1.0)
-CAR = replace(BODY, drive_type="ackermann", max_angular_speed=2.0)
+SIDEWAYS = replace(AGILE, drive_type="omni", max_lateral_speed=1.0)
+CAR = replace(AGILE, drive_type="ackermann", max_angular_speed=2.0)
 SLOW = Response(delay=0.1, lag=0.15)
 
 Motion = tuple[Pose, Velocity]
@@ -70,13 +72,18 @@ class Plant:
     """A body that answers after a delay, by and by; control, and its gate at rest at first."""
 
     def __init__(
-        self, body: BodyDescription = BODY, response: Response = SLOW, *, gain: float = 1.0
+        self,
+        body: BodyDescription = AGILE,
+        response: Response = SLOW,
+        *,
+        gain: float = 1.0,
+        slip: float = 1.0,
     ) -> None:
         self.body, self.memory, self.tick = body, Memory(), 0
         self.pose, self.velocity = Pose(x=0.0, y=0.0, yaw=0.0), Velocity()
         self._late = deque([CmdVel(linear_x=0.0)] * round(response.delay / 0.02))
         self._follows = 1 - math.exp(-0.02 / response.lag) if response.lag else 1.0
-        self._gain = gain
+        self._gain, self._slip = gain, slip
 
     def go(self, intent: Intent | None, caps: SpeedCaps | None = None) -> CmdVel:
         """One tick."""
@@ -90,7 +97,8 @@ class Plant:
         self.velocity = v = Velocity(
             linear_x=v.linear_x + share * (self._gain * acts.linear_x - v.linear_x),
             linear_y=v.linear_y + share * (self._gain * acts.linear_y - v.linear_y),
-            angular_z=v.angular_z + share * (self._gain * acts.angular_z - v.angular_z),
+            angular_z=v.angular_z
+            + share * (self._slip * self._gain * acts.angular_z - v.angular_z),
         )
         turned = v.angular_z * 0.02
         middle = replace(pose, yaw=pose.yaw + turned / 2)
@@ -159,7 +167,8 @@ def test_an_s_curve_is_driven_ten_times_as_exactly_as_with_a_twist_alone() -> No
 
 
 @pytest.mark.parametrize(
-    ("body", "path"), [(BODY, back), (SIDEWAYS, sideways), (SIDEWAYS, ess), (CAR, ess), (CAR, back)]
+    ("body", "path"),
+    [(AGILE, back), (SIDEWAYS, sideways), (SIDEWAYS, ess), (CAR, ess), (CAR, back)],
 )
 def test_every_kind_of_body_keeps_to_its_trajectory(body: BodyDescription, path: Path) -> None:
     assert max(errors(Course(path, 9.0), Plant(body), 6.0)) < 0.015
@@ -174,6 +183,13 @@ def test_turning_on_the_spot_it_keeps_to_the_heading() -> None:
 @pytest.mark.parametrize("gain", [0.8, 1.2])
 def test_a_body_that_goes_slower_or_faster_than_told_is_corrected(gain: float) -> None:
     assert max(errors(Course(ess, 11.0), Plant(gain=gain), 8.0)) < 0.07
+
+
+@pytest.mark.parametrize("slip", [0.6, 0.8, 1.1])
+def test_a_body_that_slips_as_it_turns_is_told_to_turn_more(slip: float) -> None:
+    response, course = replace(SLOW, turn_gain=slip), Course(ess, 11.0)
+    assert max(errors(course, Plant(slip=slip), 8.0, response=response)) < 0.02
+    assert max(errors(course, Plant(slip=slip), 8.0, response=SLOW)) < 0.12
 
 
 @pytest.mark.parametrize(
@@ -243,6 +259,31 @@ def test_too_far_off_the_trajectory_it_brakes_and_says_so(jump: Pose) -> None:
     assert before - plant.go(relocated(intent, course, plant)).linear_x == pytest.approx(0.02)
 
 
+async def test_the_process_brakes_and_says_so_once_when_it_is_too_far_off(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO", "gigabrain_zenoh.control")
+    course, speeds = Course(lambda t: Velocity(linear_x=0.2), 6.0), []
+    async with Bench(control.run) as bench:
+        bench.send(BODY, body())
+        x = 0.0
+        for tick in range(1, 121):
+            x += 0.02 * (speeds[-1] if speeds else 0.0) + (0.5 if tick in (51, 81) else 0.0)
+            now = state(tick, v=speeds[-1] if speeds else 0.0, pose=(x, 0.0, 0.0))
+            bench.send(STATE, now)
+            basis = max(1, 10 * ((tick - 1) // 10))  # of the jump decision does not know yet
+            bench.send(INTENT, replace(course.intent(basis, Response()), tick=tick))
+            speeds += [command.linear_x for command in bench.sent(CMD_VEL)][-1:]
+    assert [record.message for record in caplog.records] == [
+        "braking: too far off the trajectory",
+        "on the trajectory again",
+    ] * 2
+    assert speeds[48] == pytest.approx(0.2, abs=0.02)
+    assert speeds[59] == 0.0
+    assert speeds[79] == pytest.approx(0.2, abs=0.02)
+    assert speeds[119] == pytest.approx(0.2, abs=0.02)
+
+
 def test_a_basis_of_which_the_place_is_not_known_moves_nothing() -> None:
     plant = Plant()
     intent = replace(Course(ess, 11.0).intent(0, SLOW), basis=0)
@@ -274,6 +315,15 @@ def test_asked_again_within_a_tick_it_answers_the_same() -> None:
     assert step(plant.body, once[0], inputs) == once
     without = replace(inputs, intent=None)
     assert step(plant.body, step(plant.body, plant.memory, without)[0], inputs) == once
+
+
+def test_a_response_beyond_reason_makes_no_command_beyond_reason() -> None:
+    plant, course = Plant(), Course(ess, 11.0)
+    errors(course, plant, 2.0)
+    mad = Response(delay=1e9, lag=1e9, turn_gain=1e-310)
+    still = replace(course.intent(plant.tick, mad), trajectory=(TrajectoryPoint(60.0, 0, 0, 0),))
+    assert max(abs(plant.go(still).linear_x) for _ in range(5)) <= 0.52
+    assert all(math.isfinite(plant.go(still).angular_z) for _ in range(5))
 
 
 def test_points_at_one_time_and_out_of_order_make_no_command_that_is_not_a_number() -> None:

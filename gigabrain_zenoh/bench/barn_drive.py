@@ -91,7 +91,7 @@ class Brain:
 
 
 def drive(world: World, trial: int, conditions: Conditions, settings: LocalSettings, log=None) -> Trial:
-    plant = Plant(conditions, world.start, seed=1000 * world.index + trial)
+    plant = Plant(conditions, world.start, seed=1000 * world.number + trial)
     x, y, yaw = world.start
     dx, dy = world.goal[0] - x, world.goal[1] - y
     c, s = math.cos(yaw), math.sin(yaw)
@@ -102,7 +102,7 @@ def drive(world: World, trial: int, conditions: Conditions, settings: LocalSetti
     at = 7.3 * trial
     tick = 0
     def end(result):
-        return Trial(world=world.index, trial=trial, result=result,
+        return Trial(world=world.number, trial=trial, result=result,
             seconds=(tick - (begun or 0)) * TICK_S, least_clearance=least,
             cycles_ms=tuple(brain.cycles_ms))
     while True:

@@ -27,7 +27,7 @@ class Moving(NamedTuple):
 class World(NamedTuple):
     """One world."""
 
-    index: int
+    number: int  # in the original set
     posts: Floats  # (n, 3): x, y, radius [m]
     movers: tuple[Moving, ...]
     start: tuple[float, float, float]  # x, y [m], yaw [rad]

@@ -113,7 +113,8 @@ class Plant:
         ranges += self._random.normal(0.0, self._conditions.noise, lidar.beams)
         lost = self._random.random(lidar.beams) < self._conditions.dropouts
         ranges[lost | (ranges > lidar.range_max)] = np.inf
-        return np.maximum(ranges, lidar.range_min).astype(np.float32)
+        seen: NDArray[np.float32] = np.maximum(ranges, lidar.range_min).astype(np.float32)
+        return seen
 
     def clearance(self, discs: Floats) -> float:
         """How far the body is from the nearest of `discs`, exactly [m]; 0 or less in contact."""
@@ -136,9 +137,7 @@ def _to_polygon(corners: Floats, points: Floats) -> Floats:
 
 
 @kernel
-def _cast(
-    eye: tuple[float, float], yaw: float, view: float, discs: Floats, ranges: Floats
-) -> None:
+def _cast(eye: tuple[float, float], yaw: float, view: float, discs: Floats, ranges: Floats) -> None:
     """The nearest disc along each beam, over `view` [rad] from right to left."""
     beams = ranges.shape[0]
     step = view / (beams - 1)
@@ -152,8 +151,8 @@ def _cast(
         half = math.asin(r / away)
         for turn in range(-1, 1):
             middle = bearing + turn * math.tau
-            first = max(0, int(math.ceil((middle - half) / step)))
-            last = min(beams - 1, int(math.floor((middle + half) / step)))
+            first = max(0, math.ceil((middle - half) / step))
+            last = min(beams - 1, math.floor((middle + half) / step))
             for k in range(first, last + 1):
                 across = away * math.sin(k * step - middle)
                 along = away * math.cos(k * step - middle)

@@ -35,7 +35,9 @@ class CostToGo:
         Without a path, and with the goal outside, every place at the rim counts on free way beyond.
         """
         side, cell = self._side, grid.cell * COARSER
-        distance = cv2.resize(grid.distance, (side, side), interpolation=cv2.INTER_AREA)
+        distance = np.asarray(
+            cv2.resize(grid.distance, (side, side), interpolation=cv2.INTER_AREA), dtype=np.float32
+        )
         cost = _cost(distance, np.float32(half_width))
         seed = _seed(side, cell, (grid.x, grid.y), goal, path)
         _dijkstra(cost, np.float32(cell), seed, self._keys, self._heap, self._field)
@@ -50,7 +52,7 @@ def _seed(
     seed = np.full((side, side), np.inf, dtype=np.float32)
     points = np.array([goal]) if path is None else path
     cells = np.floor((points - corner) / cell).astype(np.int64)
-    inside = ((cells >= 1) & (cells < side - 1)).all(axis=1)
+    inside = np.asarray(((cells >= 1) & (cells < side - 1)).all(axis=1))
     if inside.any():
         last = _way_out(points, inside, np.add(corner, side * cell / 2))
         column, row = cells[last]
@@ -73,9 +75,8 @@ def _way_out(points: Floats, inside: NDArray[np.bool_], robot: Floats) -> int:
 
 
 def _cost(distance: NDArray[np.float32], half_width: np.float32) -> NDArray[np.float32]:
-    cost = 1.0 + np.float32(TIGHT) * np.exp(
-        (half_width - distance) * np.float32(1.0 / TIGHT_OVER), dtype=np.float32
-    )
+    near = np.exp((half_width - distance) * np.float32(1.0 / TIGHT_OVER))
+    cost: NDArray[np.float32] = np.float32(1.0) + np.float32(TIGHT) * near
     cost[distance < half_width] = TOUCHING
     cost[distance < 0.6 * half_width] = INSIDE
     return cost

@@ -69,7 +69,8 @@ def distance_at(grid: Grid, x: float, y: float) -> float:
     d = grid.distance
     low = d[i, j] + b * (d[i, j + 1] - d[i, j])
     high = d[i + 1, j] + b * (d[i + 1, j + 1] - d[i + 1, j])
-    return low + a * (high - low)
+    found: float = low + a * (high - low)
+    return found
 
 
 @kernel

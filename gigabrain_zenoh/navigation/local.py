@@ -14,26 +14,27 @@ from gigabrain_zenoh.navigation.manner import kind_of, reason_of
 from gigabrain_zenoh.navigation.models import lag_of, model_of
 from gigabrain_zenoh.navigation.moment import Goal, LocalPlan, LocalSettings, Moment, Sent
 from gigabrain_zenoh.navigation.mppi import Planned, Sampler, past_of, step_of
-from gigabrain_zenoh.navigation.rollout import SECOND, TOUCHED, Scene, Start, Weights, distance_in
+from gigabrain_zenoh.navigation.rollout import Scene, Start, Weights, distance_in
 from gigabrain_zenoh.navigation.window import Place, Window
 
 __all__ = ["Goal", "LocalPlan", "LocalPlanner", "LocalSettings", "Moment", "Sent", "warm_up"]
 
 Floats = NDArray[np.float64]
 
+DEFAULTS = LocalSettings()
 TICK_S = TICK_NS / 1e9
 MOVING = 0.15  # [m/s], slower things are part of the grid
-ROUND_DISC = 0.1  # [m], hits so near a moving thing are its own
-LONGEST_GROWTH = 0.3  # [m/s], of a disc: how fast what is known of it fades
-IN_PLACE = 0.15  # [m], who gets no farther than this is in one place
-TURNED = 0.5  # [rad], or no more than this
+SURE = 3.0  # standard deviations of its velocity that a thing must be faster than to move
+UNSURE = 0.05  # [m/s], standard deviation of a velocity that comes without
+MOST_GROWTH = 0.3  # [m/s], of a disc: how fast what is known of it fades at most
+IN_PLACE = 0.3  # [m], who gets no farther than this is in one place
 SLOW = 0.05  # share of the largest speeds at which a body has arrived
 
 
 class LocalPlanner:
     """Drives one body. It keeps what it saw and planned, and no clock."""
 
-    def __init__(self, body: BodyDescription, settings: LocalSettings = LocalSettings()) -> None:
+    def __init__(self, body: BodyDescription, settings: LocalSettings = DEFAULTS) -> None:
         self._settings = settings
         self._model = model_of(body, settings.linear_speed)
         self._outline = outline_of(body.footprint)
@@ -64,7 +65,8 @@ class LocalPlanner:
         place = Place(moment.pose.x, moment.pose.y, moment.pose.yaw)
         discs = _discs(moment.obstacles)
         hits = np.ascontiguousarray(moment.hits, dtype=np.float64)
-        self._window.see(moment.tick, place, self._lidar, hits, _moving(discs))
+        self._window.see(moment.tick, place, self._lidar, hits)
+        discs = self._window.moving(moment.tick, discs)
         if self._arrived(moment):
             return _standing("arrived: at the goal", arrived=True)
         scene = self._scene(moment, discs)
@@ -75,7 +77,7 @@ class LocalPlanner:
 
     def _scene(self, moment: Moment, discs: Floats) -> Scene:
         goal = moment.goal
-        grid = self._window.grid(moment.known)
+        grid = self._window.grid(moment.tick, moment.known, discs)
         field = self._costs.field(grid, self._half_width, (goal.x, goal.y), moment.path)
         yaw = math.nan if goal.yaw is None else goal.yaw
         tolerance = self._settings.position_tolerance
@@ -96,12 +98,6 @@ class LocalPlanner:
         room = clearance(scene.grid, self._outline, place.x, place.y, cosine, sine)
         left = distance_in(scene.field, place.x, place.y)
         blocked = self._stuck(moment)
-        rest = SECOND * left / self._model.forward  # what a far goal costs without any contact
-        if planned.cost > TOUCHED * 0.22 + rest:  # all ways end in a contact: brake
-            self._sampler.forget()
-            return _standing(
-                f"waiting: no way without a contact, {room:.2f} m of room", blocked=blocked
-            )
         kind = kind_of(self._model, planned.track, self._sampler.dt, moment.goal)
         vx, vy, w = planned.commands[0].tolist()
         return LocalPlan(
@@ -171,9 +167,9 @@ def _axes(of: Velocity) -> tuple[float, float, float]:
 def _discs(obstacles: tuple[Obstacle, ...]) -> Floats:
     """(m, 6): what moves, and how fast what is known of it fades."""
     rows = [
-        (one.x, one.y, one.velocity_x, one.velocity_y, one.radius, _growth(one))
+        (one.x, one.y, one.velocity_x, one.velocity_y, one.radius, min(MOST_GROWTH, _growth(one)))
         for one in obstacles
-        if math.hypot(one.velocity_x, one.velocity_y) > MOVING
+        if math.hypot(one.velocity_x, one.velocity_y) > max(MOVING, SURE * _growth(one))
     ]
     return np.array(rows, dtype=np.float64).reshape(-1, 6)
 
@@ -181,13 +177,8 @@ def _discs(obstacles: tuple[Obstacle, ...]) -> Floats:
 def _growth(obstacle: Obstacle) -> float:
     """Standard deviation of the velocity [m/s]."""
     if not obstacle.covariance:
-        return 0.1
-    spread = math.sqrt(max(0.0, obstacle.covariance[10], obstacle.covariance[15]))
-    return min(LONGEST_GROWTH, spread)
-
-
-def _moving(discs: Floats) -> Floats:
-    return np.ascontiguousarray(discs[:, [0, 1, 4]] + (0.0, 0.0, ROUND_DISC))
+        return UNSURE
+    return math.sqrt(max(0.0, obstacle.covariance[10], obstacle.covariance[15]))
 
 
 def warm_up(body: BodyDescription) -> None:

@@ -51,9 +51,10 @@ def model_of(body: BodyDescription, speed: float | None = None) -> Model:
 
 @kernel
 def toward(before: float, target: float, up: float, down: float) -> float:
-    """`target`, or as near to it as one step from `before` gets; it stops on its way through 0."""
-    if before * target < 0.0:
-        target = 0.0
+    """`target`, or as near to it as one step from `before` gets.
+
+    A step is several ticks, so that it may go through 0, where a ramp rests for a tick.
+    """
     highest = before + (up if before >= 0.0 else down)
     lowest = before - (up if before <= 0.0 else down)
     return max(lowest, min(highest, target))

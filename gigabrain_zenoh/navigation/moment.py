@@ -60,7 +60,7 @@ class Moment:
     path: Floats | None = None  # (k, 2) [m], to the goal; without one it looks for its own
     known: Floats = field(default_factory=no_points)  # (m, 2) [m], obstacles of the map near by
     obstacles: tuple[Obstacle, ...] = ()
-    response: Response = Response()
+    response: Response = field(default_factory=Response)
     turn_gain: float = 1.0  # measured over commanded yaw rate
     sent: tuple[Sent, ...] = ()  # oldest first; those of the last 0.5 s are enough
 
@@ -76,4 +76,3 @@ class LocalPlan:
     blocked: bool = False  # nothing has come of it for a while: another way is wanted
     arrived: bool = False
     remaining: float = 0.0  # [m of free way], cost to go from here
-

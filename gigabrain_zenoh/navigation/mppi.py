@@ -17,13 +17,13 @@ from gigabrain_zenoh.navigation.rollout import Scene, Start, Weights, drive
 Floats = NDArray[np.float64]
 
 TEMPERATURE = 0.6  # how much worse than the best still counts
-WORSE = 3.0  # a mean this much worse than the best has run into what its parts went round
+WORSE = 0.3  # a mean this much worse than the best has run into what its parts went round
 SETS = 8  # of noise, drawn once and taken in turn
 KEPT, FRESH = 0.85, 0.53  # of the noise from step to step
 SPREAD, TURNING_SPREAD = 0.175, 0.3  # of the noise, as a share of the largest speeds
-CONSTANT_EVERY, SPIN_EVERY = 8, 32  # every so manieth plan is one twist throughout, or one turn
+SIMPLE_EVERY = 4  # every so manieth plan is one twist and then another, and no noise
 STANDING = 2  # the plan that brakes
-SHARP = 0.3  # how much of the yaw rate constant plans take at high speed
+SHARP = 0.3  # how much of the yaw rate simple plans take at high speed
 
 
 class Planned(NamedTuple):
@@ -43,7 +43,7 @@ class Sampler:
         self._model, self.dt, self._turn = model, dt, 0
         random = np.random.default_rng(seed)
         self._noise = _noise(random, (SETS, samples, steps, 3), model)
-        self._constants = _constants(random, (SETS, samples, 3), model)
+        self._simple = _simple(random, SETS, samples, steps, model)
         self._plans = np.empty((samples, steps, 3))
         self._costs = np.empty(samples)
         self.last = np.zeros((steps, 3))
@@ -61,7 +61,7 @@ class Sampler:
     def plan(self, outline: Outline, weights: Weights, scene: Scene, start: Start) -> Planned:
         """The best that was found."""
         model, dt, plans, costs = self._model, self.dt, self._plans, self._costs
-        _propose(plans, self.last, self._noise[self._turn], self._constants[self._turn])
+        _propose(plans, self.last, self._noise[self._turn], self._simple[self._turn])
         self._turn = (self._turn + 1) % SETS
         _score(model, outline, weights, scene, start, dt, plans, costs)
         best = int(np.argmin(costs))
@@ -89,30 +89,48 @@ def _noise(
     return scaled
 
 
-def _constants(
-    random: np.random.Generator, shape: tuple[int, ...], model: Model
-) -> NDArray[np.float64]:
-    """Twists that are held throughout; the faster, the less they turn."""
+def _simple(
+    random: np.random.Generator, sets: int, samples: int, steps: int, model: Model
+) -> Floats:
+    """Plans of two twists, (sets, samples, 7): both, and the step in which the second begins.
+
+    Of every three, one keeps its first twist, and one turns on the spot before it drives on.
+    """
+    first, second = (_twists(random, (sets, samples, 3), model) for _ in range(2))
+    turning = np.arange(samples) // SIMPLE_EVERY % 3
+    if model.radius == 0.0:
+        first[:, turning == 1, :2] = 0.0
+        second[:, turning == 1, 0] = model.forward * random.random(
+            (sets, int((turning == 1).sum()))
+        )
+        second[:, turning == 1, 2] = 0.0
+    when = random.uniform(1.0, steps, (sets, samples, 1))
+    when[:, turning == 0] = steps
+    return np.concatenate([first, second, when], axis=2)
+
+
+def _twists(random: np.random.Generator, shape: tuple[int, ...], model: Model) -> Floats:
+    """Any twists that the body can have; the faster, the less they turn."""
     share = random.random(shape)
     twists = np.empty(shape)
     twists[..., 0] = -model.backward + (model.forward + model.backward) * share[..., 0]
     twists[..., 1] = model.lateral * (2.0 * share[..., 1] - 1.0)
     most = np.where(twists[..., 0] > 0.5 * model.forward, SHARP, 0.9)
     twists[..., 2] = model.turning * most * (2.0 * share[..., 2] - 1.0)
-    twists[:, ::SPIN_EVERY, :2] = 0.0
     return twists
 
 
 @kernel
-def _propose(plans: Floats, last: Floats, noise: NDArray[np.float32], constants: Floats) -> None:
+def _propose(plans: Floats, last: Floats, noise: NDArray[np.float32], simple: Floats) -> None:
     samples, steps, axes = plans.shape
     for k in range(samples):
         for t in range(steps):
+            second = 0 if t < simple[k, 6] else axes
             for a in range(axes):
                 if k == STANDING:
                     plans[k, t, a] = 0.0
-                elif k > 0 and k % CONSTANT_EVERY == 0:
-                    plans[k, t, a] = constants[k, a]
+                elif k > 0 and k % SIMPLE_EVERY == 0:
+                    plans[k, t, a] = simple[k, second + a]
                 else:
                     plans[k, t, a] = last[t, a] + (noise[k, t, a] if k > 0 else 0.0)
 

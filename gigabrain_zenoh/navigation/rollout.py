@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 
 SECOND = 8.0  # what a second costs
 TOUCHED, TOUCHED_DISC = 300.0, 200.0  # what a contact costs
+IMPACT = 50.0  # per m/s of a contact
 LOOK_AHEAD = 0.25  # [m], from where the last pose's heading is judged
 NEAR_GOAL = 0.2  # [m], nearer the field is too coarse
 SLOW = 0.05  # [m/s], slower than this it always stops in time
@@ -68,7 +69,7 @@ class Weights(NamedTuple):
     near_over: float = 0.05  # [m], over which that decays
     tight: float = 1.5  # of speed in tight places, per second
     tight_speed: float = 0.45  # [m/s], always allowed
-    tight_rate: float = 5.0  # [1/s], more speed per metre of room
+    tight_rate: float = 4.0  # [1/s], more speed per metre of room
     turning: float = 0.02  # per (rad/s)2 and second
     backwards: float = 1.0  # per m
     heading: float = 1.5  # of facing away from the goal, in units of the time it takes to turn
@@ -84,7 +85,8 @@ def effective(start: Start, plan: Floats, t: int, axis: int) -> float:
     older, newer = t - delayed, t - delayed + 1
     old = start.past[t, axis] if older < 0 else plan[older, axis]
     new = start.past[t + 1, axis] if newer < 0 else plan[newer, axis]
-    return start.share * old + (1.0 - start.share) * new
+    mean: float = start.share * old + (1.0 - start.share) * new
+    return mean
 
 
 @kernel
@@ -130,6 +132,7 @@ def drive(
         late = (t + 1.0) / steps
         if room < least:
             cost += TOUCHED * (1.0 - 0.7 * late) + _rest(model, scene, x, y)
+            cost += IMPACT * math.hypot(vx, vy)
             alive = False
         elif away < least_disc:
             cost += TOUCHED_DISC * (1.0 - 0.6 * late) + _rest(model, scene, x, y)
@@ -138,8 +141,10 @@ def drive(
             cost += dt * _of_place(model, weights, scene, room, away, x, y)
             cost += dt * _of_motion(weights, room, vx, vy, w)
             if t % BRAKE_EVERY == 0:
-                cost += dt * BRAKE_EVERY * _of_braking(
-                    model, outline, scene, room, x, y, cosine, sine, vx, vy
+                cost += (
+                    dt
+                    * BRAKE_EVERY
+                    * _of_braking(model, outline, scene, room, x, y, cosine, sine, vx, vy)
                 )
         if not (alive or noted):
             break
@@ -183,9 +188,7 @@ def _of_place(
 def _of_motion(weights: Weights, room: float, vx: float, vy: float, w: float) -> float:
     """What it costs to move so for a second."""
     cost = weights.turning * w * w
-    over = math.hypot(vx, vy) - (
-        weights.tight_speed + weights.tight_rate * (room - weights.margin)
-    )
+    over = math.hypot(vx, vy) - (weights.tight_speed + weights.tight_rate * (room - weights.margin))
     if over > 0.0:
         cost += weights.tight * over * over
     if vx < 0.0:
@@ -234,22 +237,29 @@ def _of_end(
     model: Model, weights: Weights, scene: Scene, x: float, y: float, yaw: float,
     vx: float, vy: float,
 ) -> float:  # fmt: skip
-    """What is left to do after the last step: the way, and the turn towards it."""
+    """What is left to do after the last step: to turn to the way, to drive it, to turn at its end.
+
+    A body that has all but arrived only has to stand, with the right yaw.
+    """
     cost = _rest(model, scene, x, y)
-    away = math.hypot(x - scene.goal_x, y - scene.goal_y)
-    if away < NEAR_GOAL:
-        cost += SECOND * 0.5 * math.hypot(vx, vy) / model.forward
-        if not math.isnan(scene.goal_yaw):
-            turn = yaw - scene.goal_yaw
-            off = abs(turn - math.tau * math.floor(turn / math.tau + 0.5))
-            cost += SECOND * off / model.turning
-        return cost
+    dx, dy = scene.goal_x - x, scene.goal_y - y
+    near = math.hypot(dx, dy) < NEAR_GOAL
+    if not math.isnan(scene.goal_yaw):
+        arrives = yaw if near else math.atan2(dy, dx)
+        cost += SECOND * _turn_between(arrives, scene.goal_yaw) / model.turning
+    if near:
+        return cost + 0.5 * SECOND * math.hypot(vx, vy) / model.forward
     here = distance_in(scene.field, x, y)
-    ahead = distance_in(
-        scene.field, x + LOOK_AHEAD * math.cos(yaw), y + LOOK_AHEAD * math.sin(yaw)
-    )
+    ahead = distance_in(scene.field, x + LOOK_AHEAD * math.cos(yaw), y + LOOK_AHEAD * math.sin(yaw))
     rise = max(-1.0, min(1.0, (ahead - here) / LOOK_AHEAD))
-    return cost + weights.heading * rise / model.turning
+    return cost + weights.heading * (1.0 + rise) / model.turning
+
+
+@kernel
+def _turn_between(one: float, other: float) -> float:
+    """The angle between two directions [rad], 0 to pi."""
+    turn = one - other
+    return abs(turn - math.tau * math.floor(turn / math.tau + 0.5))
 
 
 @kernel

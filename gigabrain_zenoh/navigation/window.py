@@ -6,7 +6,7 @@ odometry drifts.
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -20,9 +20,13 @@ CELL_M = 0.025
 BINS = 720  # of the bearings round the lidar
 MARKED = 2  # of a cell that was just hit; each beam that passes takes one
 BEYOND_M = 0.1  # [m], how far past a cell a beam must go to have passed it
+STAYS_TICKS = 20  # a cell that was hit so long ago, and is now, belongs to what stands
+MOST_STAY = 0.5  # share of its cells that may, of a thing that moves
+ROUND_DISC = 0.1  # [m], hits so near a moving thing are its own
 MOVES_AT = 0.05  # share of the window that the robot may be off its middle
 
 Floats = NDArray[np.float64]
+T = TypeVar("T", bound=np.generic)
 
 
 class Place(NamedTuple):
@@ -33,6 +37,16 @@ class Place(NamedTuple):
     yaw: float  # [rad]
 
 
+class Cells(NamedTuple):
+    """The window as compiled functions take it, (rows, columns) each."""
+
+    level: NDArray[np.uint8]  # 0 where nothing is
+    seen: NDArray[np.int64]  # tick of the last hit
+    since: NDArray[np.int64]  # tick of the first hit since it was last free
+    x: float  # [m], of the corner of cell (0, 0)
+    y: float
+
+
 class Window:
     """A square of `size` [m] round the robot, its axes those of the frame that is planned in."""
 
@@ -40,7 +54,8 @@ class Window:
         self.cells = 2 * round(size / CELL_M / 2)
         self._memory = round(memory_s * 1e9 / TICK_NS)
         self._level = np.zeros((self.cells, self.cells), dtype=np.uint8)
-        self._seen = np.zeros((self.cells, self.cells), dtype=np.int64)
+        self._seen = np.zeros((self.cells, self.cells), dtype=np.int64)  # last, by tick
+        self._since = np.zeros((self.cells, self.cells), dtype=np.int64)  # marked without a break
         self._row = self._column = 0  # of cell (0, 0), counted from the frame's origin
         self._empty = True
 
@@ -54,31 +69,39 @@ class Window:
         """Where the window begins [m]."""
         return self._row * CELL_M
 
-    def see(
-        self, tick: int, place: Place, lidar: tuple[float, float], hits: Floats, moving: Floats
-    ) -> None:
-        """Take in a scan: `hits` (n, 2) [m] in the body's frame, the `lidar` at (x, y) in it.
-
-        What belongs to the discs `moving` (m, 3), x, y and radius [m] in the frame that is planned
-        in, is not marked: it will be elsewhere soon.
-        """
+    def see(self, tick: int, place: Place, lidar: tuple[float, float], hits: Floats) -> None:
+        """Take in a scan: `hits` (n, 2) [m] in the body's frame, the `lidar` at (x, y) in it."""
         self._follow(place)
-        _observe(
-            self._level, self._seen, (self.x, self.y), place, lidar, hits, moving, tick,
-            tick - self._memory,
-        )  # fmt: skip
+        cells = Cells(self._level, self._seen, self._since, self.x, self.y)
+        _observe(cells, place, lidar, hits, tick, tick - self._memory)
 
-    def grid(self, known: Floats) -> Grid:
-        """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m]."""
-        level = self._level
+    def moving(self, tick: int, discs: Floats) -> Floats:
+        """Those of the `discs` (n, 6), x, y [m] first and the radius fifth, that really move.
+
+        What moves hits cells that were free a moment ago. Posts and corners can be taken for one
+        another, and then seem to move; but they keep hitting the same cells.
+        """
+        cells = Cells(self._level, self._seen, self._since, self.x, self.y)
+        long_ago = tick - STAYS_TICKS
+        return discs[[_stays(cells, disc, tick, long_ago) <= MOST_STAY for disc in discs]]
+
+    def grid(self, tick: int, known: Floats, moving: Floats) -> Grid:
+        """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m].
+
+        What was hit of late on one of the discs `moving` does not count: it will be elsewhere soon.
+        """
+        free = (self._level == 0).astype(np.uint8)
+        if len(moving):
+            near = np.zeros_like(free)
+            for x, y, radius in moving[:, [0, 1, 4]].tolist():
+                at = round((x - self.x) / CELL_M), round((y - self.y) / CELL_M)
+                cv2.circle(near, at, math.ceil((radius + ROUND_DISC) / CELL_M), 1, cv2.FILLED)
+            free |= near & (self._since > tick - STAYS_TICKS)
         if len(known):
-            level = level.copy()
             cells = np.floor((known - (self.x, self.y)) / CELL_M).astype(np.int64)
             cells = cells[((cells >= 0) & (cells < self.cells)).all(axis=1)]
-            level[cells[:, 1], cells[:, 0]] = MARKED
-        distance = cv2.distanceTransform(
-            (level == 0).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
-        )
+            free[cells[:, 1], cells[:, 0]] = 0
+        distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
         np.minimum(distance * np.float32(CELL_M), np.float32(FAR), out=distance)
         return Grid(distance, CELL_M, self.x, self.y)
 
@@ -92,10 +115,11 @@ class Window:
             return
         self._level = _moved(self._level, down, right)
         self._seen = _moved(self._seen, down, right)
+        self._since = _moved(self._since, down, right)
         self._row, self._column, self._empty = row, column, False
 
 
-def _moved(cells: NDArray[np.generic], down: int, right: int) -> NDArray[np.generic]:
+def _moved(cells: NDArray[T], down: int, right: int) -> NDArray[T]:
     """What a window over `cells` sees that has moved on by so many of them."""
     moved = np.zeros_like(cells)
     count = len(cells)
@@ -110,17 +134,15 @@ def _moved(cells: NDArray[np.generic], down: int, right: int) -> NDArray[np.gene
 
 @kernel
 def _observe(
-    level: NDArray[np.uint8],
-    seen: NDArray[np.int64],
-    corner: tuple[float, float],
+    cells: Cells,
     place: Place,
     lidar: tuple[float, float],
     hits: Floats,
-    moving: Floats,
     tick: int,
     oldest: int,
 ) -> None:
     """Forget what is older than `oldest`, take back what beams have passed, mark what they hit."""
+    level, seen = cells.level, cells.seen
     cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
     eye_x = place.x + cosine * lidar[0] - sine * lidar[1]
     eye_y = place.y + sine * lidar[0] + cosine * lidar[1]
@@ -140,9 +162,9 @@ def _observe(
         for j in range(columns):
             if level[i, j] == 0:
                 continue
-            x = corner[0] + (j + 0.5) * CELL_M
-            y = corner[1] + (i + 0.5) * CELL_M
-            if seen[i, j] < oldest or _inside(moving, x, y):
+            x = cells.x + (j + 0.5) * CELL_M
+            y = cells.y + (i + 0.5) * CELL_M
+            if seen[i, j] < oldest:
                 level[i, j] = 0
             elif math.hypot(x - eye_x, y - eye_y) + BEYOND_M < _passed(
                 reach, math.atan2(y - eye_y, x - eye_x)
@@ -150,17 +172,18 @@ def _observe(
                 level[i, j] -= 1
     for i in range(count):
         x, y = points[i, 0], points[i, 1]
-        row = int(math.floor((y - corner[1]) / CELL_M))
-        column = int(math.floor((x - corner[0]) / CELL_M))
-        inside = 0 <= row < rows and 0 <= column < columns
-        if inside and not _inside(moving, x, y):
+        row = math.floor((y - cells.y) / CELL_M)
+        column = math.floor((x - cells.x) / CELL_M)
+        if 0 <= row < rows and 0 <= column < columns:
+            if level[row, column] == 0:
+                cells.since[row, column] = tick
             level[row, column] = MARKED
             seen[row, column] = tick
 
 
 @kernel
 def _bin(bearing: float) -> int:
-    return int(math.floor((bearing / math.tau + 0.5) * BINS)) % BINS
+    return math.floor((bearing / math.tau + 0.5) * BINS) % BINS
 
 
 @kernel
@@ -176,8 +199,21 @@ def _passed(reach: NDArray[np.float64], bearing: float) -> float:
 
 
 @kernel
-def _inside(discs: Floats, x: float, y: float) -> bool:
-    for i in range(discs.shape[0]):
-        if math.hypot(x - discs[i, 0], y - discs[i, 1]) < discs[i, 2]:
-            return True
-    return False
+def _stays(cells: Cells, disc: Floats, tick: int, long_ago: int) -> float:
+    """The share of the cells of `disc` hit at `tick` that were hit `long_ago` already."""
+    x, y, radius = disc[0], disc[1], disc[4] + ROUND_DISC
+    rows, columns = cells.level.shape
+    hit = old = 0
+    for i in range(max(0, int((y - radius - cells.y) / CELL_M)), rows):
+        down = cells.y + (i + 0.5) * CELL_M - y
+        if down > radius:
+            break
+        for j in range(max(0, int((x - radius - cells.x) / CELL_M)), columns):
+            right = cells.x + (j + 0.5) * CELL_M - x
+            if right > radius:
+                break
+            near = math.hypot(right, down) <= radius
+            if near and cells.level[i, j] > 0 and cells.seen[i, j] == tick:
+                hit += 1
+                old += cells.since[i, j] <= long_ago
+    return old / hit if hit else 0.0

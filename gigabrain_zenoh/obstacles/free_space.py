@@ -79,6 +79,10 @@ class FreeSpace:
         """Take one scan."""
         self._scans.append(scan)
 
+    def is_free(self, x: float, y: float) -> bool:
+        """Whether beams of the newest scan went through (x, y) [m]."""
+        return bool(self._scans[-1].free(np.array([[x, y]]))[0])
+
     def shows_motion(
         self, x: float, y: float, velocity_x: float, velocity_y: float, radius: float
     ) -> bool:
