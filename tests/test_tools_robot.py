@@ -16,7 +16,7 @@ from tests.stack import Command, Home, free_port, robot_of, until
 async def demo(shared_home: Home) -> Home:
     """A robot that drives: the mock, the same one for all tests."""
     if not shared_home.processes():
-        command = shared_home.start("demo", "--headless", "--body", "mock", "--seconds", "3000")
+        command = shared_home.start("demo", "--behaviour", "avoid", "--headless", "--body", "mock", "--seconds", "3000")
         await robot_of(shared_home, command)
         await until_why(shared_home, 0)
     return shared_home

@@ -2,14 +2,17 @@
 
 import time
 
+from msgspec.structs import replace
+
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import ENABLE, GOAL, RELEASE
-from gigabrain_zenoh.asking import ANSWER_S, ask, granted
+from gigabrain_zenoh.asking import ask, granted
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.estop import press
 from gigabrain_zenoh.gate_state import BRAIN
 from gigabrain_zenoh.page.wire import Ask, Reply
+from gigabrain_zenoh.task_client import PLAN_S, Tasks
 
 
 class Operator:
@@ -35,6 +38,8 @@ class Operator:
     async def _do(self, asked: Ask) -> tuple[str, str]:
         if asked.what == "goal":
             return await self._goal(asked), ""
+        if asked.what == "cancel":
+            return await Tasks(self._bus).cancel("all"), ""
         if asked.what == "estop":
             reply = await press(self._bus, "operator page")
         elif asked.what == "release":
@@ -54,7 +59,8 @@ class Operator:
     async def _goal(self, asked: Ask) -> str:
         if asked.goal is None:
             raise Refused("a goal needs a place")
-        replies = await self._bus.ask(GOAL, asked.goal, timeout_s=ANSWER_S)
+        goal = replace(asked.goal, source=self._bus.process)
+        replies = await self._bus.ask(GOAL, goal, timeout_s=PLAN_S)
         if not replies:
             raise BodyLost("nobody serves goals: this robot has no navigation running")
         if not replies[0].ok:

@@ -21,6 +21,7 @@ from gigabrain_schemas.topics import (
     SAFETY,
     SCAN,
     STATE,
+    TASK,
     TELEOP,
     WORLD,
 )
@@ -39,6 +40,7 @@ class Scene:
         self._bus, self._tell = bus, tell
         self._state = Sampled(bus, STATE)
         self._intent, self._safety = Sampled(bus, INTENT), Sampled(bus, SAFETY)
+        self._task = Sampled(bus, TASK)
         self._world, self._scan = Sampled(bus, WORLD), Sampled(bus, SCAN)
         self._place, self._images = Sampled(bus, POSE), dict[str, Sampled[Image]]()
         self._map_frame = b""
@@ -71,6 +73,7 @@ class Scene:
                 intent=self._intent.fresh(),
                 safety=self._safety.fresh(),
                 world=_without_hits(self._world.fresh()),
+                task=self._task.fresh(),
                 driving=driving,
                 viewers=viewers,
             ),

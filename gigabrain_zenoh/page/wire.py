@@ -11,7 +11,7 @@ from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, OccupancyGrid, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import Image, LaserScan
-from gigabrain_schemas.tasks import GoalRequest
+from gigabrain_schemas.tasks import GoalRequest, TaskStatus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 
 ABOUT, MOMENT, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE = range(1, 9)  # to the browser
@@ -39,6 +39,7 @@ class Moment(Struct, frozen=True, kw_only=True):
     intent: Intent | None
     safety: SafetyState | None
     world: WorldModel | None
+    task: TaskStatus | None = None
     driving: int = 0  # the number of the viewer who steers
     viewers: int = 1
 
@@ -53,7 +54,7 @@ class Ask(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Something is asked of the robot."""
 
     id: Annotated[int, Meta(ge=0, le=2**31)]
-    what: Literal["estop", "release", "enable", "take", "goal"]
+    what: Literal["estop", "release", "enable", "take", "goal", "cancel"]
     estop_generation: Count = 0  # as the page shows it, so that nobody releases a stop unseen
     goal: GoalRequest | None = None
 

@@ -233,8 +233,14 @@ export class MapView {
   }
 
   #paintGoal(pen) {
-    const goal = this.#drag?.goal ?? this.goal
+    const task = this.moment?.frame === 'map' ? this.moment.task : null
+    const goal = this.#drag?.goal ?? task?.goal ?? this.goal
     if (!goal) return
+    pen.beginPath()
+    for (const [x, y] of task?.path ?? []) pen.lineTo(x, y)
+    pen.globalAlpha = 0.6
+    this.#stroke(pen, this.colour.plan, 1.5)
+    pen.globalAlpha = 1
     const size = 9 * this.pixel
     pen.beginPath()
     pen.arc(goal.x, goal.y, size, 0, TAU)
