@@ -1,13 +1,11 @@
 """What perception does beside the world: where the robot is in the map, and the map itself.
 
-It comes after the world of the same scan, and takes the odometry of the scan's own tick, for which
-it waits if need be. So neither depends on which of two messages was quicker.
+It comes after the world of the same scan, and takes the odometry of the scan's own tick.
 """
 
 import asyncio
 import logging
 import time
-from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,7 @@ from gigabrain_schemas.body import Body, Lidar, RobotState
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
 from gigabrain_schemas.requests import MapReply, MapRequest
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE, STATE
+from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.mapping import map_file
@@ -36,8 +34,6 @@ from gigabrain_zenoh.settings import PerceptionConfig
 log = logging.getLogger(__name__)
 
 MAP_TICKS = round(1e9 / TICK_NS)  # from one map to the next, at least
-WAITING = 10  # scans that wait for their odometry; older ones are left out
-LEAD_TICKS = 25  # a scan that is so far ahead of the states is from the future
 FREE_M = 10.0  # a beam that hit nothing counts as free so far at most
 SHORT_M = 0.05  # and ends so much before the lidar's range
 SETTLE_NS, SETTLES = 20_000_000, 100  # a save waits for the work beside, and how often
@@ -74,13 +70,11 @@ class Mapper:
         self._chart = chart_of(config)
         warm_up()
         self._fusion, self._boot = Fusion(), 0
-        self._waiting: deque[LaserScan] = deque(maxlen=WAITING)
         self._last: Moment | None = None  # of the last scan that was taken
         self._shown: OccupancyGrid | None = None
         self._shown_tick = 0
         self._said, self._left_out = "", ""
         self._took_ms = Newest(TIMED)
-        bus.latest(STATE, self._hear)
         bus.serve(MAP_SAVE, self._save)
         bus.report = self._report
 
@@ -89,21 +83,22 @@ class Mapper:
         if problem:
             self._leave_out(problem)
             return
-        self._begin_anew(scan.boot)
-        self._waiting.append(scan)
-        self._work()
+        moment = self._fusion.at(scan.basis) if scan.boot == self._boot else None
+        if moment is None or (self._last and moment.tick <= self._last.tick):
+            self._leave_out("there is no odometry for its tick")
+        else:
+            self._take(scan, moment)
 
     def close(self) -> None:
         """End what runs beside."""
         self._chart.close()
 
-    def _hear(self, state: RobotState) -> None:
+    def hear(self, state: RobotState) -> None:
+        """Take a state, before any scan that rests on it."""
         body = self._bodies.current
-        if body is None:
-            return
-        self._begin_anew(state.boot)
-        self._fusion.add(state, body.description)
-        self._work()
+        if body:
+            self._begin_anew(state.boot)
+            self._fusion.add(state, body.description)
 
     def _begin_anew(self, boot: int) -> None:
         """After a new start of the driver the odometry begins elsewhere; the map stays."""
@@ -112,24 +107,6 @@ class Mapper:
         if self._boot:
             self._chart.lose("the driver has started anew")
         self._boot, self._fusion, self._last, self._shown = boot, Fusion(), None, None
-        self._waiting.clear()
-
-    def _work(self) -> None:
-        """Take all scans whose odometry is known."""
-        while self._waiting:
-            scan, newest = self._waiting[0], self._fusion.newest
-            moment = self._fusion.at(scan.basis)
-            if moment is None and (newest is None or newest.tick < scan.basis):
-                if newest and scan.basis > newest.tick + LEAD_TICKS:
-                    self._waiting.popleft()
-                    self._leave_out("it is from the future of the robot's clock")
-                    continue
-                return
-            self._waiting.popleft()
-            if moment is None or (self._last and moment.tick <= self._last.tick):
-                self._leave_out("there is no odometry for its tick")
-                continue
-            self._take(scan, moment)
 
     def _take(self, scan: LaserScan, moment: Moment) -> None:
         body = self._bodies.current

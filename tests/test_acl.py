@@ -22,8 +22,8 @@ SAYS = {
 }
 ASKS = {
     "brain": "estop describe/driver",
-    "operator": "estop release enable goal mission task_change map_save audit_log "
-    "param/driver describe/driver",
+    "operator": "estop release enable goal mission task_change map_save audit_log param/driver "
+    "describe/driver",
     "viewer": "audit_log describe/driver",
 }
 SAID = [topic.at("perception") for topic in TOPICS]

@@ -53,7 +53,7 @@ class Errors(Struct, frozen=True, kw_only=True):
 def load(path: Path) -> Log:
     """The log in an .npz file: `ranges` [cm], `ref` and `odom`. Raises ConfigError."""
     try:
-        with np.load(path) as file:
+        with path.open("rb") as stream, np.load(stream) as file:
             ranges, reference, odometry = (file[name] for name in FIELDS)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror or 'is no whole .npz file'}") from None

@@ -22,7 +22,7 @@ class Rates:
     """How fast matched scans may drift at most."""
 
     away: float = 0.05  # [m] per square root of a metre driven
-    turn: float = 0.03  # [rad] per square root of a metre driven
+    turn: float = 0.01  # [rad] per square root of a metre driven
 
 
 class Drift:
@@ -32,14 +32,16 @@ class Drift:
         self._rates = rates
         self._ways: dict[int, list[tuple[int, float, float]]] = defaultdict(list)
 
-    def driven(self, link: Edge) -> None:
-        """Add a link that scans were matched along."""
-        away = float(np.hypot(*link.relative[:2]))
-        self._add(link, self._rates.turn**2 * away, self._rates.away**2 * away)
-
-    def broken(self, link: Edge) -> None:
-        """Add a link across which nothing was matched."""
-        self._add(link, float(link.covariance[2, 2]), float(link.covariance[:2, :2].trace()) / 2)
+    def linked(self, link: Edge) -> None:
+        """Add the link of a keyframe, unless it is the first."""
+        if link.first == link.second:
+            return
+        if link.doubtful:
+            away = float(link.covariance[:2, :2].trace()) / 2
+            self._add(link, float(link.covariance[2, 2]), away)
+        else:
+            driven = float(np.hypot(*link.relative[:2]))
+            self._add(link, self._rates.turn**2 * driven, self._rates.away**2 * driven)
 
     def closed(self, loop: Edge) -> None:
         """Add a loop that is beyond doubt."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.mapping.matching import solved
 from gigabrain_zenoh.mapping.points import Points
 from gigabrain_zenoh.mapping.se2 import Floats
 
@@ -108,7 +109,9 @@ def _fit(
                     information[i, j] += weight * slope[i] * slope[j]
         drift = pose - guess
         drift[2] = (drift[2] + np.pi) % (2 * np.pi) - np.pi
-        step = -np.linalg.solve(information + prior, off + prior @ drift)
+        for i in range(3):  # `@` would call for a BLAS
+            off[i] += (prior[i] * drift).sum()
+        step = -solved(information + prior, off)
         pose += step
         if np.abs(step).max() < ENOUGH:
             break

@@ -22,10 +22,11 @@ POINTS = 360  # of a scan are enough for ICP
 INLIERS = 0.35  # share of the points, below it ICP has failed
 MOVED = 0.4  # [m], ICP that went farther from where it began has slid away
 SCORE = 0.35  # a search below it has failed
+LEAST_SCORE = 0.2  # of a search that ICP may begin from
 SURE_SCORE, SURE_INLIERS = 0.55, 0.6  # what it takes to believe a wide search
 WIDE = Window(1.0, 0.6)  # where to look when the scan does not fit where it should
 FEW = 20  # points, with fewer there is nothing to match
-MISSES, MISSED_TRAVEL, MISSED_TURN = 3, 1.0, 0.8  # scans, [m], [rad]: after these it is broken,
+MISSES, MISSED_TRAVEL, MISSED_TURN = 3, 0.5, 0.5  # scans, [m], [rad]: after these it is broken,
 MISSES_STANDING = 30  # or after so many scans
 UNKNOWN = np.diag((10.0, 10.0, np.pi)) ** 2  # covariance of a link that nothing is known of
 
@@ -76,10 +77,11 @@ class FrontEnd:
         else:
             match = self._match(self._local, scan, guess)
         self.pose = match.pose
+        far = match.kind == "broken" or self._far_enough()
         if match.kind == "odometry":
-            return match, False
+            return match, self._adrift.far and far
         self._adrift = _Adrift()
-        return match, match.kind == "broken" or self._far_enough()
+        return match, far
 
     def keep(self, scan: Scan, alone: bool) -> None:
         """Make the scan that was added last part of the local map, or all of it."""
@@ -103,7 +105,8 @@ class FrontEnd:
         covariance = self._adrift.covariance
         found = search(local.image, scan.points, guess, _window(self._adrift))
         fit = _fit(local, scan, found, guess, covariance)
-        if fit.inliers >= INLIERS and _apart(fit.pose, found.pose) <= MOVED:
+        near = found.score > LEAST_SCORE and _apart(fit.pose, found.pose) <= MOVED
+        if near and fit.inliers >= INLIERS:
             return _matched(fit, found, covariance, "matched")
         if found.score > SCORE:
             return Match(wrapped(found.pose), covariance, "searched", found.score, fit.inliers)
@@ -155,8 +158,12 @@ class _Adrift:
 
     @property
     def broken(self) -> bool:
-        far = self.travel > MISSED_TRAVEL or self.turn > MISSED_TURN
-        return (self.misses >= MISSES and far) or self.misses >= MISSES_STANDING
+        return (self.misses >= MISSES and self.far) or self.misses >= MISSES_STANDING
+
+    @property
+    def far(self) -> bool:
+        """Whether what was matched last may be out of sight by now."""
+        return self.travel > MISSED_TRAVEL or self.turn > MISSED_TURN
 
     def after_break(self) -> Floats:
         return self.covariance if self.blind else UNKNOWN

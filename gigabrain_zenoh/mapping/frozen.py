@@ -43,6 +43,7 @@ def freeze_edges(name: str, edges: Sequence[Edge]) -> dict[str, NDArray[np.gener
         f"{name}_ends": np.array([(e.first, e.second) for e in edges], np.int32).reshape(-1, 2),
         f"{name}_relative": np.array([e.relative for e in edges]).reshape(-1, 3),
         f"{name}_covariance": np.array([e.covariance for e in edges]).reshape(-1, 3, 3),
+        f"{name}_doubtful": np.array([e.doubtful for e in edges], np.bool_),
     }
 
 
@@ -53,8 +54,8 @@ def thaw_edges(name: str, arrays: Arrays) -> list[Edge]:
     covariance = arrays[f"{name}_covariance"].astype(np.float64)
     if ends.ndim != 2 or relative.shape != (len(ends), 3) or covariance.shape != (len(ends), 3, 3):
         raise ValueError(f"{name}: {len(ends)} edges, but {len(relative)} poses")
-    rows = zip(ends, relative, covariance, strict=True)
-    return [Edge(int(first), int(second), r, c) for (first, second), r, c in rows]
+    rows = zip(ends, relative, covariance, arrays[f"{name}_doubtful"], strict=True)
+    return [Edge(int(first), int(second), r, c, bool(d)) for (first, second), r, c, d in rows]
 
 
 def _joined(parts: Iterable[Points]) -> Points:

@@ -12,7 +12,7 @@ from gigabrain_zenoh.mapping.keyframe import Edge
 from gigabrain_zenoh.mapping.se2 import Floats, compose
 
 ANCHOR = 1e-3  # [m] and [rad], how firmly the first pose is held
-ROBUST = 1.0  # standard deviations, residuals of loops beyond it lose their weight
+ROBUST = 1.0  # standard deviations, doubtful edges beyond it lose their weight
 MOVED = 0.01  # [m] and [rad], what moves farther is linearised anew
 ROUNDS = 3  # of that after loops are closed
 
@@ -38,7 +38,7 @@ class Graph:
                 factors.add(gtsam.PriorFactorPose2(link.second, _pose(link.relative), noise))
                 led = link.relative
             else:
-                factors.add(_factor(link, _noise(link)))
+                factors.add(_factor(link))
                 led = compose(placed[link.first], link.relative)
             placed.append(led if poses is None else poses[link.second])
             values.insert(link.second, _pose(placed[-1]))
@@ -47,11 +47,9 @@ class Graph:
 
     def close(self, loops: Iterable[Edge]) -> None:
         """Add loops, and move all poses to where everything agrees best."""
-        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(ROBUST)
         factors = gtsam.NonlinearFactorGraph()
         for loop in loops:
-            noise = gtsam.noiseModel.Robust.Create(cauchy, _noise(loop))
-            factors.add(_factor(loop, noise))
+            factors.add(_factor(loop))
             self.loops.append(loop)
         self._isam.update(factors, gtsam.Values())
         for _ in range(ROUNDS):
@@ -63,9 +61,13 @@ def _pose(pose: Floats) -> gtsam.Pose2:
     return gtsam.Pose2(*map(float, pose))
 
 
-def _noise(edge: Edge) -> gtsam.noiseModel.Gaussian:
-    return gtsam.noiseModel.Gaussian.Covariance(edge.covariance)
+def _factor(edge: Edge) -> gtsam.BetweenFactorPose2:
+    return gtsam.BetweenFactorPose2(edge.first, edge.second, _pose(edge.relative), _noise(edge))
 
 
-def _factor(edge: Edge, noise: gtsam.noiseModel.Base) -> gtsam.BetweenFactorPose2:
-    return gtsam.BetweenFactorPose2(edge.first, edge.second, _pose(edge.relative), noise)
+def _noise(edge: Edge) -> gtsam.noiseModel.Base:
+    noise = gtsam.noiseModel.Gaussian.Covariance(edge.covariance)
+    if not edge.doubtful:
+        return noise
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(ROBUST)
+    return gtsam.noiseModel.Robust.Create(cauchy, noise)

@@ -14,6 +14,7 @@ class Edge:
     second: int
     relative: Floats
     covariance: Floats  # (3, 3), of x, y and yaw in the axes of `second`
+    doubtful: bool  # may be all wrong, so it counts the less the more it disagrees with others
 
 
 @dataclass(frozen=True, slots=True)

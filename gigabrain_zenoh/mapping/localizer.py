@@ -16,7 +16,8 @@ from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, compose, turned
 
 LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somewhere else
 SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here
-TOLERANCE = 0.03  # a fit that is worse than the best by no more says nothing against a place
+TOLERANCE = 0.03  # a fit that is worse than the best by no more says nothing against a place,
+STILL_TOLERANCE, STILL_SCANS = 0.08, 5  # and while the robot stands, it takes more, and some scans
 AGAINST = 0.2  # that much in all speaks against it
 VIEW_M, VIEW_RAD = 0.1, math.radians(6)  # farther on, what is seen counts as seen elsewhere
 LOOSE_M, LOOSE_RAD = 0.5, math.radians(20)  # a deviation beyond that is no position
@@ -64,6 +65,7 @@ class Localizer:
     _places: list[Hypothesis] = field(default_factory=list)
     _localized: bool = False
     _unsearched: int = SEARCH_SCANS  # scans since the last search
+    _still: int = 0  # scans since the last view
     _moved: Floats = field(default_factory=lambda: IDENTITY.copy())  # since the last view
     _last: Hypothesis = field(default_factory=lambda: Hypothesis(IDENTITY, NOWHERE))
 
@@ -133,10 +135,13 @@ class Localizer:
     def _choose(self) -> None:
         """Drop places that what is seen speaks against; the last one is right."""
         best = max(one.score for one in self._places)
-        far = math.hypot(self._moved[0], self._moved[1]) > VIEW_M
-        if far or abs(self._moved[2]) > VIEW_RAD:
-            self._moved = IDENTITY.copy()
-            self._places = [_judged(one, best) for one in self._places]
+        moved = math.hypot(self._moved[0], self._moved[1]) > VIEW_M
+        moved = moved or abs(float(self._moved[2])) > VIEW_RAD
+        self._still = 0 if moved else self._still + 1
+        if moved or self._still % STILL_SCANS == 0:
+            bar = best - (TOLERANCE if moved else STILL_TOLERANCE)
+            self._moved = IDENTITY.copy() if moved else self._moved
+            self._places = [_judged(one, bar) for one in self._places]
         left = [one for one in self._places if one.against < AGAINST and one.bad < LOST_SCANS]
         self._places = []
         for one in sorted(left, key=lambda one: -one.score):
@@ -175,8 +180,8 @@ def _followed(into: Field, one: Hypothesis, view: View | None) -> Hypothesis:
     )
 
 
-def _judged(one: Hypothesis, best: float) -> Hypothesis:
-    return replace(one, against=one.against + max(best - one.score - TOLERANCE, 0.0))
+def _judged(one: Hypothesis, bar: float) -> Hypothesis:
+    return replace(one, against=one.against + max(bar - one.score, 0.0))
 
 
 def _inverse(matrix: Floats) -> Floats:

@@ -39,7 +39,7 @@ SMALL = np.array((0.3, 0.3, 0.1))  # [m], [m], [rad]: a loop that changes less n
 AGREE = np.array((0.2, 0.2, 0.05))  # [m], [m], [rad], between two witnesses
 MEMORY = 10.0  # [m] of travel, a witness is heard so long
 LOOP = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance beside that of ICP
-OPEN = 1e-3 * np.eye(3)  # information, so that open directions can be inverted
+OPEN = 0.02  # of what holds the best direction: a place that holds another less is an aisle
 
 
 class LoopSearch:
@@ -49,16 +49,6 @@ class LoopSearch:
         self.drift = Drift(rates)
         self.waiting: list[Edge] = []  # loops without a second witness
         self.searched = -SPACING  # [m] of travel
-
-    def drive(self, keyframes: Sequence[Keyframe], here: int) -> None:
-        """Take in the link of keyframe `here`."""
-        link = keyframes[here].link
-        if link.first == here:
-            return
-        if keyframes[link.first].segment == keyframes[here].segment:
-            self.drift.driven(link)
-        else:
-            self.drift.broken(link)
 
     def find(self, keyframes: Sequence[Keyframe], poses: Floats) -> list[Edge]:
         """Loops that end at the last keyframe and are beyond doubt, and those that they confirm."""
@@ -128,9 +118,12 @@ def _attempt(
     slid = float(np.hypot(*(fit.pose - found.pose)[:2]))
     if fit.inliers < INLIERS or fit.rms > RMS or slid > MOVED:
         return None
+    least, most = np.linalg.eigvalsh(fit.information[:2, :2])
+    if least < OPEN * most:
+        return None
     pose = wrapped(fit.pose)
-    covariance = LOOP + turned(inverse_of(fit.information + OPEN), -float(pose[2]))
-    return Edge(there, here, pose, covariance)
+    covariance = LOOP + turned(inverse_of(fit.information), -float(pose[2]))
+    return Edge(there, here, pose, covariance, doubtful=True)
 
 
 def _small(loop: Edge, poses: Floats) -> bool:

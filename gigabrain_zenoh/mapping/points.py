@@ -11,6 +11,7 @@ from gigabrain_zenoh.mapping.se2 import Floats
 Points = NDArray[np.float32]
 
 NEIGHBOUR = 0.4  # [m], a point farther away lies on something else
+SPREAD, FARTHEST = 2.5, 1.2  # unless beams are so many times farther apart there; and [m]
 SPAN = 0.12  # [m], a normal rests on neighbours at least so far to either side, where there are any
 LEAST, MOST = 3, 10  # neighbours on either side
 FEWEST = 3  # points under a normal
@@ -56,19 +57,29 @@ def from_beams(
     return Scan.of(ways[hit] * ranges[hit, None], ways[clear] * free_range)
 
 
-@kernel
 def normals(points: Points) -> Points:
     """The normal at each point, from the line through its neighbours in beam order."""
+    if len(points) < FEWEST:
+        return np.zeros_like(points)
+    bearings = np.arctan2(points[:, 1], points[:, 0])
+    return _normals(points, float(np.median(np.abs(np.diff(bearings)))))
+
+
+@kernel
+def _normals(points: Points, between: float) -> Points:
+    """`between` [rad] beams: where they are far apart, so are neighbours on a line."""
     count = len(points)
     found = np.zeros((count, 2), np.float32)
     for k in range(count):
         n, sx, sy, sxx, syy, sxy = 1, 0.0, 0.0, 0.0, 0.0, 0.0
+        range_ = np.sqrt(points[k, 0] ** 2 + points[k, 1] ** 2)
+        most_away = min(max(NEIGHBOUR, SPREAD * between * range_), FARTHEST)
         for side in (-1, 1):
             for step in range(1, min(MOST, count - 1) + 1):
                 j = (k + side * step) % count
                 dx, dy = points[j, 0] - points[k, 0], points[j, 1] - points[k, 1]
                 away = np.sqrt(dx * dx + dy * dy)
-                if away < NEIGHBOUR:
+                if away < most_away:
                     n += 1
                     sx, sy = sx + dx, sy + dy
                     sxx, syy, sxy = sxx + dx * dx, syy + dy * dy, sxy + dx * dy

@@ -134,7 +134,7 @@ class Slam:
         keyframes = self.keyframes[: here + 1]
         link = keyframes[here].link
         self._graph.extend([link])
-        self._search.drive(keyframes, here)
+        self._search.drift.linked(link)
         loops = self._search.find(keyframes, self._graph.poses)
         if not loops:
             return None
@@ -198,8 +198,8 @@ class Slam:
     def _thaw_graph(self, poses: Floats, arrays: Arrays) -> None:
         loops = thaw_edges("loop", arrays)
         self._graph.extend([keyframe.link for keyframe in self.keyframes[: len(poses)]], poses)
-        for here in range(len(poses)):
-            self._search.drive(self.keyframes, here)
+        for keyframe in self.keyframes[: len(poses)]:
+            self._search.drift.linked(keyframe.link)
         for loop in loops:
             self._search.drift.closed(loop)
         if loops:
@@ -219,7 +219,8 @@ class Slam:
         broken = match.kind == "broken"
         self._segment += broken
         covariance = LINK + turned(match.covariance, -float(match.pose[2]))
-        link = Edge(self._anchor[0], here, relative if here else match.pose, covariance)
+        doubtful = match.kind in ("odometry", "broken")
+        link = Edge(self._anchor[0], here, relative if here else match.pose, covariance, doubtful)
         self.keyframes.append(Keyframe(scan, link, self._travel, self._segment))
         self._poses.append(compose(self._poses[link.first], relative) if here else match.pose)
         self._anchor = (here, match.pose)

@@ -1,18 +1,19 @@
 """What viewers ask of the robot, and what becomes of it."""
 
 import time
+from collections.abc import Sequence
 
 from msgspec.structs import replace
 
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
-from gigabrain_schemas.topics import ENABLE, GOAL, RELEASE
-from gigabrain_zenoh.asking import ask, granted
+from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
+from gigabrain_schemas.topics import ENABLE, GOAL, RELEASE, TASK_CHANGE
+from gigabrain_zenoh.asking import ANSWER_S, ask, granted
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.estop import press
 from gigabrain_zenoh.gate_state import BRAIN
 from gigabrain_zenoh.page.wire import Ask, Reply
-from gigabrain_zenoh.task_client import PLAN_S, Tasks
 
 
 class Operator:
@@ -39,7 +40,7 @@ class Operator:
         if asked.what == "goal":
             return await self._goal(asked), ""
         if asked.what == "cancel":
-            return await Tasks(self._bus).cancel("all"), ""
+            return await self._cancel(), ""
         if asked.what == "estop":
             reply = await press(self._bus, "operator page")
         elif asked.what == "release":
@@ -56,13 +57,23 @@ class Operator:
         request = EnableRequest(source=BRAIN, take=take, by=self._bus.process)
         return granted(await ask(self._bus, ENABLE, request))
 
+    async def _cancel(self) -> str:
+        request = TaskRequest(do="cancel", source=self._bus.process)
+        replies = await self._bus.ask(TASK_CHANGE, request, timeout_s=ANSWER_S)
+        return _answered(replies)
+
     async def _goal(self, asked: Ask) -> str:
         if asked.goal is None:
             raise Refused("a goal needs a place")
         goal = replace(asked.goal, source=self._bus.process)
-        replies = await self._bus.ask(GOAL, goal, timeout_s=PLAN_S)
-        if not replies:
-            raise BodyLost("nobody serves goals: this robot has no navigation running")
-        if not replies[0].ok:
-            raise Refused(replies[0].text)
-        return replies[0].text
+        replies = await self._bus.ask(GOAL, goal, timeout_s=ANSWER_S)
+        return _answered(replies)
+
+
+def _answered(replies: Sequence[GoalReply | TaskReply]) -> str:
+    """What a robot that goes somewhere says. Raises BodyLost where none does, and Refused."""
+    if not replies:
+        raise BodyLost("nobody serves goals: this robot has no navigation running")
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    return replies[0].text

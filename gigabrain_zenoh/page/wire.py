@@ -11,10 +11,10 @@ from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, OccupancyGrid, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import Image, LaserScan
-from gigabrain_schemas.tasks import GoalRequest, TaskStatus
+from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_zenoh.codec import DECODE_ERRORS
 
-ABOUT, MOMENT, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE = range(1, 9)  # to the browser
+ABOUT, MOMENT, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
 LOGIN, DRIVE, ASK = range(1, 4)  # from it
 
 T = TypeVar("T")
@@ -39,7 +39,6 @@ class Moment(Struct, frozen=True, kw_only=True):
     intent: Intent | None
     safety: SafetyState | None
     world: WorldModel | None
-    task: TaskStatus | None = None
     driving: int = 0  # the number of the viewer who steers
     viewers: int = 1
 

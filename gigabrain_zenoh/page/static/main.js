@@ -2,10 +2,9 @@
 import { Drive } from './drive.js'
 import { Link } from './link.js'
 import { MapView } from './map.js'
-import { $, hearHealth, hearLine, put, showFigures, showGate, showImage, showSafety, showTables } from './panels.js'
+import { $, hearHealth, hearLine, put, showFigures, showGate, showImage, showSafety, showTables, showTask } from './panels.js'
 
 const STOP_MS = 2500 // the server gives up after two seconds
-const GOAL_MS = 6000 // a way through a large map takes its time
 const HANDS = 'press the hardware e-stop or cut the power'
 const remembered = (key) => { try { return sessionStorage.getItem(key) ?? '' } catch { return '' } }
 const remember = (key, value) => { try { sessionStorage.setItem(key, value) } catch { /* private mode */ } }
@@ -32,11 +31,14 @@ const link = new Link({
     showGate(now.state, looking())
     showFigures(now.state, now)
     showSafety(now.safety, about.body)
-    showTask(now.task)
     $('stick').classList.toggle('off', !mayDrive())
   },
   scan: (head, ranges) => map.setScan(head, ranges),
   map: (head, cells) => map.setMap(head, cells),
+  task(status) {
+    map.setTask(status)
+    showTask(status, looking())
+  },
   health: hearHealth,
   log: hearLine,
   image: showImage,
@@ -100,26 +102,12 @@ function say(reply) {
   show($('said'), reply.text, `note${reply.ok ? '' : ' bad'}`)
 }
 
-/** What the robot was sent to do; what was last, for as long as nothing else is said. */
-let told = ''
-function showTask(task) {
-  const now = task?.current, last = task?.done[0]
-  $('cancel').hidden = looking() || !now
-  const left = task?.distance_remaining == null ? '' : `, ${task.distance_remaining.toFixed(1)} m`
-  const text = now ? `${task.doing || now.label}${left}: ${now.state === 'paused' ? `paused, ${now.reason}` : now.reason}`
-    : last ? `${last.label} has ${last.state}${last.reason ? `: ${last.reason}` : ''}` : ''
-  if (text === told) return
-  if (!now) map.goal = null
-  told = text
-  show($('goal'), text, `note${!now && last?.state === 'failed' ? ' bad' : ''}`)
-}
-
 async function sendGoal(goal) {
   if (looking()) return
   map.goal = goal
   show($('goal'), 'asking …', 'note')
-  const reply = await link.ask('goal', { goal: { x: goal.x, y: goal.y, yaw: goal.yaw } }, GOAL_MS)
-  if (!reply.ok) map.goal = null
+  const reply = await link.ask('goal', { goal: { x: goal.x, y: goal.y, yaw: goal.yaw } })
+  if (!reply.ok) map.goal = map.task?.goal ?? null
   show($('goal'), reply.text, `note${reply.ok ? '' : ' bad'}`)
   map.draw()
 }
@@ -131,8 +119,7 @@ function show(element, text, kind) {
 
 $('estop').addEventListener('pointerdown', (event) => { event.preventDefault(); stop() })
 $('estop').addEventListener('click', (event) => { if (event.detail === 0) stop() }) // by keyboard or by a screen reader
-$('cancel').addEventListener('click', async () => { const reply = await link.ask('cancel'); show($('goal'), reply.text, 'note') })
-for (const what of ['release', 'enable', 'take']) $(what).addEventListener('click', () => ask(what))
+for (const what of ['release', 'enable', 'take', 'cancel']) $(what).addEventListener('click', () => ask(what))
 $('share').addEventListener('input', () => put($('percent'), `${$('share').value} %`))
 $('closer').addEventListener('click', () => map.zoom(1.3))
 $('farther').addEventListener('click', () => map.zoom(1 / 1.3))
