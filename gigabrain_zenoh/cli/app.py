@@ -72,6 +72,7 @@ COMMANDS = {
     "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
     "bench plan": ("bench_plan:plan", "Global planning, timed and checked."),
+    "bench barn": ("bench_barn:barn", "BARN: through a field of posts, scored."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
 }
