@@ -87,3 +87,15 @@ def _read_dynamic(file: Path) -> list[World]:
         World(index, none, tuple(movers[name] for name in names), start, goal, DYNAMIC_LENGTH)
         for index, names in zip(data["index"], data["worlds"], strict=True)
     ]
+
+
+def choose(worlds: list[World], only: str) -> list[World]:
+    """Those whose numbers are in `only`, separated by commas; all where that is empty."""
+    if not only:
+        return worlds
+    known = {world.number: world for world in worlds}
+    try:
+        return [known[int(number)] for number in only.split(",")]
+    except (KeyError, ValueError):
+        numbers = ", ".join(map(str, known))
+        raise ConfigError(f"--only: expected numbers out of {numbers}, got {only!r}") from None

@@ -23,6 +23,7 @@ ACCELERATION, ANGULAR_ACCELERATION = 5.0, 20.0  # [m/s2], [rad/s2], what the flo
 LENGTH, WIDTH = 0.458, 0.416  # [m], of chassis and wheels
 FIELD_OF_VIEW = math.radians(270.0)
 
+LIDAR = Lidar(beams=720, rate_hz=25, range_min=0.1, range_max=10.0, x=0.055)
 JACKAL = BodyDescription(
     robot_type="jackal",
     drive_type="differential",
@@ -37,7 +38,7 @@ JACKAL = BodyDescription(
     max_linear_acceleration=ACCELERATION,
     max_linear_deceleration=ACCELERATION,
     max_angular_acceleration=ANGULAR_ACCELERATION,
-    lidar=Lidar(beams=720, rate_hz=25, range_min=0.1, range_max=10.0, x=0.055),
+    lidar=LIDAR,
 )
 
 

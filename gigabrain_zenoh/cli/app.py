@@ -83,6 +83,7 @@ COMMANDS = {
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
     "bench plan": ("bench_plan:plan", "Global planning, timed and checked."),
     "bench slam": ("bench_slam:slam", "Maps from recorded laser logs, and their errors."),
+    "bench barn": ("bench_barn:barn", "BARN: through a field of posts, scored."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
 }

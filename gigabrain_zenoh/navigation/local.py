@@ -14,7 +14,8 @@ from gigabrain_zenoh.navigation.manner import kind_of, reason_of
 from gigabrain_zenoh.navigation.models import lag_of, model_of
 from gigabrain_zenoh.navigation.moment import Goal, LocalPlan, LocalSettings, Moment, Sent
 from gigabrain_zenoh.navigation.mppi import Planned, Sampler, past_of, step_of
-from gigabrain_zenoh.navigation.rollout import Scene, Start, Weights, distance_in
+from gigabrain_zenoh.navigation.rating import Scene, Weights, distance_in
+from gigabrain_zenoh.navigation.rollout import Start
 from gigabrain_zenoh.navigation.window import Place, Window
 
 __all__ = ["Goal", "LocalPlan", "LocalPlanner", "LocalSettings", "Moment", "Sent", "warm_up"]
@@ -87,10 +88,12 @@ class LocalPlanner:
         v, sent, dt = moment.velocity, moment.sent, self._sampler.dt
         times = [((one.tick - moment.tick) * TICK_S, *_axes(one.velocity)) for one in sent]
         rows = np.array([row for row in times if row[0] <= 0.0]).reshape(-1, 4)
+        gain = moment.response.turn_gain
+        rows[:, 3] *= gain  # what the floor makes of it; control undoes that in what is to come
         before = tuple(rows[-1, 1:].tolist()) if len(rows) else _axes(v)
         past, share = past_of(rows, _axes(v), moment.response.delay, dt)
         lag = lag_of(moment.response.lag, dt)
-        return Start(*place, *_axes(v), before, past, share, lag, moment.turn_gain)
+        return Start(*place, *_axes(v), before, past, share, lag, gain)
 
     def _answer(self, moment: Moment, scene: Scene, planned: Planned) -> LocalPlan:
         place = moment.pose

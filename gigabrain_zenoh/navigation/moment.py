@@ -61,7 +61,6 @@ class Moment:
     known: Floats = field(default_factory=no_points)  # (m, 2) [m], obstacles of the map near by
     obstacles: tuple[Obstacle, ...] = ()
     response: Response = field(default_factory=Response)
-    turn_gain: float = 1.0  # measured over commanded yaw rate
     sent: tuple[Sent, ...] = ()  # oldest first; those of the last 0.5 s are enough
 
 

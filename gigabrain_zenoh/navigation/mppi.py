@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.kernels import kernel
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.models import Model
-from gigabrain_zenoh.navigation.rollout import Scene, Start, Weights, drive
+from gigabrain_zenoh.navigation.rating import Scene, Weights
+from gigabrain_zenoh.navigation.rollout import Start, drive
 
 Floats = NDArray[np.float64]
 
