@@ -13,6 +13,7 @@ from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel, Twist
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.tasks import Task
 from gigabrain_schemas.topics import (
     BODY,
     ENABLE,
@@ -32,6 +33,7 @@ from gigabrain_zenoh.keys.checks import may_not_ask, no_router
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 from gigabrain_zenoh.listening import listen, topic_named
 from gigabrain_zenoh.running import find_endpoint
+from gigabrain_zenoh.task_client import Tasks
 
 M = TypeVar("M", bound=Message)
 
@@ -88,6 +90,20 @@ class Robot:
         self._until_tick = 0
         self._hold = Hold(bus.process)
         self._arrived = asyncio.Event()
+        self.tasks = Tasks(bus, keys)
+
+    async def go_to(self, x: float, y: float, yaw: float | None = None) -> Task:
+        """Send the robot to a place in its map [m, m, rad]; how that ended, once it has.
+
+        Whoever is cancelled meanwhile leaves the robot without that goal. `tasks` has the rest:
+        missions, the queue, progress. Raises Refused, and BodyLost when nobody serves goals.
+        """
+        name = await self.tasks.go_to(x, y, yaw)
+        try:
+            return await self.tasks.result(name)
+        except asyncio.CancelledError:
+            await self.tasks.cancel(name)
+            raise
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float = 0.0, angular_z: float = 0.0

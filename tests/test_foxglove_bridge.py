@@ -30,6 +30,7 @@ from gigabrain_schemas.topics import (
     POSE,
     SCAN,
     STATE,
+    TASK,
     TELEOP,
     WORLD,
 )
@@ -112,7 +113,7 @@ async def test_a_scan_arrives_in_foxgloves_schema_beam_by_beam(bridge: Bridge) -
 
 
 async def test_every_kind_of_message_has_a_channel_to_be_drawn_from(bridge: Bridge) -> None:
-    said = (STATE, SCAN, WORLD, POSE, MAP, LOG)
+    said = (STATE, SCAN, WORLD, POSE, MAP, TASK, LOG)
     for topic in said:
         message = EXAMPLES[topic.type.__name__]
         assert isinstance(message, topic.type)
@@ -120,7 +121,7 @@ async def test_every_kind_of_message_has_a_channel_to_be_drawn_from(bridge: Brid
     picture = Image(frame_id="cam", encoding="mono8", height=1, width=2, data=b"\x00\xff")
     bridge.robot.publish(IMAGE, picture, name="front")
     async with bridge.viewer() as viewer:
-        for topic in ("scan", "map", "pose", "tf", "obstacles", "image/front", "log",
+        for topic in ("scan", "map", "pose", "tf", "obstacles", "way", "image/front", "log",
                       "state_numbers", "world_numbers"):  # fmt: skip
             assert await viewer.channel(f"/viz/{topic}")
     assert viewer.server["capabilities"] == ["clientPublish", "connectionGraph"]

@@ -79,7 +79,7 @@ class Terminal:
 
 @pytest.fixture
 def terminal(home: Home) -> Iterator[Terminal]:
-    place = Terminal(home, "demo", "--world", "house", "--seconds", "600")
+    place = Terminal(home, "demo", "--behaviour", "avoid", "--world", "house", "--seconds", "600")
     yield place
     place.close()
 

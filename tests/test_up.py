@@ -271,7 +271,7 @@ async def test_a_folder_that_cannot_be_written_is_said_in_one_line(home: Home, w
     router = ("--connect", f"tcp/127.0.0.1:{free_port()}")
     commands: dict[str, tuple[str, ...]] = {
         "state": ("up", str(home.deployment())),
-        "run": ("demo", "--headless", "--seconds", "1"),
+        "run": ("demo", "--behaviour", "avoid", "--headless", "--seconds", "1"),
         "run_dir": ("perception", "--run-dir", str(place), *router),
         "remember": ("driver", "run", "mock", "--remember", str(place)),
     }

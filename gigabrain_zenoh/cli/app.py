@@ -13,7 +13,7 @@ MODULES = "gigabrain_zenoh.cli"
 
 # command -> where it is, and what it does in a line
 COMMANDS = {
-    "demo": ("run:demo", "Drive a simulated robot round a room, until Ctrl-C."),
+    "demo": ("run:demo", "Drive a simulated robot round its world, until Ctrl-C."),
     "up": ("run:up", "Start what a deployment file puts on this host, and keep it running."),
     "router": ("process:router", "Start the router that joins the other processes."),
     "perception": ("process:perception", "Start perception."),
@@ -29,6 +29,14 @@ COMMANDS = {
     "estop": ("operate:estop", "Stop the robot at once, and latch it."),
     "release": ("operate:release", "Let go of a latched gate."),
     "enable": ("operate:enable", "Let the robot's brain drive."),
+    "goto": ("tasks:goto", "Send the robot to a place in its map, and wait until it is there."),
+    "explore": ("tasks:explore", "Have it drive until nothing is left to be seen."),
+    "patrol": ("tasks:patrol", "Have it go round the places of a file."),
+    "mission": ("tasks:mission", "Have it carry out a mission, which is a file."),
+    "task list": ("tasks:list_", "Show what it is at, what waits, and what was last."),
+    "task cancel": ("tasks:cancel", "End what it is at, or another task."),
+    "task pause": ("tasks:pause", "Have a task wait."),
+    "task resume": ("tasks:resume", "Have a task go on that waits for a person."),
     "keys new": ("keys:new", "Make a fleet's own authority, which issues identities."),
     "keys issue": ("keys:issue", "Make an identity: a folder to copy to its host."),
     "keys list": ("keys:identities", "List identities, and when they expire."),
@@ -73,8 +81,9 @@ COMMANDS = {
     "faults": ("faults:faults", "Break the robot in 44 ways, and see whether it stops."),
     "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
-    "bench slam": ("bench_slam:slam", "Maps from recorded laser logs, and their errors."),
     "bench plan": ("bench_plan:plan", "Global planning, timed and checked."),
+    "bench slam": ("bench_slam:slam", "Maps from recorded laser logs, and their errors."),
+    "bench barn": ("bench_barn:barn", "BARN: through a field of posts, scored."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
 }
@@ -84,6 +93,7 @@ GROUPS = {
     "bag": "Recordings.",
     "topic": "What goes over the bus.",
     "node": "The processes of a robot.",
+    "task": "What the robot was sent to do.",
     "param": "What may be changed at run time.",
     "map": "Maps that a robot has made.",
     "bench": "Measure this machine.",

@@ -1,0 +1,105 @@
+"""`gigabrain bench barn`: the BARN and DynaBARN tasks against a plant that makes it hard."""
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from gigabrain_zenoh.cli.checked import above_zero
+from gigabrain_zenoh.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from gigabrain_zenoh.bench.barn import BarnResult
+    from gigabrain_zenoh.bench.barn_drive import Trial
+
+
+def barn(
+    *,
+    worlds: Path,
+    trials: int = 1,
+    only: str = "",
+    dynamic: bool = False,
+    plant: Literal["hard", "ideal"] = "hard",
+    samples: int = 1000,
+    jobs: int = 2,
+    json: Path | None = None,
+) -> int:
+    """Drive a Jackal through worlds that it does not know, and score it as the contest does.
+
+    Example: gigabrain bench barn --worlds worlds.npz --trials 1 --only 1,7
+
+    Perception, planning, control and the gate's limits run in fake time, tick by tick, against a
+    plant with delay, lag, slip, drift and noise. Contacts are looked for in every tick.
+
+    Parameters
+    ----------
+    worlds
+        The file of worlds: npz for BARN, JSON for DynaBARN.
+    trials
+        How often in each world.
+    only
+        Numbers of worlds, separated by commas; all without.
+    dynamic
+        DynaBARN: the obstacles move.
+    plant
+        hard: 100 ms delay, 150 ms lag, slip to 0.6, drift 2 %, 3 cm noise, 10 % dropouts.
+        ideal: none of it but 1 cm noise.
+    samples
+        Plans per cycle.
+    jobs
+        How many trials at the same time.
+    json
+        Write all trials into this file.
+    """
+    import msgspec
+    from rich.console import Console
+
+    from gigabrain_zenoh.bench.barn import measure_barn
+    from gigabrain_zenoh.bench.barn_worlds import choose, read_worlds
+
+    for name, value in (("trials", trials), ("samples", samples), ("jobs", jobs)):
+        above_zero(name, value)
+    chosen = choose(read_worlds(worlds, dynamic), only)
+    result = measure_barn(chosen, trials, plant, samples, jobs, _progress)
+    Console().print(_table(result, worlds.name, plant))
+    if json is not None:
+        try:
+            json.write_bytes(msgspec.json.format(msgspec.json.encode(result)) + b"\n")
+        except OSError as error:
+            raise ConfigError(f"cannot write {json}: {error.strerror}") from None
+    return 0
+
+
+def _progress(trial: "Trial") -> None:
+    text = f"world {trial.world} trial {trial.trial}: {trial.result} after {trial.seconds:.2f} s"
+    text += f", least clearance {trial.least_clearance:.3f} m"
+    print(text, file=sys.stderr, flush=True)
+
+
+def _table(result: "BarnResult", file: str, plant: str) -> "Table":
+    from rich.table import Table
+
+    table = Table(title=f"{file}, plant {plant}, {result.samples} plans a cycle")
+    table.add_column("")
+    table.add_column("", justify="right")
+    smallest, median = result.clearances
+    rows = (
+        ("trials", str(len(result.trials))),
+        ("success", f"{result.share('success'):.3f}"),
+        ("collision", f"{result.share('collision'):.3f}"),
+        ("timeout", f"{result.share('timeout'):.3f}"),
+        ("score (2024 and later, of 0.5)", f"{result.score:.4f}"),
+        ("mean time of successes, s", _number(result.seconds)),
+        ("least clearance, m", f"{smallest:.3f}"),
+        ("median of each trial's least, m", f"{median:.3f}"),
+        ("planning p50, ms", _number(result.cycle_ms(0.5))),
+        ("planning p99, ms", _number(result.cycle_ms(0.99))),
+    )
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

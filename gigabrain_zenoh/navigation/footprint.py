@@ -1,0 +1,146 @@
+"""How far the whole outline of a body is from the nearest obstacle."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.sweep import Corners, box
+
+SPACING = 0.05  # [m], between points on the outline at most
+STRETCH = 6  # points between two that are always looked at
+ROOM = 0.4  # [m], more than that round the body makes no difference
+FAR = 3.0  # [m], what is farther away, or beyond the window, does not matter
+
+
+class Outline(NamedTuple):
+    """A footprint as compiled functions take it, in the body's frame."""
+
+    points: NDArray[np.float64]  # (n, 2) [m], once round
+    spacing: float  # [m], from one to the next at most
+    center_x: float  # [m], of the box around it
+    center_y: float
+    inner: float  # [m], radius of the largest circle round the center that is inside the box
+    outer: float  # [m], how far it reaches from the center
+    front: float  # [m], the box
+    rear: float
+    left: float
+    right: float
+
+
+class Grid(NamedTuple):
+    """Distances to the nearest obstacle, bilinear between the centers of cells."""
+
+    distance: NDArray[np.float32]  # (rows, columns) [m]
+    cell: float  # [m]
+    x: float  # [m], of the corner of cell (0, 0)
+    y: float
+
+
+def outline_of(footprint: Corners) -> Outline:
+    """The outline of any polygon."""
+    corners = np.array(footprint, dtype=np.float64)
+    pieces, widest = [], 0.0
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        length = float(np.hypot(*(end - start)))
+        count = max(1, math.ceil(length / SPACING))
+        widest = max(widest, length / count)
+        pieces.append(start + (end - start) * (np.arange(count) / count)[:, None])
+    front, rear, left, right = box(footprint)
+    x, y = (front + rear) / 2, (left + right) / 2
+    points = np.ascontiguousarray(np.concatenate(pieces))
+    outer = float(np.hypot(corners[:, 0] - x, corners[:, 1] - y).max())
+    # a polygon's own inside, so that what has got under a thin or hollow one counts as well
+    inner = float(np.hypot(points[:, 0] - x, points[:, 1] - y).min())
+    return Outline(points, widest, x, y, inner, outer, front, rear, left, right)
+
+
+@kernel
+def distance_at(grid: Grid, x: float, y: float) -> float:
+    """The distance [m] from (x, y) to the nearest obstacle."""
+    rows, columns = grid.distance.shape
+    u, v = (x - grid.x) / grid.cell - 0.5, (y - grid.y) / grid.cell - 0.5
+    if u < 0.0 or v < 0.0 or u >= columns - 1 or v >= rows - 1:
+        return FAR
+    i, j = int(v), int(u)
+    a, b = v - i, u - j
+    d = grid.distance
+    low = d[i, j] + b * (d[i, j + 1] - d[i, j])
+    high = d[i + 1, j] + b * (d[i + 1, j + 1] - d[i + 1, j])
+    found: float = low + a * (high - low)
+    return found
+
+
+@kernel
+def clearance(
+    grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float
+) -> float:
+    """How far the outline at a pose is from the nearest obstacle [m]; below 0 with one inside.
+
+    More than ROOM counts as ROOM. The distance changes by no more than the way along the outline,
+    so that whole stretches of it can be left out.
+    """
+    center_x = x + cosine * outline.center_x - sine * outline.center_y
+    center_y = y + sine * outline.center_x + cosine * outline.center_y
+    middle = distance_at(grid, center_x, center_y)
+    if middle >= outline.outer + ROOM:
+        return ROOM
+    nearest = min(ROOM, middle - outline.inner) if middle < outline.inner else ROOM
+    points, spacing = outline.points, outline.spacing
+    count = points.shape[0]
+    first = distance_at(
+        grid,
+        x + cosine * points[0, 0] - sine * points[0, 1],
+        y + sine * points[0, 0] + cosine * points[0, 1],
+    )
+    begin, begins = 0, first
+    while begin < count:
+        end = min(begin + STRETCH, count)
+        ends = first
+        if end < count:
+            px, py = points[end, 0], points[end, 1]
+            ends = distance_at(grid, x + cosine * px - sine * py, y + sine * px + cosine * py)
+        nearest = min(nearest, begins)
+        i = begin + 1
+        if (begins + ends - (end - begin) * spacing) * 0.5 >= nearest:
+            i = end
+        while i < end:
+            px, py = points[i, 0], points[i, 1]
+            d = distance_at(grid, x + cosine * px - sine * py, y + sine * px + cosine * py)
+            i += 1 + int(max(0.0, d - nearest) / spacing)
+            nearest = min(nearest, d)
+        begin, begins = end, ends
+    return nearest
+
+
+@kernel
+def free_ahead(
+    grid: Grid,
+    outline: Outline,
+    x: float,
+    y: float,
+    cosine: float,
+    sine: float,
+    sign: float,
+    side_margin: float,
+    reach: float,
+) -> float:
+    """How far the body can go straight on, or back for a `sign` of -1, within `reach` [m].
+
+    As wide as the body and `side_margin` [m], followed by discs from the front edge on.
+    """
+    half = (outline.left - outline.right) / 2
+    edge = outline.front if sign > 0 else -outline.rear
+    begin = edge - half
+    gone = 0.0
+    while gone < reach:
+        along = sign * (begin + gone)
+        px = x + cosine * along - sine * outline.center_y
+        py = y + sine * along + cosine * outline.center_y
+        room = distance_at(grid, px, py) - half - side_margin
+        if room <= 0.0:
+            return gone
+        gone += max(room, 0.05)
+    return reach

@@ -1,0 +1,157 @@
+"""What places, motions and ends of a plan cost, in units of which a second is worth 8."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.navigation.footprint import Grid, Outline, distance_at, free_ahead
+from gigabrain_zenoh.navigation.models import Model
+
+Floats = NDArray[np.float64]
+
+SECOND = 8.0  # what a second costs
+LOOK_AHEAD = 0.25  # [m], from where the last pose's heading is judged
+NEAR_GOAL = 0.2  # [m], nearer the field is too coarse
+SLOW = 0.05  # [m/s], slower than this it always stops in time
+NO_DISC = 1e3  # [m], where nothing moves
+TOO_FAST = 4.0  # per (m/s)2 and second above the speed from which the body stops in time
+
+
+class Scene(NamedTuple):
+    """All that is round the body."""
+
+    grid: Grid  # distances to what stands still
+    field: Grid  # cost to go [m]
+    discs: Floats  # (m, 6): x, y [m], velocity x, y [m/s], radius [m] and its growth [m/s]
+    goal_x: float  # [m]
+    goal_y: float
+    goal_yaw: float  # [rad]; nan where any will do
+    tolerance: float  # [m]
+
+
+class Weights(NamedTuple):
+    """What is preferred, by how much."""
+
+    margin: float = 0.03  # [m], nearer than this is a contact
+    near: float = 1.2  # of having obstacles near, per second
+    near_over: float = 0.05  # [m], over which that decays
+    tight: float = 1.5  # of speed in tight places, per second
+    tight_speed: float = 0.45  # [m/s], always allowed
+    tight_rate: float = 4.0  # [1/s], more speed per metre of room
+    turning: float = 0.02  # per (rad/s)2 and second
+    backwards: float = 1.0  # per m
+    heading: float = 1.5  # of facing away from the goal, in units of the time it takes to turn
+    disc: float = 3.0  # of having moving things near, per second
+    disc_over: float = 0.3  # [m]
+    disc_margin: float = 0.02  # [m]
+
+
+@kernel
+def of_place(
+    model: Model, weights: Weights, scene: Scene, room: float, away: float, x: float, y: float
+) -> float:
+    """What it costs to be here for a second, with obstacles and moving things so far away [m]."""
+    cost = weights.near * math.exp((weights.margin - room) / weights.near_over)
+    if away < NO_DISC:
+        cost += weights.disc * math.exp(-away / weights.disc_over)
+    if math.hypot(x - scene.goal_x, y - scene.goal_y) > scene.tolerance:
+        cost += 0.5 * SECOND
+    return cost
+
+
+@kernel
+def of_motion(weights: Weights, room: float, vx: float, vy: float, w: float) -> float:
+    """What it costs to move so for a second."""
+    cost = weights.turning * w * w
+    over = math.hypot(vx, vy) - (weights.tight_speed + weights.tight_rate * (room - weights.margin))
+    if over > 0.0:
+        cost += weights.tight * over * over
+    if vx < 0.0:
+        cost -= weights.backwards * vx
+    return cost
+
+
+@kernel
+def of_braking(
+    model: Model, outline: Outline, scene: Scene, room: float, x: float, y: float,
+    cosine: float, sine: float, vx: float, vy: float,
+) -> float:  # fmt: skip
+    """What it costs to be faster for a second than what is ahead allows: safety would step in."""
+    speed = math.hypot(vx, vy)
+    brake, t = model.deceleration, model.reaction_time
+    needs = speed * t + speed * speed / (2.0 * brake) + model.margin
+    if speed < SLOW or room >= needs:
+        return 0.0
+    sign = 1.0 if vx >= 0.0 else -1.0
+    free = free_ahead(scene.grid, outline, x, y, cosine, sine, sign, model.side_margin, needs)
+    allowed = math.sqrt((brake * t) ** 2 + 2.0 * brake * max(0.0, free - model.margin)) - brake * t
+    over = max(0.0, speed - allowed)
+    return TOO_FAST * over * over
+
+
+@kernel
+def rest(model: Model, scene: Scene, x: float, y: float) -> float:
+    """The cost of the way from (x, y) to the goal."""
+    away = math.hypot(x - scene.goal_x, y - scene.goal_y)
+    way = away if away < NEAR_GOAL else distance_in(scene.field, x, y)
+    return SECOND * way / model.forward
+
+
+@kernel
+def distance_in(field: Grid, x: float, y: float) -> float:
+    """The cost to go from (x, y) [m]; beyond the rim that of the rim."""
+    rows, columns = field.distance.shape
+    cell = field.cell
+    inner_x = min(max(x, field.x + cell), field.x + (columns - 1) * cell)
+    inner_y = min(max(y, field.y + cell), field.y + (rows - 1) * cell)
+    return distance_at(field, inner_x, inner_y)
+
+
+@kernel
+def of_end(
+    model: Model, weights: Weights, scene: Scene, x: float, y: float, yaw: float,
+    vx: float, vy: float,
+) -> float:  # fmt: skip
+    """What is left to do after the last step: to turn to the way, to drive it, to turn at its end.
+
+    A body that has all but arrived only has to stand, with the right yaw.
+    """
+    cost = rest(model, scene, x, y)
+    dx, dy = scene.goal_x - x, scene.goal_y - y
+    near = math.hypot(dx, dy) < NEAR_GOAL
+    if not math.isnan(scene.goal_yaw):
+        arrives = yaw if near else math.atan2(dy, dx)
+        cost += SECOND * _turn_between(arrives, scene.goal_yaw) / model.turning
+    if near:
+        return cost + 0.5 * SECOND * math.hypot(vx, vy) / model.forward
+    here = distance_in(scene.field, x, y)
+    ahead = distance_in(scene.field, x + LOOK_AHEAD * math.cos(yaw), y + LOOK_AHEAD * math.sin(yaw))
+    rise = max(-1.0, min(1.0, (ahead - here) / LOOK_AHEAD))
+    return cost + weights.heading * (1.0 + rise) / model.turning
+
+
+@kernel
+def _turn_between(one: float, other: float) -> float:
+    """The angle between two directions [rad], 0 to pi."""
+    turn = one - other
+    return abs(turn - math.tau * math.floor(turn / math.tau + 0.5))
+
+
+@kernel
+def from_discs(
+    discs: Floats, outline: Outline, x: float, y: float, cosine: float, sine: float, t: float
+) -> float:
+    """How far the body's box is from the nearest disc, `t` [s] from now [m]."""
+    nearest = NO_DISC
+    for i in range(discs.shape[0]):
+        dx = discs[i, 0] + discs[i, 2] * t - x
+        dy = discs[i, 1] + discs[i, 3] * t - y
+        ahead, aside = cosine * dx + sine * dy, cosine * dy - sine * dx
+        out_x = max(outline.rear - ahead, 0.0, ahead - outline.front)
+        out_y = max(outline.right - aside, 0.0, aside - outline.left)
+        away = math.hypot(out_x, out_y) - discs[i, 4] - discs[i, 5] * t
+        nearest = min(nearest, away)
+    return nearest

@@ -1,0 +1,219 @@
+"""The near surroundings: a grid that goes with the robot and remembers what its lidar saw of late.
+
+A hit marks a cell. A beam that goes on past a marked cell takes it back in two scans, so that what
+has moved leaves no ghost; what no beam can check is believed for a while, and not for ever, for
+odometry drifts.
+"""
+
+import math
+from typing import NamedTuple, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.base import TICK_NS
+from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.navigation.footprint import FAR, Grid
+
+CELL_M = 0.025
+BINS = 720  # of the bearings round the lidar
+MARKED = 2  # of a cell that was just hit; each beam that passes takes one
+BEYOND_M = 0.1  # [m], how far past a cell a beam must go to have passed it
+STAYS_TICKS = 20  # a cell that was hit so long ago, and is now, belongs to what stands
+MOST_STAY = 0.5  # share of its cells that may, of a thing that moves
+ROUND_DISC = 0.1  # [m], hits so near a moving thing are its own
+MOVES_AT = 0.05  # share of the window that the robot may be off its middle
+
+Floats = NDArray[np.float64]
+T = TypeVar("T", bound=np.generic)
+
+
+class Place(NamedTuple):
+    """A pose in the frame that is planned in."""
+
+    x: float  # [m]
+    y: float  # [m]
+    yaw: float  # [rad]
+
+
+class Cells(NamedTuple):
+    """The window as compiled functions take it, (rows, columns) each."""
+
+    level: NDArray[np.uint8]  # 0 where nothing is
+    seen: NDArray[np.int64]  # tick of the last hit
+    since: NDArray[np.int64]  # tick of the first hit since it was last free
+    x: float  # [m], of the corner of cell (0, 0)
+    y: float
+
+
+class Window:
+    """A square of `size` [m] round the robot, its axes those of the frame that is planned in."""
+
+    def __init__(self, size: float, memory_s: float) -> None:
+        self.cells = 2 * round(size / CELL_M / 2)
+        self._memory = round(memory_s * 1e9 / TICK_NS)
+        self._level = np.zeros((self.cells, self.cells), dtype=np.uint8)
+        self._seen = np.zeros((self.cells, self.cells), dtype=np.int64)  # last, by tick
+        self._since = np.zeros((self.cells, self.cells), dtype=np.int64)  # marked without a break
+        self._row = self._column = 0  # of cell (0, 0), counted from the frame's origin
+        self._empty = True
+
+    @property
+    def x(self) -> float:
+        """Where the window begins [m]."""
+        return self._column * CELL_M
+
+    @property
+    def y(self) -> float:
+        """Where the window begins [m]."""
+        return self._row * CELL_M
+
+    def see(self, tick: int, place: Place, lidar: tuple[float, float], hits: Floats) -> None:
+        """Take in a scan: `hits` (n, 2) [m] in the body's frame, the `lidar` at (x, y) in it."""
+        self._follow(place)
+        cells = Cells(self._level, self._seen, self._since, self.x, self.y)
+        _observe(cells, place, lidar, hits, tick, tick - self._memory)
+
+    def moving(self, tick: int, discs: Floats) -> Floats:
+        """Those of the `discs` (n, 6), x, y [m] first and the radius fifth, that really move.
+
+        What moves hits cells that were free a moment ago. Posts and corners can be taken for one
+        another, and then seem to move; but they keep hitting the same cells.
+        """
+        cells = Cells(self._level, self._seen, self._since, self.x, self.y)
+        long_ago = tick - STAYS_TICKS
+        return discs[[_stays(cells, disc, tick, long_ago) <= MOST_STAY for disc in discs]]
+
+    def grid(self, tick: int, known: Floats, moving: Floats) -> Grid:
+        """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m].
+
+        What was hit of late on one of the discs `moving` does not count: it will be elsewhere soon.
+        """
+        free = (self._level == 0).astype(np.uint8)
+        if len(moving):
+            near = np.zeros_like(free)
+            for x, y, radius in moving[:, [0, 1, 4]].tolist():
+                at = round((x - self.x) / CELL_M), round((y - self.y) / CELL_M)
+                cv2.circle(near, at, math.ceil((radius + ROUND_DISC) / CELL_M), 1, cv2.FILLED)
+            free |= near & (self._since > tick - STAYS_TICKS)
+        if len(known):
+            cells = np.floor((known - (self.x, self.y)) / CELL_M).astype(np.int64)
+            cells = cells[((cells >= 0) & (cells < self.cells)).all(axis=1)]
+            free[cells[:, 1], cells[:, 0]] = 0
+        distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        np.minimum(distance * np.float32(CELL_M), np.float32(FAR), out=distance)
+        return Grid(distance, CELL_M, self.x, self.y)
+
+    def _follow(self, place: Place) -> None:
+        """Keep the robot in the middle; what leaves the window is forgotten."""
+        half = self.cells // 2
+        row = math.floor(place.y / CELL_M) - half
+        column = math.floor(place.x / CELL_M) - half
+        down, right = row - self._row, column - self._column
+        if max(abs(down), abs(right)) <= MOVES_AT * self.cells and not self._empty:
+            return
+        self._level = _moved(self._level, down, right)
+        self._seen = _moved(self._seen, down, right)
+        self._since = _moved(self._since, down, right)
+        self._row, self._column, self._empty = row, column, False
+
+
+def _moved(cells: NDArray[T], down: int, right: int) -> NDArray[T]:
+    """What a window over `cells` sees that has moved on by so many of them."""
+    moved = np.zeros_like(cells)
+    count = len(cells)
+    if max(abs(down), abs(right)) < count:
+        rows = slice(max(0, down), min(count, count + down))
+        columns = slice(max(0, right), min(count, count + right))
+        rows_to = slice(max(0, -down), min(count, count - down))
+        columns_to = slice(max(0, -right), min(count, count - right))
+        moved[rows_to, columns_to] = cells[rows, columns]
+    return moved
+
+
+@kernel
+def _observe(
+    cells: Cells,
+    place: Place,
+    lidar: tuple[float, float],
+    hits: Floats,
+    tick: int,
+    oldest: int,
+) -> None:
+    """Forget what is older than `oldest`, take back what beams have passed, mark what they hit."""
+    level, seen = cells.level, cells.seen
+    cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
+    eye_x = place.x + cosine * lidar[0] - sine * lidar[1]
+    eye_y = place.y + sine * lidar[0] + cosine * lidar[1]
+    reach = np.full(BINS, -1.0)
+    count = hits.shape[0]
+    points = np.empty((count, 2))
+    for i in range(count):
+        x = place.x + cosine * hits[i, 0] - sine * hits[i, 1]
+        y = place.y + sine * hits[i, 0] + cosine * hits[i, 1]
+        points[i, 0], points[i, 1] = x, y
+        k = _bin(math.atan2(y - eye_y, x - eye_x))
+        r = math.hypot(x - eye_x, y - eye_y)
+        if reach[k] < 0.0 or r < reach[k]:
+            reach[k] = r
+    rows, columns = level.shape
+    for i in range(rows):
+        for j in range(columns):
+            if level[i, j] == 0:
+                continue
+            x = cells.x + (j + 0.5) * CELL_M
+            y = cells.y + (i + 0.5) * CELL_M
+            if seen[i, j] < oldest:
+                level[i, j] = 0
+            elif math.hypot(x - eye_x, y - eye_y) + BEYOND_M < _passed(
+                reach, math.atan2(y - eye_y, x - eye_x)
+            ):
+                level[i, j] -= 1
+    for i in range(count):
+        x, y = points[i, 0], points[i, 1]
+        row = math.floor((y - cells.y) / CELL_M)
+        column = math.floor((x - cells.x) / CELL_M)
+        if 0 <= row < rows and 0 <= column < columns:
+            if level[row, column] == 0:
+                cells.since[row, column] = tick
+            level[row, column] = MARKED
+            seen[row, column] = tick
+
+
+@kernel
+def _bin(bearing: float) -> int:
+    return math.floor((bearing / math.tau + 0.5) * BINS) % BINS
+
+
+@kernel
+def _passed(reach: NDArray[np.float64], bearing: float) -> float:
+    """How far all beams round a bearing went at least [m]; -1 where none is known to have."""
+    k = _bin(bearing)
+    nearest = -1.0
+    for n in range(k - 1, k + 2):
+        r = reach[n % BINS]
+        if r >= 0.0 and (nearest < 0.0 or r < nearest):
+            nearest = r
+    return nearest
+
+
+@kernel
+def _stays(cells: Cells, disc: Floats, tick: int, long_ago: int) -> float:
+    """The share of the cells of `disc` hit at `tick` that were hit `long_ago` already."""
+    x, y, radius = disc[0], disc[1], disc[4] + ROUND_DISC
+    rows, columns = cells.level.shape
+    hit = old = 0
+    for i in range(max(0, int((y - radius - cells.y) / CELL_M)), rows):
+        down = cells.y + (i + 0.5) * CELL_M - y
+        if down > radius:
+            break
+        for j in range(max(0, int((x - radius - cells.x) / CELL_M)), columns):
+            right = cells.x + (j + 0.5) * CELL_M - x
+            if right > radius:
+                break
+            near = math.hypot(right, down) <= radius
+            if near and cells.level[i, j] > 0 and cells.seen[i, j] == tick:
+                hit += 1
+                old += cells.since[i, j] <= long_ago
+    return old / hit if hit else 0.0

@@ -1,0 +1,120 @@
+"""The BARN bench: its plant, its worlds and its score."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.bench.barn_drive import drive
+from gigabrain_zenoh.bench.barn_worlds import Moving, World, choose, read_worlds
+from gigabrain_zenoh.bench.plant import HARD, IDEAL, LIDAR, Conditions, Plant
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.navigation.local import LocalSettings
+
+NONE = np.empty((0, 3))
+QUICK = LocalSettings(samples=128)
+
+
+def field(posts: np.ndarray) -> World:
+    return World(7, posts, (), (0.0, 0.0, 0.0), (4.0, 0.0), 4.0)
+
+
+def test_the_hard_plant_answers_after_its_delay_and_then_with_its_lag() -> None:
+    calm = Conditions(slip=1.0, drift=0.0)
+    plant, speeds = Plant(calm, (0.0, 0.0, 0.0), 1), []
+    for _ in range(13):
+        plant.tick(Velocity(linear_x=0.6))
+        speeds.append(plant.v)
+    assert speeds[4] == 0.0
+    assert speeds[5] == pytest.approx(0.6 * (1 - math.exp(-0.02 / 0.15)))
+    assert speeds[12] == pytest.approx(0.6 * (1 - math.exp(-0.16 / 0.15)))
+
+
+def test_the_floor_lets_through_part_of_a_turn_and_the_odometry_drifts() -> None:
+    plant = Plant(HARD, (0.0, 0.0, 0.0), 5)
+    for _ in range(200):
+        plant.tick(Velocity(linear_x=0.5, angular_z=0.3))
+    assert 0.6 <= plant.w / 0.3 <= 1.0
+    assert plant.odometry.x != plant.x
+    assert plant.velocity.linear_x == pytest.approx(plant.v, rel=0.02)
+
+
+def test_clearance_is_exact() -> None:
+    plant = Plant(IDEAL, (0.0, 0.0, math.pi / 2), 1)
+    assert plant.clearance(np.array([(0.0, 0.5, 0.1)])) == pytest.approx(0.5 - 0.229 - 0.1)
+    assert plant.clearance(np.array([(0.5, 0.0, 0.1)])) == pytest.approx(0.5 - 0.208 - 0.1)
+    corner = math.hypot(0.4 - 0.208, 0.4 - 0.229) - 0.1
+    assert plant.clearance(np.array([(0.4, 0.4, 0.1)])) == pytest.approx(corner)
+    assert plant.clearance(np.array([(0.1, 0.1, 0.05)])) < 0.0
+    assert plant.clearance(NONE) == math.inf
+
+
+def test_a_beam_ends_at_the_first_disc_in_its_way() -> None:
+    still = Conditions(noise=0.0, dropouts=0.0)
+    plant = Plant(still, (0.0, 0.0, 0.0), 1)
+    seen = plant.scan(LIDAR, np.array([(2.055, 0.0, 0.5), (4.0, 0.0, 0.5), (0.055, 3.0, 0.1)]))
+    middle = seen[359:361]
+    assert middle == pytest.approx([1.5, 1.5], abs=1e-4)
+    assert seen.min() == pytest.approx(1.5, abs=1e-4)
+    left = round(math.radians(135 + 90) / math.radians(270) * 719)
+    assert seen[left] == pytest.approx(2.9, abs=1e-3)
+    assert seen[0] == math.inf
+
+
+def test_a_free_way_is_driven_in_the_time_of_full_marks() -> None:
+    trial = drive(field(NONE), 0, HARD, QUICK)
+    assert (trial.result, trial.score) == ("success", 0.5)
+    assert trial.least_clearance == math.inf
+    again = drive(field(NONE), 0, HARD, QUICK)
+    assert again.seconds == trial.seconds
+
+
+def test_posts_are_gone_round_on_the_hard_plant() -> None:
+    posts = np.array([(2.0, 0.1 * i, 0.075) for i in range(-4, 5)])
+    trial = drive(field(posts), 0, HARD, QUICK)
+    assert trial.result == "success"
+    assert 0.0 < trial.least_clearance < 0.6
+
+
+def test_a_contact_ends_a_trial() -> None:
+    trial = drive(field(np.array([(0.25, 0.0, 0.075)])), 0, HARD, QUICK)
+    assert (trial.result, trial.score) == ("collision", 0.0)
+
+
+def test_moving_discs_go_from_key_to_key_over_and_over() -> None:
+    mover = Moving(4.0, np.array([(0.0, 0.0, 1.0), (4.0, 2.0, 1.0)]), 0.5)
+    world = World(1, NONE, (mover,), (0.0, 0.0, 0.0), (1.0, 0.0), 20.0)
+    assert world.discs(1.0).tolist() == [[0.5, 1.0, 0.5]]
+    assert world.discs(9.0).tolist() == [[0.5, 1.0, 0.5]]
+
+
+def test_worlds_are_read_and_chosen(tmp_path: Path) -> None:
+    meta = {"start": [-2.25, 3.0, 1.57], "goal": [-2.25, 13.0]}
+    file = tmp_path / "worlds.npz"
+    np.savez(
+        file, index=np.array([3, 9]), cyl=np.ones((5, 3), np.float32), n_cyl=np.array([2, 3]),
+        path_cells=np.zeros((2, 2), np.int16), n_path=np.array([1, 1]), meta=json.dumps(meta),
+    )  # fmt: skip
+    worlds = read_worlds(file, dynamic=False)
+    assert [(w.number, len(w.posts)) for w in worlds] == [(3, 2), (9, 3)]
+    assert worlds[0].length == pytest.approx(
+        math.hypot(-2.325, 2.075) + math.hypot(2.325, 13.0 - 5.075)
+    )
+    assert choose(worlds, "9") == [worlds[1]]
+    assert choose(worlds, "") == worlds
+    with pytest.raises(ConfigError, match="expected numbers out of 3, 9, got '4'"):
+        choose(worlds, "4")
+
+
+def test_a_file_that_holds_no_worlds_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "worlds.npz"
+    with pytest.raises(ConfigError, match="cannot read .*No such file"):
+        read_worlds(file, dynamic=False)
+    file.write_bytes(b"PK nonsense")
+    with pytest.raises(ConfigError, match="expected BARN worlds"):
+        read_worlds(file, dynamic=False)
+    with pytest.raises(ConfigError, match="expected DynaBARN worlds"):
+        read_worlds(file, dynamic=True)

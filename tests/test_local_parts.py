@@ -1,0 +1,165 @@
+"""The parts of the local planner, each against what is known without it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.navigation.cost_to_go import CostToGo
+from gigabrain_zenoh.navigation.footprint import Grid, clearance, free_ahead, outline_of
+from gigabrain_zenoh.navigation.models import answer, feasible, lag_of, model_of
+from gigabrain_zenoh.navigation.mppi import past_of
+from gigabrain_zenoh.navigation.window import Place, Window
+from tests.local_rig import CAR, WAFFLE, wall
+
+NOBODY = np.empty((0, 6))
+NOTHING = np.empty((0, 2))
+
+
+def test_a_car_turns_no_more_tightly_than_at_full_speed_and_lock() -> None:
+    model = model_of(CAR)
+    assert model.radius == 0.5
+    assert feasible(model, (0.0, 0.0, 0.0), (0.0, 0.0, 2.0), 0.1) == (0.0, 0.0, 0.0)
+    vx, _, w = feasible(model, (0.4, 0.0, 0.0), (0.4, 0.0, 2.0), 1.0)
+    assert (vx, w) == (0.4, 0.8)
+
+
+def test_a_command_changes_no_faster_than_the_body_can() -> None:
+    model = model_of(WAFFLE)
+    vx, vy, w = feasible(model, (0.0, 0.0, 0.0), (1.0, 1.0, 9.0), 0.1)
+    assert (vx, vy, w) == pytest.approx((0.09, 0.0, 0.27))
+    assert feasible(model, (0.1, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.1)[0] == pytest.approx(0.01)
+    assert feasible(model, (0.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 9.0)[0] == -0.13
+
+
+def test_a_slower_speed_can_be_asked_for() -> None:
+    assert model_of(WAFFLE, 0.1).forward == 0.1
+    assert model_of(WAFFLE, 9.0).forward == 0.26
+
+
+def test_a_lag_closes_the_gap_by_the_same_share_in_each_step() -> None:
+    velocity, way = answer(0.0, 1.0, lag_of(0.15, 0.05), 0.05)
+    assert velocity == pytest.approx(0.2834687)
+    assert way == pytest.approx(0.0074797, abs=1e-6)
+    assert answer(0.0, 1.0, lag_of(0.0, 0.05), 0.05) == (1.0, 0.05)
+
+
+def test_commands_on_their_way_are_averaged_over_each_step() -> None:
+    sent = np.array([(-0.10, 1.0, 0.0, 0.0), (-0.06, 2.0, 0.0, 0.5)])
+    past, share = past_of(sent, (0.0, 0.0, 0.0), 0.12, 0.05)
+    assert share == pytest.approx(0.4)
+    # -0.15 to -0.10, -0.10 to -0.05, -0.05 to 0
+    assert past[:, 0] == pytest.approx([0.0, 1.2, 2.0])
+    assert past[:, 2] == pytest.approx([0.0, 0.1, 0.5])
+
+
+def test_clearance_is_the_outlines_distance_to_the_nearest_obstacle() -> None:
+    window = Window(4.0, 10.0)
+    random = np.random.default_rng(3)
+    points = random.uniform(-1.5, 1.5, (25, 2))
+    points = points[np.hypot(points[:, 0], points[:, 1]) > 0.5]
+    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), points)
+    grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
+    for x, y, yaw in random.uniform((-0.3, -0.3, -3.0), (0.3, 0.3, 3.0), (50, 3)).tolist():
+        got = clearance(grid, outline, x, y, math.cos(yaw), math.sin(yaw))
+        want = min(0.4, _exact(points, x, y, yaw))
+        assert got == pytest.approx(want, abs=0.04)
+
+
+def _exact(points: np.ndarray, x: float, y: float, yaw: float) -> float:
+    """From the waffle's box, by hand."""
+    off = points - (x, y)
+    ahead = math.cos(yaw) * off[:, 0] + math.sin(yaw) * off[:, 1]
+    aside = math.cos(yaw) * off[:, 1] - math.sin(yaw) * off[:, 0]
+    out = np.hypot(
+        np.maximum(np.maximum(-0.2 - ahead, ahead - 0.075), 0.0),
+        np.maximum(np.abs(aside) - 0.155, 0.0),
+    )
+    return float(out.min())
+
+
+def test_what_is_inside_the_body_leaves_no_clearance() -> None:
+    distance = np.full((80, 80), 3.0, dtype=np.float32)
+    distance[30:50, 30:50] = 0.0
+    grid = Grid(distance, 0.025, -1.0, -1.0)
+    assert clearance(grid, outline_of(WAFFLE.footprint), 0.06, 0.0, 1.0, 0.0) < 0.0
+
+
+def test_the_way_straight_on_ends_at_a_wall() -> None:
+    window = Window(4.0, 10.0)
+    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.9, -0.5), (0.9, 0.5)))
+    grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
+    free = free_ahead(grid, outline, 0.0, 0.0, 1.0, 0.0, 1.0, 0.03, 2.0)
+    assert free == pytest.approx(0.8, abs=0.05)
+    assert free_ahead(grid, outline, 0.0, 0.0, 1.0, 0.0, -1.0, 0.03, 2.0) == 2.0
+
+
+def test_what_has_moved_leaves_no_ghost() -> None:
+    window, here = Window(4.0, 10.0), Place(0.0, 0.0, 0.0)
+    behind = wall((1.5, -0.5), (1.5, 0.5))
+    window.see(1, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
+    assert window.grid(1, NOTHING, NOBODY).distance[80, 112] < 0.03
+    window.see(6, here, (0.0, 0.0), behind)
+    assert window.grid(6, NOTHING, NOBODY).distance[80, 112] < 0.03  # one beam may err
+    window.see(11, here, (0.0, 0.0), behind)
+    assert window.grid(11, NOTHING, NOBODY).distance[80, 112] == pytest.approx(0.7, abs=0.03)
+
+
+def test_what_no_beam_can_check_is_believed_for_its_time() -> None:
+    window, here = Window(4.0, 1.0), Place(0.0, 0.0, 0.0)
+    window.see(1, here, (0.0, 0.0), np.array([(-0.8, 0.0)]))
+    window.see(50, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
+    assert window.grid(50, NOTHING, NOBODY).distance[80, 48] < 0.03
+    window.see(52, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
+    assert window.grid(52, NOTHING, NOBODY).distance[80, 48] > 1.0
+
+
+def test_the_window_goes_with_the_robot_and_keeps_what_it_saw() -> None:
+    window = Window(4.0, 10.0)
+    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), np.array([(1.0, 0.5)]))
+    window.see(2, Place(0.5, 0.0, math.pi / 2), (0.0, 0.0), np.array([(0.0, 1.2)]))
+    grid = window.grid(2, NOTHING, NOBODY)
+    for x, y in ((1.0, 0.5), (-0.7, 0.0)):
+        row, column = int((y - grid.y) / 0.025), int((x - grid.x) / 0.025)
+        assert grid.distance[row, column] < 0.03
+
+
+def test_known_points_of_the_map_count_and_are_not_remembered() -> None:
+    window = Window(4.0, 10.0)
+    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    known = np.array([(0.5, 0.0), (99.0, 0.0)])
+    assert window.grid(1, known, NOBODY).distance[80, 100] < 0.03
+    assert window.grid(1, NOTHING, NOBODY).distance[80, 100] == 3.0
+
+
+def test_a_post_that_seems_to_move_is_believed_only_where_it_was_not_before() -> None:
+    window, here = Window(4.0, 10.0), Place(0.0, 0.0, 0.0)
+    claimed = np.array([(1.0, 0.0, 0.8, 0.0, 0.1, 0.1)])
+    for tick in range(1, 32, 5):
+        window.see(tick, here, (0.0, 0.0), np.array([(0.95, 0.0)]))
+    assert len(window.moving(31, claimed)) == 0
+    window.see(36, here, (0.0, 0.0), np.array([(1.05, 0.05)]))
+    assert len(window.moving(36, claimed)) == 1
+
+
+def test_the_way_to_the_goal_goes_round_a_wall() -> None:
+    window = Window(4.0, 10.0)
+    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.8, -1.0), (0.8, 1.0)))
+    grid = window.grid(1, NOTHING, NOBODY)
+    field = CostToGo(window.cells).field(grid, 0.155, (1.6, 0.0), None)
+    middle = field.distance.shape[0] // 2
+    here = float(field.distance[middle, middle])
+    assert here > 2.0 * math.hypot(0.8, 1.0)  # not through it
+    assert field.distance[middle, middle + 32] == 0.0
+
+
+def test_a_path_is_followed_to_where_it_leaves_the_window() -> None:
+    window = Window(4.0, 10.0)
+    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    grid = window.grid(1, NOTHING, NOBODY)
+    path = np.array([(0.0, 0.1 * i) for i in range(60)])
+    field = CostToGo(window.cells).field(grid, 0.155, (5.0, 5.0), path)
+    row, column = np.unravel_index(int(np.argmin(field.distance)), field.distance.shape)
+    assert (grid.x + (column + 0.5) * 0.05, grid.y + (row + 0.5) * 0.05) == pytest.approx(
+        (0.0, 1.9), abs=0.06
+    )

@@ -1,0 +1,117 @@
+"""The local planner drives a body with delay and lag, on a clock of its own."""
+
+import math
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.brain import Obstacle, Response
+from gigabrain_zenoh.navigation.local import Goal, LocalPlanner, Moment, Sent
+from tests.local_rig import CAR, QUICK, WAFFLE, Drive, wall
+
+NOTHING = np.empty((0, 2))
+LATE = Response(delay=0.1, lag=0.15)
+TRIKE = replace(CAR, drive_type="differential", robot_type="trike")
+DOOR = np.concatenate(
+    [wall((0.8, 0.225), (0.8, 1.5)), wall((0.8, -0.225), (0.8, -1.5))]
+)  # 45 cm wide, for a body of 31 cm
+
+
+def test_a_goal_is_reached_with_its_yaw() -> None:
+    drive = Drive(WAFFLE, Goal(x=0.8, y=0.4, yaw=-1.0), NOTHING, response=LATE)
+    assert drive.go(20.0).arrived
+    assert math.hypot(drive.pose.x - 0.8, drive.pose.y - 0.4) < 0.12
+    assert abs(drive.pose.yaw + 1.0) < 0.15
+    assert drive.plans[-1].twist == Velocity()
+
+
+def test_a_narrow_door_is_passed() -> None:
+    drive = Drive(WAFFLE, Goal(x=1.6, y=0.0), DOOR, response=LATE)
+    assert drive.go(25.0).arrived
+    assert drive.least > 0.0
+
+
+def test_a_dead_end_is_left_backwards_or_by_turning() -> None:
+    pocket = np.concatenate(
+        [wall((0.3, -0.26), (0.3, 0.26)), wall((-0.5, 0.26), (0.3, 0.26)),
+         wall((-0.5, -0.26), (0.3, -0.26))]
+    )  # fmt: skip
+    drive = Drive(WAFFLE, Goal(x=-1.2, y=0.0), pocket, response=LATE)
+    drive.go(25.0)
+    assert drive.poses[-1].x < -0.8
+    assert drive.least > 0.0
+    assert "backing out" in {plan.kind for plan in drive.plans}
+
+
+@pytest.mark.parametrize("speed", [0.3, 0.6])
+def test_a_disc_that_comes_head_on_is_gone_round_or_let_pass(speed: float) -> None:
+    def someone(now: float) -> tuple[Obstacle, ...]:
+        return (Obstacle(id=1, x=2.5 - speed * now, y=0.05, velocity_x=-speed, radius=0.25),)
+
+    drive = Drive(TRIKE, Goal(x=3.0, y=0.0), NOTHING, response=LATE, someone=someone)
+    drive.go(20.0)
+    assert drive.least > 0.0
+    assert math.hypot(drive.pose.x - 3.0, drive.pose.y) < 0.15
+    said = {plan.reason.partition(":")[0] for plan in drive.plans}
+    assert said & {"going round", "waiting", "backing out"}
+    assert any("somebody" in plan.reason for plan in drive.plans)
+
+
+def test_who_is_shut_in_says_that_another_way_is_wanted() -> None:
+    cell = np.concatenate(
+        [wall((0.4, -0.4), (0.4, 0.4)), wall((-0.5, -0.4), (-0.5, 0.4)),
+         wall((-0.5, 0.4), (0.4, 0.4)), wall((-0.5, -0.4), (0.4, -0.4))]
+    )  # fmt: skip
+    drive = Drive(WAFFLE, Goal(x=2.0, y=0.0), cell)
+    plan = drive.go(14.0)
+    assert plan.blocked
+    assert not plan.arrived
+    assert drive.least > 0.0
+
+
+def test_a_car_never_turns_on_the_spot() -> None:
+    drive = Drive(CAR, Goal(x=-1.5, y=0.5), NOTHING, response=LATE)
+    drive.go(15.0)
+    assert math.hypot(drive.pose.x + 1.5, drive.pose.y - 0.5) < 0.2
+    for plan in drive.plans:
+        assert abs(plan.twist.angular_z) <= abs(plan.twist.linear_x) / 0.5 + 1e-9
+
+
+def test_the_expected_trajectory_is_what_a_late_body_then_does() -> None:
+    drive = Drive(TRIKE, Goal(x=4.0, y=0.0), NOTHING, response=LATE)
+    drive.go(1.0)
+    moment, start = drive.moment(), drive.pose
+    plan = drive.planner.plan(moment)
+    # 0.1 s on, all of it decided by commands that had been sent before
+    for _ in range(5):
+        drive._tick(Velocity(linear_x=-9.9))
+    dx, dy = drive.pose.x - start.x, drive.pose.y - start.y
+    ahead = math.cos(start.yaw) * dx + math.sin(start.yaw) * dy
+    expected = next(p for p in plan.trajectory if p.t == pytest.approx(0.1))
+    assert ahead == pytest.approx(expected.x, abs=1e-4)
+    assert drive.velocity.linear_x == pytest.approx(expected.linear_x, abs=1e-3)
+    assert drive.velocity.angular_z == pytest.approx(expected.angular_z, abs=1e-3)
+
+
+def test_the_same_questions_get_the_same_answers() -> None:
+    runs = []
+    for _ in range(2):
+        drive = Drive(WAFFLE, Goal(x=1.6, y=0.0), DOOR)
+        drive.go(2.0)
+        runs.append([(plan.twist, plan.reason) for plan in drive.plans])
+    assert runs[0] == runs[1]
+
+
+@pytest.mark.parametrize(
+    "goal", [Goal(x=math.nan, y=0.0), Goal(x=0.0, y=math.inf), Goal(x=0.0, y=0.0, yaw=math.nan)]
+)
+def test_a_goal_that_is_no_place_is_refused(goal: Goal) -> None:
+    planner = LocalPlanner(WAFFLE, QUICK)
+    moment = Moment(
+        tick=1, pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity(), goal=goal, hits=NOTHING,
+        sent=(Sent(0, Velocity()),),
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="a goal has finite numbers"):
+        planner.plan(moment)
