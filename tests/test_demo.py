@@ -133,7 +133,10 @@ async def test_ctrl_c_ends_all_of_it_also_when_one_hangs(home: Home, frozen: str
 
 
 async def test_two_demos_side_by_side_do_not_meet(home: Home) -> None:
-    demos = [home.start("demo", "--behaviour", "avoid", "--headless", "--seed", seed) for seed in ("1", "2")]
+    demos = [
+        home.start("demo", "--behaviour", "avoid", "--headless", "--seed", seed)
+        for seed in ("1", "2")
+    ]
     boots = []
     for demo in demos:
         async with looking_on(await robot_of(home, demo)) as robot:
@@ -170,7 +173,9 @@ async def test_a_report_that_cannot_be_written_is_refused_before_anything_starts
     home: Home,
 ) -> None:
     nowhere = Path("nowhere") / "report.json"
-    demo = await home.run("demo", "--behaviour", "avoid", "--headless", "--seconds", "1", "--report", str(nowhere))
+    demo = await home.run(
+        "demo", "--behaviour", "avoid", "--headless", "--seconds", "1", "--report", str(nowhere)
+    )
     assert await demo.ended() == 2
     assert demo.err == "gigabrain: cannot write the report nowhere/report.json: no such folder\n"
     assert not (home.folder / "state").exists()

@@ -145,7 +145,9 @@ async def test_a_demo_says_where_its_page_is_and_steps_aside_from_a_taken_port(
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        demo = home.start("demo", "--behaviour", "avoid", "--headless", "--page", "--port", str(port))
+        demo = home.start(
+            "demo", "--behaviour", "avoid", "--headless", "--page", "--port", str(port)
+        )
         await until(lambda: "operator page: http://127.0.0.1:" in demo.err, "it says where")
         said = re.search(r"http://127\.0\.0\.1:(\d+)\n", demo.err)
         assert said

@@ -24,7 +24,16 @@ from tests.stack import Home, free_port, robot_of, until
 async def demo(shared_home: Home) -> Home:
     """A robot that drives: the mock, the same one for all tests."""
     if not shared_home.processes():
-        arguments = ("demo", "--behaviour", "avoid", "--headless", "--body", "mock", "--seconds", "3000")
+        arguments = (
+            "demo",
+            "--behaviour",
+            "avoid",
+            "--headless",
+            "--body",
+            "mock",
+            "--seconds",
+            "3000",
+        )
         await robot_of(shared_home, shared_home.start(*arguments))
     await until_driving(shared_home)
     return shared_home
