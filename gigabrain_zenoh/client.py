@@ -15,12 +15,12 @@ from gigabrain_schemas.brain import CmdVel, Twist
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import (
     BODY,
-    CMD_VEL,
     ENABLE,
     RELEASE,
     STATE,
     TELEOP,
     Topic,
+    command_topic,
 )
 from gigabrain_zenoh.asking import ANSWER_S, ask, audit_log, granted
 from gigabrain_zenoh.bus import Bus
@@ -243,12 +243,13 @@ class Robot:
         self._send()
 
     def _send(self) -> None:
-        target = self._target
-        if target is None or self._hold.lost:
+        target, body = self._target, self._bodies.current
+        if target is None or body is None or self._hold.lost:
             return
         if self._bus.time.tick > self._until_tick:
             target = ZERO
-        self._bus.publish(CMD_VEL, CmdVel(**asdict(target), source=self._bus.process))
+        command = CmdVel(**asdict(target), source=self._bus.process)
+        self._bus.publish(command_topic(body.description), command)
 
     async def _ticks(self, count: int) -> None:
         """Let the robot's time go on by `count` states, or a second of ours."""

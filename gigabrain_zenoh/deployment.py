@@ -17,6 +17,7 @@ from gigabrain_zenoh.settings import (
     ButtonConfig,
     DecisionConfig,
     Endpoint,
+    FoxgloveConfig,
     LinkName,
     PageConfig,
     PerceptionConfig,
@@ -38,12 +39,13 @@ ProcessName = Literal[
     "safety",
     "recorder",
     "page",
+    "foxglove",
     "button",
 ]
 ROBOT: tuple[ProcessName, ...] = (
     "router", "driver", "perception", "decision", "control", "safety",
 )  # fmt: skip
-ALL: tuple[ProcessName, ...] = (*ROBOT, "recorder", "page")
+ALL: tuple[ProcessName, ...] = (*ROBOT, "recorder", "page", "foxglove")
 LOOPBACK = ("127.", "localhost", "[::1]")
 
 
@@ -69,6 +71,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     decision: DecisionConfig = DecisionConfig()
     recorder: RecorderConfig = RecorderConfig()
     page: PageConfig = PageConfig()
+    foxglove: FoxgloveConfig = FoxgloveConfig()
 
     def __post_init__(self) -> None:
         if not self.hosts:

@@ -53,6 +53,7 @@ TICK_S = TICK_NS / 1e9
 STOPPING_TICKS = 15  # 300 ms, then idle
 CALM_TICKS = 5  # 100 ms at zero after an enable, however hard somebody holds a joystick
 HEALTHY_TICKS = 25  # 0.5 s without a cause before an automatic resume
+RESUME_TICKS = 50  # from one start to an automatic one: on a bad link it stands, or drives on
 NAN_STORM_COUNT, NAN_STORM_TICKS = 5, 50  # five in a second
 
 
@@ -121,7 +122,8 @@ def _waiting(config: GateConfig, state: GateState, now: tuple[Cause, ...]) -> Ga
     if held:
         return replace(state, mode="latched", causes=held)
     rested = min(state.healthy_ticks, state.still_ticks) >= HEALTHY_TICKS
-    if config.auto_resume and not state.by_hand and rested:
+    again = state.tick - state.enabled_tick >= RESUME_TICKS
+    if config.auto_resume and not state.by_hand and rested and again:
         return _enabled(state, BRAIN)
     boot = (why.BOOT,) if state.mode == "latched" else ()
     return replace(state, causes=boot + now)

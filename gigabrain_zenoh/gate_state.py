@@ -33,7 +33,7 @@ class GateState(msgspec.Struct, frozen=True, kw_only=True):
     by_hand: bool = False  # released from a latch: only a person enables it, not auto resume
     commander: str = ""
     enables: int = 0
-    enabled_tick: int = 0  # when the present commander was let in
+    enabled_tick: int = -1000  # when the present commander was let in
     command: CmdVel | None = None  # last good one of the commander
     command_tick: int = 0  # when it came
     next_seq: int = 0  # the lowest that the commander may use

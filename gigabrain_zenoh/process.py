@@ -18,7 +18,7 @@ from typing import Any
 
 import msgspec
 
-from gigabrain_schemas.topics import INTENT, LOG, SAFETY, STATE
+from gigabrain_schemas.topics import CMD_VEL, INTENT, LOG, SAFETY, STATE
 from gigabrain_zenoh import lifeline, logs
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
@@ -74,6 +74,11 @@ PROGRAMS = {
         "gigabrain_zenoh.page.node:run",
         "gigabrain_zenoh.settings:PageConfig",
         {STATE.key: 20.0, INTENT.key: 6.0, SAFETY.key: 11.0},
+    ),
+    "foxglove": Program(
+        "gigabrain_zenoh.foxglove_bridge.node:run",
+        "gigabrain_zenoh.settings:FoxgloveConfig",
+        {STATE.key: 20.0, INTENT.key: 11.0, SAFETY.key: 11.0, CMD_VEL.key: 11.0},
     ),
 }
 

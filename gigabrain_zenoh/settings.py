@@ -92,6 +92,13 @@ class PageConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     tokens: str = ""  # the file that keeps them; one in the user's state folder without
 
 
+class FoxgloveConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The `foxglove` part of a deployment file."""
+
+    port: Annotated[int, Meta(ge=0, le=65535)] = 8765  # on loopback
+    tokens: str = ""  # the page's file of tokens; the one in the user's state folder without
+
+
 class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The settings of the emulator process."""
 

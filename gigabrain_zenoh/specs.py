@@ -118,6 +118,7 @@ def _settings(
         "decision": msgspec.to_builtins(deployment.decision),
         "recorder": msgspec.to_builtins(with_notes(deployment)),
         "page": msgspec.to_builtins(deployment.page),
+        "foxglove": msgspec.to_builtins(deployment.foxglove),
     }
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from msgspec import structs
 
+from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.acl import access_control, known_names
 from gigabrain_zenoh.keys.files import CA, CERTIFICATE, KEY, check_files
@@ -14,6 +15,7 @@ from gigabrain_zenoh.settings import Endpoint, RouterConfig
 
 SECURE, PLAIN = "tls/", "tcp/"
 PENDING = 4000  # links that may be on their way in; silent ones are dropped after a second
+FAR_TOO_LARGE = 4  # times a topic's bound
 IP_ENDPOINT = re.compile(r"(?:tcp|udp|tls|quic|ws)/[^/#?]+:(\d+)(?:[?#].*)?")
 LOCAL_ENDPOINT = re.compile(r"unixsock-stream/.+")
 
@@ -65,11 +67,30 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
     }
     if endpoint.listen and (endpoint.keys or endpoint.connect):
         config["adminspace/enabled"] = False
+    if endpoint.listen:
+        config["low_pass_filter"] = [
+            _small(size) for size in sorted({topic.max_bytes for topic in TOPICS})
+        ]
     if endpoint.at_most_hz:
         config["downsampling"] = [_thinned(endpoint.at_most_hz)]
     if endpoint.namespace:
         config["namespace"] = endpoint.namespace
     return config
+
+
+def _small(size: int) -> dict[str, Any]:
+    """Zenoh's low-pass filter: what is far too large ends at the router.
+
+    Readers refuse less than that themselves, and count it; but megabytes hold up what comes after
+    them on the same line, and an e-stop may be among it.
+    """
+    return {
+        "id": f"at most {size // 1024} KB",
+        "messages": ["put"],
+        "flows": ["ingress"],
+        "key_exprs": [f"**/{topic.key}/**" for topic in TOPICS if topic.max_bytes == size],
+        "size_limit": FAR_TOO_LARGE * size,
+    }
 
 
 def _thinned(at_most_hz: Mapping[str, float]) -> dict[str, Any]:

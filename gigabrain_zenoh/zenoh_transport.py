@@ -12,6 +12,7 @@ from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.linger import close_in_background
 from gigabrain_zenoh.mailbox import Mailbox
 from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.staying import stay
 from gigabrain_zenoh.transport import Answer, Close, Link, OnLink, OnRaw, OnSample
 from gigabrain_zenoh.zenoh_session import close_session, open_session
 
@@ -78,6 +79,7 @@ class ZenohTransport:
         """
 
         def deliver(sample: zenoh.Sample) -> None:
+            stay()
             on_raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes())
 
         direct = Callback(deliver, indirect=False)

@@ -6,11 +6,29 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from tests import disturbance
 from tests.stack import Home
 
 # how long an example takes says something of the machine, and nothing of the code
 settings.register_profile("gigabrain", deadline=None)
 settings.load_profile("gigabrain")
+
+
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
+    """One test; again where it failed and the machine stood still meanwhile."""
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    for report in disturbance.run_test(item, nextitem):
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say which tests were run again."""
+    reports = terminalreporter.getreports("passed") + terminalreporter.getreports("failed")
+    again = {r.nodeid for r in reports if disturbance.AGAIN in dict(r.user_properties)}
+    for name in sorted(again):
+        terminalreporter.write_line(f"run again, the machine had stood still: {name}")
 
 
 @pytest.fixture

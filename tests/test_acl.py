@@ -16,13 +16,14 @@ from tests.keys_rig import Site, make_fleet, raw, site
 from tests.zenoh_rig import Ear, repeat
 
 SAYS = {
-    "brain": "world pose map intent health/perception log",
+    "brain": "world pose map intent task health/perception log",
     "operator": "teleop cmd_vel joint_cmd button log",
     "viewer": "",
 }
 ASKS = {
     "brain": "estop describe/driver",
-    "operator": "estop release enable goal mission audit_log param/driver describe/driver",
+    "operator": "estop release enable goal mission task_change map_save audit_log param/driver "
+    "describe/driver",
     "viewer": "audit_log describe/driver",
 }
 SAID = [topic.at("perception") for topic in TOPICS]

@@ -18,7 +18,8 @@ from gigabrain_zenoh.bench.figures import Figures, figures, over_rounds
 from gigabrain_zenoh.bench.listening import Heard, median_ms
 from gigabrain_zenoh.bench.runs import relay_roles
 from gigabrain_zenoh.bench.stack import Process, StackResult, physics_share, targets
-from gigabrain_zenoh.bench.tables import chain_page, estop_page, stack_page
+from gigabrain_zenoh.bench.tables import chain_page, estop_page, stack_page, tools_page
+from gigabrain_zenoh.bench.with_tools import Beside, Tool, ToolsResult
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.percentile import Newest, percentile
 from gigabrain_zenoh.settings import Endpoint
@@ -278,3 +279,46 @@ def test_the_page_of_the_e_stop_shows_each_figure_beside_its_target() -> None:
     assert [cell.strip() for cell in rows[1].split("│")[1:-1]] == [
         "flooded", "2", "60.0", "101.0 (≤ 50)", "101.0 (≤ 100)", "0.000 (≤ 0.06)",
     ]  # fmt: skip
+
+
+def beside() -> ToolsResult:
+    return ToolsResult(
+        seconds=10.0,
+        recorded_hz=318.0,
+        rates=(
+            Beside(
+                rate_hz=10.0,
+                alone=(one(100, 0.6, 1.0), one(100, 0.7, 2.0), one(100, 0.8, 9.0)),
+                tools=(one(100, 0.7, 1.9), one(100, 0.8, 2.2), one(100, 0.9, 8.0)),
+            ),
+        ),
+        tools=(
+            Tool(name="recorder", cpu=0.034, limit=3.0),
+            Tool(name="page", cpu=0.017, limit=2.0),
+            Tool(name="topic echo", cpu=0.05),
+        ),
+    )
+
+
+def test_what_tools_add_is_told_by_the_median_rounds() -> None:
+    assert beside().rates[0].added_p99 == pytest.approx(10.0)
+    page = shown(tools_page(beside()))
+    assert "+10 % (≤ 5)" in page
+    assert "318 messages a second" in page
+    rows = [line.split() for line in page.splitlines()]
+    assert ["│", "recorder", "│", "3.4", "%", "│", "3", "%", "│"] in rows
+    assert ["│", "topic", "echo", "│", "5.0", "%", "│", "│"] in rows
+
+
+async def test_the_chain_is_timed_with_all_tools_beside_it(home: Home) -> None:
+    result = home.folder / "tools.json"
+    ran = await home.run(
+        "bench", "chain", "--with", "tools", "--seconds", "2", "--rounds", "1", "--rates", "10",
+        "--json", str(result),
+    )  # fmt: skip
+    assert (await ran.ended(), result.exists()) == (0, True), ran.err
+    told = msgspec.json.decode(result.read_bytes(), type=ToolsResult)
+    assert [tool.name for tool in told.tools] == ["recorder", "page", "foxglove", "topic echo"]
+    assert all(0 < tool.cpu < 1 for tool in told.tools), told.tools
+    assert told.recorded_hz > 50
+    assert told.rates[0].tools[0].n > 10

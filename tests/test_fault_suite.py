@@ -183,6 +183,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Result]:
     return {result.number: result for result in asyncio.run(running)}
 
 
+@pytest.mark.once
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
 def test_the_robot_stops_whatever_breaks(fault: Fault, results: dict[int, Result]) -> None:
     result = results[fault.number]

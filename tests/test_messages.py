@@ -48,6 +48,11 @@ REQUIRED: dict[str, set[str]] = {
     "GoalReply": {"ok", "text"},
     "MissionRequest": {"mission"},
     "MissionReply": {"ok", "text"},
+    "MapRequest": {"name"},
+    "MapReply": {"ok", "text"},
+    "TaskRequest": {"do"},
+    "TaskReply": {"ok", "text"},
+    "TaskStatus": set(),
     "ParamRequest": set(),
     "ParamReply": {"ok", "text"},
     "DescribeRequest": set(),
@@ -75,11 +80,13 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/health/*": ("Health", 1),
         "robot/button": ("ButtonState", 20),
         "robot/log": ("LogRecord", 10),
+        "robot/task": ("TaskStatus", 5),
         "robot/audit": ("AuditRecord", 10),
     }
     assert [service.at("*") for service in SERVICES] == [
         "robot/estop", "robot/release", "robot/enable", "robot/goal", "robot/mission",
-        "robot/audit_log", "robot/param/*", "robot/describe/*",
+        "robot/task_change", "robot/map_save", "robot/audit_log", "robot/param/*",
+        "robot/describe/*",
     ]  # fmt: skip
 
 
@@ -101,6 +108,7 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/health": 5_000_000_000,
         "robot/button": 200_000_000,
         "robot/log": 500_000_000,
+        "robot/task": 1_000_000_000,
         "robot/audit": 500_000_000,
     }
 
@@ -139,7 +147,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in golden.FOLDER.iterdir()}
     assert stored == golden.files()
-    assert len(stored) == 62
+    assert len(stored) == 72
 
 
 @by_name

@@ -17,6 +17,7 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.limits import ZERO
 from gigabrain_zenoh.replay import Event, Node, record, replay
+from gigabrain_zenoh.safety.host import Host
 from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.transport import LocalNetwork
 from tests.brain_rig import BOOT, DRIVING, TICK_NS, body, round_room, scan, state
@@ -25,7 +26,7 @@ SYSTEMS: dict[str, tuple[Node, str]] = {
     "perception": (functools.partial(perception.run, PerceptionConfig()), "robot/world"),
     "decision": (functools.partial(decision.run, DecisionConfig()), "robot/intent"),
     "control": (control.run, "robot/cmd_vel"),
-    "safety": (safety.run, "robot/safety"),
+    "safety": (functools.partial(safety.run, look=lambda _: Host()), "robot/safety"),
 }
 
 

@@ -119,6 +119,29 @@ def test_from_03_metres_a_second_it_stops_within_15_centimetres() -> None:
     assert simulation.truth.pose().x - before.x < 0.15
 
 
+@pytest.mark.parametrize(
+    "twist",
+    [
+        Twist(0.25, 0.0, 0.0),
+        Twist(-0.25, 0.0, 0.0),
+        Twist(0.0, 0.1, 0.0),
+        Twist(0.0, 0.0, -0.5),
+        Twist(0.2, 0.08, 0.0),
+    ],
+    ids=["ahead", "backwards", "sideways", "turning", "aslant"],
+)
+def test_on_any_foot_it_rests_in_truth_and_by_its_own_estimate_after_600_ms(twist: Twist) -> None:
+    for phase in (0.0, 0.07, 0.14, 0.21):  # [s], of a cycle of 0.28 s
+        simulation = Simulation(alpha(), room(), 0)
+        walk(simulation, 1.2 + phase, lambda _: twist)
+        walk(simulation, 0.6, lambda _: Twist(0.0, 0.0, 0.0))
+        for _ in range(40):
+            for speeds in (true_velocity(simulation), simulation.velocity()):
+                assert max(map(abs, speeds[:2])) < 0.01
+                assert abs(speeds[2]) < 0.05
+            walk(simulation, 0.01, lambda _: Twist(0.0, 0.0, 0.0))
+
+
 def test_it_stands_at_the_height_of_its_gait() -> None:
     simulation = Simulation(alpha(), room(), 0)
     for _ in range(200):

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
-from textual.widgets import DataTable
 
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import Description, ParamReply, ParamRequest
@@ -21,6 +20,7 @@ from gigabrain_zenoh.settings import DecisionConfig
 from gigabrain_zenoh.tools.graph import as_dot, as_mermaid, as_text, chain, positions, write_png
 from gigabrain_zenoh.tools.log_reading import Wanted, ago_ns, as_line, read, run_folder
 from gigabrain_zenoh.tools.nodes import Nodes, about
+from gigabrain_zenoh.tools.plain_table import PlainTable
 from gigabrain_zenoh.tools.roll_call import Flow
 from gigabrain_zenoh.tools.top import Top
 from gigabrain_zenoh.tools.top_feed import Rows
@@ -91,15 +91,19 @@ class Feed:
         return processes, topics
 
 
-def column(table: DataTable[object], index: int) -> list[str]:
-    return [str(table.get_row_at(i)[index]) for i in range(table.row_count)]
+def column(table: PlainTable, index: int) -> list[str]:
+    return [row[index] for row in table.rows]
+
+
+def line_of(table: PlainTable, y: int) -> str:
+    return table.render_line(y).text.rstrip()
 
 
 async def test_top_shows_both_tables_and_sorts_them_by_keys() -> None:
     app = Top(Feed(), "")
     async with app.run_test(size=(120, 40)) as pilot:
         processes, topics = (
-            app.query_one(f"#{name}", DataTable) for name in ("processes", "topics")
+            app.query_one(f"#{name}", PlainTable) for name in ("processes", "topics")
         )
         assert column(processes, 0) == ["busy", "calm"]
         assert column(processes, 1) == ["silent", "ok"]
@@ -110,6 +114,12 @@ async def test_top_shows_both_tables_and_sorts_them_by_keys() -> None:
         assert column(processes, 2) == ["90.0", "1.0"]
         await pilot.press("tab", "less_than_sign", "r")
         assert column(topics, 9) == ["3", "0"]
+        assert line_of(topics, 0).split()[:3] == ["topic", "Hz", "promised"]
+        assert line_of(topics, 1).startswith("pose   0.0")
+        await pilot.click("#topics", offset=(1, 0))
+        assert column(topics, 0) == ["scan", "pose"]
+        await pilot.click("#topics", offset=(1, 0))
+        assert column(topics, 0) == ["pose", "scan"]
         await pilot.press("space")
         assert app.title == "gigabrain top (held)"
         await pilot.press("q")

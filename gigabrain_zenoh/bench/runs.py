@@ -1,7 +1,7 @@
 """Single runs of what is compared: our chain, and a bare relay of four processes beside it."""
 
 import sys
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -28,13 +28,15 @@ NAMES = ("source", "first", "second", "third")
 
 
 @asynccontextmanager
-async def brain(rate_hz: float, folder: Path) -> AsyncIterator[tuple[Group, Bus]]:
+async def brain(
+    rate_hz: float, folder: Path, change: Callable[[Deployment], Deployment] = lambda plain: plain
+) -> AsyncIterator[tuple[Group, Bus]]:
     """Our processes as `gigabrain up` runs them, from the moment when the gate is open.
 
     Safety is no part of the chain, but without it the gate opens for nobody.
     """
     body = str(_mock_body(rate_hz, folder))
-    deployment = with_free_port(Deployment(body=body, resume="auto", router=LOOPBACK))
+    deployment = with_free_port(change(Deployment(body=body, resume="auto", router=LOOPBACK)))
     specs = process_specs(deployment, "robot", folder, folder / "state")
     async with running(specs) as group, client(client_endpoint(deployment)) as bus:
         while not (await driver_report(bus)).get("scan_to_cmd_n"):

@@ -9,6 +9,7 @@ from gigabrain_zenoh.bench.costs import Hop
 from gigabrain_zenoh.bench.estop import MAX_MS, P99_MS, TRAVEL_M, EstopResult
 from gigabrain_zenoh.bench.figures import Figures, over_rounds
 from gigabrain_zenoh.bench.stack import StackResult, Target, targets
+from gigabrain_zenoh.bench.with_tools import ADDED, ToolsResult
 
 MB = 1e6
 
@@ -38,6 +39,35 @@ def chain_page(result: ChainResult) -> Group:
     )
 
 
+def tools_page(result: ToolsResult) -> Group:
+    """What `gigabrain bench chain --with tools` prints."""
+    table = _table("rate", "tools", "n", "p50 [ms]", "p99 [ms]", "added to p99")
+    for one in result.rates:
+        _figures(table, f"{one.rate_hz:g} Hz", "none", over_rounds(one.alone))
+        added = Text(f"{one.added_p99:+.0f} % (≤ {ADDED:g})", style=_style(one.added_p99, ADDED))
+        _figures(table, "", "all", over_rounds(one.tools), added)
+        table.add_section()
+    needs = _table("tool", "CPU of one core", "at most")
+    for tool in result.tools:
+        percent, limit = 100 * tool.cpu, tool.limit
+        used = Text(f"{percent:.1f} %", style=_style(percent, limit) if limit else "")
+        needs.add_row(tool.name, used, f"{limit:g} %" if limit else "")
+    runs = f"runs of {result.seconds:g} s in turns, median of {len(result.rates[0].alone)}"
+    about = (
+        f"The recorder took {result.recorded_hz:.0f} messages a second, with what viewers draw. "
+        "One viewer reads all that the page sends and another all that the bridge has; they draw "
+        "nothing, and are not counted."
+    )
+    return Group(
+        _title(f"Scan to command with tools beside it ({runs})"), table, needs,
+        Text(about, style="dim"),
+    )  # fmt: skip
+
+
+def _style(value: float, limit: float) -> str:
+    return "green" if value <= limit else "yellow"
+
+
 def _compared(rates: tuple[Compared, ...]) -> Table:
     table = _table("rate", "who", "n", "p50 [ms]", "p99 [ms]", "ratio p50", "ratio p99")
     for one in rates:
@@ -55,7 +85,7 @@ def _figures(table: Table, rate: str, who: str, one: Figures, *ratios: Text) -> 
 
 
 def _ratio(value: float, limit: float) -> Text:
-    return Text(f"{value:.2f} (≤ {limit:g})", style="green" if value <= limit else "yellow")
+    return _within(value, limit, 2)
 
 
 def _hops(hops: tuple[Hop, ...]) -> Table:
@@ -100,8 +130,7 @@ def estop_page(result: EstopResult) -> Group:
 
 
 def _within(value: float, limit: float, digits: int) -> Text:
-    style = "green" if value <= limit else "yellow"
-    return Text(f"{value:.{digits}f} (≤ {limit:g})", style=style)
+    return Text(f"{value:.{digits}f} (≤ {limit:g})", style=_style(value, limit))
 
 
 def _target(target: Target) -> tuple[str, str, str, Text]:
@@ -118,6 +147,6 @@ def _table(first: str, *others: str) -> Table:
     table = Table()
     table.add_column(first, no_wrap=True)
     for name in others:
-        justify: JustifyMethod = "left" if name == "who" else "right"
+        justify: JustifyMethod = "left" if name in ("who", "tools") else "right"
         table.add_column(Text(name), justify=justify, no_wrap=True)
     return table

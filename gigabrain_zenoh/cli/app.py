@@ -35,6 +35,7 @@ COMMANDS = {
     "keys zenohd": ("keys:zenohd", "Print the configuration of a router for a larger site."),
     "teleop": ("teleop:teleop", "Drive by keys or by a gamepad."),
     "page": ("page:page", "Serve the operator page: the robot in a browser."),
+    "foxglove": ("foxglove:foxglove", "Show the robot in Foxglove or Lichtblick, live."),
     "audit": ("audit:audit", "Show who did what to the robot."),
     "topic list": ("topic:list_", "List topics, their rates, and who talks to whom."),
     "topic echo": ("topic:echo", "Show messages as they come."),
@@ -53,6 +54,8 @@ COMMANDS = {
     "param list": ("param:list_", "List what may be changed while the robot runs."),
     "param get": ("param:get", "Show one value."),
     "param set": ("param:set_", "Change one value."),
+    "map save": ("map:save", "Save the map that a robot makes."),
+    "map info": ("map:info", "Check a saved map, and tell its size."),
     "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
     "robots": ("names:robots", "List the robots that there are."),
     "worlds": ("names:worlds", "List the simulated worlds that there are."),
@@ -71,6 +74,7 @@ COMMANDS = {
     "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
     "bench slam": ("bench_slam:slam", "Maps from recorded laser logs, and their errors."),
+    "bench plan": ("bench_plan:plan", "Global planning, timed and checked."),
     "schema export": ("schema:export", "Write JSON Schema of every message."),
     "completion": ("completion:completion", "Shell completion."),
 }
@@ -81,6 +85,7 @@ GROUPS = {
     "topic": "What goes over the bus.",
     "node": "The processes of a robot.",
     "param": "What may be changed at run time.",
+    "map": "Maps that a robot has made.",
     "bench": "Measure this machine.",
     "schema": "Messages.",
 }

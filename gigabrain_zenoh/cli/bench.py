@@ -2,8 +2,9 @@
 
 import asyncio
 import sys
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 from cyclopts import Parameter
@@ -20,11 +21,13 @@ def chain(
     seconds: float = 10.0,
     rounds: int = 3,
     rates: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (10.0, 50.0),
+    beside: Annotated[Literal["relay", "tools"], Parameter(name="--with")] = "relay",
     json: Path | None = None,
 ) -> int:
-    """Time the way from a scan to its command, beside a bare Zenoh relay.
+    """Time the way from a scan to its command, in turns with something to compare it with.
 
     Example: gigabrain bench chain --seconds 10 --rounds 3 --rates 10 50
+    Example: gigabrain bench chain --with tools --rates 10
 
     Parameters
     ----------
@@ -34,19 +37,36 @@ def chain(
         How often the chain and the relay take turns.
     rates
         How many scans a second [Hz].
+    beside
+        A bare Zenoh relay, or the same chain with recorder, page, bridge and echo beside it.
     json
         Write all figures into this file.
     """
     from gigabrain_zenoh.bench.chain import measure_chain
-    from gigabrain_zenoh.bench.tables import chain_page
 
     above_zero("seconds", seconds)
     above_zero("rounds", rounds)
     for rate in rates:
         if not 0 < rate <= FASTEST_HZ:
             raise ConfigError(f"--rates: expected above 0, at most {FASTEST_HZ:g}, got {rate:g}")
+    if beside == "tools":
+        return _with_tools(seconds, rounds, rates, json)
+    from gigabrain_zenoh.bench.tables import chain_page
+
     result = asyncio.run(measure_chain(seconds, rounds, rates, _progress))
     _finish(chain_page(result), result, json)
+    return 0
+
+
+def _with_tools(seconds: float, rounds: int, rates: tuple[float, ...], json: Path | None) -> int:
+    for name, extra in (("websockets", "page"), ("starlette", "page"), ("foxglove", "record")):
+        if not find_spec(name):
+            raise ConfigError(f"this needs more: pip install 'gigabrain-zenoh[{extra}]'")
+    from gigabrain_zenoh.bench.tables import tools_page
+    from gigabrain_zenoh.bench.with_tools import measure_with_tools
+
+    result = asyncio.run(measure_with_tools(seconds, rounds, rates, _progress))
+    _finish(tools_page(result), result, json)
     return 0
 
 

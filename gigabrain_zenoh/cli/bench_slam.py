@@ -1,4 +1,4 @@
-"""`gigabrain bench slam`: maps from recorded logs, against what others made of them."""
+"""`gigabrain bench slam`: maps from recorded logs and simulated worlds, against what is true."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,12 +17,17 @@ if TYPE_CHECKING:
 def slam(
     *,
     log: Annotated[tuple[Path, ...], Parameter(consume_multiple=True)] = (),
+    world: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
+    minutes: float = 10.0,
+    body: str = "turtlebot3_waffle",
+    seed: int = 0,
     png: Path | None = None,
     json: Path | None = None,
 ) -> int:
-    """Map recorded laser logs, and tell how far the maps are from their references.
+    """Map recorded laser logs or simulated worlds, and tell how far the maps are from the truth.
 
     Example: gigabrain bench slam --log intel.npz fhw.npz --png maps.png
+    Example: gigabrain bench slam --world house warehouse --minutes 10 --png maps.png
 
     Errors are those of Kümmerle et al. (2009): of poses that are near one another, and that the
     robot passed at different times. A log is an .npz file with `ranges` [cm] (scans, beams),
@@ -32,11 +37,26 @@ def slam(
     ----------
     log
         The logs, one or more files.
+    world
+        Worlds that a simulated robot roams instead; see `gigabrain worlds`. Errors are of all its
+        poses then, against the physics.
+    minutes
+        How long it roams each [min of its own time].
+    body
+        Which robot roams; see `gigabrain robots`.
+    seed
+        For its start and the noise of its sensors.
     png
         Draw the maps into this file.
     json
         Write all figures into this file.
     """
+    if bool(log) == bool(world):
+        raise ConfigError("expected --log with .npz files, or --world with names of worlds")
+    if world:
+        from gigabrain_zenoh.cli.bench_slam_world import slam_world
+
+        return slam_world(world, minutes, body, seed, png, json)
     import msgspec
     from rich.console import Console
 
@@ -44,8 +64,6 @@ def slam(
     from gigabrain_zenoh.bench.slam_logs import load
     from gigabrain_zenoh.bench.slam_picture import draw
 
-    if not log:
-        raise ConfigError("--log: expected one or more .npz files")
     drives = _driven([load(path) for path in log])
     result = total([judged(one, driven) for one, driven in drives])
     if png:

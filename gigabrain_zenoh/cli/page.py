@@ -68,7 +68,7 @@ def page(
     check(config)
     endpoint = find_endpoint(connect, namespace, str(keys) if keys else "")
     if wants_login(config):
-        made, new = tokens(token_file(config))
+        made, new = tokens(token_file(config.tokens))
         if new:
             print(f"to drive: {made.operator}\nto look:  {made.viewer}", flush=True)
     return run(ProcessConfig(name="page", endpoint=endpoint, settings=msgspec.to_builtins(config)))

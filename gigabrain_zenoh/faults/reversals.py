@@ -65,10 +65,12 @@ async def _at_wheels(subject: Subject) -> float:
     async with forging(client_endpoint(subject.deployment)) as forger:
         for hold in HOLDS:
             await _shake(subject, forger, hold, body.description.max_linear_speed)
-    speeds = [s.velocity.linear_x for s in onlooker.states if s.tick > start.tick]
-    if max(map(abs, speeds)) < 0.5 * body.description.max_linear_speed:
-        raise Failed(f"it has not obeyed: {max(map(abs, speeds)):.2f} m/s at most")
-    change = max(abs(b - a) for a, b in zip(speeds, speeds[WINDOW_TICKS:], strict=False))
+    speeds = {s.tick: s.velocity.linear_x for s in onlooker.states if s.tick > start.tick}
+    fastest = max(map(abs, speeds.values()))
+    if fastest < 0.5 * body.description.max_linear_speed:
+        raise Failed(f"it has not obeyed: {fastest:.2f} m/s at most")
+    later = {tick: speeds.get(tick + WINDOW_TICKS) for tick in speeds}  # a busy one misses some
+    change = max(abs(b - speeds[tick]) for tick, b in later.items() if b is not None)
     await onlooker.ticks(50)
     return 100.0 * max(0.0, change / (_limit(body.description) * WINDOW_TICKS * TICK_S) - 1.0)
 

@@ -21,10 +21,13 @@ from gigabrain_schemas.topics import (
     JOINT_CMD,
     LOG,
     MAP,
+    MAP_SAVE,
     MISSION,
     PARAM,
     POSE,
     RELEASE,
+    TASK,
+    TASK_CHANGE,
     TELEOP,
     TOPICS,
     WORLD,
@@ -49,16 +52,27 @@ class Rights:
 
 
 BRAIN = Rights(
-    says=(WORLD, POSE, MAP, INTENT, HEALTH, LOG),
+    says=(WORLD, POSE, MAP, INTENT, TASK, HEALTH, LOG),
     asks=(DESCRIBE, ESTOP),
-    answers=(GOAL, MISSION, PARAM, DESCRIBE),
+    answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
     names=("perception", "decision", "relay"),
 )
 OPERATOR = Rights(
     says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG),
-    asks=(DESCRIBE, AUDIT_LOG, PARAM, ESTOP, RELEASE, ENABLE, GOAL, MISSION),
+    asks=(
+        DESCRIBE,
+        AUDIT_LOG,
+        PARAM,
+        ESTOP,
+        RELEASE,
+        ENABLE,
+        GOAL,
+        MISSION,
+        TASK_CHANGE,
+        MAP_SAVE,
+    ),
     answers=(PARAM, DESCRIBE),
-    names=("page", "recorder", "button"),
+    names=("page", "foxglove", "recorder", "button"),
 )
 FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer")  # where no robot is named
 Rule = dict[str, Any]

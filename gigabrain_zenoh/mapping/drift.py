@@ -6,22 +6,30 @@ an upper bound of what the whole graph knows, and it tells an aisle from the nex
 
 import heapq
 from collections import defaultdict
+from dataclasses import dataclass
 
 import numpy as np
 
 from gigabrain_zenoh.mapping.keyframe import Edge
 from gigabrain_zenoh.mapping.se2 import Floats, between
 
-AWAY = 0.05  # [m] per square root of a metre driven
-TURN = 0.01  # [rad] per square root of a metre driven
 JOINT = 0.03  # [m] and [rad], of every loop
 GATE = 16.3  # 99.9 % of chi-square with three degrees of freedom
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """How fast matched scans may drift at most."""
+
+    away: float = 0.05  # [m] per square root of a metre driven
+    turn: float = 0.01  # [rad] per square root of a metre driven
 
 
 class Drift:
     """The ways between keyframes, with the variance of yaw [rad²] and of place [m²] on each."""
 
-    def __init__(self) -> None:
+    def __init__(self, rates: Rates) -> None:
+        self._rates = rates
         self._ways: dict[int, list[tuple[int, float, float]]] = defaultdict(list)
 
     def linked(self, link: Edge) -> None:
@@ -33,7 +41,7 @@ class Drift:
             self._add(link, float(link.covariance[2, 2]), away)
         else:
             driven = float(np.hypot(*link.relative[:2]))
-            self._add(link, TURN**2 * driven, AWAY**2 * driven)
+            self._add(link, self._rates.turn**2 * driven, self._rates.away**2 * driven)
 
     def closed(self, loop: Edge) -> None:
         """Add a loop that is beyond doubt."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gigabrain_zenoh.mapping.drift import Drift
+from gigabrain_zenoh.mapping.drift import Drift, Rates
 from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.local_map import build
 from gigabrain_zenoh.mapping.matching import Window, icp, search, thinned
@@ -45,8 +45,8 @@ OPEN = 0.02  # of what holds the best direction: a place that holds another less
 class LoopSearch:
     """Looks for loops from each keyframe in turn. One thread at a time."""
 
-    def __init__(self) -> None:
-        self.drift = Drift()
+    def __init__(self, rates: Rates) -> None:
+        self.drift = Drift(rates)
         self.waiting: list[Edge] = []  # loops without a second witness
         self.searched = -SPACING  # [m] of travel
 

@@ -155,7 +155,7 @@ def _nearest(
 
 
 @kernel
-def _solved(m: Floats, v: Floats) -> Floats:
+def solved(m: Floats, v: Floats) -> Floats:
     """x of m x = v, m being a symmetric (3, 3) matrix, by Cramer's rule."""
     a, b, c = m[0, 0], m[0, 1], m[0, 2]
     d, e, f = m[1, 1], m[1, 2], m[2, 2]
@@ -235,7 +235,7 @@ def _icp(
         off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi
         for row in range(3):  # `@` would call for a BLAS
             gradient[row] += (prior[row] * off).sum()
-        step = _solved(hessian + prior + SOFT * np.eye(3), gradient)
+        step = solved(hessian + prior + SOFT * np.eye(3), gradient)
         pose -= step
         if np.abs(step).max() < STILL and gate <= GATE_LEAST:
             break

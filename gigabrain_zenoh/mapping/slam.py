@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_zenoh.mapping.drift import Rates
 from gigabrain_zenoh.mapping.front_end import FrontEnd, Kind, Match, Spacing
 from gigabrain_zenoh.mapping.frozen import (
     Arrays,
@@ -63,7 +64,9 @@ def warm_up() -> None:
 class Slam:
     """A map that grows. All but `close_loops` belongs to one thread."""
 
-    def __init__(self, pose: Floats = IDENTITY, spacing: Spacing | None = None) -> None:
+    def __init__(
+        self, pose: Floats = IDENTITY, spacing: Spacing | None = None, rates: Rates | None = None
+    ) -> None:
         self._front = FrontEnd(spacing or Spacing(), pose)
         self._anchor = (0, pose)  # a keyframe, and where the front end has it
         self._poses: list[Floats] = []
@@ -71,7 +74,7 @@ class Slam:
         self._joined = {0}  # segments that loops have joined to the first
         self._travel = 0.0
         self._graph = Graph()
-        self._search = LoopSearch()
+        self._search = LoopSearch(rates or Rates())
         self.keyframes: list[Keyframe] = []  # only ever appended to
         self.revision = 0  # changes whenever poses of keyframes are corrected
 
@@ -173,9 +176,11 @@ class Slam:
         }
 
     @classmethod
-    def thaw(cls, arrays: Arrays, spacing: Spacing | None = None) -> "Slam":
+    def thaw(
+        cls, arrays: Arrays, spacing: Spacing | None = None, rates: Rates | None = None
+    ) -> "Slam":
         """Go on from what was frozen; KeyError or ValueError if it does not belong together."""
-        slam = cls(arrays["front"].astype(np.float64), spacing)
+        slam = cls(arrays["front"].astype(np.float64), spacing, rates)
         slam.keyframes = thaw_keyframes(arrays)
         poses = arrays["poses"].astype(np.float64)
         behind, anchor = int(arrays["behind"]), int(arrays["anchor"])

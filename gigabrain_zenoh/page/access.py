@@ -60,9 +60,9 @@ def check(config: PageConfig) -> None:
             raise ConfigError(f"page: cannot read {file}")
 
 
-def token_file(config: PageConfig) -> Path:
-    """Where the tokens are kept."""
-    return Path(config.tokens) if config.tokens else state_dir() / "page" / "tokens.json"
+def token_file(named: str) -> Path:
+    """Where the tokens are kept; in the file that is `named`, where one is."""
+    return Path(named) if named else state_dir() / "page" / "tokens.json"
 
 
 def tokens(path: Path) -> tuple[Tokens, bool]:
@@ -92,7 +92,7 @@ class Access:
     """Decides who is let in."""
 
     def __init__(self, config: PageConfig, port: int) -> None:
-        self._tokens = tokens(token_file(config))[0] if wants_login(config) else None
+        self._tokens = tokens(token_file(config.tokens))[0] if wants_login(config) else None
         names = LOOPBACK_NAMES if on_loopback(config.listen) else (config.listen,)
         hosts = {f"{name}:{port}" for name in (*names, *config.names)}
         if config.certificate and port == 443:

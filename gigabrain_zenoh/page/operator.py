@@ -1,58 +1,19 @@
-"""What viewers ask of the robot, and who of them steers."""
+"""What viewers ask of the robot, and what becomes of it."""
 
 import time
+from collections.abc import Sequence
 
-from gigabrain_schemas.base import Velocity
+from msgspec.structs import replace
+
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
-from gigabrain_schemas.topics import ENABLE, GOAL, RELEASE
+from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
+from gigabrain_schemas.topics import ENABLE, GOAL, RELEASE, TASK_CHANGE
 from gigabrain_zenoh.asking import ANSWER_S, ask, granted
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.estop import press
 from gigabrain_zenoh.gate_state import BRAIN
-from gigabrain_zenoh.limits import ZERO, clamp, limits_of
-from gigabrain_zenoh.page.scene import Scene
-from gigabrain_zenoh.page.viewer import Viewer
 from gigabrain_zenoh.page.wire import Ask, Reply
-
-SEAT_S = 0.5  # after so long without a command another viewer may steer
-
-
-class Seat:
-    """One viewer steers at a time, for as long as commands come. Nothing is ever repeated here."""
-
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._viewer: Viewer | None = None
-        self._until_s = 0.0
-
-    def driving(self, now_s: float) -> int:
-        """The number of the viewer who steers, or 0."""
-        return self._viewer.number if self._viewer and now_s < self._until_s else 0
-
-    def drive(self, viewer: Viewer, wanted: Velocity, now_s: float) -> bool:
-        """Pass on what a viewer wants; False where another one steers."""
-        if self.driving(now_s) not in (0, viewer.number):
-            return wanted == ZERO
-        body = self._scene.body
-        if body is None or (wanted == ZERO and viewer is not self._viewer):
-            return True
-        self._viewer, self._until_s = viewer, now_s + SEAT_S
-        if wanted == ZERO:
-            self._viewer = None
-        self._scene.steer(clamp(wanted, limits_of(body.description)))
-        return True
-
-    def leave(self, viewer: Viewer) -> None:
-        """A viewer is gone: whatever it wanted ends."""
-        if viewer is self._viewer:
-            self._viewer = None
-            self._scene.steer(ZERO)
-
-    def clear(self) -> None:
-        """Nobody steers any more: an e-stop was pressed."""
-        if self._viewer:
-            self.leave(self._viewer)
 
 
 class Operator:
@@ -78,6 +39,8 @@ class Operator:
     async def _do(self, asked: Ask) -> tuple[str, str]:
         if asked.what == "goal":
             return await self._goal(asked), ""
+        if asked.what == "cancel":
+            return await self._cancel(), ""
         if asked.what == "estop":
             reply = await press(self._bus, "operator page")
         elif asked.what == "release":
@@ -94,12 +57,23 @@ class Operator:
         request = EnableRequest(source=BRAIN, take=take, by=self._bus.process)
         return granted(await ask(self._bus, ENABLE, request))
 
+    async def _cancel(self) -> str:
+        request = TaskRequest(do="cancel", source=self._bus.process)
+        replies = await self._bus.ask(TASK_CHANGE, request, timeout_s=ANSWER_S)
+        return _answered(replies)
+
     async def _goal(self, asked: Ask) -> str:
         if asked.goal is None:
             raise Refused("a goal needs a place")
-        replies = await self._bus.ask(GOAL, asked.goal, timeout_s=ANSWER_S)
-        if not replies:
-            raise BodyLost("nobody serves goals: this robot has no navigation running")
-        if not replies[0].ok:
-            raise Refused(replies[0].text)
-        return replies[0].text
+        goal = replace(asked.goal, source=self._bus.process)
+        replies = await self._bus.ask(GOAL, goal, timeout_s=ANSWER_S)
+        return _answered(replies)
+
+
+def _answered(replies: Sequence[GoalReply | TaskReply]) -> str:
+    """What a robot that goes somewhere says. Raises BodyLost where none does, and Refused."""
+    if not replies:
+        raise BodyLost("nobody serves goals: this robot has no navigation running")
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    return replies[0].text

@@ -2,15 +2,15 @@
 
 import itertools
 from collections.abc import Callable, Iterator
-from typing import Generic, TypeVar
 
-from msgspec.structs import asdict
+from msgspec.structs import asdict, replace
 
-from gigabrain_schemas.base import Message, Pose, Velocity
+from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Body, RobotState
 from gigabrain_schemas.brain import OccupancyGrid, Twist
 from gigabrain_schemas.safety import Health, LogRecord
 from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import (
     BODY,
     HEALTH,
@@ -22,54 +22,16 @@ from gigabrain_schemas.topics import (
     SAFETY,
     SCAN,
     STATE,
+    TASK,
     TELEOP,
     WORLD,
-    Topic,
 )
-from gigabrain_zenoh.bus import Bus, Latest
-from gigabrain_zenoh.codec import Codec
-from gigabrain_zenoh.freshness import CLOCK_KEYS
+from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.page import wire
+from gigabrain_zenoh.sampled import Sampled
 
-M = TypeVar("M", bound=Message)
-
-SHOWN_NS = 500_000_000  # how old a message may be; the page gets fewer than others (process.py)
 CAMERAS = 4  # whose pictures are shown
 KEPT_LINES = 30  # of the log, for a viewer who comes later
-
-
-class Sampled(Generic[M]):
-    """The newest message of a topic, which is decoded no more often than somebody looks."""
-
-    def __init__(self, bus: Bus, topic: Topic[M]) -> None:
-        self._latest = Latest(topic, bus.clock, bus.time)
-        self._time = bus.time if topic.key in CLOCK_KEYS else None
-        self._codec = Codec(topic.type, topic.max_bytes)
-        self._raw: bytes | None = None
-        if not topic.many:
-            bus.tap(topic.key, self.take)
-
-    def take(self, _key: str, _encoding: str, payload: bytes) -> None:
-        """Keep a payload, in whatever thread it comes."""
-        self._raw = payload
-
-    def look(self) -> M | None:
-        """The message that has come since the last look, if there is a valid one."""
-        raw, self._raw = self._raw, None
-        if raw is None:
-            return None
-        try:
-            message = self._codec.decode(raw)
-        except ValueError:
-            return None
-        if self._time:
-            self._time.see(message)
-        return message if self._latest.take(message) else None
-
-    def fresh(self) -> M | None:
-        """The newest message, while it is worth showing."""
-        self.look()
-        return self._latest.fresh(SHOWN_NS)
 
 
 class Scene:
@@ -81,7 +43,7 @@ class Scene:
         self._intent, self._safety = Sampled(bus, INTENT), Sampled(bus, SAFETY)
         self._world, self._scan = Sampled(bus, WORLD), Sampled(bus, SCAN)
         self._place, self._images = Sampled(bus, POSE), dict[str, Sampled[Image]]()
-        self._map_frame = b""
+        self._map_frame = self._task_frame = b""
         self._health: dict[str, bytes] = {}
         self._lines: list[bytes] = []
         self._numbers = itertools.count()
@@ -89,6 +51,7 @@ class Scene:
         bus.subscribe(HEALTH, self._hear_health)
         bus.subscribe(LOG, self._hear_line)
         bus.latest(MAP, self._hear_map)
+        bus.latest(TASK, self._hear_task)
         bus.latest(BODY, self._hear_body)
         bus.tap(IMAGE.at("*"), self._hear_image)
         self.on_body: Callable[[], None] = lambda: None
@@ -102,6 +65,7 @@ class Scene:
         """How the robot is now."""
         state = self._state.fresh()
         pose, in_map = self._pose(state)
+        world = self._world.fresh()
         return wire.as_json(
             wire.MOMENT,
             wire.Moment(
@@ -110,7 +74,7 @@ class Scene:
                 frame="map" if in_map else "odom",
                 intent=self._intent.fresh(),
                 safety=self._safety.fresh(),
-                world=self._world.fresh(),
+                world=world and replace(world, hits=b""),  # the page draws the scan itself
                 driving=driving,
                 viewers=viewers,
             ),
@@ -127,9 +91,10 @@ class Scene:
                 yield f"image/{camera}", wire.image_frame(camera, image)
 
     def before(self) -> Iterator[tuple[str, bytes]]:
-        """What somebody who comes late has missed: the map, healths, the log."""
-        if self._map_frame:
-            yield "map", self._map_frame
+        """What somebody who comes late has missed: the map, the task, healths, the log."""
+        for slot, frame in (("map", self._map_frame), ("task", self._task_frame)):
+            if frame:
+                yield slot, frame
         yield from ((f"health/{name}", frame) for name, frame in self._health.items())
         yield from ((f"log/{next(self._numbers)}", frame) for frame in self._lines)
 
@@ -153,6 +118,10 @@ class Scene:
     def _hear_map(self, grid: OccupancyGrid) -> None:
         self._map_frame = wire.map_frame(grid)
         self._tell("map", self._map_frame)
+
+    def _hear_task(self, status: TaskStatus) -> None:
+        self._task_frame = wire.as_json(wire.TASK, status)
+        self._tell("task", self._task_frame)
 
     def _hear_body(self, body: Body) -> None:
         before, self.body = self.body, body

@@ -19,9 +19,10 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.page.access import Access, check, token_file, wants_login
-from gigabrain_zenoh.page.operator import Operator, Seat
+from gigabrain_zenoh.page.operator import Operator
 from gigabrain_zenoh.page.scene import Scene
 from gigabrain_zenoh.page.sessions import Sessions
+from gigabrain_zenoh.seat import Seat
 from gigabrain_zenoh.settings import PageConfig
 
 log = logging.getLogger(__name__)
@@ -94,7 +95,7 @@ async def run(config: PageConfig, bus: Bus, ready: Callable[[], None]) -> None:
         host = f"[{config.listen}]" if ":" in config.listen else config.listen
         log.info("operator page at %s://%s:%d", scheme, host, port)
         if wants_login(config):
-            log.info("it wants a token of %s", token_file(config))
+            log.info("it wants a token of %s", token_file(config.tokens))
         ready()
         try:
             ends = (serving, showing, bus.failed)

@@ -9,9 +9,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gigabrain_zenoh.page import wire
 from gigabrain_zenoh.page.access import Access, Role
-from gigabrain_zenoh.page.operator import Operator, Seat
+from gigabrain_zenoh.page.operator import Operator
 from gigabrain_zenoh.page.scene import Scene
 from gigabrain_zenoh.page.viewer import Viewer
+from gigabrain_zenoh.seat import Seat
 from gigabrain_zenoh.version import __version__
 
 log = logging.getLogger(__name__)
@@ -90,7 +91,7 @@ class Sessions:
             await asyncio.wait((sending, hearing), return_when=asyncio.FIRST_COMPLETED)
         finally:
             self.viewers.remove(viewer)
-            self._seat.leave(viewer)
+            self._seat.leave(viewer.number)
             sending.cancel()
             hearing.cancel()
             await asyncio.gather(sending, hearing, return_exceptions=True)
@@ -134,7 +135,7 @@ class Sessions:
         if viewer.role != "operator":
             raise ValueError("a viewer may look and not drive")
         if kind == bytes((wire.DRIVE,)):
-            if not self._seat.drive(viewer, wire.drive_of(content), now_s):
+            if not self._seat.drive(viewer.number, wire.drive_of(content), now_s):
                 self._reply(viewer, wire.Reply(id=0, what="drive", ok=False, text=SEATED))
         elif kind == bytes((wire.ASK,)):
             self._ask(viewer, wire.ask_of(content))

@@ -5,23 +5,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import msgspec
-from mcap.well_known import MessageEncoding, SchemaEncoding
+from foxglove import Schema
+from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, IndexType, Writer
 
 from gigabrain_schemas.topics import TOPICS, Topic
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.recording.drawing import Drawer, Drawn
+from gigabrain_zenoh.recording.drawing import Drawer, Drawn, json_schema
 from gigabrain_zenoh.recording.gaps import is_json
 from gigabrain_zenoh.recording.intake import Arrival
-from gigabrain_zenoh.recording.schema import flat_schema
 from gigabrain_zenoh.recording.tape import Tape
 
 CHUNK_BYTES = 1 << 20
 PROFILE = "gigabrain"
 RAW, VIEW = "raw", "view"  # what a channel is for, under the name "kind" in its metadata
-PLOTTED = ("robot/state", "robot/world", "robot/intent", "robot/cmd_vel", "robot/safety")
 BY_KEY = {topic.key: topic for topic in TOPICS}
 
 
@@ -77,7 +75,8 @@ class BagFile:
         self.pending[arrival.key] += count
         self.first_ns = self.first_ns or arrival.log_ns
         channel = self._raw_channel(arrival)
-        self._settle(Counter({arrival.key: count}))
+        if self._tape.size != self._settled:
+            self._settle(Counter({arrival.key: count}))
         header = arrival.header
         stamp_ns = header.stamp_ns or arrival.log_ns
         self._writer.add_message(
@@ -85,18 +84,18 @@ class BagFile:
         )
         if self._drawer:
             self._draw(self._drawer, arrival)
-        self._settle(Counter())
+        if self._tape.size != self._settled:
+            self._settle(Counter())
 
     def flush(self) -> None:
         """Bring all that was added to the disk."""
         self._writer.flush()
-        self._settle(Counter())
+        if self._tape.size != self._settled:
+            self._settle(Counter())
         self._tape.sync()
 
     def _settle(self, still: Counter[str]) -> None:
-        """Whenever the file has grown, all but `still` has been written."""
-        if self._tape.size == self._settled:
-            return
+        """The file has grown: all but `still` has been written."""
         self._settled = self._tape.size
         self.written += self.pending.total() - still.total()
         self.pending = still
@@ -121,54 +120,32 @@ class BagFile:
             return known
         topic = topic_of(arrival.key)
         notes = {"kind": RAW, "zenoh_encoding": arrival.encoding}
-        schema = self._schema(topic) if topic else 0
+        schema = self._schema(json_schema(topic.type)) if topic else 0
         channel = self._writer.register_channel(arrival.key, form, schema, notes)
         self._channels[arrival.key, form + arrival.encoding] = channel
         return channel
 
-    def _schema(self, topic: Topic[Any]) -> int:
-        name = f"gigabrain.{topic.type.__name__}"
-        if name not in self._schemas:
-            self._schemas[name] = self._writer.register_schema(
-                name, SchemaEncoding.JSONSchema, flat_schema(topic.type)
-            )
-        return self._schemas[name]
+    def _schema(self, of: Schema) -> int:
+        if of.name not in self._schemas:
+            self._schemas[of.name] = self._writer.register_schema(of.name, of.encoding, of.data)
+        return self._schemas[of.name]
 
     def _draw(self, drawer: Drawer, arrival: Arrival) -> None:
         topic = topic_of(arrival.key)
-        plotted = arrival.key in PLOTTED
-        if topic is None or not (plotted or drawer.draws(topic.type)):
+        if topic is None or not drawer.draws(topic):
             return
         try:
             message = self._decoders[topic.type](arrival.payload)
         except ValueError:  # not a valid message: kept as it came, but there is nothing to see
             return
-        if drawer.draws(topic.type):
-            for drawn in drawer.draw(message, arrival.key.rpartition("/")[2]):
-                self._view(arrival, self._foxglove_channel(drawn), drawn.data)
-        if plotted:
-            self._view(arrival, self._json_channel(topic), msgspec.json.encode(message))
-
-    def _view(self, arrival: Arrival, channel: int, data: bytes) -> None:
         stamp_ns = arrival.header.stamp_ns or arrival.log_ns
-        self._writer.add_message(channel, arrival.log_ns, data, stamp_ns)
+        for drawn in drawer.draw(topic, message, arrival.key.rpartition("/")[2]):
+            channel = self._view_channel(drawn)
+            self._writer.add_message(channel, arrival.log_ns, drawn.data, stamp_ns)
 
-    def _foxglove_channel(self, drawn: Drawn) -> int:
-        place = f"/viz/{drawn.topic}", "protobuf"
+    def _view_channel(self, drawn: Drawn) -> int:
+        place = drawn.topic, drawn.encoding
         if place not in self._channels:
-            schema = drawn.schema.get_schema()
-            if schema.name not in self._schemas:
-                self._schemas[schema.name] = self._writer.register_schema(
-                    schema.name, schema.encoding, schema.data
-                )
-            of_kind = self._schemas[schema.name]
-            self._channels[place] = self._writer.register_channel(*place, of_kind, {"kind": VIEW})
-        return self._channels[place]
-
-    def _json_channel(self, topic: Topic[Any]) -> int:
-        place = f"/viz/{topic.key.rpartition('/')[2]}_numbers", MessageEncoding.JSON
-        if place not in self._channels:
-            self._channels[place] = self._writer.register_channel(
-                *place, self._schema(topic), {"kind": VIEW}
-            )
+            schema = self._schema(drawn.schema())
+            self._channels[place] = self._writer.register_channel(*place, schema, {"kind": VIEW})
         return self._channels[place]

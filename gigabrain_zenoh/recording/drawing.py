@@ -1,21 +1,29 @@
 """What Foxglove, Lichtblick and Rerun draw of our messages: one conversion per message type.
 
-Frames by REP-105: map → odom → base_link → the lidar's own.
+The recorder and the live bridge have this table in common. Frames by REP-105: map → odom →
+base_link → the lidar's own.
 """
 
+import functools
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, cast
 
+import msgspec
 import numpy as np
+from foxglove import Schema
 from foxglove import messages as fox
 
 from gigabrain_schemas import arrays
 from gigabrain_schemas.base import Message, Pose
 from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import Intent, OccupancyGrid, PoseInMap
+from gigabrain_schemas.brain import Intent, OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.safety import LogRecord
 from gigabrain_schemas.sensors import Image, LaserScan
+from gigabrain_schemas.tasks import TaskStatus
+from gigabrain_schemas.topics import CMD_VEL, INTENT, SAFETY, STATE, WORLD, Topic
+from gigabrain_zenoh.recording.schema import flat_schema
+from gigabrain_zenoh.recording.shapes import obstacle, pose_of, stamp, turn
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
 LIDAR = "base_scan"  # as LaserScan has it
@@ -29,32 +37,37 @@ LEVELS = {
 }
 
 
+PLOTTED = {topic.key for topic in (STATE, WORLD, INTENT, CMD_VEL, SAFETY)}
+
+
 class Drawn(NamedTuple):
     """One message for a viewer."""
 
-    topic: str  # below /viz
-    schema: Any  # a message type of foxglove's, with get_schema
-    data: bytes  # Protocol Buffers
+    topic: str
+    encoding: str  # protobuf or json
+    schema: Callable[[], Schema]
+    data: bytes
 
 
 def of(topic: str, message: Any) -> Drawn:
     """A message of foxglove's, encoded."""
-    return Drawn(topic, type(message), message.encode())
+    return Drawn(f"/viz/{topic}", "protobuf", type(message).get_schema, message.encode())
 
 
-def stamp(message: Message) -> fox.Timestamp:
-    """When `message` was valid."""
-    return fox.Timestamp(message.stamp_ns // 1_000_000_000, message.stamp_ns % 1_000_000_000)
+def numbers(topic: Topic[Any], message: Message) -> Drawn:
+    """The numbers of a message, for plots; what is drawn anyway is left out."""
+    if isinstance(message, WorldModel):
+        message = msgspec.structs.replace(message, hits=b"", obstacles=())
+    elif isinstance(message, Intent):
+        message = msgspec.structs.replace(message, trajectory=())
+    schema = functools.partial(json_schema, topic.type)
+    name = f"/viz/{topic.key.rpartition('/')[2]}_numbers"
+    return Drawn(name, "json", schema, msgspec.json.encode(message))
 
 
-def turn(yaw: float) -> fox.Quaternion:
-    """A heading [rad] as a quaternion."""
-    return fox.Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
-
-
-def pose_of(x: float, y: float, yaw: float) -> fox.Pose:
-    """A planar pose [m, m, rad]."""
-    return fox.Pose(position=fox.Vector3(x=x, y=y), orientation=turn(yaw))
+def json_schema(kind: type[Message]) -> Schema:
+    """The schema of one of our messages, as viewers accept it."""
+    return Schema(name=f"gigabrain.{kind.__name__}", encoding="jsonschema", data=flat_schema(kind))
 
 
 class Drawer:
@@ -62,24 +75,37 @@ class Drawer:
 
     def __init__(self) -> None:
         self._odometry = Pose(x=0.0, y=0.0, yaw=0.0)
+        self._thought = (0, -1)  # boot and basis of the intent whose path was drawn last
         self._converters: dict[type[Message], Callable[[Any, str], Iterable[Drawn]]] = {
             LaserScan: self._scan,
             OccupancyGrid: self._map,
             PoseInMap: self._pose,
             Intent: self._path,
+            WorldModel: self._obstacles,
+            TaskStatus: self._task,
             Image: self._image,
             LogRecord: self._log,
             RobotState: self._state,
             Body: self._body,
         }
 
-    def draws(self, kind: type[Message]) -> bool:
-        """Whether there is anything to see of this type of message."""
-        return kind in self._converters
+    def draws(self, topic: Topic[Any]) -> bool:
+        """Whether there is anything to see of a topic."""
+        return topic.key in PLOTTED or topic.type in self._converters
 
-    def draw(self, message: Message, name: str = "") -> Iterable[Drawn]:
+    def draw(self, topic: Topic[Any], message: Message, name: str = "") -> Iterable[Drawn]:
         """What viewers show of `message`; `name` is the camera's, where there are several."""
-        return self._converters[type(message)](message, name)
+        if isinstance(message, Intent) and not self._thought_again(message):
+            return
+        if topic.type in self._converters:
+            yield from self._converters[topic.type](message, name)
+        if topic.key in PLOTTED:
+            yield numbers(topic, message)
+
+    def _thought_again(self, intent: Intent) -> bool:
+        """Whether it is new: it is said again with every tick, and drawn once."""
+        before, self._thought = self._thought, (intent.boot, intent.basis)
+        return before != self._thought
 
     def _scan(self, scan: LaserScan, _: str) -> Iterable[Drawn]:
         ranges = arrays.ranges(scan)
@@ -124,9 +150,19 @@ class Drawer:
 
     def _path(self, intent: Intent, _: str) -> Iterable[Drawn]:
         poses = [pose_of(point.x, point.y, point.yaw) for point in intent.trajectory]
-        if poses:
-            drawn = fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses)
-            yield of("path", drawn)
+        yield of("path", fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses))
+
+    def _obstacles(self, world: WorldModel, _: str) -> Iterable[Drawn]:
+        entities = [obstacle(world, one, ODOM) for one in world.obstacles]
+        yield of("obstacles", fox.SceneUpdate(entities=entities))
+
+    def _task(self, status: TaskStatus, _: str) -> Iterable[Drawn]:
+        """The way to the goal, and the goal at its end."""
+        way = [pose_of(x, y, 0.0) for x, y in status.path]
+        if status.goal:
+            goal = status.goal
+            way.append(pose_of(goal.x, goal.y, goal.yaw or 0.0))
+        yield of("way", fox.PosesInFrame(timestamp=stamp(status), frame_id=MAP, poses=way))
 
     def _image(self, image: Image, name: str) -> Iterable[Drawn]:
         when = stamp(image)

@@ -1,8 +1,9 @@
 """Process replay: recorded input through the real node in fake time, its output against the record.
 
-What cannot be the same is left aside: when a message was sent (`stamp_ns`), and its number (`seq`).
-Several messages that a node sends on one key for one tick and basis are one word, of which the last
-counts: which of two inputs within a tick was quicker decides how often it is repeated.
+What cannot be the same is left aside: when a message was sent (`stamp_ns`), its number (`seq`), and
+what safety says of its computer. Several messages that a node sends on one key for one tick and
+basis are one word, of which the last counts: which of two inputs within a tick was quicker decides
+how often it is repeated.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,6 +14,7 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_schemas.base import Message
+from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import CMD_VEL, INTENT, JOINT_CMD, MAP, POSE, SAFETY, WORLD, Topic
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.deployment import deployment_path, load_deployment
@@ -23,6 +25,7 @@ from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.recording.fields import message_of, row
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.replay import Event, replay
+from gigabrain_zenoh.safety import host
 from gigabrain_zenoh.settings import Endpoint
 
 SAYS: dict[str, tuple[Topic[Any], ...]] = {
@@ -88,7 +91,14 @@ def load(path: Path, process: str) -> tuple[list[Event], dict[Word, Message]]:
 
 
 def _words(said: Iterable[tuple[str, Message]]) -> dict[Word, Message]:
-    return {(key, m.boot, m.tick, m.basis): m for key, m in said}
+    return {(key, m.boot, m.tick, m.basis): _without_computer(m) for key, m in said}
+
+
+def _without_computer(message: Message) -> Message:
+    if not isinstance(message, SafetyState):
+        return message
+    warnings = tuple(each for each in message.warnings if each.code not in host.CODES)
+    return msgspec.structs.replace(message, warnings=warnings)
 
 
 def compare(then: Mapping[Word, Message], now: Mapping[Word, Message]) -> Outcome:

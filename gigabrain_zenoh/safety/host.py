@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -11,6 +12,7 @@ from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh.safety.words import say
 
 PERIOD_NS = 1_000_000_000
+CODES = ("disk_low", "cpu_busy", "memory_low")  # of the warnings below
 LOOKS = 10  # the processors' share is taken over so many, ten seconds
 
 
@@ -32,6 +34,9 @@ def warnings(limits: Thresholds, host: Host) -> tuple[Cause, ...]:
     if host.memory is not None and host.memory > limits.memory_warn:
         found.append(say("memory_low"))
     return tuple(found)
+
+
+Look = Callable[[int], Host]  # what the computer has left at a time of the monotonic clock [ns]
 
 
 class HostWatch:

@@ -9,6 +9,7 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import SAFETY
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.causes import in_words
+from gigabrain_zenoh.safety.host import HostWatch, Look
 from gigabrain_zenoh.safety.senses import Senses
 from gigabrain_zenoh.safety.step import Memory, step
 
@@ -17,8 +18,8 @@ log = logging.getLogger("gigabrain_zenoh.safety")
 REPEAT_TICKS = 2  # the verdict is repeated every 40 ms, and at once when it changes
 
 
-async def run(bus: Bus, ready: Callable[[], None]) -> None:
-    """Judge until the process ends."""
+async def run(bus: Bus, ready: Callable[[], None], look: Look | None = None) -> None:
+    """Judge until the process ends; `look` tells of the computer, this one unless it is given."""
     memory, said, said_tick = Memory(), SafetyState(verdict="stop"), 0
 
     def judge(_: Message) -> None:
@@ -36,7 +37,7 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
             basis = memory.field.basis
             said, said_tick = bus.publish(SAFETY, verdict, basis=basis), state.tick
 
-    senses = Senses(bus, judge)
+    senses = Senses(bus, judge, look or HostWatch().now)
     ready()
     await bus.failed
 

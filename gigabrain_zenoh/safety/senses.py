@@ -29,7 +29,7 @@ from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.gate_state import BRAIN
 from gigabrain_zenoh.safety.attitude import horizontal
-from gigabrain_zenoh.safety.host import HostWatch
+from gigabrain_zenoh.safety.host import Look
 from gigabrain_zenoh.safety.progress import SYSTEMS, Bases
 from gigabrain_zenoh.safety.step import Inputs
 
@@ -42,8 +42,8 @@ WORLD_MARGIN_NS = 50_000_000  # how much later than a scan its world may come
 class Senses:
     """Keeps the newest of everything; `on_new` is called with each state and each scan."""
 
-    def __init__(self, bus: Bus, on_new: Callable[[Message], None]) -> None:
-        self._bus, self._host = bus, HostWatch()
+    def __init__(self, bus: Bus, on_new: Callable[[Message], None], look: Look) -> None:
+        self._bus, self._look = bus, look
         self._by_commander: dict[str, Earlier[CmdVel]] = {}
         # age [ticks] and source; tick, and horizontal acceleration [m/s2]
         self._echoes: deque[tuple[int, str]] = deque(maxlen=MOST)
@@ -77,7 +77,7 @@ class Senses:
             command=heard.at(state.boot, state.tick, STATE.stale_after_ns) if heard else None,
             echo_ages=self._echo_ages(commander),
             shock=self._shock(state),
-            host=self._host.now(self._bus.clock.now_ns()),
+            host=self._look(self._bus.clock.now_ns()),
         )
 
     def _silent(self, body: BodyDescription) -> tuple[str, ...]:

@@ -57,7 +57,8 @@ class Stream:
 
     def figures(self, since_ns: int, now_ns: int) -> Figures | None:
         """Of what came after `since_ns`; None where nothing did."""
-        some = [a for a in self.arrivals if since_ns < a.at_ns <= now_ns]
+        newest = itertools.takewhile(lambda a: a.at_ns > since_ns, reversed(self.arrivals))
+        some = [a for a in newest if a.at_ns <= now_ns][::-1]
         if not some:
             return None
         times = [a.at_ns for a in some]
@@ -80,7 +81,7 @@ class Stream:
 
     def age_s(self, now_ns: int) -> float | None:
         """Since the newest message [s]; None before the first."""
-        return (now_ns - self.arrivals[-1].at_ns) / 1e9 if self.arrivals else None
+        return max(0, now_ns - self.arrivals[-1].at_ns) / 1e9 if self.arrivals else None
 
 
 class Tally:

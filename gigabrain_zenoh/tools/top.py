@@ -2,13 +2,13 @@
 
 from typing import ClassVar
 
-from rich.text import Text
 from textual.app import App, ComposeResult
 from textual.binding import BindingType
-from textual.widgets import DataTable, Footer, Header
+from textual.widgets import Footer, Header
 
+from gigabrain_zenoh.tools.plain_table import PlainTable
 from gigabrain_zenoh.tools.top_feed import Feed, Rows
-from gigabrain_zenoh.tools.top_rows import PROCESS_COLUMNS, TOPIC_COLUMNS, in_order, shown
+from gigabrain_zenoh.tools.top_rows import PROCESS_COLUMNS, TOPIC_COLUMNS, in_order
 
 PERIOD_S = 1.0
 DOWN, UP = " ▼", " ▲"
@@ -18,7 +18,7 @@ class Top(App[None]):
     """Two tables. Left and right choose the column that a table is sorted by."""
 
     CSS = """
-    DataTable { height: auto; max-height: 50%; margin: 0 1; }
+    PlainTable { max-height: 50%; margin: 0 1 1 1; }
     #topics { max-height: 1fr; }
     """
     TITLE = "gigabrain top"
@@ -43,7 +43,7 @@ class Top(App[None]):
         """The two tables."""
         yield Header()
         for name in self._sorted:
-            yield DataTable(id=name, cursor_type="row", zebra_stripes=True)
+            yield PlainTable(name=name)
         yield Footer()
 
     def on_mount(self) -> None:
@@ -52,11 +52,11 @@ class Top(App[None]):
         self._refresh()
         self.set_interval(PERIOD_S, self._refresh)
 
-    def on_data_table_header_selected(self, event: "DataTable.HeaderSelected") -> None:
+    def on_plain_table_heading_clicked(self, event: PlainTable.HeadingClicked) -> None:
         """A click on a column sorts by it; another turns the order round."""
-        name = event.data_table.id or "topics"
+        name = event.table.id or "topics"
         column, down = self._sorted[name]
-        self._sorted[name] = event.column_index, not down if column == event.column_index else down
+        self._sorted[name] = event.column, not down if column == event.column else down
         self._draw(name)
 
     def action_column(self, step: int) -> None:
@@ -93,21 +93,10 @@ class Top(App[None]):
             self._draw(name)
 
     def _draw(self, name: str) -> None:
-        """Anew, with the cursor on the row where it was."""
-        table = self.query_one(f"#{name}", DataTable)
         column, down = self._sorted[name]
-        at = table.cursor_row
-        labels = [
+        headings = [
             label + (DOWN if down else UP) if i == column else label
             for i, label in enumerate(self._columns(name))
         ]
-        same = labels == [str(known.label) for known in table.ordered_columns]
-        table.clear(columns=not same)
-        if not same:
-            table.add_columns(*labels)
-        for key, cells in in_order(self._rows[name], column, down=down):
-            made = [
-                Text(shown(c), justify="left" if isinstance(c, str) else "right") for c in cells
-            ]
-            table.add_row(*made, key=key)
-        table.move_cursor(row=min(at, max(0, len(self._rows[name]) - 1)))
+        rows = [cells for _, cells in in_order(self._rows[name], column, down=down)]
+        self.query_one(f"#{name}", PlainTable).show(headings, rows)

@@ -37,10 +37,8 @@ from gigabrain_schemas.requests import (
     EnableRequest,
     EstopRequest,
     GateReply,
-    GoalReply,
-    GoalRequest,
-    MissionReply,
-    MissionRequest,
+    MapReply,
+    MapRequest,
     Param,
     ParamReply,
     ParamRequest,
@@ -48,6 +46,17 @@ from gigabrain_schemas.requests import (
 )
 from gigabrain_schemas.safety import Health, LogRecord, SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import Image, Imu, ImuData, LaserScan
+from gigabrain_schemas.tasks import (
+    Goal,
+    GoalReply,
+    GoalRequest,
+    MissionReply,
+    MissionRequest,
+    Task,
+    TaskReply,
+    TaskRequest,
+    TaskStatus,
+)
 
 M = TypeVar("M", bound=Message)
 
@@ -261,10 +270,8 @@ REQUESTS: tuple[Message, ...] = (
         stamp_ns=STAMP_NS, seq=1, boot=BOOT, tick=205,
         ok=True, text="control holds the body", robot_type="turtlebot3_waffle", gate=GATE,
     ),
-    GoalRequest(stamp_ns=STAMP_NS, seq=1, x=3.0, y=1.5, yaw=1.571),
-    GoalReply(ok=True, text="on the way, 4.2 m", goal="goal-1"),
-    MissionRequest(mission="- go: kitchen\n- wait: 5 s\n", source="operator"),
-    MissionReply(ok=False, text="there is no place 'kitchen'"),
+    MapRequest(name="office", replace=True, source="ann"),
+    MapReply(ok=True, text="office.yaml is saved: 9.6 x 7.2 m, 41 m² free"),
     ParamRequest(stamp_ns=STAMP_NS, seq=1, name="linear_speed", value="0.15", source="ann"),
     ParamReply(
         stamp_ns=STAMP_NS, seq=1, boot=BOOT, tick=205,
@@ -284,9 +291,47 @@ REQUESTS: tuple[Message, ...] = (
     ),
 )  # fmt: skip
 
+PATROL = Task(
+    id="mission-4", kind="mission", label="evening round", source="ann", state="paused",
+    reason="until goal-7 is done",
+)  # fmt: skip
+TASKS: tuple[Message, ...] = (
+    GoalRequest(stamp_ns=STAMP_NS, seq=1, x=3.0, y=1.5, yaw=1.571, how="preempt", source="ann"),
+    GoalReply(ok=True, text="on the way, 4.2 m", goal="goal-7"),
+    MissionRequest(
+        mission="places: {kitchen: [3, 1.5]}\ndo:\n- goto: kitchen\n- wait: 5\n",
+        how="queue",
+        source="ann",
+        label="tea",
+    ),
+    MissionReply(ok=False, text="mission:2: do[0].goto: no place 'kitchen'"),
+    TaskRequest(stamp_ns=STAMP_NS, seq=1, do="cancel", task="goal-7", source="ann"),
+    TaskReply(ok=True, text="goal-7 is cancelled", task="goal-7"),
+    TaskStatus(
+        stamp_ns=STAMP_NS, seq=91, boot=BOOT, tick=206, basis=205,
+        current=Task(
+            id="goal-7", kind="goal", label="(3.00, 1.50)", source="ann", state="active",
+            reason="going round something",
+        ),
+        doing="going to (3.00, 1.50)",
+        progress=0.25,
+        distance_remaining=3.15,
+        eta=15.8,
+        goal=Goal(x=3.0, y=1.5, yaw=1.571),
+        path=((0.41, -0.02), (1.4, 0.6), (3.0, 1.5)),
+        queue=(PATROL,),
+        done=(
+            Task(
+                id="goal-6", kind="goal", label="(0.00, 0.00)", source="page", state="failed",
+                reason="the goal is inside something; nearest reachable point is 0.40 m away",
+            ),
+        ),
+    ),
+)  # fmt: skip
+
 EXAMPLES: dict[str, Message] = {
     type(message).__name__: message
-    for message in (*SENSORS, *BODY, *BRAIN, *SAFETY, *AUDIT, *REQUESTS)
+    for message in (*SENSORS, *BODY, *BRAIN, *SAFETY, *AUDIT, *REQUESTS, *TASKS)
 }  # fmt: skip
 
 

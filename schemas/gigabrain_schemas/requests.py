@@ -1,6 +1,8 @@
 """What may be asked of a robot, and what it answers."""
 
-from msgspec import field
+from typing import Annotated
+
+from msgspec import Meta, field
 
 from gigabrain_schemas.base import Count, Finite, Message, Name, Record, Text
 from gigabrain_schemas.body import GateStatus
@@ -37,34 +39,21 @@ class GateReply(Message, frozen=True, kw_only=True):
     gate: GateStatus
 
 
-class GoalRequest(Message, frozen=True, kw_only=True):
-    """Go there."""
+class MapRequest(Message, frozen=True, kw_only=True):
+    """Save the map, with the pose graph, where perception runs."""
 
-    x: Finite  # [m], in the map
-    y: Finite  # [m]
-    yaw: Finite | None = None  # [rad]; None for any
-
-
-class GoalReply(Message, frozen=True, kw_only=True):
-    """Whether the robot will go there."""
-
-    ok: bool
-    text: Text
-    goal: Name = ""  # the goal's name, to cancel it by
-
-
-class MissionRequest(Message, frozen=True, kw_only=True):
-    """Carry out a mission."""
-
-    mission: str  # the YAML text
+    name: Annotated[
+        str, Meta(pattern=r"^\w[\w.-]*$", max_length=64)
+    ]  # of its files, without ending
+    replace: bool = False  # another map of that name
     source: Name = "anonymous"
 
 
-class MissionReply(Message, frozen=True, kw_only=True):
-    """Whether the robot will carry it out."""
+class MapReply(Message, frozen=True, kw_only=True):
+    """Whether it was saved, and where."""
 
     ok: bool
-    text: Text
+    text: Text  # a sentence for people
 
 
 class DescribeRequest(Message, frozen=True, kw_only=True):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
-from gigabrain_schemas import audit, body, brain, button, requests, safety, sensors
+from gigabrain_schemas import audit, body, brain, button, requests, safety, sensors, tasks
 from gigabrain_schemas.base import Message
 
 M = TypeVar("M", bound=Message)
@@ -88,6 +88,7 @@ BUTTON = Topic(
     "robot/button", button.ButtonState, 20, missed=4, priority="real_time", express=True,
     max_bytes=KB,
 )  # fmt: skip
+TASK = Topic("robot/task", tasks.TaskStatus, 5, keep=True, max_bytes=64 * KB)
 AUDIT = Topic("robot/audit", audit.AuditRecord, 10, depth=256)
 
 
@@ -98,14 +99,16 @@ def command_topic(of: body.BodyDescription) -> Topic[brain.CmdVel]:
 
 TOPICS: tuple[Topic[Any], ...] = (
     SCAN, IMU, STATE, BODY, IMAGE, WORLD, POSE, MAP, INTENT, TELEOP, CMD_VEL, JOINT_CMD, SAFETY,
-    BUTTON, HEALTH, LOG, AUDIT,
+    BUTTON, HEALTH, LOG, TASK, AUDIT,
 )  # fmt: skip
 
 ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time")
 RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply)
 ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply)
-GOAL = Service("robot/goal", requests.GoalRequest, requests.GoalReply)
-MISSION = Service("robot/mission", requests.MissionRequest, requests.MissionReply)
+GOAL = Service("robot/goal", tasks.GoalRequest, tasks.GoalReply)
+MISSION = Service("robot/mission", tasks.MissionRequest, tasks.MissionReply)
+TASK_CHANGE = Service("robot/task_change", tasks.TaskRequest, tasks.TaskReply)
+MAP_SAVE = Service("robot/map_save", requests.MapRequest, requests.MapReply)
 AUDIT_LOG = Service(
     "robot/audit_log", audit.AuditRequest, audit.AuditPage, priority="background",
     max_bytes=1024 * KB,
@@ -119,6 +122,8 @@ SERVICES: tuple[Service[Any, Any], ...] = (
     ENABLE,
     GOAL,
     MISSION,
+    TASK_CHANGE,
+    MAP_SAVE,
     AUDIT_LOG,
     PARAM,
     DESCRIBE,

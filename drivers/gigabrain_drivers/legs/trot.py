@@ -3,6 +3,7 @@
 Each foot bears the body for a part of the cycle and is then lifted to where it will be needed
 (Raibert, "Legged Robots That Balance", 1986). The heights of standing feet keep the body level,
 and the torques that bear its weight are added to the position targets, so that servos do not sag.
+They also lean against what the body is too fast by: servos alone are springs, and swing on.
 """
 
 import math
@@ -16,8 +17,7 @@ ACCELERATION = Twist(1.0, 1.0, 2.0)  # [m/s2], [rad/s2]
 SMOOTH_S = 0.1  # over which the measured velocity is smoothed
 INTEGRAL = 1.0  # [1/s], of the velocity error
 MOST_INTEGRAL = Twist(0.2, 0.2, 0.6)  # [m/s], [rad/s]
-FORGET_S = 0.5  # in which the integral fades at rest
-PAUSE_S = 0.3  # for which a body that has come to rest goes on stepping
+BRACE_S = 0.12  # how far, in time, a standing foot leans for each m/s too fast
 LIFT = 0.05  # [m], of a swinging foot
 PRESS = 0.002  # [m], below the floor, where a swinging foot is put down
 CAPTURE_S = 0.12  # how far, in time, a foot is put ahead for each m/s too fast
@@ -25,7 +25,7 @@ FURTHEST = (0.15, 0.10)  # [m], of a foot from its home, ahead and sideways
 LEVEL, DAMP_S = 0.45, 0.02  # how firmly the standing feet hold the body level
 FOOT_SPEED = 2.0  # [m/s], up or down, of a standing foot
 HEIGHT_SPEED = 0.1  # [m/s], of the whole body
-STILL, SLOW = 1e-3, 0.08  # [m/s], commanded and measured, below which stepping ends
+STILL, SLOW = 1e-3, 0.15  # [m/s], commanded and measured, below which stepping ends
 FALLEN = 0.8  # [rad] of roll or pitch
 
 
@@ -40,12 +40,8 @@ class Trot:
         self._feet = [leg.home(height) for leg in geometry.legs]
         self._lifted: list[Vector | None] = [None] * 4  # where a swinging foot left the floor
         self._command = self._measured = self._integral = Twist(0.0, 0.0, 0.0)
-        self._phase = self._pace_s = 0.0
-
-    @property
-    def stepping(self) -> bool:
-        """Whether feet are lifted at all."""
-        return self._pace_s > 0
+        self._phase = 0.0
+        self.stepping = False  # whether feet are lifted at all
 
     def sense(self, senses: Senses, passed_s: float) -> None:
         """Take in a sample, `passed_s` after the one before."""
@@ -68,7 +64,8 @@ class Trot:
                 self._swing(leg, (share - gait.duty) / (1 - gait.duty), twist, gait)
             else:
                 self._stand(leg, twist, tilt, passed_s)
-            bearing.append(senses.contacts[leg] and not swings)
+            # at rest all bear: by touch, two feet would hold the body up and off the other two
+            bearing.append(not swings and (senses.contacts[leg] or not self.stepping))
         return self._servo_targets(senses, bearing)
 
     def _follow(self, gait: Gait, passed_s: float) -> Twist:
@@ -78,21 +75,27 @@ class Trot:
         pairs = zip(self._measured, self.odometry.velocity, strict=True)
         share = passed_s / SMOOTH_S
         self._measured = Twist(*(before + share * (now - before) for before, now in pairs))
-        moving = max(map(abs, self._command)) > STILL
-        moving = moving or max(map(abs, self._measured[:2])) > SLOW
-        self._pace_s = PAUSE_S if moving else max(self._pace_s - passed_s, 0.0)
-        self._phase = (self._phase + passed_s * gait.frequency) % 1.0 if self.stepping else 0.0
+        self._height += _within(gait.height - self._height, HEIGHT_SPEED * passed_s)
+        self._pace(gait, passed_s)
+        if not self.stepping:  # an integral that faded would turn a standing body for a second
+            self._integral = Twist(0.0, 0.0, 0.0)
+            return self._integral
         errors = zip(self._integral, self._command, self._measured, MOST_INTEGRAL, strict=True)
         self._integral = Twist(
             *(
                 _within(sum_ + INTEGRAL * passed_s * (to - now), most)
-                if moving
-                else sum_ * (1 - passed_s / FORGET_S)
                 for sum_, to, now, most in errors
             )
         )
-        self._height += _within(gait.height - self._height, HEIGHT_SPEED * passed_s)
         return Twist(*(a + b for a, b in zip(self._command, self._integral, strict=True)))
+
+    def _pace(self, gait: Gait, passed_s: float) -> None:
+        """Go on with the cycle, which ends at rest as soon as no foot is in the air."""
+        measured = self.odometry.velocity
+        moving = max(map(abs, self._command)) > STILL or max(map(abs, measured[:2])) > SLOW
+        lifted = any((self._phase + phase) % 1.0 >= gait.duty for phase in gait.phases)
+        self.stepping = moving or (self.stepping and lifted)
+        self._phase = (self._phase + passed_s * gait.frequency) % 1.0 if self.stepping else 0.0
 
     def _stand(self, leg: int, twist: Twist, tilt: tuple[float, float], passed_s: float) -> None:
         """Push the body on: a standing foot moves against it, and holds it level."""
@@ -135,13 +138,20 @@ class Trot:
         for leg, foot, joints, bears in zip(
             self._geometry.legs, self._feet, senses.joints, bearing, strict=True
         ):
-            a, b, c = leg.joints(foot)
+            a, b, c = leg.joints(self._braced(foot) if bears else foot)
             if bears:
                 sag = weight / self._stiffness
                 (*_, za), (*_, zb), (*_, zc) = leg.jacobian(joints)
                 a, b, c = a - sag * za, b - sag * zb, c - sag * zc
             targets.append((a, b, c))
         return tuple(targets)
+
+    def _braced(self, foot: Vector) -> Vector:
+        """Where a standing foot goes to slow down what the body is too fast by."""
+        pairs = zip(self.odometry.velocity, self._command, strict=True)
+        ahead, left, turning = (BRACE_S * (now - to) for now, to in pairs)
+        x, y, z = foot
+        return x + ahead - turning * y, y + left + turning * x, z
 
 
 def _hermite(start: float, end: float, speed: float, done: float) -> float:

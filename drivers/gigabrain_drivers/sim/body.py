@@ -118,7 +118,7 @@ class SimQuadruped(SimModel):
     its position servo; each leg has a touch sensor `..._contact` on its foot.
     """
 
-    substeps: int = 5  # feet that meet the ground ask for finer steps than wheels do
+    substeps: int = 3  # feet that meet the ground ask for finer steps than wheels do
     geometry: LegGeometry = field(default_factory=LegGeometry)
     walker: Walker = WALKER  # turns velocities into gaits
     encoder_ticks: int = 65536  # per turn of a joint

@@ -1,0 +1,119 @@
+"""`gigabrain bench chain --with tools`: the chain alone and with all tools beside it, in turns."""
+
+import statistics
+import tempfile
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import HEALTH
+from gigabrain_zenoh.bench.figures import Figures, over_rounds
+from gigabrain_zenoh.bench.onlookers import ECHO, Ports, looking_on
+from gigabrain_zenoh.bench.runs import brain, chain_figures, time_chain
+from gigabrain_zenoh.deployment import ROBOT, Deployment
+from gigabrain_zenoh.settings import FoxgloveConfig, PageConfig, RecorderConfig
+
+TOOLS = {"recorder": 3.0, "page": 2.0, "foxglove": 2.0, ECHO: None}  # [% of a core] at most
+SETTLE_S = 2.0  # until the tools are connected, and health has forgotten how they started
+ADDED = 5.0  # [%] at most, to the p99 from scan to command
+
+
+class Tool(Struct, frozen=True, kw_only=True):
+    """What one tool needs."""
+
+    name: str
+    cpu: float  # of one core, mean over the rounds
+    limit: float | None = None  # [%]
+
+
+class Beside(Struct, frozen=True, kw_only=True):
+    """One rate: the rounds, which were run in turns."""
+
+    rate_hz: float
+    alone: tuple[Figures, ...]
+    tools: tuple[Figures, ...]
+
+    @property
+    def added_p99(self) -> float:
+        """What the tools add to the p99 [%]."""
+        return 100 * (over_rounds(self.tools).p99_ms / over_rounds(self.alone).p99_ms - 1)
+
+
+class ToolsResult(Struct, frozen=True, kw_only=True):
+    """The whole benchmark."""
+
+    seconds: float  # of each run
+    recorded_hz: float  # messages a second that the recorder took
+    rates: tuple[Beside, ...]
+    tools: tuple[Tool, ...]
+
+
+class _Run(Struct, frozen=True):
+    """One run with tools."""
+
+    figures: Figures
+    cpu: dict[str, float]  # of one core
+    recorded_hz: float
+
+
+async def measure_with_tools(
+    seconds: float, rounds: int, rates_hz: Sequence[float], say: Callable[[str], None]
+) -> ToolsResult:
+    """Run it all. Raises GigabrainError when a process dies on the way."""
+    compared, runs = [], list[_Run]()
+    with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as name:
+        for rate_hz in rates_hz:
+            alone, beside = [], list[_Run]()
+            for i in range(1, rounds + 1):
+                say(f"{rate_hz:g} Hz, round {i} of {rounds}: chain alone")
+                alone.append(await time_chain(rate_hz, seconds, Path(name)))
+                say(f"{rate_hz:g} Hz, round {i} of {rounds}: chain with tools")
+                beside.append(await _time_with_tools(rate_hz, seconds, Path(name)))
+            tools = tuple(run.figures for run in beside)
+            compared.append(Beside(rate_hz=rate_hz, alone=tuple(alone), tools=tools))
+            runs += beside
+    return ToolsResult(
+        seconds=seconds,
+        recorded_hz=statistics.fmean(run.recorded_hz for run in runs),
+        rates=tuple(compared),
+        tools=tuple(_tool(name, runs) for name in TOOLS),
+    )
+
+
+def _tool(name: str, runs: Sequence[_Run]) -> Tool:
+    cpu = statistics.fmean(run.cpu.get(name, 0.0) for run in runs)
+    return Tool(name=name, cpu=cpu, limit=TOOLS[name])
+
+
+async def _time_with_tools(rate_hz: float, seconds: float, folder: Path) -> _Run:
+    ports = Ports.free()
+
+    def add_tools(deployment: Deployment) -> Deployment:
+        return replace(
+            deployment,
+            router=ports.endpoint,
+            hosts={"robot": (*ROBOT, "recorder", "page", "foxglove")},
+            recorder=RecorderConfig(folder=str(folder / "bags"), keep_free_mb=0),
+            page=PageConfig(port=ports.page),
+            foxglove=FoxgloveConfig(port=ports.foxglove, tokens=str(folder / "tokens.json")),
+        )
+
+    told: defaultdict[str, list[Health]] = defaultdict(list)
+    async with brain(rate_hz, folder, add_tools) as (group, bus):
+        async with looking_on(ports) as echo:
+            await group.go_on(SETTLE_S)
+            close = bus.subscribe(HEALTH, lambda _key, health: told[health.process].append(health))
+            spent_s = echo.cpu_s()
+            await group.go_on(seconds)
+            cpu = {ECHO: (echo.cpu_s() - spent_s) / seconds}
+            close()
+        figures = await chain_figures(bus)
+    for name, healths in told.items():
+        cpu[name] = statistics.fmean(health.cpu for health in healths)
+    recorded = [health.counters.get("recorded", 0) for health in told["recorder"]]
+    rate = (recorded[-1] - recorded[0]) / max(len(recorded) - 1, 1)
+    return _Run(figures=figures, cpu=cpu, recorded_hz=rate)

@@ -1,0 +1,50 @@
+"""`gigabrain foxglove`: the robot in Foxglove or Lichtblick, live."""
+
+from pathlib import Path
+
+
+def foxglove(
+    *,
+    port: int = 8765,
+    layout: Path | None = None,
+    connect: str | None = None,
+    namespace: str = "",
+    keys: Path | None = None,
+) -> int:
+    """Show the robot in Foxglove or Lichtblick, live, at ws://127.0.0.1:8765.
+
+    Example: gigabrain foxglove --layout robot.json
+
+    It serves this machine alone: run it where you look, also when the robot is elsewhere. Whoever
+    has the layout file may steer from its Teleop panel.
+
+    Parameters
+    ----------
+    port
+        Where it listens, on loopback.
+    layout
+        Write a layout for the viewer into this file, to be imported there, and do nothing else.
+    connect
+        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
+    namespace
+        The robot's own part of the key space.
+    keys
+        The folder of your identity, for a router that wants one.
+    """
+    import msgspec
+
+    from gigabrain_zenoh.cli.checked import checked
+    from gigabrain_zenoh.foxglove_bridge.layout import write_layout
+    from gigabrain_zenoh.process import run
+    from gigabrain_zenoh.process_config import ProcessConfig
+    from gigabrain_zenoh.running import find_endpoint
+    from gigabrain_zenoh.settings import FoxgloveConfig
+
+    config = checked({"port": port}, FoxgloveConfig)
+    if layout:
+        write_layout(config, layout)
+        print(f"{layout}: import it as a layout, and open a connection to ws://127.0.0.1:{port}")
+        return 0
+    endpoint = find_endpoint(connect, namespace, str(keys) if keys else "")
+    settings = msgspec.to_builtins(config)
+    return run(ProcessConfig(name="foxglove", endpoint=endpoint, settings=settings))

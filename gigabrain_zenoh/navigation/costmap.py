@@ -1,0 +1,214 @@
+"""What it costs a body to be in each cell of a map: 1 in the open, LETHAL and more where it cannot.
+
+Obstacles are grown by the body's half width, as it drives along its path; from there on the cost
+falls with distance, so that a path keeps off walls where there is room and squeezes where not.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import cells as cells_of
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_zenoh import sweep
+from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.navigation.distance import Cells, Singles, squared_distance
+
+LETHAL = 100.0  # from here on the body does not fit; up to twice that where its centre touches
+NEAR = 12.0  # added where the body just fits
+UNSEEN = 4.0  # added in unknown space that is avoided: a detour of five times its length is better
+LEAST_DECAY = 0.1  # [m]
+FADED = 0.05  # what of NEAR may be left off at the end
+PART = 0.5  # of a map: if more of it has changed, all is computed anew
+WORDS = {"allow": 0.0, "avoid": UNSEEN, "forbid": LETHAL}
+
+Unknown = Literal["avoid", "allow", "forbid"]
+Costs = NDArray[np.float32]
+Box = tuple[int, int, int, int]  # first row, row after the last, the same of columns
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inflation:
+    """How obstacles and unknown space weigh for one body."""
+
+    fits: float  # [m] from its centre to an obstacle, at least: it drives past
+    turns: float  # [m], at which it also turns on the spot
+    unknown: Unknown = "avoid"
+
+    @property
+    def decay(self) -> float:
+        """Over how many metres the cost falls to 1/e."""
+        return max(LEAST_DECAY, self.turns - self.fits)
+
+    @property
+    def reach(self) -> float:
+        """How far from an obstacle it still costs something [m]."""
+        return self.fits + self.decay * math.log(NEAR / FADED)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Costmap:
+    """A map as a planner sees it. Rows go with y, columns with x."""
+
+    resolution: float  # [m] per cell
+    origin_x: float  # [m], of the corner of cell (0, 0)
+    origin_y: float  # [m]
+    inflation: Inflation
+    cells: Cells  # (height, width): the map's, with extra obstacles in it
+    cost: Costs  # (height, width)
+
+    def cell(self, x: float, y: float) -> tuple[int, int] | None:
+        """Row and column at (x, y) [m]; None outside the map, and for what is not a number."""
+        column, row = (x - self.origin_x) / self.resolution, (y - self.origin_y) / self.resolution
+        height, width = self.cost.shape
+        if not (0 <= row < height and 0 <= column < width):
+            return None
+        return int(row), int(column)
+
+    def points(
+        self, rows: NDArray[np.integer], columns: NDArray[np.integer]
+    ) -> NDArray[np.float64]:
+        """The centres of cells (n,) in metres, (n, 2)."""
+        x = self.origin_x + (columns + 0.5) * self.resolution
+        y = self.origin_y + (rows + 0.5) * self.resolution
+        return np.column_stack((x, y))
+
+
+def inflation(body: BodyDescription, unknown: Unknown = "avoid") -> Inflation:
+    """How obstacles weigh for `body`, with the room beside it that safety keeps as well."""
+    edges, margin = sweep.box(body.footprint), body.thresholds.side_margin
+    fits = max(edges.left, -edges.right) + margin
+    return Inflation(fits=fits, turns=sweep.radius(body.footprint) + margin, unknown=unknown)
+
+
+def costmap(
+    grid: OccupancyGrid,
+    rules: Inflation,
+    points: NDArray[np.floating] | None = None,
+    before: Costmap | None = None,
+) -> Costmap:
+    """The costs of `grid`. `points` [m], (n, 2) in the map's frame, are obstacles besides.
+
+    With the costmap `before` only what has changed since is computed; the result is the same.
+    """
+    cells = _with_points(grid, points)
+    box = _box_to_renew(before, grid, rules, cells)
+    if box is None or before is None:
+        cost = np.empty(cells.shape, np.float32)
+        _fill(cost, cells, rules, grid.resolution, (0, cells.shape[0], 0, cells.shape[1]))
+    else:
+        cost = before.cost
+        if box[0] < box[1]:
+            cost = cost.copy()
+            _fill(cost, cells, rules, grid.resolution, box)
+    return Costmap(
+        resolution=grid.resolution,
+        origin_x=grid.origin_x,
+        origin_y=grid.origin_y,
+        inflation=rules,
+        cells=cells,
+        cost=cost,
+    )
+
+
+def _with_points(grid: OccupancyGrid, points: NDArray[np.floating] | None) -> Cells:
+    cells = cells_of(grid).copy()
+    if points is not None and len(points):
+        at = (points - (grid.origin_x, grid.origin_y)) / grid.resolution
+        inside = (at >= 0).all(axis=1) & (at < (grid.width, grid.height)).all(axis=1)
+        columns, rows = at[inside].astype(np.intp).T
+        cells[rows, columns] = 100
+    return cells
+
+
+def _box_to_renew(
+    before: Costmap | None, grid: OccupancyGrid, rules: Inflation, cells: Cells
+) -> Box | None:
+    """The part of the map whose cost may differ from `before`; None for all of it."""
+    if before is None or before.inflation != rules or before.cells.shape != cells.shape:
+        return None
+    if (grid.resolution, grid.origin_x, grid.origin_y) != (
+        before.resolution,
+        before.origin_x,
+        before.origin_y,
+    ):
+        return None
+    top, bottom, left, right = _changed(before.cells, cells)
+    if top == bottom:
+        return top, bottom, left, right
+    box = _wider((top, bottom, left, right), _reach_cells(rules, grid.resolution), cells.shape)
+    large = (box[1] - box[0]) * (box[3] - box[2]) > PART * cells.size
+    return None if large else box
+
+
+def _reach_cells(rules: Inflation, resolution: float) -> int:
+    return math.ceil(rules.reach / resolution + 0.5)
+
+
+def _wider(box: Box, by: int, shape: tuple[int, ...]) -> Box:
+    top, bottom, left, right = box
+    return (
+        max(top - by, 0),
+        min(bottom + by, shape[0]),
+        max(left - by, 0),
+        min(right + by, shape[1]),
+    )
+
+
+def _fill(cost: Costs, cells: Cells, rules: Inflation, resolution: float, box: Box) -> None:
+    """Compute the cost of `box`. Obstacles beyond it count as far as they reach."""
+    reach = _reach_cells(rules, resolution)
+    wide = _wider(box, reach, cells.shape)
+    part = np.ascontiguousarray(cells[wide[0] : wide[1], wide[2] : wide[3]])
+    squares, table = squared_distance(part, reach), _table(rules, resolution, reach)
+    _price(cells, squares, wide, box, table, np.float32(WORDS[rules.unknown]), cost)
+
+
+def _table(rules: Inflation, resolution: float, reach: int) -> Costs:
+    """Cost by the square of the distance to the nearest obstacle in cells, a whole number.
+
+    Centres are that far apart; the obstacle's cell may be full up to its edge.
+    """
+    away = (np.sqrt(np.arange(reach * reach + 1)) - 0.5).clip(0) * resolution
+    near = 1 + NEAR * np.exp(-(away - rules.fits) / rules.decay)
+    lethal = LETHAL * (2 - away / rules.fits)
+    table = np.where(away < rules.fits, lethal, near)
+    table[-1] = 1.0
+    return table.astype(np.float32)
+
+
+@kernel
+def _price(
+    cells: Cells,
+    squares: Singles,
+    wide: Box,
+    box: Box,
+    table: Costs,
+    unknown: np.float32,
+    out: Costs,
+) -> None:
+    """Fill `box` of `out`; `squares` are those of the box `wide`."""
+    lethal = np.float32(LETHAL)
+    for row in range(box[0], box[1]):
+        for column in range(box[2], box[3]):
+            cost = table[int(squares[row - wide[0], column - wide[2]])]
+            if cells[row, column] < 0 and cost < lethal:
+                cost = min(cost + unknown, lethal)
+            out[row, column] = cost
+
+
+@kernel
+def _changed(before: Cells, now: Cells) -> Box:
+    """The smallest box with all cells that differ; empty when none does."""
+    height, width = now.shape
+    top, bottom, left, right = height, 0, width, 0
+    for row in range(height):
+        for column in range(width):
+            if before[row, column] != now[row, column]:
+                top, bottom = min(top, row), row + 1
+                left, right = min(left, column), max(right, column + 1)
+    return (top, bottom, left, right) if bottom else (0, 0, 0, 0)

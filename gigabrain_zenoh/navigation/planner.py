@@ -1,0 +1,175 @@
+"""The global planner: from where the robot is to a goal, over the whole map."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_zenoh.navigation.costmap import LETHAL, Costmap, Inflation
+from gigabrain_zenoh.navigation.costmap import costmap as make_costmap
+from gigabrain_zenoh.navigation.distance import OCCUPIED
+from gigabrain_zenoh.navigation.search import Floats, Search
+from gigabrain_zenoh.navigation.tighten import costs_to_go, is_free, pull
+
+SPACING = 0.1  # [m] between the points of a path, at most
+STRAYED = 0.5  # [m] off its path: then it is planned anew
+BETTER = 0.85  # of what the present path costs: a new one must not cost more, or it flips
+
+Point = tuple[float, float]  # [m], in the map's frame
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Path:
+    """A way to a goal, in the map's frame."""
+
+    points: Floats  # (n, 2) [m], from where the robot is to the goal
+    remaining: Floats  # (n,) [m] from each to the goal
+    cost: Floats  # (n,) the same, weighted: metres in the open
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unreachable:
+    """A goal that no way leads to: why, and how near the robot could come."""
+
+    reason: str
+    nearest: Point | None = None
+    distance: float | None = None  # [m] from there to the goal, straight
+
+
+class Planner:
+    """Plans with the same memory again and again. Not for two threads at once."""
+
+    def __init__(self) -> None:
+        self.search = Search()
+
+    def plan(self, costmap: Costmap, start: Point, goal: Point) -> Path | Unreachable:
+        """The cheapest path from `start` to `goal`, or why there is none."""
+        if not all(math.isfinite(value) for value in (*start, *goal)):
+            return Unreachable(reason="the goal and the robot's place must be finite numbers")
+        begin, end = costmap.cell(*start), costmap.cell(*goal)
+        if begin is None:
+            return Unreachable(reason="the robot is outside the map")
+        fault = _fault(costmap, goal)
+        if fault or end is None:
+            self.search.reach(costmap.cost, begin)
+            return self._nearest(costmap, goal, fault)
+        cells = self.search.path(costmap.cost, begin, end)
+        if cells is None:
+            return self._nearest(costmap, goal, "no way leads to the goal")
+        places = np.column_stack((cells[:, 1] + 0.5, cells[:, 0] + 0.5))
+        places = np.vstack((places[:1], places)) if len(places) == 1 else places
+        places[0], places[-1] = _in_cells(costmap, np.array((start, goal)))
+        corners = _in_metres(costmap, pull(costmap.cost, places))
+        corners[0], corners[-1] = start, goal  # exactly
+        return _path(costmap, corners)
+
+    def replan(self, costmap: Costmap, start: Point, goal: Point, path: Path) -> Path | Unreachable:
+        """What is left of `path` while that is free and nothing much better turns up."""
+        found = self.plan(costmap, start, goal)
+        rest = rest_of(path, costmap, start)
+        if rest is None or tuple(path.points[-1]) != goal or not valid(rest, costmap):
+            return found
+        if isinstance(found, Path) and found.cost[0] < BETTER * rest.cost[0]:
+            return found
+        return rest
+
+    def field(self, costmap: Costmap, goal: Point) -> Floats | None:
+        """What it costs to get to `goal` from each cell, (height, width) [m in the open].
+
+        None outside the map; inf from where no way leads there.
+        """
+        cell = costmap.cell(*goal)
+        if cell is None:
+            return None
+        return self.search.field(costmap.cost, cell, "to") * costmap.resolution
+
+    def _nearest(self, costmap: Costmap, goal: Point, why: str) -> Unreachable:
+        """How near to `goal` one gets with what the last search has reached."""
+        column, row = _in_cells(costmap, np.array((goal,)))[0] - 0.5
+        cell = self.search.nearest(costmap.cost, row, column)
+        if cell is None:
+            return Unreachable(reason=f"{why}; the robot has no room to leave where it stands")
+        x, y = costmap.points(np.array(cell[:1]), np.array(cell[1:]))[0]
+        away = math.hypot(x - goal[0], y - goal[1])
+        where = f"nearest reachable point is {away:.1f} m away at ({x:.2f}, {y:.2f})"
+        return Unreachable(reason=f"{why}; {where}", nearest=(float(x), float(y)), distance=away)
+
+
+def valid(path: Path, costmap: Costmap) -> bool:
+    """Whether all of `path` is still free."""
+    return is_free(costmap.cost, _in_cells(costmap, path.points))
+
+
+def rest_of(path: Path, costmap: Costmap, start: Point) -> Path | None:
+    """`path` from where the robot is now; None if it has strayed from it."""
+    begin, end = path.points[:-1], path.points[1:]
+    along = end - begin
+    lengths = (along**2).sum(axis=1)
+    share = ((start - begin) * along).sum(axis=1) / np.where(lengths > 0, lengths, 1.0)
+    beside = begin + share.clip(0, 1)[:, np.newaxis] * along
+    away = np.hypot(*(beside - start).T)
+    at = int(away.argmin())
+    if away[at] > STRAYED:
+        return None
+    return _path(costmap, np.vstack((start, path.points[at + 1 :])))
+
+
+def warm_up() -> None:
+    """Compile all that planning calls: it takes seconds, or a moment where it is kept."""
+    cells = np.zeros((40, 40), np.int8)
+    rules = Inflation(fits=0.1, turns=0.2)
+    planner = Planner()
+    grid = OccupancyGrid(
+        resolution=0.1, width=40, height=40, origin_x=0.0, origin_y=0.0, cells=cells.tobytes()
+    )
+    before = make_costmap(grid, rules)
+    now = make_costmap(grid, rules, np.array([[3.9, 3.9]]), before)
+    path = planner.plan(now, (0.1, 0.1), (1.0, 0.1))
+    if isinstance(path, Path):
+        planner.replan(now, (0.1, 0.1), (1.0, 0.1), path)
+    planner.plan(now, (0.1, 0.1), (3.9, 3.9))
+    planner.field(now, (0.1, 0.1))
+
+
+def _fault(costmap: Costmap, goal: Point) -> str:
+    """What is wrong with a goal; nothing if the body fits there."""
+    cell = costmap.cell(*goal)
+    if cell is None:
+        return "the goal is outside the map"
+    if costmap.cells[cell] >= OCCUPIED:
+        return "the goal is inside something"
+    if costmap.cost[cell] > LETHAL:
+        fits = costmap.inflation.fits
+        return f"the goal is too close to something: the body needs {fits:.2f} m"
+    if costmap.cost[cell] == LETHAL:
+        return "the goal is in unknown space, which is forbidden"
+    return ""
+
+
+def _path(costmap: Costmap, corners: Floats) -> Path:
+    """The path along straight lines between `corners` (n, 2) [m]."""
+    points = _resampled(corners)
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    remaining = np.append(np.cumsum(steps[::-1])[::-1], 0.0)
+    cost = costs_to_go(costmap.cost, _in_cells(costmap, points)) * costmap.resolution
+    return Path(points=points, remaining=remaining, cost=cost)
+
+
+def _resampled(corners: Floats) -> Floats:
+    """Points (n, 2) along straight lines, at most SPACING apart, with all corners among them."""
+    lengths = np.hypot(*np.diff(corners, axis=0).T)
+    counts = np.maximum(np.ceil(lengths / SPACING).astype(np.intp), 1)
+    first = np.concatenate(([0], np.cumsum(counts)))
+    at = np.arange(first[-1] + 1)
+    return np.column_stack([np.interp(at, first, values) for values in corners.T])
+
+
+def _in_cells(costmap: Costmap, points: Floats) -> Floats:
+    cells: Floats = (points - (costmap.origin_x, costmap.origin_y)) / costmap.resolution
+    return cells
+
+
+def _in_metres(costmap: Costmap, places: Floats) -> Floats:
+    points: Floats = places * costmap.resolution + (costmap.origin_x, costmap.origin_y)
+    return points

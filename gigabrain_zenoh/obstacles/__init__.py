@@ -1,0 +1,1 @@
+"""Things round the robot that are followed from scan to scan."""

@@ -1,0 +1,97 @@
+"""What a robot is sent to do, and how far it has come with it."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from gigabrain_schemas.base import Finite, Fraction, Message, Name, NonNegative, Record, Text
+
+How = Literal["replace", "queue", "preempt"]
+# in place of all that there is to do; after it; or before it, which goes on afterwards
+TaskState = Literal["queued", "active", "paused", "succeeded", "failed", "cancelled"]
+MOST_POINTS = 256  # of a path that is only drawn
+
+
+class Goal(Record, frozen=True, kw_only=True):
+    """A place to be, in the map."""
+
+    x: Finite  # [m]
+    y: Finite  # [m]
+    yaw: Finite | None = None  # [rad]; None for any
+
+
+class GoalRequest(Message, frozen=True, kw_only=True):
+    """Go there."""
+
+    x: Finite  # [m], in the map
+    y: Finite  # [m]
+    yaw: Finite | None = None  # [rad]; None for any
+    how: How = "replace"
+    source: Name = "anonymous"
+
+
+class GoalReply(Message, frozen=True, kw_only=True):
+    """Whether the robot will go there."""
+
+    ok: bool
+    text: Text
+    goal: Name = ""  # the task's name, to follow and to cancel it by
+
+
+class MissionRequest(Message, frozen=True, kw_only=True):
+    """Carry out a mission."""
+
+    mission: str  # the YAML text
+    how: How = "replace"
+    source: Name = "anonymous"
+    label: Name = "mission"  # what people call it; stands for the file's name in errors
+
+
+class MissionReply(Message, frozen=True, kw_only=True):
+    """Whether the robot will carry it out."""
+
+    ok: bool
+    text: Text
+    task: Name = ""  # the task's name, to follow and to cancel it by
+
+
+class TaskRequest(Message, frozen=True, kw_only=True):
+    """Change what the robot is at."""
+
+    do: Literal["cancel", "pause", "resume"]
+    task: Name = ""  # which one; without, the present one; "all" to cancel whatever there is
+    source: Name = "anonymous"
+
+
+class TaskReply(Message, frozen=True, kw_only=True):
+    """What became of it."""
+
+    ok: bool
+    text: Text
+    task: Name = ""
+
+
+class Task(Record, frozen=True, kw_only=True):
+    """One thing that the robot was sent to do."""
+
+    id: Name
+    kind: Literal["goal", "mission"]
+    label: Name
+    source: Name  # who wanted it
+    state: TaskState
+    reason: Text = ""  # in words: why it waits, what became of it
+
+
+class TaskStatus(Message, frozen=True, kw_only=True):
+    """What the robot is at, what comes next, and what was last."""
+
+    current: Task | None = None  # active or paused
+    doing: Text = ""  # the step that it is at, in words
+    progress: Fraction = 0.0  # of that step
+    distance_remaining: NonNegative | None = None  # [m] along the path; None while none is known
+    eta: NonNegative | None = None  # [s] until the step is done
+    goal: Goal | None = None  # where it drives to now
+    path: Annotated[tuple[tuple[Finite, Finite], ...], Meta(max_length=MOST_POINTS)] = ()
+    # [m] in the map, from here to the goal, for drawing
+    queue: Annotated[tuple[Task, ...], Meta(max_length=32)] = ()
+    done: Annotated[tuple[Task, ...], Meta(max_length=16)] = ()  # the last ones, newest first

@@ -1,0 +1,266 @@
+"""Plans to goals: tight, clear of walls, steady; and what cannot be reached, with the reason."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.navigation.costmap import Costmap, Inflation, Unknown, costmap
+from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable, rest_of, valid
+from tests.navigation_rig import drawn, empty, grid_of
+
+NAN, INF = float("nan"), float("inf")
+
+
+def seen(cells: np.ndarray, unknown: Unknown = "avoid", fits: float = 0.15) -> Costmap:
+    return costmap(grid_of(cells), Inflation(fits=fits, turns=fits + 0.1, unknown=unknown))
+
+
+def path(made: Costmap, start: tuple[float, float], goal: tuple[float, float]) -> Path:
+    found = Planner().plan(made, start, goal)
+    assert isinstance(found, Path), found
+    return found
+
+
+def refused(made: Costmap, start: tuple[float, float], goal: tuple[float, float]) -> Unreachable:
+    found = Planner().plan(made, start, goal)
+    assert isinstance(found, Unreachable)
+    return found
+
+
+def rooms(door: int = 8) -> np.ndarray:
+    """Two rooms of 3 x 3 m; in the wall between them, at x = 3.0 to 3.1 m, a door at the bottom."""
+    cells = empty(6.1, 3.0)
+    cells[:, 30] = 100
+    cells[5 : 5 + door, 30] = 0
+    return cells
+
+
+def test_in_the_open_the_path_is_the_straight_line() -> None:
+    found = path(seen(empty(10, 10)), (0.52, 0.53), (8.31, 3.77))
+    straight = math.hypot(8.31 - 0.52, 3.77 - 0.53)
+    assert tuple(found.points[0]) == (0.52, 0.53)
+    assert tuple(found.points[-1]) == (8.31, 3.77)
+    assert found.remaining[0] == pytest.approx(straight)
+    assert found.cost[0] == pytest.approx(straight)
+    assert found.remaining[-1] == found.cost[-1] == 0.0
+    steps = np.hypot(*np.diff(found.points, axis=0).T)
+    assert steps.max() <= 0.1 + 1e-9
+    assert (np.diff(found.remaining) < 0).all()
+
+
+def test_the_path_leads_through_the_door_and_keeps_off_its_posts() -> None:
+    made = seen(rooms())
+    found = path(made, (0.5, 2.5), (5.5, 2.5))
+    at_door = found.points[np.abs(found.points[:, 0] - 3.05).argmin()]
+    assert 0.8 <= at_door[1] <= 1.0  # it is open from 0.5 to 1.3 m
+    walls = made.points(*np.nonzero(made.cells == 100))
+    gaps = np.hypot(*(found.points[:, None] - walls[None]).transpose(2, 0, 1)).min(axis=1)
+    assert gaps.min() > 0.3
+
+
+def test_pulling_tight_costs_no_more_than_the_cells_did() -> None:
+    rng = np.random.default_rng(5)
+    cells = np.where(rng.random((80, 80)) < 0.03, 100, 0)
+    cells[:4, :4] = cells[-4:, -4:] = 0
+    made, planner = seen(cells, fits=0.1), Planner()
+    found = planner.plan(made, (0.05, 0.05), (7.95, 7.95))
+    assert isinstance(found, Path)
+    field = planner.field(made, (7.95, 7.95))
+    assert field is not None
+    assert found.cost[0] <= field[0, 0] * (1 + 1e-6)
+    assert valid(found, made)
+
+
+@pytest.mark.parametrize(("door", "passes"), [(2, False), (3, True)])
+def test_a_door_lets_through_what_fits(door: int, passes: bool) -> None:
+    """It needs 0.15 m to each side, and the cells are 0.1 m."""
+    found = Planner().plan(seen(rooms(door)), (0.5, 2.5), (5.5, 2.5))
+    assert isinstance(found, Path) is passes
+
+
+@pytest.mark.parametrize(
+    ("goal", "why"),
+    [
+        ((3.05, 2.05), "the goal is inside something"),
+        ((2.95, 2.05), "the goal is too close to something: the body needs 0.15 m"),
+        ((6.35, 2.05), "the goal is outside the map"),
+        ((-0.25, 2.05), "the goal is outside the map"),
+    ],
+)
+def test_a_goal_where_the_body_cannot_be_is_refused_with_the_nearest_place_where_it_can(
+    goal: tuple[float, float], why: str
+) -> None:
+    found = refused(seen(rooms()), (0.55, 2.05), goal)
+    assert found.reason.startswith(why + "; nearest reachable point is ")
+    assert found.nearest is not None
+    assert found.distance == pytest.approx({3.05: 0.2, 2.95: 0.1, 6.35: 0.3, -0.25: 0.3}[goal[0]])
+    assert isinstance(Planner().plan(seen(rooms()), (0.55, 2.05), found.nearest), Path)
+
+
+def test_the_refusal_says_it_in_words() -> None:
+    found = refused(seen(rooms()), (5.55, 2.05), (3.05, 2.05))
+    assert found.reason == (
+        "the goal is inside something; nearest reachable point is 0.2 m away at (2.85, 2.05)"
+    )
+
+
+def test_without_a_way_the_nearest_point_is_the_one_on_this_side() -> None:
+    found = refused(seen(rooms(door=0)), (0.55, 1.05), (4.05, 1.05))
+    assert found.reason == (
+        "no way leads to the goal; nearest reachable point is 1.2 m away at (2.85, 1.05)"
+    )
+    assert found.nearest == pytest.approx((2.85, 1.05))
+
+
+@pytest.mark.parametrize("wrong", [NAN, INF, -INF])
+def test_what_is_not_a_number_is_no_goal(wrong: float) -> None:
+    for start, goal in (
+        ((1.0, 1.0), (wrong, 1.0)),
+        ((1.0, 1.0), (1.0, wrong)),
+        ((wrong, 1), (1, 1)),
+    ):
+        found = refused(seen(rooms()), start, goal)
+        assert found == Unreachable(reason="the goal and the robot's place must be finite numbers")
+
+
+def test_a_robot_outside_the_map_cannot_plan() -> None:
+    assert refused(seen(rooms()), (-1.0, 1.0), (1.0, 1.0)).reason == "the robot is outside the map"
+
+
+def test_a_robot_that_is_walled_in_is_told_so() -> None:
+    cells = empty(3.0, 3.0)
+    cells[14:17, 14:17] = 100
+    cells[15, 15] = 0
+    found = refused(seen(cells), (1.55, 1.55), (0.5, 0.5))
+    assert found.reason == (
+        "no way leads to the goal; the robot has no room to leave where it stands"
+    )
+    assert found.nearest is None
+
+
+def test_a_robot_too_close_to_a_wall_plans_away_from_it() -> None:
+    made = seen(rooms())
+    found = path(made, (2.95, 2.05), (0.5, 2.05))
+    assert tuple(found.points[0]) == (2.95, 2.05)
+    assert (np.diff(found.points[:5, 0]) < 0).all()
+    assert valid(found, made)
+
+
+def test_a_robot_too_close_to_a_wall_does_not_plan_through_it() -> None:
+    found = path(seen(rooms()), (2.95, 2.05), (5.5, 2.05))
+    assert found.remaining[0] > 4.0
+
+
+def test_unknown_space_is_crossed_avoided_or_forbidden() -> None:
+    cells = drawn("....... ..???.. ..???.. ..???.. .......", times=10)
+    start, goal = (0.55, 2.55), (6.45, 2.55)
+    assert path(seen(cells, "allow"), start, goal).remaining[0] == pytest.approx(5.9)
+    for policy in ("avoid", "forbid"):
+        found = path(seen(cells, policy), start, goal)
+        assert found.remaining[0] > 6.5
+        assert all(cells[int(y * 10), int(x * 10)] == 0 for x, y in found.points)
+    inside = (3.55, 2.55)
+    assert path(seen(cells, "avoid"), start, inside).remaining[0] == pytest.approx(3.0)
+    why = refused(seen(cells, "forbid"), start, inside).reason
+    assert why.startswith("the goal is in unknown space, which is forbidden; nearest reachable")
+    out = path(seen(cells, "forbid"), inside, start)  # by the shortest way, then round
+    assert 4.0 < out.remaining[0] < 5.5
+
+
+def test_avoided_unknown_space_is_crossed_where_nothing_else_leads() -> None:
+    cells = drawn("..???..", times=10)
+    assert path(seen(cells, "avoid"), (0.5, 0.5), (6.5, 0.5)).remaining[0] == pytest.approx(6.0)
+    assert refused(seen(cells, "forbid"), (0.5, 0.5), (6.5, 0.5)).nearest == pytest.approx(
+        (1.95, 0.55)
+    )
+
+
+def test_a_path_is_valid_until_something_stands_on_it() -> None:
+    cells = rooms()
+    found = path(seen(cells), (0.5, 2.5), (5.5, 2.5))
+    assert valid(found, seen(cells))
+    cells[5:13, 30] = 100
+    assert not valid(found, seen(cells))
+
+
+def test_a_path_beyond_a_map_that_shrank_is_not_valid() -> None:
+    found = path(seen(empty(5, 5)), (0.5, 0.5), (4.5, 4.5))
+    assert not valid(found, seen(empty(3, 3)))
+
+
+def test_of_two_equal_ways_the_one_taken_is_kept() -> None:
+    cells = empty(6.1, 6.1)
+    cells[25:36, 25:36] = 100
+    made, planner = seen(cells), Planner()
+    goal = (5.55, 3.05)
+    right_round = path(made, (0.55, 3.05), goal)
+    below = right_round.points[:, 1].min() < 2.5
+    cells[30, 36] = 0  # a change that matters to neither
+    for shift in (0.1, -0.1, 0.2, -0.2):
+        again = planner.replan(seen(cells), (0.75, 3.05 + shift), goal, right_round)
+        assert isinstance(again, Path)
+        assert (again.points[:, 1].min() < 2.5) is below
+        assert tuple(again.points[0]) == (0.75, 3.05 + shift)
+
+
+def test_a_much_better_way_is_taken_and_a_slightly_better_one_is_not() -> None:
+    cells = empty(6.1, 3.0)
+    cells[:27, 30] = 100
+    cells[0:5, 30] = 100
+    start, goal = (0.55, 0.55), (5.55, 0.55)
+    over = path(seen(cells, fits=0.1), start, goal)
+    cells[5:12, 30] = 0
+    opened = Planner().replan(seen(cells, fits=0.1), start, goal, over)
+    assert isinstance(opened, Path)
+    assert opened.remaining[0] < 0.9 * over.remaining[0]
+    cells[5:12, 30] = 100
+    cells[21:26, 30] = 0  # not much lower
+    kept = Planner().replan(seen(cells, fits=0.1), start, goal, over)
+    assert isinstance(kept, Path)
+    np.testing.assert_allclose(kept.points[-20:], over.points[-20:])
+
+
+def test_who_has_strayed_or_has_another_goal_gets_a_new_path() -> None:
+    made = seen(empty(6, 6))
+    old = path(made, (0.5, 0.5), (5.5, 0.5))
+    assert rest_of(old, made, (2.0, 1.2)) is None
+    strayed = Planner().replan(made, (2.0, 1.2), (5.5, 0.5), old)
+    assert isinstance(strayed, Path)
+    assert strayed.remaining[0] == pytest.approx(math.hypot(3.5, 0.7))
+    other = Planner().replan(made, (0.5, 0.5), (5.5, 5.5), old)
+    assert isinstance(other, Path)
+    assert tuple(other.points[-1]) == (5.5, 5.5)
+
+
+def test_what_is_left_of_a_path_begins_where_the_robot_is() -> None:
+    made = seen(empty(6, 6))
+    rest = rest_of(path(made, (0.5, 0.5), (5.5, 0.5)), made, (3.02, 0.6))
+    assert rest is not None
+    assert tuple(rest.points[0]) == (3.02, 0.6)
+    assert rest.remaining[0] == pytest.approx(2.5, abs=0.1)
+
+
+def test_a_plan_to_where_the_robot_is_ends_there() -> None:
+    found = path(seen(empty(3, 3)), (1.0, 1.0), (1.0, 1.0))
+    assert found.remaining[0] == found.cost[0] == 0.0
+
+
+def test_the_same_question_has_the_same_answer() -> None:
+    made = seen(rooms())
+    one, other = (path(made, (0.5, 2.5), (5.5, 2.5)) for _ in range(2))
+    np.testing.assert_array_equal(one.points, other.points)
+
+
+def test_the_cost_to_go_falls_along_the_path_and_is_infinite_where_no_way_leads() -> None:
+    cells = rooms()
+    cells[20:25, 50:55] = 100
+    cells[22, 52] = 0
+    made, planner = seen(cells), Planner()
+    field = planner.field(made, (5.5, 0.5))
+    assert field is not None
+    found = path(made, (0.5, 2.5), (5.5, 0.5))
+    along = [field[made.cell(x, y)] for x, y in found.points]
+    assert (np.diff(along) <= 1e-9).all()
+    assert field[22, 52] == np.inf
+    assert planner.field(made, (9.0, 0.5)) is None
