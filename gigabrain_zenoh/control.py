@@ -1,5 +1,6 @@
 """Control: what decision or an operator wants becomes smooth commands that the body can follow."""
 
+import logging
 from collections.abc import Callable
 
 import msgspec
@@ -14,7 +15,11 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.gate import BRAIN
 from gigabrain_zenoh.limits import NO_CAPS, ZERO, clamp, limits_of, ramp
+from gigabrain_zenoh.pose_history import PoseHistory
 from gigabrain_zenoh.teleop import Teleop
+from gigabrain_zenoh.tracking_control import LONGEST_DELAY_TICKS, undone, wanted
+
+log = logging.getLogger(__name__)
 
 TICK_S = TICK_NS / 1e9
 LONGEST_STEP_TICKS = 5  # after a gap the ramp goes on as if no more than this had passed
@@ -48,6 +53,9 @@ class Memory(msgspec.Struct, frozen=True, kw_only=True):
     opened: int = 0  # the tick in which the gate opened; 0 while it is shut
     holding: bool = False  # an operator has driven and has not handed back yet
     enables: int = 0  # the gate's count when the body was last handed over
+    told: tuple[Velocity, ...] = ()  # setpoints of the ticks before, the newest last
+    history: PoseHistory = PoseHistory()
+    off_track: bool = False  # the body is too far from the trajectory that it should follow
 
 
 def step(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Memory, CmdVel]:
@@ -66,35 +74,43 @@ def step(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Memory,
         memory = replace(memory, holding=True, basis=state.tick)  # resting on the operator's eyes
     memory = replace(memory, opened=memory.opened or state.tick)
     limits = limits_of(body)
-    target = clamp(_target(memory, intent, inputs.teleop), limits, inputs.caps)
+    memory, wish = _wish(body, memory, inputs, intent)
+    target = clamp(wish, limits, inputs.caps)
     setpoint = ramp(memory.before, target, limits, TICK_S * memory.elapsed_ticks)
     if memory.opened == state.tick:  # the first command after enabling is zero
         setpoint = ZERO
-    wanted = replace(
+    gain_z = memory.gain_z
+    if intent and _follows(memory, intent, inputs.teleop):  # decision knows how the body turns
+        gain_z, memory = undone(intent.response.turn_gain), replace(memory, steady_ticks=0)
+    needed = replace(
         setpoint,
         linear_x=setpoint.linear_x * memory.gain_x,
-        angular_z=setpoint.angular_z * memory.gain_z,
+        angular_z=setpoint.angular_z * gain_z,
     )
-    allowed = clamp(wanted, limits, inputs.caps)
-    memory = replace(memory, setpoint=setpoint, wanted=wanted, allowed=allowed)
-    return memory, _command(clamp(wanted, limits))
+    allowed = clamp(needed, limits, inputs.caps)
+    memory = replace(memory, setpoint=setpoint, wanted=needed, allowed=allowed)
+    return memory, _command(clamp(needed, limits))
 
 
 def _next_tick(body: BodyDescription, memory: Memory, state: RobotState) -> Memory:
     """Move on to the tick of `state`, learning from how well the body followed."""
     if state.boot != memory.boot:
-        return Memory(boot=state.boot, tick=state.tick)
+        return Memory(boot=state.boot, tick=state.tick, history=memory.history.then(state))
     if state.tick == memory.tick:
         return memory
     steady = memory.steady_ticks + 1 if memory.setpoint == memory.before else 0
     if steady >= STEADY_TICKS:
         memory = _learn(body.control, memory, state.velocity)
+    passed = state.tick - memory.tick
+    told = (*memory.told, *(memory.setpoint,) * min(passed, LONGEST_DELAY_TICKS))
     return replace(
         memory,
         tick=state.tick,
-        elapsed_ticks=min(state.tick - memory.tick, LONGEST_STEP_TICKS),
+        elapsed_ticks=min(passed, LONGEST_STEP_TICKS),
         before=memory.setpoint,
         steady_ticks=steady,
+        told=told[-LONGEST_DELAY_TICKS:],
+        history=memory.history.then(state),
     )
 
 
@@ -129,15 +145,32 @@ def _at_rest(memory: Memory) -> Memory:
         basis=memory.basis,
         holding=memory.holding,
         enables=memory.enables,
+        history=memory.history,
     )
 
 
-def _target(memory: Memory, intent: Intent | None, teleop: Velocity | None) -> Velocity:
+def _follows(memory: Memory, intent: Intent, teleop: Velocity | None) -> bool:
+    return intent.follow and not teleop and not memory.holding
+
+
+def _wish(
+    body: BodyDescription, memory: Memory, inputs: Inputs, intent: Intent | None
+) -> tuple[Memory, Velocity]:
+    """Where to: what the operator wants, else what decision wants, else nowhere."""
+    state, teleop = inputs.state, inputs.teleop
+    if intent and _follows(memory, intent, teleop):
+        start = memory.history.at(state.boot, intent.basis)
+        if start is None:
+            return memory, ZERO
+        told, velocity = memory.told, state.velocity
+        wish = wanted(body, intent, state.tick, start, state.pose, velocity, told)
+        return replace(memory, off_track=wish is None), wish or ZERO
+    memory = replace(memory, off_track=False)
     if teleop:
-        return teleop
+        return memory, teleop
     if memory.holding or intent is None or intent.twist is None:
-        return ZERO
-    return intent.twist
+        return memory, ZERO
+    return memory, intent.twist
 
 
 def _command(velocity: Velocity) -> CmdVel:
@@ -147,6 +180,14 @@ def _command(velocity: Velocity) -> CmdVel:
         angular_z=velocity.angular_z,
         source=BRAIN,
     )
+
+
+def _tell(tick: int, *, lost: bool) -> None:
+    data = {"event": "off_track" if lost else "on_track", "tick": tick}
+    if lost:
+        log.warning("braking: too far off the trajectory", extra={"data": data})
+    else:
+        log.info("on the trajectory again", extra={"data": data})
 
 
 class EarlierCaps:
@@ -171,11 +212,11 @@ class EarlierCaps:
 
 async def run(bus: Bus, ready: Callable[[], None]) -> None:
     """A command at the body's rate, and at once when decision has thought again."""
-    memory = Memory()
+    memory, lost = Memory(), False
     teleop, caps = Teleop(bus.clock.now_ns), EarlierCaps()
 
     def act(_: Message) -> None:
-        nonlocal memory
+        nonlocal memory, lost
         state, body = states.fresh(), bodies.current
         if state is None or body is None:
             return
@@ -187,6 +228,9 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
         )
         before = memory.basis
         memory, command = step(body.description, memory, inputs)
+        if memory.off_track != lost:
+            lost = memory.off_track
+            _tell(state.tick, lost=lost)
         due = state.tick % body.description.control.period_ticks == 0
         if due or memory.basis != before:
             bus.publish(command_topic(body.description), command, basis=memory.basis)

@@ -96,8 +96,8 @@ class ResponseEstimator:
 
     @property
     def turn_gain(self) -> float:
-        """Measured over commanded turn rate; 1 until it is known."""
-        return self._turn_gain
+        """Measured over commanded turn rate, as in `response`."""
+        return self._response.turn_gain
 
     def command(self, command: CmdVel) -> None:
         """Take what the body was told. Of several commands of a tick the last counts."""
@@ -132,7 +132,7 @@ class ResponseEstimator:
         self._states: dict[int, RobotState] = {}
         self._told: CmdVel | None = None
         self._axes = tuple(Axis(*each) for each in zip(LEAST_CHANGE, NOISE, strict=True))
-        self._response, self._turn_gain = self._prior, 1.0
+        self._response = self._prior
 
     def _look(self, state: RobotState) -> None:
         learnt = False
@@ -169,11 +169,12 @@ class ResponseEstimator:
         cost = (x.cost() + z.cost()) / ALIKE + off / (2 * SPREAD_S**2)
         likely = np.exp(cost.min() - cost)
         likely /= likely.sum()
+        known = z.weight >= ENOUGH_TICKS
         self._response = Response(
-            delay=float((likely * DELAYS_S[:, None]).sum()), lag=float((likely * LAGS_S).sum())
+            delay=float((likely * DELAYS_S[:, None]).sum()),
+            lag=float((likely * LAGS_S).sum()),
+            turn_gain=float((likely * z.gains()).sum()) if known else self._prior.turn_gain,
         )
-        if z.weight >= ENOUGH_TICKS:
-            self._turn_gain = float((likely * z.gains()).sum())
 
 
 def _velocity(command: CmdVel) -> Velocity:

@@ -133,7 +133,9 @@ def test_a_new_start_of_the_driver_is_a_new_beginning() -> None:
     drive.go(want(0.2), teleop=Velocity(linear_x=0.2))
     drive.tick = 2
     assert drive.go(boot=8).linear_x == 0.0
-    assert drive.memory == Memory(boot=8, tick=3, opened=3, enables=1)
+    anew = Memory(boot=8, tick=3, opened=3, enables=1, history=drive.memory.history)
+    assert drive.memory == anew
+    assert drive.memory.history.ticks == (3,)
 
 
 def test_an_operator_comes_before_decision() -> None:

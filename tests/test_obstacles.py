@@ -138,6 +138,43 @@ def test_walls_do_not_move_while_the_robot_turns_and_drives() -> None:
         assert all(speed(one) < 0.05 for one in obstacles), (i, obstacles)
 
 
+def box(x: float, y: float, half_x: float, half_y: float) -> tuple[Wall, ...]:
+    left, right, low, high = x - half_x, x + half_x, y - half_y, y + half_y
+    return (
+        (left, low, right, low),
+        (right, low, right, high),
+        (right, high, left, high),
+        (left, high, left, low),
+    )
+
+
+def test_what_only_shows_another_side_to_a_robot_that_drives_past_does_not_move() -> None:
+    things = (*box(0.0, 0.8, 0.35, 0.2), *box(1.2, -0.9, 0.1, 0.4), *box(2.4, 0.9, 0.3, 0.3))
+    stub: tuple[Wall, ...] = ((0.6, 3, 0.6, 2.0), (-1.5, -3, -1.5, -1.9))
+    watch, told = Watch(walls=(*ROOM, *things, *stub)), 0
+    for i in range(150):
+        pose = Pose(x=-2.0 + 0.03 * i, y=0.0, yaw=0.3 * math.sin(0.1 * i))
+        obstacles = watch.scan(pose=pose)
+        told += len(obstacles)
+        assert all(speed(one) == 0.0 for one in obstacles), (i, obstacles)
+    assert told > 100
+
+
+def test_whoever_moves_in_the_open_is_seen_to_move_though_no_wall_is_behind() -> None:
+    for lidar, fov in ((WIDE, math.tau), (JACKAL, math.radians(270))):
+        watch = Watch(lidar, (), fov=fov)
+        *_, obstacles = watch.walk(lambda t: (2.0, -0.8 + 0.6 * t), 15)
+        assert nearest(obstacles, 2.0, 0.1).velocity_y == pytest.approx(0.6, abs=0.1)
+
+
+def test_what_comes_into_view_as_the_robot_turns_does_not_move() -> None:
+    watch = Watch(JACKAL, ROOM, fov=math.radians(270))
+    for i in range(80):
+        pose = Pose(x=0.0, y=0.0, yaw=0.1 * i)
+        obstacles = watch.scan((1.5, 0.4, 0.4), (-1.5, 1.0, 0.3), (0.4, -2.0, 0.4), pose=pose)
+        assert all(speed(one) == 0.0 for one in obstacles), (i, obstacles)
+
+
 def test_a_wall_is_no_obstacle_but_a_person_in_front_of_it_is() -> None:
     watch = Watch()
     for _ in range(5):
@@ -181,13 +218,20 @@ def test_whoever_walks_behind_a_post_is_still_the_same() -> None:
     assert len(ids) == 1
 
 
-def test_whoever_is_gone_is_forgotten_within_a_second() -> None:
+def test_whoever_is_gone_is_forgotten_within_half_a_second() -> None:
     watch = Watch()
     *_, obstacles = watch.walk(lambda t: (1.5, 0.0), 8)
     assert len(obstacles) == 1
-    for _ in range(11):
-        obstacles = watch.scan()
-    assert obstacles == ()
+    told = [len(watch.scan()) for _ in range(6)]
+    assert told == [1, 1, 1, 1, 0, 0]
+
+
+def test_whoever_is_hidden_for_longer_is_forgotten_within_a_second() -> None:
+    watch = Watch()
+    watch.walk(lambda t: (2.5, 0.0), 8)
+    screen = [[one.id for one in watch.scan((1.2, 0.0, 0.5))] for _ in range(11)]
+    assert all(1 in ids for ids in screen[:9])
+    assert 1 not in screen[10]
 
 
 def test_whoever_stops_stands() -> None:

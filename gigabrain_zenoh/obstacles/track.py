@@ -62,20 +62,23 @@ class Track:
         self.position_variance *= 1.0 - k
         self.radius += RADIUS_SHARE * (radius - self.radius)
         self.seen += 1
-        self._judge(self.unseen_s)
+        self._stand(self.unseen_s)
         self.unseen_s = 0.0
 
-    def _judge(self, dt: float) -> None:
-        """Whether it moves: what only turns another side to the robot shall not."""
+    def seems_to_move(self) -> bool:
+        """Whether it has gone so far and so fast that it must be told whether it moves."""
+        if self.moving or self.unseen_s > 0:
+            return False
         speed = math.hypot(self.velocity_x, self.velocity_y)
-        if not self.moving:
-            gone = math.hypot(self.x - self.anchor_x, self.y - self.anchor_y)
-            sure = speed > SURE * math.sqrt(self.velocity_variance)
-            self.moving = gone > MOVING_M and speed > MOVING_SPEED and sure
-            self.standing_s = 0.0
-            return
+        gone = math.hypot(self.x - self.anchor_x, self.y - self.anchor_y)
+        sure = speed > SURE * math.sqrt(self.velocity_variance)
+        return gone > MOVING_M and speed > MOVING_SPEED and sure
+
+    def _stand(self, dt: float) -> None:
+        """Notice when it has stopped."""
+        speed = math.hypot(self.velocity_x, self.velocity_y)
         self.standing_s = self.standing_s + dt if speed < STANDING_SPEED else 0.0
-        if self.standing_s >= STANDING_S:
+        if self.moving and self.standing_s >= STANDING_S:
             self.moving, self.anchor_x, self.anchor_y = False, self.x, self.y
 
     def obstacle(self) -> Obstacle:

@@ -9,6 +9,7 @@ from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle
 from gigabrain_zenoh.obstacles.clusters import Cluster, find_clusters
+from gigabrain_zenoh.obstacles.free_space import FreeSpace, Seen
 from gigabrain_zenoh.obstacles.track import Track
 
 Floats = NDArray[np.float64]
@@ -18,7 +19,8 @@ GATE = 4.0  # standard deviations; what is farther from where a thing should be 
 FARTHEST_JUMP_M = 0.6
 PARTLY = 4.0  # times as far off may be what is partly hidden
 SEEN = 2  # scans, before others hear of it
-FORGET_S, FORGET_NEW_S = 1.0, 0.25  # without having been seen
+FORGET_S, FORGET_NEW_S = 1.0, 0.25  # without having been seen, for what may be hidden
+FORGET_GONE_S = 0.45  # where beams go through the place
 LONGEST_GAP_S = 1.0  # between scans; after a longer one it begins anew
 MOST = 64  # obstacles, the nearest of which are told
 
@@ -28,6 +30,7 @@ class ObstacleTracker:
 
     def __init__(self) -> None:
         self._tracks: list[Track] = []
+        self._space = FreeSpace()
         self._boot = self._tick = self._ids = 0
 
     def update(
@@ -41,6 +44,7 @@ class ObstacleTracker:
         dt = (tick - self._tick) * TICK_S
         if boot != self._boot or dt > LONGEST_GAP_S:
             self._tracks.clear()
+            self._space.clear()
         elif dt <= 0:
             return self._told(pose)
         self._boot, self._tick = boot, tick
@@ -51,7 +55,9 @@ class ObstacleTracker:
         taken = self._match(clusters, places)
         for i, j in taken.items():
             self._correct(self._tracks[i], clusters[j], lidar, pose)
-        self._tracks = [track for track in self._tracks if _lives(track)]
+        self._space.see(Seen(tick, _placed(hits, pose), lidar, abs(spacing), pose))
+        self._judge()
+        self._tracks = [track for track in self._tracks if self._lives(track)]
         for j in set(range(len(clusters))) - set(taken.values()):
             if clusters[j].whole:
                 self._begin(clusters[j], places[j])
@@ -79,12 +85,23 @@ class ObstacleTracker:
         return taken
 
     def _correct(self, track: Track, cluster: Cluster, lidar: Lidar, pose: Pose) -> None:
+        x, y = _place(cluster, lidar, pose, track.radius)
         if cluster.whole:
-            x, y = _place(cluster, lidar, pose, track.radius)
             track.correct(x, y, cluster.radius, cluster.noise)
         else:  # what is hidden of it is not missing from its size
-            x, y = _place(cluster, lidar, pose, track.radius)
             track.correct(x, y, track.radius, PARTLY * cluster.noise)
+
+    def _judge(self) -> None:
+        """Which things move: what only turns another side to the robot does not."""
+        for t in self._tracks:
+            if t.seems_to_move():
+                t.moving = self._space.shows_motion(t.x, t.y, t.velocity_x, t.velocity_y, t.radius)
+
+    def _lives(self, track: Track) -> bool:
+        limit = FORGET_S if track.seen > SEEN else FORGET_NEW_S
+        if FORGET_GONE_S <= track.unseen_s < limit and self._space.is_free(track.x, track.y):
+            return False
+        return track.unseen_s < limit
 
     def _begin(self, cluster: Cluster, place: tuple[float, float]) -> None:
         self._ids += 1
@@ -99,8 +116,12 @@ class ObstacleTracker:
         return tuple(track.obstacle() for track in known[:MOST])
 
 
-def _lives(track: Track) -> bool:
-    return track.unseen_s < (FORGET_S if track.seen >= SEEN + 1 else FORGET_NEW_S)
+def _placed(hits: Floats, pose: Pose) -> Floats:
+    """`hits` (n, 2) of the body's frame in that of `pose`."""
+    cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
+    x = pose.x + cosine * hits[:, 0] - sine * hits[:, 1]
+    y = pose.y + sine * hits[:, 0] + cosine * hits[:, 1]
+    return np.column_stack((x, y))
 
 
 def _place(cluster: Cluster, lidar: Lidar, pose: Pose, radius: float) -> tuple[float, float]:

@@ -99,6 +99,7 @@ class Response(Record, frozen=True, kw_only=True):
 
     delay: NonNegative = 0.0  # [s]
     lag: NonNegative = 0.0  # [s], time constant
+    turn_gain: Positive = 1.0  # of the turn rate: measured over commanded
 
 
 class JointTarget(Record, frozen=True, kw_only=True):
