@@ -98,7 +98,10 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
     worlds = bus.latest(WORLD, see)
     bus.latest(SAFETY, verdicts.receive)
     ready()
-    await bus.failed
+    try:
+        await bus.failed
+    finally:
+        await senses.close()
 
 
 def _must_charge(verdict: SafetyState | None) -> bool:

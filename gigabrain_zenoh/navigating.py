@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+from collections import deque
 
 import numpy as np
 
@@ -32,7 +33,6 @@ from gigabrain_zenoh.tasks.service import TaskService
 log = logging.getLogger(__name__)
 
 POSE_NS = 1_000_000_000  # so old may be what was last heard of the place
-FOR_EVER_NS = 2**62  # a map is sent when it changes
 SENT_TICKS = 25  # commands of the last half second are planned with
 SMALL = 250_000  # cells; plans in larger maps are made in a thread
 AGAIN_TICKS = 25  # a route is looked at twice a second, whatever happens
@@ -55,10 +55,10 @@ class Navigating:
         self._bus, self._config = bus, config
         self._response, self._history = ResponseEstimator(), PoseHistory()
         self._places: Earlier[PoseInMap] = Earlier()
-        self._maps: Earlier[OccupancyGrid] = Earlier()
+        self._maps: deque[OccupancyGrid] = deque(maxlen=2)
         self._bodies = bus.latest(BODY)
         bus.latest(POSE, self._places.receive)
-        bus.latest(MAP, self._maps.receive)
+        bus.latest(MAP, self._maps.append)
         self._hears_commands = False
         self._service = TaskService(bus, self, folder=config.state_dir, scripts=config.scripts)
         self._guide = Guide()
@@ -72,7 +72,7 @@ class Navigating:
 
     async def warm_up(self) -> None:
         """Compile all that a driving robot calls."""
-        compiling = asyncio.ensure_future(asyncio.to_thread(_warm_up))
+        compiling = asyncio.ensure_future(asyncio.to_thread(warm_up))
         done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
         if not done:
             told = {"event": "compiling"}
@@ -130,6 +130,10 @@ class Navigating:
         if isinstance(behaviour, Navigate):
             self._outcome, self._driven = behaviour.outcome, behaviour.driven or self._driven
 
+    async def close(self) -> None:
+        """Once all is written down."""
+        await self._service.close()
+
     async def can_drive(self) -> None:
         """Raises Refused where nobody says where the robot is, with what to change."""
         for _ in range(PATIENCE_NS // LOOK_NS):
@@ -141,8 +145,8 @@ class Navigating:
     async def can_reach(self, goal: Goal) -> str:
         """How it would get there, in words. Raises Refused, and why."""
         await self.can_drive()
-        state_boot, tick = self._bus.time.boot, self._bus.time.tick
-        grid, body = self._maps.at(state_boot, tick + 1, FOR_EVER_NS), self._bodies.current
+        grid = self._grid(self._bus.time.boot, self._bus.time.tick + 1)
+        body = self._bodies.current
         if grid is None or body is None or self._here is None:
             raise Refused(self._lost())
         # beside whatever the guide is at: it has a memory of its own
@@ -167,6 +171,11 @@ class Navigating:
             return None, "the odometry of its last place is missing"
         return compose(Pose(x=place.x, y=place.y, yaw=place.yaw), inverse(then)), ""
 
+    def _grid(self, boot: int, tick: int) -> OccupancyGrid | None:
+        """The newest map of before a tick: it is sent when it changes, and outlives the driver."""
+        earlier = (one for one in reversed(self._maps) if one.boot != boot or one.tick < tick)
+        return next(earlier, None)
+
     def _steer(
         self,
         state: RobotState,
@@ -178,7 +187,7 @@ class Navigating:
         """Have a route thought of where one is due; a finished one counts from now on."""
         if self._thinking and self._thinking.done():
             self._route, self._thinking = self._thinking.result(), None
-        grid = self._maps.at(state.boot, world.basis, FOR_EVER_NS)
+        grid = self._grid(state.boot, world.basis)
         if order is None or grid is None or self._here is None or self._thinking:
             return
         if not self._due(order, world.basis, grid):
@@ -209,6 +218,7 @@ class Navigating:
         return grid is not known or not 0 <= tick - before < AGAIN_TICKS
 
 
-def _warm_up() -> None:
+def warm_up() -> None:
+    """Call every kernel of planning and driving once."""
     planner.warm_up()
     local.warm_up(ANY_BODY)

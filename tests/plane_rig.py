@@ -46,12 +46,12 @@ def drawn(picture: str, scale: int = 5) -> Cells:
     return np.kron(rows, np.ones((scale, scale), np.int8))
 
 
-def as_map(cells: Cells, tick: int = 1) -> OccupancyGrid:
+def as_map(cells: Cells, tick: int, boot: int) -> OccupancyGrid:
     """The map of these cells, with the origin in the corner of the first."""
     height, width = cells.shape
     return OccupancyGrid(
         resolution=CELL, width=width, height=height, origin_x=0.0, origin_y=0.0,
-        cells=cells.tobytes(), boot=BOOT, tick=tick, basis=tick,
+        cells=cells.tobytes(), boot=boot, tick=tick, basis=tick,
     )  # fmt: skip
 
 
@@ -74,7 +74,11 @@ class Plane:
         self.status = TaskStatus()
         self.travelled = 0.0
         self.closest = math.inf  # [m], from the body's middle to anything
-        self.maps = True
+        self.maps = True  # whether perception makes any
+        self.maps_sent = False  # and whether the last one has been sent
+        self.boot = BOOT
+        self.late_ticks = 0  # that worlds and places take on their way
+        self._on_the_way: list[tuple[int, WorldModel, PoseInMap]] = []
 
     async def __aenter__(self) -> Self:
         await self.bench.__aenter__()
@@ -119,6 +123,11 @@ class Plane:
         """The same, while time stands still."""
         return (await self.operator.ask(service, request, timeout_s=30.0))[0]
 
+    def driver_starts_anew(self) -> None:
+        """Ticks and odometry begin anew; the map and the place in it stay. No new map is sent."""
+        self.boot, self.tick, self.start = self.boot + 1, 1, (self.x, self.y, self.yaw)
+        self.velocity, self.maps_sent = Velocity(), True
+
     async def restart(self) -> None:
         """End the node, and start it again."""
         await self.bench.restart()
@@ -128,19 +137,22 @@ class Plane:
         self.tick += 1
         self._move()
         bench = self.bench
-        if self.tick % 50 == 1:
-            bench.send(BODY, body())
-            if self.maps:
-                bench.send(MAP, as_map(self.known, self.tick))
+        if self.tick % 50 == 2:
+            bench.send(BODY, body(boot=self.boot))
+            if self.maps and not self.maps_sent:
+                bench.send(MAP, as_map(self.known, self.tick, self.boot))
         x, y, yaw = self._odometry()
         bench.send(
             STATE, state(self.tick, v=self.velocity.linear_x, w=self.velocity.angular_z,
-                         pose=(x, y, yaw)),
+                         pose=(x, y, yaw), boot=self.boot),
         )  # fmt: skip
         if self.tick % 5 == 0:
-            bench.send(WORLD, self._world())
+            self._on_the_way.append((self.tick + self.late_ticks, self._world(), self._place()))
+        while self._on_the_way and self._on_the_way[0][0] <= self.tick:
+            _, world, place = self._on_the_way.pop(0)
+            bench.send(WORLD, world)
             if self.maps:
-                bench.send(POSE, self._place())
+                bench.send(POSE, place)
         await bench.clock.advance(TICK_NS)
 
     def _hear_intent(self, _key: str, intent: Intent) -> None:
@@ -169,7 +181,7 @@ class Plane:
         self.closest = min(self.closest, float(np.nanmin(ranges)))
         config = PerceptionConfig(mapping="slam")
         seen = perception.step(config, WAFFLE, scan(ranges, self.tick))
-        return msgspec.structs.replace(seen, boot=BOOT, tick=self.tick, basis=self.tick)
+        return msgspec.structs.replace(seen, boot=self.boot, tick=self.tick, basis=self.tick)
 
     def _ranges(self) -> NDArray[np.float64]:
         """What 360 beams find, in steps of half a cell."""
@@ -201,5 +213,5 @@ class Plane:
         covariance = (0.0,) * 9
         return PoseInMap(
             x=self.x, y=self.y, yaw=math.remainder(self.yaw, math.tau), covariance=covariance,
-            localized=self.localized, boot=BOOT, tick=self.tick, basis=self.tick,
+            localized=self.localized, boot=self.boot, tick=self.tick, basis=self.tick,
         )  # fmt: skip

@@ -117,6 +117,39 @@ async def test_it_rests_while_the_battery_is_nearly_empty() -> None:
         assert plane.intent.twist == STANDS
 
 
+async def test_it_stands_while_its_scans_come_too_late_to_drive_by() -> None:
+    async with Plane(CELLS) as plane:
+        await plane.go(0.2)
+        await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
+        await plane.go(1.5)
+        assert plane.travelled > 0.05
+        plane.late_ticks = 11
+        await plane.go(0.5)
+        said = set[str]()
+        for _ in range(50):
+            await plane.go(0.02)
+            assert plane.intent.twist == STANDS
+            said.add(plane.intent.reason)
+        # between two of these scans the older one no longer counts at all
+        assert said == {
+            "waiting: this host is too busy, its newest scan is 0.22 s old",
+            "waiting: perception is silent",
+        }
+        plane.late_ticks = 0
+        await plane.go(2.0)
+        assert plane.intent.reason.startswith("going to (4.00, 0.80): ")
+
+
+async def test_a_driver_that_starts_anew_does_not_end_what_there_is_to_do() -> None:
+    async with Plane(CELLS) as plane:
+        await plane.go(0.2)
+        await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
+        await plane.go(2.0)
+        plane.driver_starts_anew()
+        await plane.go(3.0)
+        assert plane.intent.reason.startswith("going to (4.00, 0.80): ")
+
+
 async def test_a_pause_stands_and_a_goal_before_it_goes_first() -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)

@@ -17,14 +17,21 @@ from gigabrain_zenoh.gate_state import BRAIN
 from gigabrain_zenoh.running import Running
 from gigabrain_zenoh.tools.graph import ORDER
 from tests.onlooker import Onlooker, looking_on
-from tests.stack import Home, free_port, robot_of, until
+from tests.stack import AVOID, Home, free_port, robot_of, until
 
 
 @pytest.fixture
 async def demo(shared_home: Home) -> Home:
     """A robot that drives: the mock, the same one for all tests."""
     if not shared_home.processes():
-        arguments = ("demo", "--behaviour", "avoid", "--headless", "--body", "mock", "--seconds", "3000")
+        arguments = (
+            *AVOID,
+            "--headless",
+            "--body",
+            "mock",
+            "--seconds",
+            "3000",
+        )
         await robot_of(shared_home, shared_home.start(*arguments))
     await until_driving(shared_home)
     return shared_home

@@ -57,6 +57,10 @@ class Senses(Protocol):
         """Take note of what the behaviour has made of it."""
         ...
 
+    async def close(self) -> None:
+        """Once all is written down."""
+        ...
+
 
 class Plain:
     """The senses of a behaviour that goes by the world alone."""
@@ -75,6 +79,9 @@ class Plain:
 
     def heed(self, behaviour: Behaviour) -> None:
         """Nothing to note."""
+
+    async def close(self) -> None:
+        """Nothing to write."""
 
 
 # name in a deployment file -> "module:class"; the class takes the `decision` part of that file

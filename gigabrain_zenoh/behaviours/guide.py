@@ -54,7 +54,8 @@ class Guide:
 
     def think(self, asked: Asked) -> Route:
         """The route for an order, from here."""
-        if asked.order.number != self._number:
+        anew = asked.tick < self._last_tick  # the driver has been started anew
+        if anew or asked.order.number != self._number:
             self._forget(asked.order.number, asked.tick)
         self._note(asked)
         chart = self._chart(asked)
