@@ -22,6 +22,8 @@ BLOCK = np.array(
     ]
 )  # fmt: skip
 
+NOISE = np.diag((0.003, 0.003, 0.001)) ** 2  # of good odometry from scan to scan
+
 
 def lap() -> Floats:
     """Once round the block and a bit farther, the robot always looking ahead."""
@@ -136,6 +138,29 @@ def test_an_aisle_is_not_taken_for_the_next_one_like_it(reach: float, uprights: 
     slam = Slam(pose=poses[0])
     estimates = feed(slam, scans, stepped(poses, turn=0.002, scale=1.0))
     assert estimates[-1].pose == pytest.approx(poses[-1], abs=0.3)
+
+
+def passed_by(noise: Floats | None) -> float:
+    """How far ahead a robot ends up in a bare aisle that a crate goes through beside it [m]."""
+    poses = line(np.array((0.0, 0.0, 0.0)), np.array((2.0, 0.0, 0.0)), 0.025)
+    lidar, slam = Lidar(180, reach=4.0), Slam()
+    steps = stepped(poses, 0.0, 1.0)
+    for at, (pose, step) in enumerate(zip(poses, steps, strict=True)):
+        aisle = np.array([*box(-20, -0.8, 40, 1.6), *box(1.0 + 0.008 * at, 0.3, 0.4, 0.3)])
+        found = slam.add(lidar.scan(aisle, pose), step, noise)
+    return float(found.pose[0] - poses[-1, 0])
+
+
+def test_good_odometry_holds_an_aisle_where_all_that_can_be_seen_along_it_moves() -> None:
+    assert abs(passed_by(NOISE)) < 0.06
+    assert abs(passed_by(None)) > 0.2
+
+
+def test_wheels_that_slip_are_found_out_however_good_odometry_says_it_is() -> None:
+    lidar, slam = Lidar(180, reach=6.0), Slam()
+    for _ in range(20):
+        found = slam.add(lidar.scan(BLOCK, IDENTITY), np.array((0.03, 0.0, 0.0)), NOISE)
+    assert found.pose == pytest.approx(IDENTITY, abs=0.05)
 
 
 def test_a_slow_robot_keeps_one_scan_in_ten() -> None:

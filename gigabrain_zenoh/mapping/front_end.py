@@ -36,7 +36,7 @@ WIDE = Window(1.0, 0.6)  # where to look when the scan does not fit where it sho
 FEW = 20  # points, with fewer there is nothing to match
 MISSES, MISSED_TRAVEL, MISSED_TURN = 3, 0.5, 0.5  # scans, [m], [rad]: after these it is broken,
 MISSES_STANDING = 30  # or after so many scans
-CONTRADICTED = 16.3  # 99.9 % of chi-square with three degrees of freedom: odometry was wrong
+CONTRADICTED = 0.6  # squared deviations: a match that pulls odometry farther speaks against it
 UNMOVED = np.zeros((3, 3))
 UNKNOWN = np.diag((10.0, 10.0, np.pi)) ** 2  # covariance of a link that nothing is known of
 
