@@ -13,14 +13,15 @@ from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel, Twist
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.tasks import Task
 from gigabrain_schemas.topics import (
     BODY,
-    CMD_VEL,
     ENABLE,
     RELEASE,
     STATE,
     TELEOP,
     Topic,
+    command_topic,
 )
 from gigabrain_zenoh.asking import ANSWER_S, ask, audit_log, granted
 from gigabrain_zenoh.bus import Bus
@@ -32,6 +33,7 @@ from gigabrain_zenoh.keys.checks import may_not_ask, no_router
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 from gigabrain_zenoh.listening import listen, topic_named
 from gigabrain_zenoh.running import find_endpoint
+from gigabrain_zenoh.task_client import Tasks
 
 M = TypeVar("M", bound=Message)
 
@@ -88,6 +90,20 @@ class Robot:
         self._until_tick = 0
         self._hold = Hold(bus.process)
         self._arrived = asyncio.Event()
+        self.tasks = Tasks(bus, keys)
+
+    async def go_to(self, x: float, y: float, yaw: float | None = None) -> Task:
+        """Send the robot to a place in its map [m, m, rad]; how that ended, once it has.
+
+        Whoever is cancelled meanwhile leaves the robot without that goal. `tasks` has the rest:
+        missions, the queue, progress. Raises Refused, and BodyLost when nobody serves goals.
+        """
+        name = await self.tasks.go_to(x, y, yaw)
+        try:
+            return await self.tasks.result(name)
+        except asyncio.CancelledError:
+            await self.tasks.cancel(name)
+            raise
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float = 0.0, angular_z: float = 0.0
@@ -243,12 +259,13 @@ class Robot:
         self._send()
 
     def _send(self) -> None:
-        target = self._target
-        if target is None or self._hold.lost:
+        target, body = self._target, self._bodies.current
+        if target is None or body is None or self._hold.lost:
             return
         if self._bus.time.tick > self._until_tick:
             target = ZERO
-        self._bus.publish(CMD_VEL, CmdVel(**asdict(target), source=self._bus.process))
+        command = CmdVel(**asdict(target), source=self._bus.process)
+        self._bus.publish(command_topic(body.description), command)
 
     async def _ticks(self, count: int) -> None:
         """Let the robot's time go on by `count` states, or a second of ours."""

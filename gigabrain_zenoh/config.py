@@ -17,9 +17,14 @@ def load(path: Path, type: type[T]) -> T:
 
     Raises ConfigError, whose one line reads `FILE:LINE: what is wrong; what was expected`.
     """
+    return loads(read(path), type, str(path))
+
+
+def read(path: Path) -> str:
+    """The text of a YAML file. Raises ConfigError."""
     try:
         data = path.read_bytes()
-        text = data.decode()
+        return data.decode()
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file{_nearest(path)}") from None
     except IsADirectoryError:
@@ -30,7 +35,6 @@ def load(path: Path, type: type[T]) -> T:
         line = data.count(b"\n", 0, error.start) + 1
         byte = data[error.start]
         raise ConfigError(f"{path}:{line}: byte 0x{byte:02x}; expected UTF-8 text") from None
-    return loads(text, type, str(path))
 
 
 def loads(text: str, type: type[T], source: str) -> T:

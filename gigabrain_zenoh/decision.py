@@ -10,7 +10,7 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, WORLD
 from gigabrain_zenoh import behaviours
 from gigabrain_zenoh.ages import scan_limit_ns
-from gigabrain_zenoh.behaviours import Situation
+from gigabrain_zenoh.behaviours import Plain, Senses
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.settings import DecisionConfig
@@ -31,8 +31,9 @@ class Thinker:
     which of two messages was quicker.
     """
 
-    def __init__(self, config: DecisionConfig) -> None:
+    def __init__(self, config: DecisionConfig, senses: Senses | None = None) -> None:
         self._load, self._config = behaviours.load(config.behaviour), config
+        self._senses = senses or Plain()
         self._behaviour, self._boot = self._load(config), 0
         self.intent = Intent(behaviour=config.behaviour, reason="starting")
         self.basis = 0
@@ -52,16 +53,20 @@ class Thinker:
         """Form a new intent if there is anything new to go by."""
         if state.boot != self._boot:  # the driver has started anew, and with it the odometry
             self._behaviour, self._boot, self.basis = self._load(self._config), state.boot, 0
-        if world is None:
-            self.intent = self._behaviour.step(Situation(None, state.pose, must_charge))
-        elif world.basis != self.basis and world.basis <= state.tick:
-            self.intent = self._behaviour.step(Situation(world, state.pose, must_charge))
+        if world is not None:
+            if world.basis == self.basis or world.basis > state.tick:
+                return
             self.basis = world.basis
+        situation = self._senses.situation(state, world, must_charge)
+        self.intent = self._behaviour.step(situation)
+        self._senses.heed(self._behaviour)
 
 
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """An intent per world, as soon as it comes; repeated with the newest tick at each state."""
-    thinker, said = Thinker(config), ""
+    senses = behaviours.senses(config, bus)
+    await senses.warm_up()
+    thinker, said = Thinker(config, senses), ""
     for name, expected in CHANGEABLE.items():
         bus.params.add_field(name, expected, lambda: thinker.config, thinker.configure)
     verdicts: Earlier[SafetyState] = Earlier()
@@ -71,6 +76,7 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
         state = states.fresh()
         if state is None:
             return
+        senses.see(state)
         body = bodies.current
         world = worlds.fresh(scan_limit_ns(body.description) if body else None)
         verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
@@ -92,7 +98,10 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
     worlds = bus.latest(WORLD, see)
     bus.latest(SAFETY, verdicts.receive)
     ready()
-    await bus.failed
+    try:
+        await bus.failed
+    finally:
+        await senses.close()
 
 
 def _must_charge(verdict: SafetyState | None) -> bool:

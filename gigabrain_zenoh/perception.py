@@ -2,14 +2,16 @@
 
 import math
 from collections.abc import Callable
+from contextlib import closing
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import hits_bytes, ranges
 from gigabrain_schemas.base import Pose
-from gigabrain_schemas.body import Body, BodyDescription, Lidar
+from gigabrain_schemas.body import Body, BodyDescription, Lidar, RobotState
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
@@ -17,6 +19,9 @@ from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.obstacles.surroundings import Surroundings
 from gigabrain_zenoh.placed_scans import PlacedScans
 from gigabrain_zenoh.settings import PerceptionConfig
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.mapper import Mapper
 
 Floats = NDArray[np.float64]
 
@@ -152,14 +157,19 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
 
     if config.mapping == "off":
         bus.latest(SCAN, see)
-    else:
-        _follow(config, bus, body)
-    ready()
-    await bus.failed
+        ready()
+        await bus.failed
+        return
+    from gigabrain_zenoh.mapper import Mapper  # numba and gtsam: only who makes maps pays
+
+    with closing(Mapper(config, bus, body)) as mapper:
+        _follow(config, bus, body, mapper)
+        ready()
+        await bus.failed
 
 
-def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body]) -> None:
-    """Worlds with the obstacles in them, each in its place by the odometry."""
+def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body], mapper: "Mapper") -> None:
+    """Worlds with the obstacles in them, each in its place by the odometry; then the map."""
     surroundings = Surroundings()
 
     def see(scan: LaserScan, pose: Pose | None) -> None:
@@ -168,7 +178,12 @@ def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body]) -> None:
             world = step(config, description, scan)
             world = surroundings.add(world, description.lidar, scan, pose)
             bus.publish(WORLD, world, basis=scan.basis)
+            mapper.see(scan, world.scan_problem)
+
+    def hear(state: RobotState) -> None:
+        mapper.hear(state)
+        placed.state(state)
 
     placed = PlacedScans(see)
-    bus.latest(STATE, placed.state)
+    bus.latest(STATE, hear)
     bus.latest(SCAN, placed.scan)

@@ -7,6 +7,8 @@ from gigabrain_schemas.body import Body
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 
 SEAT_S = 0.5  # after so long without a command another viewer may steer
+GAP_S = 0.2  # a stream with a longer gap begins anew
+SETTLE_S = 0.1  # what a network had stored comes at once: so much of a new stream is passed over
 
 
 class Steered(Protocol):
@@ -28,7 +30,7 @@ class Seat:
     def __init__(self, robot: Steered) -> None:
         self._robot = robot
         self._viewer = 0
-        self._until_s = 0.0
+        self._until_s = self._said_s = self._from_s = 0.0
 
     def driving(self, now_s: float) -> int:
         """The number of the viewer who steers, or 0."""
@@ -41,9 +43,13 @@ class Seat:
         body = self._robot.body
         if body is None or (wanted == ZERO and viewer != self._viewer):
             return True
-        self._viewer, self._until_s = viewer, now_s + SEAT_S
+        if viewer != self._viewer or now_s - self._said_s > GAP_S:
+            self._from_s = now_s + SETTLE_S
+        self._viewer, self._said_s, self._until_s = viewer, now_s, now_s + SEAT_S
         if wanted == ZERO:
             self._viewer = 0
+        elif now_s < self._from_s:
+            return True
         self._robot.steer(clamp(wanted, limits_of(body.description)))
         return True
 

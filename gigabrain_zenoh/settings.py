@@ -57,6 +57,11 @@ class DecisionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     turn: Literal["right", "left", "clearer"] = "right"
     linear_speed: Annotated[float, Meta(gt=0, le=10)] = 0.2  # [m/s]
     angular_speed: Annotated[float, Meta(gt=0, le=10)] = 0.5  # [rad/s]
+    # of `navigate`, which needs a map (perception: {mapping: slam}):
+    speed_limit: Annotated[float, Meta(gt=0, le=10)] | None = None  # [m/s]; also the body's own
+    begin: Literal["wait", "roam"] = "wait"  # roam: explore, then visit places, until it is sent
+    scripts: str = ""  # the folder of the programs that missions may run; without, they run none
+    state_dir: str = ""  # where it remembers what it is to do; nowhere without
 
 
 class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

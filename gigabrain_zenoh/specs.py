@@ -17,6 +17,7 @@ from gigabrain_zenoh.zenoh_config import router_config
 # -P: a folder that happens to be the current one must not stand in for an installed package
 COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.process")
 LATER_S, SOON_S = 3600.0, 30.0  # where the router is elsewhere, it may come later
+COMPILING_S = 600.0  # what maps and navigates is compiled at its very first start
 
 
 def process_specs(
@@ -49,10 +50,17 @@ def process_specs(
                 argv=(*COMMAND, msgspec.json.encode(process).decode()),
                 after=after,
                 stop_last=name in ("router", RELAY, EMULATOR),
-                ready_timeout_s=SOON_S if after else LATER_S,
+                ready_timeout_s=_patience_s(deployment, name) if after else LATER_S,
             )
         )
     return specs
+
+
+def _patience_s(deployment: Deployment, name: str) -> float:
+    """How long a process may take until it is ready."""
+    maps = name == "perception" and deployment.perception.mapping != "off"
+    navigates = name == "decision" and deployment.decision.behaviour == "navigate"
+    return COMPILING_S if maps or navigates else SOON_S
 
 
 def _names(deployment: Deployment, host: str) -> list[str]:
@@ -115,7 +123,7 @@ def _settings(
         EMULATOR: msgspec.to_builtins(emulator),
         BUTTON: msgspec.to_builtins(deployment.button) if deployment.button else {},
         "perception": msgspec.to_builtins(deployment.perception),
-        "decision": msgspec.to_builtins(deployment.decision),
+        "decision": msgspec.to_builtins(deployment.decision) | {"state_dir": str(state_dir)},
         "recorder": msgspec.to_builtins(with_notes(deployment)),
         "page": msgspec.to_builtins(deployment.page),
         "foxglove": msgspec.to_builtins(deployment.foxglove),

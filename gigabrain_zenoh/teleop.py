@@ -7,14 +7,15 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Twist
 
 GAP_NS = 200_000_000  # a stream with a longer gap has ended
-DEAF_NS = 500_000_000  # how long a stream is not believed after a gap
+DEAF_NS = 500_000_000  # how long a stream without an echo is not believed after a gap
 
 
 class Teleop:
     """An operator's stream, trusted only while it is plainly live.
 
-    A network that was cut hands over what it had stored when it heals: after a gap nothing is
-    believed for half a second. A real body wants the newest tick echoed as well.
+    A network that was cut hands over what it had stored when it heals. Whoever echoes the newest
+    tick is told from that at once; of anybody else nothing is believed for half a second after a
+    gap, and on a real body nothing at all.
     """
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
@@ -33,9 +34,12 @@ class Teleop:
     def velocity(self, state: RobotState, echo_wanted: bool) -> Velocity | None:
         """What the operator wants now, or None when nobody steers."""
         now, twist = self._now_ns(), self._newest
-        if twist is None or now - self._arrived_ns > GAP_NS or now < self._trusted_from_ns:
+        if twist is None or now - self._arrived_ns > GAP_NS:
             return None
         off_ns = abs(state.tick - twist.tick) * TICK_NS  # of the future is as wrong as of the past
-        if (echo_wanted or twist.boot) and (twist.boot != state.boot or off_ns > GAP_NS):
+        if echo_wanted or twist.boot:
+            if twist.boot != state.boot or off_ns > GAP_NS:
+                return None
+        elif now < self._trusted_from_ns:
             return None
         return Velocity(linear_x=twist.linear_x, linear_y=twist.linear_y, angular_z=twist.angular_z)

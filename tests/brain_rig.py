@@ -121,12 +121,27 @@ class Bench:
     def __init__(self, node: Node) -> None:
         self.clock, self.network = FakeClock(), LocalNetwork()
         self._node, self._read = node, 0
+        self._ready = asyncio.Event()
 
     async def __aenter__(self) -> Self:
         self.bus = Bus(self.network.transport(), self.clock, "node")
-        self._running = asyncio.ensure_future(self._node(self.bus, lambda: None))
+        self._running = asyncio.ensure_future(self._node(self.bus, self._ready.set))
         await self.clock.advance(0)
         return self
+
+    async def ready(self) -> None:
+        """Wait until the node says that it is; some compile first."""
+        waiting = asyncio.ensure_future(self._ready.wait())
+        await asyncio.wait((waiting, self._running), return_when=asyncio.FIRST_COMPLETED)
+        waiting.cancel()
+        if self._running.done():
+            self._running.result()
+
+    async def restart(self) -> None:
+        """End the node, and start it anew."""
+        await self._end()
+        self._ready.clear()
+        await self.__aenter__()
 
     async def __aexit__(
         self,
@@ -134,6 +149,9 @@ class Bench:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        await self._end()
+
+    async def _end(self) -> None:
         self._running.cancel()
         result = (await asyncio.gather(self._running, return_exceptions=True))[0]
         await self.bus.close()

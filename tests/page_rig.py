@@ -4,6 +4,7 @@ import contextlib
 import shutil
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Protocol
 
 import pytest
 from playwright.async_api import BrowserContext, Page, async_playwright
@@ -48,15 +49,27 @@ class Robot:
         return f"http://127.0.0.1:{self.port}"
 
 
+class Served(Protocol):
+    """Whoever serves a page."""
+
+    @property
+    def origin(self) -> str: ...
+
+
 class Browser:
     """One Chromium; nothing that its pages do may fail, nor leave this machine."""
 
-    def __init__(self, context: BrowserContext, robot: Robot) -> None:
+    def __init__(self, context: BrowserContext, robot: Served) -> None:
         self._context, self._robot = context, robot
         self.faults: list[str] = []
 
-    async def open(self, token: str = OPERATOR, *, width: int = 1280, height: int = 800) -> Page:
+    async def open(
+        self, token: str = OPERATOR, *, width: int = 1280, height: int = 800, before: str = ""
+    ) -> Page:
+        """A page that has a connection; `before` is a script that runs ahead of its own."""
         page = await self._context.new_page()
+        if before:
+            await page.add_init_script(before)
         page.set_default_timeout(TIMEOUT_MS)
         await page.set_viewport_size({"width": width, "height": height})
         page.on("pageerror", lambda error: self.faults.append(str(error)))
@@ -71,10 +84,14 @@ class Browser:
 
 
 @contextlib.asynccontextmanager
-async def browser(robot: Robot, folder: Path) -> AsyncIterator[Browser]:
+async def browser(robot: Served, folder: Path) -> AsyncIterator[Browser]:
     async with async_playwright() as playwright:
         context = await playwright.chromium.launch_persistent_context(
-            folder, executable_path=CHROMIUM, headless=True, args=FLAGS
+            folder,
+            executable_path=CHROMIUM,
+            headless=True,
+            args=FLAGS,
+            ignore_https_errors=robot.origin.startswith("https"),  # its certificate is its own
         )
         try:
             made = Browser(context, robot)

@@ -20,6 +20,7 @@ from gigabrain_zenoh.settings import Endpoint
 
 ROOT = Path(__file__).parent.parent
 SOURCES = (ROOT, ROOT / "drivers", ROOT / "schemas")
+AVOID = ("demo", "--behaviour", "avoid")  # the quickest demo to start
 GIGABRAIN = (sys.executable, "-P", "-c", "from gigabrain_zenoh.cli.app import main; main()")
 
 

@@ -22,7 +22,7 @@ SAYS = {
 }
 ASKS = {
     "brain": "estop describe/driver",
-    "operator": "estop release enable goal mission task_change audit_log param/driver "
+    "operator": "estop release enable goal mission task_change map_save audit_log param/driver "
     "describe/driver",
     "viewer": "audit_log describe/driver",
 }

@@ -21,12 +21,12 @@ from gigabrain_zenoh.errors import (
     Unsupported,
 )
 from tests.onlooker import Onlooker, looking_on
-from tests.stack import Command, Home, free_port, robot_of, until
+from tests.stack import AVOID, Command, Home, free_port, robot_of, until
 
 
 @pytest.fixture(scope="module")
 def demo(shared_home: Home) -> Command:
-    return shared_home.start("demo", "--headless")
+    return shared_home.start(*AVOID, "--headless")
 
 
 @pytest.fixture
@@ -143,7 +143,7 @@ async def test_what_there_is_not_is_said_in_words(robot: Onlooker) -> None:
 async def test_several_robots_are_listed(
     robot: Onlooker, shared_home: Home, demo: Command, home: Home
 ) -> None:
-    second = shared_home.start("demo", "--headless", "--world", "house")
+    second = shared_home.start(*AVOID, "--headless", "--world", "house")
     first_at, second_at = await robot_of(shared_home, demo), await robot_of(shared_home, second)
     with pytest.raises(BusError) as error:
         async with connect():

@@ -26,5 +26,9 @@ async def test_every_robot_passes_the_kit(name: str, tmp_path: Path) -> None:
     for link, results in zip(links, checked, strict=True):
         assert [result for result in results if result.verdict == "fail"] == []
         assert len(results) == 16
-        not_applicable = {result.check for result in results if result.verdict == "n/a"}
+        not_applicable = {
+            result.check
+            for result in results
+            if result.verdict == "n/a" and "too busy to tell" not in result.measured
+        }
         assert not_applicable == (NEEDS_A_PEER if link == "sim" else set())

@@ -205,6 +205,15 @@ def test_a_stream_is_believed_from_half_a_second_on() -> None:
     assert stick.moves()
 
 
+def test_whoever_echoes_the_newest_tick_is_believed_at_once() -> None:
+    stick = Stick()
+    stick.push(50, 1, Twist(linear_x=0.1, boot=BOOT, tick=100))
+    assert stick.moves()
+    assert stick.moves(echo_wanted=True)
+    stick.push(3000, 100, Twist(linear_x=0.1, boot=BOOT, tick=80))  # stored by a network
+    assert not stick.moves()
+
+
 @pytest.mark.parametrize(("gap_ms", "believed"), [(200, True), (201, False)])
 def test_after_a_gap_of_more_than_200_ms_it_is_deaf_again(gap_ms: int, believed: bool) -> None:
     stick = Stick()

@@ -11,7 +11,7 @@ import pytest
 
 from gigabrain_zenoh.report import Observed, make_report, summary
 from tests.onlooker import looking_on
-from tests.stack import ROOT, Command, Home, robot_of, until
+from tests.stack import AVOID, ROOT, Command, Home, robot_of, until
 
 BODIES = ROOT / "drivers" / "gigabrain_drivers" / "bodies"
 FIELDS = {
@@ -23,7 +23,7 @@ FIELDS = {
 async def run(home: Home, *options: str) -> tuple[Command, dict[str, Any]]:
     """A demo with `options` to its end, and its report."""
     path = home.folder / f"report-{len(list(home.folder.iterdir()))}.json"
-    demo = await home.run("demo", "--headless", "--report", str(path), *options)
+    demo = await home.run(*AVOID, "--headless", "--report", str(path), *options)
     assert path.exists(), demo.err
     return demo, json.loads(path.read_bytes())
 
@@ -98,7 +98,7 @@ async def test_a_robot_that_does_not_move_fails_the_run(home: Home) -> None:
 async def test_a_process_that_dies_fails_the_run_but_does_not_end_it(home: Home) -> None:
     report = home.folder / "report.json"
     options = ("--seconds", "12", "--speed", "4", "--headless", "--report", str(report))
-    demo = home.start("demo", *options)
+    demo = home.start(*AVOID, *options)
     async with looking_on(await robot_of(home, demo)) as robot:
         await until(lambda: robot.state.gate.mode == "enabled", "driving")
         os.kill(await robot.pid("perception"), signal.SIGKILL)
@@ -118,7 +118,7 @@ async def test_a_body_without_a_truth_of_its_own_is_judged_by_its_odometry(home:
 
 @pytest.mark.parametrize("frozen", ["none", "router", "driver", "decision"])
 async def test_ctrl_c_ends_all_of_it_also_when_one_hangs(home: Home, frozen: str) -> None:
-    demo = home.start("demo", "--headless")
+    demo = home.start(*AVOID, "--headless")
     async with looking_on(await robot_of(home, demo)) as robot:
         await until(lambda: robot.state.gate.mode == "enabled", "driving")
         assert len(home.processes()) == 6
@@ -131,7 +131,7 @@ async def test_ctrl_c_ends_all_of_it_also_when_one_hangs(home: Home, frozen: str
 
 
 async def test_two_demos_side_by_side_do_not_meet(home: Home) -> None:
-    demos = [home.start("demo", "--headless", "--seed", seed) for seed in ("1", "2")]
+    demos = [home.start(*AVOID, "--headless", "--seed", seed) for seed in ("1", "2")]
     boots = []
     for demo in demos:
         async with looking_on(await robot_of(home, demo)) as robot:
@@ -168,7 +168,7 @@ async def test_a_report_that_cannot_be_written_is_refused_before_anything_starts
     home: Home,
 ) -> None:
     nowhere = Path("nowhere") / "report.json"
-    demo = await home.run("demo", "--headless", "--seconds", "1", "--report", str(nowhere))
+    demo = await home.run(*AVOID, "--headless", "--seconds", "1", "--report", str(nowhere))
     assert await demo.ended() == 2
     assert demo.err == "gigabrain: cannot write the report nowhere/report.json: no such folder\n"
     assert not (home.folder / "state").exists()

@@ -9,7 +9,7 @@ import pytest
 from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.specs import process_specs
-from tests.stack import Home
+from tests.stack import AVOID, Home
 
 
 def specs(tmp_path: Path, link: str) -> dict[str, tuple[tuple[str, ...], ProcessConfig]]:
@@ -43,7 +43,7 @@ def test_other_links_have_no_emulator(tmp_path: Path, link: str) -> None:
 async def test_a_robot_roams_by_bytes_on_two_serial_lines(home: Home) -> None:
     path = home.folder / "report.json"
     demo = await home.run(
-        "demo", "--body", "mycustombot", "--link", "emulated", "--seconds", "8",
+        *AVOID, "--body", "mycustombot", "--link", "emulated", "--seconds", "8",
         "--headless", "--report", str(path),
     )  # fmt: skip
     assert await demo.ended() == 0, demo.err
@@ -55,12 +55,12 @@ async def test_a_robot_roams_by_bytes_on_two_serial_lines(home: Home) -> None:
 
 async def test_a_real_body_starts_neither_released_nor_enabled(home: Home) -> None:
     demo = await home.run(
-        "demo", "--body", "mycustombot", "--link", "real", "--seconds", "1.5", "--headless"
+        *AVOID, "--body", "mycustombot", "--link", "real", "--seconds", "1.5", "--headless"
     )
     await demo.ended()
     assert "enabled" not in "".join(p.read_text() for p in home.folder.rglob("driver.jsonl"))
     refused = await home.run(
-        "demo", "--body", "mycustombot", "--link", "real", "--resume", "auto", "--headless"
+        *AVOID, "--body", "mycustombot", "--link", "real", "--resume", "auto", "--headless"
     )
     assert await refused.ended() == 2
     assert "resume: auto is for simulation" in refused.err

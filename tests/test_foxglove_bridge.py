@@ -8,7 +8,7 @@ import math
 import socket
 import stat
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +30,7 @@ from gigabrain_schemas.topics import (
     POSE,
     SCAN,
     STATE,
+    TASK,
     TELEOP,
     WORLD,
 )
@@ -43,7 +44,7 @@ from gigabrain_zenoh.health import answer_to_name
 from gigabrain_zenoh.settings import FoxgloveConfig
 from gigabrain_zenoh.transport import LocalNetwork
 from tests.foxglove_rig import Viewer, fields
-from tests.stack import Home, free_port, until
+from tests.stack import PATIENCE_S, Home, free_port, until
 
 LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
 
@@ -83,6 +84,16 @@ async def bridge(tmp_path: Path) -> AsyncIterator[Bridge]:
         await serving
 
 
+async def hold(viewer: Viewer, content: object, done: Callable[[], object]) -> None:
+    """Say it again and again, as the Teleop panel does while a button is held."""
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            await viewer.publish(content)
+            await asyncio.sleep(0.04)
+            if done():
+                return
+
+
 async def test_a_scan_arrives_in_foxgloves_schema_beam_by_beam(bridge: Bridge) -> None:
     ranges = np.array([1.0, 2.5, math.inf], np.float32).tobytes()
     scan = LaserScan(
@@ -102,7 +113,7 @@ async def test_a_scan_arrives_in_foxgloves_schema_beam_by_beam(bridge: Bridge) -
 
 
 async def test_every_kind_of_message_has_a_channel_to_be_drawn_from(bridge: Bridge) -> None:
-    said = (STATE, SCAN, WORLD, POSE, MAP, LOG)
+    said = (STATE, SCAN, WORLD, POSE, MAP, TASK, LOG)
     for topic in said:
         message = EXAMPLES[topic.type.__name__]
         assert isinstance(message, topic.type)
@@ -110,7 +121,7 @@ async def test_every_kind_of_message_has_a_channel_to_be_drawn_from(bridge: Brid
     picture = Image(frame_id="cam", encoding="mono8", height=1, width=2, data=b"\x00\xff")
     bridge.robot.publish(IMAGE, picture, name="front")
     async with bridge.viewer() as viewer:
-        for topic in ("scan", "map", "pose", "tf", "obstacles", "image/front", "log",
+        for topic in ("scan", "map", "pose", "tf", "obstacles", "way", "image/front", "log",
                       "state_numbers", "world_numbers"):  # fmt: skip
             assert await viewer.channel(f"/viz/{topic}")
     assert viewer.server["capabilities"] == ["clientPublish", "connectionGraph"]
@@ -176,12 +187,11 @@ async def test_the_teleop_panel_steers_and_a_viewer_that_vanishes_stops(bridge: 
     topic = topic_to_steer(bridge.config)
     async with bridge.viewer() as viewer:
         await viewer.publish_on(topic)
-        await viewer.publish(LEFT)
-        await until(lambda: bridge.turns == [0.5], "steered")
-        await viewer.publish({"linear_x": 9.0})
-        await until(lambda: bridge.steered[-1].linear_x == 0.26, "no faster than the body can")
-    await until(lambda: len(bridge.steered) == 3, "a last word")
-    assert bridge.steered[-1].linear_x == 0.0
+        await hold(viewer, LEFT, lambda: bridge.turns)
+        assert bridge.turns[-1] == 0.5
+        await hold(viewer, {"linear_x": 9.0}, lambda: bridge.steered[-1].linear_x)
+        assert bridge.steered[-1].linear_x == 0.26  # no faster than the body can
+    await until(lambda: bridge.steered[-1].linear_x == 0.0, "a last word")
 
 
 async def test_of_two_viewers_one_steers(bridge: Bridge) -> None:
@@ -189,11 +199,11 @@ async def test_of_two_viewers_one_steers(bridge: Bridge) -> None:
     async with bridge.viewer() as one, bridge.viewer() as two:
         for viewer in (one, two):
             await viewer.publish_on(topic)
-        await one.publish(LEFT)
-        await until(lambda: bridge.turns == [0.5], "the first steers")
-        await two.publish({"angular_z": -0.5})
-        await one.publish({"angular_z": 0.25})
-        await until(lambda: bridge.turns[-1] == 0.25, "it goes on")
+        await hold(one, LEFT, lambda: bridge.turns)
+        for _ in range(5):
+            await two.publish({"angular_z": -0.5})
+            await hold(one, LEFT, lambda: True)
+        await hold(one, {"angular_z": 0.25}, lambda: bridge.turns[-1] == 0.25)
     assert -0.5 not in bridge.turns
 
 
@@ -208,8 +218,7 @@ async def test_what_is_no_velocity_steers_nobody(bridge: Bridge, content: object
     async with bridge.viewer() as viewer:
         await viewer.publish_on(topic_to_steer(bridge.config))
         await viewer.publish(content)
-        await viewer.publish(LEFT)
-        await until(lambda: bridge.turns == [0.5], "a good one does")
+        await hold(viewer, LEFT, lambda: bridge.turns)
     assert {twist.linear_x for twist in bridge.steered} == {0.0}
 
 
@@ -219,11 +228,11 @@ async def test_who_does_not_know_the_topic_may_look_and_not_drive(
 ) -> None:
     async with bridge.viewer() as stranger, bridge.viewer() as owner:
         await stranger.publish_on(topic)
-        await stranger.publish({"angular_z": -0.5})
         await owner.publish_on(topic_to_steer(bridge.config))
-        await stranger.publish({"angular_z": -0.5})
-        await owner.publish(LEFT)
-        await until(lambda: bridge.turns, "the owner steers")
+        for _ in range(10):
+            await stranger.publish({"angular_z": -0.5})
+            await asyncio.sleep(0.02)
+        await hold(owner, LEFT, lambda: bridge.turns)
     assert -0.5 not in bridge.turns
 
 
@@ -297,14 +306,7 @@ async def test_a_robot_turns_as_a_viewer_tells_it_and_a_second_bridge_says_what_
             viewer = Viewer(made)
             await viewer.publish_on(topic)
 
-            async def hold() -> None:
-                while True:
-                    await viewer.publish(LEFT)
-                    await asyncio.sleep(0.05)
-
-            holding = asyncio.ensure_future(hold())
-            await until(lambda: seen.state.velocity.angular_z > 0.3, "turning left")
-            holding.cancel()
+            await hold(viewer, LEFT, lambda: seen.state.velocity.angular_z > 0.3)
         await seen.still()
         second = await home.run(
             "foxglove", "--port", str(port), "--namespace", "other",

@@ -30,7 +30,7 @@ from gigabrain_zenoh.faults.hostile import replaced
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.onlooker import SYSTEMS, Onlooker, looking_on
-from tests.stack import Home, endpoint_of, robot_of, until
+from tests.stack import AVOID, Home, endpoint_of, robot_of, until
 from tests.wire_rig import as_map, numbers, refuses
 
 LISTENERS = {
@@ -82,7 +82,7 @@ async def test_a_flood_on_every_key_is_dropped_and_counted_and_the_robot_drives_
     path, chance = home.folder / "report.json", random.Random(7)
     # in lock-step, where time waits for the brain: a stop would be the flood's, not the machine's
     options = ("--headless", "--speed", "2", "--seconds", "30", "--report", str(path))
-    demo = home.start("demo", *options)
+    demo = home.start(*AVOID, *options)
     endpoint = await robot_of(home, demo)
     async with looking_on(endpoint) as robot, stranger_at(endpoint) as (transport, _):
         await until(lambda: robot.state.gate.mode == "enabled", "driving")

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import pytest
 from rich.cells import cell_len
 
-from tests.stack import GIGABRAIN, Home, until
+from tests.stack import AVOID, GIGABRAIN, Home, until
 
 # becomes the leader of the terminal's session, as a shell would, and then the command
 AT_TERMINAL = "import os, sys; os.login_tty(0); os.execv(sys.argv[1], sys.argv[1:])"
@@ -79,7 +79,7 @@ class Terminal:
 
 @pytest.fixture
 def terminal(home: Home) -> Iterator[Terminal]:
-    place = Terminal(home, "demo", "--world", "house", "--seconds", "600")
+    place = Terminal(home, *AVOID, "--world", "house", "--seconds", "600")
     yield place
     place.close()
 

@@ -48,6 +48,8 @@ REQUIRED: dict[str, set[str]] = {
     "GoalReply": {"ok", "text"},
     "MissionRequest": {"mission"},
     "MissionReply": {"ok", "text"},
+    "MapRequest": {"name"},
+    "MapReply": {"ok", "text"},
     "TaskRequest": {"do"},
     "TaskReply": {"ok", "text"},
     "TaskStatus": set(),
@@ -83,7 +85,8 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
     }
     assert [service.at("*") for service in SERVICES] == [
         "robot/estop", "robot/release", "robot/enable", "robot/goal", "robot/mission",
-        "robot/task_change", "robot/audit_log", "robot/param/*", "robot/describe/*",
+        "robot/task_change", "robot/map_save", "robot/audit_log", "robot/param/*",
+        "robot/describe/*",
     ]  # fmt: skip
 
 
@@ -144,7 +147,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in golden.FOLDER.iterdir()}
     assert stored == golden.files()
-    assert len(stored) == 68
+    assert len(stored) == 72
 
 
 @by_name

@@ -121,17 +121,33 @@ async def test_one_viewer_steers_until_it_lets_go_or_falls_silent() -> None:
     await settle()
     fast, slow = Velocity(linear_x=9.0), Velocity(linear_x=0.1)
     assert page.seat.drive(page.one, fast, 0.0)
-    assert not page.seat.drive(page.two, slow, 0.4)
-    assert page.seat.drive(page.two, ZERO, 0.4)  # says nothing, and does not end the other's
-    assert page.seat.drive(page.two, slow, 0.6)
+    assert page.seat.drive(page.one, fast, 0.1)
+    assert not page.seat.drive(page.two, slow, 0.5)
+    assert page.seat.drive(page.two, ZERO, 0.5)  # says nothing, and does not end the other's
+    assert page.seat.drive(page.two, slow, 0.7)
+    assert page.seat.drive(page.two, slow, 0.8)
     page.seat.leave(page.one)
-    assert page.seat.driving(0.7) == 2
-    assert page.seat.drive(page.two, ZERO, 0.7)
-    assert page.seat.driving(0.7) == 0
-    assert page.seat.drive(page.one, slow, 0.8)
+    assert page.seat.driving(0.8) == 2
+    assert page.seat.drive(page.two, ZERO, 0.8)
+    assert page.seat.driving(0.8) == 0
     page.seat.leave(page.one)
     await settle()
-    assert page.speeds == [0.26, 0.1, 0.0, 0.1, 0.0]
+    assert page.speeds == [0.26, 0.1, 0.0]
+
+
+async def test_what_a_network_had_stored_and_hands_over_at_once_steers_nobody() -> None:
+    page = Seated()
+    await settle()
+    for at_s in (1.0, 1.04, 1.08):
+        page.seat.drive(page.one, Velocity(linear_x=0.1), at_s)
+    await settle()
+    assert page.speeds == []
+    page.seat.drive(page.one, Velocity(linear_x=0.1), 1.12)
+    for _ in range(75):  # after a cut of three seconds
+        page.seat.drive(page.one, Velocity(linear_x=0.2), 4.12)
+    page.seat.drive(page.one, ZERO, 4.12)
+    await settle()
+    assert page.speeds == [0.1, 0.0]
 
 
 async def test_a_goal_that_nobody_serves_is_said_to_be_so() -> None:

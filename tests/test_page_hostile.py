@@ -15,7 +15,7 @@ from gigabrain_schemas.topics import TELEOP
 from gigabrain_zenoh.page import wire
 from tests.onlooker import looking_on
 from tests.page_rig import OPERATOR, VIEWER, Robot, client
-from tests.stack import Home, until
+from tests.stack import AVOID, Home, until
 
 DRIVE = struct.pack("<4B3f", wire.DRIVE, 0, 0, 0, 0.1, 0.0, 0.0)
 REST = struct.pack("<4B3f", wire.DRIVE, 0, 0, 0, 0.0, 0.0, 0.0)
@@ -145,7 +145,7 @@ async def test_a_demo_says_where_its_page_is_and_steps_aside_from_a_taken_port(
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        demo = home.start("demo", "--headless", "--page", "--port", str(port))
+        demo = home.start(*AVOID, "--headless", "--page", "--port", str(port))
         await until(lambda: "operator page: http://127.0.0.1:" in demo.err, "it says where")
         said = re.search(r"http://127\.0\.0\.1:(\d+)\n", demo.err)
         assert said

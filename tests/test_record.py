@@ -143,6 +143,7 @@ def test_viewers_find_something_to_draw_of_every_kind(tmp_path: Path) -> None:
         "/viz/image/front": "foxglove.RawImage",
         "/viz/image/rear": "foxglove.CompressedImage",
         "/viz/obstacles": "foxglove.SceneUpdate",
+        "/viz/way": "foxglove.PosesInFrame",
         "/viz/log": "foxglove.Log",
         "/viz/tf": "foxglove.FrameTransform",
         "/viz/state_numbers": "gigabrain.RobotState",

@@ -1,34 +1,58 @@
 """The tools beside a robot that runs: one demo, broken link by link with real signals."""
 
 import asyncio
+import contextlib
 import json
 import os
 import re
 import signal
+from collections.abc import AsyncIterator
 
+import msgspec
 import pytest
+import yaml
 
+from gigabrain_drivers.catalog import robot_path
+from gigabrain_zenoh.gate_state import BRAIN
+from gigabrain_zenoh.running import Running
 from gigabrain_zenoh.tools.graph import ORDER
-from tests.stack import Command, Home, free_port, robot_of, until
+from tests.onlooker import Onlooker, looking_on
+from tests.stack import AVOID, Home, free_port, robot_of, until
 
 
 @pytest.fixture
 async def demo(shared_home: Home) -> Home:
     """A robot that drives: the mock, the same one for all tests."""
     if not shared_home.processes():
-        command = shared_home.start("demo", "--headless", "--body", "mock", "--seconds", "3000")
-        await robot_of(shared_home, command)
-        await until_why(shared_home, 0)
+        arguments = (
+            *AVOID,
+            "--headless",
+            "--body",
+            "mock",
+            "--seconds",
+            "3000",
+        )
+        await robot_of(shared_home, shared_home.start(*arguments))
+    await until_driving(shared_home)
     return shared_home
 
 
-async def until_why(home: Home, code: int) -> Command:
-    """`gigabrain why`, again and again until it ends with `code`."""
-    for _ in range(30):
-        why = await home.run("why")
-        if await why.ended() == code:
-            return why
-    raise AssertionError(why.out)
+@contextlib.asynccontextmanager
+async def looking(home: Home) -> AsyncIterator[Onlooker]:
+    """Somebody at the robot of this home."""
+    (note,) = (home.folder / "run" / "gigabrain").glob("*.json")
+    endpoint = msgspec.json.decode(note.read_bytes(), type=Running).endpoint
+    async with looking_on(endpoint) as seen:
+        yield seen
+
+
+async def until_driving(home: Home) -> None:
+    """Whatever was broken is whole again, and the brain drives."""
+    async with looking(home) as seen:
+        while (seen.state.gate.mode, seen.state.gate.commander) != ("enabled", BRAIN):
+            if seen.state.gate.mode == "idle":
+                await seen.hand_to_brain()
+            await seen.ticks(5)
 
 
 async def printed(home: Home, *arguments: str) -> str:
@@ -38,17 +62,20 @@ async def printed(home: Home, *arguments: str) -> str:
     return command.out
 
 
-async def test_topics_are_listed_shown_measured_and_sent(demo: Home) -> None:
-    table = await printed(demo, "topic", "list")
+async def test_topics_are_listed_shown_and_measured(demo: Home) -> None:
+    commands = (
+        "list", "echo scan -n 1", "echo state --json -n 3", "hz scan -n 1", "bw scan -n 1",
+        "delay scan -n 1", "info scan",
+    )  # fmt: skip
+    told = [printed(demo, "topic", *command.split()) for command in commands]
+    table, scan, states, hz, size, delay, about = await asyncio.gather(*told)
     assert re.search(r"^scan +LaserScan +\d+\.\d +10 +\d{4} .* driver +perception", table, re.M)
-    told = await printed(demo, "topic", "echo", "scan", "-n", "1")
-    assert re.search(r"^ranges: 360 values, min ", told, re.M)
-    lines = (await printed(demo, "topic", "echo", "state", "--json", "-n", "3")).splitlines()
-    assert [json.loads(line)["key"] for line in lines] == ["robot/state"] * 3
-    assert " Hz  promised 10" in await printed(demo, "topic", "hz", "scan", "-n", "1")
-    assert "kB/s" in await printed(demo, "topic", "bw", "scan", "-n", "1")
-    assert "delay median" in await printed(demo, "topic", "delay", "scan", "-n", "1")
-    assert "from driver to perception" in await printed(demo, "topic", "info", "scan")
+    assert re.search(r"^ranges: 360 values, min ", scan, re.M)
+    assert [json.loads(line)["key"] for line in states.splitlines()] == ["robot/state"] * 3
+    assert " Hz  promised 10" in hz
+    assert "kB/s" in size
+    assert "delay median" in delay
+    assert "from driver to perception" in about
 
 
 async def test_foreign_keys_are_shown_raw_and_unknown_ones_answered_with_the_nearest(
@@ -74,7 +101,6 @@ async def test_a_message_that_is_sent_arrives(demo: Home) -> None:
 
 
 async def test_a_velocity_asks_for_the_body_and_gives_it_back(demo: Home) -> None:
-    await until_why(demo, 0)
     refused = await demo.run("topic", "pub", "cmd_vel", "linear_x=0.1")
     assert await refused.ended() == 1
     assert refused.err == "gigabrain: control drives; take it over with --take\n"
@@ -82,26 +108,25 @@ async def test_a_velocity_asks_for_the_body_and_gives_it_back(demo: Home) -> Non
         driven = await demo.run("topic", "pub", "cmd_vel", "linear_x=0.1", "--take")
         if re.fullmatch(r"driven for \d\.\d s; control drives\n", driven.out):
             break
-        await until_moving(demo)
+        await until_driving(demo)
     else:
         raise AssertionError(driven.out + driven.err)
     driving = demo.start("topic", "pub", "cmd_vel", "linear_x=0.1", "--take", "--rate", "20")
-    ask = ("topic", "echo", "state", "-n", "1", "--fields", "gate.commander")
-    while "-pub" not in await printed(demo, *ask):
-        assert driving.running, driving.err
+    async with looking(demo) as seen:
+        await until(lambda: seen.state.gate.commander.endswith("-pub"), "it is driven by hand")
     driving.send(signal.SIGINT)
     assert await driving.ended() == 0
     assert re.search(r"; (control drives|the brain has not got it back: .*)\n$", driving.out)
-    await until_moving(demo)
 
 
 async def test_processes_and_who_talks_to_whom_are_shown(demo: Home) -> None:
-    table = await printed(demo, "node", "list")
+    told = ("node list", "node info driver", "graph", "top --once")
+    table, driver, graph, once = await asyncio.gather(
+        *(printed(demo, *command.split()) for command in told)
+    )
     assert {line.split()[0] for line in table.splitlines()} >= set(ORDER)
-    assert "stale_commands_executed" in await printed(demo, "node", "info", "driver")
-    graph = await printed(demo, "graph")
+    assert "stale_commands_executed" in driver
     assert re.search(r"^perception\n  world +\d+\.\d Hz  -> decision, safety$", graph, re.M)
-    once = await printed(demo, "top", "--once")
     assert re.search(r"^control +ok ", once, re.M)
     assert re.search(r"^cmd_vel +\d", once, re.M)
 
@@ -134,7 +159,6 @@ async def test_the_log_tells_who_changed_a_parameter(demo: Home) -> None:
 async def test_a_process_that_hangs_is_named(
     process: str, code: int, words: str, demo: Home
 ) -> None:
-    await until_why(demo, 0)
     pid = pid_of(demo, process)
     os.kill(pid, signal.SIGSTOP)
     try:
@@ -142,17 +166,6 @@ async def test_a_process_that_hangs_is_named(
         assert (await why.ended(), words in why.out) == (code, True), why.out
     finally:
         os.kill(pid, signal.SIGCONT)
-    await until_moving(demo)
-
-
-async def until_moving(home: Home) -> None:
-    """Whatever was broken is whole again; a router that was gone takes a little longer."""
-    for _ in range(30):
-        if await (await home.run("why")).ended() == 0:
-            return
-        await home.run("enable")
-        await asyncio.sleep(0.5)
-    raise AssertionError("it does not move again")
 
 
 def pid_of(home: Home, process: str) -> int:
@@ -165,18 +178,26 @@ def pid_of(home: Home, process: str) -> int:
 
 
 async def test_an_e_stop_is_named_with_the_way_out(demo: Home) -> None:
-    await until_why(demo, 0)
+    for _ in range(20):  # as busy as the machine may be
+        moves = await demo.run("why")
+        if await moves.ended() == 0:
+            break
+    else:
+        raise AssertionError(moves.out)
     assert await (await demo.run("estop")).ended() == 0
-    await until_why(demo, 18)
-    told = json.loads((await demo.run("why", "--json")).out)
+    latched = await demo.run("why", "--json")
+    assert await latched.ended() == 18
+    told = json.loads(latched.out)
     assert "latched" in {one["link"]: one["text"] for one in told["findings"]}["gate"]
+    async with looking(demo) as seen:
+        await seen.still(30)
     assert await (await demo.run("release")).ended() == 0
-    assert "it is idle: nobody has enabled it" in (await until_why(demo, 18)).out
-    await until_moving(demo)
+    idle = await demo.run("why")
+    assert await idle.ended() == 18
+    assert "it is idle: nobody has enabled it" in idle.out
 
 
 async def test_the_doctor_finds_a_process_that_is_gone(demo: Home) -> None:
-    await until_why(demo, 0)
     os.kill(pid_of(demo, "safety"), signal.SIGSTOP)
     doctor = await demo.run("doctor")
     os.kill(pid_of(demo, "safety"), signal.SIGCONT)
@@ -186,26 +207,28 @@ async def test_the_doctor_finds_a_process_that_is_gone(demo: Home) -> None:
 
 
 async def test_pipes_end_without_a_complaint(demo: Home) -> None:
-    for arguments in (("topic", "echo", "state"), ("log", "--follow"), ("topic", "list")):
+    async def broken_off(*arguments: str) -> str:
         read, write = os.pipe()
         command = demo.start(*arguments, stdout=write)
         os.close(write)
-        os.read(read, 1)
+        await asyncio.to_thread(os.read, read, 1)
         os.close(read)
         await command.ended()
-        assert command.err == ""
+        return command.err
+
+    commands = ("topic echo state", "log --follow", "topic list")
+    assert await asyncio.gather(*(broken_off(*one.split()) for one in commands)) == ["", "", ""]
 
 
-@pytest.mark.parametrize(
-    "command",
-    ["topic list", "topic echo scan", "node list", "graph", "top --once", "param list",
-     "log --follow --connect tcp/127.0.0.1:1"],
-)  # fmt: skip
-async def test_without_a_robot_one_line_says_what_to_do(home: Home, command: str) -> None:
-    alone = await home.run(*command.split())
-    assert await alone.ended() == 1
-    assert alone.err.count("\n") == 1
-    assert "gigabrain demo" in alone.err or "is the robot running" in alone.err
+async def test_without_a_robot_one_line_says_what_to_do(home: Home) -> None:
+    commands = (
+        "topic list", "topic echo scan", "node list", "graph", "top --once", "param list",
+        "foxglove", "log --follow --connect tcp/127.0.0.1:1",
+    )  # fmt: skip
+    for alone in await asyncio.gather(*(home.run(*command.split()) for command in commands)):
+        assert await alone.ended() == 1
+        assert alone.err.count("\n") == 1
+        assert "gigabrain demo" in alone.err or "is the robot running" in alone.err
 
 
 async def test_why_and_doctor_say_that_no_robot_runs(home: Home) -> None:
@@ -213,3 +236,31 @@ async def test_why_and_doctor_say_that_no_robot_runs(home: Home) -> None:
     assert (await why.ended(), "no robot runs here" in why.out) == (10, True)
     doctor = await home.run("doctor", "--connect", f"tcp/127.0.0.1:{free_port()}")
     assert (await doctor.ended(), "Nothing listens on that port." in doctor.out) == (1, True)
+
+
+async def test_a_body_that_obeys_a_key_of_its_own_is_driven_and_explained_all_the_same(
+    home: Home,
+) -> None:
+    known = yaml.safe_load(robot_path("mock").read_text())
+    body = home.folder / "own.yaml"
+    body.write_text(yaml.safe_dump(known | {"control_topic": "robot/base/cmd"}))
+    home.start("up", str(home.deployment(body=str(body), resume="auto")))
+    await until(lambda: list((home.folder / "run" / "gigabrain").glob("*.json")), "it runs")
+    await until_driving(home)
+    driving = home.start(
+        "topic", "pub", "base/cmd", "linear_x=0", "angular_z=0.8", "--take", "--rate", "20"
+    )
+    async with looking(home) as seen:
+        await until(lambda: seen.state.velocity.angular_z > 0.5, "it turns left")
+    driving.send(signal.SIGINT)
+    assert await driving.ended() == 0
+    await until_driving(home)
+    other, why, doctor = await asyncio.gather(
+        home.run("topic", "pub", "base/cmt", "linear_x=0.1", "--take"),
+        home.run("why", "--json"),
+        home.run("doctor", "--json"),
+    )
+    assert "no topic 'base/cmt'; did you mean 'base/cmd'?" in other.err
+    links = {one["link"]: one["ok"] for one in json.loads(why.out)["findings"]}
+    assert links["control"] is True, why.out
+    assert "cmd_vel" not in doctor.out

@@ -15,7 +15,7 @@ import pytest
 from gigabrain_zenoh.client import Robot
 from gigabrain_zenoh.settings import Endpoint
 from tests.onlooker import looking_on
-from tests.stack import ROOT, Command, Home, endpoint_of, free_port, robot_of, until
+from tests.stack import AVOID, ROOT, Command, Home, endpoint_of, free_port, robot_of, until
 
 ALL = ["router", "driver", "perception", "decision", "control", "safety"]
 READY = re.compile(r"^\S+ (\w+) +info +ready pid=\d+$", re.MULTILINE)
@@ -271,7 +271,7 @@ async def test_a_folder_that_cannot_be_written_is_said_in_one_line(home: Home, w
     router = ("--connect", f"tcp/127.0.0.1:{free_port()}")
     commands: dict[str, tuple[str, ...]] = {
         "state": ("up", str(home.deployment())),
-        "run": ("demo", "--headless", "--seconds", "1"),
+        "run": (*AVOID, "--headless", "--seconds", "1"),
         "run_dir": ("perception", "--run-dir", str(place), *router),
         "remember": ("driver", "run", "mock", "--remember", str(place)),
     }

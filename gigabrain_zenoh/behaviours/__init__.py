@@ -1,14 +1,20 @@
 """What decision can do. Adding a behaviour means a module and a line in BEHAVIOURS."""
 
 import importlib
-from typing import Protocol, cast
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Protocol, cast
 
 import msgspec
 
 from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent, WorldModel
-from gigabrain_zenoh.errors import unknown
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.settings import DecisionConfig
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.behaviours.bearings import Bearings
 
 
 class Situation(msgspec.Struct, frozen=True):
@@ -17,6 +23,7 @@ class Situation(msgspec.Struct, frozen=True):
     world: WorldModel | None  # None while perception is silent
     pose: Pose  # odometry of the same tick
     must_charge: bool = False  # safety says that the battery is nearly empty
+    bearings: "Bearings | None" = None  # for a behaviour that is sent to places
 
 
 class Behaviour(Protocol):
@@ -29,15 +36,87 @@ class Behaviour(Protocol):
         ...
 
 
+class Senses(Protocol):
+    """What a behaviour goes by beside the world: hears it, and hands back what became of it."""
+
+    async def warm_up(self) -> None:
+        """Whatever takes its time, before anything drives."""
+        ...
+
+    def see(self, state: RobotState) -> None:
+        """Take note of each state."""
+        ...
+
+    def situation(
+        self, state: RobotState, world: WorldModel | None, must_charge: bool
+    ) -> Situation:
+        """What the behaviour is to look at now."""
+        ...
+
+    def heed(self, behaviour: Behaviour) -> None:
+        """Take note of what the behaviour has made of it."""
+        ...
+
+    async def close(self) -> None:
+        """Once all is written down."""
+        ...
+
+
+class Plain:
+    """The senses of a behaviour that goes by the world alone."""
+
+    async def warm_up(self) -> None:
+        """Nothing to do."""
+
+    def see(self, state: RobotState) -> None:
+        """Nothing to note."""
+
+    def situation(
+        self, state: RobotState, world: WorldModel | None, must_charge: bool
+    ) -> Situation:
+        """The world and the odometry."""
+        return Situation(world, state.pose, must_charge)
+
+    def heed(self, behaviour: Behaviour) -> None:
+        """Nothing to note."""
+
+    async def close(self) -> None:
+        """Nothing to write."""
+
+
 # name in a deployment file -> "module:class"; the class takes the `decision` part of that file
 BEHAVIOURS = {
     "avoid": "gigabrain_zenoh.behaviours.avoid:Avoid",
+    "navigate": "gigabrain_zenoh.behaviours.navigate:Navigate",
 }
+SENSES = {"navigate": "gigabrain_zenoh.navigating:Navigating"}  # of those that need more
+
+
+def check(name: str) -> None:
+    """Raises UnknownName where there is no behaviour called `name`, listing the known ones."""
+    if name not in BEHAVIOURS:
+        raise unknown("behaviour", name, BEHAVIOURS)
 
 
 def load(name: str) -> type[Behaviour]:
-    """The behaviour called `name`. Raises UnknownName listing the known ones."""
-    if name not in BEHAVIOURS:
-        raise unknown("behaviour", name, BEHAVIOURS)
-    module, _, attribute = BEHAVIOURS[name].partition(":")
-    return cast("type[Behaviour]", getattr(importlib.import_module(module), attribute))
+    """The behaviour called `name`. Raises UnknownName listing the known ones, and ConfigError."""
+    check(name)
+    return cast("type[Behaviour]", _find(name, BEHAVIOURS[name]))
+
+
+def senses(config: DecisionConfig, bus: Bus) -> Senses:
+    """What the configured behaviour goes by. Raises ConfigError."""
+    if config.behaviour not in SENSES:
+        return Plain()
+    make = _find(config.behaviour, SENSES[config.behaviour])
+    return cast("Callable[[DecisionConfig, Bus], Senses]", make)(config, bus)
+
+
+def _find(name: str, path: str) -> object:
+    module, _, attribute = path.partition(":")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"behaviour {name} needs {error.name}; pip install 'gigabrain-zenoh[nav]'"
+        ) from None

@@ -1,8 +1,10 @@
 """Global planning, timed: costs of a map, the first plan on a changed one, paths, optimality."""
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path as File
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,8 +21,8 @@ from gigabrain_zenoh.percentile import percentile
 RESOLUTION = 0.05  # [m]
 RULES = Inflation(fits=0.2, turns=0.3)
 ROUNDS = 7  # of what is timed on one and the same map
-GOALS = 4  # from one start: they share the Dijkstra that checks them
-SHARE, SPREAD = 0.75, 0.1  # of the map's side a path is long, more or less
+GOALS = 4  # from one start: they share the Dijkstra that finds and checks them
+SHARE, SPREAD = 0.75, 0.1  # of the map's side a path costs, more or less
 DENSITY = 0.2  # of the random map
 PITCH, ROOM, WALL, DOOR = 240, 96, 2, 20  # cells: four rooms and two corridors repeat
 FURNITURE = 3  # pieces a room
@@ -57,6 +59,16 @@ class PlanResult(Struct, frozen=True, kw_only=True):
     def ok(self) -> bool:
         """Whether every path was optimal."""
         return all(abs(one.ratio - 1) < 1e-6 for one in self.sizes)
+
+
+class Query(NamedTuple):
+    """A start and a goal, and what Dijkstra pays."""
+
+    begin: tuple[int, int]  # row, column
+    end: tuple[int, int]
+    start: Point
+    goal: Point
+    cheapest: float
 
 
 class Stopwatch:
@@ -139,21 +151,23 @@ def _measure(
     cells = office(size, rng)
     grid, planner = _grid(cells), Planner()
     made, anew, changed, first = costmap(grid, RULES), Stopwatch(), Stopwatch(), Stopwatch()
-    asked = list(_queries(made, planner, queries, rng))
+    asked = list(itertools.islice(_queries(made, planner.search, rng), queries))
     for i in range(ROUNDS):
         with anew:
             costmap(grid, RULES)
         now = _grid(_something_new(cells, rng))
         with changed:
             costmap(now, RULES, None, made)
-        start, goal = asked[i % len(asked)]
+        one = asked[i % len(asked)]
         with first:
-            planner.plan(costmap(now, RULES, None, made), start, goal)
+            planner.plan(costmap(now, RULES, None, made), one.start, one.goal)
     searching, planning, ratios, paths = Stopwatch(), Stopwatch(), [], []
-    for start, goal in asked:
-        ratios.append(_searched(made, planner.search, start, goal, searching))
+    for one in asked:
+        with searching:
+            cells_on = planner.search.path(made.cost, one.begin, one.end)
+        ratios.append(_paid(made.cost, cells_on) / one.cheapest)
         with planning:
-            found = planner.plan(made, start, goal)
+            found = planner.plan(made, one.start, one.goal)
         paths += [found] if isinstance(found, Path) else []
     timings = (
         anew.timing("costs of the whole map"),
@@ -168,31 +182,27 @@ def _measure(
     return SizeFigures(size=size, path_m=length, timings=timings, ratio=worst), made, paths
 
 
-def _queries(
-    made: Costmap, planner: Planner, count: int, rng: np.random.Generator
-) -> Iterator[tuple[Point, Point]]:
-    """Starts and goals as far apart as asked, as the robot drives."""
-    wanted, found = SHARE * len(made.cost) * made.resolution, 0
-    rows, columns = np.nonzero(made.cost < 2)
-    while found < count:
-        at = rng.integers(0, len(rows), 1 + GOALS)
-        start, *goals = ((float(x), float(y)) for x, y in made.points(rows[at], columns[at]))
-        for goal in goals:
-            path = planner.plan(made, start, goal)
-            near = isinstance(path, Path) and abs(path.remaining[0] / wanted - 1) <= SPREAD
-            if near and found < count:
-                found += 1
-                yield start, goal
+def _queries(made: Costmap, search: Search, rng: np.random.Generator) -> Iterator[Query]:
+    """Starts and goals as far apart as wanted, by Dijkstra."""
+    wanted = SHARE * len(made.cost)
+    open_ = np.argwhere(made.cost < 2)
+    while True:
+        begin = _cell(open_[rng.integers(len(open_))])
+        field = search.field(made.cost, begin, "from")
+        far = np.argwhere((np.abs(field / wanted - 1) < SPREAD) & (made.cost < 2))
+        for _ in range(GOALS if len(far) else 0):
+            end = _cell(far[rng.integers(len(far))])
+            start, goal = _middle(made, begin), _middle(made, end)
+            yield Query(begin, end, start, goal, float(field[end]))
 
 
-def _searched(made: Costmap, search: Search, start: Point, goal: Point, watch: Stopwatch) -> float:
-    """What A* pays for what Dijkstra pays."""
-    begin, end = made.cell(*start), made.cell(*goal)
-    if begin is None or end is None:
-        raise ValueError("a query outside its own map")
-    with watch:
-        cells = search.path(made.cost, begin, end)
-    return _paid(made.cost, cells) / float(search.field(made.cost, begin, "from")[end])
+def _cell(at: NDArray[np.intp]) -> tuple[int, int]:
+    return int(at[0]), int(at[1])
+
+
+def _middle(made: Costmap, cell: tuple[int, int]) -> Point:
+    x, y = made.points(np.array(cell[:1]), np.array(cell[1:]))[0].tolist()
+    return x, y
 
 
 def _corner_to_corner(

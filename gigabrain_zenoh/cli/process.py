@@ -14,7 +14,7 @@ from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.process import find, run
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.running import find_endpoint
-from gigabrain_zenoh.settings import DriverConfig, Endpoint, LinkName, Resume
+from gigabrain_zenoh.settings import DecisionConfig, DriverConfig, Endpoint, LinkName, Resume
 from gigabrain_zenoh.zenoh_config import router_config, secured
 
 ROUTER = "tcp/127.0.0.1:7447"
@@ -77,6 +77,9 @@ def decision(
     *,
     behaviour: str = "avoid",
     turn: Literal["right", "left", "clearer"] = "right",
+    begin: Literal["wait", "roam"] = "wait",
+    scripts: Path | None = None,
+    remember: Path | None = None,
     place: Place = HERE,
 ) -> int:
     """Start decision: what is round the robot becomes what to do.
@@ -88,10 +91,23 @@ def decision(
     behaviour
         What it does.
     turn
-        Which way it turns from an obstacle.
+        Which way it turns from an obstacle, where it avoids.
+    begin
+        What it does until somebody sends it somewhere, where it navigates.
+    scripts
+        The folder of the programs that missions may run.
+    remember
+        The folder for what must survive a restart: what it is to do.
     """
     behaviours.load(behaviour)  # a wrong name is better told now than once there is a router
-    return _run("decision", place, {"behaviour": behaviour, "turn": turn})
+    settings = DecisionConfig(
+        behaviour=behaviour,
+        turn=turn,
+        begin=begin,
+        scripts=str(scripts.absolute()) if scripts else "",
+        state_dir=str(remember or state_dir() / "robots" / (place.namespace or "decision")),
+    )
+    return _run("decision", place, msgspec.to_builtins(settings))
 
 
 def control(*, place: Place = HERE) -> int:

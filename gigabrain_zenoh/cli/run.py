@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+from gigabrain_zenoh import behaviours
 from gigabrain_zenoh.cli.checked import above_zero, checked
 from gigabrain_zenoh.config_places import located
 from gigabrain_zenoh.deployment import (
@@ -27,6 +28,7 @@ def demo(
     seconds: float | None = None,
     seed: int = 0,
     speed: float = 1.0,
+    behaviour: str = "navigate",
     turn: Literal["right", "left", "clearer"] = "right",
     resume: Resume | None = None,
     headless: bool = False,
@@ -35,7 +37,7 @@ def demo(
     page: bool | None = None,
     port: int = 8080,
 ) -> int:
-    """Drive a simulated robot round a room, until Ctrl-C.
+    """Drive a simulated robot round its world, until Ctrl-C: it makes a map, then visits places.
 
     Example: gigabrain demo --world house --seconds 60 --speed 5 --headless --report run.json
 
@@ -55,8 +57,10 @@ def demo(
         For the start pose and the noise of the sensors.
     speed
         Simulated over real time; other than 1, time waits for the brain.
+    behaviour
+        What it does: `navigate`, or `avoid`, which makes no map.
     turn
-        Which way it turns from an obstacle.
+        Which way it turns from an obstacle, where it avoids.
     resume
         Whether it goes on by itself after a stop that has passed; a real body never does.
     headless
@@ -73,10 +77,11 @@ def demo(
     from gigabrain_zenoh.demo import Demo, DemoOptions
     from gigabrain_zenoh.page.beside import with_page
 
+    behaviours.check(behaviour)
     if record and record.exists():
         raise ConfigError(f"{record} exists; choose another file")
     above_zero("seconds", seconds)
-    values = {
+    values: dict[str, object] = {
         "body": body,
         "link": link,
         "world": world,
@@ -84,8 +89,11 @@ def demo(
         "speed": speed,
         "resume": resume or ("manual" if link == "real" else "auto"),
         "router": "tcp/127.0.0.1:0",
-        "decision": {"turn": turn},
+        "decision": {"behaviour": behaviour, "turn": turn},
     }
+    if behaviour == "navigate":
+        values["decision"] = {"behaviour": behaviour, "begin": "roam"}
+        values["perception"] = {"mapping": "slam"}
     if record:
         values |= recorded(record)
     deployment, where = checked(values, Deployment), ""

@@ -1,17 +1,13 @@
 """`gigabrain topic`: what goes over the bus."""
 
 import asyncio
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.cli.live_names import topics
 from gigabrain_zenoh.cli.where import HERE, Which, say, show
-
-if TYPE_CHECKING:
-    from gigabrain_schemas.brain import CmdVel
-    from gigabrain_zenoh.recording.joining import Where
 
 Name = Annotated[str, Parameter(completer=topics)]
 Count = Annotated[int | None, Parameter(alias="-n")]
@@ -203,44 +199,27 @@ def pub(
     take
         Even when somebody else drives, the robot's own brain included.
     """
-    from gigabrain_schemas.brain import CmdVel
     from gigabrain_schemas.topics import CMD_VEL
     from gigabrain_zenoh.recording.joining import joined
     from gigabrain_zenoh.tools.names import not_found, target
-    from gigabrain_zenoh.tools.publishing import send, typed_in
+    from gigabrain_zenoh.tools.publishing import drive, send, typed_in
 
     above_zero("rate", rate)
     above_zero("count", count)
     aim = target(name)
-    if aim is None or aim.topic is None or "*" in aim.pattern:
+    topic = aim.topic if aim else None
+    if (aim and "*" in aim.pattern) or (topic is None and "/" not in name):
         raise not_found(name, ())
-    topic = aim.topic
-    message = typed_in(topic, words)
-    if isinstance(message, CmdVel) and topic is CMD_VEL:
+    if topic is None or topic is CMD_VEL:  # a key that is not ours may be what the body obeys
         seconds = None if rate and not count else (count or 1) / (rate or 1.0)
-        asyncio.run(_drive(at.where(), message, seconds, take))
+        say(asyncio.run(drive(at.where(), name, words, seconds, take=take)))
         return 0
+    message = typed_in(topic, words)
 
     async def run() -> None:
         async with joined(at.where(), "pub") as (bus, _):
-            of = aim.pattern.removeprefix(f"{topic.key}/") if topic.many else ""
+            of = name.rpartition("/")[2] if topic.many else ""
             say(f"sent {await send(bus, topic, message, rate, count, of)}")
 
     asyncio.run(run())
     return 0
-
-
-async def _drive(where: "Where", message: "CmdVel", seconds: float | None, take: bool) -> None:
-    import getpass
-
-    from gigabrain_zenoh.client import connect
-    from gigabrain_zenoh.tools.publishing import drive
-
-    async with connect(
-        where.connect,
-        namespace=where.namespace,
-        keys=where.keys,
-        source=message.source or f"{getpass.getuser()}-pub",
-        take=take,
-    ) as robot:
-        say(await drive(robot, message, seconds, take=take))

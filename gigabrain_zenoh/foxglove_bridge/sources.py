@@ -10,6 +10,7 @@ from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.brain import OccupancyGrid, Twist
 from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import (
     BODY,
     CMD_VEL,
@@ -21,6 +22,7 @@ from gigabrain_schemas.topics import (
     SAFETY,
     SCAN,
     STATE,
+    TASK,
     TELEOP,
     WORLD,
     Topic,
@@ -47,6 +49,7 @@ class Sources:
         self.body: Body | None = None
         bus.subscribe(LOG, lambda _key, line: self._draw(LOG, line))
         bus.latest(MAP, self._hear_map)
+        bus.latest(TASK, self._hear_task)
         bus.latest(BODY, self._hear_body)
         bus.tap(IMAGE.at("*"), self._hear_image)
 
@@ -96,6 +99,10 @@ class Sources:
     def _hear_map(self, grid: OccupancyGrid) -> None:
         self._kept[MAP] = grid
         self._draw(MAP, grid)
+
+    def _hear_task(self, status: TaskStatus) -> None:
+        self._kept[TASK] = status
+        self._draw(TASK, status)
 
     def _hear_body(self, body: Body) -> None:
         self.body = self._kept[BODY] = body

@@ -21,6 +21,7 @@ from gigabrain_schemas.topics import (
     JOINT_CMD,
     LOG,
     MAP,
+    MAP_SAVE,
     MISSION,
     PARAM,
     POSE,
@@ -53,12 +54,23 @@ class Rights:
 BRAIN = Rights(
     says=(WORLD, POSE, MAP, INTENT, TASK, HEALTH, LOG),
     asks=(DESCRIBE, ESTOP),
-    answers=(GOAL, MISSION, TASK_CHANGE, PARAM, DESCRIBE),
+    answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
     names=("perception", "decision", "relay"),
 )
 OPERATOR = Rights(
     says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG),
-    asks=(DESCRIBE, AUDIT_LOG, PARAM, ESTOP, RELEASE, ENABLE, GOAL, MISSION, TASK_CHANGE),
+    asks=(
+        DESCRIBE,
+        AUDIT_LOG,
+        PARAM,
+        ESTOP,
+        RELEASE,
+        ENABLE,
+        GOAL,
+        MISSION,
+        TASK_CHANGE,
+        MAP_SAVE,
+    ),
     answers=(PARAM, DESCRIBE),
     names=("page", "foxglove", "recorder", "button"),
 )

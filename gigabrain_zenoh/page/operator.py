@@ -1,9 +1,13 @@
 """What viewers ask of the robot, and what becomes of it."""
 
 import time
+from collections.abc import Sequence
+
+from msgspec.structs import replace
 
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
-from gigabrain_schemas.topics import ENABLE, GOAL, RELEASE
+from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
+from gigabrain_schemas.topics import ENABLE, GOAL, RELEASE, TASK_CHANGE
 from gigabrain_zenoh.asking import ANSWER_S, ask, granted
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
@@ -35,6 +39,8 @@ class Operator:
     async def _do(self, asked: Ask) -> tuple[str, str]:
         if asked.what == "goal":
             return await self._goal(asked), ""
+        if asked.what == "cancel":
+            return await self._cancel(), ""
         if asked.what == "estop":
             reply = await press(self._bus, "operator page")
         elif asked.what == "release":
@@ -51,12 +57,23 @@ class Operator:
         request = EnableRequest(source=BRAIN, take=take, by=self._bus.process)
         return granted(await ask(self._bus, ENABLE, request))
 
+    async def _cancel(self) -> str:
+        request = TaskRequest(do="cancel", source=self._bus.process)
+        replies = await self._bus.ask(TASK_CHANGE, request, timeout_s=ANSWER_S)
+        return _answered(replies)
+
     async def _goal(self, asked: Ask) -> str:
         if asked.goal is None:
             raise Refused("a goal needs a place")
-        replies = await self._bus.ask(GOAL, asked.goal, timeout_s=ANSWER_S)
-        if not replies:
-            raise BodyLost("nobody serves goals: this robot has no navigation running")
-        if not replies[0].ok:
-            raise Refused(replies[0].text)
-        return replies[0].text
+        goal = replace(asked.goal, source=self._bus.process)
+        replies = await self._bus.ask(GOAL, goal, timeout_s=ANSWER_S)
+        return _answered(replies)
+
+
+def _answered(replies: Sequence[GoalReply | TaskReply]) -> str:
+    """What a robot that goes somewhere says. Raises BodyLost where none does, and Refused."""
+    if not replies:
+        raise BodyLost("nobody serves goals: this robot has no navigation running")
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    return replies[0].text

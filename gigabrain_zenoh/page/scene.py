@@ -7,9 +7,10 @@ from msgspec.structs import asdict, replace
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import OccupancyGrid, Twist, WorldModel
+from gigabrain_schemas.brain import OccupancyGrid, Twist
 from gigabrain_schemas.safety import Health, LogRecord
 from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import (
     BODY,
     HEALTH,
@@ -21,6 +22,7 @@ from gigabrain_schemas.topics import (
     SAFETY,
     SCAN,
     STATE,
+    TASK,
     TELEOP,
     WORLD,
 )
@@ -41,7 +43,7 @@ class Scene:
         self._intent, self._safety = Sampled(bus, INTENT), Sampled(bus, SAFETY)
         self._world, self._scan = Sampled(bus, WORLD), Sampled(bus, SCAN)
         self._place, self._images = Sampled(bus, POSE), dict[str, Sampled[Image]]()
-        self._map_frame = b""
+        self._map_frame = self._task_frame = b""
         self._health: dict[str, bytes] = {}
         self._lines: list[bytes] = []
         self._numbers = itertools.count()
@@ -49,6 +51,7 @@ class Scene:
         bus.subscribe(HEALTH, self._hear_health)
         bus.subscribe(LOG, self._hear_line)
         bus.latest(MAP, self._hear_map)
+        bus.latest(TASK, self._hear_task)
         bus.latest(BODY, self._hear_body)
         bus.tap(IMAGE.at("*"), self._hear_image)
         self.on_body: Callable[[], None] = lambda: None
@@ -62,6 +65,7 @@ class Scene:
         """How the robot is now."""
         state = self._state.fresh()
         pose, in_map = self._pose(state)
+        world = self._world.fresh()
         return wire.as_json(
             wire.MOMENT,
             wire.Moment(
@@ -70,7 +74,7 @@ class Scene:
                 frame="map" if in_map else "odom",
                 intent=self._intent.fresh(),
                 safety=self._safety.fresh(),
-                world=_without_hits(self._world.fresh()),
+                world=world and replace(world, hits=b""),  # the page draws the scan itself
                 driving=driving,
                 viewers=viewers,
             ),
@@ -87,9 +91,10 @@ class Scene:
                 yield f"image/{camera}", wire.image_frame(camera, image)
 
     def before(self) -> Iterator[tuple[str, bytes]]:
-        """What somebody who comes late has missed: the map, healths, the log."""
-        if self._map_frame:
-            yield "map", self._map_frame
+        """What somebody who comes late has missed: the map, the task, healths, the log."""
+        for slot, frame in (("map", self._map_frame), ("task", self._task_frame)):
+            if frame:
+                yield slot, frame
         yield from ((f"health/{name}", frame) for name, frame in self._health.items())
         yield from ((f"log/{next(self._numbers)}", frame) for frame in self._lines)
 
@@ -114,6 +119,10 @@ class Scene:
         self._map_frame = wire.map_frame(grid)
         self._tell("map", self._map_frame)
 
+    def _hear_task(self, status: TaskStatus) -> None:
+        self._task_frame = wire.as_json(wire.TASK, status)
+        self._tell("task", self._task_frame)
+
     def _hear_body(self, body: Body) -> None:
         before, self.body = self.body, body
         if before is None or before.description != body.description:
@@ -124,8 +133,3 @@ class Scene:
         if camera in self._images or len(self._images) < CAMERAS:
             sampled = self._images.setdefault(camera, Sampled(self._bus, IMAGE))
             sampled.take(key, encoding, payload)
-
-
-def _without_hits(world: WorldModel | None) -> WorldModel | None:
-    """The page has the scan."""
-    return replace(world, hits=b"") if world else None

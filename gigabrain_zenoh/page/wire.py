@@ -14,7 +14,7 @@ from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_zenoh.codec import DECODE_ERRORS
 
-ABOUT, MOMENT, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE = range(1, 9)  # to the browser
+ABOUT, MOMENT, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
 LOGIN, DRIVE, ASK = range(1, 4)  # from it
 
 T = TypeVar("T")
@@ -53,7 +53,7 @@ class Ask(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Something is asked of the robot."""
 
     id: Annotated[int, Meta(ge=0, le=2**31)]
-    what: Literal["estop", "release", "enable", "take", "goal"]
+    what: Literal["estop", "release", "enable", "take", "goal", "cancel"]
     estop_generation: Count = 0  # as the page shows it, so that nobody releases a stop unseen
     goal: GoalRequest | None = None
 

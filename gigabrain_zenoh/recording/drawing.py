@@ -17,11 +17,13 @@ from foxglove import messages as fox
 from gigabrain_schemas import arrays
 from gigabrain_schemas.base import Message, Pose
 from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import Intent, Obstacle, OccupancyGrid, PoseInMap, WorldModel
+from gigabrain_schemas.brain import Intent, OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.safety import LogRecord
 from gigabrain_schemas.sensors import Image, LaserScan
+from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import CMD_VEL, INTENT, SAFETY, STATE, WORLD, Topic
 from gigabrain_zenoh.recording.schema import flat_schema
+from gigabrain_zenoh.recording.shapes import obstacle, pose_of, stamp, turn
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
 LIDAR = "base_scan"  # as LaserScan has it
@@ -36,11 +38,6 @@ LEVELS = {
 
 
 PLOTTED = {topic.key for topic in (STATE, WORLD, INTENT, CMD_VEL, SAFETY)}
-AMBER = fox.Color(r=0.96, g=0.62, b=0.04, a=0.6)
-TALL = 0.3  # [m], how high an obstacle is drawn
-AHEAD_S = 1.0  # how far its arrow reaches
-SLOW = 0.05  # [m/s], below it no arrow is drawn
-GONE = fox.Duration(sec=1)  # after so long without news an obstacle is no longer drawn
 
 
 class Drawn(NamedTuple):
@@ -73,21 +70,6 @@ def json_schema(kind: type[Message]) -> Schema:
     return Schema(name=f"gigabrain.{kind.__name__}", encoding="jsonschema", data=flat_schema(kind))
 
 
-def stamp(message: Message) -> fox.Timestamp:
-    """When `message` was valid."""
-    return fox.Timestamp(message.stamp_ns // 1_000_000_000, message.stamp_ns % 1_000_000_000)
-
-
-def turn(yaw: float) -> fox.Quaternion:
-    """A heading [rad] as a quaternion."""
-    return fox.Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
-
-
-def pose_of(x: float, y: float, yaw: float) -> fox.Pose:
-    """A planar pose [m, m, rad]."""
-    return fox.Pose(position=fox.Vector3(x=x, y=y), orientation=turn(yaw))
-
-
 class Drawer:
     """Converts message after message; remembers how the frames lie to one another."""
 
@@ -100,6 +82,7 @@ class Drawer:
             PoseInMap: self._pose,
             Intent: self._path,
             WorldModel: self._obstacles,
+            TaskStatus: self._task,
             Image: self._image,
             LogRecord: self._log,
             RobotState: self._state,
@@ -170,28 +153,16 @@ class Drawer:
         yield of("path", fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses))
 
     def _obstacles(self, world: WorldModel, _: str) -> Iterable[Drawn]:
-        entities = [self._obstacle(world, one) for one in world.obstacles]
+        entities = [obstacle(world, one, ODOM) for one in world.obstacles]
         yield of("obstacles", fox.SceneUpdate(entities=entities))
 
-    @staticmethod
-    def _obstacle(world: WorldModel, one: Obstacle) -> fox.SceneEntity:
-        """A cylinder, and an arrow to where it will be."""
-        here = pose_of(one.x, one.y, 0.0)
-        wide = 2 * max(one.radius, 0.01)
-        body = fox.CylinderPrimitive(
-            pose=here, size=fox.Vector3(x=wide, y=wide, z=TALL), color=AMBER,
-            top_scale=1.0, bottom_scale=1.0,
-        )  # fmt: skip
-        speed = math.hypot(one.velocity_x, one.velocity_y)
-        arrow = fox.ArrowPrimitive(
-            pose=pose_of(one.x, one.y, math.atan2(one.velocity_y, one.velocity_x)),
-            shaft_length=AHEAD_S * speed, shaft_diameter=0.03,
-            head_length=0.08, head_diameter=0.08, color=AMBER,
-        )  # fmt: skip
-        return fox.SceneEntity(
-            timestamp=stamp(world), frame_id=ODOM, id=str(one.id), lifetime=GONE,
-            cylinders=[body], arrows=[arrow] if speed > SLOW else [],
-        )  # fmt: skip
+    def _task(self, status: TaskStatus, _: str) -> Iterable[Drawn]:
+        """The way to the goal, and the goal at its end."""
+        way = [pose_of(x, y, 0.0) for x, y in status.path]
+        if status.goal:
+            goal = status.goal
+            way.append(pose_of(goal.x, goal.y, goal.yaw or 0.0))
+        yield of("way", fox.PosesInFrame(timestamp=stamp(status), frame_id=MAP, poses=way))
 
     def _image(self, image: Image, name: str) -> Iterable[Drawn]:
         when = stamp(image)

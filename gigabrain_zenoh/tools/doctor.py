@@ -185,10 +185,11 @@ def _rates(robot: Robot) -> Iterator[Finding]:
         health = robot.health.get(process)
         if health is None:
             continue
-        hz, promised = health.sent_hz.get(topic.key, 0.0), topic.hz * pace
+        key = robot.control_topic if topic is CMD_VEL else topic.key
+        hz, promised = health.sent_hz.get(key, 0.0), topic.hz * pace
         if hz < SLOW * promised and topic.key != BODY.key:
             cure = f"relieve this computer, or read the log: gigabrain log --process {process}"
-            yield _bad(topic.key, f"{hz:g} Hz from {process}, promised {promised:g}", cure)
+            yield _bad(key, f"{hz:g} Hz from {process}, promised {promised:g}", cure)
     for process, health in robot.health.items():
         for key, count in health.rejected.items():
             cure = f"find out who sends it: gigabrain topic info {key.removeprefix('robot/')}"

@@ -16,7 +16,7 @@ from serial.tools import list_ports
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.requests import Description
 from gigabrain_schemas.safety import Health
-from gigabrain_schemas.topics import HEALTH, STATE
+from gigabrain_schemas.topics import BODY, CMD_VEL, HEALTH, STATE
 from gigabrain_zenoh import running
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BusError, ConfigError
@@ -83,6 +83,7 @@ class Robot(Struct, frozen=True, kw_only=True):
     health: Mapping[str, Health] = {}  # newest, by process
     lead_ms: Mapping[str, float] = {}  # by host: how far its clock seems behind ours, at least
     state: RobotState | None = None
+    control_topic: str = CMD_VEL.key  # what its body obeys
     pace: float | None = None  # of the robot's ticks against its stamps; 1 in real time
 
 
@@ -178,14 +179,17 @@ async def _look(bus: Bus, router: str, seconds: float) -> Robot:
         lead_ms[told.host] = min(lead, lead_ms.get(told.host, lead), key=abs)
 
     bus.subscribe(HEALTH, hear)
+    bodies = bus.latest(BODY)
     bus.subscribe(STATE, lambda _key, state: states.append(state))
     there, _ = await asyncio.gather(roll_call(bus), asyncio.sleep(seconds))
+    body = bodies.current
     return Robot(
         router=router,
         there=there,
         health=health,
         lead_ms=lead_ms,
         state=states[-1] if states else None,
+        control_topic=body.description.control_topic if body else CMD_VEL.key,
         pace=_pace(states),
     )
 

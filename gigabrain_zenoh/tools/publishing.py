@@ -1,26 +1,30 @@
 """`gigabrain topic pub`: what people type becomes messages, and drives the body where it must."""
 
 import asyncio
+import getpass
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.topics import Topic
+from gigabrain_schemas.topics import CMD_VEL, Topic
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.client import Robot
+from gigabrain_zenoh.client import Robot, connect
 from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.gate import BRAIN
+from gigabrain_zenoh.recording.joining import Where
 from gigabrain_zenoh.stop_signals import stop_signals
+from gigabrain_zenoh.tools.names import OURS, not_found, short
 
+M = TypeVar("M", bound=Message)
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 LISTENERS_S = 0.5  # for those who listen to be known everywhere, before the first message goes
 
 
-def typed_in(topic: Topic[Any], words: Sequence[str]) -> Message:
+def typed_in(topic: Topic[M], words: Sequence[str]) -> M:
     """The message in `{"json": 1}`, or in words such as `linear_x=0.1 pose.x=2`.
 
     Raises ConfigError, which says what was expected, and UnknownName for a field.
@@ -37,7 +41,7 @@ def typed_in(topic: Topic[Any], words: Sequence[str]) -> Message:
         if name not in known:
             raise unknown(f"field of {topic.type.__name__}", name, known)
     try:
-        made: Message = msgspec.convert(values, topic.type)
+        made = msgspec.convert(values, topic.type)
     except msgspec.ValidationError as error:
         raise ConfigError(f"not a valid {topic.type.__name__}: {error}") from None
     return made
@@ -93,7 +97,28 @@ async def send(
     return sent
 
 
-async def drive(robot: Robot, command: CmdVel, seconds: float | None, *, take: bool) -> str:
+async def drive(
+    where: Where, name: str, words: Sequence[str], seconds: float | None, *, take: bool
+) -> str:
+    """Drive by cmd_vel, or by the key of its own that this body obeys; what became of it.
+
+    Raises UnknownName for any other key, ConfigError, and Refused.
+    """
+    command = typed_in(CMD_VEL, words)
+    async with connect(
+        where.connect,
+        namespace=where.namespace,
+        keys=where.keys,
+        source=command.source or f"{getpass.getuser()}-pub",
+        take=take,
+    ) as robot:
+        obeyed = (await robot.read_body()).control_topic
+        if OURS + short(name) not in (CMD_VEL.key, obeyed) and name != obeyed:
+            raise not_found(name, (obeyed,))
+        return await obey(robot, command, seconds, take=take)
+
+
+async def obey(robot: Robot, command: CmdVel, seconds: float | None, *, take: bool) -> str:
     """Have the body obey a command for `seconds` of its time, or until Ctrl-C; what became of it.
 
     It is asked for first, and goes back to whoever had it. Raises Refused where it is not given.

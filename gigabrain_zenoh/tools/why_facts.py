@@ -11,7 +11,16 @@ from gigabrain_schemas.body import Body, RobotState
 from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
 from gigabrain_schemas.requests import Description
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, SCAN, STATE, WORLD
+from gigabrain_schemas.topics import (
+    BODY,
+    CMD_VEL,
+    INTENT,
+    SAFETY,
+    SCAN,
+    STATE,
+    WORLD,
+    command_topic,
+)
 from gigabrain_zenoh.bench.listening import HOPS, Heard, listen
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.gate import BRAIN
@@ -44,12 +53,18 @@ class Watcher:
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
-        self._state, self._body = bus.latest(STATE), bus.latest(BODY)
+        self._state, self._body = bus.latest(STATE), bus.latest(BODY, self._join)
         self._scan, self._world = bus.latest(SCAN), bus.latest(WORLD)
         self._intent, self._safety = bus.latest(INTENT), bus.latest(SAFETY)
         self._heard = listen(bus)
         self._commands: dict[str, list[tuple[int, CmdVel]]] = {}
         bus.subscribe(CMD_VEL, self._command)
+
+    def _join(self, body: Body) -> None:
+        """A body may obey a key of its own."""
+        topic = command_topic(body.description)
+        if topic.key not in self._bus.listens:
+            self._bus.subscribe(topic, self._command)
 
     def _command(self, _key: str, command: CmdVel) -> None:
         said = self._commands.setdefault(command.source, [])

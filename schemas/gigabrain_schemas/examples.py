@@ -37,6 +37,8 @@ from gigabrain_schemas.requests import (
     EnableRequest,
     EstopRequest,
     GateReply,
+    MapReply,
+    MapRequest,
     Param,
     ParamReply,
     ParamRequest,
@@ -268,6 +270,8 @@ REQUESTS: tuple[Message, ...] = (
         stamp_ns=STAMP_NS, seq=1, boot=BOOT, tick=205,
         ok=True, text="control holds the body", robot_type="turtlebot3_waffle", gate=GATE,
     ),
+    MapRequest(name="office", replace=True, source="ann"),
+    MapReply(ok=True, text="office.yaml is saved: 9.6 x 7.2 m, 41 m² free"),
     ParamRequest(stamp_ns=STAMP_NS, seq=1, name="linear_speed", value="0.15", source="ann"),
     ParamReply(
         stamp_ns=STAMP_NS, seq=1, boot=BOOT, tick=205,

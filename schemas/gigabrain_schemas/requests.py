@@ -1,6 +1,8 @@
 """What may be asked of a robot, and what it answers."""
 
-from msgspec import field
+from typing import Annotated
+
+from msgspec import Meta, field
 
 from gigabrain_schemas.base import Count, Finite, Message, Name, Record, Text
 from gigabrain_schemas.body import GateStatus
@@ -35,6 +37,23 @@ class GateReply(Message, frozen=True, kw_only=True):
     text: Text  # a sentence for people
     robot_type: Name
     gate: GateStatus
+
+
+class MapRequest(Message, frozen=True, kw_only=True):
+    """Save the map, with the pose graph, where perception runs."""
+
+    name: Annotated[
+        str, Meta(pattern=r"^\w[\w.-]*$", max_length=64)
+    ]  # of its files, without ending
+    replace: bool = False  # another map of that name
+    source: Name = "anonymous"
+
+
+class MapReply(Message, frozen=True, kw_only=True):
+    """Whether it was saved, and where."""
+
+    ok: bool
+    text: Text  # a sentence for people
 
 
 class DescribeRequest(Message, frozen=True, kw_only=True):

@@ -108,6 +108,7 @@ ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply)
 GOAL = Service("robot/goal", tasks.GoalRequest, tasks.GoalReply)
 MISSION = Service("robot/mission", tasks.MissionRequest, tasks.MissionReply)
 TASK_CHANGE = Service("robot/task_change", tasks.TaskRequest, tasks.TaskReply)
+MAP_SAVE = Service("robot/map_save", requests.MapRequest, requests.MapReply)
 AUDIT_LOG = Service(
     "robot/audit_log", audit.AuditRequest, audit.AuditPage, priority="background",
     max_bytes=1024 * KB,
@@ -122,6 +123,7 @@ SERVICES: tuple[Service[Any, Any], ...] = (
     GOAL,
     MISSION,
     TASK_CHANGE,
+    MAP_SAVE,
     AUDIT_LOG,
     PARAM,
     DESCRIBE,

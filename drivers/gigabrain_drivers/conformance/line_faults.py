@@ -10,6 +10,7 @@ from pathlib import Path
 from gigabrain_drivers.conformance.result import Failed, Finding
 from gigabrain_drivers.conformance.rig import SHARE, Rig, stop_ticks
 from gigabrain_drivers.conformance.session import Session
+from gigabrain_drivers.conformance.stops import LATE_TICKS
 from gigabrain_drivers.conformance.subject import Subject
 from gigabrain_schemas.base import TICK_NS, Velocity
 
@@ -77,8 +78,9 @@ async def driver_killed(subject: Subject) -> Finding:
         await child.wait()
     await _until(lambda: not any(subject.told(None)), 2.0, "the motors ran on for 2 s")
     took = (loop.time() - begin) * 1e3
-    within = took <= subject.promised_ms + SLACK_MS
-    return Finding(within, f"motors told zero after {took:.0f} ms", {"motors told zero": took})
+    late = took - subject.promised_ms - SLACK_MS
+    told = f"motors told zero after {took:.0f} ms"
+    return Finding(late <= 0, told, {"motors told zero": took}, max(late, 0.0))
 
 
 def _rest_ticks(rig: Rig) -> int:
@@ -96,7 +98,7 @@ async def _cut(rig: Rig, fault: str, known_ms: float) -> Finding:
                 TOLD: lambda: not any(rig.subject.told(rig.state)),
                 RESTS: lambda: rig.rests,
             },
-            _rest_ticks(rig),
+            _rest_ticks(rig) + LATE_TICKS,
         )
         rig.wanted = None
         await rig.go_on(QUIET_TICKS)
@@ -108,12 +110,13 @@ async def _cut(rig: Rig, fault: str, known_ms: float) -> Finding:
     limits = {
         KNOWN: known_ms + SLACK_MS,
         TOLD: rig.subject.promised_ms + SLACK_MS,
-        RESTS: math.inf,
+        RESTS: _rest_ticks(rig) * TICK_NS / 1e6,
     }
-    good = all(times.get(name, math.inf) <= most for name, most in limits.items())
+    late = max(times.get(name, math.inf) - most for name, most in limits.items())
     told = [f"{n} after {times[n]:.0f} ms" if n in times else f"never {n}" for n in limits]
     again = "; then what had piled up moved it" if thawed is not None else ""
-    return Finding(good and RESTS in times and not again, ", ".join(told) + again, times)
+    missed = late if math.isfinite(late) and not again else 0.0
+    return Finding(late <= 0 and not again, ", ".join(told) + again, times, max(missed, 0.0))
 
 
 async def _until(condition: Callable[[], bool], within_s: float, what: str) -> None:

@@ -21,6 +21,7 @@ class Finding(NamedTuple):
     ok: bool
     measured: str
     times_ms: Mapping[str, float] = {}  # from the fault on, of a check that can be repeated
+    late_ms: float = 0.0  # by how much it missed a time, where nothing else is wrong
 
 
 class Result(NamedTuple):

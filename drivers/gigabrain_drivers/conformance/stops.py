@@ -15,7 +15,9 @@ from gigabrain_zenoh.limits import ZERO
 
 SILENCE = 7  # ticks: 100 ms without a command, told in the next tick
 AT_ONCE = 2
+TICK_MS = TICK_NS / 1e6
 DISORDER_TICKS = 35
+LATE_TICKS = 100  # for which a body that still moves is watched, to say how late it is
 COMMANDER = "import time\nwhile True:\n print(flush=True)\n time.sleep(0.02)\n"
 
 
@@ -54,7 +56,8 @@ async def disorder(rig: Rig) -> Finding:
     replace = msgspec.structs.replace
     at_rest: int | None = None
     begin = rig.tick
-    while rig.tick < end:
+    most = stop_ticks(rig, SILENCE)
+    while rig.tick < end or (at_rest is None and rig.tick < begin + most + LATE_TICKS):
         rig.deliver(replace(last, linear_x=back))  # a duplicate
         rig.deliver(replace(last, linear_x=back, seq=last.seq - 3))  # overtaken
         rig.deliver(replace(earlier, linear_x=back, seq=last.seq + 100))  # old, though new by count
@@ -64,9 +67,12 @@ async def disorder(rig: Rig) -> Finding:
         await rig.go_on(1)
     refused = sum(rig.refused.values()) - before
     backward = sum(1 for call in rig.tap.calls[calls:] if call.asked.linear_x * back > 0)
-    good = backward == 0 and at_rest is not None and at_rest <= stop_ticks(rig, SILENCE)
-    rest = "never at rest" if at_rest is None else f"at rest after {at_rest} ticks"
-    return Finding(good, f"{refused} refused, {backward} obeyed; {rest}")
+    text = f"{refused} refused, {backward} obeyed; "
+    if at_rest is None:
+        return Finding(False, text + "never at rest")
+    late_ms = 0.0 if backward else max((at_rest - most) * TICK_MS, 0.0)
+    good = backward == 0 and at_rest <= most
+    return Finding(good, f"{text}at rest after {at_rest} ticks", late_ms=late_ms)
 
 
 async def killed(rig: Rig) -> Finding:
@@ -108,8 +114,8 @@ async def _relay(rig: Rig, commander: asyncio.subprocess.Process) -> None:
 
 
 async def _stopped(rig: Rig, most: int) -> Finding:
-    ticks = await rig.until(lambda: rig.rests, most)
+    ticks = await rig.until(lambda: rig.rests, most + LATE_TICKS)
     if ticks is None:
-        return Finding(False, f"still moving after {most} ticks")
-    text = f"at rest after {ticks} ticks of at most {most}"
-    return Finding(True, text, {"at rest": ticks * TICK_NS / 1e6})
+        return Finding(False, f"still moving after {most + LATE_TICKS} ticks of at most {most}")
+    text, late_ms = f"at rest after {ticks} ticks of at most {most}", (ticks - most) * TICK_MS
+    return Finding(ticks <= most, text, {"at rest": ticks * TICK_MS}, max(late_ms, 0.0))

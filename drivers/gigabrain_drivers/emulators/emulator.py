@@ -88,7 +88,7 @@ class Emulator:
         try:
             faults = msgspec.convert(given, Faults, strict=False)
         except msgspec.ValidationError as error:
-            raise ConfigError(f"{words!r}: {error}") from None
+            raise ConfigError(f"{words!r}: {error}; a number goes like bit_errors=0.001") from None
         now = {name: station.faults for name, station in self.stations.items()}
         return {**now, **dict.fromkeys(wanted, faults)}
 

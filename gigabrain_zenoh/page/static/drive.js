@@ -50,8 +50,9 @@ export class Drive {
     const pad = [...(navigator.getGamepads?.() ?? [])].find(Boolean)
     if (!pad || document.hidden) return [0, 0, 0]
     const pressed = pad.buttons[PAD_STOP]?.pressed ?? false
-    if (pressed && !this.#padStopped) this.stop()
-    this.#padStopped = pressed
+    const before = this.#padStopped
+    this.#padStopped = pressed // first: to stop is to let go, which looks at the pad again
+    if (pressed && !before) this.stop()
     if (!SHOULDERS.some((n) => pad.buttons[n]?.pressed)) return [0, 0, 0]
     const axis = (n) => (Math.abs(pad.axes[n] ?? 0) < DEAD_ZONE ? 0 : -pad.axes[n])
     return [axis(1), axis(0), axis(2)]

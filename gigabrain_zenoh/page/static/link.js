@@ -1,5 +1,5 @@
 // The WebSocket: frames of one byte of kind and their content. Nothing is kept for later while it is down.
-const ABOUT = 1, MOMENT = 2, SCAN = 3, MAP = 4, HEALTH = 5, LOG = 6, REPLY = 7, IMAGE = 8
+const ABOUT = 1, MOMENT = 2, SCAN = 3, MAP = 4, HEALTH = 5, LOG = 6, REPLY = 7, IMAGE = 8, TASK = 9
 const LOGIN = 1, DRIVE = 2, ASK = 3
 const SILENT_MS = 1000, AGAIN_MS = [300, 600, 1200, 2500]
 const STRANGER = 4401, FULL = 4429
@@ -13,7 +13,7 @@ export class Link {
   #waiting = new Map()
   #heard = 0
 
-  /** `on` has about, moment, scan, map, health, log, image, state(word) and login(). */
+  /** `on` has about, moment, scan, map, task, health, log, image, state(word) and login(). */
   constructor(on, token) {
     this.on = on
     this.token = token
@@ -69,6 +69,7 @@ export class Link {
     if (kind === MOMENT) { this.#heard = performance.now(); this.#tries = 0; this.on.state('live'); this.on.moment(json()) }
     else if (kind === SCAN) this.on.scan(new Float32Array(data, 4, 9), new Float32Array(data, 40))
     else if (kind === MAP) this.on.map(new DataView(data, 4, 20), new Int8Array(data, 24))
+    else if (kind === TASK) this.on.task(json())
     else if (kind === HEALTH) this.on.health(json())
     else if (kind === LOG) this.on.log(json())
     else if (kind === REPLY) this.#answer(json())

@@ -2,7 +2,7 @@
 import { Drive } from './drive.js'
 import { Link } from './link.js'
 import { MapView } from './map.js'
-import { $, hearHealth, hearLine, put, showFigures, showGate, showImage, showSafety, showTables } from './panels.js'
+import { $, hearHealth, hearLine, put, showFigures, showGate, showImage, showSafety, showTables, showTask } from './panels.js'
 
 const STOP_MS = 2500 // the server gives up after two seconds
 const HANDS = 'press the hardware e-stop or cut the power'
@@ -35,6 +35,10 @@ const link = new Link({
   },
   scan: (head, ranges) => map.setScan(head, ranges),
   map: (head, cells) => map.setMap(head, cells),
+  task(status) {
+    map.setTask(status)
+    showTask(status, looking())
+  },
   health: hearHealth,
   log: hearLine,
   image: showImage,
@@ -103,7 +107,7 @@ async function sendGoal(goal) {
   map.goal = goal
   show($('goal'), 'asking …', 'note')
   const reply = await link.ask('goal', { goal: { x: goal.x, y: goal.y, yaw: goal.yaw } })
-  if (!reply.ok) map.goal = null
+  if (!reply.ok) map.goal = map.task?.goal ?? null
   show($('goal'), reply.text, `note${reply.ok ? '' : ' bad'}`)
   map.draw()
 }
@@ -115,7 +119,7 @@ function show(element, text, kind) {
 
 $('estop').addEventListener('pointerdown', (event) => { event.preventDefault(); stop() })
 $('estop').addEventListener('click', (event) => { if (event.detail === 0) stop() }) // by keyboard or by a screen reader
-for (const what of ['release', 'enable', 'take']) $(what).addEventListener('click', () => ask(what))
+for (const what of ['release', 'enable', 'take', 'cancel']) $(what).addEventListener('click', () => ask(what))
 $('share').addEventListener('input', () => put($('percent'), `${$('share').value} %`))
 $('closer').addEventListener('click', () => map.zoom(1.3))
 $('farther').addEventListener('click', () => map.zoom(1 / 1.3))

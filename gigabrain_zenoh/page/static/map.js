@@ -1,8 +1,10 @@
 // The map: what is known of the place, the robot in it, and where it means to go. Drawn when there is news.
+import { ON_ROBOT } from './layers.js'
+
 const CELL_M = 0.05, SIDE = 1200 // of what the scan has left behind, where there is no map
 const HEADING_M = 0.1 // a shorter drag gives a place and no heading
 const TAU = 2 * Math.PI
-const COLOURS = ['floor', 'grid', 'wall', 'scan', 'plan', 'zone', 'trail', 'seen', 'robot', 'ink']
+const COLOURS = ['floor', 'grid', 'wall', 'scan', 'plan', 'zone', 'trail', 'seen', 'robot', 'thing', 'ink']
 
 export class MapView {
   #scale = 90 // pixels per metre
@@ -25,7 +27,7 @@ export class MapView {
   clear() {
     this.seen = new OffscreenCanvas(SIDE, SIDE)
     this.trail = []
-    this.scan = this.map = this.goal = this.moment = null
+    this.scan = this.map = this.goal = this.moment = this.task = null
   }
 
   recolour() {
@@ -68,6 +70,13 @@ export class MapView {
     const [width, height] = [12, 16].map((at) => head.getUint32(at, true))
     this.map = { resolution, x, y, width, height, cells: cells.slice() }
     this.#paintMap()
+    this.draw()
+  }
+
+  /** What the robot is at: its way and its goal, in the map. */
+  setTask(task) {
+    this.task = task
+    this.goal = task.goal
     this.draw()
   }
 
@@ -121,14 +130,20 @@ export class MapView {
       pen.save()
       pen.translate(moment.pose.x, moment.pose.y)
       pen.rotate(moment.pose.yaw)
-      this.#paintFree(pen)
-      this.#paintZones(pen)
-      this.#paintObstacles(pen)
-      this.#paintPlan(pen)
-      this.#paintRobot(pen)
+      for (const paint of ON_ROBOT) paint(pen, this)
       pen.restore()
     }
+    this.#paintWay(pen)
     this.#paintGoal(pen)
+  }
+
+  #paintWay(pen) {
+    const path = this.task?.path ?? []
+    pen.beginPath()
+    path.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)))
+    pen.setLineDash([8 * this.pixel, 6 * this.pixel])
+    this.stroke(pen, this.colour.plan, 2)
+    pen.setLineDash([])
   }
 
   #paintGrid(pen, w, h) {
@@ -137,7 +152,7 @@ export class MapView {
     pen.beginPath()
     for (let x = Math.ceil((cx - half[0]) / step) * step; x < cx + half[0]; x += step) { pen.moveTo(x, cy - half[1]); pen.lineTo(x, cy + half[1]) }
     for (let y = Math.ceil((cy - half[1]) / step) * step; y < cy + half[1]; y += step) { pen.moveTo(cx - half[0], y); pen.lineTo(cx + half[0], y) }
-    this.#stroke(pen, this.colour.grid, 1)
+    this.stroke(pen, this.colour.grid, 1)
   }
 
   #paintPlace(pen) {
@@ -153,83 +168,10 @@ export class MapView {
     else put(this.seen, (-SIDE / 2) * CELL_M, (-SIDE / 2) * CELL_M, CELL_M)
     pen.beginPath()
     this.trail.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)))
-    this.#stroke(pen, this.colour.trail, 2)
+    this.stroke(pen, this.colour.trail, 2)
     pen.fillStyle = this.colour.scan
     const size = 3.5 * this.pixel
     for (const [x, y] of this.scan ?? []) pen.fillRect(x - size / 2, y - size / 2, size, size)
-  }
-
-  /** The nearest thing in each sector, as perception sees it. */
-  #paintFree(pen) {
-    const sectors = this.moment.world?.sectors ?? []
-    pen.beginPath()
-    sectors.forEach((distance, i) => {
-      if (distance === null) return
-      const middle = (i * TAU) / sectors.length, half = (0.42 * TAU) / sectors.length
-      pen.moveTo(distance * Math.cos(middle - half), distance * Math.sin(middle - half))
-      pen.arc(0, 0, distance, middle - half, middle + half)
-    })
-    pen.globalAlpha = 0.5
-    this.#stroke(pen, this.colour.zone, 1.5)
-    pen.globalAlpha = 1
-  }
-
-  /** What must be free for the body to stop at its present speed. */
-  #paintZones(pen) {
-    const { body, moment: { state } } = this
-    if (!body || !state) return
-    const v = state.velocity.linear_x, t = body.thresholds
-    const reach = Math.abs(v) * t.reaction_time + (v * v) / (2 * body.max_linear_deceleration) + t.stop_margin
-    const xs = body.footprint.map((p) => p[0]), ys = body.footprint.map((p) => p[1])
-    const left = Math.max(...ys), right = Math.min(...ys)
-    pen.globalAlpha = 0.45
-    pen.fillStyle = this.colour.zone
-    if (v >= 0) pen.fillRect(Math.max(...xs), right, reach, left - right)
-    else pen.fillRect(Math.min(...xs) - reach, right, reach, left - right)
-    pen.globalAlpha = 1
-  }
-
-  /** What perception follows, and where it will be in a second; in the frame of the odometry. */
-  #paintObstacles(pen) {
-    const { world, state } = this.moment
-    if (!world || !state) return
-    pen.save()
-    pen.rotate(-state.pose.yaw)
-    pen.translate(-state.pose.x, -state.pose.y)
-    pen.beginPath()
-    for (const { x, y, radius, velocity_x: vx, velocity_y: vy } of world.obstacles) {
-      pen.moveTo(x + radius, y)
-      pen.arc(x, y, radius, 0, TAU)
-      pen.moveTo(x, y)
-      pen.lineTo(x + vx, y + vy)
-    }
-    this.#stroke(pen, this.colour.scan, 2)
-    pen.restore()
-  }
-
-  #paintPlan(pen) {
-    const points = this.moment.intent?.trajectory ?? []
-    pen.beginPath()
-    pen.moveTo(0, 0)
-    for (const [, x, y] of points) pen.lineTo(x, y)
-    this.#stroke(pen, this.colour.plan, 3)
-  }
-
-  #paintRobot(pen) {
-    const outline = this.body?.footprint ?? []
-    pen.beginPath()
-    outline.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)))
-    pen.closePath()
-    pen.fillStyle = this.colour.robot
-    pen.fill()
-    this.#stroke(pen, this.colour.ink, 2)
-    const size = Math.max(0.07, 7 * this.pixel)
-    pen.beginPath()
-    pen.moveTo(size, 0)
-    pen.lineTo(-size * 0.7, size * 0.7)
-    pen.lineTo(-size * 0.7, -size * 0.7)
-    pen.fillStyle = this.colour.plan
-    pen.fill()
   }
 
   #paintGoal(pen) {
@@ -242,10 +184,10 @@ export class MapView {
       pen.moveTo(goal.x, goal.y)
       pen.lineTo(goal.x + 3.5 * size * Math.cos(goal.yaw), goal.y + 3.5 * size * Math.sin(goal.yaw))
     }
-    this.#stroke(pen, this.colour.plan, 3)
+    this.stroke(pen, this.colour.plan, 3)
   }
 
-  #stroke(pen, colour, pixels) {
+  stroke(pen, colour, pixels) {
     pen.strokeStyle = colour
     pen.lineWidth = pixels * this.pixel
     pen.stroke()

@@ -85,6 +85,27 @@ export function showSafety(safety, body) {
   }))
 }
 
+/** What the robot was sent to do, how far it is, and what became of the last one. */
+export function showTask(status, looking) {
+  const { current } = status
+  $('cancel').hidden = looking || !current
+  $('goal').className = current || status.done[0]?.state !== 'failed' ? 'note' : 'note bad'
+  put($('goal'), current ? present(status) : lastTask(status.done[0]))
+}
+
+function present({ current, doing, distance_remaining: left, eta, queue }) {
+  const words = [current.state === 'paused' ? `paused: ${doing}` : doing || current.label]
+  if (left != null) words.push(`${left.toFixed(1)} m left`)
+  if (eta != null) words.push(`about ${since(eta)}`)
+  if (current.reason) words.push(current.reason)
+  if (queue.length) words.push(`then ${queue.map((task) => task.label).join(', ')}`)
+  return words.join(' · ')
+}
+
+function lastTask(task) {
+  return task ? [`${task.label}: ${task.state}`, task.reason].filter(Boolean).join(' · ') : ''
+}
+
 const healths = new Map() // process -> [health, when]
 
 export function hearHealth(health) {

@@ -1,0 +1,207 @@
+"""From an order to a route: where to go next, which way through the map, and when to give up."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.behaviours.bearings import Driven, Floats, Route
+from gigabrain_zenoh.navigation.costmap import Costmap, costmap, inflation
+from gigabrain_zenoh.navigation.frontiers import frontiers
+from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable
+from gigabrain_zenoh.tasks.orders import GoTo, Order, Visit
+
+GIVE_UP_TICKS = 1500  # 30 s of driving without coming any nearer
+LEAVE_TICKS = 500  # 10 s, for a place that is only to be looked at
+NEARER_M = 0.3  # what counts as nearer
+REMEMBERED_TICKS = 500  # 10 s, that what was in the way stays in the plans
+MUCH_BETTER_M = 1.5  # so much better has another frontier to be, or it goes to and fro
+OPEN, FAR_M = 2.0, 1.5  # cost of a place worth visiting, and the way there at least [m]
+SURE_TICKS = 125  # 2.5 s: the map comes once a second
+SAME_M = 0.6  # a frontier so near is the same one: it moves as the map grows
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Asked:
+    """What a route is wanted for."""
+
+    tick: int
+    driving: bool  # the gate lets it drive
+    order: Order
+    here: Pose  # in the map
+    grid: OccupancyGrid
+    body: BodyDescription
+    driven: Driven | None  # what became of the last route
+    seen: Floats  # (n, 2) [m], what is round the robot now, in the map
+
+
+class Guide:
+    """Plans route after route. Not for two threads at once."""
+
+    def __init__(self) -> None:
+        self._planner = Planner()
+        self._costmap: Costmap | None = None
+        self._drawn: tuple[object, ...] = ()
+        self._in_the_way: Floats = np.empty((0, 2))
+        self._in_the_way_tick = 0
+        self._version = 0
+        self._forget(0, 0)
+
+    def think(self, asked: Asked) -> Route:
+        """The route for an order, from here."""
+        anew = asked.tick < self._last_tick  # the driver has been started anew
+        if anew or asked.order.number != self._number:
+            self._forget(asked.order.number, asked.tick)
+        self._note(asked)
+        chart = self._chart(asked)
+        if isinstance(asked.order, GoTo):
+            return self._to(asked.order.goal, asked, chart)
+        if isinstance(asked.order, Visit):
+            return self._to(self._goal or self._anywhere(asked, chart), asked, chart)
+        return self._onward(asked, chart)
+
+    def check(self, grid: OccupancyGrid, body: BodyDescription, here: Pose, goal: Goal) -> str:
+        """The way to a goal in words; `no: …` where there is none."""
+        chart = costmap(grid, inflation(body), before=None)
+        found = Planner().plan(chart, (here.x, here.y), (goal.x, goal.y))
+        if isinstance(found, Unreachable):
+            return f"no: {found.reason}"
+        return f"on the way, {found.remaining[0]:.1f} m"
+
+    def _forget(self, number: int, tick: int) -> None:
+        self._number = number
+        self._path: Path | None = None
+        self._goal: Goal | None = None
+        self._been: list[tuple[float, float]] = []
+        self._nearest, self._nearest_tick, self._last_tick = math.inf, tick, tick
+        self._open_tick = tick  # when there was something left to be seen
+        self._version += 1
+
+    def _note(self, asked: Asked) -> None:
+        """Take note of what became of the last route."""
+        driven = asked.driven
+        if not asked.driving:  # whoever is held back by the gate is not stuck
+            self._nearest_tick += max(0, asked.tick - self._last_tick)
+        self._last_tick = asked.tick
+        if driven and driven.blocked and driven.version == self._version:
+            self._in_the_way, self._in_the_way_tick = asked.seen, asked.tick
+        elif asked.tick - self._in_the_way_tick > REMEMBERED_TICKS:
+            self._in_the_way = np.empty((0, 2))
+
+    def _chart(self, asked: Asked) -> Costmap:
+        drawn = (asked.grid, asked.body, self._in_the_way_tick if len(self._in_the_way) else 0)
+        same = self._drawn and all(
+            a is b or a == b for a, b in zip(drawn, self._drawn, strict=True)
+        )
+        if self._costmap is None or not same:
+            rules = inflation(asked.body)
+            self._costmap = costmap(asked.grid, rules, self._in_the_way, self._costmap)
+            self._drawn = drawn
+        return self._costmap
+
+    def _to(self, goal: Goal, asked: Asked, chart: Costmap) -> Route:
+        first = self._goal is None
+        found = self._plan(goal, asked.here, chart)
+        if isinstance(found, Unreachable):
+            if first or self._stuck(asked, GIVE_UP_TICKS):
+                return self._ended("failed", found.reason)
+            return self._waiting(found.reason)
+        self._measure(found, asked.tick)
+        if self._stuck(asked, GIVE_UP_TICKS):
+            left = f"{found.remaining[0]:.1f} m before the goal"
+            return self._ended("failed", f"no nearer for 30 s, {left}: something is in the way")
+        return self._going(goal, found)
+
+    def _anywhere(self, asked: Asked, chart: Costmap) -> Goal:
+        """A place in the open that can be reached; where it is, if there is no other."""
+        start, here = chart.cell(asked.here.x, asked.here.y), asked.here
+        if start is not None:
+            way = self._planner.search.field(chart.cost, start, "from") * chart.resolution
+            rows, columns = np.nonzero((chart.cost < OPEN) & (way > FAR_M) & np.isfinite(way))
+            if len(rows):
+                one = int(np.random.default_rng(asked.order.number).integers(len(rows)))
+                x, y = chart.points(rows[one : one + 1], columns[one : one + 1])[0].tolist()
+                return Goal(x=x, y=y)
+        return Goal(x=here.x, y=here.y)
+
+    def _onward(self, asked: Asked, chart: Costmap) -> Route:
+        """To the next place from which something new can be seen."""
+        here = asked.here.x, asked.here.y
+        arrived = asked.driven is not None and asked.driven.arrived
+        if self._goal and (arrived or self._stuck(asked, LEAVE_TICKS)):
+            self._been.append((self._goal.x, self._goal.y))
+            self._leave(asked.tick)
+        for _ in range(len(self._been) + 10):
+            goal = self._frontier(chart, here)
+            if goal is None:
+                return self._mapped(asked, chart)
+            self._open_tick = asked.tick
+            if self._goal and math.hypot(goal.x - self._goal.x, goal.y - self._goal.y) > SAME_M:
+                self._leave(asked.tick)
+            found = self._plan(goal, asked.here, chart)
+            if isinstance(found, Path):
+                self._measure(found, asked.tick)
+                return self._going(goal, found)
+            self._been.append((goal.x, goal.y))
+        return self._waiting("no way leads to what is still unknown")
+
+    def _mapped(self, asked: Asked, chart: Costmap) -> Route:
+        """Nothing is left to be seen, if that is still so once the map has caught up."""
+        cell = chart.cell(asked.here.x, asked.here.y)
+        if cell is None or chart.cells[cell] < 0:
+            return self._waiting("the map does not reach here yet")
+        if asked.tick - self._open_tick < SURE_TICKS:
+            return self._waiting("nothing new in sight; looking once more")
+        return self._ended("done", "all is mapped that can be reached")
+
+    def _frontier(self, chart: Costmap, here: tuple[float, float]) -> Goal | None:
+        """The best frontier; the present one, unless another is much better."""
+        found = frontiers(chart, here, self._been, self._planner.search)
+        if not found:
+            return None
+        best = min(found, key=lambda one: one.score)
+        if self._goal:
+            x, y = self._goal.x, self._goal.y
+            same = min(found, key=lambda one: math.hypot(one.x - x, one.y - y))
+            near = math.hypot(same.x - x, same.y - y) <= SAME_M
+            if near and same.score < best.score + MUCH_BETTER_M:
+                best = same
+        return Goal(x=best.x, y=best.y)
+
+    def _plan(self, goal: Goal, here: Pose, chart: Costmap) -> Path | Unreachable:
+        start, end = (here.x, here.y), (goal.x, goal.y)
+        if self._path is None or goal != self._goal:
+            found = self._planner.plan(chart, start, end)
+        else:
+            found = self._planner.replan(chart, start, end, self._path)
+        self._goal = goal
+        self._path = found if isinstance(found, Path) else None
+        return found
+
+    def _measure(self, path: Path, tick: int) -> None:
+        left = float(path.remaining[0])
+        if left < self._nearest - NEARER_M:
+            self._nearest, self._nearest_tick = left, tick
+
+    def _stuck(self, asked: Asked, ticks: int) -> bool:
+        return asked.tick - self._nearest_tick > ticks
+
+    def _leave(self, tick: int) -> None:
+        """This goal is done with; the next is another."""
+        self._goal = self._path = None
+        self._nearest, self._nearest_tick = math.inf, tick
+        self._version += 1
+
+    def _going(self, goal: Goal, path: Path) -> Route:
+        return Route(number=self._number, version=self._version, goal=goal, points=path.points)
+
+    def _waiting(self, reason: str) -> Route:
+        return Route(number=self._number, version=self._version, reason=reason)
+
+    def _ended(self, state: Literal["done", "failed"], reason: str) -> Route:
+        return Route(number=self._number, version=self._version, state=state, reason=reason)

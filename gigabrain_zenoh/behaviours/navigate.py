@@ -1,0 +1,163 @@
+"""Be where it is wanted: along a way through the map, round whatever is near."""
+
+import math
+
+import numpy as np
+
+from gigabrain_schemas.arrays import hits
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.brain import Intent, WorldModel
+from gigabrain_schemas.tasks import MOST_POINTS, Goal
+from gigabrain_zenoh.behaviours import Situation
+from gigabrain_zenoh.behaviours.bearings import Bearings, Driven, Floats, Route
+from gigabrain_zenoh.navigation import local
+from gigabrain_zenoh.planar import compose, inverse
+from gigabrain_zenoh.settings import DecisionConfig
+from gigabrain_zenoh.tasks.orders import Explore, Order, Outcome, where
+
+TOO_LATE_TICKS = 10  # a scan so old is not to be driven by
+
+
+class Navigate:
+    """Drives along a route. Without an order, or where anything is uncertain, it stands."""
+
+    def __init__(self, config: DecisionConfig) -> None:
+        self._config = config
+        self._planner: local.LocalPlanner | None = None
+        self._body: object = None
+        self._longest = 0.0  # [m], of the present order: what progress is measured by
+        self._number = 0
+        self.outcome: Outcome | None = None  # of the order, as of the last step
+        self.driven: Driven | None = None
+
+    def step(self, situation: Situation) -> Intent:
+        """What to do now, with the reason in words."""
+        self.outcome = self.driven = None
+        world, bearings = situation.world, situation.bearings
+        why = _why_not(situation)
+        if why or world is None or bearings is None:
+            return _stand(why)
+        order, route = bearings.order, bearings.route
+        if order is None:
+            return _stand("waiting: for a goal")
+        if route is None or route.number != order.number:
+            return _stand("waiting: for a way through the map")
+        if order.number != self._number:
+            self._number, self._longest = order.number, 0.0
+        if route.goal is None or route.points is None:
+            self.outcome = Outcome(number=order.number, state=route.state, reason=route.reason)
+            return _stand(f"waiting: {route.reason}")
+        return self._drive(situation.pose, world, bearings, route)
+
+    def _drive(self, pose: Pose, world: WorldModel, bearings: Bearings, route: Route) -> Intent:
+        assert bearings.map_from_odom
+        assert route.goal
+        assert route.points is not None
+        to_odom, goal = inverse(bearings.map_from_odom), route.goal
+        there = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
+        yaw = None if goal.yaw is None else there.yaw
+        moment = local.Moment(
+            tick=bearings.tick,
+            pose=pose,
+            velocity=bearings.velocity,
+            goal=local.Goal(x=there.x, y=there.y, yaw=yaw),
+            hits=hits(world).astype(np.float64),
+            path=moved(to_odom, route.points),
+            obstacles=world.obstacles,
+            response=bearings.response,
+            sent=bearings.sent,
+        )
+        plan = self._planner_for(bearings).plan(moment)
+        here = compose(bearings.map_from_odom, pose)
+        self._tell(plan, here, bearings, route)
+        assert self.outcome
+        return Intent(
+            twist=plan.twist,
+            trajectory=plan.trajectory,
+            follow=bool(plan.trajectory),
+            response=bearings.response,
+            progress=self.outcome.progress,
+            behaviour="navigate",
+            reason=f"{_headline(bearings.order, goal)}: {plan.reason}"[:500],
+        )
+
+    def _tell(self, plan: local.LocalPlan, here: Pose, bearings: Bearings, route: Route) -> None:
+        assert bearings.order
+        assert bearings.body
+        assert route.goal
+        assert route.points is not None
+        order, goal = bearings.order, route.goal
+        left = _ahead(route.points, here)
+        distance = float(np.hypot(*np.diff(left, axis=0).T).sum())
+        self._longest = max(self._longest, distance, 1e-6)
+        self.driven = Driven(version=route.version, arrived=plan.arrived, blocked=plan.blocked)
+        arrived = plan.arrived and not isinstance(order, Explore)
+        speed = min(self._config.speed_limit or math.inf, bearings.body.max_linear_speed)
+        self.outcome = Outcome(
+            number=order.number,
+            state="done" if arrived else "running",
+            reason=f"at {where(goal)}" if arrived else plan.reason,
+            progress=1.0 if arrived else 1.0 - min(1.0, distance / self._longest),
+            distance=distance,
+            eta=distance / speed,
+            goal=goal,
+            path=_thinned(left),
+        )
+
+    def _planner_for(self, bearings: Bearings) -> local.LocalPlanner:
+        body = bearings.body
+        assert body
+        if self._planner is None or body != self._body:
+            settings = local.LocalSettings(linear_speed=self._config.speed_limit)
+            self._planner, self._body = local.LocalPlanner(body, settings), body
+        return self._planner
+
+
+def _why_not(situation: Situation) -> str:
+    """Why it must not drive now, whatever is wanted; or an empty text."""
+    world, bearings = situation.world, situation.bearings
+    if situation.must_charge:
+        return "resting: the battery is nearly empty; charge it"
+    if world is None or bearings is None:
+        return "waiting: perception is silent"
+    if not world.scan_ok:
+        return f"waiting: {world.scan_problem}"
+    if bearings.body is None:
+        return "waiting: the driver has not said what body this is"
+    if bearings.lost and bearings.order is not None:
+        return f"waiting: {bearings.lost}"
+    if bearings.late_ticks > TOO_LATE_TICKS:
+        late_s = bearings.late_ticks * 0.02
+        return f"waiting: this host is too busy, its newest scan is {late_s:.2f} s old"
+    return ""
+
+
+def _headline(order: Order | None, goal: Goal) -> str:
+    """What it is at: the same for as long as that does not change."""
+    return "exploring" if isinstance(order, Explore) else f"going to {where(goal)}"
+
+
+def _stand(reason: str) -> Intent:
+    return Intent(twist=Velocity(), behaviour="navigate", reason=reason[:500])
+
+
+def moved(frame: Pose, points: Floats) -> Floats:
+    """Points (n, 2) given in `frame`, in the frame that `frame` is given in."""
+    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
+    turned: Floats = points @ np.array(((cosine, sine), (-sine, cosine)))
+    there: Floats = turned + np.array((frame.x, frame.y))
+    return there
+
+
+def _ahead(points: Floats, here: Pose) -> Floats:
+    """What is left of a path, from here on: (k, 2), at least two points."""
+    nearest = int(np.argmin(np.hypot(points[:, 0] - here.x, points[:, 1] - here.y)))
+    rest = points[nearest + 1 :] if nearest + 1 < len(points) else points[-1:]
+    return np.vstack(((here.x, here.y), rest))
+
+
+def _thinned(points: Floats) -> tuple[tuple[float, float], ...]:
+    """Few enough of them to be drawn, with the first and the last."""
+    count = min(len(points), MOST_POINTS)
+    chosen = np.linspace(0, len(points) - 1, count).round().astype(int)
+    return tuple((round(x, 3), round(y, 3)) for x, y in points[chosen].tolist())

@@ -1,0 +1,158 @@
+"""SLAM in a simulated world against the physics' truth, on what perception itself calls."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from msgspec import Struct
+
+from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.body import Lidar
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.bench.figures import Figures, figures
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.health import rss_bytes
+from gigabrain_zenoh.mapper import view_of
+from gigabrain_zenoh.mapping.fusion import Fusion, Moment, uncertainty
+from gigabrain_zenoh.mapping.growing import GrowingMap
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, inverse
+from gigabrain_zenoh.process import find
+from gigabrain_zenoh.settings import PerceptionConfig
+
+PATIENCE_S = 60.0  # so that a slow machine makes the same map
+COLD = 20  # scans before anything is timed
+TICKS_A_MINUTE = round(60e9 / TICK_NS)
+
+Progress = Callable[[], None]  # called after each minute
+
+
+class Off(Struct, frozen=True, kw_only=True):
+    """How far poses are from the truth, both having begun in the same place."""
+
+    mean_m: float
+    max_m: float
+    mean_deg: float
+    max_deg: float
+
+
+class WorldResult(Struct, frozen=True, kw_only=True):
+    """One world. Times are of the CPU, which is what a free core would take."""
+
+    world: str
+    body: str
+    seed: int
+    minutes: float
+    driven_m: float
+    contacts: int
+    scans: int
+    not_localized: int  # scans
+    keyframes: int
+    loops: int
+    drawn_anew: int
+    fused: Off  # odometry with gyro
+    slam: Off
+    last_minute: Off
+    scan: Figures
+    grew_mb: float  # this process, from the second minute to the last
+
+
+class WorldsResult(Struct, frozen=True, kw_only=True):
+    """All worlds."""
+
+    worlds: tuple[WorldResult, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Toured:
+    """A world that was mapped, with all that it takes to draw it."""
+
+    result: WorldResult
+    grid: OccupancyGrid
+    poses: Floats  # (n, 3), as mapped, in the map
+    truth: Floats  # (n, 3), in the map
+
+
+def tour(body: str, world: str, seed: int, minutes: float, progress: Progress) -> Toured:
+    """Let the body roam the world for so long. Raises ConfigError."""
+    roaming = find("gigabrain_drivers.sim.tour:Tour")(body, world, seed)
+    run = _Run(GrowingMap(PATIENCE_S))
+    memory = [0, 0]
+    for count, moment in enumerate(roaming.moments(round(minutes * TICKS_A_MINUTE)), 1):
+        run.fusion.add(moment.state, roaming.body)
+        if moment.scan:
+            run.scan(roaming.body.lidar, moment.scan, np.array(moment.truth))
+        if count % TICKS_A_MINUTE == 0:
+            memory = [memory[0] or rss_bytes(), rss_bytes()]
+            progress()
+    if not run.poses:
+        raise ConfigError(f"--minutes: {minutes:g} is too short for a scan")
+    truth, report = roaming.simulation.truth, run.chart.report()
+    grid = run.chart.grid()
+    run.chart.close()
+    poses, seen, fused = np.array(run.poses), run.in_map(), np.array(run.fused)
+    off = between(seen, poses)
+    begun = compose(poses[0], inverse(fused[0]))
+    result = WorldResult(
+        world=world,
+        body=body,
+        seed=seed,
+        minutes=minutes,
+        driven_m=round(truth.distance_m, 1),
+        contacts=truth.contacts,
+        scans=len(poses),
+        not_localized=run.not_localized,
+        keyframes=report["keyframes"],
+        loops=report["loops"],
+        drawn_anew=report["drawn_anew"],
+        fused=_off(between(seen, compose(begun, fused))),
+        slam=_off(off),
+        last_minute=_off(off[-600:]),
+        scan=figures(run.took_ms[COLD:]),
+        grew_mb=(memory[1] - memory[0]) / 1e6,
+    )
+    return Toured(result=result, grid=grid, poses=poses, truth=seen)
+
+
+class _Run:
+    """What perception does with scans and states, and what came of it."""
+
+    def __init__(self, chart: GrowingMap) -> None:
+        self.chart, self.fusion, self.not_localized = chart, Fusion(), 0
+        self.poses: list[Floats] = []
+        self.fused: list[Floats] = []
+        self.took_ms: list[float] = []
+        self._truth: list[Floats] = []  # in the world
+        self._last: Moment | None = None
+
+    def scan(self, lidar: Lidar, scan: LaserScan, truth: Floats) -> None:
+        """One scan, taken at `truth` (3,)."""
+        moment = self.fusion.at(scan.basis)
+        if moment is None:
+            return
+        began = time.thread_time()
+        view = view_of(lidar, scan, PerceptionConfig().ignore_below)
+        motion = between(self._last.fused, moment.fused) if self._last else IDENTITY
+        place = self.chart.step(view, motion, uncertainty(motion, slipping=moment.slipping))
+        self.took_ms.append((time.thread_time() - began) * 1e3)
+        self._last = moment
+        self.not_localized += not place.localized
+        self.poses.append(place.pose)
+        self.fused.append(moment.fused)
+        self._truth.append(truth)
+
+    def in_map(self) -> Floats:
+        """The truth (n, 3), as seen from where the map began."""
+        begun = compose(self.poses[0], inverse(self._truth[0]))
+        return compose(begun, np.array(self._truth))
+
+
+def _off(off: Floats) -> Off:
+    away, turn = np.hypot(off[:, 0], off[:, 1]), np.degrees(np.abs(off[:, 2]))
+    return Off(
+        mean_m=float(away.mean()),
+        max_m=float(away.max()),
+        mean_deg=float(turn.mean()),
+        max_deg=float(turn.max()),
+    )

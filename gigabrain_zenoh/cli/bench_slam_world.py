@@ -1,0 +1,75 @@
+"""The part of `gigabrain bench slam` that maps simulated worlds."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gigabrain_zenoh.cli.checked import above_zero
+from gigabrain_zenoh.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from gigabrain_zenoh.bench.slam_world import Off, WorldResult
+
+
+def slam_world(
+    worlds: Sequence[str], minutes: float, body: str, seed: int, png: Path | None, json: Path | None
+) -> int:
+    """Let a robot roam each of the worlds, and show what its maps are worth."""
+    import msgspec
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from gigabrain_zenoh.bench.slam_world import WorldsResult, tour
+    from gigabrain_zenoh.bench.slam_world_picture import draw
+
+    above_zero("minutes", minutes)
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        tasks = [progress.add_task(world, total=minutes) for world in worlds]
+        toured = [
+            tour(body, world, seed, minutes, partial(progress.advance, task))
+            for world, task in zip(worlds, tasks, strict=True)
+        ]
+    result = WorldsResult(worlds=tuple(one.result for one in toured))
+    if png:
+        draw(toured, png)
+    if json:
+        try:
+            json.write_bytes(msgspec.json.format(msgspec.json.encode(result)) + b"\n")
+        except OSError as error:
+            raise ConfigError(f"cannot write {json}: {error.strerror}") from None
+    Console().print(_table(result.worlds))
+    return 0
+
+
+def _table(worlds: "Sequence[WorldResult]") -> "Table":
+    from rich.table import Table
+
+    table = Table(
+        title="Errors of poses against the physics: mean, most",
+        caption=f"{worlds[0].body}, seed {worlds[0].seed}. Times are of the CPU.",
+    )
+    table.add_column("")
+    for one in worlds:
+        table.add_column(one.world, justify="right")
+    rows = {
+        "driven, in minutes": [f"{one.driven_m:g} m, {one.minutes:g}" for one in worlds],
+        "contacts": [str(one.contacts) for one in worlds],
+        "scans, not localized": [f"{one.scans}, {one.not_localized}" for one in worlds],
+        "keyframes": [str(one.keyframes) for one in worlds],
+        "loops closed, drawn anew": [f"{one.loops}, {one.drawn_anew}" for one in worlds],
+        "odometry with gyro": [_off(one.fused) for one in worlds],
+        "map": [_off(one.slam) for one in worlds],
+        "map, last minute": [_off(one.last_minute) for one in worlds],
+        "scan p50, p99 [ms]": [f"{o.scan.p50_ms:.1f}, {o.scan.p99_ms:.1f}" for o in worlds],
+        "memory, second minute to last": [f"+{one.grew_mb:.0f} MB" for one in worlds],
+    }
+    for title, cells in rows.items():
+        table.add_row(title.replace("[", "\\["), *cells)
+    return table
+
+
+def _off(off: "Off") -> str:
+    return f"{off.mean_m:.3f}, {off.max_m:.3f} m; {off.mean_deg:.2f}, {off.max_deg:.2f}°"

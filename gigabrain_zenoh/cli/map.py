@@ -1,0 +1,74 @@
+"""`gigabrain map`: save the map that a robot makes, and look at saved ones."""
+
+from gigabrain_zenoh.cli.where import HERE, Which, say
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
+
+PATIENCE_S = 20.0  # a large map takes a while to write
+
+
+def save(name: str, /, *, at: Which = HERE, replace: bool = False) -> int:
+    """Save the map that perception makes, where perception runs.
+
+    Example: gigabrain map save office
+
+    An empty map is refused, and one in which the robot does not know where it is.
+
+    Parameters
+    ----------
+    name
+        Of the files: NAME.yaml and NAME.pgm for ROS, NAME.graph.npz to go on with.
+    replace
+        Another map of that name.
+    """
+    import asyncio
+    import getpass
+
+    import msgspec
+
+    from gigabrain_schemas.requests import MapRequest
+    from gigabrain_schemas.topics import MAP_SAVE
+    from gigabrain_zenoh.recording.joining import joined
+    from gigabrain_zenoh.tools.hearing import NAME
+
+    try:
+        fields = {"name": name, "replace": replace, "source": getpass.getuser()}
+        request = msgspec.convert(fields, MapRequest)
+    except msgspec.ValidationError:
+        raise ConfigError(f"no name for a map: {name!r}; expected letters, digits, - _ .") from None
+
+    async def ask() -> None:
+        async with joined(at.where(), NAME) as (bus, _):
+            replies = await bus.ask(MAP_SAVE, request, timeout_s=PATIENCE_S)
+        if not replies:
+            raise BodyLost(
+                "nobody makes a map: perception needs `mapping: slam`; or may your keys not ask?"
+            )
+        if not replies[0].ok:
+            raise Refused(replies[0].text)
+        say(replies[0].text)
+
+    asyncio.run(ask())
+    return 0
+
+
+def info(name: str, /) -> int:
+    """Check a saved map, and tell its size.
+
+    Example: gigabrain map info office
+
+    Parameters
+    ----------
+    name
+        Its name, or the path of its YAML file.
+    """
+    from gigabrain_zenoh.mapping import map_file
+
+    path = map_file.path_of(name)
+    saved = map_file.load(path)
+    say(f"{path}: {map_file.in_words(saved)}, {saved.resolution:g} m a cell")
+    if path.with_suffix(map_file.GRAPH).exists():
+        graph = map_file.load_graph(path)
+        say(f"pose graph: {len(graph.get('poses', ()))} keyframes; mapping can go on from it")
+    else:
+        say("no pose graph: the robot can find its way in it, but not go on mapping")
+    return 0

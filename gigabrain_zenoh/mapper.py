@@ -1,0 +1,195 @@
+"""What perception does beside the world: where the robot is in the map, and the map itself.
+
+It comes after the world of the same scan, and takes the odometry of the scan's own tick.
+"""
+
+import asyncio
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+
+from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.body import Body, Lidar, RobotState
+from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
+from gigabrain_schemas.requests import MapReply, MapRequest
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE
+from gigabrain_zenoh.bus import Bus, Latest
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping.fusion import Fusion, Moment, uncertainty
+from gigabrain_zenoh.mapping.growing import GrowingMap
+from gigabrain_zenoh.mapping.known import Chart, KnownMap
+from gigabrain_zenoh.mapping.localizer import Place, View
+from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between
+from gigabrain_zenoh.mapping.warm import warm_up
+from gigabrain_zenoh.percentile import Newest
+from gigabrain_zenoh.perception import beams, hits
+from gigabrain_zenoh.settings import PerceptionConfig
+
+log = logging.getLogger(__name__)
+
+MAP_TICKS = round(1e9 / TICK_NS)  # from one map to the next, at least
+FREE_M = 10.0  # a beam that hit nothing counts as free so far at most
+SHORT_M = 0.05  # and ends so much before the lidar's range
+SETTLE_NS, SETTLES = 20_000_000, 100  # a save waits for the work beside, and how often
+TIMED = 1000  # scans whose time is kept
+
+
+def chart_of(config: PerceptionConfig) -> Chart:
+    """The map that the settings ask for. Raises ConfigError."""
+    path = map_file.path_of(config.map) if config.map else None
+    if config.mapping == "localize":
+        if path is None:
+            raise ConfigError("perception: map: expected a saved map, as mapping is 'localize'")
+        return KnownMap(map_file.load(path))
+    return GrowingMap.thaw(map_file.load_graph(path)) if path else GrowingMap()
+
+
+def view_of(lidar: Lidar, scan: LaserScan, ignore_below: float) -> View:
+    """The scan in the body's frame, as points and as ways that are free."""
+    values = ranges(scan)
+    points = np.column_stack(hits(lidar, scan, ignore_below))
+    cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
+    sensor = np.array((lidar.x, lidar.y))
+    clear = values == np.inf if lidar.no_return == "free" else np.zeros(len(values), np.bool_)
+    reach = min(scan.range_max - SHORT_M, FREE_M)
+    free = sensor + reach * np.column_stack((cosines[clear], sines[clear]))
+    return View(Scan.of(points, free), sensor)
+
+
+class Mapper:
+    """Publishes `robot/pose` and `robot/map`, and answers `robot/map_save`."""
+
+    def __init__(self, config: PerceptionConfig, bus: Bus, bodies: Latest[Body]) -> None:
+        self._config, self._bus, self._bodies = config, bus, bodies
+        self._chart = chart_of(config)
+        warm_up()
+        self._fusion, self._boot = Fusion(), 0
+        self._last: Moment | None = None  # of the last scan that was taken
+        self._shown: OccupancyGrid | None = None
+        self._shown_tick = 0
+        self._said, self._left_out = "", ""
+        self._took_ms = Newest(TIMED)
+        bus.serve(MAP_SAVE, self._save)
+        bus.report = self._report
+
+    def see(self, scan: LaserScan, problem: str) -> None:
+        """Take a scan, unless there is a `problem` with it."""
+        if problem:
+            self._leave_out(problem)
+            return
+        moment = self._fusion.at(scan.basis) if scan.boot == self._boot else None
+        if moment is None or (self._last and moment.tick <= self._last.tick):
+            self._leave_out("there is no odometry for its tick")
+        else:
+            self._take(scan, moment)
+
+    def close(self) -> None:
+        """End what runs beside."""
+        self._chart.close()
+
+    def hear(self, state: RobotState) -> None:
+        """Take a state, before any scan that rests on it."""
+        body = self._bodies.current
+        if body:
+            self._begin_anew(state.boot)
+            self._fusion.add(state, body.description)
+
+    def _begin_anew(self, boot: int) -> None:
+        """After a new start of the driver the odometry begins elsewhere; the map stays."""
+        if boot == self._boot:
+            return
+        if self._boot:
+            self._chart.lose("the driver has started anew")
+        self._boot, self._fusion, self._last, self._shown = boot, Fusion(), None, None
+
+    def _take(self, scan: LaserScan, moment: Moment) -> None:
+        body = self._bodies.current
+        if body is None or body.description.lidar is None:
+            return
+        began = time.perf_counter()
+        view = view_of(body.description.lidar, scan, self._config.ignore_below)
+        motion = self._motion(moment)
+        place = self._chart.step(view, motion, uncertainty(motion, slipping=moment.slipping))
+        self._bus.publish(POSE, message_of(place), basis=scan.basis)
+        self._tell(place)
+        self._show(scan.basis)
+        self._left_out = ""
+        self._took_ms.add((time.perf_counter() - began) * 1e3)
+
+    def _motion(self, moment: Moment) -> Floats:
+        """From the last scan to this one."""
+        last, self._last = self._last, moment
+        if last is None:
+            return IDENTITY
+        if last.jumps != moment.jumps:
+            self._chart.lose("the odometry has jumped")
+        return between(last.fused, moment.fused)
+
+    def _show(self, tick: int) -> None:
+        """Publish the map when it is time to and it has changed."""
+        if self._shown and tick < self._shown_tick + MAP_TICKS:
+            return
+        grid = self._chart.grid()
+        if grid != self._shown and grid.cells:
+            self._bus.publish(MAP, grid, basis=tick)
+            self._shown = grid
+        self._shown_tick = tick
+
+    def _tell(self, place: Place) -> None:
+        """Say once in the log whether it is known where the robot is, and why not."""
+        said = "localized" if place.localized else f"not localized: {place.why}"
+        if said == self._said:
+            return
+        self._said = said
+        level = logging.INFO if place.localized else logging.WARNING
+        x, y, yaw = place.pose.tolist()
+        text = f"{said} at ({x:.2f}, {y:.2f}), {np.degrees(yaw):.0f} degrees"
+        log.log(level, text if place.localized else said, extra={"data": {"event": "localized"}})
+
+    def _leave_out(self, why: str) -> None:
+        self._bus.counters["scans_left_out"] += 1
+        if why != self._left_out:
+            self._left_out = why
+            log.warning("a scan is left out of the map: %s", why, extra={"data": {"event": "scan"}})
+
+    async def _save(self, request: MapRequest) -> MapReply:
+        path = map_file.path_of(request.name)
+        same = bool(self._config.map) and path == map_file.path_of(self._config.map)
+        try:
+            text = await self._saved(path, replace=request.replace or same)
+        except Refused as error:
+            log.warning("map for %s: %s", request.source, error, extra={"data": {"event": "map"}})
+            return MapReply(ok=False, text=str(error)[:500])
+        log.info("map by %s: %s", request.source, text, extra={"data": {"event": "map"}})
+        return MapReply(ok=True, text=text[:500])
+
+    async def _saved(self, path: Path, *, replace: bool) -> str:
+        for _ in range(SETTLES):
+            if self._chart.settle():
+                break
+            await self._bus.clock.sleep_ns(SETTLE_NS)
+        saved, graph = self._chart.to_save()
+        await asyncio.to_thread(map_file.save, path, saved, graph, replace=replace)
+        return f"saved {path}: {map_file.in_words(saved)}"
+
+    def _report(self) -> dict[str, float | int | str | None]:
+        times = {f"map_ms_p{p}": self._took_ms.percentile(p / 100) for p in (50, 99)}
+        return {**times, **self._chart.report()}
+
+
+def message_of(place: Place) -> PoseInMap:
+    """The place as others see it."""
+    x, y, yaw = place.pose.tolist()
+    return PoseInMap(
+        x=x,
+        y=y,
+        yaw=yaw,
+        covariance=tuple(place.covariance.ravel().tolist()),
+        localized=place.localized,
+    )

@@ -1,0 +1,57 @@
+"""Work beside the scans, whose result is taken at a scan that is fixed beforehand.
+
+So what follows from it does not depend on how fast this machine is, unless it is too slow.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+
+PATIENCE_S = 0.1  # how long a scan waits for a result that is due
+
+Take = Callable[[], None]  # makes the result count, in the scans' own thread
+Work = Callable[[], Take]
+
+
+class Background:
+    """One thread, and at most one piece of work at a time."""
+
+    def __init__(self, patience_s: float = PATIENCE_S) -> None:
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="mapping")
+        self._job: Future[Take] | None = None
+        self._left = 0  # scans until the result is due
+        self._patience_s = patience_s
+        self.late = 0  # how often a result was not there when it was due
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is under way."""
+        return self._job is None
+
+    def start(self, work: Work, scans: int) -> None:
+        """Begin; the result is due in so many scans."""
+        self._job, self._left = self._pool.submit(work), scans
+
+    def at_scan(self) -> None:
+        """Take the result, when it is due at this scan and there. Raises what the work raised."""
+        if self._job is None:
+            return
+        self._left -= 1
+        if self._left > 0:
+            return
+        try:
+            take = self._job.result(self._patience_s)
+        except TimeoutError:
+            self.late += 1
+            return
+        self._job = None
+        take()
+
+    def finish(self) -> None:
+        """Take the result of what is under way, however long that takes."""
+        job, self._job = self._job, None
+        if job:
+            job.result()()
+
+    def close(self) -> None:
+        """End the thread, after what is under way."""
+        self._pool.shutdown()

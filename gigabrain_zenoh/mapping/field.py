@@ -1,0 +1,180 @@
+"""How far every cell of a map is from the next wall, and how well a scan fits in."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.mapping.matching import solved
+from gigabrain_zenoh.mapping.points import Points
+from gigabrain_zenoh.mapping.se2 import Floats
+
+OCCUPIED, FREE = 65, 40  # percent: from here on a wall, and up to here free
+FAR = 2.0  # [m], farther from any wall is not told apart
+FIT_SIGMA = 0.1  # [m], how near a hit should be to a wall
+ROBUST_M = 0.1  # [m], hits farther off than that count little (Geman and McClure)
+HIT_SIGMA = 0.1  # [m] of one hit, larger than a lidar's: neighbours err alike
+ITERATIONS, ENOUGH = 20, 1e-4
+BLUR_M = 0.25  # [m], a beam that ends so much behind a wall has passed through it
+
+Image = NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A map as scans are matched to it."""
+
+    distance: Image  # (height, width) [m], from each cell's centre to the nearest wall's
+    free: NDArray[np.bool_]  # (height, width), where a robot may be
+    origin: Floats  # (2,) [m], the corner of cell (0, 0)
+    cell: float  # [m]
+
+
+class Fit(NamedTuple):
+    """A scan in its best place nearby."""
+
+    pose: Floats  # (3,)
+    information: Floats  # (3, 3), what the scan alone says of it, in the map's axes
+    score: float  # 0 to 1: how near its hits are to walls, less the share of pierced walls
+
+
+def field_of(cells: NDArray[np.int8], cell: float, origin: tuple[float, float]) -> Field:
+    """The field of an occupancy grid (height, width): 0 free to 100 occupied, -1 unknown."""
+    walls = cells >= OCCUPIED
+    if walls.any():
+        open_ground = np.where(walls, 0, 1).astype(np.uint8)
+        distance = cv2.distanceTransform(open_ground, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        metres = np.minimum(distance * cell, FAR).astype(np.float32)
+    else:
+        metres = np.full(cells.shape, FAR, np.float32)
+    free = (cells >= 0) & (cells <= FREE)
+    return Field(metres, free, np.array(origin, np.float64), cell)
+
+
+def fit(
+    field: Field, hits: Points, free: Points, sensor: Floats, guess: Floats, prior: Floats
+) -> Fit:
+    """The pose of the body near `guess` (3,) in which the scan fits best.
+
+    `hits` (n, 2) and `free` (m, 2) are ends of beams in the body's frame, `sensor` (2,) is where
+    the beams start. `prior` (3, 3) is the information that holds the pose at its guess.
+    """
+    pose, information, score = _fit(field.distance, field.origin, field.cell, hits, guess, prior)
+    through = _pierced(field.distance, field.origin, field.cell, hits, free, sensor, pose)
+    return Fit(pose, information, score - through)
+
+
+def contradiction(field: Field, hits: Points, free: Points, sensor: Floats, pose: Floats) -> float:
+    """The share of beams that the map rules out at `pose` (3,): unknown ground rules out none."""
+    count = len(hits) + len(free)
+    through = _pierced(field.distance, field.origin, field.cell, hits, free, sensor, pose)
+    amid = _amid(field.distance, field.free, field.origin, field.cell, hits, pose)
+    return through + amid / max(count, 1)
+
+
+@kernel
+def _amid(
+    distance: Image,
+    free: NDArray[np.bool_],
+    origin: Floats,
+    cell: float,
+    hits: Points,
+    pose: Floats,
+) -> int:
+    """How many hits lie amid free ground, far from any wall."""
+    height, width = distance.shape
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    count = 0
+    for x, y in hits:
+        column = int(np.floor((pose[0] + cos * x - sin * y - origin[0]) / cell))
+        row = int(np.floor((pose[1] + sin * x + cos * y - origin[1]) / cell))
+        if 0 <= row < height and 0 <= column < width and free[row, column]:
+            count += distance[row, column] > BLUR_M
+    return count
+
+
+@kernel
+def _look(distance: Image, x: float, y: float) -> tuple[float, float, float]:
+    """Distance and its slope at (x, y) in cells, from the centres of four cells round it."""
+    height, width = distance.shape
+    left, low = int(np.floor(x - 0.5)), int(np.floor(y - 0.5))
+    if left < 0 or low < 0 or left + 1 >= width or low + 1 >= height:
+        return FAR, 0.0, 0.0
+    u, v = x - 0.5 - left, y - 0.5 - low
+    a, b = distance[low, left], distance[low, left + 1]
+    c, d = distance[low + 1, left], distance[low + 1, left + 1]
+    value = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * c + u * d)
+    return value, (1 - v) * (b - a) + v * (d - c), (1 - u) * (c - a) + u * (d - b)
+
+
+@kernel
+def _fit(
+    distance: Image, origin: Floats, cell: float, hits: Points, guess: Floats, prior: Floats
+) -> tuple[Floats, Floats, float]:
+    """Gauss and Newton on the distances, each weighted by how small it is."""
+    pose, information, score = guess.copy(), np.zeros((3, 3)), 0.0
+    slope = np.zeros(3)
+    for _ in range(ITERATIONS):
+        cos, sin = np.cos(pose[2]), np.sin(pose[2])
+        information[:] = 0.0
+        off, score = np.zeros(3), 0.0
+        for x, y in hits:
+            ahead, aside = cos * x - sin * y, sin * x + cos * y
+            away, dx, dy = _look(
+                distance,
+                (pose[0] + ahead - origin[0]) / cell,
+                (pose[1] + aside - origin[1]) / cell,
+            )
+            score += np.exp(-0.5 * (away / FIT_SIGMA) ** 2)
+            weight = (ROBUST_M**2 / (ROBUST_M**2 + away * away)) ** 2 / HIT_SIGMA**2
+            slope[0], slope[1] = dx / cell, dy / cell
+            slope[2] = slope[1] * ahead - slope[0] * aside
+            for i in range(3):
+                off[i] += weight * slope[i] * away
+                for j in range(3):
+                    information[i, j] += weight * slope[i] * slope[j]
+        drift = pose - guess
+        drift[2] = (drift[2] + np.pi) % (2 * np.pi) - np.pi
+        for i in range(3):  # `@` would call for a BLAS
+            off[i] += (prior[i] * drift).sum()
+        step = -solved(information + prior, off)
+        pose += step
+        if np.abs(step).max() < ENOUGH:
+            break
+    return pose, information, score / max(len(hits), 1)
+
+
+@kernel
+def _pierced(
+    distance: Image,
+    origin: Floats,
+    cell: float,
+    hits: Points,
+    free: Points,
+    sensor: Floats,
+    pose: Floats,
+) -> float:
+    """The share of beams that would have passed through a wall."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x0 = pose[0] + cos * sensor[0] - sin * sensor[1]
+    y0 = pose[1] + sin * sensor[0] + cos * sensor[1]
+    through = 0
+    for ends in (hits, free):
+        for x, y in ends:
+            dx = pose[0] + cos * x - sin * y - x0
+            dy = pose[1] + sin * x + cos * y - y0
+            length = np.sqrt(dx * dx + dy * dy)
+            way = 0.0
+            while way < length - BLUR_M:
+                at = way / length
+                away, _, _ = _look(
+                    distance, (x0 + at * dx - origin[0]) / cell, (y0 + at * dy - origin[1]) / cell
+                )
+                if away < cell / 2:
+                    through += 1
+                    break
+                way += max(away, cell / 2)
+    return through / max(len(hits) + len(free), 1)

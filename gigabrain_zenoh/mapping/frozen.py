@@ -1,0 +1,69 @@
+"""A map's keyframes and loops as arrays, to be saved, and back."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
+from gigabrain_zenoh.mapping.points import Points, Scan
+
+Arrays = Mapping[str, NDArray[np.generic]]
+
+
+def freeze_keyframes(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[np.generic]]:
+    """All of the keyframes; their normals are left out, as points give them."""
+    scans = [keyframe.scan for keyframe in keyframes]
+    return {
+        **freeze_edges("link", [keyframe.link for keyframe in keyframes]),
+        "travel": np.array([keyframe.travel for keyframe in keyframes]),
+        "segment": np.array([keyframe.segment for keyframe in keyframes], np.int32),
+        "points": _joined(scan.points for scan in scans),
+        "points_each": np.array([len(scan.points) for scan in scans], np.int32),
+        "free": _joined(scan.free for scan in scans),
+        "free_each": np.array([len(scan.free) for scan in scans], np.int32),
+    }
+
+
+def thaw_keyframes(arrays: Arrays) -> list[Keyframe]:
+    """The keyframes again; KeyError or ValueError if the arrays do not belong together."""
+    links = thaw_edges("link", arrays)
+    points = _split(arrays["points"], arrays["points_each"])
+    free = _split(arrays["free"], arrays["free_each"])
+    rows = zip(links, points, free, arrays["travel"], arrays["segment"], strict=True)
+    return [
+        Keyframe(Scan.of(hits, ends), link, float(travel), int(segment))
+        for link, hits, ends, travel, segment in rows
+    ]
+
+
+def freeze_edges(name: str, edges: Sequence[Edge]) -> dict[str, NDArray[np.generic]]:
+    """The edges as three arrays whose names begin with `name`."""
+    return {
+        f"{name}_ends": np.array([(e.first, e.second) for e in edges], np.int32).reshape(-1, 2),
+        f"{name}_relative": np.array([e.relative for e in edges]).reshape(-1, 3),
+        f"{name}_covariance": np.array([e.covariance for e in edges]).reshape(-1, 3, 3),
+        f"{name}_doubtful": np.array([e.doubtful for e in edges], np.bool_),
+    }
+
+
+def thaw_edges(name: str, arrays: Arrays) -> list[Edge]:
+    """The edges again."""
+    ends = arrays[f"{name}_ends"].astype(int)
+    relative = arrays[f"{name}_relative"].astype(np.float64)
+    covariance = arrays[f"{name}_covariance"].astype(np.float64)
+    if ends.ndim != 2 or relative.shape != (len(ends), 3) or covariance.shape != (len(ends), 3, 3):
+        raise ValueError(f"{name}: {len(ends)} edges, but {len(relative)} poses")
+    rows = zip(ends, relative, covariance, arrays[f"{name}_doubtful"], strict=True)
+    return [Edge(int(first), int(second), r, c, bool(d)) for (first, second), r, c, d in rows]
+
+
+def _joined(parts: Iterable[Points]) -> Points:
+    return np.concatenate([np.empty((0, 2), np.float32), *parts])
+
+
+def _split(rows: NDArray[np.generic], each: NDArray[np.generic]) -> list[Points]:
+    counts = each.astype(int)
+    if len(rows) != counts.sum() or (counts < 0).any():
+        raise ValueError(f"expected {counts.sum()} points, got {len(rows)}")
+    return np.split(rows.astype(np.float32), np.cumsum(counts)[:-1]) if len(counts) else []

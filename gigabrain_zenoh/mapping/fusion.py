@@ -1,0 +1,158 @@
+"""Odometry and gyro in one: the wheels say how far, the gyro says how much it turned.
+
+Wheels slip and their track is known roughly, which shows in the heading first; a gyro drifts slowly
+and can be read off at rest. Where the two disagree, something slips, and neither length counts.
+"""
+
+import math
+from bisect import bisect_left
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_zenoh.mapping.se2 import Floats, between, compose
+
+KEPT = 250  # states, so 5 s
+GAP_TICKS = 25  # no pose is made up between states that lie farther apart
+
+REST_TICKS = 25  # without a turn of a wheel, then what the gyro says is its bias
+REST_RATE = 0.02  # [rad/s], faster is no bias: somebody turns the robot
+FIRST_RATE = 0.1  # [rad/s], the bias of a gyro that was never at rest before
+BIAS_SHARE = 0.02  # of a new reading at 50 Hz: over about a second
+
+SLIP_RATE = 0.15  # [rad/s] between wheels and gyro, smoothed
+SLIP_SHARE = 0.1  # of a new difference: over about 0.2 s
+SLIPPING = 5.0  # so much more uncertain is what the wheels say then
+
+JUMP_FACTOR, JUMP_M, JUMP_RAD = 2.0, 0.2, 0.5  # more than the body can do is no motion
+
+
+class Moment(NamedTuple):
+    """Where dead reckoning has got to at one tick."""
+
+    tick: int
+    odometry: Floats  # (3,), as the body says it
+    fused: Floats  # (3,), with the gyro's heading
+    slipping: bool
+    jumps: int  # how often the odometry has jumped since the start
+
+
+class Fusion:
+    """Dead reckoning over the states of one start of the driver."""
+
+    def __init__(self) -> None:
+        self._moments: deque[Moment] = deque(maxlen=KEPT)
+        self.bias = 0.0  # [rad/s], of the gyro
+        self._calibrated = False
+        self._rate: float | None = None  # [rad/s], the gyro's last reading without its bias
+        self._rest = 0  # ticks
+        self._slip = 0.0  # [rad/s], smoothed
+
+    @property
+    def newest(self) -> Moment | None:
+        """The last moment."""
+        return self._moments[-1] if self._moments else None
+
+    def add(self, state: RobotState, body: BodyDescription) -> None:
+        """Take one state; one that is not newer than the last is left out."""
+        pose = np.array((state.pose.x, state.pose.y, state.pose.yaw))
+        last = self.newest
+        if last is None:
+            self._rate = self._turn_rate(state)
+            self._moments.append(Moment(state.tick, pose, pose, False, 0))
+            return
+        if state.tick <= last.tick:
+            return
+        seconds = (state.tick - last.tick) * TICK_NS / 1e9
+        step = between(last.odometry, pose)
+        if jumped(step, seconds, body):
+            self._rate, self._rest = self._turn_rate(state), 0
+            moment = Moment(state.tick, pose, last.fused, self.slipping, last.jumps + 1)
+        else:
+            fused = advanced(last.fused, step, self._turn(state, step, seconds))
+            moment = Moment(state.tick, pose, fused, self.slipping, last.jumps)
+        self._moments.append(moment)
+
+    @property
+    def slipping(self) -> bool:
+        """Whether wheels and gyro disagree."""
+        return abs(self._slip) > SLIP_RATE
+
+    def at(self, tick: int) -> Moment | None:
+        """The moment of `tick`; between two states it is on the way from one to the other.
+
+        None where it is not known (yet), or where too many states are missing.
+        """
+        moments = self._moments
+        place = bisect_left(moments, tick, key=lambda moment: moment.tick)
+        if place == len(moments):
+            return None
+        after = moments[place]
+        if after.tick == tick:
+            return after
+        before = moments[place - 1] if place else after
+        if not 0 < after.tick - before.tick <= GAP_TICKS:
+            return None
+        share = (tick - before.tick) / (after.tick - before.tick)
+        return Moment(
+            tick,
+            _along(before.odometry, after.odometry, share),
+            _along(before.fused, after.fused, share),
+            after.slipping,
+            after.jumps,
+        )
+
+    def _turn_rate(self, state: RobotState) -> float | None:
+        return state.imu.angular_velocity[2] - self.bias if state.imu else None
+
+    def _turn(self, state: RobotState, step: Floats, seconds: float) -> float:
+        """How much the body has turned since the last state [rad]."""
+        before, self._rate = self._rate, self._turn_rate(state)
+        if before is None or self._rate is None:
+            return float(step[2])
+        if self._learn_bias(step, self._rate):
+            return 0.0
+        turn = (before + self._rate) / 2 * seconds
+        self._slip += SLIP_SHARE * ((float(step[2]) - turn) / seconds - self._slip)
+        return turn
+
+    def _learn_bias(self, step: Floats, rate: float) -> bool:
+        """Whether the body is at rest, when what the gyro says is nothing but its bias."""
+        self._rest = self._rest + 1 if not step.any() else 0
+        if self._rest < REST_TICKS or abs(rate) > (REST_RATE if self._calibrated else FIRST_RATE):
+            return False
+        share = BIAS_SHARE if self._calibrated else 1.0
+        self.bias += share * rate
+        self._calibrated, self._slip = True, 0.0
+        return True
+
+
+def jumped(step: Floats, seconds: float, body: BodyDescription) -> bool:
+    """Whether `step` (3,) in so many seconds is more than this body can do."""
+    fastest = max(body.max_linear_speed, body.max_lateral_speed)
+    far = math.hypot(float(step[0]), float(step[1])) > JUMP_FACTOR * fastest * seconds + JUMP_M
+    return far or abs(float(step[2])) > JUMP_FACTOR * body.max_angular_speed * seconds + JUMP_RAD
+
+
+def advanced(pose: Floats, step: Floats, turn: float) -> Floats:
+    """`pose` after a small `step` of the wheels during which the body turned by `turn` [rad].
+
+    The way is taken at the middle of the turn, whatever the wheels made of that.
+    """
+    along = compose(np.array((0.0, 0.0, (turn - float(step[2])) / 2)), step)
+    return compose(pose, np.array((along[0], along[1], turn)))
+
+
+def uncertainty(step: Floats, *, slipping: bool) -> Floats:
+    """The covariance (3, 3) of `step` in its own frame: about 5 % of the way and of the turn."""
+    factor = SLIPPING if slipping else 1.0
+    way, turn = math.hypot(float(step[0]), float(step[1])), abs(float(step[2]))
+    xy = factor * (0.002 + 0.05 * way + 0.02 * turn)
+    return np.diag((xy, xy, factor * (0.002 + 0.02 * turn + 0.01 * way))) ** 2
+
+
+def _along(first: Floats, second: Floats, share: float) -> Floats:
+    return compose(first, share * between(first, second))

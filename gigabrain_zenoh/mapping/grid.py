@@ -1,0 +1,184 @@
+"""An occupancy grid: every beam says that its way is free and its end is not.
+
+Log-odds in tenths, bounded, so that what stands there now outweighs what once did (Thrun, Burgard,
+Fox: Probabilistic Robotics, chapter 9). A cell changes once per scan, and a hit in it goes first.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.mapping.points import Points
+from gigabrain_zenoh.mapping.se2 import Floats, transform
+
+CELL = 0.05  # [m]
+HIT, PASS = 9, -5  # tenths of log-odds: one hit is 0.71, one beam that goes on is 0.38
+SURE, CLEAR = 35, -25  # no surer than 0.97 and 0.08
+GROWTH = 64  # cells; the grid grows by so many at least
+MOST_CELLS = 2800  # along one side: a message of 8 MB holds no more
+
+Cells = NDArray[np.int8]
+Stamps = NDArray[np.int32]
+
+ODDS = np.arange(-128, 128) / 10
+PERCENT = np.round(100 / (1 + np.exp(-ODDS))).astype(np.int8)  # at log-odds + 128
+
+
+class Grid:
+    """Cells of `CELL` metres that grow with what is drawn."""
+
+    def __init__(self) -> None:
+        self.origin_x = self.origin_y = 0.0  # [m], the corner of cell (0, 0)
+        self.log_odds: Cells = np.zeros((0, 0), np.int8)
+        self._stamps: Stamps = np.zeros((0, 0), np.int32)  # the newest scan of each cell; 0: none
+        self._scans = 0
+        self.full = False  # whether something was left out because the grid may grow no more
+
+    @classmethod
+    def of(cls, log_odds: Cells, known: NDArray[np.bool_], origin: tuple[float, float]) -> "Grid":
+        """A grid as it was saved."""
+        grid = cls()
+        grid.origin_x, grid.origin_y = origin
+        grid.log_odds = np.array(log_odds, np.int8)
+        grid._stamps, grid._scans = known.astype(np.int32), 1
+        return grid
+
+    def draw(self, sensor: Floats, hits: Points, free: Points) -> None:
+        """One scan from `sensor`, a pose in the map; the ends of its beams in the sensor's frame.
+
+        `hits` (n, 2) is where beams ended [m], `free` (m, 2) how far others were seen to go.
+        """
+        ends, clear = transform(sensor, hits), transform(sensor, free)
+        around = np.vstack((sensor[None, :2], ends, clear))
+        self._cover(around.min(axis=0), around.max(axis=0))
+        self._scans += 1
+        corner = np.array((self.origin_x, self.origin_y))
+        start = ((sensor[:2] - corner) / CELL).astype(np.int64)
+        cells, far = _cells(ends, corner), _cells(clear, corner)
+        _draw(self.log_odds, self._stamps, self._scans, start, cells, far)
+
+    def known(self) -> NDArray[np.bool_]:
+        """Which cells some beam has touched (height, width)."""
+        return self._stamps > 0
+
+    def percent(self) -> Cells:
+        """0 free to 100 occupied, -1 unknown (height, width)."""
+        shown = np.empty(self.log_odds.shape, np.int8)
+        _show(self.log_odds, self._stamps, PERCENT, shown)
+        return shown
+
+    def around(self, x: float, y: float, reach: float) -> tuple[Cells, tuple[float, float]]:
+        """What `percent` is within a square of `reach` [m] round a place, and its corner."""
+        height, width = self.log_odds.shape
+        left = min(max(int((x - reach - self.origin_x) / CELL), 0), width)
+        low = min(max(int((y - reach - self.origin_y) / CELL), 0), height)
+        side = int(2 * reach / CELL)
+        part = np.s_[low : low + side, left : left + side]
+        shown = np.empty(self.log_odds[part].shape, np.int8)
+        _show(self.log_odds[part], self._stamps[part], PERCENT, shown)
+        return shown, (self.origin_x + left * CELL, self.origin_y + low * CELL)
+
+    def message(self) -> OccupancyGrid:
+        """The grid as others see it."""
+        height, width = self.log_odds.shape
+        return OccupancyGrid(
+            resolution=CELL,
+            width=width,
+            height=height,
+            origin_x=self.origin_x,
+            origin_y=self.origin_y,
+            cells=self.percent().tobytes(),
+        )
+
+    def _cover(self, low: Floats, high: Floats) -> None:
+        """Grow until the rectangle from `low` to `high` [m] lies within, if that may be."""
+        height, width = self.log_odds.shape
+        if width == 0:
+            self.origin_x, self.origin_y = (math.floor(v / CELL) * CELL for v in low.tolist())
+        left, right = _missing(float(low[0]), float(high[0]), self.origin_x, width)
+        below, above = _missing(float(low[1]), float(high[1]), self.origin_y, height)
+        if not (left or right or below or above):
+            return
+        if max(width + left + right, height + below + above) > MOST_CELLS:
+            self.full = True
+            return
+        room = ((below, above), (left, right))
+        self.log_odds = np.pad(self.log_odds, room)
+        self._stamps = np.pad(self._stamps, room)
+        self.origin_x -= left * CELL
+        self.origin_y -= below * CELL
+
+
+def _missing(low: float, high: float, origin: float, count: int) -> tuple[int, int]:
+    """How many cells are wanted before and after those that there are."""
+    before = math.floor((origin - low) / CELL) + 1 if low < origin else 0
+    after = math.floor((high - origin) / CELL) + 1 - count
+    return _rounded(before), _rounded(after)
+
+
+def _rounded(cells: int) -> int:
+    return math.ceil(cells / GROWTH) * GROWTH if cells > 0 else 0
+
+
+def _cells(points: Floats, corner: Floats) -> NDArray[np.int64]:
+    """The cells (n, 2) as x, y that `points` [m] lie in."""
+    return np.floor((points - corner) / CELL).astype(np.int64)
+
+
+@kernel
+def _draw(
+    log_odds: Cells,
+    stamps: Stamps,
+    stamp: int,
+    start: NDArray[np.int64],
+    hits: NDArray[np.int64],
+    free: NDArray[np.int64],
+) -> None:
+    height, width = log_odds.shape
+    for x, y in hits:
+        if 0 <= x < width and 0 <= y < height and stamps[y, x] != stamp:
+            stamps[y, x] = stamp
+            log_odds[y, x] = min(log_odds[y, x] + HIT, SURE)
+    for ends in (hits, free):
+        for x, y in ends:
+            _pass(log_odds, stamps, stamp, start[0], start[1], x, y)
+
+
+@kernel
+def _pass(
+    log_odds: Cells, stamps: Stamps, stamp: int, x: int, y: int, end_x: int, end_y: int
+) -> None:
+    """The way from a cell to another, without the last (Bresenham's line)."""
+    height, width = log_odds.shape
+    across, up = abs(end_x - x), -abs(end_y - y)
+    step_x, step_y = 1 if x < end_x else -1, 1 if y < end_y else -1
+    off = across + up
+    while x != end_x or y != end_y:
+        if 0 <= x < width and 0 <= y < height and stamps[y, x] != stamp:
+            stamps[y, x] = stamp
+            log_odds[y, x] = max(log_odds[y, x] + PASS, CLEAR)
+        twice = 2 * off
+        if twice >= up:
+            off += up
+            x += step_x
+        if twice <= across:
+            off += across
+            y += step_y
+
+
+@kernel
+def _show(log_odds: Cells, stamps: Stamps, percent: Cells, shown: Cells) -> None:
+    height, width = log_odds.shape
+    for y in range(height):
+        for x in range(width):
+            shown[y, x] = percent[log_odds[y, x] + 128] if stamps[y, x] else -1
+
+
+def warm_up() -> None:
+    """Compile what a driving robot calls."""
+    points, grid = np.array([[1.0, 0.0]], np.float32), Grid()
+    grid.draw(np.zeros(3), points, points)
+    grid.percent()

@@ -1,0 +1,83 @@
+"""What perception does with a map: the same for one that was saved and for one that grows."""
+
+from typing import Protocol
+
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.mapping.background import PATIENCE_S, Background
+from gigabrain_zenoh.mapping.field import field_of
+from gigabrain_zenoh.mapping.finder import Finder
+from gigabrain_zenoh.mapping.localizer import Place, View
+from gigabrain_zenoh.mapping.map_file import Arrays, SavedMap
+from gigabrain_zenoh.mapping.se2 import Floats
+
+
+class Chart(Protocol):
+    """A map, and where the robot is in it."""
+
+    def step(self, view: View, motion: Floats, noise: Floats) -> Place:
+        """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
+
+    def lose(self, why: str) -> None:
+        """The robot may be anywhere in the map."""
+
+    def grid(self) -> OccupancyGrid:
+        """The map as others see it."""
+
+    def settle(self) -> bool:
+        """Begin nothing new beside, until `to_save`; whether nothing is under way there."""
+
+    def to_save(self) -> tuple[SavedMap, Arrays]:
+        """What there is to save. Raises Refused."""
+
+    def report(self) -> dict[str, int]:
+        """Figures for people."""
+
+    def close(self) -> None:
+        """End what runs beside."""
+
+
+class KnownMap:
+    """A saved map, which stays as it is."""
+
+    def __init__(self, saved: SavedMap, patience_s: float = PATIENCE_S) -> None:
+        self._saved, self._background = saved, Background(patience_s)
+        field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
+        self._finder = Finder(field, "looking for the robot in the map", self._background)
+
+    def step(self, view: View, motion: Floats, noise: Floats) -> Place:
+        """See Chart."""
+        self._background.at_scan()
+        return self._finder.step(view, motion, noise)
+
+    def lose(self, why: str) -> None:
+        """See Chart."""
+        self._finder.lose(why)
+
+    def grid(self) -> OccupancyGrid:
+        """See Chart."""
+        height, width = self._saved.cells.shape
+        return OccupancyGrid(
+            resolution=self._saved.resolution,
+            width=width,
+            height=height,
+            origin_x=self._saved.origin_x,
+            origin_y=self._saved.origin_y,
+            cells=self._saved.cells.tobytes(),
+        )
+
+    def settle(self) -> bool:
+        """See Chart."""
+        return True
+
+    def to_save(self) -> tuple[SavedMap, Arrays]:
+        """Never: it is saved already."""
+        raise Refused("not saved: perception finds its way in a saved map, it makes none")
+
+    def report(self) -> dict[str, int]:
+        """See Chart."""
+        return {"late": self._background.late}
+
+    def close(self) -> None:
+        """See Chart."""
+        self._background.close()

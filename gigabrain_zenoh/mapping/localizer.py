@@ -1,0 +1,188 @@
+"""Where the robot is in a map that is known: followed from scan to scan, or found from nothing.
+
+While more than one place explains what is seen, none is believed. Each is followed until what is
+seen elsewhere speaks against it; the last one left is where the robot is.
+"""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from gigabrain_zenoh.mapping.field import Field, fit
+from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.relocalize import FEWEST_POINTS, Candidate, apart
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, compose, turned
+
+LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somewhere else
+SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here
+TOLERANCE = 0.03  # a fit that is worse than the best by no more says nothing against a place,
+STILL_TOLERANCE, STILL_SCANS = 0.08, 5  # and while the robot stands, it takes more, and some scans
+AGAINST = 0.2  # that much in all speaks against it
+VIEW_M, VIEW_RAD = 0.1, math.radians(6)  # farther on, what is seen counts as seen elsewhere
+LOOSE_M, LOOSE_RAD = 0.5, math.radians(20)  # a deviation beyond that is no position
+SEARCH_SCANS = 10  # from one search of the whole map to the next
+SPREAD = np.diag((0.1, 0.1, 0.05)) ** 2  # the covariance of a place that a search has found
+NOWHERE = np.diag((1e3, 1e3, math.pi)) ** 2  # the covariance of what is not known
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One scan in the body's frame."""
+
+    scan: Scan
+    sensor: Floats  # (2,) [m], where the beams start
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the robot is, as far as that is known."""
+
+    pose: Floats  # (3,)
+    covariance: Floats  # (3, 3), in the map's axes
+    localized: bool
+    why: str = ""  # not
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """One place where the robot may be."""
+
+    pose: Floats
+    covariance: Floats
+    score: float = 0.0
+    against: float = 0.0
+    good: int = 0  # scans in a row that fit
+    bad: int = 0  # scans in a row that do not
+
+
+@dataclass(slots=True)
+class Localizer:
+    """Follows hypotheses through one map."""
+
+    map: Field
+    why: str = "not found yet"
+    _places: list[Hypothesis] = field(default_factory=list)
+    _localized: bool = False
+    _unsearched: int = SEARCH_SCANS  # scans since the last search
+    _still: int = 0  # scans since the last view
+    _moved: Floats = field(default_factory=lambda: IDENTITY.copy())  # since the last view
+    _last: Hypothesis = field(default_factory=lambda: Hypothesis(IDENTITY, NOWHERE))
+
+    @property
+    def wants_search(self) -> bool:
+        """Whether somebody should search the whole map now."""
+        return not self._places and self._unsearched >= SEARCH_SCANS
+
+    @property
+    def place(self) -> Place:
+        """What is known now."""
+        if self._localized:
+            here = self._places[0]
+            return Place(here.pose, here.covariance, True)
+        best = self._places[0] if self._places else self._last
+        return Place(best.pose, NOWHERE, False, self.why)
+
+    def believe(self, pose: Floats, covariance: Floats) -> None:
+        """Follow this place alone, as somebody else knows that it is right."""
+        self._places, self._localized, self.why = [Hypothesis(pose, covariance)], True, ""
+
+    def lose(self, why: str) -> None:
+        """Believe nothing any more; search at once."""
+        if self._places:
+            self._last = self._places[0]
+        self._places, self._localized, self.why = [], False, why
+        self._unsearched = SEARCH_SCANS
+
+    def searching(self) -> None:
+        """Somebody has begun to search with the scan of the last step."""
+        self._unsearched = 0
+
+    def found(self, candidates: list[Candidate], moved: Floats) -> None:
+        """Follow what a search has found, `moved` (3,) being the way since its scan."""
+        if self._places:
+            return
+        there = [(compose(one.pose, moved), one.score) for one in candidates]
+        self._places = [Hypothesis(pose, SPREAD, score) for pose, score in there]
+        places = {0: "no place in the map looks like this", 1: "one place looks like this"}
+        self.why = places.get(len(there), f"{len(there)} places look like this")
+
+    def step(self, view: View, motion: Floats, noise: Floats) -> Place:
+        """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
+        self._unsearched += 1
+        self._moved = compose(self._moved, motion)
+        seen = len(view.scan.points) >= FEWEST_POINTS
+        self._places = [
+            _followed(self.map, _predicted(one, motion, noise), view if seen else None)
+            for one in self._places
+        ]
+        if self._localized:
+            self._doubt()
+        elif seen and self._places:
+            self._choose()
+        return self.place
+
+    def _doubt(self) -> None:
+        """Whether the one place is still right."""
+        here = self._places[0]
+        if here.bad >= LOST_SCANS:
+            self.lose("what is seen is not where the robot was thought to be")
+            return
+        deviations = np.sqrt(np.diag(here.covariance))
+        if max(deviations[0], deviations[1]) > LOOSE_M or deviations[2] > LOOSE_RAD:
+            self.lose("nothing to go by was seen for too long")
+
+    def _choose(self) -> None:
+        """Drop places that what is seen speaks against; the last one is right."""
+        best = max(one.score for one in self._places)
+        moved = math.hypot(self._moved[0], self._moved[1]) > VIEW_M
+        moved = moved or abs(float(self._moved[2])) > VIEW_RAD
+        self._still = 0 if moved else self._still + 1
+        if moved or self._still % STILL_SCANS == 0:
+            bar = best - (TOLERANCE if moved else STILL_TOLERANCE)
+            self._moved = IDENTITY.copy() if moved else self._moved
+            self._places = [_judged(one, bar) for one in self._places]
+        left = [one for one in self._places if one.against < AGAINST and one.bad < LOST_SCANS]
+        self._places = []
+        for one in sorted(left, key=lambda one: -one.score):
+            if apart(one.pose, (other.pose for other in self._places)):
+                self._places.append(one)
+        if not self._places:
+            self.lose("no place in the map looks like this")
+        elif len(self._places) == 1 and self._places[0].good >= SURE_SCANS:
+            self._localized, self.why = True, ""
+
+
+def _predicted(one: Hypothesis, motion: Floats, noise: Floats) -> Hypothesis:
+    """Where `one` is after `motion`."""
+    pose = compose(one.pose, motion)
+    turn = np.eye(3)
+    turn[0, 2], turn[1, 2] = one.pose[1] - pose[1], pose[0] - one.pose[0]
+    spread = turn @ one.covariance @ turn.T + turned(noise, float(one.pose[2]))
+    return replace(one, pose=pose, covariance=spread)
+
+
+def _followed(into: Field, one: Hypothesis, view: View | None) -> Hypothesis:
+    """`one` moved to where the scan fits best, unless it fits nowhere near."""
+    if view is None:
+        return one
+    prior = _inverse(one.covariance)
+    found = fit(into, view.scan.points, view.scan.free, view.sensor, one.pose, prior)
+    if found.score < LOST_SCORE:
+        return replace(one, score=found.score, good=0, bad=one.bad + 1)
+    return replace(
+        one,
+        pose=found.pose,
+        covariance=_inverse(prior + found.information),
+        score=found.score,
+        good=one.good + 1 if found.score >= SURE_SCORE else 0,
+        bad=0,
+    )
+
+
+def _judged(one: Hypothesis, bar: float) -> Hypothesis:
+    return replace(one, against=one.against + max(bar - one.score, 0.0))
+
+
+def _inverse(matrix: Floats) -> Floats:
+    return np.asarray(np.linalg.inv(matrix), np.float64)

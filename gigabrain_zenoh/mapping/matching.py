@@ -1,0 +1,243 @@
+"""Matching a scan to a local map: correlative search, then point-to-line ICP from what it found.
+
+E. Olson, Real-time correlative scan matching, ICRA 2009; A. Censi, An ICP variant using a
+point-to-line metric, ICRA 2008.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.mapping.local_map import BUCKET, Buckets, Bytes, Image
+from gigabrain_zenoh.mapping.points import Points
+from gigabrain_zenoh.mapping.se2 import Floats
+
+SEARCHED = 90  # points of a scan are enough to search with
+ITERATIONS = 25
+STILL = 1e-4  # [m] and [rad], a step this small ends ICP
+SHRINK = 0.6  # of the gate, each iteration
+GATE_LEAST = 0.12  # [m]
+SIGMA = 0.06  # [m], residuals beyond it lose their weight
+SOFT = 1e-9  # keeps the normal equations regular where the points say nothing
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """How far round the guess to search."""
+
+    away: float  # [m], to each side
+    turn: float  # [rad], to each side
+    step: float = 0.025  # [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The likeliest pose of a search."""
+
+    pose: Floats
+    score: float  # 0 to 1, the mean likelihood of the hits
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """What ICP arrived at."""
+
+    pose: Floats
+    information: Floats  # (3, 3), of x, y and yaw about the body, in the map's axes
+    inliers: float  # share of the scan's points
+    rms: float  # [m], of the inliers
+
+
+def thinned(points: Points, most: int) -> Points:
+    """At most so many of the points, evenly by beam."""
+    if len(points) <= most:
+        return points
+    return points[np.linspace(0, len(points) - 1, most).astype(np.intp)]
+
+
+def search(image: Image, points: Points, guess: Floats, window: Window) -> Found:
+    """The pose within the window whose points fall on the likeliest cells."""
+    if not len(points):
+        return Found(guess, 0.0)
+    steps = int(np.ceil(window.away / image.cell))
+    turns = int(np.ceil(window.turn / window.step))
+    x, y, yaw, score = _search(
+        image.cells, image.origin, image.cell, thinned(points, SEARCHED), guess,
+        steps, turns, window.step,
+    )  # fmt: skip
+    return Found(np.array((x, y, yaw)), score)
+
+
+@kernel
+def _search(
+    cells: Bytes,
+    origin: Floats,
+    cell: float,
+    points: Points,
+    guess: Floats,
+    steps: int,
+    turns: int,
+    turn: float,
+) -> tuple[float, float, float, float]:
+    height, width = cells.shape
+    side = 2 * steps + 1
+    scores = np.empty((side, side), np.int32)
+    best, best_x, best_y, best_yaw = -1.0, 0, 0, 0
+    for t in range(-turns, turns + 1):
+        cos, sin = np.cos(guess[2] + t * turn), np.sin(guess[2] + t * turn)
+        scores[:] = 0
+        for k in range(len(points)):
+            px = guess[0] + cos * points[k, 0] - sin * points[k, 1]
+            py = guess[1] + sin * points[k, 0] + cos * points[k, 1]
+            left = int(np.floor((px - origin[0]) / cell)) - steps
+            top = int(np.floor((py - origin[1]) / cell)) - steps
+            first, last = max(0, -left), min(side, width - left)
+            for i in range(max(0, -top), min(side, height - top)):
+                for j in range(first, last):
+                    scores[i, j] += cells[top + i, left + j]
+        for i in range(side):
+            for j in range(side):
+                # of equals, the one nearest to the guess
+                away = ((i - steps) ** 2 + (j - steps) ** 2) / (steps * steps + 1)
+                off = (t * t) / (turns * turns + 1)
+                value = scores[i, j] / (255 * len(points)) - 0.01 * (away + off)
+                if value > best:
+                    best, best_x, best_y, best_yaw = value, j - steps, i - steps, t
+    away = (best_x**2 + best_y**2) / (steps * steps + 1)
+    off = (best_yaw * best_yaw) / (turns * turns + 1)
+    score = best + 0.01 * (away + off)
+    return guess[0] + best_x * cell, guess[1] + best_y * cell, guess[2] + best_yaw * turn, score
+
+
+def icp(
+    local: Buckets, points: Points, start: Floats, gate: float, prior: Floats, guess: Floats
+) -> Fit:
+    """Slide `points` onto the lines of `local`, beginning at `start`.
+
+    `prior` is the (3, 3) information about `guess`, the pose that odometry expects: it decides
+    where the lines leave a direction open.
+    """
+    pose, information, inliers, rms = _icp(
+        local.points, local.normals, local.starts, local.width, local.origin,
+        points, start, gate, prior, guess,
+    )  # fmt: skip
+    return Fit(pose, information, inliers, rms)
+
+
+@kernel
+def _nearest(
+    local: Points,
+    starts: NDArray[np.int32],
+    width: int,
+    origin: Floats,
+    x: float,
+    y: float,
+    gate: float,
+) -> int:
+    """The index of the nearest point within `gate`, or -1."""
+    height = (len(starts) - 1) // width
+    left = max(int(np.floor((x - gate - origin[0]) / BUCKET)), 0)
+    right = min(int(np.floor((x + gate - origin[0]) / BUCKET)), width - 1)
+    top = max(int(np.floor((y - gate - origin[1]) / BUCKET)), 0)
+    bottom = min(int(np.floor((y + gate - origin[1]) / BUCKET)), height - 1)
+    best, found = gate * gate, -1
+    if left > right:
+        return found
+    for row in range(top, bottom + 1):
+        for k in range(starts[row * width + left], starts[row * width + right + 1]):
+            dx, dy = local[k, 0] - x, local[k, 1] - y
+            away = dx * dx + dy * dy
+            if away < best:
+                best, found = away, k
+    return found
+
+
+@kernel
+def solved(m: Floats, v: Floats) -> Floats:
+    """x of m x = v, m being a symmetric (3, 3) matrix, by Cramer's rule."""
+    a, b, c = m[0, 0], m[0, 1], m[0, 2]
+    d, e, f = m[1, 1], m[1, 2], m[2, 2]
+    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
+    whole = a * aa + b * bb + c * cc
+    x = np.empty(3)
+    x[0] = (aa * v[0] + bb * v[1] + cc * v[2]) / whole
+    x[1] = (bb * v[0] + dd * v[1] + ee * v[2]) / whole
+    x[2] = (cc * v[0] + ee * v[1] + ff * v[2]) / whole
+    return x
+
+
+@kernel
+def _lay(
+    local: Points,
+    normals: Points,
+    starts: NDArray[np.int32],
+    width: int,
+    origin: Floats,
+    points: Points,
+    pose: Floats,
+    gate: float,
+    hessian: Floats,
+    gradient: Floats,
+) -> tuple[int, float]:
+    """Add the points at `pose` to the normal equations; how many have a line, and squares."""
+    inliers, squares = 0, 0.0
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    for k in range(len(points)):
+        rx = cos * points[k, 0] - sin * points[k, 1]
+        ry = sin * points[k, 0] + cos * points[k, 1]
+        j = _nearest(local, starts, width, origin, pose[0] + rx, pose[1] + ry, gate)
+        if j < 0:
+            continue
+        nx, ny = normals[j, 0], normals[j, 1]
+        error = (pose[0] + rx - local[j, 0]) * nx + (pose[1] + ry - local[j, 1]) * ny
+        weight = (SIGMA / (SIGMA * SIGMA + error * error)) ** 2  # divided by the variance
+        lever = rx * ny - ry * nx  # how the error grows with yaw
+        inliers += 1
+        squares += error * error
+        gradient[0] += weight * error * nx
+        gradient[1] += weight * error * ny
+        gradient[2] += weight * error * lever
+        hessian[0, 0] += weight * nx * nx
+        hessian[0, 1] += weight * nx * ny
+        hessian[0, 2] += weight * nx * lever
+        hessian[1, 1] += weight * ny * ny
+        hessian[1, 2] += weight * ny * lever
+        hessian[2, 2] += weight * lever * lever
+    hessian[1, 0], hessian[2, 0], hessian[2, 1] = hessian[0, 1], hessian[0, 2], hessian[1, 2]
+    return inliers, squares
+
+
+@kernel
+def _icp(
+    local: Points,
+    normals: Points,
+    starts: NDArray[np.int32],
+    width: int,
+    origin: Floats,
+    points: Points,
+    start: Floats,
+    gate: float,
+    prior: Floats,
+    guess: Floats,
+) -> tuple[Floats, Floats, float, float]:
+    pose = start.copy()
+    hessian = np.zeros((3, 3))
+    inliers, squares = 0, 0.0
+    for _ in range(ITERATIONS):
+        hessian, gradient = np.zeros((3, 3)), np.zeros(3)
+        inliers, squares = _lay(
+            local, normals, starts, width, origin, points, pose, gate, hessian, gradient
+        )
+        off = pose - guess
+        off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi
+        for row in range(3):  # `@` would call for a BLAS
+            gradient[row] += (prior[row] * off).sum()
+        step = solved(hessian + prior + SOFT * np.eye(3), gradient)
+        pose -= step
+        if np.abs(step).max() < STILL and gate <= GATE_LEAST:
+            break
+        gate = max(gate * SHRINK, GATE_LEAST)
+    return pose, hessian, inliers / max(len(points), 1), np.sqrt(squares / max(inliers, 1))

@@ -1,0 +1,176 @@
+"""Where in the whole map can the robot be, by one scan alone?
+
+Every block of 8 x 8 cells at every heading gets an upper bound of how well the scan may fit there;
+only the best blocks are looked at cell by cell (Olson 2009, Hess et al. 2016).
+"""
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.mapping.field import Field, fit
+from gigabrain_zenoh.mapping.points import Points
+from gigabrain_zenoh.mapping.se2 import Floats, wrap
+
+POINTS = 90  # of a scan, evenly chosen
+FEWEST_POINTS = 20
+SIGMA = 0.15  # [m], wide enough for the steps between headings
+BLOCK = 8  # cells
+STEP_M, FINEST_RAD, COARSEST_RAD = 0.15, math.radians(1.0), math.radians(3.0)
+LEAST = 0.5  # a fit below that is none
+BAND = 0.15  # candidates that much worse than the best are not looked at
+MOST_BLOCKS, MOST_TRIED, MOST_FOUND = 40_000, 96, 24
+APART_M, APART_RAD = 0.3, math.radians(20)  # nearer ones are the same
+WEAK = np.diag((1.0, 1.0, 1.0))  # information that holds a candidate where it was found
+
+Bytes = NDArray[np.uint8]
+
+
+class Candidate(NamedTuple):
+    """A pose of the body that would explain the scan."""
+
+    pose: Floats  # (3,)
+    score: float  # as Fit's
+
+
+def search(field: Field, hits: Points, free: Points, sensor: Floats) -> list[Candidate]:
+    """All poses in the map that explain a scan about equally well, the best first.
+
+    Takes the scan as `field.fit` does. Meant for a thread in the background.
+    """
+    if len(hits) < FEWEST_POINTS or not field.free.any():
+        return []
+    chosen = hits[np.linspace(0, len(hits) - 1, min(POINTS, len(hits))).astype(np.intp)]
+    image = np.round(255 * np.exp(-0.5 * (field.distance / SIGMA) ** 2)).astype(np.uint8)
+    bounds, headings = _bounds(field, image, chosen)
+    places = _best_blocks(bounds)
+    offsets = _turned(chosen, headings, field.cell)
+    scores, cells = _inside(image, field.free, offsets, places, bounds)
+    tried: list[Floats] = []
+    for k in np.argsort(-scores, kind="stable")[: 50 * MOST_TRIED]:
+        if scores[k] < max(LEAST, scores.max() - BAND) or len(tried) == MOST_TRIED:
+            break
+        xy = field.origin + (cells[k] + 0.5) * field.cell
+        pose = np.array((*xy, headings[places[k, 0]]))
+        if apart(pose, tried):
+            tried.append(pose)
+    fits = [fit(field, hits, free, sensor, pose, WEAK) for pose in tried]
+    return _distinct([Candidate(found.pose, found.score) for found in fits])
+
+
+def _bounds(field: Field, image: Bytes, points: Points) -> tuple[Bytes, Floats]:
+    """Upper bounds (headings, rows, columns) of blocks, 0 to 255, and the headings [rad]."""
+    reach = float(np.percentile(np.hypot(points[:, 0], points[:, 1]), 75))
+    finest = min(max(STEP_M / max(reach, STEP_M), FINEST_RAD), COARSEST_RAD)
+    headings = np.arange(0.0, math.tau, math.tau / math.ceil(math.tau / finest))
+    best_within = cv2.dilate(image, np.ones((BLOCK, BLOCK), np.uint8), anchor=(0, 0))
+    free = field.free.astype(np.uint8)
+    some_free = cv2.dilate(free, np.ones((BLOCK, BLOCK), np.uint8), anchor=(0, 0))
+    blocks = np.array(some_free[::BLOCK, ::BLOCK], np.uint8)
+    offsets = _turned(points, headings, field.cell)
+    return _coarse(np.array(best_within, np.uint8), blocks, offsets), headings
+
+
+def _turned(points: Points, headings: Floats, cell: float) -> NDArray[np.int64]:
+    """How many cells away from the body's own each point is (headings, points, 2)."""
+    cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
+    x, y = points[:, 0][None, :], points[:, 1][None, :]
+    turned = np.stack((cos * x - sin * y, sin * x + cos * y), axis=-1)
+    return np.floor(turned / cell + 0.5).astype(np.int64)
+
+
+def _best_blocks(bounds: Bytes) -> NDArray[np.int64]:
+    """The blocks worth a look (n, 3) as heading, row and column, the best first."""
+    flat = bounds.ravel()
+    worth = np.flatnonzero(flat >= round(255 * LEAST))
+    order = np.argsort(-flat[worth].astype(np.int16), kind="stable")[:MOST_BLOCKS]
+    return np.stack(np.unravel_index(worth[order], bounds.shape), axis=-1).astype(np.int64)
+
+
+def apart(pose: Floats, others: Iterable[Floats]) -> bool:
+    """Whether `pose` is none of the others."""
+    for other in others:
+        off = pose - other
+        near = math.hypot(off[0], off[1]) < APART_M
+        if near and abs(float(wrap(off[2]))) < APART_RAD:
+            return False
+    return True
+
+
+def _distinct(candidates: list[Candidate]) -> list[Candidate]:
+    """The best of those that lie together, the best first, down to the band below the best."""
+    found: list[Candidate] = []
+    for candidate in sorted(candidates, key=lambda one: -one.score):
+        good = candidate.score >= max(LEAST, found[0].score - BAND if found else LEAST)
+        if good and apart(candidate.pose, (one.pose for one in found)) and len(found) < MOST_FOUND:
+            found.append(candidate)
+    return found
+
+
+@kernel
+def _coarse(image: Bytes, some_free: Bytes, offsets: NDArray[np.int64]) -> Bytes:
+    height, width = image.shape
+    rows, columns = some_free.shape
+    headings, count, _ = offsets.shape
+    bounds = np.zeros((headings, rows, columns), np.uint8)
+    for heading in range(headings):
+        for row in range(rows):
+            for column in range(columns):
+                if not some_free[row, column]:
+                    continue
+                total = 0
+                for k in range(count):
+                    x = column * BLOCK + offsets[heading, k, 0]
+                    y = row * BLOCK + offsets[heading, k, 1]
+                    # a block that begins outside may end within
+                    if -BLOCK < x < width and -BLOCK < y < height:
+                        total += image[max(y, 0), max(x, 0)]
+                bounds[heading, row, column] = total // count
+    return bounds
+
+
+@kernel
+def _inside(
+    image: Bytes,
+    free: NDArray[np.bool_],
+    offsets: NDArray[np.int64],
+    places: NDArray[np.int64],
+    bounds: Bytes,
+) -> tuple[Floats, NDArray[np.int64]]:
+    """The best score in each block, and its cell as x, y; blocks that cannot win are left at 0."""
+    height, width = image.shape
+    count, best = offsets.shape[1], 0.0
+    scores, cells = np.zeros(len(places)), np.zeros((len(places), 2), np.int64)
+    for place in range(len(places)):
+        heading, row, column = places[place]
+        enough = max(LEAST, best - BAND) * 255.0 * count
+        if (bounds[heading, row, column] + 1) * count < enough:
+            break  # those that follow are no better
+        for y in range(row * BLOCK, min((row + 1) * BLOCK, height)):
+            for x in range(column * BLOCK, min((column + 1) * BLOCK, width)):
+                total = _total(image, offsets[heading], x, y, enough) if free[y, x] else 0
+                score = total / (255.0 * count)
+                if score > scores[place]:
+                    scores[place] = score
+                    cells[place, 0], cells[place, 1] = x, y
+        best = max(best, scores[place])
+    return scores, cells
+
+
+@kernel
+def _total(image: Bytes, offsets: NDArray[np.int64], x: int, y: int, enough: float) -> int:
+    """The sum over all points, or 0 as soon as `enough` is out of reach."""
+    height, width = image.shape
+    count, total = len(offsets), 0
+    for k in range(count):
+        at_x, at_y = x + offsets[k, 0], y + offsets[k, 1]
+        if 0 <= at_x < width and 0 <= at_y < height:
+            total += image[at_y, at_x]
+        if total + 255 * (count - 1 - k) < enough:
+            return 0
+    return total

@@ -1,0 +1,229 @@
+"""Simultaneous localisation and mapping: front end, pose graph and loop search put together.
+
+`add` is what each scan costs. `close_loops` may run in a thread of its own meanwhile; what it finds
+moves nothing until `apply`, and as the front end never sees a correction, no match depends on when
+that was.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.mapping.drift import Rates
+from gigabrain_zenoh.mapping.front_end import FrontEnd, Kind, Match, Spacing
+from gigabrain_zenoh.mapping.frozen import (
+    Arrays,
+    freeze_edges,
+    freeze_keyframes,
+    thaw_edges,
+    thaw_keyframes,
+)
+from gigabrain_zenoh.mapping.graph import Graph
+from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
+from gigabrain_zenoh.mapping.loops import LoopSearch, around
+from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, turned
+
+LINK = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance of a link beside that of its match
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Where the robot was at a scan."""
+
+    pose: Floats  # in the map as it is now
+    covariance: Floats  # (3, 3), of x, y and yaw in the map, against what is mapped round the robot
+    keyframe: int  # the keyframe that this hangs on: a correction moves both
+    relative: Floats  # the pose in that keyframe's frame
+    kind: Kind  # how it was found, see Match
+    score: float  # 0 to 1, how well the scan fits
+    kept: bool  # the scan has become a keyframe
+    lost: bool  # the sequence broke, and nothing has joined the parts since
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """What closing loops has made of the first keyframes' poses."""
+
+    poses: Floats  # (n, 3)
+    loops: tuple[Edge, ...]
+
+
+def warm_up() -> None:
+    """Compile whatever a driving robot calls: seconds when cold, then as good as nothing."""
+    along = np.linspace(-3.0, 3.0, 60)
+    walls = np.concatenate([np.c_[along, along * 0 + 3.0], np.c_[along * 0 + 3.0, along]])
+    scan = Scan.of(walls)
+    slam = Slam()
+    slam.add(scan, IDENTITY)
+    slam.add(scan, IDENTITY)
+
+
+class Slam:
+    """A map that grows. All but `close_loops` belongs to one thread."""
+
+    def __init__(
+        self, pose: Floats = IDENTITY, spacing: Spacing | None = None, rates: Rates | None = None
+    ) -> None:
+        self._front = FrontEnd(spacing or Spacing(), pose)
+        self._anchor = (0, pose)  # a keyframe, and where the front end has it
+        self._poses: list[Floats] = []
+        self._segment = 0
+        self._joined = {0}  # segments that loops have joined to the first
+        self._travel = 0.0
+        self._graph = Graph()
+        self._search = LoopSearch(rates or Rates())
+        self.keyframes: list[Keyframe] = []  # only ever appended to
+        self.revision = 0  # changes whenever poses of keyframes are corrected
+
+    @property
+    def poses(self) -> Floats:
+        """Where the keyframes are in the map, (n, 3)."""
+        return np.array(self._poses).reshape(-1, 3)
+
+    @property
+    def smooth(self) -> Floats:
+        """Where the robot is in the front end's own frame, which drifts and never jumps."""
+        return self._front.pose
+
+    def add(self, scan: Scan, delta: Floats) -> Estimate:
+        """Where the robot is, odometry having moved by `delta` (x, y, yaw) since the last scan."""
+        if not np.isfinite(delta).all():
+            raise ValueError(f"odometry: expected finite numbers, got {delta}")
+        self._travel += float(np.hypot(delta[0], delta[1]))
+        match, kept = self._front.add(scan, delta)
+        keyframe, placed = self._anchor
+        relative = between(placed, match.pose)
+        if kept:
+            self._keep(scan, match, relative)
+            keyframe, relative = len(self.keyframes) - 1, IDENTITY
+        pose = compose(self._poses[keyframe], relative)
+        return Estimate(
+            pose=pose,
+            covariance=turned(match.covariance, float(pose[2] - match.pose[2])),
+            keyframe=keyframe,
+            relative=relative,
+            kind=match.kind,
+            score=match.score,
+            kept=kept,
+            lost=self._segment not in self._joined,
+        )
+
+    def relocate(self, pose: Floats) -> None:
+        """The robot is at `pose` in the map, whatever was known before: match to what is there."""
+        travel = np.array([keyframe.travel for keyframe in self.keyframes])
+        poses = self.poses
+        away = np.hypot(*(poses[:, :2] - pose[:2]).T)
+        away[[keyframe.segment not in self._joined for keyframe in self.keyframes]] = np.inf
+        nearest = int(np.argmin(away))
+        place = around(travel, nearest, len(poses))
+        ids = sorted(range(place.start, place.stop), key=lambda k: -abs(k - nearest))
+        self._front.pose = pose
+        self._front.restart([self.keyframes[k].scan for k in ids], [poses[k] for k in ids])
+        self._anchor = (nearest, poses[nearest])
+        self._segment = self.keyframes[nearest].segment
+
+    def close_loops(self) -> Correction | None:
+        """Take in the next keyframe and look for a loop from it; None when that corrects nothing.
+
+        Call it until `behind` is 0. At most one thread at a time, which may be any.
+        """
+        here = len(self._graph.poses)
+        if here == len(self.keyframes):
+            return None
+        keyframes = self.keyframes[: here + 1]
+        link = keyframes[here].link
+        self._graph.extend([link])
+        self._search.drift.linked(link)
+        loops = self._search.find(keyframes, self._graph.poses)
+        if not loops:
+            return None
+        self._graph.close(loops)
+        return Correction(self._graph.poses, tuple(loops))
+
+    @property
+    def behind(self) -> int:
+        """Keyframes that no loop was looked for from yet."""
+        return len(self.keyframes) - len(self._graph.poses)
+
+    def apply(self, correction: Correction) -> None:
+        """Move the keyframes to where `close_loops` has found them to be."""
+        done = len(correction.poses)
+        self._poses[:done] = list(correction.poses)
+        for keyframe in self.keyframes[done:]:
+            link = keyframe.link
+            self._poses[link.second] = compose(self._poses[link.first], link.relative)
+        self._join(correction.loops)
+        self.revision += 1
+
+    def freeze(self) -> dict[str, NDArray[np.generic]]:
+        """All that it takes to go on later, in arrays. Not while `close_loops` runs."""
+        held = {id(keyframe.scan): k for k, keyframe in enumerate(self.keyframes)}
+        scans, placed = self._front.held
+        return {
+            **freeze_keyframes(self.keyframes),
+            **freeze_edges("loop", self._graph.loops),
+            **freeze_edges("waiting", self._search.waiting),
+            "poses": self.poses,
+            "behind": np.array(self.behind),
+            "searched": np.array(self._search.searched),
+            "driven": np.array(self._travel),
+            "local": np.array([held[id(scan)] for scan in scans], np.int32),
+            "local_poses": np.array(placed).reshape(-1, 3),
+            "front": self._front.pose,
+            "anchor": np.array(self._anchor[0]),
+            "anchor_pose": self._anchor[1],
+        }
+
+    @classmethod
+    def thaw(
+        cls, arrays: Arrays, spacing: Spacing | None = None, rates: Rates | None = None
+    ) -> "Slam":
+        """Go on from what was frozen; KeyError or ValueError if it does not belong together."""
+        slam = cls(arrays["front"].astype(np.float64), spacing, rates)
+        slam.keyframes = thaw_keyframes(arrays)
+        poses = arrays["poses"].astype(np.float64)
+        behind, anchor = int(arrays["behind"]), int(arrays["anchor"])
+        if poses.shape != (len(slam.keyframes), 3) or not 0 <= behind < len(poses) > anchor >= 0:
+            raise ValueError(f"{len(slam.keyframes)} keyframes, but {len(poses)} poses")
+        slam._poses = list(poses)
+        slam._travel = float(arrays["driven"])
+        slam._anchor = (anchor, arrays["anchor_pose"].astype(np.float64))
+        slam._segment = slam.keyframes[anchor].segment
+        scans = [slam.keyframes[k].scan for k in arrays["local"].astype(int)]
+        slam._front.restart(scans, list(arrays["local_poses"].astype(np.float64)))
+        slam._thaw_graph(poses[: len(poses) - behind], arrays)
+        return slam
+
+    def _thaw_graph(self, poses: Floats, arrays: Arrays) -> None:
+        loops = thaw_edges("loop", arrays)
+        self._graph.extend([keyframe.link for keyframe in self.keyframes[: len(poses)]], poses)
+        for keyframe in self.keyframes[: len(poses)]:
+            self._search.drift.linked(keyframe.link)
+        for loop in loops:
+            self._search.drift.closed(loop)
+        if loops:
+            self._graph.close(loops)
+        self._search.waiting = thaw_edges("waiting", arrays)
+        self._search.searched = float(arrays["searched"])
+        self._join(loops)
+
+    def _join(self, loops: Sequence[Edge]) -> None:
+        for loop in loops:
+            ends = {self.keyframes[loop.first].segment, self.keyframes[loop.second].segment}
+            if ends & self._joined:
+                self._joined |= ends
+
+    def _keep(self, scan: Scan, match: Match, relative: Floats) -> None:
+        here = len(self.keyframes)
+        broken = match.kind == "broken"
+        self._segment += broken
+        covariance = LINK + turned(match.covariance, -float(match.pose[2]))
+        doubtful = match.kind in ("odometry", "broken")
+        link = Edge(self._anchor[0], here, relative if here else match.pose, covariance, doubtful)
+        self.keyframes.append(Keyframe(scan, link, self._travel, self._segment))
+        self._poses.append(compose(self._poses[link.first], relative) if here else match.pose)
+        self._anchor = (here, match.pose)
+        self._front.keep(scan, alone=broken)

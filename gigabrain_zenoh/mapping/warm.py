@@ -1,0 +1,24 @@
+"""Compile whatever a driving robot calls, before it drives."""
+
+import numpy as np
+
+from gigabrain_zenoh.mapping import grid, slam
+from gigabrain_zenoh.mapping.field import field_of
+from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.relocalize import search
+from gigabrain_zenoh.mapping.se2 import IDENTITY
+
+BEAMS, ROOM_M = 60, 1.0
+
+
+def warm_up() -> None:
+    """Call every kernel once, in a room of 2 x 2 m."""
+    angles = np.linspace(0.0, 2 * np.pi, BEAMS, endpoint=False)
+    ways = np.column_stack((np.cos(angles), np.sin(angles)))
+    scan = Scan.of(ROOM_M * ways / np.abs(ways).max(axis=1, keepdims=True), ways[:1])
+    grid.warm_up()
+    drawn = grid.Grid()
+    drawn.draw(IDENTITY, scan.points, scan.free)
+    field = field_of(drawn.percent(), grid.CELL, (drawn.origin_x, drawn.origin_y))
+    search(field, scan.points, scan.free, IDENTITY[:2])
+    slam.warm_up()

@@ -1,0 +1,83 @@
+// What is drawn in the robot's own frame. Each takes the pen and the map view.
+const TAU = 2 * Math.PI
+const AHEAD_S = 1, SLOW = 0.05 // how far ahead of a moving thing its line reaches; below [m/s] there is none
+
+/** The nearest thing in each sector, as perception sees it. */
+function paintFree(pen, view) {
+  const sectors = view.moment.world?.sectors ?? []
+  pen.beginPath()
+  sectors.forEach((distance, i) => {
+    if (distance === null) return
+    const middle = (i * TAU) / sectors.length, half = (0.42 * TAU) / sectors.length
+    pen.moveTo(distance * Math.cos(middle - half), distance * Math.sin(middle - half))
+    pen.arc(0, 0, distance, middle - half, middle + half)
+  })
+  pen.globalAlpha = 0.5
+  view.stroke(pen, view.colour.zone, 1.5)
+  pen.globalAlpha = 1
+}
+
+/** What must be free for the body to stop at its present speed. */
+function paintZones(pen, view) {
+  const { body, moment: { state } } = view
+  if (!body || !state) return
+  const v = state.velocity.linear_x, t = body.thresholds
+  const reach = Math.abs(v) * t.reaction_time + (v * v) / (2 * body.max_linear_deceleration) + t.stop_margin
+  const xs = body.footprint.map((p) => p[0]), ys = body.footprint.map((p) => p[1])
+  const left = Math.max(...ys), right = Math.min(...ys)
+  pen.globalAlpha = 0.45
+  pen.fillStyle = view.colour.zone
+  if (v >= 0) pen.fillRect(Math.max(...xs), right, reach, left - right)
+  else pen.fillRect(Math.min(...xs) - reach, right, reach, left - right)
+  pen.globalAlpha = 1
+}
+
+function paintPlan(pen, view) {
+  const points = view.moment.intent?.trajectory ?? []
+  pen.beginPath()
+  pen.moveTo(0, 0)
+  for (const [, x, y] of points) pen.lineTo(x, y)
+  view.stroke(pen, view.colour.plan, 3)
+}
+
+function paintRobot(pen, view) {
+  const outline = view.body?.footprint ?? []
+  pen.beginPath()
+  outline.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)))
+  pen.closePath()
+  pen.fillStyle = view.colour.robot
+  pen.fill()
+  view.stroke(pen, view.colour.ink, 2)
+  const size = Math.max(0.07, 7 * view.pixel)
+  pen.beginPath()
+  pen.moveTo(size, 0)
+  pen.lineTo(-size * 0.7, size * 0.7)
+  pen.lineTo(-size * 0.7, -size * 0.7)
+  pen.fillStyle = view.colour.plan
+  pen.fill()
+}
+
+/** What perception follows from scan to scan; it is told in the frame of the odometry. */
+function paintThings(pen, view) {
+  const { world, state } = view.moment
+  if (!state) return
+  pen.save()
+  pen.rotate(-state.pose.yaw)
+  pen.translate(-state.pose.x, -state.pose.y)
+  for (const thing of world?.obstacles ?? []) {
+    pen.beginPath()
+    pen.arc(thing.x, thing.y, Math.max(thing.radius, 3 * view.pixel), 0, TAU)
+    pen.globalAlpha = 0.35
+    pen.fillStyle = view.colour.thing
+    pen.fill()
+    pen.globalAlpha = 1
+    if (Math.hypot(thing.velocity_x, thing.velocity_y) > SLOW) {
+      pen.moveTo(thing.x, thing.y)
+      pen.lineTo(thing.x + AHEAD_S * thing.velocity_x, thing.y + AHEAD_S * thing.velocity_y)
+    }
+    view.stroke(pen, view.colour.thing, 2)
+  }
+  pen.restore()
+}
+
+export const ON_ROBOT = [paintFree, paintZones, paintThings, paintPlan, paintRobot]

@@ -1,0 +1,48 @@
+"""What a task wants of whoever drives, and what became of it."""
+
+from typing import Literal
+
+from msgspec import Struct
+
+from gigabrain_schemas.tasks import Goal
+
+
+class GoTo(Struct, frozen=True):
+    """Be at a place."""
+
+    number: int  # of this order; another number is another order, even for the same place
+    goal: Goal
+
+
+class Explore(Struct, frozen=True):
+    """See all that there is to see."""
+
+    number: int
+
+
+class Visit(Struct, frozen=True):
+    """Be at some place that can be reached, chosen at random."""
+
+    number: int
+
+
+Order = GoTo | Explore | Visit
+
+
+class Outcome(Struct, frozen=True, kw_only=True):
+    """How far an order has come."""
+
+    number: int  # of the order
+    state: Literal["running", "done", "failed"] = "running"
+    reason: str = ""  # in words
+    progress: float = 0.0
+    distance: float | None = None  # [m] that is left along the path
+    eta: float | None = None  # [s]
+    goal: Goal | None = None  # where it drives to now
+    path: tuple[tuple[float, float], ...] = ()  # [m] in the map, for drawing
+
+
+def where(goal: Goal) -> str:
+    """A place as people read it."""
+    turned = "" if goal.yaw is None else f", {goal.yaw:.2f} rad"
+    return f"({goal.x:.2f}, {goal.y:.2f}{turned})"

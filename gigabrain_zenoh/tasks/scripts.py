@@ -1,0 +1,87 @@
+"""Programs of the host that missions may run: those of one folder, and no others."""
+
+import asyncio
+import contextlib
+import os
+import signal
+from pathlib import Path
+
+from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
+from gigabrain_zenoh.tasks.mission import Script
+
+LAST = 200  # characters of what it wrote that are told
+
+
+class Scripts:
+    """Starts what the deployment file allows."""
+
+    def __init__(self, folder: str) -> None:
+        self._folder = Path(folder).expanduser() if folder else None
+
+    def path(self, name: str) -> Path:
+        """Where a program is. Raises Refused, which says what to change, and UnknownName."""
+        if self._folder is None:
+            raise Refused(
+                f"script {name!r}: this robot runs none; name their folder in its deployment "
+                "file, as in decision: {scripts: /home/robot/scripts}"
+            )
+        there = sorted(p.name for p in self._folder.glob("*") if p.is_file())
+        if name not in there:
+            raise unknown("script", name, there or ("none",))
+        path = self._folder / name
+        if not os.access(path, os.X_OK):
+            raise Refused(f"script {name!r} may not be run; chmod +x {path}")
+        return path
+
+    def start(self, script: Script) -> "Run":
+        """Run a program. What keeps it from running is its result."""
+        return Run(self, script)
+
+
+class Run:
+    """One program while it runs, in a process group of its own."""
+
+    def __init__(self, scripts: Scripts, script: Script) -> None:
+        self.result: tuple[bool, str] | None = None
+        self._task = asyncio.ensure_future(self._run(scripts, script))
+
+    def stop(self) -> None:
+        """End it, and whatever it has started."""
+        self._task.cancel()
+
+    async def _run(self, scripts: Scripts, script: Script) -> None:
+        try:
+            path = scripts.path(script.run)
+            process = await asyncio.create_subprocess_exec(
+                path, *script.arguments, cwd=path.parent, start_new_session=True,
+                stdin=asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+            )  # fmt: skip
+        except (GigabrainError, OSError, ValueError) as error:
+            self.result = False, f"cannot be run: {error}"
+            return
+        try:
+            async with asyncio.timeout(script.seconds):
+                said = await _last_words(process)
+                code = await process.wait()
+            self.result = code == 0, _in_words(code, said)
+        except TimeoutError:
+            self.result = False, f"did not end within {script.seconds:g} s and was ended"
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            await asyncio.shield(process.wait())
+
+
+async def _last_words(process: asyncio.subprocess.Process) -> str:
+    """The end of what a program writes, once it has ended."""
+    assert process.stdout
+    said = b""
+    while chunk := await process.stdout.read(4096):
+        said = (said + chunk)[-LAST:]
+    return " ".join(said.decode(errors="replace").split())
+
+
+def _in_words(code: int, said: str) -> str:
+    ended = "ended well" if code == 0 else f"ended with exit code {code}"
+    return f"{ended}: {said}" if said else ended

@@ -1,0 +1,54 @@
+"""Tasks on disk: they survive a restart of decision."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+
+from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.tasks.executive import Saved
+
+
+class TaskFile:
+    """One small file, replaced as a whole and synced; nowhere, where there is no folder."""
+
+    def __init__(self, folder: str) -> None:
+        self._path = Path(folder) / "tasks.json" if folder else None
+
+    def read(self) -> tuple[Saved, str]:
+        """What there was to do, and a problem in one line. What cannot be read is set aside."""
+        if self._path is None:
+            return Saved(), ""
+        try:
+            return msgspec.json.decode(self._path.read_bytes(), type=Saved), ""
+        except FileNotFoundError:
+            return Saved(), ""
+        except OSError as error:
+            return Saved(), f"{self._path} cannot be read: {error.strerror}; nothing is to be done"
+        except DECODE_ERRORS as error:
+            return Saved(), self._set_aside(self._path, error)
+
+    def write(self, newest: Sequence[Saved]) -> str:
+        """Write the last of `newest`; the problem in one line, or an empty text."""
+        if self._path is None:
+            return ""
+        fresh = self._path.with_suffix(".new")
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with fresh.open("wb") as file:
+                file.write(msgspec.json.encode(newest[-1]))
+                file.flush()
+                os.fsync(file.fileno())
+            fresh.replace(self._path)
+        except OSError as error:
+            return f"cannot write {self._path}: {error.strerror}; tasks will not survive a restart"
+        return ""
+
+    def _set_aside(self, path: Path, error: Exception) -> str:
+        bad = path.with_suffix(".bad")
+        try:
+            path.replace(bad)
+        except OSError as problem:
+            return f"{path} is damaged ({error}) and stays: {problem.strerror}"
+        return f"{path} is damaged ({error}); it is {bad} now, and nothing is to be done"

@@ -1,0 +1,100 @@
+"""The SLAM benchmark: relations, what it refuses, and a short log."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.bench.slam import drive, judged, total
+from gigabrain_zenoh.bench.slam_logs import Log, errors, load, relations
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.mapping.se2 import Floats, compose
+
+DATA = os.environ.get("GIGABRAIN_DATA")
+
+
+def circles(scans: int = 120, radius: float = 8.0) -> Floats:
+    """Two laps of a circle."""
+    turned = np.linspace(0, 4 * np.pi, scans, endpoint=False)
+    ahead = turned + np.pi / 2
+    return np.column_stack((radius * np.cos(turned), radius * np.sin(turned), ahead))
+
+
+def log(reference: Floats) -> Log:
+    return Log("circles", np.ones((len(reference), 180)), reference, reference)
+
+
+def test_relations_are_near_in_place_and_far_in_time() -> None:
+    reference = circles()
+    pairs = relations(log(reference))
+    first, second = pairs.T
+    assert len(pairs) == 426
+    assert (second - first).min() > 30
+    assert np.hypot(*(reference[first] - reference[second])[:, :2].T).max() < 3.0
+    assert relations(log(circles(8000))).shape == (2000, 2)
+
+
+def test_a_map_in_another_frame_has_no_error_and_a_bent_one_has() -> None:
+    one = log(circles())
+    pairs = relations(one)
+    elsewhere = compose(np.array((5.0, -3.0, 1.0)), one.reference)
+    assert errors(one, elsewhere, pairs).mean_m == pytest.approx(0.0, abs=1e-9)
+    second_lap = (np.arange(120) >= 60)[:, None] * (0.3, 0.0, 0.0)
+    bent = errors(one, one.reference + second_lap, pairs[pairs[:, 1] >= 60])
+    assert bent.mean_m == pytest.approx(0.3, abs=0.01)
+    assert bent.mean_deg == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_log_without_a_place_passed_twice_is_refused() -> None:
+    straight = np.column_stack((np.arange(100.0), np.zeros(100), np.zeros(100)))
+    with pytest.raises(ConfigError, match="circles: no place is passed twice"):
+        relations(log(straight))
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"ref": None}, "expected the arrays ranges, ref, odom"),
+        ({"ref": np.zeros((4, 3))}, r"ref: expected poses of shape \(5, 3\)"),
+        ({"odom": np.full((5, 3), np.nan)}, "odom: expected finite numbers"),
+        ({"ranges": np.zeros(5, np.uint16)}, "ranges: expected whole centimetres"),
+        ({"ranges": np.zeros((5, 180))}, "ranges: expected whole centimetres"),
+    ],
+)
+def test_a_wrong_log_is_refused_in_one_line(
+    tmp_path: Path, change: dict[str, Floats | None], complaint: str
+) -> None:
+    arrays = {
+        "ranges": np.zeros((5, 180), np.uint16),
+        "ref": np.zeros((5, 3)),
+        "odom": np.zeros((5, 3)),
+        **change,
+    }
+    path = tmp_path / "log.npz"
+    np.savez(path, **{name: rows for name, rows in arrays.items() if rows is not None})
+    with pytest.raises(ConfigError, match=complaint) as refused:
+        load(path)
+    assert str(refused.value).startswith(f"{path}: ")
+
+
+def test_a_cut_log_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "log.npz"
+    np.savez(path, ranges=np.zeros((50, 180), np.uint16), ref=np.zeros((50, 3)))
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ConfigError, match=r"is no whole \.npz file"):
+        load(path)
+    with pytest.raises(ConfigError, match="No such file"):
+        load(tmp_path / "nope.npz")
+
+
+@pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
+def test_edmonton_is_mapped_within_7_cm_of_its_reference() -> None:
+    recorded = load(Path(str(DATA)) / "slam" / "edmonton.npz")
+    scans: list[None] = []
+    result = judged(recorded, drive(recorded, lambda: scans.append(None)))
+    assert len(scans) == result.scans == 340
+    assert result.graph.mean_m < 0.07
+    assert result.graph.mean_deg < 1.0
+    assert result.breaks == 0
+    assert total([result]).mean_m == result.graph.mean_m

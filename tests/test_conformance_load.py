@@ -1,0 +1,89 @@
+"""What the kit says on a machine that has no time for it."""
+
+import itertools
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.conformance import kit, machine
+from gigabrain_drivers.conformance.result import Failed, Finding, NotApplicable
+
+
+def waiting(monkeypatch: pytest.MonkeyPatch, each_ms: float) -> None:
+    """A machine that has the kit wait so long between two looks."""
+    steps = itertools.count()
+    monkeypatch.setattr(machine, "waited_ms", lambda: each_ms * next(steps))
+
+
+def finds(*findings: Finding) -> Callable[[], Awaitable[Finding]]:
+    """A check that finds this, one after the other."""
+    rest = iter(findings)
+
+    async def check() -> Finding:
+        return next(rest)
+
+    return check
+
+
+LATE = Finding(False, "at rest after 60 ticks of at most 50", late_ms=200.0)
+GOOD = Finding(True, "at rest after 20 ticks of at most 50")
+WRONG = Finding(False, "3 obeyed")
+
+
+async def test_late_on_a_machine_that_was_later_still_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    waiting(monkeypatch, 300.0)
+    assert await kit._found(finds(LATE, LATE, GOOD)) == GOOD
+
+
+async def test_late_three_times_on_such_a_machine_says_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    waiting(monkeypatch, 300.0)
+    with pytest.raises(NotApplicable, match="60 ticks of at most 50; this machine is too busy"):
+        await kit._found(finds(LATE, LATE, LATE))
+
+
+async def test_late_by_more_than_the_machine_is_the_drivers_fault(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    waiting(monkeypatch, 100.0)
+    assert await kit._found(finds(LATE)) == LATE
+
+
+async def test_what_is_wrong_is_wrong_on_any_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    waiting(monkeypatch, 1e6)
+    assert await kit._found(finds(WRONG)) == WRONG
+
+
+async def test_a_driver_that_does_not_come_as_far_fails_on_a_machine_with_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def stuck() -> Finding:
+        raise Failed("the body did not move; gate idle")
+
+    waiting(monkeypatch, 0.0)
+    assert (await kit._found(stuck)).measured == "the body did not move; gate idle"
+    waiting(monkeypatch, 1e6)
+    with pytest.raises(NotApplicable, match="did not move; gate idle; this machine is too busy"):
+        await kit._found(stuck)
+
+
+def test_waiting_for_a_core_is_summed_over_all_threads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for thread, text in (("7", "900 2000000 5\n"), ("8", "100 500000 2\n")):
+        (tmp_path / thread).mkdir()
+        (tmp_path / thread / "schedstat").write_text(text)
+    monkeypatch.setattr(machine, "TASKS", tmp_path)
+    assert machine.waited_ms() == 2.5
+
+
+def test_where_the_system_does_not_say_nothing_was_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(machine, "TASKS", tmp_path / "none")
+    monkeypatch.setattr(machine, "OWN", tmp_path / "none")
+    assert (machine.waited_ms(), machine.own_waited_ms()) == (0.0, 0.0)

@@ -1,0 +1,122 @@
+"""The occupancy grid: ways are free, ends are not, and what has gone does not stay."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.mapping import grid as grids
+from gigabrain_zenoh.mapping.grid import Grid
+from tests.map_rig import HOUSE, Rooms, at
+
+NONE = np.empty((0, 2), np.float32)
+
+
+def points(*pairs: tuple[float, float]) -> NDArray[np.float32]:
+    return np.array(pairs, np.float32).reshape(-1, 2)
+
+
+def percent(grid: Grid, x: float, y: float) -> int:
+    column, row = int((x - grid.origin_x) / 0.05), int((y - grid.origin_y) / 0.05)
+    return int(grid.percent()[row, column])
+
+
+def test_a_beam_frees_its_way_and_fills_its_end() -> None:
+    grid = Grid()
+    grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
+    assert percent(grid, 1.025, 0.025) == 71
+    assert [percent(grid, x, 0.025) for x in (0.025, 0.5, 0.976)] == [38, 38, 38]
+    assert percent(grid, 1.1, 0.025) == percent(grid, 0.5, 0.1) == -1
+
+
+def test_a_beam_that_hit_nothing_frees_its_way_and_fills_nothing() -> None:
+    grid = Grid()
+    grid.draw(at(0.025, 0.025), NONE, points((0.0, 2.0)))
+    assert percent(grid, 0.025, 1.976) == 38
+    assert grid.percent().max() == 38
+
+
+def test_in_one_scan_a_hit_goes_before_beams_that_pass_and_counts_once() -> None:
+    grid = Grid()
+    grid.draw(at(0.025, 0.025), points((1.0, 0.0), (1.0, 0.001), (2.0, 0.0)), NONE)
+    assert percent(grid, 1.025, 0.025) == 71
+    assert percent(grid, 1.5, 0.025) == 38
+
+
+def test_a_turned_sensor_draws_where_it_looks() -> None:
+    grid = Grid()
+    grid.draw(at(1.025, 2.025, 90), points((1.0, 0.0)), NONE)
+    assert percent(grid, 1.025, 3.025) == 71
+
+
+def test_it_grows_to_all_sides_and_keeps_what_was_drawn() -> None:
+    grid = Grid()
+    grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
+    before = grid.log_odds.shape
+    for end in ((-9.0, 0.0), (9.0, 0.0), (0.0, -9.0), (0.0, 9.0)):
+        grid.draw(at(0.025, 0.025), points(end), NONE)
+    assert percent(grid, -8.975, 0.025) == percent(grid, 0.025, 9.025) == 71
+    assert percent(grid, 1.025, 0.025) == 60  # hit once, passed once
+    assert all(now > then for now, then in zip(grid.log_odds.shape, before, strict=True))
+    assert all(side % 64 == 0 for side in grid.log_odds.shape)
+
+
+def test_what_would_not_fit_into_a_message_is_left_out_and_told() -> None:
+    grid = Grid()
+    grid.draw(at(0, 0), points((1.0, 0.0)), NONE)
+    grid.draw(at(0, 0), points((200.0, 0.0)), NONE)
+    assert grid.full
+    assert grid.log_odds.size < 100_000
+
+
+def test_what_walked_by_leaves_no_trace_and_walls_stay() -> None:
+    rooms, grid = Rooms(HOUSE), Grid()
+    for step in range(60):  # somebody crosses the room, 0.4 m wide
+        x = 1.0 + 0.04 * step
+        person = [(x, 3.2, x, 3.6), (x - 0.2, 3.4, x + 0.2, 3.4)]
+        scan = rooms.view(at(2.0, 2.5), person).scan
+        grid.draw(at(2.0, 2.5), scan.points, scan.free)
+    assert all(percent(grid, 1.0 + 0.1 * k, 3.4) < 40 for k in range(18))
+    assert max(percent(grid, x, 2.5) for x in (-0.03, 0.02)) > 90
+
+
+def test_what_stood_there_for_long_is_gone_after_eight_scans_without_it() -> None:
+    grid = Grid()
+    for _ in range(100):
+        grid.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
+    assert percent(grid, 1.025, 0.025) == 97
+    history = []
+    for _ in range(8):
+        grid.draw(at(0.025, 0.025), points((2.0, 0.0)), NONE)
+        history.append(percent(grid, 1.025, 0.025))
+    assert history[5] >= 60
+    assert history[-1] < 40
+
+
+def test_its_message_says_where_it_is() -> None:
+    grid = Grid()
+    grid.draw(at(-2.025, 1.025), points((1.0, 0.0)), NONE)
+    message = grid.message()
+    assert (message.resolution, message.width, message.height) == (0.05, 64, 64)
+    assert message.origin_x == pytest.approx(-2.05)
+    assert message.origin_y == pytest.approx(1.0)
+    assert message.cells.count(b"\xff") == 64 * 64 - 21
+
+
+def test_a_grid_as_it_was_saved_goes_on() -> None:
+    first = Grid()
+    first.draw(at(0.025, 0.025), points((1.0, 0.0)), NONE)
+    again = Grid.of(first.log_odds, first.known(), (first.origin_x, first.origin_y))
+    for grid in (first, again):
+        grid.draw(at(0.025, 0.025), points((1.5, 0.0)), NONE)
+    assert np.array_equal(first.percent(), again.percent())
+    assert grids.MOST_CELLS**2 <= 8 * 1024 * 1024
+
+
+def test_a_part_of_it_is_what_the_whole_shows_there() -> None:
+    grid = Grid()
+    grid.draw(at(0.025, 0.025), points((3.0, 0.0), (-3.0, 2.0)), NONE)
+    part, (x, y) = grid.around(2.0, 0.5, 1.0)
+    column, row = round((x - grid.origin_x) / 0.05), round((y - grid.origin_y) / 0.05)
+    assert part.shape == (40, 40)
+    assert np.array_equal(part, grid.percent()[row : row + 40, column : column + 40])
+    assert grid.around(500.0, 0.0, 1.0)[0].size == 0

@@ -1,0 +1,133 @@
+"""A map that grows: it closes its loop, survives a kidnapping, and goes on after it was saved."""
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.mapping.background import Background
+from gigabrain_zenoh.mapping.growing import GrowingMap
+from gigabrain_zenoh.mapping.se2 import between
+from tests.map_rig import HOUSE, PATIENCE_S, Rooms, Walker, at, error, grown
+
+START = (1.0, 2.5)
+ROUND = ((3.0, 3.0), (5.5, 3.0), (6.5, 4.8), (6.5, 1.8), (5.0, 3.0), (3.0, 4.5), (1.2, 3.8), START)
+
+
+def in_map(walker: Walker) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    return between(at(*START), walker.pose)
+
+
+@pytest.fixture(scope="module")
+def toured() -> tuple[GrowingMap, Walker]:
+    return grown(Rooms(HOUSE), START, *ROUND, *ROUND[:3])
+
+
+def test_after_a_tour_it_knows_where_it_is_and_has_drawn_the_house(
+    toured: tuple[GrowingMap, Walker],
+) -> None:
+    chart, walker = toured
+    place = walker.look()
+    assert place.localized
+    assert error(place, in_map(walker)) < 0.03
+    assert chart.report()["loops"] > 0
+    saved, _ = chart.to_save()
+    area = np.count_nonzero(saved.cells[saved.cells >= 0] < 40) * 0.05**2
+    assert area == pytest.approx(8 * 6 - 1.5 * 1.4 - 1.8 * 0.7 - 0.16, abs=2.5)
+
+
+def test_where_people_walked_the_map_is_free() -> None:
+    rooms = Rooms(HOUSE)
+    chart = GrowingMap(PATIENCE_S)
+    for k in range(120):
+        x = 1.0 + 0.02 * k
+        chart.step(rooms.view(at(*START, 0), [(x, 3.4, x, 3.7), (x, 3.4, x + 0.3, 3.4)]),
+                   at(0, 0), np.eye(3) * 1e-6)  # fmt: skip
+    for _ in range(40):
+        chart.step(rooms.view(at(*START, 0)), at(0, 0), np.eye(3) * 1e-6)
+    saved, _ = chart.to_save()
+    left, low = (
+        (v - o) / 0.05 for v, o in zip((0.2, 0.8), (saved.origin_x, saved.origin_y), strict=True)
+    )
+    inside = saved.cells[int(low) : int(low) + 10, int(left) : int(left) + 40]
+    assert inside.max() < 40
+
+
+def test_carried_off_it_is_lost_and_found_and_the_map_is_not_spoilt() -> None:
+    chart, walker = grown(Rooms(HOUSE), START, *ROUND)
+    before = chart.to_save()[0]
+    walker.pose = at(6.0, 4.5, 100)
+    chart.lose("the odometry has jumped")
+    assert not walker.look().localized
+    with pytest.raises(Refused, match="where the robot is, is not known"):
+        chart.to_save()
+    place = walker.look(20)
+    assert place.localized
+    assert error(place, in_map(walker)) < 0.05
+    assert walker.go((6.5, 1.8)).localized
+    after = chart.to_save()[0]
+    free = (before.cells >= 0) & (before.cells < 40)
+    assert after.cells.shape == before.cells.shape
+    assert np.count_nonzero(after.cells[free] > 60) < 0.01 * np.count_nonzero(free)
+
+
+def test_lifted_without_a_sign_in_the_odometry_it_notices_after_3_scans() -> None:
+    chart, walker = grown(Rooms(HOUSE), START, *ROUND)
+    before = chart.to_save()[0]
+    walker.pose = at(6.0, 4.5, 100)
+    assert [walker.look().localized for _ in range(3)] == [True, True, False]
+    with pytest.raises(Refused, match="what is seen is not where the robot was thought to be"):
+        chart.to_save()
+    assert chart.grid().cells == before.cells.tobytes()
+    place = walker.look(20)
+    assert place.localized
+    assert error(place, in_map(walker)) < 0.05
+
+
+def test_what_was_saved_goes_on(toured: tuple[GrowingMap, Walker]) -> None:
+    chart, walker = toured
+    _, arrays = chart.to_save()
+    again = Walker(Rooms(HOUSE, seed=3), GrowingMap.thaw(arrays, PATIENCE_S), walker.pose)
+    assert not again.look().localized
+    place = again.look(30)
+    assert place.localized
+    assert error(place, in_map(again)) < 0.05
+    place = again.go((5.0, 3.0), (3.0, 3.0))
+    assert error(place, in_map(again)) < 0.05
+
+
+@pytest.mark.parametrize("missing", ["poses", "sweep_hits", "link_ends"])
+def test_arrays_that_do_not_belong_together_are_refused(
+    missing: str, toured: tuple[GrowingMap, Walker]
+) -> None:
+    arrays = dict(toured[0].to_save()[1])
+    short = {**arrays, missing: arrays[missing][:-1]}
+    for bad in (short, {name: values for name, values in arrays.items() if name != missing}):
+        with pytest.raises(ConfigError, match="no pose graph: "):
+            GrowingMap.thaw(bad)
+
+
+def test_the_same_drive_gives_the_same_map_bit_for_bit() -> None:
+    maps = [grown(Rooms(HOUSE), START, *ROUND)[0].to_save()[0] for _ in range(2)]
+    assert np.array_equal(maps[0].cells, maps[1].cells)
+
+
+def test_work_beside_counts_at_the_scan_that_was_fixed_for_it() -> None:
+    background, taken = Background(PATIENCE_S), []
+    background.start(lambda: lambda: taken.append("now"), 3)
+    for scan in range(1, 5):
+        background.at_scan()
+        assert taken == (["now"] if scan >= 3 else [])
+    assert background.idle
+    background.close()
+
+
+def test_work_that_failed_is_raised_at_its_scan() -> None:
+    background = Background(PATIENCE_S)
+
+    def fail() -> None:
+        raise ValueError("broken")
+
+    background.start(fail, 1)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="broken"):
+        background.at_scan()
+    background.close()

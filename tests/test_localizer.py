@@ -1,0 +1,130 @@
+"""Localisation in a saved map: found from nothing, followed, lost when carried off, found again."""
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.mapping.field import field_of, fit
+from gigabrain_zenoh.mapping.known import KnownMap
+from gigabrain_zenoh.mapping.map_file import SavedMap
+from gigabrain_zenoh.mapping.relocalize import search
+from tests.map_rig import (
+    BEAMS,
+    CORRIDOR,
+    HOUSE,
+    NICHE,
+    PATIENCE_S,
+    Rooms,
+    Walker,
+    at,
+    drawn,
+    error,
+)
+
+WAY = [at(x, y, 10) for x in (1.0, 2.0, 3.0, 5.0, 6.0, 7.0) for y in (1.0, 2.0, 3.0, 4.0, 5.0)]
+
+
+@pytest.fixture(scope="module")
+def house() -> SavedMap:
+    return drawn(Rooms(HOUSE), *(pose for pose in WAY if (pose[:2] != (1.0, 5.0)).any()))
+
+
+@pytest.fixture(scope="module")
+def corridor() -> SavedMap:
+    walls = [*CORRIDOR, *NICHE]
+    return drawn(Rooms(walls), *(at(x, y) for x in range(1, 16) for y in (0.7, 2.3)))
+
+
+def walker(saved: SavedMap, walls: list[tuple[float, float, float, float]], x: float, y: float,
+           degrees: float = 0.0) -> Walker:  # fmt: skip
+    return Walker(Rooms(walls), KnownMap(saved, PATIENCE_S), at(x, y, degrees))
+
+
+def test_a_scan_is_drawn_to_where_it_belongs(house: SavedMap) -> None:
+    field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
+    view = Rooms(HOUSE).view(at(3.0, 2.5, 30))
+    free = np.eye(3) * 1e-3
+    found = fit(field, view.scan.points, view.scan.free, view.sensor, at(3.12, 2.41, 35), free)
+    assert found.pose[:2] == pytest.approx((3.0, 2.5), abs=0.02)
+    assert np.degrees(found.pose[2]) == pytest.approx(30, abs=0.5)
+    assert found.score > 0.9
+    elsewhere = fit(field, view.scan.points, view.scan.free, view.sensor, at(6, 4), free)
+    assert elsewhere.score < 0.45
+
+
+@pytest.mark.parametrize(
+    "pose", [at(1.0, 1.0, 77), at(3.3, 5.2, -140), at(5.5, 1.5, 180), at(7.2, 4.4, -12)]
+)
+def test_one_scan_finds_its_place_in_the_whole_house(pose: object, house: SavedMap) -> None:
+    assert isinstance(pose, np.ndarray)
+    field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
+    view = Rooms(HOUSE).view(pose)
+    best = search(field, view.scan.points, view.scan.free, view.sensor)[0]
+    assert best.pose[:2] == pytest.approx(pose[:2], abs=0.04)
+    assert np.cos(best.pose[2] - pose[2]) == pytest.approx(1.0, abs=2e-4)  # 1 degree
+
+
+def test_a_scan_of_nothing_and_a_map_of_nothing_give_no_place(house: SavedMap) -> None:
+    field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
+    view = Rooms([(50, 50, 51, 51)]).view(at(0, 0))
+    assert len(view.scan.free) == BEAMS
+    assert search(field, view.scan.points, view.scan.free, view.sensor) == []
+    unknown = field_of(np.full((50, 50), -1, np.int8), 0.05, (0.0, 0.0))
+    seen = Rooms(HOUSE).view(at(3.0, 2.5))
+    assert search(unknown, seen.scan.points, seen.scan.free, seen.sensor) == []
+
+
+def test_it_is_found_from_nothing_and_followed_to_3_cm(house: SavedMap) -> None:
+    robot = walker(house, HOUSE, 3.0, 2.0, 45)
+    assert not robot.look().localized
+    assert robot.look(14).localized
+    for x, y in ((3.0, 4.0), (5.0, 3.0), (6.5, 1.8), (6.5, 5.0)):
+        place = robot.go((x, y))
+        assert place.localized
+        assert error(place, robot.pose) < 0.03
+    assert np.sqrt(place.covariance.diagonal()).max() < 0.03
+
+
+def test_carried_off_it_is_lost_within_5_scans_and_found_again(house: SavedMap) -> None:
+    robot = walker(house, HOUSE, 3.0, 2.0)
+    assert robot.look(15).localized
+    robot.pose = at(6.5, 4.8, 120)
+    lost = [robot.look() for _ in range(5)]
+    assert not lost[-1].localized
+    assert lost[-1].why == "what is seen is not where the robot was thought to be"
+    place = robot.look(15)
+    assert place.localized
+    assert error(place, robot.pose) < 0.03
+
+
+def test_while_two_places_look_alike_neither_is_believed(corridor: SavedMap) -> None:
+    walls = [*CORRIDOR, *NICHE]
+    robot = walker(corridor, walls, 1.5, 0.7)
+    place = robot.look(30)
+    assert not place.localized
+    assert place.why == "2 places look like this"
+    assert not robot.go((2.5, 0.7)).localized  # not from there either
+    place = robot.go((7.5, 0.8))
+    assert place.localized
+    assert error(place, robot.pose) < 0.05
+
+
+def test_in_open_space_it_goes_on_by_odometry_until_that_is_too_vague(house: SavedMap) -> None:
+    robot = walker(house, HOUSE, 3.0, 2.0)
+    assert robot.look(15).localized
+    robot.rooms = Rooms([(50, 50, 51, 51)])
+    robot.pose = at(3.0, 2.0)
+    places = [robot.look(1, at(0.1, 0.0)) for _ in range(2000)]
+    assert places[50].localized
+    deviations = [np.sqrt(place.covariance[0, 0]) for place in places[:50]]
+    assert deviations == sorted(deviations)
+    assert not places[-1].localized
+
+
+def test_a_wall_that_stands_in_the_way_of_beams_counts_against_a_place(house: SavedMap) -> None:
+    field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
+    view = Rooms(HOUSE).view(at(3.0, 2.5))
+    free = np.eye(3)
+    here = fit(field, view.scan.points, view.scan.free, view.sensor, at(3.0, 2.5), free)
+    long = np.array([[5.0, -1.5]] * len(view.scan.points), np.float32)  # through the inner wall
+    through = fit(field, view.scan.points, long, view.sensor, at(3.0, 2.5), free)
+    assert here.score - through.score == pytest.approx(0.5, abs=0.06)

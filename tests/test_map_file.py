@@ -1,0 +1,201 @@
+"""Maps on disk: what was saved comes back, what is damaged is refused, a good map is never lost."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping.map_file import SavedMap
+
+GRAPH = {"poses": np.arange(6.0).reshape(2, 3)}
+
+
+def room() -> SavedMap:
+    """6 x 5 m with walls all round, the last row unknown."""
+    cells = np.zeros((100, 120), np.int8)
+    cells[0], cells[:, 0], cells[:, -1], cells[98] = 100, 100, 100, 100
+    cells[99] = -1
+    return SavedMap(cells, 0.05, -2.35, 1.1)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    where = tmp_path / "maps" / "room.yaml"
+    map_file.save(where, room(), GRAPH)
+    return where
+
+
+def test_a_map_comes_back_as_it_was_saved(path: Path) -> None:
+    found = map_file.load(path)
+    assert np.array_equal(found.cells, room().cells)
+    assert (found.resolution, found.origin_x, found.origin_y) == (0.05, -2.35, 1.1)
+    assert np.array_equal(map_file.load_graph(path)["poses"], GRAPH["poses"])
+    assert {file.name for file in path.parent.iterdir()} == {
+        "room.yaml", "room.pgm", "room.graph.npz",
+    }  # fmt: skip
+
+
+def test_the_files_are_those_of_ros(path: Path) -> None:
+    assert path.read_text() == (
+        "image: room.pgm\nresolution: 0.05\norigin: [-2.35, 1.1, 0.0]\n"
+        "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
+    )
+    image = path.with_suffix(".pgm").read_bytes()
+    assert image.startswith(b"P5\n120 100\n255\n")
+    pixels = image.removeprefix(b"P5\n120 100\n255\n")
+    assert set(pixels[:120]) == {205}  # the highest row comes first
+    assert pixels[-1] == 0
+    assert pixels[120 * 50 + 60] == 254
+
+
+def test_a_map_of_ros_with_comments_another_cell_size_and_white_walls_is_read(
+    tmp_path: Path,
+) -> None:
+    pixels = bytes((255, 0, 0, 128, 0, 0))
+    (tmp_path / "hall.pgm").write_bytes(b"P5 # by hand\n3\n# rows\n2\n255\n" + pixels)
+    (tmp_path / "hall.yaml").write_text(
+        "image: hall.pgm\nresolution: 0.1\norigin: [0, 0, 0]\nnegate: 1\nmode: scale\n"
+        "occupied_thresh: 0.65\nfree_thresh: 0.25\n"
+    )
+    found = map_file.load(tmp_path / "hall.yaml")
+    assert found.cells.tolist() == [[-1, 0, 0], [100, 0, 0]]
+    assert found.resolution == 0.1
+
+
+def cut(image: bytes) -> bytes:
+    return image[:5000]
+
+
+def longer(image: bytes) -> bytes:
+    return image + b"\0"
+
+
+def other_maxval(image: bytes) -> bytes:
+    return image.replace(b"\n255\n", b"\n65535\n", 1)
+
+
+def ascii_pgm(image: bytes) -> bytes:
+    return image.replace(b"P5", b"P2", 1)
+
+
+def enormous(image: bytes) -> bytes:
+    return image.replace(b"120 100", b"120000 100000", 1)
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (cut, "room.pgm: cut: 4985 of 120 x 100 pixels are there"),
+        (longer, "room.pgm: of another size: 12001 of 120 x 100 pixels are there"),
+        (other_maxval, "room.pgm: a maxval of 65535; expected 255"),
+        (ascii_pgm, "room.pgm: no binary PGM; expected a header such as 'P5 640 480 255'"),
+        (enormous, "room.pgm: 120000 x 100000 pixels; expected 1 to 8000000 in all"),
+    ],
+)
+def test_a_damaged_image_is_refused_in_one_line(damage: object, told: str, path: Path) -> None:
+    image = path.with_suffix(".pgm")
+    assert callable(damage)
+    image.write_bytes(damage(image.read_bytes()))
+    with pytest.raises(ConfigError) as error:
+        map_file.load(path)
+    assert str(error.value) == f"{path.parent}/{told}"
+
+
+@pytest.mark.parametrize(
+    ("line", "instead", "told"),
+    [
+        ("origin: [-2.35, 1.1, 0.0]\n", "", "room.yaml:1: missing field 'origin'"),
+        ("resolution: 0.05", "resolution: 0", "room.yaml:2: resolution"),
+        ("resolution: 0.05", "resolution: .nan", "room.yaml:2: .nan is not allowed"),
+        ("0.0]", "0.7]", "room.yaml: origin: turned by 0.7 rad; expected yaw 0"),
+        ("0.196", "0.7", "room.yaml: free_thresh must be below occupied_thresh"),
+        ("room.pgm", "gone.pgm", "gone.pgm: the map's image: No such file or directory"),
+    ],
+)
+def test_a_wrong_description_is_refused_in_one_line(
+    line: str, instead: str, told: str, path: Path
+) -> None:
+    path.write_text(path.read_text().replace(line, instead, 1))
+    with pytest.raises(ConfigError) as error:
+        map_file.load(path)
+    assert told in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("keep", [0, 100, 200])
+def test_a_cut_graph_is_refused_in_one_line(keep: int, path: Path) -> None:
+    graph = path.with_suffix(".graph.npz")
+    graph.write_bytes(graph.read_bytes()[:keep])
+    with pytest.raises(ConfigError) as error:
+        map_file.load_graph(path)
+    assert f"{graph}: cut or damaged" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def empty() -> SavedMap:
+    return SavedMap(np.full((200, 200), -1, np.int8), 0.05, 0.0, 0.0)
+
+
+def without_walls() -> SavedMap:
+    return SavedMap(np.zeros((200, 200), np.int8), 0.05, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("bad", "told"),
+    [
+        (empty(), "not saved: the map is empty: 0.00 m² of it are free"),
+        (without_walls(), "not saved: the map has no walls: 0.00 m of them"),
+    ],
+)
+def test_what_is_no_map_is_not_saved_over_a_good_one(bad: SavedMap, told: str, path: Path) -> None:
+    with pytest.raises(Refused) as error:
+        map_file.save(path, bad, {}, replace=True)
+    assert str(error.value) == told
+    assert np.array_equal(map_file.load(path).cells, room().cells)
+
+
+def test_another_map_is_overwritten_only_when_asked_to(path: Path) -> None:
+    other = SavedMap(np.roll(room().cells, 3, axis=1), 0.05, 0.0, 0.0)
+    with pytest.raises(Refused, match=r"there is a map .*room\.yaml already; --replace"):
+        map_file.save(path, other, GRAPH)
+    assert map_file.load(path).origin_x == -2.35
+    map_file.save(path, other, GRAPH, replace=True)
+    assert map_file.load(path).origin_x == 0.0
+
+
+def test_a_save_that_fails_half_way_leaves_the_old_map(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_fd: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(map_file.os, "fsync", full)
+    with pytest.raises(Refused, match="No space left on device"):
+        map_file.save(path, room(), GRAPH, replace=True)
+    monkeypatch.undo()
+    assert np.array_equal(map_file.load(path).cells, room().cells)
+    map_file.save(path, room(), GRAPH, replace=True)
+    assert len(list(path.parent.iterdir())) == 3
+
+
+def test_whoever_looks_next_finishes_a_save_that_a_crash_interrupted(path: Path) -> None:
+    complete = path.with_name(".room.complete")
+    complete.mkdir()
+    image = path.with_suffix(".pgm").read_bytes()
+    (complete / "room.pgm").write_bytes(image.replace(b"\xfe", b"\xcd"))  # free is unknown now
+    (complete / "room.yaml").write_text(path.read_text().replace("-2.35", "4.0"))
+    found = map_file.load(path)
+    assert found.origin_x == 4.0
+    assert (found.cells == 0).sum() == 0
+    assert not complete.exists()
+
+
+def test_a_name_is_a_file_in_the_state_folder_and_a_path_is_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", "/state")
+    assert map_file.path_of("office") == Path("/state/gigabrain/maps/office.yaml")
+    assert map_file.path_of("maps/office.yaml") == Path("maps/office.yaml")
+    assert map_file.path_of("office.yml") == Path("office.yml")

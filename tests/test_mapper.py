@@ -1,0 +1,223 @@
+"""Perception with mapping on: the world first, then the pose of the same scan, and a map."""
+
+import asyncio
+import functools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
+from gigabrain_schemas.requests import MapReply, MapRequest
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import BODY, MAP, MAP_SAVE, POSE, SCAN, STATE, WORLD
+from gigabrain_zenoh import perception
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.mapper import chart_of
+from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.settings import PerceptionConfig
+from tests.brain_rig import Bench, body, scan, state
+from tests.map_rig import HOUSE, Rooms, at, drawn
+
+SLAM = PerceptionConfig(mapping="slam")
+START = at(3.0, 2.0)
+
+
+@pytest.fixture(autouse=True)
+def own_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return tmp_path / "gigabrain" / "maps"
+
+
+class Robot(Bench):
+    """Perception alone, with a robot that drives north in the house at 0.2 m/s."""
+
+    def __init__(self, config: PerceptionConfig = SLAM) -> None:
+        super().__init__(functools.partial(perception.run, config))
+        self.rooms, self.tick, self.boot = Rooms(HOUSE), 0, 7
+
+    def say(self) -> None:
+        self.send(BODY, body(boot=self.boot))
+
+    def scan(self, *, y: float | None = None) -> LaserScan:
+        """As seen now."""
+        away = 0.004 * self.tick if y is None else y
+        values = self.rooms.ranges(at(3.0, 2.0 + away, 90))
+        return scan(values, self.tick, boot=self.boot)
+
+    def drive(self, scans: int, *, still: bool = False) -> None:
+        """So many scans, five ticks apart."""
+        for _ in range(scans):
+            for _ in range(5):
+                self.tick += 1
+                x = 0.0 if still else 0.004 * self.tick
+                self.send(STATE, state(self.tick, pose=(x, 0, 0), boot=self.boot))
+            self.send(SCAN, self.scan(y=0.0 if still else None))
+
+    async def save(self, name: str, *, replace: bool = False) -> MapReply:
+        """What perception answers."""
+        bus = Bus(self.network.transport(), self.clock, "test")
+        asking = asyncio.ensure_future(bus.ask(MAP_SAVE, MapRequest(name=name, replace=replace)))
+        async with asyncio.timeout(30):
+            while not asking.done():
+                await self.clock.advance(20_000_000)
+                await asyncio.sleep(0.005)
+        await bus.close()
+        return asking.result()[0]
+
+
+async def test_each_scan_gives_a_world_and_then_a_pose_that_rest_on_it() -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(3)
+        keys = [key for key, _ in robot.network.sent if key in (WORLD.key, POSE.key)]
+        poses = robot.sent(POSE)
+    assert keys == [WORLD.key, POSE.key] * 3
+    assert [pose.basis for pose in poses] == [5, 10, 15]
+    assert [pose.x for pose in poses] == pytest.approx([0.0, 0.02, 0.04], abs=0.01)
+    assert all(pose.localized for pose in poses)
+    assert len(poses[0].covariance) == 9
+
+
+async def test_a_scan_that_was_quicker_than_the_state_of_its_tick_waits_for_it() -> None:
+    poses = []
+    for quicker in (False, True):
+        async with Robot() as robot:
+            robot.say()
+            robot.drive(1)
+            robot.tick += 5
+            first = robot.scan()
+            late = state(10, pose=(0.04, 0, 0))
+            for send in (1, 0) if quicker else (0, 1):
+                robot.send(*((STATE, late), (SCAN, first))[send])  # type: ignore[misc]
+            poses.append([(pose.basis, pose.x, pose.y) for pose in robot.sent(POSE)])
+    assert poses[0] == poses[1]
+    assert [basis for basis, _, _ in poses[0]] == [5, 10]
+
+
+async def test_the_map_comes_once_a_second_and_only_when_it_has_changed() -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(30)
+        maps = robot.sent(MAP)
+    assert [grid.basis for grid in maps] == [5, 55, 105]
+    last: OccupancyGrid = maps[-1]
+    assert last.resolution == 0.05
+    cells = np.frombuffer(last.cells, np.int8).reshape(last.height, last.width)
+    column, row = int((0.5 - last.origin_x) / 0.05), int((0.0 - last.origin_y) / 0.05)
+    assert 0 <= cells[row, column] < 20  # it has driven there
+
+
+async def test_bad_scans_are_left_out_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(2)
+        good = robot.scan()
+        for _ in range(3):
+            robot.send(SCAN, scan(np.full(200, 2.0), robot.tick))  # of wrong length
+        robot.send(SCAN, replace(good, basis=good.basis + 1000))  # from the future
+        robot.drive(2)
+        assert robot.bus.counters["scans_left_out"] == 3
+        poses: list[PoseInMap] = robot.sent(POSE)
+    assert [pose.basis for pose in poses] == [5, 10, 15, 20]
+    told = [record.message for record in caplog.records if "left out" in record.message]
+    assert told == [
+        "a scan is left out of the map: the scan has 200 beams, the body's lidar 360",
+    ]
+
+
+async def test_a_jump_of_the_odometry_is_told_and_the_robot_found_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(20)
+        robot.tick += 5
+        robot.send(STATE, state(robot.tick, pose=(9.0, 9.0, 0)))
+        robot.send(SCAN, robot.scan())
+        assert not robot.sent(POSE)[-1].localized
+        base = robot.tick
+        for _ in range(40):
+            robot.tick += 5
+            robot.send(STATE, state(robot.tick, pose=(9.0, 9.0, 0)))
+            robot.send(SCAN, scan(robot.rooms.ranges(at(3, 2 + 0.004 * base, 90)), robot.tick))
+            await asyncio.sleep(0.005)  # the search runs in a thread beside
+        pose = robot.sent(POSE)[-1]
+    assert pose.localized
+    assert pose.x == pytest.approx(0.004 * (base - 5), abs=0.04)
+    assert "not localized: the odometry has jumped" in caplog.messages
+
+
+async def test_after_a_new_start_of_the_driver_the_map_stays_and_the_robot_is_found() -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(20, still=True)
+        before = robot.sent(MAP)[-1]
+        robot.boot, robot.tick = 8, 0
+        robot.say()
+        robot.drive(1, still=True)
+        assert not robot.sent(POSE)[-1].localized
+        for _ in range(40):
+            robot.drive(1, still=True)
+            await asyncio.sleep(0.005)
+        maps = robot.sent(MAP)
+        robot.drive(1, still=True)
+        pose = robot.sent(POSE)[-1]
+    assert maps[0].boot == 8
+    assert (maps[0].width, maps[0].origin_x) == (before.width, before.origin_x)
+    assert pose.localized
+    assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
+
+
+async def test_a_map_is_saved_and_found_in_again(own_maps: Path) -> None:
+    async with Robot() as robot:
+        robot.say()
+        assert (await robot.save("early")).text.startswith("not saved: where the robot is")
+        robot.drive(80)
+        reply = await robot.save("house")
+        assert reply.ok, reply.text
+        assert reply.text.startswith(f"saved {own_maps}/house.yaml: ")
+        assert "already" in (await robot.save("house")).text
+        assert (await robot.save("house", replace=True)).ok
+    found = PerceptionConfig(mapping="localize", map="house")
+    async with Robot(found) as robot:
+        robot.say()
+        for _ in range(40):
+            robot.drive(1, still=True)
+            await asyncio.sleep(0.005)
+        pose, grid = robot.sent(POSE)[-1], map_file.load(own_maps / "house.yaml")
+        reply = await robot.save("other")
+    assert pose.localized
+    assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
+    assert grid.resolution == 0.05
+    assert reply.text == "not saved: perception finds its way in a saved map, it makes none"
+
+
+async def test_a_saved_map_grows_on(own_maps: Path) -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(60)
+        assert (await robot.save("house")).ok
+    size = map_file.load(own_maps / "house.yaml").cells.size
+    async with Robot(PerceptionConfig(mapping="slam", map="house")) as robot:
+        robot.say()
+        for _ in range(40):
+            robot.drive(1, still=True)
+            await asyncio.sleep(0.005)
+        assert robot.sent(POSE)[-1].localized
+        assert (await robot.save("house")).ok  # the same map: nobody else's is lost
+    assert map_file.load(own_maps / "house.yaml").cells.size >= size
+
+
+def test_a_map_that_is_missing_or_not_named_is_told_at_the_start(own_maps: Path) -> None:
+    with pytest.raises(ConfigError, match="expected a saved map, as mapping is 'localize'"):
+        chart_of(PerceptionConfig(mapping="localize"))
+    with pytest.raises(ConfigError, match=r"gone\.yaml: no such file"):
+        chart_of(PerceptionConfig(mapping="localize", map="gone"))
+    with pytest.raises(ConfigError, match="the pose graph to go on with"):
+        chart_of(PerceptionConfig(mapping="slam", map="gone"))
+    map_file.save(own_maps / "bare.yaml", drawn(Rooms(HOUSE), START), {"poses": np.zeros((1, 3))})
+    with pytest.raises(ConfigError, match="no pose graph: "):
+        chart_of(PerceptionConfig(mapping="slam", map="bare"))

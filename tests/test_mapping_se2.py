@@ -1,0 +1,35 @@
+"""Poses in the plane."""
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.mapping.se2 import between, compose, inverse, transform, turned, wrap, wrapped
+
+
+def test_what_lies_a_metre_north_is_a_metre_ahead_of_who_looks_north() -> None:
+    here, there = np.array((1.0, 2.0, np.pi / 2)), np.array((1.0, 3.0, np.pi))
+    assert between(here, there) == pytest.approx((1.0, 0.0, np.pi / 2))
+
+
+def test_there_and_back_is_where_it_began() -> None:
+    poses = np.random.default_rng(3).uniform(-4, 4, (50, 3))
+    assert np.abs(compose(poses, inverse(poses))).max() < 1e-12
+    a, b = poses[:25], poses[25:]
+    assert np.abs(compose(a, between(a, b)) - wrapped(b)).max() < 1e-12
+
+
+def test_angles_are_told_within_a_half_turn() -> None:
+    assert wrap(np.array((3 * np.pi / 2, -3 * np.pi / 2, 0.5))) == pytest.approx(
+        (-np.pi / 2, np.pi / 2, 0.5)
+    )
+
+
+def test_points_are_turned_and_then_moved() -> None:
+    points = np.array(((1.0, 0.0), (0.0, 2.0)))
+    moved = transform(np.array((10.0, 20.0, np.pi / 2)), points)
+    assert moved == pytest.approx(np.array(((10.0, 21.0), (8.0, 20.0))))
+
+
+def test_who_is_sure_ahead_and_turns_left_is_sure_to_the_left() -> None:
+    covariance = turned(np.diag((0.01, 4.0, 0.5)), np.pi / 2)
+    assert covariance == pytest.approx(np.diag((4.0, 0.01, 0.5)))

@@ -1,0 +1,217 @@
+"""A robot maps as it drives: loops, drift, breaks, and going on after a restart."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.mapping.front_end import FEW
+from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose
+from gigabrain_zenoh.mapping.slam import Estimate, Slam
+from tests.rooms import Lidar, Walls, box, dead_reckoned, drifting, line
+
+# a corridor round a block, with pillars on both sides so that no stretch is like another
+BLOCK = np.array(
+    [
+        *box(-1, -1, 12, 10), *box(1, 1, 8, 6),
+        *box(2.3, -1, 0.3, 0.4), *box(6.1, 0.7, 0.5, 0.3), *box(10.6, 2.2, 0.4, 0.3),
+        *box(8.7, 4.9, 0.3, 0.5), *box(7.2, 8.5, 0.4, 0.5), *box(3.4, 7.0, 0.6, 0.2),
+        *box(-1, 5.2, 0.3, 0.6), *box(0.8, 2.9, 0.2, 0.4),
+    ]
+)  # fmt: skip
+
+
+def lap() -> Floats:
+    """Once round the block and a bit farther, the robot always looking ahead."""
+    corners = np.array([(0, 0), (10, 0), (10, 8), (0, 8), (0, 0), (4, 0)], float)
+    legs = []
+    for start, end in pairwise(corners):
+        yaw = np.arctan2(*(end - start)[::-1])
+        legs.append(line(np.append(start, yaw), np.append(end, yaw), 0.25))
+    return np.concatenate(legs)
+
+
+def feed(slam: Slam, scans: list[Scan], steps: Floats) -> list[Estimate]:
+    """Add the scans after these steps of odometry, loops being closed after each."""
+    estimates = []
+    for scan, step in zip(scans, steps, strict=True):
+        estimates.append(slam.add(scan, step))
+        close(slam)
+    return estimates
+
+
+def close(slam: Slam) -> None:
+    while slam.behind:
+        correction = slam.close_loops()
+        if correction:
+            slam.apply(correction)
+
+
+def look(walls: Walls, poses: Floats, lidar: Lidar) -> list[Scan]:
+    return [lidar.scan(walls, pose) for pose in poses]
+
+
+def stepped(poses: Floats, turn: float, scale: float) -> Floats:
+    return np.concatenate((IDENTITY[None], drifting(poses, turn, scale)))
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A lap, as the lidar and bad odometry tell it."""
+
+    poses: Floats
+    scans: list[Scan]
+    steps: Floats
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    poses = lap()
+    scans = look(BLOCK, poses, Lidar(180, reach=6.0))
+    return Drive(poses, scans, stepped(poses, turn=0.02, scale=1.05))
+
+
+@pytest.fixture(scope="module")
+def mapped(drive: Drive) -> tuple[Slam, list[Estimate]]:
+    slam = Slam()
+    return slam, feed(slam, drive.scans, drive.steps)
+
+
+def test_a_loop_takes_back_what_odometry_has_drifted(
+    drive: Drive, mapped: tuple[Slam, list[Estimate]]
+) -> None:
+    slam, estimates = mapped
+    reckoned = dead_reckoned(drive.poses[0], drive.steps)
+    assert np.hypot(*(reckoned - drive.poses[-1])[:2]) > 2.0
+    corrected = [compose(slam.poses[e.keyframe], e.relative) for e in estimates]
+    assert np.hypot(*(np.array(corrected) - drive.poses)[:, :2].T).max() < 0.10
+    assert np.degrees(np.abs(estimates[-1].pose - drive.poses[-1])[2]) < 0.5
+    assert slam.revision > 0
+    assert {e.kind for e in estimates} == {"matched"}
+    assert not estimates[-1].lost
+
+
+def test_neither_matches_nor_the_map_depend_on_when_loops_are_closed(
+    drive: Drive, mapped: tuple[Slam, list[Estimate]]
+) -> None:
+    at_once, _ = mapped
+    later = Slam()
+    for scan, step in zip(drive.scans, drive.steps, strict=True):
+        later.add(scan, step)
+    close(later)
+    assert later.smooth.tolist() == at_once.smooth.tolist()
+    assert later.poses.tolist() == at_once.poses.tolist()
+
+
+def test_a_correction_carries_along_what_has_come_since(drive: Drive) -> None:
+    slam = Slam()
+    correction = None
+    for scan, step in zip(drive.scans, drive.steps, strict=True):
+        slam.add(scan, step)
+        while slam.behind and correction is None:
+            correction = slam.close_loops()
+    assert correction is not None
+    known, before = len(correction.poses), slam.poses
+    assert len(before) > known
+    slam.apply(correction)
+    assert slam.poses[:known].tolist() == correction.poses.tolist()
+    assert between(slam.poses[known - 1], slam.poses[-1]) == pytest.approx(
+        between(before[known - 1], before[-1]), abs=1e-9
+    )
+
+
+@pytest.mark.parametrize(("reach", "uprights"), [(1.5, 0), (2.5, 8)])
+def test_an_aisle_is_not_taken_for_the_next_one_like_it(reach: float, uprights: int) -> None:
+    racks = [wall for k in range(3) for wall in box(1.6 * k, 0, 0.4, 8)]
+    for k in range(uprights):
+        racks += [wall for x in (0.4, 1.5, 2.0, 3.1) for wall in box(x, k + 0.3, 0.1, 0.1)]
+    lidar = Lidar(180, reach)
+    up = line(np.array((1.0, -1.0, 0.0)), np.array((1.0, 9.0, 0.0)), 0.1)
+    over = line(up[-1], np.array((2.6, 9.0, 0.0)), 0.1)
+    down = line(over[-1], np.array((2.6, 0.5, 0.0)), 0.1)
+    poses = np.concatenate((up, over, down))
+    scans = look(np.array(racks), poses, lidar)
+    slam = Slam(pose=poses[0])
+    estimates = feed(slam, scans, stepped(poses, turn=0.002, scale=1.0))
+    assert estimates[-1].pose == pytest.approx(poses[-1], abs=0.3)
+
+
+def test_a_slow_robot_keeps_one_scan_in_ten() -> None:
+    poses = line(np.array((0.0, 0.0, 0.0)), np.array((8.0, 0.0, 0.0)), 0.02)
+    slam = Slam()
+    estimates = feed(slam, look(BLOCK, poses, Lidar(180)), stepped(poses, 0.0, 1.0))
+    assert 35 <= len(slam.keyframes) <= 40
+    assert estimates[-1].pose == pytest.approx(poses[-1], abs=0.03)
+
+
+def test_a_robot_that_is_carried_away_says_so_until_it_is_told_where_it_is() -> None:
+    poses = lap()[:60]
+    lidar = Lidar(180, reach=6.0)
+    slam = Slam()
+    feed(slam, look(BLOCK, poses, lidar), stepped(poses, 0.0, 1.0))
+    hall = np.array([*box(47, 46, 7, 12), *box(48, 49, 1.0, 0.5), *box(52.3, 53, 0.5, 1.5)])
+    elsewhere = line(np.array((50.0, 50.0, 0.4)), np.array((51.0, 50.5, 0.4)), 0.05)
+    carried = feed(slam, look(hall, elsewhere, lidar), stepped(elsewhere, 0.0, 1.0))
+    kinds = [estimate.kind for estimate in carried]
+    assert kinds[0] == "odometry"
+    assert kinds.count("broken") == 1
+    assert carried[-1].lost
+    home = poses[20]
+    slam.relocate(np.add(home, (0.1, -0.05, 0.03)))
+    found = slam.add(lidar.scan(BLOCK, home), IDENTITY)
+    assert (found.kind, found.lost) == ("matched", False)
+    assert found.pose == pytest.approx(home, abs=0.03)
+
+
+def test_when_odometry_jumps_the_scan_tells_that_the_robot_did_not() -> None:
+    poses = lap()[:30]
+    lidar = Lidar(180, reach=6.0)
+    slam = Slam()
+    feed(slam, look(BLOCK, poses, lidar), stepped(poses, 0.0, 1.0))
+    jumped = slam.add(lidar.scan(BLOCK, poses[-1]), np.array((7.0, 3.0, 2.0)))
+    assert jumped.kind == "recovered"
+    assert jumped.pose == pytest.approx(poses[-1], abs=0.03)
+    with pytest.raises(ValueError, match="odometry: expected finite numbers"):
+        slam.add(lidar.scan(BLOCK, poses[-1]), np.array((np.nan, 0.0, 0.0)))
+
+
+def test_with_nothing_in_sight_odometry_carries_on_and_the_doubt_grows() -> None:
+    poses = line(np.array((0.0, 0.0, 0.0)), np.array((4.0, 0.0, 0.0)), 0.1)
+    lidar = Lidar(180)
+    slam = Slam()
+    feed(slam, look(BLOCK, poses[:5], lidar), stepped(poses[:5], 0.0, 1.0))
+    few = Scan.of(np.ones((FEW - 1, 2)))
+    blind = feed(slam, [few] * 30, np.tile((0.1, 0.0, 0.0), (30, 1)))
+    assert {estimate.kind for estimate in blind} == {"odometry"}
+    assert blind[-1].pose == pytest.approx((3.4, 0.0, 0.0), abs=0.02)
+    assert blind[-1].covariance[0, 0] > 10 * blind[0].covariance[0, 0]
+
+
+def test_what_was_frozen_goes_on_as_if_it_had_not_been(
+    drive: Drive, mapped: tuple[Slam, list[Estimate]]
+) -> None:
+    whole, _ = mapped
+    half = len(drive.poses) // 2
+    begun = Slam()
+    feed(begun, drive.scans[:half], drive.steps[:half])
+    thawed = Slam.thaw(begun.freeze())
+    assert thawed.poses.tolist() == begun.poses.tolist()
+    feed(thawed, drive.scans[half:], drive.steps[half:])
+    assert thawed.poses == pytest.approx(whole.poses, abs=0.01)
+    again = Slam.thaw(whole.freeze())
+    assert again.poses.tolist() == whole.poses.tolist()
+    assert again.behind == 0
+
+
+def test_arrays_that_do_not_belong_together_are_refused() -> None:
+    slam = Slam()
+    feed(slam, look(BLOCK, lap()[:6], Lidar(90)), stepped(lap()[:6], 0.0, 1.0))
+    frozen = slam.freeze()
+    with pytest.raises(ValueError, match="6 keyframes, but 5 poses"):
+        Slam.thaw({**frozen, "poses": frozen["poses"][:-1]})
+    with pytest.raises(ValueError, match="points, got"):
+        Slam.thaw({**frozen, "points": frozen["points"][:-1]})
+    with pytest.raises(KeyError):
+        Slam.thaw({name: rows for name, rows in frozen.items() if name != "travel"})
