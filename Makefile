@@ -6,8 +6,7 @@ BIN := $(VENV)/bin
 PYTHON ?= python3
 DONE := $(VENV)/.done
 
-.PHONY: setup demo test lint unit bench mutation fuzz golden pictures clean
-.PHONY: setup demo test lint unit bench mutation golden recordings pictures clean
+.PHONY: setup demo test lint unit bench mutation fuzz golden recordings pictures clean
 
 setup: $(DONE)
 
@@ -22,6 +21,7 @@ $(DONE): pyproject.toml
 	  $(PYTHON) -m venv $(VENV) && \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[all,dev]'; \
 	fi
+	@$(BIN)/gigabrain warm
 	@touch $@
 
 demo: setup

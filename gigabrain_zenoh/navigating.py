@@ -72,7 +72,7 @@ class Navigating:
 
     async def warm_up(self) -> None:
         """Compile all that a driving robot calls."""
-        compiling = asyncio.ensure_future(asyncio.to_thread(_warm_up))
+        compiling = asyncio.ensure_future(asyncio.to_thread(warm_up))
         done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
         if not done:
             told = {"event": "compiling"}
@@ -218,6 +218,7 @@ class Navigating:
         return grid is not known or not 0 <= tick - before < AGAIN_TICKS
 
 
-def _warm_up() -> None:
+def warm_up() -> None:
+    """Call every kernel of planning and driving once."""
     planner.warm_up()
     local.warm_up(ANY_BODY)

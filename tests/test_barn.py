@@ -105,8 +105,10 @@ def test_worlds_are_read_and_chosen(tmp_path: Path) -> None:
     )
     assert choose(worlds, "9") == [worlds[1]]
     assert choose(worlds, "") == worlds
-    with pytest.raises(ConfigError, match="expected numbers out of 3, 9, got '4'"):
+    with pytest.raises(ConfigError, match="no world 4 in the file; it has 2, from 3 to 9"):
         choose(worlds, "4")
+    with pytest.raises(ConfigError, match="expected numbers like 1,7, got 'three'"):
+        choose(worlds, "three")
 
 
 def test_a_file_that_holds_no_worlds_is_refused(tmp_path: Path) -> None:

@@ -110,3 +110,13 @@ def test_a_grid_as_it_was_saved_goes_on() -> None:
         grid.draw(at(0.025, 0.025), points((1.5, 0.0)), NONE)
     assert np.array_equal(first.percent(), again.percent())
     assert grids.MOST_CELLS**2 <= 8 * 1024 * 1024
+
+
+def test_a_part_of_it_is_what_the_whole_shows_there() -> None:
+    grid = Grid()
+    grid.draw(at(0.025, 0.025), points((3.0, 0.0), (-3.0, 2.0)), NONE)
+    part, (x, y) = grid.around(2.0, 0.5, 1.0)
+    column, row = round((x - grid.origin_x) / 0.05), round((y - grid.origin_y) / 0.05)
+    assert part.shape == (40, 40)
+    assert np.array_equal(part, grid.percent()[row : row + 40, column : column + 40])
+    assert grid.around(500.0, 0.0, 1.0)[0].size == 0

@@ -70,6 +70,19 @@ def test_carried_off_it_is_lost_and_found_and_the_map_is_not_spoilt() -> None:
     assert np.count_nonzero(after.cells[free] > 60) < 0.01 * np.count_nonzero(free)
 
 
+def test_lifted_without_a_sign_in_the_odometry_it_notices_after_3_scans() -> None:
+    chart, walker = grown(Rooms(HOUSE), START, *ROUND)
+    before = chart.to_save()[0]
+    walker.pose = at(6.0, 4.5, 100)
+    assert [walker.look().localized for _ in range(3)] == [True, True, False]
+    with pytest.raises(Refused, match="what is seen is not where the robot was thought to be"):
+        chart.to_save()
+    assert chart.grid().cells == before.cells.tobytes()
+    place = walker.look(20)
+    assert place.localized
+    assert error(place, in_map(walker)) < 0.05
+
+
 def test_what_was_saved_goes_on(toured: tuple[GrowingMap, Walker]) -> None:
     chart, walker = toured
     _, arrays = chart.to_save()

@@ -96,6 +96,8 @@ def choose(worlds: list[World], only: str) -> list[World]:
     known = {world.number: world for world in worlds}
     try:
         return [known[int(number)] for number in only.split(",")]
-    except (KeyError, ValueError):
-        numbers = ", ".join(map(str, known))
-        raise ConfigError(f"--only: expected numbers out of {numbers}, got {only!r}") from None
+    except ValueError:
+        raise ConfigError(f"--only: expected numbers like 1,7, got {only!r}") from None
+    except KeyError as error:
+        some = f"it has {len(known)}, from {min(known)} to {max(known)}"
+        raise ConfigError(f"--only: no world {error} in the file; {some}") from None

@@ -57,6 +57,7 @@ COMMANDS = {
     "graph": ("graph:graph", "Draw who talks to whom."),
     "top": ("top:top", "Watch processes and topics, live."),
     "why": ("why:why", "Why does it not move?"),
+    "warm": ("warm:warm", "Compile navigation, so that the first start is quick."),
     "doctor": ("doctor:doctor", "Check this machine and the robot, and say what to do."),
     "log": ("log:log", "Show what the processes have logged."),
     "param list": ("param:list_", "List what may be changed while the robot runs."),

@@ -67,6 +67,35 @@ def fit(
     return Fit(pose, information, score - through)
 
 
+def contradiction(field: Field, hits: Points, free: Points, sensor: Floats, pose: Floats) -> float:
+    """The share of beams that the map rules out at `pose` (3,): unknown ground rules out none."""
+    count = len(hits) + len(free)
+    through = _pierced(field.distance, field.origin, field.cell, hits, free, sensor, pose)
+    amid = _amid(field.distance, field.free, field.origin, field.cell, hits, pose)
+    return through + amid / max(count, 1)
+
+
+@kernel
+def _amid(
+    distance: Image,
+    free: NDArray[np.bool_],
+    origin: Floats,
+    cell: float,
+    hits: Points,
+    pose: Floats,
+) -> int:
+    """How many hits lie amid free ground, far from any wall."""
+    height, width = distance.shape
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    count = 0
+    for x, y in hits:
+        column = int(np.floor((pose[0] + cos * x - sin * y - origin[0]) / cell))
+        row = int(np.floor((pose[1] + sin * x + cos * y - origin[1]) / cell))
+        if 0 <= row < height and 0 <= column < width and free[row, column]:
+            count += distance[row, column] > BLUR_M
+    return count
+
+
 @kernel
 def _look(distance: Image, x: float, y: float) -> tuple[float, float, float]:
     """Distance and its slope at (x, y) in cells, from the centres of four cells round it."""

@@ -53,7 +53,8 @@ class Graph:
             self.loops.append(loop)
         self._isam.update(factors, gtsam.Values())
         for _ in range(ROUNDS):
-            self._isam.update()
+            if not self._isam.update().getVariablesRelinearized():
+                break
         self.poses = np.array(gtsam.utilities.extractPose2(self._isam.calculateEstimate()))
 
 

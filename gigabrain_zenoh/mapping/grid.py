@@ -70,6 +70,17 @@ class Grid:
         _show(self.log_odds, self._stamps, PERCENT, shown)
         return shown
 
+    def around(self, x: float, y: float, reach: float) -> tuple[Cells, tuple[float, float]]:
+        """What `percent` is within a square of `reach` [m] round a place, and its corner."""
+        height, width = self.log_odds.shape
+        left = min(max(int((x - reach - self.origin_x) / CELL), 0), width)
+        low = min(max(int((y - reach - self.origin_y) / CELL), 0), height)
+        side = int(2 * reach / CELL)
+        part = np.s_[low : low + side, left : left + side]
+        shown = np.empty(self.log_odds[part].shape, np.int8)
+        _show(self.log_odds[part], self._stamps[part], PERCENT, shown)
+        return shown, (self.origin_x + left * CELL, self.origin_y + low * CELL)
+
     def message(self) -> OccupancyGrid:
         """The grid as others see it."""
         height, width = self.log_odds.shape

@@ -7,13 +7,14 @@ import numpy as np
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.mapping.background import PATIENCE_S, Background, Take
+from gigabrain_zenoh.mapping.doubt import Doubt
 from gigabrain_zenoh.mapping.drift import Rates
 from gigabrain_zenoh.mapping.field import field_of
 from gigabrain_zenoh.mapping.finder import Finder
 from gigabrain_zenoh.mapping.grid import CELL, Grid
 from gigabrain_zenoh.mapping.localizer import NOWHERE, Place, View
 from gigabrain_zenoh.mapping.map_file import Arrays, SavedMap
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, wrap
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, compose, wrap
 from gigabrain_zenoh.mapping.slam import Correction, Estimate, Slam
 from gigabrain_zenoh.mapping.sweeps import Sweep, Sweeps
 
@@ -21,7 +22,7 @@ DRAWN_SCANS = 5  # every so many scans one is drawn, and every keyframe
 DRAWN_AT_ONCE = 8  # sweeps, of those that wait after the map was drawn anew
 LOOP_SCANS, KEYFRAME_SCANS, SWEEPS_A_SCAN = 5, 2, 200  # how long the work beside may take
 SHIFT_M, SHIFT_RAD = 0.02, 0.004  # keyframes that moved less need not be drawn anew
-RATES = Rates(away=0.02, turn=0.006)  # of scans every few centimetres, guessed with a gyro
+RATES = Rates(away=0.012, turn=0.004)  # of scans every few centimetres, guessed with a gyro
 FITS = ("matched", "recovered")  # scans that were found otherwise are not drawn
 
 
@@ -36,6 +37,8 @@ class GrowingMap:
         self._undrawn = 0  # scans
         self._settling = False
         self._finder: Finder | None = None
+        self._doubt = Doubt()
+        self._seen = self._moved = IDENTITY  # the last scan's pose, and the way since then
         self._last = Place(IDENTITY, NOWHERE, False, "no scan yet")
         self._loops = self._renewals = 0
 
@@ -60,13 +63,18 @@ class GrowingMap:
         if self._finder:
             self._last = self._find(self._finder, view, motion, noise)
             return self._last
-        estimate = self._slam.add(view.scan, motion)
+        self._moved = compose(self._moved, motion)
+        if self._doubtful(view):
+            return self._last
+        estimate = self._slam.add(view.scan, self._moved)
+        self._moved = IDENTITY
         if estimate.lost:
             self.lose("scans do not fit together any more")
             return self._last
         self._take(view, estimate)
         if self._slam.behind and self._background.idle and not self._settling:
             self._close_loops(self._slam.behind)
+        self._seen = estimate.pose
         self._last = Place(estimate.pose, estimate.covariance, True)
         return self._last
 
@@ -115,13 +123,27 @@ class GrowingMap:
         place = finder.step(view, motion, noise)
         if place.localized:
             self._slam.relocate(place.pose)
-            self._finder = None
+            self._finder, self._doubt = None, Doubt()
+            self._seen, self._moved = place.pose, IDENTITY
         return place
+
+    def _doubtful(self, view: View) -> bool:
+        """Leave out a scan that does not belong here; after some of them, the robot is lost."""
+        if not self._slam.keyframes:
+            return False
+        pose = compose(self._seen, self._moved)
+        if not self._doubt.look(self._grid, view, pose):
+            return False
+        if self._doubt.certain:
+            self.lose("what is seen is not where the robot was thought to be")
+        else:
+            self._last = Place(pose, self._last.covariance, True)
+        return True
 
     def _take(self, view: View, estimate: Estimate) -> None:
         """Draw the scan, if it is time to and it fits."""
-        if estimate.kept:
-            self._drawn.append(estimate.pose)
+        if len(self._drawn) < len(self._slam.keyframes):
+            self._drawn += list(self._slam.poses[len(self._drawn) :])
         self._undrawn += 1
         if estimate.kind not in FITS or (self._undrawn < DRAWN_SCANS and not estimate.kept):
             return

@@ -14,6 +14,7 @@ BUCKET = 0.15  # [m]
 REACH = 30.0  # [m], points farther from the centre are left out
 
 Ints = NDArray[np.int32]
+Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +32,7 @@ class Buckets:
 class Image:
     """How likely a hit is, by cell."""
 
-    cells: NDArray[np.float32]  # (height, width), 0 to 1
+    cells: Bytes  # (height, width), 0 to 255 for certain
     origin: Floats  # (2,), the corner of cell (0, 0) [m]
     cell: float  # [m]
 
@@ -61,12 +62,12 @@ def build(
     near = (np.abs(points - centre[:2]) < REACH).all(axis=1)
     points, normals = points[near], normals[near]
     if not len(points):
-        empty = Image(np.zeros((1, 1), np.float32), np.zeros(2), cell)
+        empty = Image(np.zeros((1, 1), np.uint8), np.zeros(2), cell)
         return LocalMap(empty, _buckets(points, normals))
     blob = _blob(cell, sigma)
     origin = points.min(axis=0).astype(np.float64) - len(blob) * cell
     width, height = ((points.max(axis=0) - origin) / cell).astype(int) + len(blob)
-    cells = np.zeros((height, width), np.float32)
+    cells = np.zeros((height, width), np.uint8)
     last = _stamp(cells, points, origin, cell, blob)
     kept = last & normals.any(axis=1)
     return LocalMap(Image(cells, origin, cell), _buckets(points[kept], normals[kept]))
@@ -122,19 +123,20 @@ def _sorted(
     return starts, order
 
 
-def _blob(cell: float, sigma: float) -> NDArray[np.float32]:
+def _blob(cell: float, sigma: float) -> Bytes:
     reach = int(np.ceil(2.5 * sigma / cell))
     along = np.arange(-reach, reach + 1) * cell
-    return np.exp(-(along[:, None] ** 2 + along**2) / (2 * sigma**2)).astype(np.float32)
+    likely = np.exp(-(along[:, None] ** 2 + along**2) / (2 * sigma**2))
+    return np.asarray(np.rint(255 * likely), dtype=np.uint8)
 
 
 @kernel
 def _stamp(
-    cells: NDArray[np.float32],
+    cells: Bytes,
     points: Points,
     origin: Floats,
     cell: float,
-    blob: NDArray[np.float32],
+    blob: Bytes,
 ) -> NDArray[np.bool_]:
     """Put the blob on every cell that holds a point, the likelier counts; who is last in a cell."""
     side = len(blob)
@@ -142,7 +144,7 @@ def _stamp(
     for k in range(len(points) - 1, -1, -1):
         column = int((points[k, 0] - origin[0]) / cell)
         row = int((points[k, 1] - origin[1]) / cell)
-        if cells[row, column] >= 1.0:  # stamped before
+        if cells[row, column] == 255:  # stamped before
             continue
         last[k] = True
         left, top = column - side // 2, row - side // 2

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import kernel
-from gigabrain_zenoh.mapping.local_map import BUCKET, Buckets, Image
+from gigabrain_zenoh.mapping.local_map import BUCKET, Buckets, Bytes, Image
 from gigabrain_zenoh.mapping.points import Points
 from gigabrain_zenoh.mapping.se2 import Floats
 
@@ -72,7 +72,7 @@ def search(image: Image, points: Points, guess: Floats, window: Window) -> Found
 
 @kernel
 def _search(
-    cells: NDArray[np.float32],
+    cells: Bytes,
     origin: Floats,
     cell: float,
     points: Points,
@@ -83,11 +83,11 @@ def _search(
 ) -> tuple[float, float, float, float]:
     height, width = cells.shape
     side = 2 * steps + 1
-    scores = np.empty((side, side), np.float32)
+    scores = np.empty((side, side), np.int32)
     best, best_x, best_y, best_yaw = -1.0, 0, 0, 0
     for t in range(-turns, turns + 1):
         cos, sin = np.cos(guess[2] + t * turn), np.sin(guess[2] + t * turn)
-        scores[:] = 0.0
+        scores[:] = 0
         for k in range(len(points)):
             px = guess[0] + cos * points[k, 0] - sin * points[k, 1]
             py = guess[1] + sin * points[k, 0] + cos * points[k, 1]
@@ -102,7 +102,7 @@ def _search(
                 # of equals, the one nearest to the guess
                 away = ((i - steps) ** 2 + (j - steps) ** 2) / (steps * steps + 1)
                 off = (t * t) / (turns * turns + 1)
-                value = scores[i, j] / len(points) - 0.01 * (away + off)
+                value = scores[i, j] / (255 * len(points)) - 0.01 * (away + off)
                 if value > best:
                     best, best_x, best_y, best_yaw = value, j - steps, i - steps, t
     away = (best_x**2 + best_y**2) / (steps * steps + 1)

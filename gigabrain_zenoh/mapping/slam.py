@@ -115,7 +115,9 @@ class Slam:
         """The robot is at `pose` in the map, whatever was known before: match to what is there."""
         travel = np.array([keyframe.travel for keyframe in self.keyframes])
         poses = self.poses
-        nearest = int(np.argmin(np.hypot(*(poses[:, :2] - pose[:2]).T)))
+        away = np.hypot(*(poses[:, :2] - pose[:2]).T)
+        away[[keyframe.segment not in self._joined for keyframe in self.keyframes]] = np.inf
+        nearest = int(np.argmin(away))
         place = around(travel, nearest, len(poses))
         ids = sorted(range(place.start, place.stop), key=lambda k: -abs(k - nearest))
         self._front.pose = pose

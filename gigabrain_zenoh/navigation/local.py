@@ -188,6 +188,14 @@ def warm_up(body: BodyDescription) -> None:
     """Compile all that a driving robot will call, with `body`'s own shapes."""
     goal, here = Goal(x=0.5, y=0.0), Pose(x=0.0, y=0.0, yaw=0.0)
     planner = LocalPlanner(body, LocalSettings(samples=64, steps=10, window=2.0))
+    somebody = Obstacle(id=1, x=0.9, y=0.0, velocity_x=1.0, radius=0.3)
     planner.plan(
-        Moment(tick=1, pose=here, velocity=Velocity(), goal=goal, hits=np.array([[0.9, 0.0]]))
+        Moment(
+            tick=1,
+            pose=here,
+            velocity=Velocity(),
+            goal=goal,
+            hits=np.array([[0.9, 0.0]]),
+            obstacles=(somebody,),
+        )
     )
