@@ -113,7 +113,7 @@ def test_worlds_are_read_and_chosen(tmp_path: Path) -> None:
 
 def test_a_file_that_holds_no_worlds_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "worlds.npz"
-    with pytest.raises(ConfigError, match="cannot read .*No such file"):
+    with pytest.raises(ConfigError, match=r"cannot read .*No such file"):
         read_worlds(file, dynamic=False)
     file.write_bytes(b"PK nonsense")
     with pytest.raises(ConfigError, match="expected BARN worlds"):
