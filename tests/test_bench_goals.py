@@ -10,6 +10,7 @@ GOOD = GoalFigures(
     body="alpha",
     world="house",
     speed=5.0,
+    accepted_s=1.5,
     explored="succeeded: all is mapped that can be reached",
     explored_s=30.0,
     goals=100,
@@ -19,6 +20,7 @@ GOOD = GoalFigures(
     met=3,
     distance_m=400.0,
     seconds=1030.0,
+    alone=0,
     failures=(),
 )
 

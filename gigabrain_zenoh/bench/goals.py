@@ -48,6 +48,7 @@ class GoalFigures(Struct, frozen=True, kw_only=True):
     body: str
     world: str
     speed: float
+    accepted_s: float  # of the host's time, from the start of the processes to the first task
     explored: str  # how exploring ended
     explored_s: float  # of the robot's time
     goals: int
@@ -57,6 +58,7 @@ class GoalFigures(Struct, frozen=True, kw_only=True):
     met: int  # how often the person had to stand for the robot
     distance_m: float
     seconds: float  # of the robot's time, in all
+    alone: int  # ticks that went on without the brain, on a host too busy for the speed
     failures: tuple[Failure, ...]
 
     @property
@@ -121,6 +123,7 @@ async def _run(
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
         specs = process_specs(deployment, "robot", Path(folder), Path(folder) / "state")
         say(f"{name}: starting")
+        began_s = asyncio.get_running_loop().time()
         async with (
             running(specs, START_S) as group,
             client(client_endpoint(deployment)) as bus,
@@ -129,6 +132,7 @@ async def _run(
             await group.until(lambda: sender.knows_its_place, START_S)
             say(f"{name}: exploring")
             explored = await sender.explore()
+            accepted_s = sender.accepted_s - began_s
             explored_s = sender.seconds
             while not await sender.done(goals, meetings):
                 await sender.send()
@@ -138,6 +142,7 @@ async def _run(
         body=deployment.body,
         world=deployment.world,
         speed=deployment.speed,
+        accepted_s=round(accepted_s, 2),
         explored=explored,
         explored_s=explored_s,
         goals=sender.sent,
@@ -147,6 +152,7 @@ async def _run(
         met=int(report["person_stood"]),
         distance_m=report["distance_m"],
         seconds=report["sim_seconds"],
+        alone=int(report["lockstep_timeouts"]),
         failures=tuple(sender.failures),
     )
 
@@ -160,6 +166,7 @@ class _Sender:
         bus.latest(STATE)  # which start of the driver all else has to be of
         self._random, self._search = np.random.default_rng(seed), Search()
         self.sent = self.reached = 0
+        self.accepted_s = 0.0  # when, by the host's clock, the first task was
         self.failures: list[Failure] = []
 
     @property
@@ -176,6 +183,7 @@ class _Sender:
     async def explore(self) -> str:
         """Have it explore; in words, how that ended."""
         task = await self._tasks.explore()
+        self.accepted_s = asyncio.get_running_loop().time()
         ended = await self._while_all_live(self._tasks.result(task))
         return f"{ended.state}: {ended.reason}"
 

@@ -22,7 +22,7 @@ def goals(
     worlds: tuple[str, ...] = WORLDS,
     goals: int = 100,
     meetings: int = 0,
-    speed: float = 10.0,
+    speed: float = 5.0,
     seed: int = 0,
     json: Path | None = None,
 ) -> int:
@@ -31,7 +31,9 @@ def goals(
     Example: gigabrain bench goals --bodies alpha --worlds house --goals 10 --speed 1
 
     The table says how long mapping took, how much room the body kept round it at least, how long a
-    goal took in the mean, and how often the person of the world had to stand for the robot.
+    goal took in the mean, how often the person of the world had to stand for the robot, and how
+    many ticks went on without the brain because the host was too busy.
+
     Ends with 1 after any contact, or when more than one goal in a hundred was not reached.
 
     Parameters
@@ -78,13 +80,13 @@ def _table(result: "GoalsResult") -> "Table":
     from rich.table import Table
 
     table = Table("body", "world", title=f"seed {result.seed}")
-    for name in ("speed", "mapped", "reached", "share", "contacts", "room", "goal", "met"):
+    for name in ("speed", "mapped", "reached", "share", "contacts", "room", "goal", "met", "alone"):
         table.add_column(name, justify="right")
     for run in result.runs:
         table.add_row(
             run.body, run.world, f"x{run.speed:g}", f"{run.explored_s:.0f} s",
             f"{run.reached} of {run.goals}", f"{100 * run.reached / run.goals:.0f} %",
             str(run.contacts), f"{run.min_clearance_m:.3f} m", f"{run.seconds_per_goal:.1f} s",
-            str(run.met),
+            str(run.met), str(run.alone),
         )  # fmt: skip
     return table
