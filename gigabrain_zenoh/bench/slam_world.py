@@ -134,7 +134,8 @@ class _Run:
         began = time.thread_time()
         view = view_of(lidar, scan, PerceptionConfig().ignore_below)
         motion = between(self._last.fused, moment.fused) if self._last else IDENTITY
-        place = self.chart.step(view, motion, uncertainty(motion, slipping=moment.slipping))
+        noise = uncertainty(motion, slipping=moment.slipping, gyro=moment.gyro)
+        place = self.chart.step(view, motion, noise)
         self.took_ms.append((time.thread_time() - began) * 1e3)
         self._last = moment
         self.not_localized += not place.localized

@@ -53,11 +53,11 @@ class Drift:
 
     def explains(self, loop: Edge, poses: Floats) -> bool:
         """Whether drift may have brought about what closing `loop` would correct."""
-        turn, away = self._between(loop.first, loop.second, poses)
+        turn, away = self.between(loop.first, loop.second, poses)
         x, y, yaw = between(between(poses[loop.first], poses[loop.second]), loop.relative)
         return bool((x * x + y * y) / away + yaw * yaw / turn < GATE)
 
-    def _between(self, first: int, second: int, poses: Floats) -> tuple[float, float]:
+    def between(self, first: int, second: int, poses: Floats) -> tuple[float, float]:
         """The variance of yaw and of place on the least uncertain way (Dijkstra)."""
         far = poses[:, :2] - poses[second, :2]
         levers = (far * far).sum(axis=1)  # a turn on the way moves what is far from it

@@ -4,7 +4,7 @@ It knows nothing of loops: its own frame is smooth and drifts, and a correction 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -12,7 +12,15 @@ import numpy as np
 from gigabrain_zenoh.mapping.local_map import LocalMap, build
 from gigabrain_zenoh.mapping.matching import Fit, Found, Window, icp, search, thinned
 from gigabrain_zenoh.mapping.points import Scan
-from gigabrain_zenoh.mapping.se2 import Floats, between, compose, inverse_of, wrapped
+from gigabrain_zenoh.mapping.se2 import (
+    Floats,
+    between,
+    compose,
+    inverse_of,
+    rotation,
+    turned,
+    wrapped,
+)
 
 Kind = Literal["matched", "searched", "recovered", "odometry", "broken"]
 
@@ -28,6 +36,8 @@ WIDE = Window(1.0, 0.6)  # where to look when the scan does not fit where it sho
 FEW = 20  # points, with fewer there is nothing to match
 MISSES, MISSED_TRAVEL, MISSED_TURN = 3, 0.5, 0.5  # scans, [m], [rad]: after these it is broken,
 MISSES_STANDING = 30  # or after so many scans
+CONTRADICTED = 16.3  # 99.9 % of chi-square with three degrees of freedom: odometry was wrong
+UNMOVED = np.zeros((3, 3))
 UNKNOWN = np.diag((10.0, 10.0, np.pi)) ** 2  # covariance of a link that nothing is known of
 
 
@@ -55,6 +65,7 @@ class Match:
     kind: Kind
     score: float  # 0 to 1, of the search
     inliers: float  # share of the points that ICP laid onto lines
+    guided: bool = False  # by odometry whose covariance is known, and does not speak against it
 
 
 class FrontEnd:
@@ -66,12 +77,17 @@ class FrontEnd:
         self._poses: list[Floats] = []
         self._local: LocalMap | None = None
         self._adrift = _Adrift()
+        self._noise: Floats | None = UNMOVED  # of odometry since a scan was matched
         self.pose = pose
 
-    def add(self, scan: Scan, delta: Floats) -> tuple[Match, bool]:
-        """Where the scan lies, after odometry has moved by `delta`; and whether to keep it."""
+    def add(self, scan: Scan, delta: Floats, noise: Floats | None = None) -> tuple[Match, bool]:
+        """Where the scan lies, after odometry has moved by `delta`; and whether to keep it.
+
+        `noise` is the covariance of `delta` in its own frame, if it is known.
+        """
         guess = compose(self.pose, delta)
         self._adrift = self._adrift.moved(delta, len(scan.points) < FEW)
+        self._noise = self._summed(noise, delta)
         if self._local is None:
             match = Match(guess, self._adrift.covariance, "matched", 1.0, 1.0)
         else:
@@ -80,8 +96,12 @@ class FrontEnd:
         far = match.kind == "broken" or self._far_enough()
         if match.kind == "odometry":
             return match, self._adrift.far and far
-        self._adrift = _Adrift()
+        self._adrift, self._noise = _Adrift(), UNMOVED
         return match, far
+
+    def place(self, pose: Floats) -> None:
+        """The robot is about here, and odometry until now says nothing of it."""
+        self.pose, self._noise = pose, None
 
     def keep(self, scan: Scan, alone: bool) -> None:
         """Make the scan that was added last part of the local map, or all of it."""
@@ -104,6 +124,11 @@ class FrontEnd:
             return Match(guess, self._adrift.covariance, "odometry", 0.0, 0.0)
         covariance = self._adrift.covariance
         found = search(local.image, scan.points, guess, _window(self._adrift))
+        if self._noise is not None:
+            known = turned(self._noise, float(guess[2]))
+            fit = _fit(local, scan, found, guess, known)
+            if fit.inliers >= INLIERS and _likely(fit.pose - guess, known):
+                return replace(_matched(fit, found, known, "matched"), guided=True)
         fit = _fit(local, scan, found, guess, covariance)
         near = found.score > LEAST_SCORE and _apart(fit.pose, found.pose) <= MOVED
         if near and fit.inliers >= INLIERS:
@@ -117,6 +142,15 @@ class FrontEnd:
             found.score,
             fit.inliers,
         )
+
+    def _summed(self, noise: Floats | None, delta: Floats) -> Floats | None:
+        """The odometry's covariance since a scan was matched, in the axes of the pose now."""
+        if noise is None or self._noise is None:
+            return None
+        turn = rotation(-float(delta[2]))
+        lever = np.eye(3)
+        lever[0, 2], lever[1, 2] = -delta[1], delta[0]
+        return np.asarray(turn @ (lever @ self._noise @ lever.T + noise) @ turn.T)
 
     def _recover(self, local: LocalMap, scan: Scan, guess: Floats) -> Match | None:
         """Where the scan fits beyond doubt, wide round the guess or round where it was before."""
@@ -173,6 +207,12 @@ def _window(adrift: _Adrift) -> Window:
     """The farther odometry has moved since the last match, the wider the search."""
     effort = min(1.0, adrift.travel / 0.5 + adrift.turn / 0.3)
     return Window(0.15 + 0.2 * effort, 0.12 + 0.23 * effort)
+
+
+def _likely(off: Floats, covariance: Floats) -> bool:
+    """Whether odometry of this covariance may have been `off` by so much, in the same axes."""
+    off = wrapped(off)
+    return bool(off @ inverse_of(covariance) @ off < CONTRADICTED)
 
 
 def _fit(local: LocalMap, scan: Scan, found: Found, guess: Floats, covariance: Floats) -> Fit:

@@ -25,6 +25,7 @@ BIAS_SHARE = 0.02  # of a new reading at 50 Hz: over about a second
 
 SLIP_RATE = 0.15  # [rad/s] between wheels and gyro, smoothed
 SLIP_SHARE = 0.1  # of a new difference: over about 0.2 s
+GYRO = 0.3  # of the yaw's deviation by wheels alone
 SLIPPING = 5.0  # so much more uncertain is what the wheels say then
 
 JUMP_FACTOR, JUMP_M, JUMP_RAD = 2.0, 0.2, 0.5  # more than the body can do is no motion
@@ -38,6 +39,7 @@ class Moment(NamedTuple):
     fused: Floats  # (3,), with the gyro's heading
     slipping: bool
     jumps: int  # how often the odometry has jumped since the start
+    gyro: bool = False  # whether the heading is a gyro's
 
 
 class Fusion:
@@ -62,18 +64,19 @@ class Fusion:
         last = self.newest
         if last is None:
             self._rate = self._turn_rate(state)
-            self._moments.append(Moment(state.tick, pose, pose, False, 0))
+            self._moments.append(Moment(state.tick, pose, pose, False, 0, state.imu is not None))
             return
         if state.tick <= last.tick:
             return
+        gyro = state.imu is not None
         seconds = (state.tick - last.tick) * TICK_NS / 1e9
         step = between(last.odometry, pose)
         if jumped(step, seconds, body):
             self._rate, self._rest = self._turn_rate(state), 0
-            moment = Moment(state.tick, pose, last.fused, self.slipping, last.jumps + 1)
+            moment = Moment(state.tick, pose, last.fused, self.slipping, last.jumps + 1, gyro)
         else:
             fused = advanced(last.fused, step, self._turn(state, step, seconds))
-            moment = Moment(state.tick, pose, fused, self.slipping, last.jumps)
+            moment = Moment(state.tick, pose, fused, self.slipping, last.jumps, gyro)
         self._moments.append(moment)
 
     @property
@@ -103,6 +106,7 @@ class Fusion:
             _along(before.fused, after.fused, share),
             after.slipping,
             after.jumps,
+            after.gyro,
         )
 
     def _turn_rate(self, state: RobotState) -> float | None:
@@ -146,12 +150,16 @@ def advanced(pose: Floats, step: Floats, turn: float) -> Floats:
     return compose(pose, np.array((along[0], along[1], turn)))
 
 
-def uncertainty(step: Floats, *, slipping: bool) -> Floats:
-    """The covariance (3, 3) of `step` in its own frame: about 5 % of the way and of the turn."""
+def uncertainty(step: Floats, *, slipping: bool, gyro: bool = False) -> Floats:
+    """The covariance (3, 3) of `step` in its own frame: about 5 % of the way and of the turn.
+
+    With a gyro the turn is that much better known as GYRO says.
+    """
     factor = SLIPPING if slipping else 1.0
     way, turn = math.hypot(float(step[0]), float(step[1])), abs(float(step[2]))
     xy = factor * (0.002 + 0.05 * way + 0.02 * turn)
-    return np.diag((xy, xy, factor * (0.002 + 0.02 * turn + 0.01 * way))) ** 2
+    yaw = factor * (0.002 + 0.02 * turn + 0.01 * way) * (GYRO if gyro else 1.0)
+    return np.diag((xy, xy, yaw)) ** 2
 
 
 def _along(first: Floats, second: Floats, share: float) -> Floats:

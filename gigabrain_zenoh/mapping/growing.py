@@ -22,7 +22,7 @@ DRAWN_SCANS = 5  # every so many scans one is drawn, and every keyframe
 DRAWN_AT_ONCE = 8  # sweeps, of those that wait after the map was drawn anew
 LOOP_SCANS, KEYFRAME_SCANS, SWEEPS_A_SCAN = 5, 2, 200  # how long the work beside may take
 SHIFT_M, SHIFT_RAD = 0.02, 0.004  # keyframes that moved less need not be drawn anew
-RATES = Rates(away=0.012, turn=0.004)  # of scans every few centimetres, guessed with a gyro
+RATES = Rates(away=0.008, turn=0.002)  # of scans every few centimetres, guided by odometry
 FITS = ("matched", "recovered")  # scans that were found otherwise are not drawn
 
 
@@ -39,6 +39,7 @@ class GrowingMap:
         self._finder: Finder | None = None
         self._doubt = Doubt()
         self._seen = self._moved = IDENTITY  # the last scan's pose, and the way since then
+        self._doubted = False  # since the last scan that was taken
         self._last = Place(IDENTITY, NOWHERE, False, "no scan yet")
         self._loops = self._renewals = 0
 
@@ -65,9 +66,10 @@ class GrowingMap:
             return self._last
         self._moved = compose(self._moved, motion)
         if self._doubtful(view):
+            self._doubted = True
             return self._last
-        estimate = self._slam.add(view.scan, self._moved)
-        self._moved = IDENTITY
+        estimate = self._slam.add(view.scan, self._moved, None if self._doubted else noise)
+        self._moved, self._doubted = IDENTITY, False
         if estimate.lost:
             self.lose("scans do not fit together any more")
             return self._last
@@ -124,7 +126,7 @@ class GrowingMap:
         if place.localized:
             self._slam.relocate(place.pose)
             self._finder, self._doubt = None, Doubt()
-            self._seen, self._moved = place.pose, IDENTITY
+            self._seen, self._moved, self._doubted = place.pose, IDENTITY, False
         return place
 
     def _doubtful(self, view: View) -> bool:

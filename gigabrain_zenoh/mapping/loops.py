@@ -32,6 +32,7 @@ SCORE = 0.55
 GATE = 0.4  # [m]
 POINTS = 360  # of a scan are enough for ICP
 INLIERS = 0.6  # share of the points
+WITHIN = 4.0  # standard deviations of drift, beyond them there is no loop
 RMS = 0.06  # [m]
 MOVED = 0.3  # [m], from search to ICP
 FEWEST, MOST, LENGTH = 8, 20, 4.0  # keyframes round a place, and [m] of travel between the two
@@ -59,7 +60,7 @@ class LoopSearch:
         self.waiting = [w for w in self.waiting if travel[-1] - travel[w.second] < MEMORY]
         here = len(keyframes) - 1
         attempts = [
-            _attempt(keyframes, poses, travel, there, here)
+            _attempt(keyframes, poses, travel, there, here, *self.drift.between(there, here, poses))
             for there in _candidates(poses, travel, here)
         ]
         found = [loop for loop in attempts if loop and self.drift.explains(loop, poses)]
@@ -103,18 +104,28 @@ def around(travel: Floats, there: int, end: int) -> slice:
 
 
 def _attempt(
-    keyframes: Sequence[Keyframe], poses: Floats, travel: Floats, there: int, here: int
+    keyframes: Sequence[Keyframe],
+    poses: Floats,
+    travel: Floats,
+    there: int,
+    here: int,
+    turn: float,
+    away: float,
 ) -> Edge | None:
-    """The loop from `there` to `here`, if the scan of the one fits into the place of the other."""
+    """The loop from `there` to `here`, if the scan of the one fits into the place of the other.
+
+    The variances of the drift, `turn` and `away`, decide where the place leaves a direction open;
+    the loop's own covariance does not count them, as the graph does already.
+    """
     place = around(travel, there, here)
     scans = [keyframe.scan for keyframe in keyframes[place]]
     local = build(scans, between(poses[there], poses[place]), IDENTITY, CELL, SIGMA)
     guess, scan = between(poses[there], poses[here]), keyframes[here].scan.points
-    found = search(local.image, scan, guess, WINDOW)
+    found = search(local.image, scan, guess, _window(turn, away))
     if found.score < SCORE:
         return None
-    free = np.zeros((3, 3))
-    fit = icp(local.buckets, thinned(scan, POINTS), found.pose, GATE, free, found.pose)
+    prior = np.diag((1 / away, 1 / away, 1 / turn))
+    fit = icp(local.buckets, thinned(scan, POINTS), found.pose, GATE, prior, guess)
     slid = float(np.hypot(*(fit.pose - found.pose)[:2]))
     if fit.inliers < INLIERS or fit.rms > RMS or slid > MOVED:
         return None
@@ -124,6 +135,12 @@ def _attempt(
     pose = wrapped(fit.pose)
     covariance = LOOP + turned(inverse_of(fit.information), -float(pose[2]))
     return Edge(there, here, pose, covariance, doubtful=True)
+
+
+def _window(turn: float, away: float) -> Window:
+    """Where to search after a drift of these variances."""
+    within = WITHIN * np.sqrt((away, turn))
+    return Window(min(WINDOW.away, within[0]), min(WINDOW.turn, within[1]), WINDOW.step)
 
 
 def _small(loop: Edge, poses: Floats) -> bool:

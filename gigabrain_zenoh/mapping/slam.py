@@ -26,7 +26,8 @@ from gigabrain_zenoh.mapping.loops import LoopSearch, around
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, turned
 
-LINK = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance of a link beside that of its match
+LINK = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance of a link beside that of its match,
+GUIDED = np.diag((0.02, 0.02, 0.005)) ** 2  # and where odometry was known to be good
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +89,16 @@ class Slam:
         """Where the robot is in the front end's own frame, which drifts and never jumps."""
         return self._front.pose
 
-    def add(self, scan: Scan, delta: Floats) -> Estimate:
-        """Where the robot is, odometry having moved by `delta` (x, y, yaw) since the last scan."""
+    def add(self, scan: Scan, delta: Floats, noise: Floats | None = None) -> Estimate:
+        """Where the robot is, odometry having moved by `delta` (x, y, yaw) since the last scan.
+
+        `noise` (3, 3) is the covariance of `delta` in its own frame. Without it odometry is taken
+        for bad, and counts next to nothing where there is anything to match.
+        """
         if not np.isfinite(delta).all():
             raise ValueError(f"odometry: expected finite numbers, got {delta}")
         self._travel += float(np.hypot(delta[0], delta[1]))
-        match, kept = self._front.add(scan, delta)
+        match, kept = self._front.add(scan, delta, noise)
         keyframe, placed = self._anchor
         relative = between(placed, match.pose)
         if kept:
@@ -120,7 +125,7 @@ class Slam:
         nearest = int(np.argmin(away))
         place = around(travel, nearest, len(poses))
         ids = sorted(range(place.start, place.stop), key=lambda k: -abs(k - nearest))
-        self._front.pose = pose
+        self._front.place(pose)
         self._front.restart([self.keyframes[k].scan for k in ids], [poses[k] for k in ids])
         self._anchor = (nearest, poses[nearest])
         self._segment = self.keyframes[nearest].segment
@@ -220,7 +225,8 @@ class Slam:
         here = len(self.keyframes)
         broken = match.kind == "broken"
         self._segment += broken
-        covariance = LINK + turned(match.covariance, -float(match.pose[2]))
+        beside = GUIDED if match.guided else LINK
+        covariance = beside + turned(match.covariance, -float(match.pose[2]))
         doubtful = match.kind in ("odometry", "broken")
         link = Edge(self._anchor[0], here, relative if here else match.pose, covariance, doubtful)
         self.keyframes.append(Keyframe(scan, link, self._travel, self._segment))
