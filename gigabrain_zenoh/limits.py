@@ -1,5 +1,7 @@
 """How fast a body may go, and how fast it may change that. Pure functions."""
 
+import math
+
 import msgspec
 
 from gigabrain_schemas.base import Velocity
@@ -19,6 +21,8 @@ class Limits(msgspec.Struct, frozen=True, kw_only=True):
     linear_acceleration: float  # [m/s2]
     linear_deceleration: float  # [m/s2]
     angular_acceleration: float  # [rad/s2], both ways
+    rim_speed: float = math.inf  # [m/s], of each wheel of a differential base
+    half_track: float = 0.0  # [m], from its middle to a wheel
 
 
 def limits_of(body: BodyDescription) -> Limits:
@@ -30,17 +34,33 @@ def limits_of(body: BodyDescription) -> Limits:
         linear_acceleration=body.max_linear_acceleration,
         linear_deceleration=body.max_linear_deceleration,
         angular_acceleration=body.max_angular_acceleration,
+        rim_speed=rim_speed(body),
+        half_track=body.wheel_separation / 2 if body.drive_type == "differential" else 0.0,
     )
 
 
+def rim_speed(body: BodyDescription) -> float:
+    """How fast a wheel of a differential base may roll [m/s]; inf where that is no matter."""
+    if body.max_rim_speed is None or body.drive_type != "differential":
+        return math.inf
+    return body.max_rim_speed
+
+
 def clamp(velocity: Velocity, limits: Limits, caps: SpeedCaps = NO_CAPS) -> Velocity:
-    """`velocity` within the body's speeds and the caps of the moment, axis by axis."""
+    """`velocity` within the body's speeds and the caps of the moment, axis by axis.
+
+    Where a wheel would still be too fast, the body is slower along the same curve.
+    """
     turning = limits.angular_speed if caps.rotation is None else caps.rotation
     turning = min(turning, limits.angular_speed)
+    forward = _within(velocity.linear_x, limits.linear_speed, caps.backward, caps.forward)
+    turn = _within(velocity.angular_z, turning, caps.turn_right, caps.turn_left)
+    rim = abs(forward) + abs(turn) * limits.half_track
+    share = limits.rim_speed / rim if rim > limits.rim_speed else 1.0
     return Velocity(
-        linear_x=_within(velocity.linear_x, limits.linear_speed, caps.backward, caps.forward),
+        linear_x=share * forward,
         linear_y=_within(velocity.linear_y, limits.lateral_speed, caps.right, caps.left),
-        angular_z=_within(velocity.angular_z, turning, caps.turn_right, caps.turn_left),
+        angular_z=share * turn,
     )
 
 

@@ -107,23 +107,19 @@ class Navigating:
             self._steer(state, world, map_from_odom, order, body.description)
         else:
             self._here = None
-        return Situation(
-            world,
-            pose or state.pose,
-            must_charge,
-            Bearings(
-                tick=tick,
-                late_ticks=state.tick - tick,
-                velocity=state.velocity,
-                body=body.description if body else None,
-                map_from_odom=map_from_odom,
-                lost=lost,
-                response=self._response.response,
-                sent=tuple(Sent(*one) for one in self._response.sent(tick - SENT_TICKS, tick - 1)),
-                order=order,
-                route=self._route,
-            ),
+        bearings = Bearings(
+            tick=tick,
+            late_ticks=state.tick - tick,
+            velocity=state.velocity,
+            body=body.description if body else None,
+            map_from_odom=map_from_odom,
+            lost=lost,
+            response=self._response.response,
+            sent=tuple(Sent(*one) for one in self._response.sent(tick - SENT_TICKS, tick - 1)),
+            order=order,
+            route=self._route,
         )
+        return Situation(world, pose or state.pose, must_charge, bearings)
 
     def heed(self, behaviour: Behaviour) -> None:
         """What became of the order goes to the tasks, what became of the route to the guide."""

@@ -22,7 +22,7 @@ NULLABLE = {
     "SafetyState.caps.forward", "SafetyState.caps.backward", "SafetyState.caps.left",
     "SafetyState.caps.right", "SafetyState.caps.rotation",
     "SafetyState.caps.turn_left", "SafetyState.caps.turn_right",
-    "GoalRequest.yaw",
+    "GoalRequest.yaw", "TaskStatus.distance_remaining", "TaskStatus.eta", "TaskStatus.goal.yaw",
     "Description.report.distance_m", "Description.report.contacts",
 }  # fmt: skip
 REPORT = ("Description.report.distance_m", "Description.report.contacts")  # texts as well

@@ -1,5 +1,6 @@
 """How fast a body may go, and how fast it may change that."""
 
+import msgspec
 import pytest
 
 from gigabrain_schemas.base import Velocity
@@ -53,6 +54,14 @@ def test_what_is_beyond_them_is_cut_axis_by_axis(sign: int) -> None:
     assert clamp(Velocity(linear_x=9.0 * sign, angular_z=1.0), LIMITS) == Velocity(
         linear_x=0.5 * sign, angular_z=1.0
     )
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_base_whose_wheel_would_be_too_fast_is_slower_along_the_same_curve(sign: int) -> None:
+    wheels = msgspec.structs.replace(LIMITS, rim_speed=0.5, half_track=0.25)
+    asked = Velocity(linear_x=0.5 * sign, angular_z=-2.0)
+    assert clamp(asked, wheels) == Velocity(linear_x=0.25 * sign, angular_z=-1.0)
+    assert clamp(Velocity(linear_x=0.25 * sign, angular_z=1.0), wheels).linear_x == 0.25 * sign
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import Grid, clearance, free_ahead, outline_of
@@ -30,6 +31,14 @@ def test_a_command_changes_no_faster_than_the_body_can() -> None:
     assert (vx, vy, w) == pytest.approx((0.09, 0.0, 0.27))
     assert feasible(model, (0.1, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.1)[0] == pytest.approx(0.01)
     assert feasible(model, (0.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 9.0)[0] == -0.13
+
+
+def test_a_wheel_is_never_planned_to_be_faster_than_it_can_be() -> None:
+    model = model_of(replace(WAFFLE, wheel_separation=0.28, max_rim_speed=0.26))
+    vx, _, w = feasible(model, (0.0, 0.0, 0.0), (0.26, 0.0, 1.82), 9.0)
+    assert vx + 0.14 * w == pytest.approx(0.26)
+    assert w / vx == pytest.approx(7.0)
+    assert feasible(model, (0.0, 0.0, 0.0), (0.26, 0.0, 0.0), 9.0) == (0.26, 0.0, 0.0)
 
 
 def test_a_slower_speed_can_be_asked_for() -> None:

@@ -45,6 +45,12 @@ def test_a_dead_end_is_left_backwards_or_by_turning() -> None:
     assert "backing out" in {plan.kind for plan in drive.plans}
 
 
+def test_a_body_that_has_to_go_far_the_other_way_turns_round() -> None:
+    drive = Drive(WAFFLE, Goal(x=-2.0, y=0.0), NOTHING, response=LATE)
+    assert drive.go(15.0).arrived
+    assert min(pose.x for pose in drive.poses if abs(pose.yaw) < 1.5) > -0.5
+
+
 @pytest.mark.parametrize("speed", [0.3, 0.6])
 def test_a_disc_that_comes_head_on_is_gone_round_or_let_pass(speed: float) -> None:
     def someone(now: float) -> tuple[Obstacle, ...]:

@@ -215,3 +215,25 @@ async def test_the_same_world_gives_the_same_drive() -> None:
             await plane.go(5.0)
             places.append((plane.x, plane.y, plane.yaw))
     assert places[0] == places[1]
+
+
+async def test_who_roams_explores_and_then_visits_places_until_it_is_sent_elsewhere() -> None:
+    plane = Plane(
+        CELLS, at=(2.0, 1.0, 0.3), config=DecisionConfig(behaviour="navigate", begin="roam")
+    )
+    plane.known[:] = -1
+    async with plane:
+        said = []
+        for _ in range(40):
+            await plane.go(0.5)
+            said.append(plane.intent.reason.partition(" ")[0])
+            if said[-1] == "going":
+                break
+        assert "exploring:" in said
+        assert said[-1] == "going"
+        current = plane.status.current
+        assert current
+        assert (current.label, current.source) == ("roaming", "itself")
+        await plane.ask_at_once(GOAL, GoalRequest(x=1.5, y=1.2))
+        await plane.go(0.5)
+        assert plane.status.done[0].reason == "replaced by goal-2"

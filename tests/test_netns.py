@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.brain import CmdVel, Intent
+from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, INTENT
 from gigabrain_zenoh.client import Robot
 from gigabrain_zenoh.faults.chaos import CALM, Chaos
@@ -61,14 +61,18 @@ class Ears:
     """What is said on the way from decision to the gate."""
 
     def __init__(self, robot: Onlooker) -> None:
-        self.intents: deque[Intent] = deque(maxlen=10_000)
+        self.arrivals: deque[int] = deque(maxlen=10_000)  # of intents, in the robot's ticks
         self.commands: deque[CmdVel] = deque(maxlen=10_000)
-        robot.bus.subscribe(INTENT, lambda _key, intent: self.intents.append(intent))
+        time = robot.bus.time
+        robot.bus.subscribe(INTENT, lambda _key, _intent: self.arrivals.append(time.tick))
         robot.bus.subscribe(CMD_VEL, lambda _key, command: self.commands.append(command))
 
     def silence(self, after: int) -> tuple[int, int]:
-        """The ticks of decision's last intent before it fell silent, and of the first one then."""
-        ticks = [intent.tick for intent in self.intents if intent.tick >= after]
+        """When decision was heard for the last time before it fell silent, and then again.
+
+        As the robot's clock has it: what waited on the way may carry every tick there was.
+        """
+        ticks = [after, *(tick for tick in self.arrivals if tick >= after)]
         gaps = ((a, b) for a, b in pairwise(ticks) if b - a > STOP_TICKS)
         return next(gaps, (ticks[-1], ticks[-1]))
 

@@ -129,3 +129,15 @@ def test_the_person_may_walk_away_from_a_robot_that_came_too_close() -> None:
     for _ in range(100):
         person.advance(lambda x, y: math.hypot(x - 0.6, y))
     assert person.pose.x == pytest.approx(1.8)
+
+
+def test_standing_for_the_robot_counts_once_until_the_person_has_walked_on() -> None:
+    person = Person(ClosedPath(((0, 0), (10, 0), (10, 1), (0, 1))), 0.0)
+    for _ in range(100):
+        person.advance(lambda x, y: max(0.0, 1.0 - x))
+    assert person.stood == 1
+    for _ in range(200):
+        person.advance(lambda x, y: 9.0)
+    for _ in range(100):
+        person.advance(lambda x, y: 0.6 - 0.01 * x)
+    assert person.stood == 2

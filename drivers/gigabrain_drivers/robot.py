@@ -25,7 +25,6 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
     """A whole robot.yaml. Each link names its driver; the rest of it is the driver's own."""
 
     summary: str  # one line, for `gigabrain robots`
-    wheel_separation: NonNegative = 0.0  # [m], left to right; of omni wheels, to the next one
     wheel_base: NonNegative = 0.0  # [m], front to rear, of mecanum and Ackermann bases
     wheel_radius: NonNegative = 0.0  # [m]
     joints: tuple[JointLimits, ...] = ()

@@ -68,13 +68,15 @@ class Group:
 
 
 @asynccontextmanager
-async def running(specs: Sequence[ProcessSpec]) -> AsyncIterator[Group]:
+async def running(
+    specs: Sequence[ProcessSpec], within_s: float = PATIENCE_S
+) -> AsyncIterator[Group]:
     """Run `specs` while the block lasts; all are ready when it begins, none is left after it."""
     group = Group(specs)
     async with group.supervisor:
         work = asyncio.create_task(group.supervisor.run())
         try:
-            await group.until(lambda: group.ready)
+            await group.until(lambda: group.ready, within_s)
             yield group
         finally:
             await group.supervisor.stop(STOP_S)

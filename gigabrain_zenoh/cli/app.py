@@ -82,6 +82,7 @@ COMMANDS = {
     "faults": ("faults:faults", "Break the robot in 44 ways, and see whether it stops."),
     "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
+    "bench goals": ("bench_goals:goals", "Explore, then get to random places."),
     "bench plan": ("bench_plan:plan", "Global planning, timed and checked."),
     "bench slam": ("bench_slam:slam", "Maps from recorded laser logs, and their errors."),
     "bench barn": ("bench_barn:barn", "BARN: through a field of posts, scored."),

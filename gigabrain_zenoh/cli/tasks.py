@@ -11,7 +11,7 @@ from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import Refused
 
 if TYPE_CHECKING:
-    from gigabrain_schemas.tasks import Task, TaskStatus
+    from gigabrain_schemas.tasks import Task
     from gigabrain_zenoh.task_client import Tasks
 
 How = Literal["replace", "queue", "preempt"]
@@ -190,11 +190,13 @@ def _with(at: Which, do: "Callable[[Tasks], Awaitable[None]]") -> int:
 
 
 def _send(at: Which, send: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> int:
+    from gigabrain_zenoh.cli.task_line import Line
+
     async def run(tasks: "Tasks") -> None:
         name = await send(tasks)
         if not wait:
             return say(f"{name}: accepted")
-        line = _Line()
+        line = Line()
         try:
             ended = await tasks.result(name, lambda status: line.show(name, status))
         except asyncio.CancelledError:  # Ctrl-C
@@ -213,42 +215,3 @@ def _tell(ended: "Task") -> None:
     if ended.state != "succeeded":
         raise Refused(f"{ended.id} has {ended.state}{why}")
     say(f"{ended.id} has succeeded{why}")
-
-
-class _Line:
-    """Progress in one line of a terminal; in a pipe a line for each thing that is done."""
-
-    def __init__(self) -> None:
-        import sys
-
-        self._terminal, self._said = sys.stdout.isatty(), ""
-
-    def show(self, name: str, status: "TaskStatus") -> None:
-        """How far it has come."""
-        text = _progress(name, status)
-        if self._terminal:
-            print(f"\r\x1b[K{text}", end="", flush=True)
-        elif (head := text.partition(":")[0] + status.doing) != self._said:
-            self._said = head
-            say(text)
-
-    def end(self) -> None:
-        """Leave the line."""
-        if self._terminal:
-            print("\r\x1b[K", end="", flush=True)
-
-
-def _progress(name: str, status: "TaskStatus") -> str:
-    current = status.current
-    if current is None or current.id != name:
-        ahead = [task.id for task in status.queue]
-        place = ahead.index(name) + 1 if name in ahead else 0
-        return f"{name}: waits, {place} in the queue" if place else f"{name}: accepted"
-    if current.state == "paused":
-        return f"{name}: paused, {current.reason}"
-    parts = [f"{name}: {status.doing}", f"{100 * status.progress:.0f} %"]
-    if status.distance_remaining is not None:
-        parts.append(f"{status.distance_remaining:.1f} m")
-    if status.eta is not None:
-        parts.append(f"{status.eta:.0f} s")
-    return ", ".join((*parts, current.reason))

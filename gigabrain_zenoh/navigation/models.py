@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.limits import limits_of
 
 RESERVE = 0.9  # of the body's accelerations: what is planned must be possible on a bad floor too
 SLOWEST_REVERSE = 0.4  # [m/s], no faster backwards: the lidar may not see there
@@ -24,6 +25,8 @@ class Model(NamedTuple):
     reaction_time: float  # [s] from a scan to the brake
     margin: float  # [m], kept free in front of the body at rest
     side_margin: float  # [m], kept free beside it
+    rim: float  # [m/s], fastest of each wheel of a differential base; inf for others
+    half_track: float  # [m], from its middle to a wheel
 
 
 def model_of(body: BodyDescription, speed: float | None = None) -> Model:
@@ -33,7 +36,7 @@ def model_of(body: BodyDescription, speed: float | None = None) -> Model:
     is its tightest turn.
     """
     fastest = body.max_linear_speed if speed is None else min(speed, body.max_linear_speed)
-    car = body.drive_type == "ackermann"
+    car, limits = body.drive_type == "ackermann", limits_of(body)
     return Model(
         forward=fastest,
         backward=min(SLOWEST_REVERSE, 0.5 * fastest),
@@ -46,6 +49,8 @@ def model_of(body: BodyDescription, speed: float | None = None) -> Model:
         reaction_time=body.thresholds.reaction_time,
         margin=body.thresholds.stop_margin,
         side_margin=body.thresholds.side_margin,
+        rim=limits.rim_speed,
+        half_track=limits.half_track,
     )
 
 
@@ -69,9 +74,12 @@ def feasible(
     turn = model.angular_acceleration * dt
     vx = max(-model.backward, min(model.forward, target[0]))
     vy = max(-model.lateral, min(model.lateral, target[1]))
+    w = max(-model.turning, min(model.turning, target[2]))
+    rim = abs(vx) + abs(w) * model.half_track
+    if rim > model.rim:
+        vx, w = vx * model.rim / rim, w * model.rim / rim
     vx = toward(before[0], vx, up, down)
     vy = toward(before[1], vy, up, down)
-    w = max(-model.turning, min(model.turning, target[2]))
     w = toward(before[2], w, turn, turn)
     if model.radius > 0.0:
         tightest = abs(vx) / model.radius

@@ -17,7 +17,7 @@ LOOK_AHEAD = 0.25  # [m], from where the last pose's heading is judged
 NEAR_GOAL = 0.2  # [m], nearer the field is too coarse
 SLOW = 0.05  # [m/s], slower than this it always stops in time
 NO_DISC = 1e3  # [m], where nothing moves
-TOO_FAST = 4.0  # per (m/s)2 and second above the speed from which the body stops in time
+TOO_FAST = 16.0  # per second at full speed where it cannot stop in time, by the square of the share
 
 
 class Scene(NamedTuple):
@@ -36,14 +36,14 @@ class Weights(NamedTuple):
     """What is preferred, by how much."""
 
     margin: float = 0.03  # [m], nearer than this is a contact
-    near: float = 1.2  # of having obstacles near, per second
-    near_over: float = 0.05  # [m], over which that decays
+    near: float = 3.0  # of having obstacles near, per second
+    near_over: float = 0.08  # [m], over which that decays
     tight: float = 1.5  # of speed in tight places, per second
     tight_speed: float = 0.45  # [m/s], always allowed
     tight_rate: float = 4.0  # [1/s], more speed per metre of room
     turning: float = 0.02  # per (rad/s)2 and second
     backwards: float = 1.0  # per m
-    heading: float = 1.5  # of facing away from the goal, in units of the time it takes to turn
+    heading: float = 0.8  # of facing away from the goal, in units of the time it takes to turn
     disc: float = 3.0  # of having moving things near, per second
     disc_over: float = 0.3  # [m]
     disc_margin: float = 0.02  # [m]
@@ -88,7 +88,7 @@ def of_braking(
     sign = 1.0 if vx >= 0.0 else -1.0
     free = free_ahead(scene.grid, outline, x, y, cosine, sine, sign, model.side_margin, needs)
     allowed = math.sqrt((brake * t) ** 2 + 2.0 * brake * max(0.0, free - model.margin)) - brake * t
-    over = max(0.0, speed - allowed)
+    over = max(0.0, speed - allowed) / model.forward
     return TOO_FAST * over * over
 
 
@@ -130,7 +130,8 @@ def of_end(
     here = distance_in(scene.field, x, y)
     ahead = distance_in(scene.field, x + LOOK_AHEAD * math.cos(yaw), y + LOOK_AHEAD * math.sin(yaw))
     rise = max(-1.0, min(1.0, (ahead - here) / LOOK_AHEAD))
-    return cost + weights.heading * (1.0 + rise) / model.turning
+    turn = 0.5 * math.pi * (1.0 + rise)
+    return cost + SECOND * weights.heading * turn / model.turning
 
 
 @kernel

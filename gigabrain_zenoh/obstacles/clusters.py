@@ -22,6 +22,7 @@ FARTHEST_M = 10.0  # things beyond are left alone
 FEWEST = 3  # hits; fewer may be chance
 GRAZING_RAD = math.radians(10.0)  # surfaces met at less than that fall into single hits
 LEAST_GAP_M, MOST_GAP_M = 0.10, 0.35  # between two things
+LOST_GAP_M, LOST_BEAMS = 0.10, 6.5  # so near, few beams may be lost on one thing
 MISSING_BEAMS = 2.5  # neighbours so many beams apart are two things
 LARGEST_M = 1.2  # what is longer is a wall
 LARGEST_RADIUS_M = 0.75
@@ -81,7 +82,8 @@ def _breaks(
     steps = np.minimum(turned, GRAZING_RAD / 2)
     most = nearer * np.sin(steps) / np.sin(GRAZING_RAD - steps)
     empty = turned > MISSING_BEAMS * spacing
-    return empty | (apart > np.clip(most, LEAST_GAP_M, MOST_GAP_M)), empty
+    ended = empty & ((apart > LOST_GAP_M) | (turned > LOST_BEAMS * spacing))
+    return ended | (apart > np.clip(most, LEAST_GAP_M, MOST_GAP_M)), empty
 
 
 def _in_front(ranges: Floats, empty: Bools, first: Indices, last: Indices, reach: float) -> Bools:

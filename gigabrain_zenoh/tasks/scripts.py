@@ -60,17 +60,22 @@ class Run:
         except (GigabrainError, OSError, ValueError) as error:
             self.result = False, f"cannot be run: {error}"
             return
-        try:
-            async with asyncio.timeout(script.seconds):
-                said = await _last_words(process)
-                code = await process.wait()
-            self.result = code == 0, _in_words(code, said)
-        except TimeoutError:
-            self.result = False, f"did not end within {script.seconds:g} s and was ended"
-        finally:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
-            await asyncio.shield(process.wait())
+        self.result = await _outcome(process, script.seconds)
+
+
+async def _outcome(process: asyncio.subprocess.Process, seconds: float) -> tuple[bool, str]:
+    """Whether a program ended well, and what it said; nothing of it is left then."""
+    try:
+        async with asyncio.timeout(seconds):
+            said = await _last_words(process)
+            code = await process.wait()
+        return code == 0, _in_words(code, said)
+    except TimeoutError:
+        return False, f"did not end within {seconds:g} s and was ended"
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        await asyncio.shield(process.communicate())
 
 
 async def _last_words(process: asyncio.subprocess.Process) -> str:

@@ -158,6 +158,9 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     max_linear_acceleration: Positive = 1.0  # [m/s2]
     max_linear_deceleration: Positive = 1.0  # [m/s2]
     max_angular_acceleration: Positive = 3.0  # [rad/s2]
+    wheel_separation: NonNegative = 0.0  # [m], left to right; of omni wheels, to the next one
+    max_rim_speed: Positive | None = None
+    # [m/s], of a wheel of a differential base; None: it has its largest speeds both at once
     lidar: Lidar | None = None
     thresholds: Thresholds = Thresholds()
     control: ControlGains = ControlGains()

@@ -139,6 +139,8 @@ BODY: tuple[Message, ...] = (
             max_linear_acceleration=1.0,
             max_linear_deceleration=1.0,
             max_angular_acceleration=3.0,
+            wheel_separation=0.287,
+            max_rim_speed=0.26,
             lidar=Lidar(beams=360, rate_hz=10.0, range_min=0.12, range_max=3.5, x=-0.064),
             thresholds=Thresholds(),
             control=ControlGains(),

@@ -150,6 +150,7 @@ class MujocoDriver(Driver):
             "distance_m": round(truth.distance_m, 3),
             "contacts": truth.contacts,
             "min_clearance_m": round(truth.min_clearance_m, 3),
+            "person_stood": self._simulation.person_stood,
             "true_speed": round(truth.speed()[0], 4),
             "physics_cpu_s": round(self._physics_s, 3),
         }

@@ -8,6 +8,7 @@ from gigabrain_drivers.sim.tick import TICK_S
 RADIUS_M = 0.25
 SPEED = 0.8  # [m/s]
 KEEP_AWAY_M = 0.5  # from the person's side to the robot's outer edge
+ANEW_M = 1.0  # walked since it last stood: standing again is another meeting
 
 
 class Person:
@@ -17,6 +18,8 @@ class Person:
         self._path = path
         self._walked = start
         self.pose = path.at(start)
+        self.stood = 0  # how often it had to, for the robot
+        self._since_m = ANEW_M
 
     def advance(self, robot_distance: Callable[[float, float], float]) -> Pose:
         """Walk for one tick; `robot_distance(x, y)` is from a point to the robot's edge [m]."""
@@ -25,4 +28,8 @@ class Person:
         gap = robot_distance(ahead.x, ahead.y)
         if gap >= KEEP_AWAY_M + RADIUS_M or gap > robot_distance(self.pose.x, self.pose.y):
             self._walked, self.pose = walked, ahead
+            self._since_m += SPEED * TICK_S
+        else:
+            self.stood += self._since_m >= ANEW_M
+            self._since_m = 0.0
         return self.pose

@@ -74,6 +74,11 @@ class Simulation:
         """Simulated time since the start."""
         return self._ticks * TICK_NS
 
+    @property
+    def person_stood(self) -> int:
+        """How often the person had to stand for the robot."""
+        return self._person.stood if self._person else 0
+
     def command(self, linear_x: float, angular_z: float) -> tuple[float, float]:
         """Drive without going sideways; returns (forward, turning), see `drive`."""
         twist = self.drive(linear_x, 0.0, angular_z)

@@ -1,0 +1,92 @@
+"""`gigabrain bench goals`: explore, then get to places drawn at random, all processes running."""
+
+import asyncio
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gigabrain_zenoh.cli.checked import above_zero
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from gigabrain_zenoh.bench.goals import GoalsResult
+
+BODIES = ("turtlebot3_waffle", "mycustombot", "alpha")
+WORLDS = ("house", "warehouse")
+
+
+def goals(
+    *,
+    bodies: tuple[str, ...] = BODIES,
+    worlds: tuple[str, ...] = WORLDS,
+    goals: int = 100,
+    meetings: int = 0,
+    speed: float = 5.0,
+    seed: int = 0,
+    json: Path | None = None,
+) -> int:
+    """Have each body explore each world in MuJoCo, then send it to places drawn at random.
+
+    Example: gigabrain bench goals --bodies alpha --worlds house --goals 10 --speed 1
+
+    The table says how long mapping took, how much room the body kept round it at least, how long a
+    goal took in the mean, how often the person of the world had to stand for the robot, and how
+    many ticks went on without the brain because the host was too busy.
+
+    Ends with 1 after any contact, or when more than one goal in a hundred was not reached.
+
+    Parameters
+    ----------
+    bodies
+        Which robots; may be given again.
+    worlds
+        Where; may be given again.
+    goals
+        How many places each robot is sent to in each world.
+    meetings
+        Send it on until the person of the world has had to stand for it so often.
+    speed
+        How many times faster than real time.
+    seed
+        For the start, the sensors' noise and the places.
+    json
+        Write all figures into this file.
+    """
+    import msgspec
+    from rich.console import Console
+
+    from gigabrain_zenoh.bench.goals import measure_goals
+
+    above_zero("goals", goals)
+    above_zero("speed", speed)
+    measuring = measure_goals(bodies, worlds, goals, meetings, speed, seed, _progress)
+    result = asyncio.run(measuring)
+    if json:
+        json.write_bytes(msgspec.json.format(msgspec.json.encode(result)))
+    console = Console()
+    console.print(_table(result))
+    for run in result.runs:
+        for one in run.failures:
+            console.print(f"{run.body} in {run.world}, ({one.x}, {one.y}): {one.reason}")
+    return 0 if result.ok else 1
+
+
+def _progress(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def _table(result: "GoalsResult") -> "Table":
+    from rich.table import Table
+
+    table = Table("body", "world", title=f"seed {result.seed}")
+    for name in ("speed", "mapped", "reached", "share", "contacts", "room", "goal", "met", "alone"):
+        table.add_column(name, justify="right")
+    for run in result.runs:
+        table.add_row(
+            run.body, run.world, f"x{run.speed:g}", f"{run.explored_s:.0f} s",
+            f"{run.reached} of {run.goals}", f"{100 * run.reached / run.goals:.0f} %",
+            str(run.contacts), f"{run.min_clearance_m:.3f} m", f"{run.seconds_per_goal:.1f} s",
+            str(run.met), str(run.alone),
+        )  # fmt: skip
+    return table

@@ -1,0 +1,45 @@
+"""What `gigabrain bench goals` makes of its figures."""
+
+from msgspec.structs import replace
+from rich.console import Console
+
+from gigabrain_zenoh.bench.goals import GoalFigures, GoalsResult
+from gigabrain_zenoh.cli.bench_goals import _table
+
+GOOD = GoalFigures(
+    body="alpha",
+    world="house",
+    speed=5.0,
+    accepted_s=1.5,
+    explored="succeeded: all is mapped that can be reached",
+    explored_s=30.0,
+    goals=100,
+    reached=99,
+    contacts=0,
+    min_clearance_m=0.09,
+    met=3,
+    distance_m=400.0,
+    seconds=1030.0,
+    alone=0,
+    failures=(),
+)
+
+
+def test_one_goal_in_a_hundred_may_be_missed_and_nothing_may_be_touched() -> None:
+    assert GOOD.ok
+    assert not replace(GOOD, reached=98).ok
+    assert not replace(GOOD, contacts=1).ok
+    assert not GoalsResult(seed=0, runs=(GOOD, replace(GOOD, contacts=1))).ok
+
+
+def test_the_table_says_what_was_measured() -> None:
+    lines = _text(GoalsResult(seed=7, runs=(GOOD,)))
+    for figure in ("seed 7", "99 of 100", "99 %", "0.090 m", "10.0 s"):
+        assert figure in lines
+
+
+def _text(result: GoalsResult) -> str:
+    console = Console(width=120)
+    with console.capture() as capture:
+        console.print(_table(result))
+    return capture.get()
