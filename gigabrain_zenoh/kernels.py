@@ -1,16 +1,48 @@
-"""Functions compiled by numba."""
+"""Functions compiled by numba, and where what was compiled is kept."""
 
+import hashlib
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar, cast
 
 import numba
 
 F = TypeVar("F", bound=Callable[..., object])
 
+PACKAGE = Path(__file__).parent
+HOLDERS = ("mapping", "navigation", "obstacles", "bench")  # packages with kernels
+
 
 def kernel(function: F) -> F:
     """Compile `function` at its first call, without the GIL while it runs.
 
-    What was compiled is kept beside its source, or in NUMBA_CACHE_DIR where that cannot be written.
+    What was compiled is kept in NUMBA_CACHE_DIR, or in the user's cache folder; where neither can
+    be written it is compiled anew in each process.
     """
-    return cast("F", numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    try:
+        compiled = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    except RuntimeError:  # numba: no locator available
+        compiled = numba.njit(nogil=True, error_model="numpy")(function)
+    return cast("F", compiled)
+
+
+def cache_folder() -> Path | None:
+    """A folder for kernels of exactly these sources; None for a user without a home.
+
+    Numba notices a change in a kernel's own file and none in those that it calls.
+    """
+    digest = hashlib.sha256()
+    for holder in HOLDERS:
+        for source in sorted((PACKAGE / holder).glob("*.py")):
+            digest.update(source.read_bytes())
+    try:
+        root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError:
+        return None
+    return Path(root) / "gigabrain" / f"kernels-{digest.hexdigest()[:16]}"
+
+
+if folder := cache_folder():
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))
+    numba.core.config.reload_config()

@@ -13,8 +13,8 @@ def warm() -> None:
 
     Example: gigabrain warm
 
-    What was compiled is kept beside the package, or in NUMBA_CACHE_DIR where that is set. It is
-    done again by itself after an update, at the first start, while nothing drives.
+    What was compiled is kept in the user's cache folder, or in NUMBA_CACHE_DIR where that is set.
+    After an update it is done again, at the latest at the first start, while nothing drives.
     """
     from gigabrain_zenoh.errors import ConfigError
     from gigabrain_zenoh.process import find

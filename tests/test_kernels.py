@@ -1,0 +1,48 @@
+"""Where compiled functions are kept."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.stack import SOURCES
+
+numba = pytest.importorskip("numba")
+
+from gigabrain_zenoh import kernels  # noqa: E402
+
+
+def test_a_change_in_any_source_with_kernels_asks_for_a_folder_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(kernels, "PACKAGE", tmp_path)
+    (tmp_path / "mapping").mkdir()
+    (tmp_path / "mapping" / "one.py").write_text("x = 1")
+    first = kernels.cache_folder()
+    assert first is not None
+    assert first.parent == tmp_path / "gigabrain"
+    assert kernels.cache_folder() == first
+    (tmp_path / "mapping" / "one.py").write_text("x = 2")
+    assert kernels.cache_folder() != first
+
+
+def test_where_nothing_can_be_written_it_is_compiled_all_the_same(tmp_path: Path) -> None:
+    no_folder = tmp_path / "file"
+    no_folder.write_text("")
+    environment = {
+        "PYTHONPATH": ":".join(map(str, SOURCES)),
+        "NUMBA_CACHE_DIR": str(no_folder / "below"),
+    }
+    code = (
+        "import numba; from gigabrain_zenoh.kernels import kernel\n"
+        "@kernel\ndef double(x: int) -> int:\n    return 2 * x\n"
+        "print(double(21))"
+    )
+    source = tmp_path / "run.py"
+    source.write_text(code)
+    done = subprocess.run(
+        (sys.executable, str(source)), capture_output=True, text=True, env=environment
+    )
+    assert done.stdout == "42\n", done.stderr
