@@ -15,6 +15,7 @@ from tests.wire_rig import as_map, at, codec, dotted, maps, numbers, refuses
 
 # numbers that may be null: nothing measured, nothing in the way, no limit, any yaw
 NULLABLE = {
+    "Body.description.max_rim_speed",
     "RobotState.joints.0.effort", "RobotState.joints.0.temperature",
     "RobotState.joints.1.effort", "RobotState.joints.1.temperature",
     "WorldModel.distance_ahead",
