@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+from itertools import pairwise
 
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import BodyDescription
@@ -12,12 +13,15 @@ from gigabrain_zenoh.deployment import client_endpoint
 from gigabrain_zenoh.faults.bodies import description_of
 from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.forger import Forger, forging
+from gigabrain_zenoh.faults.onlooker import Onlooker
 from gigabrain_zenoh.faults.open_gate import OpenGate
 from gigabrain_zenoh.faults.rig import Rig
 from gigabrain_zenoh.faults.subject import Subject
 
 COMMANDS, LONG_COMMANDS = 20_000, 1_000_000
 WINDOW_TICKS = 12  # 240 ms
+SETTLE_TICKS = 5  # a body that was told too much at once is through with it after so many
+LEAST_WINDOWS = 50
 TICK_S = TICK_NS / 1e9
 HOLDS = (1, 2, 50)  # half-ticks for which one way is asked for: 100 Hz, 50 Hz, 1 Hz
 HELD_TICKS = 150  # of each, on the robot
@@ -69,10 +73,25 @@ async def _at_wheels(subject: Subject) -> float:
     fastest = max(map(abs, speeds.values()))
     if fastest < 0.5 * body.description.max_linear_speed:
         raise Failed(f"it has not obeyed: {fastest:.2f} m/s at most")
-    later = {tick: speeds.get(tick + WINDOW_TICKS) for tick in speeds}  # a busy one misses some
-    change = max(abs(b - speeds[tick]) for tick, b in later.items() if b is not None)
+    changes = [
+        abs(speeds[tick + WINDOW_TICKS] - speed)
+        for tick, speed in speeds.items()
+        if _in_time(onlooker, tick - SETTLE_TICKS, tick + WINDOW_TICKS)
+    ]
+    if len(changes) < LEAST_WINDOWS:
+        raise Failed(f"the driver kept time in {len(changes)} windows only")
     await onlooker.ticks(50)
-    return 100.0 * max(0.0, change / (_limit(body.description) * WINDOW_TICKS * TICK_S) - 1.0)
+    return 100.0 * max(0.0, max(changes) / (_limit(body.description) * WINDOW_TICKS * TICK_S) - 1.0)
+
+
+def _in_time(onlooker: Onlooker, first: int, last: int) -> bool:
+    """Whether all states of these ticks are there, and the driver made each at its time.
+
+    One that was held up catches up on its ticks, and the body is told several steps at once.
+    """
+    made = [s.stamp_ns for s in onlooker.states if first <= s.tick <= last]
+    steps = [b - a for a, b in pairwise(made)]
+    return len(made) == last - first + 1 and all(0 < 2 * step < 3 * TICK_NS for step in steps)
 
 
 async def _shake(subject: Subject, forger: Forger, hold: int, speed: float) -> None:
