@@ -56,11 +56,11 @@ def clamp(velocity: Velocity, limits: Limits, caps: SpeedCaps = NO_CAPS) -> Velo
     forward = _within(velocity.linear_x, limits.linear_speed, caps.backward, caps.forward)
     turn = _within(velocity.angular_z, turning, caps.turn_right, caps.turn_left)
     rim = abs(forward) + abs(turn) * limits.half_track
-    share = limits.rim_speed / rim if rim > limits.rim_speed else 1.0
+    slower = max(1.0, rim / limits.rim_speed)
     return Velocity(
-        linear_x=share * forward,
+        linear_x=forward / slower,
         linear_y=_within(velocity.linear_y, limits.lateral_speed, caps.right, caps.left),
-        angular_z=share * turn,
+        angular_z=turn / slower,
     )
 
 

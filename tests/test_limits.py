@@ -1,10 +1,12 @@
 """How fast a body may go, and how fast it may change that."""
 
+import math
+
 import msgspec
 import pytest
 
 from gigabrain_schemas.base import Velocity
-from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.body import BodyDescription, DriveType
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_zenoh.limits import ZERO, Limits, clamp, limits_of, ramp
 
@@ -37,6 +39,37 @@ def test_the_limits_are_those_of_the_bodys_file() -> None:
         linear_acceleration=0.9,
         linear_deceleration=1.1,
         angular_acceleration=3.3,
+    )
+
+
+@pytest.mark.parametrize(
+    ("drive_type", "rim", "rim_speed", "half_track"),
+    [
+        ("differential", 0.25, 0.25, 0.125),
+        ("differential", None, math.inf, 0.125),
+        ("mecanum", 0.25, math.inf, 0.0),
+    ],
+)
+def test_only_the_wheels_of_a_differential_base_have_a_limit_of_their_own(
+    drive_type: DriveType, rim: float | None, rim_speed: float, half_track: float
+) -> None:
+    body = BodyDescription(
+        robot_type="test",
+        drive_type=drive_type,
+        footprint=((0.1, 0.1), (-0.1, 0.1), (-0.1, -0.1)),
+        max_linear_speed=0.5,
+        max_angular_speed=2.0,
+        wheel_separation=0.25,
+        max_rim_speed=rim,
+    )
+    limits = limits_of(body)
+    assert (limits.rim_speed, limits.half_track) == (rim_speed, half_track)
+
+
+def test_a_wheel_may_be_far_over_its_limit() -> None:
+    wheels = msgspec.structs.replace(LIMITS, rim_speed=0.25, half_track=0.75)
+    assert clamp(Velocity(linear_x=0.5, angular_z=2.0), wheels) == Velocity(
+        linear_x=0.0625, angular_z=0.25
     )
 
 
