@@ -41,6 +41,9 @@ HOUSE = [
 # 16 x 3 m: a corridor that looks the same from both ends, but for a niche far off the middle
 CORRIDOR = [*box(0, 0, 16, 3), *box(2.0, 1.2, 2.6, 1.8), *box(13.4, 1.2, 14, 1.8)]
 NICHE = box(7.0, 2.2, 7.6, 3.0)
+# 16 x 6 m: a hall that is the same from both ends, whatever is seen of it
+HALF = [(4, 0, 4, 2.4), *box(1, 4.6, 2.5, 6), *box(2, 1.2, 2.4, 1.6), *box(5.5, 4, 6.1, 4.6)]
+HALL = [*box(0, 0, 16, 6), *HALF, *((16 - a, 6 - b, 16 - c, 6 - d) for a, b, c, d in HALF)]
 
 
 class Rooms:

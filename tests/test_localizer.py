@@ -6,10 +6,11 @@ import pytest
 from gigabrain_zenoh.mapping.field import field_of, fit
 from gigabrain_zenoh.mapping.known import KnownMap
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.mapping.relocalize import search
+from gigabrain_zenoh.mapping.relocalize import Candidate, search
 from tests.map_rig import (
     BEAMS,
     CORRIDOR,
+    HALL,
     HOUSE,
     NICHE,
     PATIENCE_S,
@@ -20,6 +21,7 @@ from tests.map_rig import (
     error,
 )
 
+CUPBOARD = [(1, 5), (2, 5)]  # in the hall
 WAY = [at(x, y, 10) for x in (1.0, 2.0, 3.0, 5.0, 6.0, 7.0) for y in (1.0, 2.0, 3.0, 4.0, 5.0)]
 
 
@@ -106,6 +108,34 @@ def test_while_two_places_look_alike_neither_is_believed(corridor: SavedMap) -> 
     place = robot.go((7.5, 0.8))
     assert place.localized
     assert error(place, robot.pose) < 0.05
+
+
+def hall(reach: int) -> SavedMap:
+    """The hall from the left, as seen from places up to `reach` [m]: the right end is not shown."""
+    places = [(x, y) for x in range(1, reach + 1) for y in (1, 3, 5) if (x, y) not in CUPBOARD]
+    return drawn(Rooms(HALL), *(at(x, y) for x, y in places))
+
+
+def ends(found: list[Candidate]) -> list[float]:
+    """Where along the hall [m], to 10 cm."""
+    return [round(float(one.pose[0]), 1) for one in found]
+
+
+@pytest.mark.parametrize("x", [11.0, 11.5])
+def test_a_place_that_is_mapped_whole_is_not_taken_for_one_that_is_mapped_half(x: float) -> None:
+    robot = walker(hall(9), HALL, x, 3.0)
+    place = robot.look(16)
+    assert not place.localized
+    assert place.why == "2 places look like this"
+
+
+def test_where_it_was_known_to_be_last_stays_a_place_if_it_explains_what_is_seen() -> None:
+    saved, view = hall(8), Rooms(HALL).view(at(10.5, 3.0))
+    field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
+    scan = view.scan.points, view.scan.free, view.sensor
+    assert ends(search(field, *scan)) == [5.5]  # the other end of the hall
+    assert ends(search(field, *scan, at(10.5, 3.0))) == [5.5, 10.5]
+    assert ends(search(field, *scan, at(3.0, 3.0))) == [5.5]
 
 
 def test_in_open_space_it_goes_on_by_odometry_until_that_is_too_vague(house: SavedMap) -> None:

@@ -18,6 +18,8 @@ FIT_SIGMA = 0.1  # [m], how near a hit should be to a wall
 ROBUST_M = 0.1  # [m], hits farther off than that count little (Geman and McClure)
 HIT_SIGMA = 0.1  # [m] of one hit, larger than a lidar's: neighbours err alike
 ITERATIONS, ENOUGH = 20, 1e-4
+BESIDE_M = 0.3  # [m] round a wall a hit is judged by it, even where nothing else is known
+JUDGED = 0.5  # of the hits, at least: of a place that the map shows less of, not much is said
 BLUR_M = 0.25  # [m], a beam that ends so much behind a wall has passed through it
 
 Image = NDArray[np.float32]
@@ -29,6 +31,7 @@ class Field:
 
     distance: Image  # (height, width) [m], from each cell's centre to the nearest wall's
     free: NDArray[np.bool_]  # (height, width), where a robot may be
+    shown: NDArray[np.bool_]  # (height, width), where a hit can be judged; elsewhere it is neutral
     origin: Floats  # (2,) [m], the corner of cell (0, 0)
     cell: float  # [m]
 
@@ -38,7 +41,7 @@ class Fit(NamedTuple):
 
     pose: Floats  # (3,)
     information: Floats  # (3, 3), what the scan alone says of it, in the map's axes
-    score: float  # 0 to 1: how near its hits are to walls, less the share of pierced walls
+    score: float  # 0 to 1: how near hits on what is shown are to walls, less pierced walls' share
 
 
 def field_of(cells: NDArray[np.int8], cell: float, origin: tuple[float, float]) -> Field:
@@ -51,7 +54,8 @@ def field_of(cells: NDArray[np.int8], cell: float, origin: tuple[float, float]) 
     else:
         metres = np.full(cells.shape, FAR, np.float32)
     free = (cells >= 0) & (cells <= FREE)
-    return Field(metres, free, np.array(origin, np.float64), cell)
+    shown = (cells >= 0) | (metres <= BESIDE_M)
+    return Field(metres, free, shown, np.array(origin, np.float64), cell)
 
 
 def fit(
@@ -62,7 +66,9 @@ def fit(
     `hits` (n, 2) and `free` (m, 2) are ends of beams in the body's frame, `sensor` (2,) is where
     the beams start. `prior` (3, 3) is the information that holds the pose at its guess.
     """
-    pose, information, score = _fit(field.distance, field.origin, field.cell, hits, guess, prior)
+    pose, information, score = _fit(
+        field.distance, field.shown, field.origin, field.cell, hits, guess, prior
+    )
     through = _pierced(field.distance, field.origin, field.cell, hits, free, sensor, pose)
     return Fit(pose, information, score - through)
 
@@ -111,24 +117,37 @@ def _look(distance: Image, x: float, y: float) -> tuple[float, float, float]:
 
 
 @kernel
+def _is(shown: NDArray[np.bool_], x: float, y: float) -> bool:
+    """Whether the map shows what is at (x, y) in cells."""
+    height, width = shown.shape
+    column, row = int(np.floor(x)), int(np.floor(y))
+    return 0 <= row < height and 0 <= column < width and bool(shown[row, column])
+
+
+@kernel
 def _fit(
-    distance: Image, origin: Floats, cell: float, hits: Points, guess: Floats, prior: Floats
+    distance: Image,
+    shown: NDArray[np.bool_],
+    origin: Floats,
+    cell: float,
+    hits: Points,
+    guess: Floats,
+    prior: Floats,
 ) -> tuple[Floats, Floats, float]:
     """Gauss and Newton on the distances, each weighted by how small it is."""
-    pose, information, score = guess.copy(), np.zeros((3, 3)), 0.0
+    pose, information, score, judged = guess.copy(), np.zeros((3, 3)), 0.0, 0
     slope = np.zeros(3)
     for _ in range(ITERATIONS):
         cos, sin = np.cos(pose[2]), np.sin(pose[2])
         information[:] = 0.0
-        off, score = np.zeros(3), 0.0
+        off, score, judged = np.zeros(3), 0.0, 0
         for x, y in hits:
             ahead, aside = cos * x - sin * y, sin * x + cos * y
-            away, dx, dy = _look(
-                distance,
-                (pose[0] + ahead - origin[0]) / cell,
-                (pose[1] + aside - origin[1]) / cell,
-            )
-            score += np.exp(-0.5 * (away / FIT_SIGMA) ** 2)
+            at_x, at_y = (pose[0] + ahead - origin[0]) / cell, (pose[1] + aside - origin[1]) / cell
+            away, dx, dy = _look(distance, at_x, at_y)
+            if _is(shown, at_x, at_y):
+                judged += 1
+                score += np.exp(-0.5 * (away / FIT_SIGMA) ** 2)
             weight = (ROBUST_M**2 / (ROBUST_M**2 + away * away)) ** 2 / HIT_SIGMA**2
             slope[0], slope[1] = dx / cell, dy / cell
             slope[2] = slope[1] * ahead - slope[0] * aside
@@ -144,7 +163,7 @@ def _fit(
         pose += step
         if np.abs(step).max() < ENOUGH:
             break
-    return pose, information, score / max(len(hits), 1)
+    return pose, information, score / max(judged, JUDGED * len(hits), 1)
 
 
 @kernel

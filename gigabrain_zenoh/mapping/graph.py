@@ -31,8 +31,9 @@ class Graph:
     def extend(self, links: Iterable[Edge], poses: Floats | None = None) -> None:
         """Add keyframes, each by its link; at `poses` (n, 3), or where the links lead."""
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        placed = list(self.poses)
-        for link in links:
+        links, known = list(links), len(self.poses)
+        placed = np.concatenate((self.poses, np.empty((len(links), 3))))
+        for at, link in enumerate(links, known):
             if link.first == link.second:
                 noise = gtsam.noiseModel.Isotropic.Sigma(3, ANCHOR)
                 factors.add(gtsam.PriorFactorPose2(link.second, _pose(link.relative), noise))
@@ -40,10 +41,10 @@ class Graph:
             else:
                 factors.add(_factor(link))
                 led = compose(placed[link.first], link.relative)
-            placed.append(led if poses is None else poses[link.second])
-            values.insert(link.second, _pose(placed[-1]))
+            placed[at] = led if poses is None else poses[link.second]
+            values.insert(link.second, _pose(placed[at]))
         self._isam.update(factors, values)
-        self.poses = np.array(placed).reshape(-1, 3)
+        self.poses = placed
 
     def close(self, loops: Iterable[Edge]) -> None:
         """Add loops, and move all poses to where everything agrees best."""

@@ -86,7 +86,11 @@ class GrowingMap:
             return
         origin = (self._grid.origin_x, self._grid.origin_y)
         field = field_of(self._grid.percent(), CELL, origin)
-        self._finder = Finder(field, why, self._background)
+        if self._finder:
+            last = self._finder.last
+        else:
+            last = compose(self._seen, self._moved) if self._last.localized else None
+        self._finder = Finder(field, why, self._background, last)
         self._last = Place(self._last.pose, NOWHERE, False, why)
 
     def grid(self) -> OccupancyGrid:
@@ -145,7 +149,7 @@ class GrowingMap:
     def _take(self, view: View, estimate: Estimate) -> None:
         """Draw the scan, if it is time to and it fits."""
         if len(self._drawn) < len(self._slam.keyframes):
-            self._drawn += list(self._slam.poses[len(self._drawn) :])
+            self._drawn += self._slam.poses_from(len(self._drawn))
         self._undrawn += 1
         if estimate.kind not in FITS or (self._undrawn < DRAWN_SCANS and not estimate.kept):
             return
@@ -164,14 +168,13 @@ class GrowingMap:
 
     def _close_loops(self, count: int) -> None:
         """Beside the scans: look for loops from so many keyframes, and draw what they correct."""
-        slam, before = self._slam, np.array(self._drawn)
-        sweeps = self._sweeps.all()
+        slam, sweeps, drawn = self._slam, self._sweeps.all(), list(self._drawn)
 
         def work() -> Take:
             found = [slam.close_loops() for _ in range(count)]
             corrections = [one for one in found if one]
             grid = None
-            if corrections and _shifted(before, corrections[-1].poses):
+            if corrections and _shifted(np.array(drawn), corrections[-1].poses):
                 poses = corrections[-1].poses
                 there = [one for one in sweeps if one.keyframe < len(poses)]
                 grid = _rendered(there, poses)

@@ -23,6 +23,7 @@ SIGMA = 0.15  # [m], wide enough for the steps between headings
 BLOCK = 8  # cells
 STEP_M, FINEST_RAD, COARSEST_RAD = 0.15, math.radians(1.0), math.radians(3.0)
 LEAST = 0.5  # a fit below that is none
+NEUTRAL = 0.65  # what a hit on what the map does not show counts: neither for a place nor against
 BAND = 0.15  # candidates that much worse than the best are not looked at
 MOST_BLOCKS, MOST_TRIED, MOST_FOUND = 40_000, 96, 24
 APART_M, APART_RAD = 0.3, math.radians(20)  # nearer ones are the same
@@ -38,15 +39,20 @@ class Candidate(NamedTuple):
     score: float  # as Fit's
 
 
-def search(field: Field, hits: Points, free: Points, sensor: Floats) -> list[Candidate]:
+def search(
+    field: Field, hits: Points, free: Points, sensor: Floats, last: Floats | None = None
+) -> list[Candidate]:
     """All poses in the map that explain a scan about equally well, the best first.
 
-    Takes the scan as `field.fit` does. Meant for a thread in the background.
+    Takes the scan as `field.fit` does. The pose (3,) that was known `last` is among them if it
+    explains the scan at all. Meant for a thread in the background.
     """
     if len(hits) < FEWEST_POINTS or not field.free.any():
         return []
     chosen = hits[np.linspace(0, len(hits) - 1, min(POINTS, len(hits))).astype(np.intp)]
-    image = np.round(255 * np.exp(-0.5 * (field.distance / SIGMA) ** 2)).astype(np.uint8)
+    likely = np.exp(-0.5 * (field.distance / SIGMA) ** 2)
+    likely[~field.shown] = NEUTRAL
+    image = np.round(255 * likely).astype(np.uint8)
     bounds, headings = _bounds(field, image, chosen)
     places = _best_blocks(bounds)
     offsets = _turned(chosen, headings, field.cell)
@@ -60,7 +66,13 @@ def search(field: Field, hits: Points, free: Points, sensor: Floats) -> list[Can
         if apart(pose, tried):
             tried.append(pose)
     fits = [fit(field, hits, free, sensor, pose, WEAK) for pose in tried]
-    return _distinct([Candidate(found.pose, found.score) for found in fits])
+    found = _distinct([Candidate(one.pose, one.score) for one in fits])
+    if last is None:
+        return found
+    here = fit(field, hits, free, sensor, last, WEAK)
+    if here.score < LEAST or not apart(here.pose, (one.pose for one in found)):
+        return found
+    return [*found, Candidate(here.pose, here.score)]
 
 
 def _bounds(field: Field, image: Bytes, points: Points) -> tuple[Bytes, Floats]:
@@ -117,6 +129,7 @@ def _coarse(image: Bytes, some_free: Bytes, offsets: NDArray[np.int64]) -> Bytes
     height, width = image.shape
     rows, columns = some_free.shape
     headings, count, _ = offsets.shape
+    neutral = round(255 * NEUTRAL)
     bounds = np.zeros((headings, rows, columns), np.uint8)
     for heading in range(headings):
         for row in range(rows):
@@ -129,7 +142,9 @@ def _coarse(image: Bytes, some_free: Bytes, offsets: NDArray[np.int64]) -> Bytes
                     y = row * BLOCK + offsets[heading, k, 1]
                     # a block that begins outside may end within
                     if -BLOCK < x < width and -BLOCK < y < height:
-                        total += image[max(y, 0), max(x, 0)]
+                        total += max(neutral, image[max(y, 0), max(x, 0)])
+                    else:
+                        total += neutral
                 bounds[heading, row, column] = total // count
     return bounds
 
@@ -171,6 +186,8 @@ def _total(image: Bytes, offsets: NDArray[np.int64], x: int, y: int, enough: flo
         at_x, at_y = x + offsets[k, 0], y + offsets[k, 1]
         if 0 <= at_x < width and 0 <= at_y < height:
             total += image[at_y, at_x]
+        else:
+            total += round(255 * NEUTRAL)
         if total + 255 * (count - 1 - k) < enough:
             return 0
     return total

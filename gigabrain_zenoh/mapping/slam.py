@@ -84,6 +84,10 @@ class Slam:
         """Where the keyframes are in the map, (n, 3)."""
         return np.array(self._poses).reshape(-1, 3)
 
+    def poses_from(self, first: int) -> list[Floats]:
+        """Where the keyframes from the `first` on are in the map, (3,) each."""
+        return self._poses[first:]
+
     @property
     def smooth(self) -> Floats:
         """Where the robot is in the front end's own frame, which drifts and never jumps."""
