@@ -12,7 +12,7 @@ from gigabrain_zenoh.tools.reader import ended_with_reader
 async def quiet():
     stop = asyncio.Event()
     with ended_with_reader(stop):
-        print("one line and no more", flush=True)
+        print("one word and no more", end="", flush=True)
         await asyncio.wait_for(stop.wait(), float("{patience_s}"))
 
 asyncio.run(quiet())
