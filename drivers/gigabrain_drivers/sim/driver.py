@@ -142,6 +142,7 @@ class MujocoDriver(Driver):
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far."""
         truth = self._simulation.truth
+        pose = truth.pose()
         return {
             "body": self.robot.robot_type,
             "world": self.run.world,
@@ -152,6 +153,9 @@ class MujocoDriver(Driver):
             "min_clearance_m": round(truth.min_clearance_m, 3),
             "person_stood": self._simulation.person_stood,
             "true_speed": round(truth.speed()[0], 4),
+            "true_x": round(pose.x, 4),
+            "true_y": round(pose.y, 4),
+            "true_yaw": round(pose.yaw, 4),
             "physics_cpu_s": round(self._physics_s, 3),
         }
 
