@@ -9,6 +9,7 @@ from gigabrain_drivers.sim.physics import Simulation
 def account_of(simulation: Simulation, robot: RobotFile, run: Run) -> dict[str, Any]:
     """The truth of the run so far, by the physics itself."""
     truth = simulation.truth
+    pose = truth.pose()
     return {
         "body": robot.robot_type,
         "world": run.world,
@@ -19,4 +20,7 @@ def account_of(simulation: Simulation, robot: RobotFile, run: Run) -> dict[str, 
         "min_clearance_m": round(truth.min_clearance_m, 3),
         "person_stood": simulation.person_stood,
         "true_speed": round(truth.speed()[0], 4),
+        "true_x": round(pose.x, 4),
+        "true_y": round(pose.y, 4),
+        "true_yaw": round(pose.yaw, 4),
     }
