@@ -75,4 +75,6 @@ def turn_start(angles: tuple[float, ...], last: float | None) -> int | None:
     """Index of the first of `angles` (n,) [deg], rising, that is in another turn than `last`."""
     if last is not None and angles[0] % 360 < last - 180:
         return 0
-    return next((n for n, angle in enumerate(angles) if angle >= 360), None)
+    if angles[-1] < 360:
+        return None
+    return next(n for n, angle in enumerate(angles) if angle >= 360)

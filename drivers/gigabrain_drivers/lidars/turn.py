@@ -1,9 +1,11 @@
 """Samples of a turning lidar, gathered into one scan per turn."""
 
 import math
+from array import array
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.body import Lidar
@@ -24,25 +26,9 @@ class Turn:
 
     def clear(self) -> None:
         """Forget what was gathered."""
-        self._angles: list[float] = []
-        self._ranges: list[float] = []
+        self._angles, self._distances = array("d"), array("d")
         self._began_ns = self._last_ns = 0
         self._whole = False  # whether it was seen from its start
-
-    def add(self, angles: Sequence[float], ranges: Sequence[float], now_ns: int) -> None:
-        """Samples (n,) at `angles` [rad] counter-clockwise from ahead, with `ranges` [m].
-
-        inf is a sample without a return, nan one that cannot be trusted. After a whole turn of
-        silence what was gathered before it is forgotten.
-        """
-        silent = self._angles and now_ns - self._last_ns > self._period_ns
-        if silent or len(self._angles) + len(angles) > MOST_SAMPLES:
-            self.clear()
-        if not self._angles:
-            self._began_ns = now_ns
-        self._last_ns = now_ns
-        self._angles += angles
-        self._ranges += ranges
 
     def clockwise(
         self,
@@ -53,37 +39,50 @@ class Turn:
     ) -> LaserScan | None:
         """Samples (n,) of a lidar that turns clockwise and says 0 mm where there was no return.
 
-        `turn_at` is the index of the first that belongs to a new turn; the scan of the turn that
-        ends there is returned.
+        nan is one that cannot be trusted. `turn_at` is the index of the first that belongs to a new
+        turn; the scan of the turn that ends there is returned. After a whole turn of silence what
+        was gathered before it is forgotten.
         """
-        angles = [a * CLOCKWISE for a in angles_deg]
-        ranges = [d / 1000 if d else math.inf for d in distances_mm]
         if turn_at is None:
-            self.add(angles, ranges, now_ns)
+            self._add(angles_deg, distances_mm, now_ns)
             return None
         if turn_at:
-            self.add(angles[:turn_at], ranges[:turn_at], now_ns)
-        scan = self.finish(now_ns)
-        self.add(angles[turn_at:], ranges[turn_at:], now_ns)
+            self._add(angles_deg[:turn_at], distances_mm[:turn_at], now_ns)
+        scan = self._finish(now_ns)
+        self._add(angles_deg[turn_at:], distances_mm[turn_at:], now_ns)
         return scan
 
-    def finish(self, now_ns: int) -> LaserScan | None:
+    def _add(self, angles: Sequence[float], distances: Sequence[float], now_ns: int) -> None:
+        silent = self._angles and now_ns - self._last_ns > self._period_ns
+        if silent or len(self._angles) + len(angles) > MOST_SAMPLES:
+            self.clear()
+        if not self._angles:
+            self._began_ns = now_ns
+        self._last_ns = now_ns
+        self._angles.extend(angles)
+        self._distances.extend(distances)
+
+    def _finish(self, now_ns: int) -> LaserScan | None:
         """The scan of the turn that ends here; a new one begins.
 
         None when its start was not seen, and when its bytes came faster or slower than a lidar
         turns: a process that was held up gets what waited in the port at once, and that is old.
         """
-        angles, ranges, whole = self._angles, self._ranges, self._whole
+        angles, distances, whole = self._angles, self._distances, self._whole
         took = (now_ns - self._began_ns) / self._period_ns
         self.clear()
         self._whole = True
         if not angles or not whole or not SHORTEST <= took <= LONGEST:
             return None
-        return scan_of(self._lidar, angles, ranges)
+        ranges = np.frombuffer(distances) / 1000
+        ranges[ranges == 0.0] = np.inf
+        return scan_of(self._lidar, np.frombuffer(angles) * CLOCKWISE, ranges)
 
 
-def scan_of(lidar: Lidar, angles: Sequence[float], ranges: Sequence[float]) -> LaserScan:
-    """One scan of samples (n,) at `angles` [rad]: the nearest of those that share a bin.
+def scan_of(lidar: Lidar, angles: ArrayLike, ranges: ArrayLike) -> LaserScan:
+    """One scan of samples (n,) at `angles` [rad] with `ranges` [m], inf where there was no return.
+
+    Of samples that share a bin the nearest counts.
 
     Beyond `range_max` counts as no return; nearer than `range_min`, as in the simulation, as being
     at `range_min`, which is never free space.

@@ -49,8 +49,8 @@ class Frame(NamedTuple):
 
     def angles(self) -> tuple[float, ...]:
         """The points' angles (12,) [deg], clockwise, from `start` on and so up to 720."""
-        step = (self.end - self.start) % TURN / (POINTS - 1)
-        return tuple((self.start + n * step) / 100 for n in range(POINTS))
+        start, step = self.start, (self.end - self.start) % TURN / (POINTS - 1)
+        return tuple([(start + n * step) / 100 for n in range(POINTS)])
 
 
 def encode(frame: Frame) -> bytes:
