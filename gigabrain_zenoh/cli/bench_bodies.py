@@ -85,6 +85,7 @@ def _table(result: "BodiesResult") -> "Table":
         ("least clearance [m]", "min_clearance_m"),
         ("command to motion, median [ticks]", "latency_ticks"),
         ("... of so many motions", "motions"),
+        ("CPU of the driver [% of a core]", "driver_cpu"),
         ("reconnects", "reconnects"),
         ("gate shut meanwhile", "stops"),
     )
