@@ -1,6 +1,7 @@
 """How sessions are configured, and what a refusal means. Zenoh is not needed to read this."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 

@@ -81,6 +81,13 @@ def test_a_body_without_the_line_in_question_is_skipped() -> None:
         deployment_of(Options(body="alpha"), "serial")
 
 
+def test_the_same_robots_can_be_had_navigating() -> None:
+    robot = deployment_of(Options(behaviour="navigate"), "serial")
+    assert (robot.decision.behaviour, robot.decision.begin) == ("navigate", "roam")
+    assert (robot.perception.mapping, robot.decision.speed_limit) == ("slam", 0.26)
+    assert deployment_of(Options(), "serial").perception.mapping == "off"
+
+
 async def test_what_cannot_run_is_skipped_and_says_why(tmp_path: Path) -> None:
     (result,) = await run_suite(choose(["8"]), Options(body="alpha"), tmp_path)
     assert result.verdict == "skipped"

@@ -5,7 +5,7 @@ import logging
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -29,6 +29,7 @@ def faults(
     repeat: Annotated[int, Parameter(validator=Number(gte=1))] = 1,
     body: str = "",
     world: str = "arena",
+    behaviour: Literal["avoid", "navigate"] = "avoid",
     long: Annotated[bool, Parameter(negative=())] = False,
     json: Path | None = None,
 ) -> int:
@@ -51,6 +52,8 @@ def faults(
         Which robot, instead of the one that each test has.
     world
         Where it drives.
+    behaviour
+        What drives it: navigate explores and visits places, with a map (tests 1 to 6, 18, 19, 45).
     long
         The long forms, for a release: soak, load, all orders of deaths.
     json
@@ -82,7 +85,7 @@ def faults(
             console.print(_line(result))
 
         running = run_suite(
-            chosen, Options(body, world, long), Path(folder), repeat, begun, ended
+            chosen, Options(body, world, behaviour, long), Path(folder), repeat, begun, ended
         )  # fmt: skip
         judged = asyncio.run(running)
     show(_table(judged, chosen))
