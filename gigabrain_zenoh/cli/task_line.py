@@ -43,4 +43,6 @@ def progress(name: str, status: TaskStatus) -> str:
         parts.append(f"{status.distance_remaining:.1f} m")
     if status.eta is not None:
         parts.append(f"{status.eta:.0f} s")
-    return ", ".join((*parts, current.reason))
+    if current.reason != status.doing:
+        parts.append(current.reason)
+    return ", ".join(parts)
