@@ -102,13 +102,19 @@ class Demo:
                 view.show()
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), LOOK_S)
-                if watch.seconds != seconds:
+                if watch.seconds != seconds or self._starting:
                     moved_s, seconds = loop.time(), watch.seconds
                 elif loop.time() - moved_s > STALLED_S:
                     self._failures.append(f"the robot's clock stood still for {STALLED_S:.0f} s")
                     break
             view.show()
         return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)
+
+    @property
+    def _starting(self) -> bool:
+        """Whether a process is on its way: the very first start compiles, and time may wait."""
+        statuses = self._supervisor.statuses.values()
+        return any(status.state in ("waiting", "starting") for status in statuses)
 
     def _over(self, watch: Watch) -> bool:
         seconds = self._options.seconds
@@ -174,5 +180,6 @@ class Demo:
         if report is None:
             reason = self._failures[-1] if self._failures else "the driver did not answer"
             raise BodyLost(f"no report: {reason}; logs in {self._run_dir}")
-        print(f"logs in {self._run_dir}", file=sys.stderr)
+        why = f"{self._failures[-1]}; " if self._failures else ""
+        print(f"{why}logs in {self._run_dir}", file=sys.stderr)
         return 1

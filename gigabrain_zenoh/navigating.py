@@ -99,7 +99,7 @@ class Navigating:
     ) -> Situation:
         """Where the robot is, what it is to do, and which way."""
         if self._config.begin == "roam" and not self._begun:
-            self._service.begin(roaming(), "roaming")
+            self._service.begin(roaming(), "roaming", state.boot)
         self._begun = True
         order = self._service.step(state, self._outcome)
         self._outcome = None
