@@ -96,9 +96,9 @@ class Navigating:
         if self._config.begin == "roam" and not self._begun:
             self._service.begin(roaming(), "roaming")
         self._begun = True
-        order = self._service.step(state, self._outcome)
-        self._outcome = None
         tick = world.basis if world else state.tick
+        order = self._service.step(state, self._outcome, tick)
+        self._outcome = None
         pose, place = self._history.at(state.boot, tick), self._place(state.boot, tick)
         body = self._bodies.current
         map_from_odom, lost = place if pose else (None, "the odometry of the scan is missing")

@@ -16,6 +16,7 @@ from gigabrain_schemas.topics import (
     ENABLE,
     ESTOP,
     GOAL,
+    GRANTED,
     HEALTH,
     INTENT,
     JOINT_CMD,
@@ -52,7 +53,7 @@ class Rights:
 
 
 BRAIN = Rights(
-    says=(WORLD, POSE, MAP, INTENT, TASK, HEALTH, LOG),
+    says=(WORLD, POSE, MAP, INTENT, TASK, GRANTED, HEALTH, LOG),
     asks=(DESCRIBE, ESTOP),
     answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
     names=("perception", "decision", "relay"),
