@@ -1,6 +1,7 @@
 """How sessions are configured, and what a refusal means. Zenoh is not needed to read this."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.acl import access_control, known_names
 from gigabrain_zenoh.keys.files import CA, CERTIFICATE, KEY, check_files
+from gigabrain_zenoh.keys.list_file import generations_in
 from gigabrain_zenoh.settings import Endpoint, RouterConfig
 
 SECURE, PLAIN = "tls/", "tcp/"
@@ -36,7 +38,7 @@ def session_config(endpoint: Endpoint) -> dict[str, Any]:
     if not endpoint.keys:
         return session_settings(endpoint)
     check_files(Path(endpoint.keys))
-    return session_settings(endpoint) | security(endpoint)
+    return session_settings(endpoint) | security(endpoint, generations_in(Path(endpoint.keys)))
 
 
 def session_settings(endpoint: Endpoint) -> dict[str, Any]:
@@ -90,7 +92,7 @@ def _small(size: int) -> dict[str, Any]:
     }
 
 
-def security(endpoint: Endpoint) -> dict[str, Any]:
+def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, Any]:
     """What keys add to a session: TLS in both directions, and in a router who may do what."""
     folder, side = Path(endpoint.keys), "connect" if endpoint.connect else "listen"
     config: dict[str, Any] = {
@@ -103,7 +105,9 @@ def security(endpoint: Endpoint) -> dict[str, Any]:
         }
     }
     if endpoint.listen and not endpoint.connect:  # a relay is itself judged where it connects
-        config["access_control"] = access_control(robots_of(endpoint), endpoint.namespace)
+        config["access_control"] = access_control(
+            robots_of(endpoint), endpoint.namespace, generations
+        )
     return config
 
 
@@ -115,7 +119,9 @@ def robots_of(endpoint: Endpoint) -> tuple[str, ...]:
 
 def router_config(endpoint: Endpoint, state_dir: Path) -> RouterConfig:
     """What the router process has to know of the rights that its session enforces."""
-    knows = known_names(robots_of(endpoint)) if endpoint.keys else ()
+    if not endpoint.keys:
+        return RouterConfig(state_dir=str(state_dir))
+    knows = known_names(robots_of(endpoint), generations_in(Path(endpoint.keys)))
     return RouterConfig(state_dir=str(state_dir), knows=knows)
 
 

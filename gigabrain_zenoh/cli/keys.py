@@ -8,7 +8,8 @@ from typing import Any
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 from gigabrain_zenoh.keys.checks import INSTALL
 from gigabrain_zenoh.keys.files import CA_KEY, CERTIFICATE
-from gigabrain_zenoh.keys.roles import Role
+from gigabrain_zenoh.keys.list_file import generations_in
+from gigabrain_zenoh.keys.roles import Role, common_name
 from gigabrain_zenoh.process import find
 
 SOON_DAYS = 30
@@ -71,6 +72,34 @@ def issue(
         print(f"next: `keys: {folder.name}` in the deployment file that lies beside it")
 
 
+def revoke(role: Role, *, robot: str = "", dir: Path | None = None) -> None:
+    """Call back all identities of a role, such as those of a lost laptop. New ones are good again.
+
+    Example: gigabrain keys revoke operator
+
+    Routers refuse them once they have the new list and were started again.
+
+    Parameters
+    ----------
+    role
+        brain, operator or viewer.
+    robot
+        The robot's namespace, where the identities name one.
+    dir
+        The fleet's folder; without it, the only one here.
+    """
+    folder = _fleet(dir)
+    lists = _find("revoked:revoke")(folder, role, robot)
+    for path in lists:
+        print(
+            f"{path}: copy it into that identity's folder on its host, and start its router again"
+        )
+    if not lists:
+        print("no router's identity here: whoever is issued one from now on has the list")
+    of = f" --robot {robot}" if robot else ""
+    print(f"next, for those who stay: gigabrain keys issue {role}{of} --dir {folder}")
+
+
 def identities(*, dir: Path | None = None) -> int:
     """List identities, and when they expire. Ends with 1 where one cannot be used.
 
@@ -94,6 +123,7 @@ def zenohd(
     robot: tuple[str, ...] = (),
     keys: Path = Path("/etc/gigabrain/keys"),
     listen: str = "tls/0.0.0.0:7447",
+    dir: Path | None = None,
 ) -> None:
     """Print the configuration of a router for a larger site.
 
@@ -107,14 +137,17 @@ def zenohd(
         The folder of its identity on its host.
     listen
         The Zenoh endpoint to listen on.
+    dir
+        The fleet's folder, where some of its identities were revoked.
     """
-    print(_find("zenohd:configuration")(robot or ("",), str(keys), listen), end="")
+    generations = generations_in(_fleet(dir)) if dir else {}
+    print(_find("zenohd:configuration")(robot or ("",), str(keys), listen, generations), end="")
 
 
 def _listed(folder: Path) -> Iterator[tuple[str, bool]]:
     """A line for each identity in a fleet's folder, or for the only one, and whether it is good."""
     places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
-    now = datetime.datetime.now(datetime.UTC)
+    now, generations = datetime.datetime.now(datetime.UTC), generations_in(folder)
     for place in places:
         if not (place / CERTIFICATE).exists():
             continue
@@ -122,6 +155,10 @@ def _listed(folder: Path) -> Iterator[tuple[str, bool]]:
             identity = _find("identity:load")(place, now)
         except GigabrainError as error:
             yield f"{place.name:<20} {error}", False
+            continue
+        good = generations.get(common_name(identity.role, identity.robot), 1)
+        if identity.generation < good:
+            yield f"{place.name:<20} {identity.name} was revoked; delete it", False
             continue
         left = identity.days_left(now)
         soon = "  SOON" if left < SOON_DAYS else ""

@@ -20,12 +20,13 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.files import CA, CA_KEY, CERTIFICATE, KEY
 from gigabrain_zenoh.keys.identity import read_certificate, read_key
-from gigabrain_zenoh.keys.roles import LONGEST, Role, common_name
+from gigabrain_zenoh.keys.list_file import generations_in
+from gigabrain_zenoh.keys.revoked import write_list
+from gigabrain_zenoh.keys.roles import LONGEST, SERVERS, Role, common_name
 
 CA_DAYS, DAYS = 3650, 365
 EARLY = datetime.timedelta(days=1)  # clocks of hosts differ
 LOCAL = ("localhost", "127.0.0.1", "::1")
-SERVERS: tuple[Role, ...] = ("robot", "router")  # only they may be a router
 
 
 def new_fleet(fleet: str, folder: Path) -> None:
@@ -66,7 +67,8 @@ def issue(
     """
     if hosts and role not in SERVERS:
         raise ConfigError(f"--host: only a {' or a '.join(SERVERS)} is connected to")
-    subject = common_name(role, robot)
+    generations = generations_in(fleet_folder)
+    subject = common_name(role, robot, generations.get(common_name(role, robot), 1))
     authority = read_certificate(fleet_folder / CA)
     key = ec.generate_private_key(ec.SECP256R1())
     names = list(authority.subject.get_attributes_for_oid(NameOID.ORGANIZATION_NAME))
@@ -83,10 +85,12 @@ def issue(
         .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
         .sign(read_key(fleet_folder / CA_KEY), hashes.SHA256())
     )
-    folder = fleet_folder / (name or subject.replace("/", "-"))
+    folder = fleet_folder / (name or subject.replace("/", "-").replace("~", "-"))
     with _new_folder(folder) as made:
         contents = {KEY: _pem(key), CERTIFICATE: _text(certificate), CA: _text(authority)}
         _write(made, contents)
+        if role in SERVERS and generations:
+            write_list(made, generations)
     return folder
 
 
