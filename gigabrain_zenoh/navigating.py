@@ -101,9 +101,9 @@ class Navigating:
         if self._config.begin == "roam" and not self._begun:
             self._service.begin(roaming(), "roaming", state.boot)
         self._begun = True
-        order = self._service.step(state, self._outcome)
-        self._outcome = None
         tick = world.basis if world else state.tick
+        order = self._service.step(state, self._outcome, tick)
+        self._outcome = None
         if world:
             self._lateness.thinks(state.tick, tick)
         pose, place = self._history.at(state.boot, tick), self._place(state.boot, tick)
