@@ -89,6 +89,10 @@ class Mapper:
         else:
             self._take(scan, moment)
 
+    def miss(self, scan: LaserScan, tick: int) -> None:
+        """Leave out a scan whose tick has not come by `tick`, when the next scan has."""
+        self._leave_out(f"it claims to be of tick {scan.basis}, which had not come by tick {tick}")
+
     def close(self) -> None:
         """End what runs beside."""
         self._chart.close()

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 
 from gigabrain_schemas.arrays import hits
-from gigabrain_schemas.base import Pose
+from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.tasks import Goal
@@ -56,6 +56,7 @@ class Navigating:
         self._bus, self._config = bus, config
         self._response, self._history = ResponseEstimator(), PoseHistory()
         self._lateness = Lateness()
+        self._states: deque[RobotState] = deque(maxlen=SENT_TICKS)
         self._places: Earlier[PoseInMap] = Earlier()
         self._maps: deque[OccupancyGrid] = deque(maxlen=2)
         self._bodies = bus.latest(BODY)
@@ -85,6 +86,7 @@ class Navigating:
         """Take note of each state."""
         self._history = self._history.then(state)
         self._lateness.sees(state.boot, state.tick)
+        self._states.append(state)
         self._response.state(state)
         body = self._bodies.current
         if body and not self._hears_commands:
@@ -116,7 +118,7 @@ class Navigating:
             tick=tick,
             late_ticks=state.tick - tick,
             delayed=self._lateness.seconds,
-            velocity=state.velocity,
+            velocity=self._velocity(state, tick),
             body=body.description if body else None,
             map_from_odom=map_from_odom,
             lost=lost,
@@ -160,6 +162,11 @@ class Navigating:
     def _lost(self) -> str:
         _, why = self._place(self._bus.time.boot, self._bus.time.tick)
         return why or "nobody has sent a map yet; try again"
+
+    def _velocity(self, state: RobotState, tick: int) -> Velocity:
+        """The speed measured at a tick, or last before it; of a scan long past, the newest."""
+        known = (one for one in reversed(self._states) if one.boot == state.boot)
+        return next((one.velocity for one in known if one.tick <= tick), state.velocity)
 
     def _place(self, boot: int, tick: int) -> tuple[Pose | None, str]:
         """The odometry's frame in the map, or why that is not known."""

@@ -184,6 +184,6 @@ def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body], mapper: "Map
         mapper.hear(state)
         placed.state(state)
 
-    placed = PlacedScans(see)
+    placed = PlacedScans(see, lambda scan: mapper.miss(scan, bus.time.tick))
     bus.latest(STATE, hear)
     bus.latest(SCAN, placed.scan)

@@ -1,6 +1,7 @@
 """Who drives, who is told, and what is written down: a whole robot in memory."""
 
 import asyncio
+import itertools
 import threading
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, R
 from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, RELEASE
 from gigabrain_zenoh.audit_file import read
 from tests.brain_in_memory import Robot
+from tests.brain_rig import TICK_NS
 
 
 class Log:
@@ -143,3 +145,29 @@ async def test_causes_are_written_down_when_they_come_and_go_with_who_raised_the
             "enabled -> stopping"
         )
     assert msgspec.json.decode((tmp_path / "latch.json").read_bytes())["causes"] == []
+
+
+async def test_a_driver_that_was_held_up_keeps_its_count_and_speeds_up_by_one_step(
+    tmp_path: Path,
+) -> None:
+    async with Robot(tmp_path) as robot:
+        while not 0.0 < (await robot.go(1))[-1] < 0.1:
+            pass
+        assert robot.state
+        tick, now = robot.state.tick, robot.clock.now_ns()
+        robot.clock.stall(3 * TICK_NS)
+        speeds = await robot.go(20)
+        passed = (robot.clock.now_ns() - now) // TICK_NS
+        assert (robot.mode, robot.state.tick - tick) == ("enabled", passed)
+        steps = [after - before for before, after in itertools.pairwise(speeds)]
+        assert max(steps) == pytest.approx(0.02)
+        assert speeds[-1] == pytest.approx(0.26)
+
+
+async def test_a_driver_that_was_held_up_stops_the_body_as_soon_as_it_goes_on(
+    tmp_path: Path,
+) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        robot.clock.stall(40 * TICK_NS)
+        assert (await robot.go(1))[-1] == 0.0

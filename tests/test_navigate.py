@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from gigabrain_schemas.base import Cause, Velocity
+from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest, TaskRequest
 from gigabrain_schemas.topics import GOAL, MISSION, SAFETY, TASK_CHANGE
+from gigabrain_zenoh.navigating import Navigating
 from gigabrain_zenoh.settings import DecisionConfig
-from tests.brain_rig import BOOT
+from tests.brain_rig import BOOT, state
+from tests.bus_rig import Net
 from tests.plane_rig import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
@@ -264,3 +267,19 @@ async def test_who_roams_explores_and_then_visits_places_until_it_is_sent_elsewh
         await plane.ask_at_once(GOAL, GoalRequest(x=1.5, y=1.2))
         await plane.go(0.5)
         assert plane.status.done[0].reason == "replaced by goal-2"
+
+
+async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_that_is() -> None:
+    net = Net()
+    senses = Navigating(DecisionConfig(behaviour="navigate"), net.one)
+    states = [state(tick, v=0.01 * tick, pose=(0.1 * tick, 0.0, 0.0)) for tick in range(1, 8)]
+    for one in states:
+        senses.see(one)
+    seen = WorldModel(scan_ok=True, obstacle_ahead=False, boot=BOOT, tick=5, basis=5)
+    now = senses.situation(states[-1], seen, False)
+    assert now.bearings
+    assert (now.pose.x, now.bearings.velocity.linear_x) == (0.5, 0.05)
+    assert now.bearings.late_ticks == 2
+    await senses.close()
+    await net.one.close()
+    await net.two.close()

@@ -5,9 +5,12 @@ import secrets
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from gigabrain_drivers.cause_watch import CauseWatch
 from gigabrain_drivers.latch import Latched, LatchFile
 from gigabrain_schemas.audit import What
+from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import ENABLE, ESTOP, RELEASE
 from gigabrain_zenoh import causes as why
@@ -19,6 +22,7 @@ from gigabrain_zenoh.scribe import Scribe
 
 log = logging.getLogger(__name__)
 
+STEP_NS = TICK_NS // 2  # so long after a tick at least, the next one is no longer late
 EVERY_TICKS = 50  # once a second: what the disk did not take is tried again
 Stop = Callable[[], Awaitable[None]]
 
@@ -43,6 +47,7 @@ class Gatekeeper:
         latched = file.read()
         self._scribe: Scribe[Latched] = Scribe(lambda newest: file.keep(newest[-1]), room=1)
         self._latched, self._on_disk = latched, self._scribe.put(latched)
+        self._on_time_ns = -STEP_NS  # when the newest tick came that was not late
         self._forgetful = Fault(log, logging.ERROR)
         self.state = gate.GateState(
             boot=secrets.randbits(47) + 1,
@@ -83,8 +88,21 @@ class Gatekeeper:
             self._trail.note("refused", source or "anonymous", text, code=reason, ok=False)
         return outcome
 
-    def every_tick(self) -> None:
-        """To be called once per tick."""
+    def ticks(self, passed: int, tick: gate.Tick) -> None:
+        """So many ticks have passed since the last call, all but one of them missed."""
+        for _ in range(passed):
+            self.step(replace(tick, late=True) if self._is_late(tick.wall_ns) else tick)
+            self._look_after_disk()
+
+    def _is_late(self, wall_ns: int | None) -> bool:
+        """Whether a tick comes in the wake of another one, to make up for lost time."""
+        if wall_ns is None:
+            return False
+        late = wall_ns - self._on_time_ns < STEP_NS
+        self._on_time_ns = self._on_time_ns if late else wall_ns
+        return late
+
+    def _look_after_disk(self) -> None:
         if self.state.tick % EVERY_TICKS == 0:
             self._trail.flush()
             if self._on_disk.done() and self._on_disk.result():

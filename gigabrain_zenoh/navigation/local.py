@@ -85,8 +85,8 @@ class LocalPlanner:
         grid = self._window.grid(moment.tick, moment.known, discs)
         field = self._costs.field(grid, self._half_width, (goal.x, goal.y), moment.path)
         yaw = math.nan if goal.yaw is None else goal.yaw
-        tolerance = self._settings.position_tolerance
-        return Scene(grid, field, discs, goal.x, goal.y, yaw, tolerance)
+        near, turned = self._settings.position_tolerance, self._settings.yaw_tolerance
+        return Scene(grid, field, discs, goal.x, goal.y, yaw, near, turned)
 
     def _start(self, moment: Moment, place: Place) -> Start:
         v, sent, dt = moment.velocity, moment.sent, self._sampler.dt

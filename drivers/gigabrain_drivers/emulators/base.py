@@ -14,6 +14,7 @@ from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.kinematics import Gait, Twist, base_of
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.sim.account import account_of
 from gigabrain_drivers.sim.pace import Pace
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry, Simulation
 from gigabrain_drivers.sim.tick import TICK_S
@@ -102,16 +103,7 @@ class EmulatedBody:
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far."""
-        truth = self._simulation.truth
-        return {
-            "body": self.robot.robot_type,
-            "world": self.run.world,
-            "seed": self.run.seed,
-            "sim_seconds": round(self._simulation.time_ns / 1e9, 2),
-            "distance_m": round(truth.distance_m, 3),
-            "contacts": truth.contacts,
-            "min_clearance_m": round(truth.min_clearance_m, 3),
-            "true_speed": round(truth.speed()[0], 4),
+        return account_of(self._simulation, self.robot, self.run) | {
             "motors_moved_s": round(self._moved_ns / 1e9, 2),
             "faulted_s": round(self._faulted_ns / 1e9, 2),
             "physics_cpu_s": round(self._cpu_s, 3),
