@@ -55,8 +55,8 @@ class Navigating:
     def __init__(self, config: DecisionConfig, bus: Bus) -> None:
         self._bus, self._config = bus, config
         self._response, self._history = ResponseEstimator(), PoseHistory()
-        self._lateness = Lateness()
         self._states: deque[RobotState] = deque(maxlen=SENT_TICKS)
+        self._lateness = Lateness()
         self._places: Earlier[PoseInMap] = Earlier()
         self._maps: deque[OccupancyGrid] = deque(maxlen=2)
         self._bodies = bus.latest(BODY)
@@ -85,8 +85,8 @@ class Navigating:
     def see(self, state: RobotState) -> None:
         """Take note of each state."""
         self._history = self._history.then(state)
-        self._lateness.sees(state.boot, state.tick)
         self._states.append(state)
+        self._lateness.sees(state.boot, state.tick)
         self._response.state(state)
         body = self._bodies.current
         if body and not self._hears_commands:
@@ -99,7 +99,7 @@ class Navigating:
     ) -> Situation:
         """Where the robot is, what it is to do, and which way."""
         if self._config.begin == "roam" and not self._begun:
-            self._service.begin(roaming(), "roaming")
+            self._service.begin(roaming(), "roaming", state.boot)
         self._begun = True
         order = self._service.step(state, self._outcome)
         self._outcome = None

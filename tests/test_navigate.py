@@ -269,6 +269,27 @@ async def test_who_roams_explores_and_then_visits_places_until_it_is_sent_elsewh
         assert plane.status.done[0].reason == "replaced by goal-2"
 
 
+async def test_who_was_told_to_do_nothing_does_not_roam_after_a_restart_of_decision(
+    tmp_path: Path,
+) -> None:
+    config = DecisionConfig(behaviour="navigate", begin="roam", state_dir=str(tmp_path))
+    async with Plane(CELLS, config=config) as plane:
+        await plane.go(0.5)
+        await plane.ask(TASK_CHANGE, TaskRequest(do="cancel", task="all", source="ann"))
+        await plane.go(0.5)
+        assert plane.intent.reason == "waiting: for a goal"
+        while b'"jobs":[]' not in (tmp_path / "tasks.json").read_bytes():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        await plane.restart()
+        await plane.go(1.0)
+        assert plane.intent.reason == "waiting: for a goal"
+        plane.driver_starts_anew()
+        await plane.restart()
+        await plane.go(1.0)
+        assert plane.status.current
+        assert plane.status.current.label == "roaming"
+
+
 async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_that_is() -> None:
     net = Net()
     senses = Navigating(DecisionConfig(behaviour="navigate"), net.one)

@@ -1,6 +1,8 @@
 """Tasks on the bus and on disk: what is asked, answered, told and remembered."""
 
 import asyncio
+import math
+import re
 from pathlib import Path
 
 import msgspec
@@ -306,6 +308,12 @@ async def test_a_script_is_told_who_is_missing() -> None:
     net = Net()
     with pytest.raises(BodyLost, match="nobody serves goals; does decision run with behaviour: n"):
         await Tasks(net.two).go_to(1.0, 0.0)
+
+
+@pytest.mark.parametrize("x", [math.nan, math.inf, -1e300])
+async def test_a_script_is_told_of_a_goal_that_is_no_place(x: float) -> None:
+    with pytest.raises(ConfigError, match=re.escape(f"numbers up to 1e+09, got {x:g} 0 1")):
+        await Tasks(Net().two).go_to(x, 0.0, 1.0)
 
 
 async def test_a_refusal_reaches_the_script(site: Site) -> None:

@@ -75,9 +75,9 @@ class TaskService:
             self._tell()
         return order
 
-    def begin(self, mission: Mission, label: str) -> None:
-        """Something to do where nobody wants anything yet."""
-        if self._tasks.idle:
+    def begin(self, mission: Mission, label: str, boot: int) -> None:
+        """Something to do where nobody has wanted anything yet since this start of the driver."""
+        if self._tasks.idle and not self._tasks.knows(boot):
             self._tasks.carry_out(mission, label, "queue", "itself")
 
     async def close(self) -> None:

@@ -103,6 +103,11 @@ TOPICS: tuple[Topic[Any], ...] = (
 )  # fmt: skip
 
 ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time")
+# for clients that can say, but not ask: it stops just the same, and nothing is confirmed
+ESTOP_SAID = Topic(
+    ESTOP.key, requests.EstopRequest, 10, priority="real_time", congestion="block", express=True,
+    depth=16, max_bytes=KB,
+)  # fmt: skip
 RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply)
 ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply)
 GOAL = Service("robot/goal", tasks.GoalRequest, tasks.GoalReply)
