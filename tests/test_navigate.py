@@ -143,6 +143,33 @@ async def test_it_stands_while_its_scans_come_too_late_to_drive_by() -> None:
         assert plane.intent.reason.startswith("going to (4.00, 0.80): ")
 
 
+async def test_it_drives_more_slowly_while_its_scans_come_late_and_says_why() -> None:
+    async with Plane(CELLS, at=(0.6, 1.5, 0.0)) as plane:
+        await plane.go(0.2)
+        await plane.ask_at_once(GOAL, GoalRequest(x=4.5, y=1.5))
+        await plane.go(1.5)
+        assert "busy" not in plane.intent.reason
+        in_time = await fastest(plane, 1.5)
+        plane.late_ticks = 7
+        await plane.go(1.0)
+        assert plane.intent.reason.endswith("; slower, this host is busy: 0.10 s late")
+        late = await fastest(plane, 1.5)
+        plane.late_ticks = 0
+        await plane.go(3.0)
+        assert "busy" not in plane.intent.reason
+        assert in_time > 0.24
+        assert 0.1 < late < 0.23
+        await plane.until("succeeded", seconds=60)
+
+
+async def fastest(plane: Plane, seconds: float) -> float:
+    speeds = []
+    for _ in range(round(seconds * 50)):
+        await plane.go(0.02)
+        speeds.append(plane.velocity.linear_x)
+    return max(speeds)
+
+
 async def test_a_driver_that_starts_anew_does_not_end_what_there_is_to_do() -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)

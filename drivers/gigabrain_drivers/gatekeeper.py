@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from gigabrain_drivers.cause_watch import CauseWatch
 from gigabrain_drivers.latch import Latched, LatchFile
 from gigabrain_schemas.audit import What
-from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.base import TICK_NS, Cause
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, RELEASE
 from gigabrain_zenoh import causes as why
@@ -196,5 +196,9 @@ def _differs(before: gate.GateState, now: gate.GateState) -> bool:
         or now.estop_generation != before.estop_generation
         or now.causes is not before.causes
         or now.faults is not before.faults
-        or now.safety is not before.safety
+        or _said(now) != _said(before)
     )
+
+
+def _said(state: gate.GateState) -> tuple[tuple[Cause, ...], ...]:
+    return (state.safety.causes, state.safety.warnings) if state.safety else ()
