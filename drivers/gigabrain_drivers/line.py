@@ -66,7 +66,7 @@ class LineDriver(Driver):
         self._hearing = Hearing(self.link, self._clock, silent_ns, SENSELESS, log)
         self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
         self._started = False  # whether start went out and no stop since: then a stop is owed
-        self._sent = ZERO
+        self._wanted = self._as_sent = self._sent = ZERO  # the second is what the line keeps of it
         self._sent_ns = self._seq = 0
         self._open = False
         self._told_flags = 0
@@ -143,7 +143,9 @@ class LineDriver(Driver):
             self._sent = ZERO
             return
         now_ns = self._clock.now_ns()
-        sent = self._command.sent(wanted)
+        if wanted != self._wanted:
+            self._wanted, self._as_sent = wanted, self._command.sent(wanted)
+        sent = self._as_sent
         if sent == self._sent and now_ns - self._sent_ns < self._repeat_ns:
             return
         if sent != ZERO and not self._started:
