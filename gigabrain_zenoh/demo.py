@@ -191,7 +191,7 @@ class Demo:
         if self._deployment.link == "real":
             print(RELEASE_FIRST, file=sys.stderr)
         why = f"{self._failures[-1]}; " if self._failures else ""
-        print(f\"{why}logs in {self._run_dir}\", file=sys.stderr)
+        print(f"{why}logs in {self._run_dir}", file=sys.stderr)
         return 1
 
 

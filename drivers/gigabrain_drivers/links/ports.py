@@ -34,6 +34,11 @@ def missing(port: str) -> str:
     return f"no {what}{port}: is it plugged in?"
 
 
+def absent(port: str) -> str:
+    """What to say of a port that is not there now; nothing where it is. Raises ValueError."""
+    return "" if any(Path(path).exists() for path in candidates(port)) else missing(port)
+
+
 def refused(path: str, error: OSError) -> str:
     """What to say when the device is there but cannot be opened."""
     if error.errno in (errno.EACCES, errno.EPERM):
