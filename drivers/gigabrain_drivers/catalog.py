@@ -18,7 +18,7 @@ from gigabrain_drivers.links.port_name import AUTO
 from gigabrain_drivers.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_zenoh import config
 from gigabrain_zenoh.config_places import located
-from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
 from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.settings import LinkName
 
@@ -55,6 +55,11 @@ def robot_path(name: str) -> Path:
         return Path(name)
     known = robot_files()
     if name not in known:
+        package = Path(f"gigabrain-{name.replace('_', '-')}")  # as `gigabrain driver new` calls it
+        if package.is_dir():
+            raise UnknownName(
+                f"no robot {name!r} yet: its package has to be installed: pip install -e {package}"
+            )
         raise unknown("robot", name, known)
     return known[name]
 
