@@ -17,6 +17,7 @@ from gigabrain_zenoh.behaviours.bearings import Bearings, Driven, Route
 from gigabrain_zenoh.behaviours.guide import Asked, Guide
 from gigabrain_zenoh.behaviours.navigate import Navigate, moved
 from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.compiling import compiled
 from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate_state import BRAIN
@@ -39,7 +40,6 @@ SMALL = 250_000  # cells; plans in larger maps are made in a thread
 AGAIN_TICKS = 25  # a route is looked at twice a second, whatever happens
 NO_MAP = "nobody says where in a map the robot is; set perception: {mapping: slam} in its file"
 PATIENCE_NS, LOOK_NS = 700_000_000, 50_000_000  # for the first word of the place, when asked
-QUIET_S = 5.0  # of compiling, before people are told
 
 ANY_BODY = BodyDescription(
     robot_type="any", drive_type="differential",
@@ -75,12 +75,7 @@ class Navigating:
 
     async def warm_up(self) -> None:
         """Compile all that a driving robot calls."""
-        compiling = asyncio.ensure_future(asyncio.to_thread(warm_up))
-        done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
-        if not done:
-            told = {"event": "compiling"}
-            log.info("compiling: the first start takes about a minute", extra={"data": told})
-        await compiling
+        await compiled(warm_up)
 
     def see(self, state: RobotState) -> None:
         """Take note of each state."""
