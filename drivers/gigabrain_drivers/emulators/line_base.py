@@ -13,7 +13,8 @@ from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.kinematics import base_of
 from gigabrain_drivers.line_command import LineCommand
 from gigabrain_drivers.line_options import LineOptions
-from gigabrain_drivers.protocols.line import LONGEST, Field
+from gigabrain_drivers.protocols.line import LONGEST
+from gigabrain_drivers.protocols.line_number import Field
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.limits import clamp, limits_of
 
