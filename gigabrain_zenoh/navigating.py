@@ -20,6 +20,7 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate_state import BRAIN
+from gigabrain_zenoh.lateness import Lateness
 from gigabrain_zenoh.navigation import local, planner
 from gigabrain_zenoh.navigation.moment import Sent
 from gigabrain_zenoh.planar import compose, inverse
@@ -55,6 +56,7 @@ class Navigating:
         self._bus, self._config = bus, config
         self._response, self._history = ResponseEstimator(), PoseHistory()
         self._states: deque[RobotState] = deque(maxlen=SENT_TICKS)
+        self._lateness = Lateness()
         self._places: Earlier[PoseInMap] = Earlier()
         self._maps: deque[OccupancyGrid] = deque(maxlen=2)
         self._bodies = bus.latest(BODY)
@@ -84,6 +86,7 @@ class Navigating:
         """Take note of each state."""
         self._history = self._history.then(state)
         self._states.append(state)
+        self._lateness.sees(state.boot, state.tick)
         self._response.state(state)
         body = self._bodies.current
         if body and not self._hears_commands:
@@ -96,11 +99,13 @@ class Navigating:
     ) -> Situation:
         """Where the robot is, what it is to do, and which way."""
         if self._config.begin == "roam" and not self._begun:
-            self._service.begin(roaming(), "roaming")
+            self._service.begin(roaming(), "roaming", state.boot)
         self._begun = True
-        order = self._service.step(state, self._outcome)
-        self._outcome = None
         tick = world.basis if world else state.tick
+        order = self._service.step(state, self._outcome, tick)
+        self._outcome = None
+        if world:
+            self._lateness.thinks(state.tick, tick)
         pose, place = self._history.at(state.boot, tick), self._place(state.boot, tick)
         body = self._bodies.current
         map_from_odom, lost = place if pose else (None, "the odometry of the scan is missing")
@@ -112,6 +117,7 @@ class Navigating:
         bearings = Bearings(
             tick=tick,
             late_ticks=state.tick - tick,
+            delayed=self._lateness.seconds,
             velocity=self._velocity(state, tick),
             body=body.description if body else None,
             map_from_odom=map_from_odom,

@@ -11,14 +11,14 @@ import importlib
 import logging
 import os
 import sys
-from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from gigabrain_schemas.topics import CMD_VEL, INTENT, LOG, SAFETY, STATE
+from gigabrain_schemas.topics import LOG
 from gigabrain_zenoh import lifeline, logs
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
@@ -30,6 +30,7 @@ from gigabrain_zenoh.param_service import serve_params
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.transport import Transport
+from gigabrain_zenoh.unobtrusive import NAP_S, step_aside
 
 log = logging.getLogger("gigabrain")
 
@@ -47,7 +48,7 @@ class Program:
 
     run: str
     settings: str = ""
-    at_most_hz: Mapping[str, float] = field(default_factory=dict)  # of what it only shows
+    looks_on: bool = False  # the robot does without it: it naps, and lets the others go first
 
 
 PROGRAMS = {
@@ -65,17 +66,17 @@ PROGRAMS = {
     "control": Program("gigabrain_zenoh.control:run"),
     "safety": Program("gigabrain_zenoh.safety:run"),
     "recorder": Program(
-        "gigabrain_zenoh.recording.node:run", "gigabrain_zenoh.settings:RecorderConfig"
+        "gigabrain_zenoh.recording.node:run",
+        "gigabrain_zenoh.settings:RecorderConfig",
+        looks_on=True,
     ),
     "page": Program(
-        "gigabrain_zenoh.page.node:run",
-        "gigabrain_zenoh.settings:PageConfig",
-        {STATE.key: 20.0, INTENT.key: 6.0, SAFETY.key: 11.0},
+        "gigabrain_zenoh.page.node:run", "gigabrain_zenoh.settings:PageConfig", looks_on=True
     ),
     "foxglove": Program(
         "gigabrain_zenoh.foxglove_bridge.node:run",
         "gigabrain_zenoh.settings:FoxgloveConfig",
-        {STATE.key: 20.0, INTENT.key: 11.0, SAFETY.key: 11.0, CMD_VEL.key: 11.0},
+        looks_on=True,
     ),
 }
 
@@ -113,6 +114,8 @@ def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
         run_dir = Path(config.run_dir) if config.run_dir else None
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
         node = node_of(config)
+        if PROGRAMS[config.name].looks_on:
+            step_aside()  # before there are threads, which inherit it
         with asyncio.Runner(loop_factory=loop_factory()) as runner:
             runner.run(_run(config, node, make_bus))
     except GigabrainError as error:
@@ -146,8 +149,8 @@ async def _run(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
 
 
 async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
-    shown = PROGRAMS[config.name].at_most_hz
-    endpoint = msgspec.structs.replace(config.endpoint, at_most_hz=dict(shown))
+    nap_s = NAP_S if PROGRAMS[config.name].looks_on else 0.0
+    endpoint = msgspec.structs.replace(config.endpoint, nap_s=nap_s)
     bus = make_bus(await join(endpoint), Clock(), config.name)
     handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
     logging.getLogger().addHandler(handler)

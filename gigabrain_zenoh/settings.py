@@ -21,7 +21,7 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     namespace: str = ""  # the robot's own part of the key space
     keys: str = ""  # the folder of an identity; without one, nobody asks who anybody is
     fleet: tuple[str, ...] = ()  # namespaces of other robots that a router serves
-    at_most_hz: dict[str, float] = {}  # of these keys the session hands on no more
+    nap_s: float = 0.0  # for how long what is tapped may gather before it is handed on
 
 
 class RouterConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -71,8 +71,6 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
         config["low_pass_filter"] = [
             _small(size) for size in sorted({topic.max_bytes for topic in TOPICS})
         ]
-    if endpoint.at_most_hz:
-        config["downsampling"] = [_thinned(endpoint.at_most_hz)]
     if endpoint.namespace:
         config["namespace"] = endpoint.namespace
     return config
@@ -91,12 +89,6 @@ def _small(size: int) -> dict[str, Any]:
         "key_exprs": [f"**/{topic.key}/**" for topic in TOPICS if topic.max_bytes == size],
         "size_limit": FAR_TOO_LARGE * size,
     }
-
-
-def _thinned(at_most_hz: Mapping[str, float]) -> dict[str, Any]:
-    """Zenoh's downsampling: what comes too fast is left out before Python hears of it."""
-    rules = [{"key_expr": f"**/{key}", "freq": hz} for key, hz in at_most_hz.items()]
-    return {"id": "thinned", "messages": ["put"], "flows": ["ingress"], "rules": rules}
 
 
 def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, Any]:

@@ -100,7 +100,7 @@ def test_the_third_base_stands_in_the_docs_as_it_is_here() -> None:
 def test_the_third_base_turns_metres_into_revolutions() -> None:
     _, driver = catalog.make_driver(str(THIRD), Run(folder=THIRD.parent, link="real"))
     assert isinstance(driver, LineDriver)
-    line = driver._command.encode({"wheel_left": 1.0, "wheel_right": -2.0})
+    line = driver._command.template.encode({"wheel_left": 1.0, "wheel_right": -2.0})
     assert line == b"$MOT,9.5,-19.1*4E\r\n"
 
 

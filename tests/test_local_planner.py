@@ -35,6 +35,7 @@ def test_who_is_there_and_looks_elsewhere_turns_at_once(body: BodyDescription, y
     assert drive.go(6.0).arrived
     assert abs(math.remainder(drive.pose.yaw - yaw, math.tau)) < 0.13
     assert math.hypot(drive.pose.x, drive.pose.y - 0.05) < 0.13
+    assert "turning in place: at the goal" in {plan.reason for plan in drive.plans}
 
 
 def test_an_omnidirectional_body_goes_sideways_through_a_gap_too_narrow_for_its_front() -> None:

@@ -51,7 +51,7 @@ def test_a_sequence_ends_with_what_fails(robot: Robot) -> None:
     robot.carry_out("do: [{goto: a}, {goto: b}]")
     robot.step()
     assert robot.failed() is None
-    assert robot.last == ("failed", "no way")
+    assert robot.last == ("failed", "a: no way")
 
 
 def test_a_fallback_takes_the_first_that_succeeds(robot: Robot) -> None:
@@ -72,7 +72,7 @@ def test_a_retry_gives_a_new_order_each_time_and_gives_up_after_so_many(robot: R
         robot.failed()
         robot.step()
     assert len(set(numbers)) == 3
-    assert robot.last == ("failed", "no way")
+    assert robot.last == ("failed", "a: no way")
 
 
 def test_a_timeout_fails_by_the_robots_time_and_withdraws_the_order(robot: Robot) -> None:

@@ -97,7 +97,7 @@ def test_after_a_restart_two_failures_are_still_two(robot: Robot) -> None:
     again = Robot(robot.tasks.saved)
     again.step()
     again.failed()
-    assert again.last == ("failed", "no way")
+    assert again.last == ("failed", "a: no way")
 
 
 def test_after_a_start_of_the_whole_robot_tasks_wait_for_a_person(robot: Robot) -> None:

@@ -10,9 +10,9 @@ from msgspec.structs import replace
 from gigabrain_drivers.cause_watch import CauseWatch
 from gigabrain_drivers.latch import Latched, LatchFile
 from gigabrain_schemas.audit import What
-from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.base import TICK_NS, Cause
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
-from gigabrain_schemas.topics import ENABLE, ESTOP, RELEASE
+from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, RELEASE
 from gigabrain_zenoh import causes as why
 from gigabrain_zenoh import gate
 from gigabrain_zenoh.audit import AuditTrail
@@ -63,6 +63,7 @@ class Gatekeeper:
         """Answer requests from now on; `stop` brings the body to rest."""
         self._stop = stop
         self._bus.serve(ESTOP, self._on_estop)
+        self._bus.subscribe(ESTOP_SAID, lambda _, said: self._told_to_stop(said), self._no_request)
         self._bus.serve(RELEASE, self._on_release)
         self._bus.serve(ENABLE, self._on_enable)
 
@@ -141,10 +142,18 @@ class Gatekeeper:
 
     def press(self, text: str) -> None:
         """The e-stop button of this robot is pressed."""
-        outcome = self.step(gate.Estop("button"))
+        self._told_to_stop(EstopRequest(source="button", reason=text))
+
+    def _told_to_stop(self, said: EstopRequest) -> None:
+        """Stop where nobody waits for an answer."""
+        outcome = self.step(gate.Estop(said.source))
         self._output_changed()
-        log.warning("e-stop by button: %s", text)
-        self._audit("estop", "button", outcome, text)
+        log.warning("e-stop by %s %s", said.source, said.reason)
+        self._audit("estop", said.source, outcome, said.reason)
+
+    def _no_request(self, payload: bytes) -> None:
+        if not payload:
+            self._told_to_stop(EstopRequest())
 
     async def _on_estop(self, request: EstopRequest) -> GateReply:
         outcome = self.step(gate.Estop(request.source))
@@ -187,5 +196,9 @@ def _differs(before: gate.GateState, now: gate.GateState) -> bool:
         or now.estop_generation != before.estop_generation
         or now.causes is not before.causes
         or now.faults is not before.faults
-        or now.safety is not before.safety
+        or _said(now) != _said(before)
     )
+
+
+def _said(state: gate.GateState) -> tuple[tuple[Cause, ...], ...]:
+    return (state.safety.causes, state.safety.warnings) if state.safety else ()

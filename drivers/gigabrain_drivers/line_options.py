@@ -59,6 +59,11 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
             _template(f"state[{i}]", text, STATE, turn) for i, text in enumerate(self.state)
         )
 
+    def strings(self) -> dict[bytes, str]:
+        """What is sent as it is, and what it is called."""
+        both = {self.start.encode(): "start", self.stop.encode(): "stop"}
+        return {text: name for text, name in both.items() if text}
+
     def _check_ends(self, command: Template, state: tuple[Template, ...]) -> None:
         for i, template in enumerate(state):
             if template.end != state[0].end:

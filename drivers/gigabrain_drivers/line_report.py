@@ -74,11 +74,12 @@ class LineReport:
             return Velocity(**{name: values.get(name, 0.0) for name in Velocity.__struct_fields__})
         if self._base and (speeds := self._of_wheels(values, "velocity")):
             return Velocity(**self._base.to_body(speeds)._asdict())
-        seconds = sum(took for took, _ in self._steps)
+        seconds = x = y = turn = 0.0
+        for took, step in self._steps:
+            seconds, x, y, turn = seconds + took, x + step[0], y + step[1], turn + step[2]
         if not seconds:
             return Velocity()
-        way = Twist(*map(sum, zip(*(step for _, step in self._steps), strict=True)))
-        return Velocity(**_scaled(way, 1 / seconds)._asdict())
+        return Velocity(linear_x=x / seconds, linear_y=y / seconds, angular_z=turn / seconds)
 
     def joints(self) -> tuple[Joint, ...]:
         """The wheels of which anything is known."""

@@ -15,7 +15,9 @@ from gigabrain_schemas.topics import (
     DESCRIBE,
     ENABLE,
     ESTOP,
+    ESTOP_SAID,
     GOAL,
+    GRANTED,
     HEALTH,
     INTENT,
     JOINT_CMD,
@@ -53,13 +55,13 @@ class Rights:
 
 
 BRAIN = Rights(
-    says=(WORLD, POSE, MAP, INTENT, TASK, HEALTH, LOG),
+    says=(WORLD, POSE, MAP, INTENT, TASK, GRANTED, HEALTH, LOG, ESTOP_SAID),
     asks=(DESCRIBE, ESTOP),
     answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
     names=("perception", "decision", "relay"),
 )
 OPERATOR = Rights(
-    says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG),
+    says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG, ESTOP_SAID),
     asks=(
         DESCRIBE,
         AUDIT_LOG,

@@ -4,6 +4,7 @@ import abc
 import asyncio
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -19,6 +20,8 @@ from gigabrain_drivers.sim.pace import Pace
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry, Simulation
 from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_zenoh.errors import BodyLost
+
+KEPT_STEPS = 25  # of 10 ms
 
 
 class Snapshot(NamedTuple):
@@ -62,6 +65,7 @@ class EmulatedBody:
         self._faulted_ns = 0  # when what is wrong with it last changed
         self._broken = Broken()
         self.snapshot = self._look()
+        self._untaken: deque[Snapshot] = deque(maxlen=KEPT_STEPS)
 
     def start(self) -> None:
         """Let time begin."""
@@ -91,6 +95,13 @@ class EmulatedBody:
             return self._commanded
         linear_x, linear_y, angular_z = WALKER.to_body(gait)
         return linear_x, linear_y, angular_z
+
+    def fresh(self) -> list[Snapshot]:
+        """What was measured since this was last asked for, oldest first; of a quarter of a second.
+
+        A device that reports every step must not leave out those in which the loop was held up.
+        """
+        return [self._untaken.popleft() for _ in range(len(self._untaken))]
 
     def break_down(self, broken: "Broken") -> None:
         """Have its motors or sensors fail from the next step on; `Broken()` mends them."""
@@ -134,6 +145,7 @@ class EmulatedBody:
         snapshot = self._look()
         if not broken.frozen_values:
             self.snapshot = snapshot
+            self._untaken.append(snapshot)
         for tell in self.on_step:
             tell(snapshot)
 

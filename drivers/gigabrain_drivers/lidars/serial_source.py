@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 LOOK_NS = 100_000_000  # how often it is looked at whether scans come
 PATIENCE_NS = 2_000_000_000  # without a scan, until something is said
 REOPEN_NS = 5_000_000_000  # without a scan, until the port is opened anew
+GATHER_S = 0.01  # a turn takes ten times as long; its bytes come hundreds of times a second
 LAST_WORDS_S = 0.02
 NEWEST = 256  # bytes, kept to say what else may be sending there
 
@@ -35,6 +36,7 @@ class SerialSource(ScanSource):
         self.baud = baud
         self.link = SerialLink(options.port, baud, clock, probe=self.probe)
         self.link.on_bytes, self.link.on_open = self._on_bytes, self._on_open
+        self.link.gather_s = GATHER_S
         self.turn = Turn(lidar)
         self._newest = b""
         self._scan_ns = self._opened_ns = 0
