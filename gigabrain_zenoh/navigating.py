@@ -64,7 +64,7 @@ class Navigating:
         bus.latest(MAP, self._maps.append)
         self._hears_commands = False
         self._service = TaskService(bus, self, folder=config.state_dir, scripts=config.scripts)
-        self._guide = Guide()
+        self._guide = Guide(config.unknown)
         self._route: Route | None = None
         self._thinking: asyncio.Future[Route] | None = None
         self._thought: tuple[int, OccupancyGrid] | None = None  # when, and about which map
@@ -154,7 +154,8 @@ class Navigating:
         if grid is None or body is None or self._here is None:
             raise Refused(self._lost())
         # beside whatever the guide is at: it has a memory of its own
-        told = await asyncio.to_thread(Guide().check, grid, body.description, self._here, goal)
+        guide = Guide(self._config.unknown)
+        told = await asyncio.to_thread(guide.check, grid, body.description, self._here, goal)
         if told.startswith("no: "):
             raise Refused(told.removeprefix("no: "))
         return told

@@ -10,11 +10,12 @@ import time
 import serial
 from msgspec.structs import replace
 
+from gigabrain_drivers import line_check
 from gigabrain_drivers.base import Driver
 from gigabrain_drivers.kinematics import base_of
 from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_drivers.line_command import LineCommand, Spoken
-from gigabrain_drivers.line_options import BITS_PER_BYTE, LineOptions, check_wheels
+from gigabrain_drivers.line_options import BITS_PER_BYTE, LineOptions
 from gigabrain_drivers.line_report import LineReport
 from gigabrain_drivers.links.hearing import Hearing
 from gigabrain_drivers.links.serial_link import SerialLink
@@ -50,7 +51,6 @@ class LineDriver(Driver):
     def __init__(self, robot: RobotFile, options: LineOptions, run: Run) -> None:
         super().__init__(robot, options, run)
         base = base_of(robot)
-        check_wheels(options, robot, run.link, base)
         self._command = LineCommand(options.command_template(), base)
         self._decoder = Decoder(options.state_templates())
         self._clock = Clock()
@@ -73,6 +73,11 @@ class LineDriver(Driver):
         self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
         self._lidar: ScanSource | None = None
         self._scan: LaserScan | None = None
+
+    @classmethod
+    def check(cls, robot: RobotFile, options: LineOptions) -> None:
+        """Raises ValueError where the lines do not fit the body."""
+        line_check.check(options, robot)
 
     async def open(self) -> None:
         """Begin to look for the body and its lidar; neither has to be there yet."""
@@ -166,8 +171,10 @@ class LineDriver(Driver):
     def _received(self, data: bytes) -> None:
         now_ns = self._clock.now_ns()
         for values in self._decoder.feed(data):
-            self._report.take(values, now_ns)
-            if self._hearing.hear():  # after a boot or a loss: at rest, whatever it was told
+            moves = self._report.take(values, now_ns)
+            if (
+                moves and self._hearing.hear()
+            ):  # after a boot or a loss: at rest, whatever it was told
                 self._sent_ns = 0
                 self._still()
             self._tell_flags()

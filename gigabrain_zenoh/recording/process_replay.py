@@ -36,7 +36,7 @@ from gigabrain_zenoh.process import node_of
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.recording.fields import message_of, row
 from gigabrain_zenoh.recording.gaps import header_of
-from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.reading import Bag, samples
 from gigabrain_zenoh.replay import Event, replay
 from gigabrain_zenoh.safety import host
 from gigabrain_zenoh.settings import Endpoint
@@ -93,7 +93,7 @@ def load(path: Path, process: str) -> tuple[list[Event], dict[Word, Message]]:
     said: list[tuple[str, Message]] = []
     keys = {topic.key for topic in SAYS[process]}
     first_ns = 0
-    for sample in Bag(path):
+    for sample in samples(path):
         first_ns = first_ns or sample.log_ns
         message = message_of(sample) if sample.key in keys else None
         if message and getattr(message, "source", BRAIN) == BRAIN:

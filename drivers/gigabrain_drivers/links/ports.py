@@ -7,8 +7,8 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
-AUTO = "auto"
-USB = "usb:"
+from gigabrain_drivers.links.port_name import AUTO, USB, usb_id
+
 NO_PORT = (errno.ENOTTY, errno.EINVAL, errno.EISDIR)  # a file, a folder, another device
 
 
@@ -24,18 +24,6 @@ def candidates(port: str) -> list[str]:
         for p in list_ports.comports()
         if (p.vid, p.pid) == (vendor, product) and serial_number in ("", p.serial_number)
     )
-
-
-def usb_id(port: str) -> tuple[int, int, str]:
-    """(vendor, product, serial number or "") of `usb:VID:PID[:SERIAL]`. Raises ValueError."""
-    parts = port.removeprefix(USB).split(":", 2)
-    if len(parts) < 2:
-        raise ValueError(f"expected usb:VID:PID or usb:VID:PID:SERIAL, got {port!r}")
-    try:
-        vendor, product = int(parts[0], 16), int(parts[1], 16)
-    except ValueError:
-        raise ValueError(f"expected hexadecimal VID and PID, got {port!r}") from None
-    return vendor, product, parts[2] if len(parts) > 2 else ""
 
 
 def missing(port: str) -> str:
