@@ -5,7 +5,7 @@ import contextlib
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,10 @@ from gigabrain_zenoh.watch import Watch
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 LOOK_S = 0.1  # how often the run is looked at
+RELEASE_FIRST = (
+    "a real body drives only when somebody has released and enabled it: while the demo runs, in "
+    "another terminal, `gigabrain release` and `gigabrain enable`"
+)
 STALLED_S = 60.0  # without a tick of the robot's clock
 ANSWER_S, HASTY_S = 5.0, 0.2  # how long the truth may take; and once a person wants it to end
 
@@ -60,6 +64,7 @@ class Demo:
         self._failures: list[str] = []
         self._refusal = ""  # what a process said before it ended
         self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
+        self._last_fault = ""  # before all were asked to end, the driver's first
 
     async def run(self) -> int:
         """The exit code: 0 for a run without contact, with motion, with all processes alive.
@@ -108,6 +113,7 @@ class Demo:
                     self._failures.append(f"the robot's clock stood still for {STALLED_S:.0f} s")
                     break
             view.show()
+        self._last_fault = newest_fault(text for _, text in self._faults)
         return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)
 
     @property
@@ -180,6 +186,16 @@ class Demo:
         if report is None:
             reason = self._failures[-1] if self._failures else "the driver did not answer"
             raise BodyLost(f"no report: {reason}; logs in {self._run_dir}")
+        if self._last_fault:
+            print(f"newest fault: {self._last_fault}", file=sys.stderr)
+        if self._deployment.link == "real":
+            print(RELEASE_FIRST, file=sys.stderr)
         why = f"{self._failures[-1]}; " if self._failures else ""
         print(f"{why}logs in {self._run_dir}", file=sys.stderr)
         return 1
+
+
+def newest_fault(texts: Iterable[str]) -> str:
+    """The one that tells most of why nothing moved: the driver's newest, else the newest at all."""
+    newest = list(texts)[::-1]
+    return next((text for text in newest if text.startswith("driver:")), "".join(newest[:1]))

@@ -64,7 +64,7 @@ class Navigating:
         bus.latest(MAP, self._maps.append)
         self._hears_commands = False
         self._service = TaskService(bus, self, folder=config.state_dir, scripts=config.scripts)
-        self._guide = Guide()
+        self._guide = Guide(config.unknown)
         self._route: Route | None = None
         self._thinking: asyncio.Future[Route] | None = None
         self._thought: tuple[int, OccupancyGrid] | None = None  # when, and about which map
@@ -101,9 +101,9 @@ class Navigating:
         if self._config.begin == "roam" and not self._begun:
             self._service.begin(roaming(), "roaming", state.boot)
         self._begun = True
-        order = self._service.step(state, self._outcome)
-        self._outcome = None
         tick = world.basis if world else state.tick
+        order = self._service.step(state, self._outcome, tick)
+        self._outcome = None
         if world:
             self._lateness.thinks(state.tick, tick)
         pose, place = self._history.at(state.boot, tick), self._place(state.boot, tick)
@@ -154,7 +154,8 @@ class Navigating:
         if grid is None or body is None or self._here is None:
             raise Refused(self._lost())
         # beside whatever the guide is at: it has a memory of its own
-        told = await asyncio.to_thread(Guide().check, grid, body.description, self._here, goal)
+        guide = Guide(self._config.unknown)
+        told = await asyncio.to_thread(guide.check, grid, body.description, self._here, goal)
         if told.startswith("no: "):
             raise Refused(told.removeprefix("no: "))
         return told

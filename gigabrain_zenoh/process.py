@@ -25,20 +25,17 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, unknown
 from gigabrain_zenoh.health import answer_to_name, publish_health
 from gigabrain_zenoh.heartbeat import beat
-from gigabrain_zenoh.keys.checks import identity_in
+from gigabrain_zenoh.meeting import join
 from gigabrain_zenoh.param_service import serve_params
 from gigabrain_zenoh.process_config import ProcessConfig
-from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.transport import Transport
 from gigabrain_zenoh.unobtrusive import NAP_S, step_aside
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 log = logging.getLogger("gigabrain")
 
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 MakeBus = Callable[[Transport, Clock, str], Bus]
-PATIENCE_S = 1.0  # how long the router may be missing before somebody is told
 
 # Zenoh's work in one thread, sending apart: a message wakes half as many threads on its way. A
 # documented variable of Zenoh's (zenoh_runtime::ZRuntime); whoever sets it has the last word.
@@ -154,7 +151,7 @@ async def _run(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
 async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
     nap_s = NAP_S if PROGRAMS[config.name].looks_on else 0.0
     endpoint = msgspec.structs.replace(config.endpoint, nap_s=nap_s)
-    bus = make_bus(await _connect(endpoint), Clock(), config.name)
+    bus = make_bus(await join(endpoint), Clock(), config.name)
     handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
     logging.getLogger().addHandler(handler)
     try:
@@ -181,28 +178,6 @@ def _ready() -> None:
     gc.freeze()  # what set-up made stays: collections look at new objects only
     gc.enable()
     log.info("ready", extra={"data": {"event": "ready", "pid": os.getpid()}})
-
-
-async def _connect(endpoint: Endpoint) -> ZenohTransport:
-    """Open the session, and say so once when that takes longer than a person would wait.
-
-    Raises ConfigError where our own keys are the reason.
-    """
-    opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
-    try:
-        done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
-        if not done:
-            if endpoint.keys:  # a router turns bad ones away without a word
-                await asyncio.to_thread(identity_in, Path(endpoint.keys))
-            where = ", ".join(endpoint.connect) or ", ".join(endpoint.listen)
-            log.warning(
-                "no router at %s yet; waiting for it (start one with: gigabrain router)",
-                where,
-                extra={"data": {"event": "waiting"}},
-            )
-        return await opening
-    finally:
-        opening.cancel()
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from typing import Any
 from msgspec import structs
 
 from gigabrain_schemas.topics import TOPICS
+from gigabrain_zenoh.addresses import LOCAL_ENDPOINT, host_and_port
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.acl import access_control, known_names
 from gigabrain_zenoh.keys.files import CA, CERTIFICATE, KEY, check_files
@@ -17,8 +18,6 @@ from gigabrain_zenoh.settings import Endpoint, RouterConfig
 SECURE, PLAIN = "tls/", "tcp/"
 PENDING = 4000  # links that may be on their way in; silent ones are dropped after a second
 FAR_TOO_LARGE = 4  # times a topic's bound
-IP_ENDPOINT = re.compile(r"(?:tcp|udp|tls|quic|ws)/[^/#?]+:(\d+)(?:[?#].*)?")
-LOCAL_ENDPOINT = re.compile(r"unixsock-stream/.+")
 
 
 def session_config(endpoint: Endpoint) -> dict[str, Any]:
@@ -165,6 +164,7 @@ def plain(error: str) -> str:
 
 
 def _check(text: str) -> None:
-    address = IP_ENDPOINT.fullmatch(text)
-    if not LOCAL_ENDPOINT.fullmatch(text) and not (address and int(address[1]) < 2**16):
-        raise ConfigError(f"{text!r} is not a Zenoh endpoint; expected one like tcp/127.0.0.1:7447")
+    try:
+        host_and_port(text)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from gigabrain_zenoh import demo as demo_module
-from gigabrain_zenoh.demo import Demo, DemoOptions
+from gigabrain_zenoh.demo import Demo, DemoOptions, newest_fault
 from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.report import Observed, make_report, summary
 from gigabrain_zenoh.watch import Watch
@@ -32,6 +32,20 @@ async def run(home: Home, *options: str) -> tuple[Command, dict[str, Any]]:
     demo = await home.run(*AVOID, "--headless", "--report", str(path), *options)
     assert path.exists(), demo.err
     return demo, json.loads(path.read_bytes())
+
+
+@pytest.mark.parametrize(
+    ("texts", "newest"),
+    [
+        ((), ""),
+        (("driver: no port", "driver: no lidar", "safety: late"), "driver: no lidar"),
+        (("safety: late", "decision: late"), "decision: late"),
+    ],
+)
+def test_the_fault_that_is_told_is_the_drivers_newest_or_the_newest(
+    texts: tuple[str, ...], newest: str
+) -> None:
+    assert newest_fault(texts) == newest
 
 
 async def undisturbed(home: Home, *options: str) -> dict[str, Any]:

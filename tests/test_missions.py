@@ -47,6 +47,14 @@ def test_a_sequence_goes_on_to_the_next_place_at_once(robot: Robot) -> None:
     assert robot.last[0] == "succeeded"
 
 
+def test_a_step_after_a_wait_begins_with_no_progress(robot: Robot) -> None:
+    robot.carry_out("do: [{wait: 5}, {goto: a}]")
+    robot.step()
+    assert robot.step(5.0) == 1.0
+    status = robot.status
+    assert (status.doing, status.progress, status.eta) == ("going to a", 0.0, None)
+
+
 def test_a_sequence_ends_with_what_fails(robot: Robot) -> None:
     robot.carry_out("do: [{goto: a}, {goto: b}]")
     robot.step()

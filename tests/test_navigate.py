@@ -3,6 +3,7 @@
 import asyncio
 import math
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -70,6 +71,25 @@ async def test_a_room_without_a_door_is_refused_with_the_nearest_place() -> None
         reply = await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
         assert not reply.ok
         assert reply.text.startswith("no way leads to the goal; nearest reachable point is ")
+
+
+@pytest.mark.parametrize(
+    ("unknown", "told"),
+    [
+        ("allow", "goal-1: on the way, "),
+        ("avoid", "goal-1: on the way, "),
+        ("forbid", "no way leads to the goal; nearest reachable point is "),
+    ],
+)
+async def test_whether_a_way_may_lead_through_the_unknown_is_a_setting(
+    unknown: Literal["allow", "avoid", "forbid"], told: str
+) -> None:
+    plane = Plane(CELLS, config=DecisionConfig(behaviour="navigate", unknown=unknown))
+    plane.known[:, 50:55] = -1
+    async with plane:
+        await plane.go(0.2)
+        reply = await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
+        assert reply.text.startswith(told)
 
 
 async def test_without_a_map_it_says_what_to_change() -> None:

@@ -40,6 +40,10 @@ class Driver(abc.ABC):
         self.robot, self.options, self.run = robot, options, run
         self.emit: Emit = lambda topic, message: None  # the driver's process puts its own here
 
+    @classmethod  # noqa: B027 - most drivers fit any body
+    def check(cls, robot: RobotFile, options: Any) -> None:
+        """Raises ValueError, as `FIELD: ...`, where its options do not fit the body."""
+
     async def __aenter__(self) -> Self:
         try:
             await self.open()

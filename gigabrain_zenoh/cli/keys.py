@@ -1,6 +1,7 @@
 """`gigabrain keys`: a fleet's own authority, and identities for its hosts and people."""
 
 import datetime
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,7 @@ def new(fleet: str, *, dir: Path | None = None) -> None:
     folder = dir or Path(fleet)
     _find("authority:new_fleet")(fleet, folder)
     print(f"{folder / CA_KEY}: keep it on this machine; whoever has it can be anybody")
-    print(f"next: gigabrain keys issue robot --host ADDRESS --dir {folder}")
+    print(f"next: gigabrain keys issue robot --host ADDRESS --dir {_quoted(folder)}")
 
 
 def issue(
@@ -66,10 +67,7 @@ def issue(
         _fleet(dir), role, robot=robot, name=name, hosts=host, days=days
     )
     print(f"{folder}: copy it to its host, and let nobody else read it")
-    if role == "operator":
-        print(f"next: gigabrain estop --connect tls/ADDRESS:7447 --keys {folder}")
-    else:
-        print(f"next: `keys: {folder.name}` in the deployment file that lies beside it")
+    print(f"next: {_use(role, robot, folder)}")
 
 
 def revoke(role: Role, *, robot: str = "", dir: Path | None = None) -> None:
@@ -97,7 +95,7 @@ def revoke(role: Role, *, robot: str = "", dir: Path | None = None) -> None:
     if not lists:
         print("no router's identity here: whoever is issued one from now on has the list")
     of = f" --robot {robot}" if robot else ""
-    print(f"next, for those who stay: gigabrain keys issue {role}{of} --dir {folder}")
+    print(f"next, for those who stay: gigabrain keys issue {role}{of} --dir {_quoted(folder)}")
 
 
 def identities(*, dir: Path | None = None) -> int:
@@ -142,6 +140,21 @@ def zenohd(
     """
     generations = generations_in(_fleet(dir)) if dir else {}
     print(_find("zenohd:configuration")(robot or ("",), str(keys), listen, generations), end="")
+
+
+def _use(role: Role, robot: str, folder: Path) -> str:
+    """The command with which an identity is used first."""
+    keys, of = _quoted(folder), f" --namespace {robot}" if robot else ""
+    if role == "router":
+        return f"gigabrain router --listen tls/0.0.0.0:7447 --fleet NAMESPACE --keys {keys}"
+    if role in ("operator", "viewer"):
+        tool = "estop" if role == "operator" else "topic list"
+        return f"gigabrain {tool} --connect tls/ADDRESS:7447{of} --keys {keys}"
+    return f"gigabrain up FILE --host HOST --keys {keys}, where FILE has a line `keys:`"
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
 
 
 def _listed(folder: Path) -> Iterator[tuple[str, bool]]:

@@ -17,6 +17,7 @@ from gigabrain_schemas.topics import (
     ESTOP,
     ESTOP_SAID,
     GOAL,
+    GRANTED,
     HEALTH,
     INTENT,
     JOINT_CMD,
@@ -54,7 +55,7 @@ class Rights:
 
 
 BRAIN = Rights(
-    says=(WORLD, POSE, MAP, INTENT, TASK, HEALTH, LOG, ESTOP_SAID),
+    says=(WORLD, POSE, MAP, INTENT, TASK, GRANTED, HEALTH, LOG, ESTOP_SAID),
     asks=(DESCRIBE, ESTOP),
     answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
     names=("perception", "decision", "relay"),

@@ -83,9 +83,11 @@ class Wait(Leaf):
     def update(self) -> Status:
         """Whether the time is over."""
         left_s = self._until_s - self.moment.now_s
-        self.moment.doing, self.moment.left_s = self.name, max(0.0, left_s)
-        self.moment.progress = min(1.0, 1.0 - left_s / self._seconds)
-        return Status.RUNNING if left_s > 1e-9 else Status.SUCCESS
+        if left_s <= 1e-9:
+            return Status.SUCCESS
+        self.moment.doing, self.moment.left_s = self.name, left_s
+        self.moment.progress = 1.0 - left_s / self._seconds
+        return Status.RUNNING
 
 
 class WaitUntil(Leaf):

@@ -54,6 +54,7 @@ class Ld(SerialSource):
     says `no_return: unknown` of it where that matters.
     """
 
+    samples_hz = 4500.0
     rate_baud: ClassVar[int]
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:

@@ -13,6 +13,7 @@ class Lds02(Ld):
     """Starts with its power. It measures from its lens, which goes round the axis."""
 
     name, rate_baud = "LDS-02", 115_200
+    samples_hz = 2300.0
 
     def place(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
         """Both seen from the axis."""

@@ -23,8 +23,9 @@ from gigabrain_zenoh.errors import unknown
 
 LONGEST = 256  # bytes of a line
 MOST = 1e8  # in SI units; beyond, either way, no number is a measurement. Counters may count on.
+DIGITS = "0123456789."  # what is no end of a number
 _FIELD = re.compile(r"\{([^{}|:]*)(?:\|([^{}|:]*))?(?::([^{}]*))?\}")
-_FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.([0-9]))?f|d|[xX])")
+_FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.[0-9])?f|d|[xX])")
 _ANY_NUMBER = r" *[-+]?[0-9]{1,12}(?:\.[0-9]{0,9})?"
 
 
@@ -42,6 +43,13 @@ class Field:
     def counts(self) -> bool:
         """Whether it is a counter or a set of flags, which may be as large as they like."""
         return self.unit.endswith("tick") or self.format[-1] in "xX"
+
+    @property
+    def step(self) -> float:
+        """The least by which two values on the wire differ, in SI units."""
+        if self.format[-1] != "f":
+            return abs(self.factor)
+        return abs(self.factor) * 10.0 ** -_places(self.format)
 
     def write(self, value: float) -> str:
         """The text for a value in SI units; zero has no sign."""
@@ -79,6 +87,7 @@ class Template:
         self.fields = tuple(_field(*triple, known, ticks_per_turn) for triple in triples)
         if not self.fields:
             raise ValueError(f"there is no field in it; known: {', '.join(known)}")
+        self._check_gaps()
         names = [field.name for field in self.fields if field.name != IGNORED]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
@@ -120,9 +129,24 @@ class Template:
                 return field.read(field.write(value))
         return value
 
+    def reads_all_of(self, other: "Template") -> bool:
+        """Whether lines of the other template can be read as lines of this one."""
+        nothing = other.encode({}).strip(b"\r\n")
+        return self.decode(nothing) is not None
+
     def longest(self) -> int:
         """About how many bytes a line has."""
         return len(self.encode({field.name: -5.0 * field.factor for field in self.fields}))
+
+    def _check_gaps(self) -> None:
+        """Numbers that touch cannot be told apart."""
+        pairs = zip(self.fields, self.fields[1:], self._texts[1:], strict=False)
+        for before, after, between in pairs:
+            if not between.strip(DIGITS) and not after.format.startswith("+"):
+                raise ValueError(
+                    f"{{{before.name}}} and {{{after.name}}} touch: expected something between "
+                    "them that is no digit, such as a comma"
+                )
 
     def _sum(self, text: str) -> str:
         check = CHECKS[self.check]
@@ -165,15 +189,20 @@ def _field(
         pattern = "[0-9A-Fa-f]{1,8}" if quantity == "flags" else _ANY_NUMBER
         plain = "d" if unit.lstrip("-") in ("tick", "tick/s") else ".3f"
         return Field(name, unit, scale, DEFAULT_FORMATS.get(quantity, plain), pattern)
-    given = _FORMAT.fullmatch(form)
-    if given is None:
+    if not _FORMAT.fullmatch(form):
         raise ValueError(f"{{{name}}}: expected a format such as .3f, d or 02x, got {form!r}")
     if form[-1] in "xX" and quantity not in DEFAULT_FORMATS:
         raise ValueError(f"{{{name}}}: a {quantity} has a sign; expected .3f or d, got {form!r}")
-    return Field(name, unit, scale, form, _pattern(form, given[1]))
+    return Field(name, unit, scale, form, _pattern(form))
 
 
-def _pattern(form: str, decimals: str | None) -> str:
+def _places(form: str) -> int:
+    """The decimals that a format ending in `f` writes."""
+    _, dot, digits = form.rstrip("f").partition(".")
+    return int(digits) if dot else 6
+
+
+def _pattern(form: str) -> str:
     """What a number of this format looks like, and nothing else."""
     sign = "[-+]" if form.startswith("+") else "-?"
     padding = " *" if len(form.rstrip("fdxX").partition(".")[0].lstrip("+0")) else ""
@@ -181,7 +210,7 @@ def _pattern(form: str, decimals: str | None) -> str:
         return f"{padding}[0-9A-Fa-f]{{1,8}}"
     if form[-1] == "d":
         return f"{padding}{sign}[0-9]{{1,12}}"
-    places = int(decimals) if decimals else 6 if "." not in form else 0
+    places = _places(form)
     return rf"{padding}{sign}[0-9]{{1,12}}" + (rf"\.[0-9]{{{places}}}" if places else "")
 
 
