@@ -92,7 +92,9 @@ class Gatekeeper:
     def ticks(self, passed: int, tick: gate.Tick) -> None:
         """So many ticks have passed since the last call, all but one of them missed."""
         for _ in range(passed):
-            self.step(replace(tick, late=True) if self._is_late(tick.wall_ns) else tick)
+            late = self._is_late(tick.wall_ns)
+            self._bus.counters["late_ticks"] += late
+            self.step(replace(tick, late=True) if late else tick)
             self._look_after_disk()
 
     def _is_late(self, wall_ns: int | None) -> bool:

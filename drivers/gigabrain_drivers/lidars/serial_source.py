@@ -22,6 +22,7 @@ LOOK_NS = 100_000_000  # how often it is looked at whether scans come
 PATIENCE_NS = 2_000_000_000  # without a scan, until something is said
 REOPEN_NS = 5_000_000_000  # without a scan, until the port is opened anew
 GATHER_S = 0.01  # a turn takes ten times as long; its bytes come hundreds of times a second
+GATHER_BAUD = 460_800  # what comes faster fills the 4 KB of a port too soon
 LAST_WORDS_S = 0.02
 NEWEST = 256  # bytes, kept to say what else may be sending there
 
@@ -36,7 +37,6 @@ class SerialSource(ScanSource):
         self.baud = baud
         self.link = SerialLink(options.port, baud, clock, probe=self.probe)
         self.link.on_bytes, self.link.on_open = self._on_bytes, self._on_open
-        self.link.gather_s = GATHER_S
         self.turn = Turn(lidar)
         self._newest = b""
         self._scan_ns = self._opened_ns = 0
@@ -144,6 +144,7 @@ class SerialSource(ScanSource):
 
     def _on_open(self) -> None:
         self._opened_ns = self.clock.now_ns()
+        self.link.gather_s = GATHER_S if self.link.baud <= GATHER_BAUD else 0.0
         self._newest = b""
         self.turn.clear()
         self.connected()
