@@ -3,6 +3,7 @@
 import asyncio
 import functools
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pytest
@@ -37,6 +38,11 @@ class Robot(Bench):
     def __init__(self, config: PerceptionConfig = SLAM) -> None:
         super().__init__(functools.partial(perception.run, config))
         self.rooms, self.tick, self.boot = Rooms(HOUSE), 0, 7
+
+    async def __aenter__(self) -> Self:
+        await super().__aenter__()
+        await self.ready()
+        return self
 
     def say(self) -> None:
         self.send(BODY, body(boot=self.boot))
