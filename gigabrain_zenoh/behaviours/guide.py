@@ -11,7 +11,7 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.behaviours.bearings import Driven, Floats, Route
-from gigabrain_zenoh.navigation.costmap import Costmap, costmap, inflation
+from gigabrain_zenoh.navigation.costmap import Costmap, Unknown, costmap, inflation
 from gigabrain_zenoh.navigation.frontiers import frontiers
 from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable
 from gigabrain_zenoh.tasks.orders import GoTo, Order, Visit
@@ -43,8 +43,8 @@ class Asked:
 class Guide:
     """Plans route after route. Not for two threads at once."""
 
-    def __init__(self) -> None:
-        self._planner = Planner()
+    def __init__(self, unknown: Unknown = "avoid") -> None:
+        self._planner, self._unknown = Planner(), unknown
         self._costmap: Costmap | None = None
         self._drawn: tuple[object, ...] = ()
         self._in_the_way: Floats = np.empty((0, 2))
@@ -67,7 +67,7 @@ class Guide:
 
     def check(self, grid: OccupancyGrid, body: BodyDescription, here: Pose, goal: Goal) -> str:
         """The way to a goal in words; `no: …` where there is none."""
-        chart = costmap(grid, inflation(body), before=None)
+        chart = costmap(grid, inflation(body, self._unknown), before=None)
         found = Planner().plan(chart, (here.x, here.y), (goal.x, goal.y))
         if isinstance(found, Unreachable):
             return f"no: {found.reason}"
@@ -99,7 +99,7 @@ class Guide:
             a is b or a == b for a, b in zip(drawn, self._drawn, strict=True)
         )
         if self._costmap is None or not same:
-            rules = inflation(asked.body)
+            rules = inflation(asked.body, self._unknown)
             self._costmap = costmap(asked.grid, rules, self._in_the_way, self._costmap)
             self._drawn = drawn
         return self._costmap

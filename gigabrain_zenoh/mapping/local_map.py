@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,6 +13,7 @@ from gigabrain_zenoh.mapping.se2 import Floats
 
 BUCKET = 0.15  # [m]
 REACH = 30.0  # [m], points farther from the centre are left out
+BLOCK = 4  # cells a side, of which only the likeliest counts at first
 
 Ints = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
@@ -33,6 +35,7 @@ class Image:
     """How likely a hit is, by cell."""
 
     cells: Bytes  # (height, width), 0 to 255 for certain
+    coarse: Bytes  # (height, width), the most of the block of cells that begins here
     origin: Floats  # (2,), the corner of cell (0, 0) [m]
     cell: float  # [m]
 
@@ -45,6 +48,15 @@ class LocalMap:
     buckets: Buckets
 
 
+EMPTY = Buckets(
+    np.empty((0, 2), np.float32),
+    np.empty((0, 2), np.float32),
+    np.zeros(2, np.int32),
+    1,
+    np.zeros(2),
+)
+
+
 def build(
     scans: Sequence[Scan], poses: Floats, centre: Floats, cell: float, sigma: float
 ) -> LocalMap:
@@ -53,51 +65,84 @@ def build(
     The likelihood of a hit is exp(-d²/2s²): d to the nearest point, s `sigma`. Where several points
     share a cell, the last is laid onto.
     """
-    points, normals = _placed(
+    points, normals, low, high = _placed(
         np.concatenate([scan.points for scan in scans]),
         np.concatenate([scan.normals for scan in scans]),
         np.array([len(scan.points) for scan in scans]),
         poses,
+        centre,
     )
-    near = (np.abs(points - centre[:2]) < REACH).all(axis=1)
-    points, normals = points[near], normals[near]
     if not len(points):
-        empty = Image(np.zeros((1, 1), np.uint8), np.zeros(2), cell)
-        return LocalMap(empty, _buckets(points, normals))
+        nothing = np.zeros((1, 1), np.uint8)
+        return LocalMap(Image(nothing, nothing, np.zeros(2), cell), EMPTY)
     blob = _blob(cell, sigma)
-    origin = points.min(axis=0).astype(np.float64) - len(blob) * cell
-    width, height = ((points.max(axis=0) - origin) / cell).astype(int) + len(blob)
+    origin = low.astype(np.float64) - len(blob) * cell
+    width, height = ((high - origin) / cell).astype(int) + len(blob)
     cells = np.zeros((height, width), np.uint8)
     last = _stamp(cells, points, origin, cell, blob)
-    kept = last & normals.any(axis=1)
-    return LocalMap(Image(cells, origin, cell), _buckets(points[kept], normals[kept]))
+    coarse = cv2.dilate(cells, np.ones((BLOCK, BLOCK), np.uint8), anchor=(0, 0))
+    image = Image(cells, np.asarray(coarse, np.uint8), origin, cell)
+    return LocalMap(image, _buckets(points, normals, last))
 
 
 @kernel
 def _placed(
-    points: Points, normals: Points, counts: NDArray[np.int64], poses: Floats
-) -> tuple[Points, Points]:
-    """Points and normals of scans, so many of each, at their poses."""
+    points: Points, normals: Points, counts: NDArray[np.int64], poses: Floats, centre: Floats
+) -> tuple[Points, Points, Points, Points]:
+    """Points and normals of scans, so many of each, at their poses, and where they lie between.
+
+    What is out of reach of `centre` is left out.
+    """
     moved, turned = np.empty_like(points), np.empty_like(normals)
-    k = 0
+    low, high = np.full(2, np.inf, np.float32), np.full(2, -np.inf, np.float32)
+    first = n = 0
     for s in range(len(counts)):
         cos, sin = np.cos(poses[s, 2]), np.sin(poses[s, 2])
-        for _ in range(counts[s]):
-            moved[k, 0] = poses[s, 0] + cos * points[k, 0] - sin * points[k, 1]
-            moved[k, 1] = poses[s, 1] + sin * points[k, 0] + cos * points[k, 1]
-            turned[k, 0] = cos * normals[k, 0] - sin * normals[k, 1]
-            turned[k, 1] = sin * normals[k, 0] + cos * normals[k, 1]
-            k += 1
-    return moved, turned
+        for k in range(first, first + counts[s]):
+            x = np.float32(poses[s, 0] + cos * points[k, 0] - sin * points[k, 1])
+            y = np.float32(poses[s, 1] + sin * points[k, 0] + cos * points[k, 1])
+            if not (abs(x - centre[0]) < REACH and abs(y - centre[1]) < REACH):
+                continue
+            moved[n, 0], moved[n, 1] = x, y
+            turned[n, 0] = cos * normals[k, 0] - sin * normals[k, 1]
+            turned[n, 1] = sin * normals[k, 0] + cos * normals[k, 1]
+            low[0], low[1] = min(low[0], x), min(low[1], y)
+            high[0], high[1] = max(high[0], x), max(high[1], y)
+            n += 1
+        first += counts[s]
+    return moved[:n], turned[:n], low, high
 
 
-def _buckets(points: Points, normals: Points) -> Buckets:
+def _buckets(points: Points, normals: Points, last: NDArray[np.bool_]) -> Buckets:
+    """Those of the points that are `last` in their cells, and have a normal."""
+    points, normals, low, high = _chosen(points, normals, last)
     if not len(points):
-        return Buckets(points, normals, np.zeros(2, np.int32), 1, np.zeros(2))
-    origin = points.min(axis=0).astype(np.float64)
-    width, height = ((points.max(axis=0) - origin) / BUCKET).astype(int) + 1
+        return EMPTY
+    origin = low.astype(np.float64)
+    width, height = ((high - origin) / BUCKET).astype(int) + 1
     starts, order = _sorted(points, origin, BUCKET, width, height)
     return Buckets(points[order], normals[order], starts, int(width), origin)
+
+
+@kernel
+def _chosen(
+    points: Points, normals: Points, last: NDArray[np.bool_]
+) -> tuple[Points, Points, Points, Points]:
+    """Some of the points with their normals, and where they lie between."""
+    those = np.empty(len(points), np.int32)
+    n = 0
+    for k in range(len(points)):
+        if last[k] and (normals[k, 0] != 0 or normals[k, 1] != 0):
+            those[n] = k
+            n += 1
+    kept, along = np.empty((n, 2), np.float32), np.empty((n, 2), np.float32)
+    low, high = np.full(2, np.inf, np.float32), np.full(2, -np.inf, np.float32)
+    for i in range(n):
+        for axis in range(2):
+            value = points[those[i], axis]
+            kept[i, axis], along[i, axis] = value, normals[those[i], axis]
+            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
+    return kept, along, low, high
 
 
 @kernel

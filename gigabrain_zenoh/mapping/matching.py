@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import kernel
-from gigabrain_zenoh.mapping.local_map import BUCKET, Buckets, Bytes, Image
+from gigabrain_zenoh.mapping.local_map import BLOCK, BUCKET, Buckets, Bytes, Image, Ints
 from gigabrain_zenoh.mapping.points import Points
 from gigabrain_zenoh.mapping.se2 import Floats
 
 SEARCHED = 90  # points of a scan are enough to search with
+ASIDE = 0.01  # of the score, at the window's rim: of equals, the one nearest to the guess
 ITERATIONS = 25
 STILL = 1e-4  # [m] and [rad], a step this small ends ICP
 SHRINK = 0.6  # of the gate, each iteration
@@ -63,52 +64,106 @@ def search(image: Image, points: Points, guess: Floats, window: Window) -> Found
         return Found(guess, 0.0)
     steps = int(np.ceil(window.away / image.cell))
     turns = int(np.ceil(window.turn / window.step))
-    x, y, yaw, score = _search(
-        image.cells, image.origin, image.cell, thinned(points, SEARCHED), guess,
-        steps, turns, window.step,
-    )  # fmt: skip
-    return Found(np.array((x, y, yaw)), score)
+    few = thinned(points, SEARCHED)
+    at = _placed(few, guess, image.origin, image.cell, steps, turns, window.step)
+    bounds = _bounds(image.coarse, at, steps)
+    score, t, i, j = _best(image.cells, at, bounds, steps)
+    off = np.array(((j - steps) * image.cell, (i - steps) * image.cell, (t - turns) * window.step))
+    return Found(guess + off, score)
 
 
 @kernel
-def _search(
-    cells: Bytes,
-    origin: Floats,
-    cell: float,
+def _placed(
     points: Points,
     guess: Floats,
+    origin: Floats,
+    cell: float,
     steps: int,
     turns: int,
     turn: float,
-) -> tuple[float, float, float, float]:
-    height, width = cells.shape
-    side = 2 * steps + 1
-    scores = np.empty((side, side), np.int32)
-    best, best_x, best_y, best_yaw = -1.0, 0, 0, 0
-    for t in range(-turns, turns + 1):
-        cos, sin = np.cos(guess[2] + t * turn), np.sin(guess[2] + t * turn)
-        scores[:] = 0
+) -> Ints:
+    """The cell (row, column) of each point at each heading (2 turns + 1, n, 2), in the corner."""
+    at = np.empty((2 * turns + 1, len(points), 2), np.int32)
+    for t in range(len(at)):
+        yaw = guess[2] + (t - turns) * turn
+        cos, sin = np.cos(yaw), np.sin(yaw)
         for k in range(len(points)):
             px = guess[0] + cos * points[k, 0] - sin * points[k, 1]
             py = guess[1] + sin * points[k, 0] + cos * points[k, 1]
-            left = int(np.floor((px - origin[0]) / cell)) - steps
-            top = int(np.floor((py - origin[1]) / cell)) - steps
-            first, last = max(0, -left), min(side, width - left)
-            for i in range(max(0, -top), min(side, height - top)):
-                for j in range(first, last):
-                    scores[i, j] += cells[top + i, left + j]
-        for i in range(side):
-            for j in range(side):
-                # of equals, the one nearest to the guess
-                away = ((i - steps) ** 2 + (j - steps) ** 2) / (steps * steps + 1)
-                off = (t * t) / (turns * turns + 1)
-                value = scores[i, j] / (255 * len(points)) - 0.01 * (away + off)
-                if value > best:
-                    best, best_x, best_y, best_yaw = value, j - steps, i - steps, t
-    away = (best_x**2 + best_y**2) / (steps * steps + 1)
-    off = (best_yaw * best_yaw) / (turns * turns + 1)
-    score = best + 0.01 * (away + off)
-    return guess[0] + best_x * cell, guess[1] + best_y * cell, guess[2] + best_yaw * turn, score
+            at[t, k, 0] = int(np.floor((py - origin[1]) / cell)) - steps
+            at[t, k, 1] = int(np.floor((px - origin[0]) / cell)) - steps
+    return at
+
+
+@kernel
+def _worth(total: int, count: int, down: int, right: int, t: int, steps: int, turns: int) -> float:
+    """What a pose so many cells and headings off the guess is worth, its points being so likely."""
+    away = (down * down + right * right) / (steps * steps + 1)
+    return total / (255 * count) - ASIDE * (away + t * t / (turns * turns + 1))
+
+
+@kernel
+def _bounds(coarse: Bytes, at: Ints, steps: int) -> Floats:
+    """What the poses of each block are worth at most (headings, blocks, blocks)."""
+    (height, width), (headings, count, _) = coarse.shape, at.shape
+    blocks, turns = 2 * steps // BLOCK + 1, headings // 2
+    bounds = np.empty((headings, blocks, blocks))
+    for t in range(headings):
+        for i in range(blocks):
+            for j in range(blocks):
+                total = 0
+                for k in range(count):
+                    row, column = at[t, k, 0] + i * BLOCK, at[t, k, 1] + j * BLOCK
+                    # a block that begins outside may end within
+                    if -BLOCK < row < height and -BLOCK < column < width:
+                        total += coarse[max(row, 0), max(column, 0)]
+                down = max(i * BLOCK - steps, steps - i * BLOCK - BLOCK + 1, 0)
+                right = max(j * BLOCK - steps, steps - j * BLOCK - BLOCK + 1, 0)
+                bounds[t, i, j] = _worth(total, count, down, right, t - turns, steps, turns)
+    return bounds
+
+
+@kernel
+def _best(cells: Bytes, at: Ints, bounds: Floats, steps: int) -> tuple[float, int, int, int]:
+    """Score, heading, row and column of the pose that is worth most; of equals, the first."""
+    (headings, blocks, _), best = bounds.shape, -np.inf
+    score, at_t, at_i, at_j = 0.0, headings, 0, 0
+    likeliest = np.argmax(bounds)  # the sooner something good is found, the more can be left out
+    for n in range(-1, bounds.size):
+        block = likeliest if n < 0 else n
+        t, row, column = block // (blocks * blocks), block // blocks % blocks, block % blocks
+        if bounds[t, row, column] < best:
+            continue
+        turn = t - headings // 2
+        worth, mean, i, j = _best_within(
+            cells, at[t], row * BLOCK, column * BLOCK, turn, steps, headings // 2
+        )
+        if worth > best or (worth == best and (t, i, j) < (at_t, at_i, at_j)):
+            best, score, at_t, at_i, at_j = worth, mean, t, i, j
+    return score, at_t, at_i, at_j
+
+
+@kernel
+def _best_within(
+    cells: Bytes, at: Ints, top: int, left: int, t: int, steps: int, turns: int
+) -> tuple[float, float, int, int]:
+    """The best pose of one block: its worth, score, row and column."""
+    (height, width), count = cells.shape, len(at)
+    sums = np.zeros((BLOCK, BLOCK), np.int64)
+    for k in range(count):
+        row, column = at[k, 0] + top, at[k, 1] + left
+        first, last = max(0, -column), min(BLOCK, width - column)
+        for i in range(max(0, -row), min(BLOCK, height - row)):
+            for j in range(first, last):
+                sums[i, j] += cells[row + i, column + j]
+    best, score, at_i, at_j = -np.inf, 0.0, 0, 0
+    for i in range(min(BLOCK, 2 * steps + 1 - top)):
+        for j in range(min(BLOCK, 2 * steps + 1 - left)):
+            worth = _worth(sums[i, j], count, top + i - steps, left + j - steps, t, steps, turns)
+            if worth > best:
+                best, score = worth, sums[i, j] / (255 * count)
+                at_i, at_j = top + i, left + j
+    return best, score, at_i, at_j
 
 
 def icp(

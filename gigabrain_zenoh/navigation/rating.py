@@ -31,6 +31,7 @@ class Scene(NamedTuple):
     goal_y: float
     goal_yaw: float  # [rad]; nan where any will do
     tolerance: float  # [m]
+    yaw_tolerance: float  # [rad]
 
 
 class Weights(NamedTuple):
@@ -52,18 +53,28 @@ class Weights(NamedTuple):
 
 @kernel
 def of_place(
-    model: Model, weights: Weights, scene: Scene, room: float, away: float, x: float, y: float
+    weights: Weights, scene: Scene, room: float, away: float, x: float, y: float, yaw: float
 ) -> float:
-    """What it costs to be here for a second, with obstacles and moving things so far away [m]."""
+    """What it costs to be here for a second, with obstacles and moving things so far away [m].
+
+    A second before it has arrived costs, or it would put off the last turn for ever.
+    """
     cost = 0.0
     if room < ROOM:
         cost += weights.near * math.exp((weights.margin - room) / weights.near_over)
     if away < NO_DISC:
         cost += weights.disc * math.exp(-away / weights.disc_over)
-    dx, dy = x - scene.goal_x, y - scene.goal_y
-    if dx * dx + dy * dy > scene.tolerance * scene.tolerance:
+    if not _arrived(scene, x, y, yaw):
         cost += 0.5 * SECOND
     return cost
+
+
+@kernel
+def _arrived(scene: Scene, x: float, y: float, yaw: float) -> bool:
+    if math.hypot(x - scene.goal_x, y - scene.goal_y) > scene.tolerance:
+        return False
+    any_yaw = math.isnan(scene.goal_yaw)
+    return any_yaw or _turn_between(yaw, scene.goal_yaw) <= scene.yaw_tolerance
 
 
 @kernel

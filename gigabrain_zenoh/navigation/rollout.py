@@ -114,7 +114,7 @@ def drive(
             cost += TOUCHED_DISC * (1.0 - 0.6 * late) + rest(model, scene, x, y)
             alive = False
         else:
-            cost += dt * of_place(model, weights, scene, room, away, x, y)
+            cost += dt * of_place(weights, scene, room, away, x, y, yaw)
             cost += dt * of_motion(weights, room, vx, vy, w)
             if t % BRAKE_EVERY == 0:
                 cost += (

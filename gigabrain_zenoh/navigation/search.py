@@ -18,20 +18,24 @@ from gigabrain_zenoh.kernels import kernel
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
 
 DIAGONAL = math.sqrt(2.0)
-DOWN = (0, 0, 1, -1, 1, 1, -1, -1)  # by way: four straight, four diagonal
-RIGHT = (1, -1, 0, 0, 1, -1, 1, -1)
-LENGTH = (1.0, 1.0, 1.0, 1.0, DIAGONAL, DIAGONAL, DIAGONAL, DIAGONAL)
-PER_UNIT = 4.0  # buckets for a cost of 1
+DOWN = (0, -1, -1, -1, 0, 1, 1, 1)  # by way: round the compass, the odd ones are diagonal
+RIGHT = (1, 1, 0, -1, -1, -1, 0, 1)
+HALF = (0.5, DIAGONAL / 2, 0.5, DIAGONAL / 2, 0.5, DIAGONAL / 2, 0.5, DIAGONAL / 2)  # its length
+ONWARD = 2  # ways to either side of that by which a cell was reached: behind, nothing is cheaper
+PER_UNIT = 12.0  # buckets for a cost of 1
 BUCKETS = 4096  # in a ring: they hold more than any one step can add
 SAME = 1e-10  # sums of the same numbers in another order differ by less
 SPARE = 1024
 ROOT = 8  # the way came from nowhere: it began here
+DONE = 16  # and more: the cell was settled
+TURN = 32  # and more: of this search
 NOWHERE = -1
 FULL = -1  # no room for more entries
+ANYWHERE = (NOWHERE, NOWHERE)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
-Bytes = NDArray[np.int8]
+Cell = tuple[int, int]  # row, column
 Way = Literal["from", "to"]
 
 
@@ -42,125 +46,124 @@ class Search:
         self._shape = (0, 0)
         self._turn = 0
         self._g: Floats = np.empty(0)
-        self._came: Bytes = np.empty(0, np.int8)
-        self._seen: Ints = np.empty(0, np.int32)  # twice the turn; one more when done with
+        self._mark: Ints = np.empty(0, np.int32)  # by what way each was reached, and in what turn
         self._first: Ints = np.empty(BUCKETS, np.int32)  # by bucket, the entry on top
-        self._entries: Ints = np.empty((2, 0), np.int32)  # the cell of each, and the one below
+        self._entries: Ints = np.empty((3, 0), np.int32)  # row, column, and the entry below
 
-    def path(self, cost: Costs, start: tuple[int, int], goal: tuple[int, int]) -> Ints | None:
+    def path(self, cost: Costs, start: Cell, goal: Cell) -> Ints | None:
         """The cheapest way from cell to cell (row, column), (n, 2); None when there is none."""
         target = goal[0] * cost.shape[1] + goal[1]
-        self._run(cost, start, target, reverse=False)
-        if self._seen[target] != 2 * self._turn + 1:
+        self._run(cost, start, goal, reverse=False)
+        if self._mark[target] < TURN * self._turn + DONE:
             return None
-        cells = _trace(self._came, cost.shape[1], target)
+        cells = _trace(self._mark, cost.shape[1], target)
         return np.column_stack(np.divmod(cells, np.int32(cost.shape[1])))
 
-    def field(self, cost: Costs, cell: tuple[int, int], way: Way) -> Floats:
+    def field(self, cost: Costs, cell: Cell, way: Way) -> Floats:
         """What the cheapest way costs, "to" `cell` from each or "from" it; inf where none leads.
 
         (height, width), in cells: times the resolution it is metres at cost 1.
         """
-        self._run(cost, cell, NOWHERE, reverse=way == "to")
-        field = np.where(self._seen == 2 * self._turn + 1, self._g, np.inf)
+        self._run(cost, cell, ANYWHERE, reverse=way == "to")
+        field = np.where(self._mark >= TURN * self._turn + DONE, self._g, np.inf)
         return field.reshape(cost.shape)
 
-    def reach(self, cost: Costs, start: tuple[int, int]) -> None:
+    def reach(self, cost: Costs, start: Cell) -> None:
         """Go wherever a way leads from `start`, for `nearest` to be asked."""
-        self._run(cost, start, NOWHERE, reverse=False)
+        self._run(cost, start, ANYWHERE, reverse=False)
 
-    def nearest(self, cost: Costs, row: float, column: float) -> tuple[int, int] | None:
+    def nearest(self, cost: Costs, row: float, column: float) -> Cell | None:
         """The cell nearest to a place of all that the last search reached, where the body fits."""
-        found = _nearest(cost, self._seen, 2 * self._turn + 1, self._g, row, column)
+        found = _nearest(cost, self._mark, TURN * self._turn + DONE, self._g, row, column)
         return None if found == NOWHERE else divmod(found, cost.shape[1])
 
-    def _run(self, cost: Costs, start: tuple[int, int], target: int, *, reverse: bool) -> None:
+    def _run(self, cost: Costs, start: Cell, target: Cell, *, reverse: bool) -> None:
         if cost.shape != self._shape:
             self._make_room(cost.shape)
         cost = np.ascontiguousarray(cost)
-        at = start[0] * cost.shape[1] + start[1]
         while True:
             self._turn += 1
-            mine = (self._g, self._came, self._seen, self._first, self._entries)
-            if _search(cost, at, target, reverse, 2 * self._turn, *mine) != FULL:
+            mine = (self._g, self._mark, self._first, self._entries)
+            if _search(cost, start, target, reverse, TURN * self._turn, *mine) != FULL:
                 return
-            self._entries = np.empty((2, 2 * self._entries.shape[1]), np.int32)
+            self._entries = np.empty((3, 2 * self._entries.shape[1]), np.int32)
 
     def _make_room(self, shape: tuple[int, ...]) -> None:
         """Memory for a grid. What no search comes to is never touched, and costs nothing."""
         size = shape[0] * shape[1]
         self._shape, self._turn = (shape[0], shape[1]), 0
         self._g = np.empty(size)
-        self._came = np.empty(size, np.int8)
-        self._seen = np.zeros(size, np.int32)
-        self._entries = np.empty((2, size + SPARE), np.int32)
+        self._mark = np.zeros(size, np.int32)
+        self._entries = np.empty((3, size + SPARE), np.int32)
 
 
 @kernel
 def _search(
     cost: Costs,
-    start: int,
-    target: int,
+    start: Cell,
+    target: Cell,
     reverse: bool,
     turn: int,
     g: Floats,
-    came: Bytes,
-    seen: Ints,
+    mark: Ints,
     first: Ints,
     entries: Ints,
 ) -> int:
-    """Fill `g` and `came` until nothing makes the way to `target` cheaper. How many, or FULL."""
+    """Fill `g` and `mark` until nothing makes the way to `target` cheaper. How many, or FULL."""
     (height, width), flat = cost.shape, cost.ravel()
     first[:] = NOWHERE
-    g[start], came[start], seen[start] = 0.0, ROOT, turn
-    now = int(_least(start // width, start % width, target, width) * PER_UNIT)
-    _put(first, entries, 0, now, start)
+    at, best = start[0] * width + start[1], np.inf  # what the way to `target` costs, so far
+    g[at], mark[at] = 0.0, turn + ROOT
+    now = int(_least(start[0], start[1], target) * PER_UNIT)
+    _put(first, entries, 0, now, start[0], start[1])
     free, used, count, settled = NOWHERE, 1, 1, 0
     while count:
         top = first[now % BUCKETS]
         if top == NOWHERE:
             now += 1
             continue
-        cell, first[now % BUCKETS] = entries[0, top], entries[1, top]
-        entries[1, top], free, count = free, top, count - 1
-        row, column = cell // width, cell % width
-        if seen[cell] == turn + 1:
+        row, column, first[now % BUCKETS] = entries[0, top], entries[1, top], entries[2, top]
+        entries[2, top], free, count = free, top, count - 1
+        cell = row * width + column
+        base, here, way = g[cell], flat[cell], mark[cell] - turn
+        if way >= DONE:
             continue  # a duplicate: it was reached at less meanwhile
-        base, half = g[cell], 0.5 * flat[cell]
-        if target >= 0 and seen[target] >= turn and cell != target:
-            least = base + _least(row, column, target, width)
-            if least >= g[target] - SAME:
-                continue
-        seen[cell] = turn + 1
+        if base + _least(row, column, target) >= best - SAME and (row, column) != target:
+            continue
+        mark[cell] += DONE
         settled += 1
-        for way in range(8):
-            down, right = row + DOWN[way], column + RIGHT[way]
+        begin, end = (0, 8) if way == ROOT else (way - ONWARD, way + ONWARD + 1)
+        for onward in range(begin, end):
+            to = onward & 7
+            down, right = row + DOWN[to], column + RIGHT[to]
             if not (0 <= down < height and 0 <= right < width):
                 continue
             other = down * width + right
-            found = base + LENGTH[way] * (half + 0.5 * flat[other])
-            if seen[other] >= turn and found >= g[other] - SAME:
+            found = base + HALF[to] * here + HALF[to] * flat[other]
+            if mark[other] >= turn and found >= g[other] - SAME:
                 continue
             if not _leads(flat, cell, other, row * width + right, down * width + column, reverse):
                 continue
-            g[other], came[other], seen[other] = found, way, turn
-            key = int((found + _least(down, right, target, width)) * PER_UNIT)
+            g[other], mark[other] = found, turn + to
+            if (down, right) == target:
+                best = found
             if free != NOWHERE:
-                entry, free = free, entries[1, free]
+                entry, free = free, entries[2, free]
             elif used < entries.shape[1]:
                 entry, used = used, used + 1
             else:
                 return FULL
-            _put(first, entries, entry, max(now, key), other)
+            key = int((found + _least(down, right, target)) * PER_UNIT)
+            _put(first, entries, entry, max(now, key), down, right)
             count += 1
     return settled
 
 
 @kernel
-def _put(first: Ints, entries: Ints, entry: int, bucket: int, cell: int) -> None:
+def _put(first: Ints, entries: Ints, entry: int, bucket: int, row: int, column: int) -> None:
     """Lay `entry`, for a cell, on top of a bucket."""
-    entries[0, entry], entries[1, entry] = cell, first[bucket % BUCKETS]
-    first[bucket % BUCKETS] = entry
+    entries[0, entry], entries[1, entry] = row, column
+    entries[2, entry], first[bucket % BUCKETS] = first[bucket % BUCKETS], entry
 
 
 @kernel
@@ -177,37 +180,37 @@ def _may(source: float, into: float) -> bool:
 
 
 @kernel
-def _least(row: int, column: int, target: int, width: int) -> float:
+def _least(row: int, column: int, target: Cell) -> float:
     """What the way to `target` costs at least: nowhere costs less than 1."""
-    if target == NOWHERE:
+    if target[0] == NOWHERE:
         return 0.0
-    down, right = abs(row - target // width), abs(column - target % width)
+    down, right = abs(row - target[0]), abs(column - target[1])
     return down + (DIAGONAL - 1) * right if down > right else right + (DIAGONAL - 1) * down
 
 
 @kernel
-def _trace(came: Bytes, width: int, target: int) -> Ints:
+def _trace(mark: Ints, width: int, target: int) -> Ints:
     """The cells from the start to `target`, (n,)."""
     count, cell = 1, target
-    while came[cell] != ROOT:
-        cell -= DOWN[came[cell]] * width + RIGHT[came[cell]]
+    while mark[cell] % DONE != ROOT:
+        cell -= DOWN[mark[cell] % DONE] * width + RIGHT[mark[cell] % DONE]
         count += 1
     cells = np.empty(count, np.int32)
     cell = target
     for i in range(count - 1, 0, -1):
         cells[i] = cell
-        cell -= DOWN[came[cell]] * width + RIGHT[came[cell]]
+        cell -= DOWN[mark[cell] % DONE] * width + RIGHT[mark[cell] % DONE]
     cells[0] = cell
     return cells
 
 
 @kernel
-def _nearest(cost: Costs, seen: Ints, done: int, g: Floats, row: float, column: float) -> int:
+def _nearest(cost: Costs, mark: Ints, done: int, g: Floats, row: float, column: float) -> int:
     """The cell that was settled and is nearest; of equals the one that is cheaper to reach."""
     best, least, flat = NOWHERE, np.inf, cost.ravel()
     width = cost.shape[1]
     for cell in range(flat.size):
-        if seen[cell] == done and flat[cell] < LETHAL:
+        if mark[cell] >= done and flat[cell] < LETHAL:
             away = (cell // width - row) ** 2 + (cell % width - column) ** 2
             if away < least or (away == least and g[cell] < g[best]):
                 best, least = cell, away
