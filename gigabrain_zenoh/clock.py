@@ -23,12 +23,16 @@ class Clock:
         await asyncio.sleep(duration_ns / 1e9)
 
     async def every(self, period_ns: int) -> AsyncIterator[int]:
-        """Yield the current time [ns] each period. Missed periods are skipped, not caught up."""
+        """Yield the current time [ns] each period. Missed periods are skipped, not caught up.
+
+        What follows comes at whole periods from the first again, however late one has been.
+        """
         due = self.now_ns()
         while True:
-            yield self.now_ns()
-            due = max(due + period_ns, self.now_ns())
-            await self.sleep_ns(due - self.now_ns())
+            now = self.now_ns()
+            yield now
+            due += period_ns * max(1, (now - due) // period_ns + 1)
+            await self.sleep_ns(max(0, due - self.now_ns()))
 
 
 class FakeClock(Clock):
@@ -64,6 +68,10 @@ class FakeClock(Clock):
                 wake.set_result(None)
             await self._settle()
         self._now = end
+
+    def stall(self, duration_ns: int) -> None:
+        """Let time pass in which nobody is woken, as on a machine that stands still."""
+        self._now += duration_ns
 
     async def _settle(self) -> None:
         for _ in range(10):  # more hand-overs than any node needs between two sleeps

@@ -48,7 +48,10 @@ def _find(node: Node, type_: Any, path: str, key_line: int) -> Fault | None:
 
 
 def _own_fault(node: Node, path: str, line: int, text: str) -> Fault:
-    """What a Struct says of itself; `FIELD: ...` or `FIELD[2]: ...` is about that very line."""
+    """What a Struct says of itself; `FIELD: ...` or `FIELD[2]: ...` is about that very line.
+
+    Else it is about the first field that it names and that stands in the file.
+    """
     match = re.match(r"(\w+)(?:\[(\d+)\])?: ", text)
     for entry in node.entries or ():
         if match and entry.key == match[1]:
@@ -56,7 +59,9 @@ def _own_fault(node: Node, path: str, line: int, text: str) -> Fault:
             number = int(match[2]) if match[2] else len(items)
             at = items[number].line if number < len(items) else entry.line
             return Fault(at, _join(path, text))
-    return Fault(line, _at(path, text))
+    lines = {entry.key: entry.line for entry in node.entries or ()}
+    named = (lines[word] for word in re.findall(r"\w+", text) if word in lines)
+    return Fault(next(named, line), _at(path, text))
 
 
 def _wrong_tag(node: Node, structs: list[Any], path: str, key_line: int) -> Fault | None:

@@ -13,7 +13,7 @@ def located(path: Path, error: ConfigError) -> ConfigError:
     if named := re.match(r"no \w+ ('.*?');", str(error)):
         for node in _scalars(config_yaml.read(path.read_text(encoding="utf-8"))):
             if repr(node.value) == named[1]:
-                return ConfigError(f"{path}:{node.line}: {error}")
+                return type(error)(f"{path}:{node.line}: {error}")
     return error
 
 

@@ -90,5 +90,5 @@ def got(node: Node) -> str:
 def nearest(name: object, known: Iterable[Any]) -> str:
     """`; did you mean 'turn'?` where something known is near, or nothing."""
     names = [k for k in known if isinstance(k, str)]
-    close = difflib.get_close_matches(name, names, 1, 0.5) if isinstance(name, str) else []
+    close = difflib.get_close_matches(name, names, 1, 0.6) if isinstance(name, str) else []
     return f"; did you mean {close[0]!r}?" if close else ""

@@ -5,12 +5,13 @@ import contextlib
 import sys
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from msgspec import Struct
 
+from gigabrain_zenoh import results
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
@@ -18,7 +19,7 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.launch import STOP_S
 from gigabrain_zenoh.live_view import HeadlessView, LiveView, View
 from gigabrain_zenoh.logs import new_run_dir
-from gigabrain_zenoh.report import Observed, Report, check_place, make_report, summary, write_report
+from gigabrain_zenoh.report import Observed, Report, make_report, summary
 from gigabrain_zenoh.running import announced
 from gigabrain_zenoh.specs import process_specs
 from gigabrain_zenoh.stop_signals import stop_signals
@@ -27,6 +28,10 @@ from gigabrain_zenoh.watch import Watch
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 LOOK_S = 0.1  # how often the run is looked at
+RELEASE_FIRST = (
+    "a real body drives only when somebody has released and enabled it: while the demo runs, in "
+    "another terminal, `gigabrain release` and `gigabrain enable`"
+)
 STALLED_S = 60.0  # without a tick of the robot's clock
 ANSWER_S, HASTY_S = 5.0, 0.2  # how long the truth may take; and once a person wants it to end
 
@@ -45,8 +50,7 @@ class Demo:
 
     def __init__(self, deployment: Deployment, options: DemoOptions) -> None:
         self._deployment, self._options = with_free_port(deployment), options
-        if options.report:
-            check_place(options.report)
+        results.check_place(options.report)
         self._run_dir = new_run_dir(None, "demo")
         specs = process_specs(
             self._deployment,
@@ -60,6 +64,7 @@ class Demo:
         self._failures: list[str] = []
         self._refusal = ""  # what a process said before it ended
         self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
+        self._last_fault = ""  # before all were asked to end, the driver's first
 
     async def run(self) -> int:
         """The exit code: 0 for a run without contact, with motion, with all processes alive.
@@ -102,13 +107,20 @@ class Demo:
                 view.show()
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), LOOK_S)
-                if watch.seconds != seconds:
+                if watch.seconds != seconds or self._starting:
                     moved_s, seconds = loop.time(), watch.seconds
                 elif loop.time() - moved_s > STALLED_S:
                     self._failures.append(f"the robot's clock stood still for {STALLED_S:.0f} s")
                     break
             view.show()
+        self._last_fault = newest_fault(text for _, text in self._faults)
         return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)
+
+    @property
+    def _starting(self) -> bool:
+        """Whether a process is on its way: the very first start compiles, and time may wait."""
+        statuses = self._supervisor.statuses.values()
+        return any(status.state in ("waiting", "starting") for status in statuses)
 
     def _over(self, watch: Watch) -> bool:
         seconds = self._options.seconds
@@ -160,9 +172,8 @@ class Demo:
             self._faults.append((time.monotonic(), text))
 
     def _finish(self, report: Report | None, *, stopped: bool) -> int:
-        if report and self._options.report:
-            write_report(report, self._options.report)
         if report:
+            results.write(report, self._options.report)
             print(summary(report))
         if stopped and report is None:
             print("ended; the driver did not answer, so there is no report", file=sys.stderr)
@@ -175,5 +186,16 @@ class Demo:
         if report is None:
             reason = self._failures[-1] if self._failures else "the driver did not answer"
             raise BodyLost(f"no report: {reason}; logs in {self._run_dir}")
-        print(f"logs in {self._run_dir}", file=sys.stderr)
+        if self._last_fault:
+            print(f"newest fault: {self._last_fault}", file=sys.stderr)
+        if self._deployment.link == "real":
+            print(RELEASE_FIRST, file=sys.stderr)
+        why = f"{self._failures[-1]}; " if self._failures else ""
+        print(f"{why}logs in {self._run_dir}", file=sys.stderr)
         return 1
+
+
+def newest_fault(texts: Iterable[str]) -> str:
+    """The one that tells most of why nothing moved: the driver's newest, else the newest at all."""
+    newest = list(texts)[::-1]
+    return next((text for text in newest if text.startswith("driver:")), "".join(newest[:1]))

@@ -9,6 +9,7 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_zenoh import config
+from gigabrain_zenoh.addresses import exposed, host_and_port
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.keys.checks import check_identity
 from gigabrain_zenoh.keys.files import identity_folder
@@ -46,7 +47,6 @@ ROBOT: tuple[ProcessName, ...] = (
     "router", "driver", "perception", "decision", "control", "safety",
 )  # fmt: skip
 ALL: tuple[ProcessName, ...] = (*ROBOT, "recorder", "page", "foxglove")
-LOOPBACK = ("127.", "localhost", "[::1]")
 
 
 class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -76,29 +76,35 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if not self.hosts:
             raise ValueError("hosts: expected at least one, with the processes that it runs")
-        if len(self.hosts) > 1 and self.router.endswith(":0"):
-            raise ValueError(f"router {self.router}: several hosts must know its port")
         placed = [name for names in self.hosts.values() for name in names]
         twice = sorted({name for name in placed if placed.count(name) > 1})
         if twice:
-            raise ValueError(f"{', '.join(twice)} must run once, on one host")
+            raise ValueError(f"hosts: {', '.join(twice)} must run once, on one host")
         if BUTTON in placed and self.button is None:
             raise ValueError("hosts: a button runs nowhere unless `button: {port: …}` says which")
         if self.button and self.speed != 1.0:
             raise ValueError("button: a person presses it in real time, so leave out `speed`")
-        address = self.router.partition("/")[2]
-        if not (self.insecure or self.keys) and not address.startswith(LOOPBACK):
-            raise ValueError(
-                f"router {self.router} can be reached by anybody on the network; "
-                "name `keys:` that `gigabrain keys new` and `keys issue` made, use a loopback "
-                "address, or write `insecure: true`"
-            )
+        self._check_router()
         if self.fleet and not self.namespace:
             raise ValueError("fleet: this robot needs a namespace of its own as well")
         if self.resume == "auto" and self.link == "real":
             raise ValueError("resume: auto is for simulation; a real body is enabled by a person")
         if self.speed != 1.0 and self.link != "sim":
             raise ValueError("speed is for the simulation; other links run in real time")
+
+    def _check_router(self) -> None:
+        try:
+            host, port = host_and_port(self.router)
+        except ValueError as error:
+            raise ValueError(f"router: {error}") from None
+        if len(self.hosts) > 1 and host and not port:
+            raise ValueError(f"router: {self.router}: several hosts must know its port")
+        if exposed((self.router,)) and not (self.insecure or self.keys):
+            raise ValueError(
+                f"router: {self.router} can be reached by anybody on the network; "
+                "name `keys:` that `gigabrain keys new` and `keys issue` made, use a loopback "
+                "address, or write `insecure: true`"
+            )
 
 
 def deployment_folder() -> Path:

@@ -29,7 +29,7 @@ from gigabrain_zenoh.gate_state import (
     Tick,
     status,
 )
-from gigabrain_zenoh.limits import ZERO, clamp, ramp
+from gigabrain_zenoh.limits import ZERO, clamp, ramp, slowed
 
 __all__ = [
     "BRAIN",
@@ -92,6 +92,7 @@ def _tick(config: GateConfig, state: GateState, event: Tick) -> GateState:
         issued_ns=issued[-ISSUED_TICKS:],
         faults=event.faults,
         still_ticks=state.still_ticks + 1 if at_rest(event.measured) else 0,
+        late=event.late,
         before=state.output,
     )
     if state.mode == "enabled":
@@ -146,7 +147,11 @@ def _enabled(state: GateState, source: str) -> GateState:
 
 
 def _output(config: GateConfig, state: GateState) -> Velocity:
-    """One step from what the body was told in the last tick, however much happens in this one."""
+    """One step from what the body was told in the last tick, however much happens in this one.
+
+    Ticks that are made up for come all at once: a stop takes the steps that it has missed, but the
+    body is not sped up by several of them within a moment.
+    """
     if state.mode in ("latched", "idle"):
         return ZERO
     target, asked = ZERO, state.command
@@ -157,7 +162,8 @@ def _output(config: GateConfig, state: GateState) -> Velocity:
             config.limits,
             state.safety.caps,
         )
-    return ramp(state.before, target, config.limits, TICK_S)
+    change = slowed if state.late else ramp
+    return change(state.before, target, config.limits, TICK_S)
 
 
 def _command(state: GateState, event: Command) -> tuple[GateState, Outcome]:

@@ -44,6 +44,7 @@ class GateState(msgspec.Struct, frozen=True, kw_only=True):
     still_ticks: int = 0
     healthy_ticks: int = 0
     nan_ticks: tuple[int, ...] = ()
+    late: bool = False  # whether this tick is one that was missed and is made up for
     before: Velocity = ZERO  # what the body was told in the last tick
     output: Velocity = ZERO  # what the body is to be told now
 
@@ -54,6 +55,7 @@ class Tick(msgspec.Struct, frozen=True):
     measured: Velocity
     wall_ns: int | None = None
     faults: tuple[Cause, ...] = ()  # what the driver itself knows to be wrong
+    late: bool = False  # it was missed and is made up for, right behind another one
 
 
 class Command(msgspec.Struct, frozen=True):

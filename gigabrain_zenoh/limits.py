@@ -75,6 +75,24 @@ def ramp(current: Velocity, target: Velocity, limits: Limits, dt: float) -> Velo
     )
 
 
+def slowed(current: Velocity, target: Velocity, limits: Limits, dt: float) -> Velocity:
+    """The same where nothing may speed up: an axis on its way to more, or round, stays as it is."""
+    return ramp(
+        current,
+        Velocity(
+            linear_x=_no_faster(current.linear_x, target.linear_x),
+            linear_y=_no_faster(current.linear_y, target.linear_y),
+            angular_z=_no_faster(current.angular_z, target.angular_z),
+        ),
+        limits,
+        dt,
+    )
+
+
+def _no_faster(current: float, target: float) -> float:
+    return target if min(0.0, current) <= target <= max(0.0, current) else current
+
+
 def _within(value: float, limit: float, below: float | None, above: float | None) -> float:
     lowest = -limit if below is None else -min(limit, below)
     highest = limit if above is None else min(limit, above)

@@ -26,7 +26,6 @@ from gigabrain_zenoh.mapping.known import Chart, KnownMap
 from gigabrain_zenoh.mapping.localizer import Place, View
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between
-from gigabrain_zenoh.mapping.warm import warm_up
 from gigabrain_zenoh.percentile import Newest
 from gigabrain_zenoh.perception import beams, hits
 from gigabrain_zenoh.settings import PerceptionConfig
@@ -68,7 +67,6 @@ class Mapper:
     def __init__(self, config: PerceptionConfig, bus: Bus, bodies: Latest[Body]) -> None:
         self._config, self._bus, self._bodies = config, bus, bodies
         self._chart = chart_of(config)
-        warm_up()
         self._fusion, self._boot = Fusion(), 0
         self._last: Moment | None = None  # of the last scan that was taken
         self._shown: OccupancyGrid | None = None
@@ -88,6 +86,10 @@ class Mapper:
             self._leave_out("there is no odometry for its tick")
         else:
             self._take(scan, moment)
+
+    def miss(self, scan: LaserScan, tick: int) -> None:
+        """Leave out a scan whose tick has not come by `tick`, when the next scan has."""
+        self._leave_out(f"it claims to be of tick {scan.basis}, which had not come by tick {tick}")
 
     def close(self) -> None:
         """End what runs beside."""

@@ -7,7 +7,7 @@ from collections import deque
 import numpy as np
 
 from gigabrain_schemas.arrays import hits
-from gigabrain_schemas.base import Pose
+from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.tasks import Goal
@@ -17,9 +17,11 @@ from gigabrain_zenoh.behaviours.bearings import Bearings, Driven, Route
 from gigabrain_zenoh.behaviours.guide import Asked, Guide
 from gigabrain_zenoh.behaviours.navigate import Navigate, moved
 from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.compiling import compiled
 from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate_state import BRAIN
+from gigabrain_zenoh.lateness import Lateness
 from gigabrain_zenoh.navigation import local, planner
 from gigabrain_zenoh.navigation.moment import Sent
 from gigabrain_zenoh.planar import compose, inverse
@@ -38,7 +40,6 @@ SMALL = 250_000  # cells; plans in larger maps are made in a thread
 AGAIN_TICKS = 25  # a route is looked at twice a second, whatever happens
 NO_MAP = "nobody says where in a map the robot is; set perception: {mapping: slam} in its file"
 PATIENCE_NS, LOOK_NS = 700_000_000, 50_000_000  # for the first word of the place, when asked
-QUIET_S = 5.0  # of compiling, before people are told
 
 ANY_BODY = BodyDescription(
     robot_type="any", drive_type="differential",
@@ -54,6 +55,8 @@ class Navigating:
     def __init__(self, config: DecisionConfig, bus: Bus) -> None:
         self._bus, self._config = bus, config
         self._response, self._history = ResponseEstimator(), PoseHistory()
+        self._states: deque[RobotState] = deque(maxlen=SENT_TICKS)
+        self._lateness = Lateness()
         self._places: Earlier[PoseInMap] = Earlier()
         self._maps: deque[OccupancyGrid] = deque(maxlen=2)
         self._bodies = bus.latest(BODY)
@@ -72,16 +75,13 @@ class Navigating:
 
     async def warm_up(self) -> None:
         """Compile all that a driving robot calls."""
-        compiling = asyncio.ensure_future(asyncio.to_thread(warm_up))
-        done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
-        if not done:
-            told = {"event": "compiling"}
-            log.info("compiling: the first start takes about a minute", extra={"data": told})
-        await compiling
+        await compiled(warm_up)
 
     def see(self, state: RobotState) -> None:
         """Take note of each state."""
         self._history = self._history.then(state)
+        self._states.append(state)
+        self._lateness.sees(state.boot, state.tick)
         self._response.state(state)
         body = self._bodies.current
         if body and not self._hears_commands:
@@ -94,11 +94,13 @@ class Navigating:
     ) -> Situation:
         """Where the robot is, what it is to do, and which way."""
         if self._config.begin == "roam" and not self._begun:
-            self._service.begin(roaming(), "roaming")
+            self._service.begin(roaming(), "roaming", state.boot)
         self._begun = True
-        order = self._service.step(state, self._outcome)
-        self._outcome = None
         tick = world.basis if world else state.tick
+        order = self._service.step(state, self._outcome, tick)
+        self._outcome = None
+        if world:
+            self._lateness.thinks(state.tick, tick)
         pose, place = self._history.at(state.boot, tick), self._place(state.boot, tick)
         body = self._bodies.current
         map_from_odom, lost = place if pose else (None, "the odometry of the scan is missing")
@@ -110,7 +112,8 @@ class Navigating:
         bearings = Bearings(
             tick=tick,
             late_ticks=state.tick - tick,
-            velocity=state.velocity,
+            delayed=self._lateness.seconds,
+            velocity=self._velocity(state, tick),
             body=body.description if body else None,
             map_from_odom=map_from_odom,
             lost=lost,
@@ -155,6 +158,11 @@ class Navigating:
     def _lost(self) -> str:
         _, why = self._place(self._bus.time.boot, self._bus.time.tick)
         return why or "nobody has sent a map yet; try again"
+
+    def _velocity(self, state: RobotState, tick: int) -> Velocity:
+        """The speed measured at a tick, or last before it; of a scan long past, the newest."""
+        known = (one for one in reversed(self._states) if one.boot == state.boot)
+        return next((one.velocity for one in known if one.tick <= tick), state.velocity)
 
     def _place(self, boot: int, tick: int) -> tuple[Pose | None, str]:
         """The odometry's frame in the map, or why that is not known."""

@@ -16,6 +16,7 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
 from gigabrain_zenoh.bus import Bus, Latest
+from gigabrain_zenoh.compiling import compiled
 from gigabrain_zenoh.obstacles.surroundings import Surroundings
 from gigabrain_zenoh.placed_scans import PlacedScans
 from gigabrain_zenoh.settings import PerceptionConfig
@@ -161,7 +162,9 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         await bus.failed
         return
     from gigabrain_zenoh.mapper import Mapper  # numba and gtsam: only who makes maps pays
+    from gigabrain_zenoh.mapping.warm import warm_up
 
+    await compiled(warm_up)
     with closing(Mapper(config, bus, body)) as mapper:
         _follow(config, bus, body, mapper)
         ready()
@@ -184,6 +187,6 @@ def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body], mapper: "Map
         mapper.hear(state)
         placed.state(state)
 
-    placed = PlacedScans(see)
+    placed = PlacedScans(see, lambda scan: mapper.miss(scan, bus.time.tick))
     bus.latest(STATE, hear)
     bus.latest(SCAN, placed.scan)

@@ -11,33 +11,31 @@ import importlib
 import logging
 import os
 import sys
-from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from gigabrain_schemas.topics import CMD_VEL, INTENT, LOG, SAFETY, STATE
+from gigabrain_schemas.topics import LOG
 from gigabrain_zenoh import lifeline, logs
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, unknown
 from gigabrain_zenoh.health import answer_to_name, publish_health
 from gigabrain_zenoh.heartbeat import beat
-from gigabrain_zenoh.keys.checks import identity_in
+from gigabrain_zenoh.meeting import join
 from gigabrain_zenoh.param_service import serve_params
 from gigabrain_zenoh.process_config import ProcessConfig
-from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.transport import Transport
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
+from gigabrain_zenoh.unobtrusive import NAP_S, step_aside
 
 log = logging.getLogger("gigabrain")
 
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 MakeBus = Callable[[Transport, Clock, str], Bus]
-PATIENCE_S = 1.0  # how long the router may be missing before somebody is told
 
 # Zenoh's work in one thread, sending apart: a message wakes half as many threads on its way. A
 # documented variable of Zenoh's (zenoh_runtime::ZRuntime); whoever sets it has the last word.
@@ -50,7 +48,7 @@ class Program:
 
     run: str
     settings: str = ""
-    at_most_hz: Mapping[str, float] = field(default_factory=dict)  # of what it only shows
+    looks_on: bool = False  # the robot does without it: it naps, and lets the others go first
 
 
 PROGRAMS = {
@@ -68,17 +66,17 @@ PROGRAMS = {
     "control": Program("gigabrain_zenoh.control:run"),
     "safety": Program("gigabrain_zenoh.safety:run"),
     "recorder": Program(
-        "gigabrain_zenoh.recording.node:run", "gigabrain_zenoh.settings:RecorderConfig"
+        "gigabrain_zenoh.recording.node:run",
+        "gigabrain_zenoh.settings:RecorderConfig",
+        looks_on=True,
     ),
     "page": Program(
-        "gigabrain_zenoh.page.node:run",
-        "gigabrain_zenoh.settings:PageConfig",
-        {STATE.key: 20.0, INTENT.key: 6.0, SAFETY.key: 11.0},
+        "gigabrain_zenoh.page.node:run", "gigabrain_zenoh.settings:PageConfig", looks_on=True
     ),
     "foxglove": Program(
         "gigabrain_zenoh.foxglove_bridge.node:run",
         "gigabrain_zenoh.settings:FoxgloveConfig",
-        {STATE.key: 20.0, INTENT.key: 11.0, SAFETY.key: 11.0, CMD_VEL.key: 11.0},
+        looks_on=True,
     ),
 }
 
@@ -116,6 +114,8 @@ def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
         run_dir = Path(config.run_dir) if config.run_dir else None
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
         node = node_of(config)
+        if PROGRAMS[config.name].looks_on:
+            step_aside()  # before there are threads, which inherit it
         with asyncio.Runner(loop_factory=loop_factory()) as runner:
             runner.run(_run(config, node, make_bus))
     except GigabrainError as error:
@@ -149,9 +149,9 @@ async def _run(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
 
 
 async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
-    shown = PROGRAMS[config.name].at_most_hz
-    endpoint = msgspec.structs.replace(config.endpoint, at_most_hz=dict(shown))
-    bus = make_bus(await _connect(endpoint), Clock(), config.name)
+    nap_s = NAP_S if PROGRAMS[config.name].looks_on else 0.0
+    endpoint = msgspec.structs.replace(config.endpoint, nap_s=nap_s)
+    bus = make_bus(await join(endpoint), Clock(), config.name)
     handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
     logging.getLogger().addHandler(handler)
     try:
@@ -178,28 +178,6 @@ def _ready() -> None:
     gc.freeze()  # what set-up made stays: collections look at new objects only
     gc.enable()
     log.info("ready", extra={"data": {"event": "ready", "pid": os.getpid()}})
-
-
-async def _connect(endpoint: Endpoint) -> ZenohTransport:
-    """Open the session, and say so once when that takes longer than a person would wait.
-
-    Raises ConfigError where our own keys are the reason.
-    """
-    opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
-    try:
-        done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
-        if not done:
-            if endpoint.keys:  # a router turns bad ones away without a word
-                await asyncio.to_thread(identity_in, Path(endpoint.keys))
-            where = ", ".join(endpoint.connect) or ", ".join(endpoint.listen)
-            log.warning(
-                "no router at %s yet; waiting for it (start one with: gigabrain router)",
-                where,
-                extra={"data": {"event": "waiting"}},
-            )
-        return await opening
-    finally:
-        opening.cancel()
 
 
 def main() -> None:

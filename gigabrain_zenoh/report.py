@@ -1,13 +1,9 @@
 """What a demo run came to."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
-import msgspec
 from msgspec import Struct
-
-from gigabrain_zenoh.errors import ConfigError
 
 MOTION_M = 0.05  # less than this is no motion
 
@@ -96,22 +92,6 @@ def _verdict(distance_m: float, contacts: int, deaths: int) -> str:
     if deaths:
         faults.append(f"{deaths} process{'es' if deaths > 1 else ''} died")
     return ", ".join(faults) or "ok"
-
-
-def check_place(path: Path) -> None:
-    """Before the run rather than after it. Raises ConfigError where no report can be written."""
-    if not path.parent.is_dir():
-        raise ConfigError(f"cannot write the report {path}: no such folder")
-    if path.is_dir():
-        raise ConfigError(f"cannot write the report {path}: it is a folder")
-
-
-def write_report(report: Report, path: Path) -> None:
-    """As JSON. Raises ConfigError where that cannot be written."""
-    try:
-        path.write_bytes(msgspec.json.format(msgspec.json.encode(report)) + b"\n")
-    except OSError as error:
-        raise ConfigError(f"cannot write the report {path}: {error.strerror}") from None
 
 
 def summary(report: Report) -> str:

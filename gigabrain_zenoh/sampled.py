@@ -10,7 +10,7 @@ from gigabrain_zenoh.freshness import CLOCK_KEYS
 
 M = TypeVar("M", bound=Message)
 
-SHOWN_NS = 500_000_000  # how old a message may be; who shows it gets few of them (process.py)
+SHOWN_NS = 500_000_000  # how old a message may be that is shown to people
 
 
 class Sampled(Generic[M]):

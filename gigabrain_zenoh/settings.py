@@ -1,5 +1,6 @@
 """The settings of the processes. Kept apart, so that reading a deployment file needs no numpy."""
 
+import re
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
@@ -20,7 +21,7 @@ class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     namespace: str = ""  # the robot's own part of the key space
     keys: str = ""  # the folder of an identity; without one, nobody asks who anybody is
     fleet: tuple[str, ...] = ()  # namespaces of other robots that a router serves
-    at_most_hz: dict[str, float] = {}  # of these keys the session hands on no more
+    nap_s: float = 0.0  # for how long what is tapped may gather before it is handed on
 
 
 class RouterConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -84,6 +85,10 @@ class ButtonConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     """The `button` part of a deployment file."""
 
     port: str  # of the USB-serial adapter: a path, or usb:VID:PID[:SERIAL]
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"usb:[0-9a-fA-F]+:[0-9a-fA-F]+(:.*)?|(?!usb:).*\S.*", self.port):
+            raise ValueError(f"port: expected a path, or usb:VID:PID[:SERIAL], got {self.port!r}")
 
 
 class PageConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

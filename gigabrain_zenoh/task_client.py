@@ -15,9 +15,10 @@ from gigabrain_schemas.tasks import (
 from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE
 from gigabrain_zenoh.asking import ANSWER_S
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.errors import BodyLost, Refused
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.keys.checks import may_not_ask
 
+LARGEST = 1e9  # as on the bus
 PLAN_S = 5.0  # how long a way through a large map may take to be found
 SILENT_S = 5.0  # without a word of the tasks
 OnNews = Callable[[TaskStatus], None]
@@ -35,7 +36,14 @@ class Tasks:
     async def go_to(
         self, x: float, y: float, yaw: float | None = None, *, how: How = "replace"
     ) -> str:
-        """Send the robot to a place in its map [m, m, rad]; the task's name. Raises Refused."""
+        """Send the robot to a place in its map [m, m, rad]; the task's name.
+
+        Raises ConfigError for what is no number, and Refused.
+        """
+        given = (x, y) if yaw is None else (x, y, yaw)
+        if not all(abs(value) <= LARGEST for value in given):
+            numbers = " ".join(f"{value:g}" for value in given)
+            raise ConfigError(f"a goal takes numbers up to {LARGEST:g}, got {numbers}")
         self._listen()
         request = GoalRequest(x=x, y=y, yaw=yaw, how=how, source=self._bus.process)
         replies = await self._bus.ask(GOAL, request, timeout_s=PLAN_S)

@@ -8,16 +8,16 @@ from typing import Any
 from msgspec import structs
 
 from gigabrain_schemas.topics import TOPICS
+from gigabrain_zenoh.addresses import LOCAL_ENDPOINT, host_and_port
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.acl import access_control, known_names
 from gigabrain_zenoh.keys.files import CA, CERTIFICATE, KEY, check_files
+from gigabrain_zenoh.keys.list_file import generations_in
 from gigabrain_zenoh.settings import Endpoint, RouterConfig
 
 SECURE, PLAIN = "tls/", "tcp/"
 PENDING = 4000  # links that may be on their way in; silent ones are dropped after a second
 FAR_TOO_LARGE = 4  # times a topic's bound
-IP_ENDPOINT = re.compile(r"(?:tcp|udp|tls|quic|ws)/[^/#?]+:(\d+)(?:[?#].*)?")
-LOCAL_ENDPOINT = re.compile(r"unixsock-stream/.+")
 
 
 def session_config(endpoint: Endpoint) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def session_config(endpoint: Endpoint) -> dict[str, Any]:
     if not endpoint.keys:
         return session_settings(endpoint)
     check_files(Path(endpoint.keys))
-    return session_settings(endpoint) | security(endpoint)
+    return session_settings(endpoint) | security(endpoint, generations_in(Path(endpoint.keys)))
 
 
 def session_settings(endpoint: Endpoint) -> dict[str, Any]:
@@ -71,8 +71,6 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
         config["low_pass_filter"] = [
             _small(size) for size in sorted({topic.max_bytes for topic in TOPICS})
         ]
-    if endpoint.at_most_hz:
-        config["downsampling"] = [_thinned(endpoint.at_most_hz)]
     if endpoint.namespace:
         config["namespace"] = endpoint.namespace
     return config
@@ -93,13 +91,7 @@ def _small(size: int) -> dict[str, Any]:
     }
 
 
-def _thinned(at_most_hz: Mapping[str, float]) -> dict[str, Any]:
-    """Zenoh's downsampling: what comes too fast is left out before Python hears of it."""
-    rules = [{"key_expr": f"**/{key}", "freq": hz} for key, hz in at_most_hz.items()]
-    return {"id": "thinned", "messages": ["put"], "flows": ["ingress"], "rules": rules}
-
-
-def security(endpoint: Endpoint) -> dict[str, Any]:
+def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, Any]:
     """What keys add to a session: TLS in both directions, and in a router who may do what."""
     folder, side = Path(endpoint.keys), "connect" if endpoint.connect else "listen"
     config: dict[str, Any] = {
@@ -112,7 +104,9 @@ def security(endpoint: Endpoint) -> dict[str, Any]:
         }
     }
     if endpoint.listen and not endpoint.connect:  # a relay is itself judged where it connects
-        config["access_control"] = access_control(robots_of(endpoint), endpoint.namespace)
+        config["access_control"] = access_control(
+            robots_of(endpoint), endpoint.namespace, generations
+        )
     return config
 
 
@@ -124,7 +118,9 @@ def robots_of(endpoint: Endpoint) -> tuple[str, ...]:
 
 def router_config(endpoint: Endpoint, state_dir: Path) -> RouterConfig:
     """What the router process has to know of the rights that its session enforces."""
-    knows = known_names(robots_of(endpoint)) if endpoint.keys else ()
+    if not endpoint.keys:
+        return RouterConfig(state_dir=str(state_dir))
+    knows = known_names(robots_of(endpoint), generations_in(Path(endpoint.keys)))
     return RouterConfig(state_dir=str(state_dir), knows=knows)
 
 
@@ -168,6 +164,7 @@ def plain(error: str) -> str:
 
 
 def _check(text: str) -> None:
-    address = IP_ENDPOINT.fullmatch(text)
-    if not LOCAL_ENDPOINT.fullmatch(text) and not (address and int(address[1]) < 2**16):
-        raise ConfigError(f"{text!r} is not a Zenoh endpoint; expected one like tcp/127.0.0.1:7447")
+    try:
+        host_and_port(text)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None

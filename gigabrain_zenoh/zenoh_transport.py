@@ -14,6 +14,7 @@ from gigabrain_zenoh.mailbox import Mailbox
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.staying import stay
 from gigabrain_zenoh.transport import Answer, Close, Link, OnLink, OnRaw, OnSample
+from gigabrain_zenoh.unobtrusive import Nap
 from gigabrain_zenoh.zenoh_session import close_session, open_session
 
 PRIORITIES: dict[Priority, zenoh.Priority] = {
@@ -29,8 +30,9 @@ CONGESTION = {"drop": zenoh.CongestionControl.DROP, "block": zenoh.CongestionCon
 class ZenohTransport:
     """One Zenoh session for the whole process."""
 
-    def __init__(self, session: zenoh.Session) -> None:
+    def __init__(self, session: zenoh.Session, nap_s: float = 0.0) -> None:
         self._session = session
+        self._nap = Nap(nap_s) if nap_s else None
         self._bridge = Bridge()
         self._loop = asyncio.get_running_loop()
         self._publishers: dict[str, zenoh.Publisher] = {}
@@ -47,7 +49,7 @@ class ZenohTransport:
     @classmethod
     async def open(cls, endpoint: Endpoint) -> "ZenohTransport":
         """Join the network, waiting for its router. Raises BusError."""
-        return cls(await open_session(endpoint))
+        return cls(await open_session(endpoint), endpoint.nap_s)
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes, encoding: str) -> None:
         """Send by the topic's QoS; a declared publisher sends nothing that nobody listens to."""
@@ -82,7 +84,8 @@ class ZenohTransport:
             stay()
             on_raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes())
 
-        direct = Callback(deliver, indirect=False)
+        take = self._nap.after_each(deliver) if self._nap else deliver
+        direct = Callback(take, indirect=False)
         return self._undeclare(self._session.declare_subscriber(pattern, direct))
 
     def serve(self, key: str, answer: Answer) -> Close:

@@ -49,9 +49,10 @@ class Rig:
         measured: Velocity = ZERO,
         faults: tuple[Cause, ...] = (),
         wall_ns: int | None = None,
+        late: bool = False,
     ) -> None:
         for _ in range(count):
-            self.feed(gate.Tick(measured, wall_ns, faults))
+            self.feed(gate.Tick(measured, wall_ns, faults, late))
 
     def send(
         self,

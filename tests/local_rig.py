@@ -43,6 +43,18 @@ CAR = BodyDescription(
     max_angular_acceleration=8.0,
     lidar=Lidar(beams=360, rate_hz=10, range_min=0.12, range_max=8.0),
 )
+OMNI = BodyDescription(
+    robot_type="omni",
+    drive_type="omni",
+    footprint=((0.12, 0.3), (-0.12, 0.3), (-0.12, -0.3), (0.12, -0.3)),  # wider than long
+    max_linear_speed=0.6,
+    max_lateral_speed=0.6,
+    max_angular_speed=1.5,
+    max_linear_acceleration=1.0,
+    max_linear_deceleration=1.5,
+    max_angular_acceleration=3.0,
+    lidar=Lidar(beams=360, rate_hz=10, range_min=0.12, range_max=8.0),
+)
 AT_ONCE = Response()
 QUICK = LocalSettings(samples=300, window=5.0)
 

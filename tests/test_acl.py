@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from gigabrain_schemas.topics import SERVICES, TOPICS
+from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TOPICS
 from gigabrain_zenoh.keys.acl import RIGHTS, access_control, known_names
 from gigabrain_zenoh.keys.authority import issue
 from gigabrain_zenoh.settings import Endpoint
@@ -16,8 +16,8 @@ from tests.keys_rig import Site, make_fleet, raw, site
 from tests.zenoh_rig import Ear, repeat
 
 SAYS = {
-    "brain": "world pose map intent task health/perception log",
-    "operator": "teleop cmd_vel joint_cmd button log",
+    "brain": "world pose map intent task granted health/perception log estop",
+    "operator": "teleop cmd_vel joint_cmd button log estop",
     "viewer": "",
 }
 ASKS = {
@@ -26,7 +26,7 @@ ASKS = {
     "describe/driver",
     "viewer": "audit_log describe/driver",
 }
-SAID = [topic.at("perception") for topic in TOPICS]
+SAID = [topic.at("perception") for topic in (*TOPICS, ESTOP_SAID)]
 ASKED = [service.at("driver") for service in SERVICES]
 
 

@@ -53,9 +53,10 @@ class Firmware:
     def __init__(self) -> None:
         self.gaits: list[Gait] = []
         self.bytes = bytearray()
-        body = SimpleNamespace(snapshot=STANDING, walk=self.gaits.append)
+        self.untaken: list[Snapshot] = []
+        self.body = SimpleNamespace(snapshot=STANDING, walk=self.gaits.append, fresh=self._fresh)
         wire = SimpleNamespace(write=self._write)
-        self.device = Alpha(body, AlphaOptions(driver="alpha"), wire)  # type: ignore[arg-type]
+        self.device = Alpha(self.body, AlphaOptions(driver="alpha"), wire)  # type: ignore[arg-type]
         self._decoder, self.now_ns = Decoder(), 0
         self.step(0)
 
@@ -63,8 +64,13 @@ class Firmware:
         self.bytes += data
         return True
 
+    def _fresh(self) -> list[Snapshot]:
+        untaken, self.untaken = self.untaken, []
+        return untaken
+
     def step(self, milliseconds: int) -> State:
         self.now_ns += milliseconds * MS
+        self.body.snapshot = STANDING._replace(time_ns=self.now_ns)
         self.device.step(self.now_ns)
         frames, self.bytes = self._decoder.feed(bytes(self.bytes)), bytearray()
         state = alpha.state_of(frames[-1])
@@ -82,6 +88,27 @@ def test_it_starts_standing_and_reports_what_it_measures() -> None:
     assert state.voltage == 28.0
     assert state.senses.contacts == (True,) * 4
     assert state.temperatures == (30.0,) * 12
+
+
+def test_steps_in_which_it_was_held_up_are_reported_all_the_same() -> None:
+    firmware = Firmware()
+    firmware.untaken = [STANDING._replace(time_ns=ms * MS) for ms in (10, 20, 30)]
+    firmware.device.step(30 * MS)
+    frames = Decoder().feed(bytes(firmware.bytes))
+    reports = [alpha.state_of(frame) for frame in frames]
+    assert [report.milliseconds for report in reports if report] == [10, 20, 30]
+    assert [frame.sequence for frame in frames] == [2, 3, 4]
+
+
+def test_its_clock_stands_still_while_its_body_does() -> None:
+    firmware = Firmware()
+    firmware.step(10)
+    firmware.bytes.clear()
+    firmware.device.step(90 * MS)
+    [frame] = Decoder().feed(bytes(firmware.bytes))
+    report = alpha.state_of(frame)
+    assert report
+    assert report.milliseconds == 10
 
 
 def test_it_walks_as_told_and_says_which_command_that_was() -> None:
@@ -201,16 +228,23 @@ async def test_the_real_driver_walks_the_emulated_body_ahead_and_sideways(rig: R
     rig.driver.emit = lambda topic, message: received.append(topic)
     rig.streaming = (0.3, 0.1, 0.0)
     truth = rig.body.simulation.truth
+    start = truth.pose()
     await until(lambda: truth.distance_m > 0.5)
-    state = await rig.driver.read_state()
-    assert math.hypot(state.pose.x, state.pose.y) == pytest.approx(truth.distance_m, abs=0.15)
+    told = rig.device.executed[-1]
+    rig.streaming = (0.0, 0.0, 0.0)
+    await until(lambda: rig.body.commanded == (0.0, 0.0, 0.0) and abs(truth.speed()[0]) < 0.01)
+    stood_ns = rig.body.snapshot.time_ns
+    await until(lambda: rig.driver._state and rig.driver._state.milliseconds * MS > stood_ns)
+    end, state = truth.pose(), await rig.driver.read_state()
+    moved = math.hypot(end.x - start.x, end.y - start.y)
+    assert math.hypot(state.pose.x, state.pose.y) == pytest.approx(moved, abs=0.15)
     assert state.pose.x == pytest.approx(3 * state.pose.y, abs=0.15)
     assert tuple(joint.name for joint in state.joints) == JOINT_NAMES
     assert all(joint.temperature is not None for joint in state.joints)
     assert state.battery
     assert 28 < state.battery.voltage < 30
     assert IMU in received
-    assert WALKER.to_body(rig.device.executed[-1]) == pytest.approx((0.3, 0.1, 0.0), abs=1e-6)
+    assert WALKER.to_body(told) == pytest.approx((0.3, 0.1, 0.0), abs=1e-6)
 
 
 async def test_it_returns_what_it_sent_within_the_limits_and_nothing_that_is_no_number(

@@ -136,7 +136,12 @@ def test_a_file_that_is_no_bag_is_refused_in_one_line(
         call("bag", "info", str(tmp_path / "none.mcap"))
 
 
-def test_a_flipped_byte_costs_its_chunk_and_no_other(whole: Path, tmp_path: Path) -> None:
+def test_a_flipped_byte_costs_its_chunk_and_no_other(
+    whole: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     path = tmp_path / "flipped.mcap"
     content = bytearray(whole.read_bytes())
     content[len(content) // 2] ^= 0x10
@@ -146,10 +151,27 @@ def test_a_flipped_byte_costs_its_chunk_and_no_other(whole: Path, tmp_path: Path
     assert len(found.damages) == 1
     assert faults(found)
     assert call("bag", "check", str(path)) == 1
+    assert f"mend it with: gigabrain bag recover {path}\n" in capsys.readouterr().out
+    call("bag", "convert", str(path), "--csv", str(tmp_path / "tables"))
+    assert caplog.messages == [
+        f"{path}: {found.damages[0].partition(': ')[2]}; mend it with: gigabrain bag recover {path}"
+    ]
     mended = tmp_path / "mended.mcap"
     assert recover(path, mended).messages == 588
     assert bag_rig.seqs(mended) == bag_rig.seqs(path)
     assert info(mended).finished
+
+
+def test_where_nothing_can_be_saved_that_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "stub.mcap"
+    path.write_bytes(b"\x89MCAP0\r\n" + bytes(12))
+    assert call("bag", "recover", str(path)) == 1
+    assert capsys.readouterr().out.endswith(f"{path}: nothing could be saved\n")
+    assert list(tmp_path.iterdir()) == [path]
+    call("bag", "info", str(path))
+    assert "\nempty\n" in capsys.readouterr().out
 
 
 def test_flipped_bytes_anywhere_never_break_the_reader(whole: Path, tmp_path: Path) -> None:

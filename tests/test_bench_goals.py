@@ -4,6 +4,7 @@ from msgspec.structs import replace
 from rich.console import Console
 
 from gigabrain_zenoh.bench.goals import GoalFigures, GoalsResult
+from gigabrain_zenoh.bench.goals_sender import Off
 from gigabrain_zenoh.cli.bench_goals import _table
 
 GOOD = GoalFigures(
@@ -15,6 +16,7 @@ GOOD = GoalFigures(
     explored_s=30.0,
     goals=100,
     reached=99,
+    off=(Off(0.08, None), Off(0.11, 0.05), Off(0.02, 0.1)),
     contacts=0,
     min_clearance_m=0.09,
     met=3,
@@ -34,7 +36,7 @@ def test_one_goal_in_a_hundred_may_be_missed_and_nothing_may_be_touched() -> Non
 
 def test_the_table_says_what_was_measured() -> None:
     lines = _text(GoalsResult(seed=7, runs=(GOOD,)))
-    for figure in ("seed 7", "99 of 100", "99 %", "0.090 m", "10.0 s"):
+    for figure in ("seed 7", "99 of 100", "0.090 m", "10.0 s", "0.11 m", "5.7°"):
         assert figure in lines
 
 

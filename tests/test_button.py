@@ -223,6 +223,6 @@ def test_a_deployment_runs_the_button_beside_the_driver(tmp_path: Path) -> None:
     )
     assert [s.name for s in process_specs(elsewhere, "robot", tmp_path, tmp_path)] == ["driver"]
     assert [s.name for s in process_specs(elsewhere, "desk", tmp_path, tmp_path)] == ["button"]
-    for wrong in ({"hosts": {"desk": ("button",)}}, {"button": ButtonConfig(port=""), "speed": 2}):
+    for wrong in ({"hosts": {"desk": ("button",)}}, {"button": ButtonConfig(port="x"), "speed": 2}):
         with pytest.raises((ValueError, ConfigError)):
             Deployment(**wrong)  # type: ignore[arg-type]

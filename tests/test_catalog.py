@@ -73,3 +73,14 @@ def test_a_wrong_value_is_refused_with_file_and_line(
     mine.write_text(text.replace(line, wrong))
     with pytest.raises(ConfigError, match=r"robot\.yaml" + complaint):
         catalog.make_driver(str(mine), Run(folder=Path()))
+
+
+def test_a_package_that_is_written_but_not_installed_says_how(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "gigabrain-my-bot").mkdir()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(
+        UnknownName, match=r"no robot 'my_bot' yet.*pip install -e gigabrain-my-bot"
+    ):
+        catalog.robot_path("my_bot")

@@ -150,3 +150,6 @@ async def test_an_e_stop_that_reaches_nobody_says_so(home: Home) -> None:
     alone = await home.run("estop")
     assert await alone.ended() == 3
     assert alone.err.startswith("gigabrain: NOT CONFIRMED: no robot runs here; start one with")
+    nowhere = await home.run("estop", "--connect", "nowhere")
+    assert await nowhere.ended() == 3
+    assert nowhere.err.startswith("gigabrain: NOT CONFIRMED: 'nowhere' is not a Zenoh endpoint; ")

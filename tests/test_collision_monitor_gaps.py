@@ -81,6 +81,9 @@ def test_c_scans_of_ticks_to_come_do_not_hide_that_none_is_true() -> None:
         memory, verdict = safety.step(BODY, memory, inputs)
         found.append((tick, [cause.code for cause in verdict.causes]))
     assert [tick for tick, causes in found if "scan_lost" in causes] == list(range(23, 41))
+    assert verdict.causes[0].text == (
+        "no scan for more than 250 ms; the newest claims to be of tick 1040, and it is tick 40"
+    )
 
 
 @pytest.mark.parametrize("value", [math.nan, 0.0, 1e9, -1.0, -math.inf])
@@ -182,6 +185,13 @@ def test_a_body_that_is_faster_than_its_lidar_sees_is_refused() -> None:
         msgspec.convert({**whole, "max_linear_speed": 5.0}, BodyDescription)
 
 
+@pytest.mark.parametrize("name", ["follow_linear", "follow_angular"])
+def test_a_body_is_refused_that_could_run_away_unseen(name: str) -> None:
+    whole = msgspec.to_builtins(BODY)
+    with pytest.raises(msgspec.ValidationError, match=rf"thresholds: {name}: it is never so far"):
+        msgspec.convert({**whole, "thresholds": {name: 100.0}}, BodyDescription)
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -191,8 +201,19 @@ def test_a_body_that_is_faster_than_its_lidar_sees_is_refused() -> None:
         {"motor_stop": 50.0},
         {"battery_sustain": -1.0},
         {"tilt_stop": 91.0},
+        {"tilt_stop": 0.5},  # radians
+        {"battery_stop": 0.07},  # a fraction
+        {"motor_stop": 1000.0},
+        {"shock_stop": 1e9},
+        {"heartbeat": 0.0001},
+        {"scan_age": 60.0},
+        {"reaction_time": 0.0001},
+        {"stop_margin": 0.0001},
+        {"resume_margin": 1e-5},
     ],
 )
-def test_thresholds_that_contradict_one_another_are_refused(wrong: dict[str, float]) -> None:
+def test_thresholds_that_contradict_one_another_or_switch_a_monitor_off_are_refused(
+    wrong: dict[str, float],
+) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(wrong, Thresholds)

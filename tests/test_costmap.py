@@ -80,6 +80,14 @@ def test_a_body_beside_its_own_centre_needs_its_wider_side() -> None:
     assert inflation(aside).fits == pytest.approx(0.33)
 
 
+def test_a_body_that_can_go_sideways_fits_by_its_shorter_side_and_a_car_does_not() -> None:
+    wide = msgspec.structs.replace(body(0.3, 0.12, 0.12), max_lateral_speed=0.5)
+    omni = msgspec.structs.replace(wide, drive_type="omni")
+    car = msgspec.structs.replace(wide, drive_type="ackermann")
+    assert inflation(omni).fits == pytest.approx(0.12 + 0.03)
+    assert inflation(car).fits == pytest.approx(0.3 + 0.03)
+
+
 @pytest.mark.parametrize(
     ("unknown", "expected"), [("allow", 1.0), ("avoid", 5.0), ("forbid", 100.0)]
 )

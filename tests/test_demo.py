@@ -1,5 +1,6 @@
 """`gigabrain demo`: what a run reports, and when it counts as failed."""
 
+import asyncio
 import json
 import os
 import re
@@ -9,7 +10,12 @@ from typing import Any
 
 import pytest
 
+from gigabrain_zenoh import demo as demo_module
+from gigabrain_zenoh.demo import Demo, DemoOptions, newest_fault
+from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.report import Observed, make_report, summary
+from gigabrain_zenoh.watch import Watch
+from tests.bus_rig import Net
 from tests.onlooker import looking_on
 from tests.stack import AVOID, ROOT, Command, Home, robot_of, until
 
@@ -26,6 +32,20 @@ async def run(home: Home, *options: str) -> tuple[Command, dict[str, Any]]:
     demo = await home.run(*AVOID, "--headless", "--report", str(path), *options)
     assert path.exists(), demo.err
     return demo, json.loads(path.read_bytes())
+
+
+@pytest.mark.parametrize(
+    ("texts", "newest"),
+    [
+        ((), ""),
+        (("driver: no port", "driver: no lidar", "safety: late"), "driver: no lidar"),
+        (("safety: late", "decision: late"), "decision: late"),
+    ],
+)
+def test_the_fault_that_is_told_is_the_drivers_newest_or_the_newest(
+    texts: tuple[str, ...], newest: str
+) -> None:
+    assert newest_fault(texts) == newest
 
 
 async def undisturbed(home: Home, *options: str) -> dict[str, Any]:
@@ -170,5 +190,28 @@ async def test_a_report_that_cannot_be_written_is_refused_before_anything_starts
     nowhere = Path("nowhere") / "report.json"
     demo = await home.run(*AVOID, "--headless", "--seconds", "1", "--report", str(nowhere))
     assert await demo.ended() == 2
-    assert demo.err == "gigabrain: cannot write the report nowhere/report.json: no such folder\n"
+    assert demo.err == "gigabrain: cannot write nowhere/report.json: no such folder\n"
     assert not (home.folder / "state").exists()
+
+
+async def test_a_clock_that_stands_still_ends_the_demo_but_not_while_a_process_is_on_its_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The very first start compiles, which may take minutes on a busy machine."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setattr(demo_module, "STALLED_S", 1.0)
+    monkeypatch.setattr(demo_module, "ANSWER_S", 0.1)
+    net, stop = Net(), asyncio.Event()
+    demo = Demo(Deployment(router="tcp/127.0.0.1:0"), DemoOptions(headless=True))
+    statuses = demo._supervisor.statuses
+    for name, status in statuses.items():
+        status.state = "starting" if name == "decision" else "ready"
+    watching = asyncio.ensure_future(demo._watch(Watch(net.one), stop))
+    await asyncio.sleep(2.0)
+    assert not watching.done()
+    statuses["decision"].state = "ready"
+    async with asyncio.timeout(60):
+        assert await watching is None
+    assert demo._failures == ["the robot's clock stood still for 1 s"]
+    await net.one.close()
+    await net.two.close()

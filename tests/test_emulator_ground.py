@@ -3,7 +3,6 @@
 import asyncio
 import os
 import select
-import signal
 import subprocess
 import sys
 import termios
@@ -15,12 +14,14 @@ import pytest
 
 from gigabrain_drivers.emulators import DEVICES
 from gigabrain_drivers.emulators.base import Device
-from gigabrain_drivers.emulators.emulator import device_class
+from gigabrain_drivers.emulators.claim import claimed
+from gigabrain_drivers.emulators.emulator import Emulator, device_class
 from gigabrain_drivers.emulators.faults import Faults, FaultyWire
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.emulators.station import Station
+from gigabrain_drivers.robot import Run
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import UnknownName
+from gigabrain_zenoh.errors import ConfigError, UnknownName
 from tests.line_rig import until
 
 
@@ -218,6 +219,40 @@ def test_a_driver_without_a_device_says_which_have_one() -> None:
         device_class("lime")
 
 
+async def test_a_port_that_is_another_emulators_by_now_is_left(tmp_path: Path) -> None:
+    first, second = Pty(tmp_path / "base"), Pty(tmp_path / "base")
+    first.plug()
+    second.plug()  # as after a folder was cleared and claimed anew
+    mine = os.readlink(tmp_path / "base")
+    first.unplug()
+    assert os.readlink(tmp_path / "base") == mine
+    second.unplug()
+    assert not (tmp_path / "base").is_symlink()
+
+
+async def test_a_file_that_is_no_port_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "base").write_text("somebody's")
+    run = Run(folder=Path(), link="emulated", emulator=str(tmp_path))
+    with pytest.raises(ConfigError, match=r"no ports can be made in .*base is there"):
+        async with Emulator("mycustombot", run):
+            pass
+    assert (tmp_path / "base").read_text() == "somebody's"
+
+
+def test_a_folder_of_ports_is_one_emulators_at_a_time(tmp_path: Path) -> None:
+    folder = tmp_path / "ports"
+    with claimed(folder), pytest.raises(ConfigError, match="another emulator"), claimed(folder):
+        pass
+    with claimed(folder):
+        pass
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(ConfigError, match="file: File exists; expected a folder"),
+        claimed(tmp_path / "file"),
+    ):
+        pass
+
+
 async def test_gigabrain_emulate_is_a_body_until_it_is_told_to_end(tmp_path: Path) -> None:
     command = [
         sys.executable, "-c", "from gigabrain_zenoh.cli.app import main; main()",
@@ -239,10 +274,12 @@ async def test_gigabrain_emulate_is_a_body_until_it_is_told_to_end(tmp_path: Pat
             await process.stdout.readline()
             assert (tmp_path / "base").is_symlink()
             process.stdin.write(b"base unplugged\nnonsense\n")
+            assert await process.stdout.readline() == b"faults now: base unplugged\n"
             assert b"no fault 'nonsense'" in await process.stdout.readline()
+            assert await process.stdout.readline() == b"faults now: base unplugged\n"
             assert not (tmp_path / "base").is_symlink()
-            process.send_signal(signal.SIGINT)
-            assert await process.wait() in (0, 130)
+            process.terminate()  # not only Ctrl-C takes the ports away
+            assert await process.wait() == 0
         assert not (tmp_path / "scan").is_symlink()
     finally:
         if process.returncode is None:

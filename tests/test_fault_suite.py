@@ -18,8 +18,9 @@ from gigabrain_zenoh.faults import suite
 from gigabrain_zenoh.faults.fault import Failed, Fault, Limit, Result, Skipped, judge
 from gigabrain_zenoh.faults.hanging import HangingBus
 from gigabrain_zenoh.faults.rig import Options, Rig, deployment_of
-from gigabrain_zenoh.faults.suite import failed, find_test, run_suite
+from gigabrain_zenoh.faults.suite import failed, run_suite
 from gigabrain_zenoh.faults.table import FAULTS, choose
+from gigabrain_zenoh.process import find
 from gigabrain_zenoh.transport import LocalNetwork
 from tests.bus_rig import settle
 
@@ -68,9 +69,9 @@ def test_tests_are_chosen_by_name_or_number() -> None:
 
 
 def test_a_test_is_the_function_of_its_name_in_the_module_of_its_group() -> None:
-    assert find_test(FAULT).__name__ == "decision_killed"
-    with pytest.raises(Skipped, match="not written yet"):
-        find_test(Fault(1, "nobody-has-written-this", "process", "", "x <= 1"))
+    assert [find(fault.path).__name__.replace("_", "-") for fault in FAULTS] == [
+        fault.name for fault in FAULTS
+    ]
 
 
 def test_a_body_without_the_line_in_question_is_skipped() -> None:
@@ -80,10 +81,17 @@ def test_a_body_without_the_line_in_question_is_skipped() -> None:
         deployment_of(Options(body="alpha"), "serial")
 
 
+def test_the_same_robots_can_be_had_navigating() -> None:
+    robot = deployment_of(Options(behaviour="navigate"), "serial")
+    assert (robot.decision.behaviour, robot.decision.begin) == ("navigate", "roam")
+    assert (robot.perception.mapping, robot.decision.speed_limit) == ("slam", 0.26)
+    assert deployment_of(Options(), "serial").perception.mapping == "off"
+
+
 async def test_what_cannot_run_is_skipped_and_says_why(tmp_path: Path) -> None:
-    missing = Fault(2, "not-there", "process", "", "x <= 1")
-    (result,) = await run_suite([missing], Options(), tmp_path)
-    assert (result.verdict, result.reason, result.runs) == ("skipped", "not written yet", 0)
+    (result,) = await run_suite(choose(["8"]), Options(body="alpha"), tmp_path)
+    assert result.verdict == "skipped"
+    assert result.reason == "alpha has no serial line"
 
 
 async def results_of(
@@ -100,7 +108,7 @@ async def results_of(
         await asyncio.sleep(0)
         return next(left)()
 
-    monkeypatch.setattr(suite, "find_test", lambda fault: test)
+    monkeypatch.setattr(suite, "find", lambda path: test)
     (result,) = await run_suite([FAULT], Options(), Path(), repeat)
     return result
 

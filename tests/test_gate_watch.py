@@ -223,3 +223,37 @@ def test_a_driver_that_was_held_up_stops_the_body_when_it_goes_on() -> None:
     rig = driving(0.2)
     rig.tick(100)
     assert (rig.mode, rig.state.output) == ("idle", ZERO)
+
+
+def test_ticks_that_are_made_up_for_do_not_speed_the_body_up() -> None:
+    rig = driving(0.1)
+    rig.tick(4, late=True)
+    assert rig.state.output == Velocity(linear_x=0.1)
+    rig.safety()
+    rig.send(0.2)
+    assert rig.state.output == Velocity(linear_x=0.1)  # this tick is a late one still
+    rig.tick()
+    assert rig.state.output.linear_x == pytest.approx(0.12)
+
+
+def test_ticks_that_are_made_up_for_do_not_turn_the_body_round() -> None:
+    rig = driving(0.2)
+    rig.tick()
+    rig.send(-0.2)
+    assert rig.state.output.linear_x == pytest.approx(0.16)
+    rig.tick(3, late=True)
+    assert (rig.mode, rig.state.output.linear_x) == ("enabled", pytest.approx(0.16))
+    rig.safety()
+    rig.tick()
+    assert rig.state.output.linear_x == pytest.approx(0.12)
+
+
+def test_a_stop_takes_the_steps_that_it_has_missed() -> None:
+    rig = driving(0.2)
+    rig.send(0.0)
+    rig.tick(2, late=True)
+    assert rig.state.output.linear_x == pytest.approx(0.08)
+    rig = driving(0.2)
+    rig.tick(faults=(LOST,))
+    rig.tick(4, late=True)
+    assert (rig.mode, rig.state.output) == ("stopping", ZERO)

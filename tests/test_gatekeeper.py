@@ -1,6 +1,7 @@
 """Who drives, who is told, and what is written down: a whole robot in memory."""
 
 import asyncio
+import itertools
 import threading
 from pathlib import Path
 
@@ -11,9 +12,10 @@ from gigabrain_drivers.latch import LatchFile
 from gigabrain_schemas.audit import AuditRecord
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
-from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, RELEASE
+from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, ESTOP_SAID, RELEASE
 from gigabrain_zenoh.audit_file import read
 from tests.brain_in_memory import Robot
+from tests.brain_rig import TICK_NS
 
 
 class Log:
@@ -77,6 +79,29 @@ async def test_a_second_commander_is_told_who_drives_and_a_take_over_names_both(
             ("enable", "control", False, "ann drives; only a person hands it to the brain"),
             ("take", "bob", True, "control drives, taken over from ann"),
         ]
+
+
+@pytest.mark.parametrize(
+    "payload", [b"", b"{}", b"\x80", b'{"source": "ann", "reason": "a child"}']
+)
+async def test_an_e_stop_that_is_said_and_not_asked_for_stops_just_the_same(
+    tmp_path: Path, payload: bytes
+) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        client = robot.network.transport()
+        client.publish(ESTOP_SAID, "robot/estop", payload, "")
+        assert (await robot.go(1))[-1] == 0.0
+        assert robot.mode == "latched"
+    assert LatchFile(tmp_path).read().estop_generation == 1
+
+
+async def test_garbage_that_is_said_on_the_key_of_the_e_stop_stops_nobody(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        for payload in (b"\xc1", b"{", b'{"source": 3}', b"x" * 2000):
+            robot.network.transport().publish(ESTOP_SAID, "robot/estop", payload, "")
+        assert (await robot.go(5))[-1] == pytest.approx(0.26)
 
 
 async def test_an_e_stop_is_on_disk_when_it_is_confirmed(tmp_path: Path) -> None:
@@ -143,3 +168,29 @@ async def test_causes_are_written_down_when_they_come_and_go_with_who_raised_the
             "enabled -> stopping"
         )
     assert msgspec.json.decode((tmp_path / "latch.json").read_bytes())["causes"] == []
+
+
+async def test_a_driver_that_was_held_up_keeps_its_count_and_speeds_up_by_one_step(
+    tmp_path: Path,
+) -> None:
+    async with Robot(tmp_path) as robot:
+        while not 0.0 < (await robot.go(1))[-1] < 0.1:
+            pass
+        assert robot.state
+        tick, now = robot.state.tick, robot.clock.now_ns()
+        robot.clock.stall(3 * TICK_NS)
+        speeds = await robot.go(20)
+        passed = (robot.clock.now_ns() - now) // TICK_NS
+        assert (robot.mode, robot.state.tick - tick) == ("enabled", passed)
+        steps = [after - before for before, after in itertools.pairwise(speeds)]
+        assert max(steps) == pytest.approx(0.02)
+        assert speeds[-1] == pytest.approx(0.26)
+
+
+async def test_a_driver_that_was_held_up_stops_the_body_as_soon_as_it_goes_on(
+    tmp_path: Path,
+) -> None:
+    async with Robot(tmp_path) as robot:
+        await driving(robot)
+        robot.clock.stall(40 * TICK_NS)
+        assert (await robot.go(1))[-1] == 0.0

@@ -10,6 +10,10 @@ import pytest
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
+from gigabrain_zenoh.cli.keys import issue as issue_command
+from gigabrain_zenoh.cli.keys import new
+from gigabrain_zenoh.cli.process import router
+from gigabrain_zenoh.cli.proxy import proxy
 from gigabrain_zenoh.deployment import Deployment, check_keys, client_endpoint, load_deployment
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.authority import issue, new_fleet
@@ -134,12 +138,86 @@ def test_with_keys_everything_is_tls_and_without_nothing_is(fleet: Path) -> None
         session_config(Endpoint(connect=("tls/10.0.0.1:1",)))
 
 
-def test_beyond_loopback_a_router_wants_keys_or_to_be_called_insecure() -> None:
-    at = "tcp/192.168.1.10:7447"
-    with pytest.raises(ValueError, match="`gigabrain keys new`"):
+@pytest.mark.parametrize(
+    "host",
+    ["192.168.1.10", "0.0.0.0", "[::]", "127.evil.lan", "localhost.evil", "127.0.0.1.evil.lan"],
+)
+def test_beyond_loopback_a_router_wants_keys_or_to_be_called_insecure(host: str) -> None:
+    at = f"tcp/{host}:7447"
+    with pytest.raises(ValueError, match=r"^router: .* can be reached .*`gigabrain keys new`"):
         Deployment(router=at)
     assert Deployment(router=at, insecure=True).router == at
     assert Deployment(router=at, keys="keys").router == at
+    with pytest.raises(ConfigError, match=r"^--listen: .* can be reached .* or say --insecure"):
+        router(listen=("tcp/127.0.0.1:0", at))
+    with pytest.raises(ConfigError, match=r"^--listen: .* can be reached .* or say --insecure"):
+        proxy("tcp/127.0.0.1:7447", listen=at)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "[::1]", "localhost"])
+def test_on_loopback_a_router_wants_neither(host: str) -> None:
+    assert Deployment(router=f"tcp/{host}:7447").router == f"tcp/{host}:7447"
+
+
+def test_an_identity_is_good_for_a_day_at_least_and_not_beyond_its_fleet(copied: Path) -> None:
+    for days in (-5, 0, 3651, 100_000_000):
+        with pytest.raises(ConfigError, match=rf"^--days {days}: expected 1 to 3650$"):
+            issue(copied, "viewer", days=days)
+    end = r"^--days 3650: the fleet's own certificate ends on 20\d\d-\d\d-\d\d; "
+    with pytest.raises(ConfigError, match=end + "say --days 3649 at most, or make a new fleet"):
+        issue(copied, "viewer", days=3650)
+    issue(copied, "viewer", days=3649)
+
+
+@pytest.mark.parametrize(
+    ("host", "complaint"),
+    [
+        ("tls/1.2.3.4:7447", "--host tls/1.2.3.4:7447: give the address alone: 1.2.3.4"),
+        ("1.2.3.4:7447", "--host 1.2.3.4:7447: give the address alone: 1.2.3.4"),
+        ("[::1]:7447", "--host [::1]:7447: give the address alone: ::1"),
+        ("bad host!", "--host 'bad host!': expected an IP address or a host name"),
+        ("", "--host '': expected an IP address or a host name"),
+        ("1.2.3", "--host '1.2.3': expected an IP address or a host name"),
+    ],
+)
+def test_a_certificate_names_addresses_and_hosts_and_nothing_else(
+    copied: Path, host: str, complaint: str
+) -> None:
+    with pytest.raises(ConfigError) as error:
+        issue(copied, "router", name="other", hosts=(host,))
+    assert str(error.value) == complaint
+    assert not (copied / "other").exists()
+    good = issue(copied, "router", name="other", hosts=("10.0.0.5", "[fe80::1]", "robot_1.lan"))
+    assert load(good).hosts[3:] == ("10.0.0.5", "fe80::1", "robot_1.lan")
+
+
+def test_what_to_do_next_can_be_typed_as_it_is_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def said() -> str:
+        return capsys.readouterr().out.splitlines()[-1]
+
+    new("x y*")
+    assert said() == "next: gigabrain keys issue robot --host ADDRESS --dir 'x y*'"
+    new("home", dir=Path("home"))
+    home = Path("home")
+    at = "tls/ADDRESS:7447"
+    issue_command("viewer", dir=home)
+    assert said() == f"next: gigabrain topic list --connect {at} --keys home/viewer"
+    issue_command("operator", robot="red", dir=home)
+    assert (
+        said() == f"next: gigabrain estop --connect {at} --namespace red --keys home/operator@red"
+    )
+    issue_command("router", dir=home)
+    assert said() == (
+        "next: gigabrain router --listen tls/0.0.0.0:7447 --fleet NAMESPACE --keys home/router"
+    )
+    issue_command("brain", dir=Path("x y*"))
+    assert said() == (
+        "next: gigabrain up FILE --host HOST --keys 'x y*/brain', where FILE has a line `keys:`"
+    )
 
 
 def test_keys_lie_beside_their_file_one_folder_for_all_hosts_or_one_each(

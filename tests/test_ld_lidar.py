@@ -76,7 +76,7 @@ def test_a_lidar_that_never_ends_a_turn_does_not_fill_the_memory() -> None:
     turn, most = Turn(SMALL), 0
     for n in range(3000):
         turn.clockwise([1.0] * 12, [1000] * 12, None, n * MS)
-        most = max(most, len(turn._angles))
+        most = max(most, sum(len(angles) for angles, _ in turn._pieces))
 
     assert most <= 20_000
 

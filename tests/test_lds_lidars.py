@@ -66,25 +66,29 @@ def test_lds01s_last_sample_looks_ahead_and_the_ones_before_to_the_right() -> No
     [(1000, (-5.6258, 1010.77)), (200, (-1.0300, 205.93)), (8000, (-6.6522, 8060.16))],
 )
 def test_lds02_is_corrected_as_the_vendor_does(distance: int, seen: tuple[float, float]) -> None:
-    assert from_axis(0.0, distance) == pytest.approx(seen, abs=0.01)
-    assert from_axis(90.0, distance)[0] == pytest.approx(90 + seen[0], abs=0.01)
+    angles, distances = from_axis(np.array([0.0, 90.0]), np.array([distance, distance]))
+    assert angles == pytest.approx([seen[0], 90 + seen[0]], abs=0.01)
+    assert distances == pytest.approx([seen[1]] * 2, abs=0.01)
 
 
 def test_no_return_is_left_where_it_is() -> None:
-    assert from_axis(12.0, 0) == (12.0, 0)
+    angles, distances = from_axis(np.array([12.0]), np.array([0.0]))
+    assert (angles, distances) == ([12.0], [0.0])
 
 
 @pytest.mark.parametrize("distance", [200.0, 1000.0, 8000.0])
 def test_the_emulated_lens_is_the_corrections_other_side(distance: float) -> None:
-    assert from_axis(0.0, lens_distance(distance))[1] == pytest.approx(distance)
+    _, distances = from_axis(np.array([0.0]), np.array([lens_distance(distance)]))
+    assert distances == pytest.approx([distance])
 
 
 def test_lds02_frames_are_ld_frames_with_the_correction() -> None:
     frame = ld.Frame(3600, 0, 1100, (1000,) * 6 + (0,) * 6, (200,) * 12, 0)
-    angles, distances = Lds02(options(), COARSE, FakeClock()).place(frame)
-    assert angles[:2] == pytest.approx((-5.626, -4.626), abs=1e-3)
+    lidar = Lds02(options(), COARSE, FakeClock())
+    angles, distances = lidar.place(*ld.points(ld.encode(frame)))
+    assert angles[:2] == pytest.approx([-5.626, -4.626], abs=1e-3)
     assert angles[6] == 6.0
-    assert distances == pytest.approx((1010.77,) * 6 + (0,) * 6, abs=0.01)
+    assert distances == pytest.approx([1010.77] * 6 + [0] * 6, abs=0.01)
 
 
 @pytest.mark.parametrize(

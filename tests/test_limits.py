@@ -8,7 +8,7 @@ import pytest
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import BodyDescription, DriveType
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.limits import ZERO, Limits, clamp, limits_of, ramp
+from gigabrain_zenoh.limits import ZERO, Limits, clamp, limits_of, ramp, slowed
 
 LIMITS = Limits(
     linear_speed=0.5,
@@ -181,6 +181,44 @@ def test_a_step_of_turning(current: float, target: float, after: float) -> None:
     assert ramp(Velocity(angular_z=current), Velocity(angular_z=target), LIMITS, 0.125) == Velocity(
         angular_z=after
     )
+
+
+@pytest.mark.parametrize(
+    ("current", "target", "after"),
+    [
+        (0.5, 0.0, 0.25),  # braking, as ever
+        (-0.5, 0.0, -0.25),
+        (0.5, 0.375, 0.375),
+        (-0.5, -0.375, -0.375),
+        (0.375, 0.375, 0.375),
+        (0.125, 0.5, 0.125),  # no faster
+        (-0.125, -0.5, -0.125),
+        (0.0, 0.5, 0.0),
+        (0.0, -0.5, 0.0),
+        (0.5, -0.5, 0.5),  # nor round
+        (-0.5, 0.5, -0.5),
+        (0.0, 0.0, 0.0),
+    ],
+)
+def test_a_step_in_which_nothing_may_speed_up(current: float, target: float, after: float) -> None:
+    assert slowed(Velocity(linear_x=current), Velocity(linear_x=target), LIMITS, 0.125) == Velocity(
+        linear_x=after
+    )
+    assert slowed(Velocity(linear_y=current), Velocity(linear_y=target), LIMITS, 0.125) == Velocity(
+        linear_y=after
+    )
+
+
+@pytest.mark.parametrize(
+    ("current", "target", "after"),
+    [(2.0, 0.0, 1.5), (-2.0, -1.75, -1.75), (1.0, 2.0, 1.0), (1.0, -1.0, 1.0)],
+)
+def test_a_step_in_which_turning_may_not_speed_up(
+    current: float, target: float, after: float
+) -> None:
+    assert slowed(
+        Velocity(angular_z=current), Velocity(angular_z=target), LIMITS, 0.125
+    ) == Velocity(angular_z=after)
 
 
 def test_a_ramp_reaches_its_target_exactly() -> None:

@@ -13,6 +13,9 @@ from gigabrain_zenoh.errors import BodyLost
 from tests.line_rig import BARE, bench, until
 
 ZERO = Velocity()
+STARTED = BARE.replace(
+    "  ticks_per_turn", '  start: "ENABLE\\n"\n  stop: "DISABLE\\n"\n  ticks_per_turn'
+)
 
 
 async def test_it_obeys_and_reports_what_its_wheels_did(tmp_path: Path) -> None:
@@ -48,8 +51,11 @@ async def test_what_is_no_number_is_zero_for_all(tmp_path: Path, bad: float) -> 
         await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
 
 
-async def test_nothing_is_written_before_the_body_was_heard_and_then_zero(tmp_path: Path) -> None:
-    async with bench(tmp_path, plugged=False) as it:
+@pytest.mark.parametrize("text", [BARE, STARTED])
+async def test_nothing_is_written_before_the_body_was_heard_and_then_zero(
+    tmp_path: Path, text: str
+) -> None:
+    async with bench(tmp_path, text, plugged=False) as it:
         written: list[bytes] = []
         it.driver.link.trace = lambda way, data: written.append(data) if way == "tx" else None
         assert await it.driver.set_base_velocity(0.2, 0.0, 0.0) == ZERO
@@ -192,11 +198,6 @@ async def test_an_unchanged_command_is_repeated_at_its_rate_and_a_new_one_goes_a
         assert 3 <= len(written) <= 7
 
 
-STARTED = BARE.replace(
-    "  ticks_per_turn", '  start: "ENABLE\\n"\n  stop: "DISABLE\\n"\n  ticks_per_turn'
-)
-
-
 async def test_start_and_stop_strings_frame_the_motion(tmp_path: Path) -> None:
     async with bench(tmp_path, STARTED) as it:
         written: list[bytes] = []
@@ -211,6 +212,46 @@ async def test_start_and_stop_strings_frame_the_motion(tmp_path: Path) -> None:
         assert [line for line in written if not line.startswith(b"V,0.0")] == [
             b"ENABLE\n", b"V,0.200,0.000\n", b"DISABLE\n", b"ENABLE\n", b"V,0.100,0.000\n",
         ]  # fmt: skip
+
+
+async def test_a_body_that_was_never_moved_is_never_started(tmp_path: Path) -> None:
+    async with bench(tmp_path, STARTED) as it:
+        written: list[bytes] = []
+        it.driver.link.trace = lambda way, data: written.append(data) if way == "tx" else None
+        for _ in range(3):
+            await it.driver.set_base_velocity(0.0, 0.0, 0.0)
+            await it.driver.stop()
+        await it.driver.close()
+        assert set(written) <= {b"V,0.000,0.000\n"}
+
+
+async def test_a_started_body_is_stopped_with_its_string_also_after_its_cable_was_out(
+    tmp_path: Path,
+) -> None:
+    async with bench(tmp_path, STARTED) as it:
+        written: list[bytes] = []
+        it.driver.link.trace = lambda way, data: written.append(data) if way == "tx" else None
+        await it.driver.set_base_velocity(0.2, 0.0, 0.0)
+        it.station.set(Faults(unplugged=True))
+        await it.until_connected(False)
+        await it.driver.stop()
+        it.station.set(NONE)
+        await until(lambda: len(written) > 2)
+        assert written[:2] == [b"ENABLE\n", b"V,0.200,0.000\n"]
+        assert written[2:4] == [b"V,0.000,0.000\n", b"DISABLE\n"]
+
+
+WHEELED = BARE.replace("V,{linear_x:.3f},{angular_z:.3f}", "W,{wheel_left:.1f},{wheel_right:.1f}")
+
+
+async def test_what_is_written_for_wheels_is_returned_as_the_body_then_goes(tmp_path: Path) -> None:
+    async with bench(tmp_path, WHEELED) as it:
+        sent = await it.driver.set_base_velocity(0.1, 0.0, 0.5)
+        # (0.1 -+ 0.5 * 0.25) / 0.08 = -0.31 and 2.81 rad/s
+        await until(lambda: it.body.commanded != (0.0, 0.0, 0.0))
+        assert sent.linear_x == pytest.approx((2.8 - 0.3) * 0.08 / 2)
+        assert sent.angular_z == pytest.approx((2.8 + 0.3) * 0.08 / 0.5)
+        assert it.body.commanded == (sent.linear_x, sent.linear_y, sent.angular_z)
 
 
 async def test_stop_and_close_work_in_any_state(tmp_path: Path) -> None:

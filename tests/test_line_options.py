@@ -70,19 +70,112 @@ def test_a_mistake_is_refused_with_file_line_and_field(
 
 
 @pytest.mark.parametrize(
-    ("right", "wrong", "complaint"),
+    ("command", "complaint"),
     [
-        ("{linear_x:.3f}", "{wheel_back}", r"real\.command: no wheel_back on a differential base"),
-        ("wheel_radius: 0.08\n", "", r"real\.state\[0\]: .* its wheels: none"),
+        ("{wheel_back}", r"no wheel_back on a differential base; its wheels: left, right"),
+        ("{wheel_left}", r"no \{wheel_right\}; a differential base needs \{linear_x\} and"),
+        ("{linear_x}", r"no \{angular_z\}"),
+        ("{angular_z}", r"no \{linear_x\}"),
+        ("{wheel_left},{wheel_right},{angular_z}", r"\{angular_z\} beside \{wheel_left\} and"),
+        ("{linear_x:d},{angular_z}", r"\{linear_x\}: its smallest step is 1, .* does 0.4"),
+        ("{linear_x},{angular_z|10deg/s:d}", r"\{angular_z\}: its smallest step is 0.175"),
+        ("{wheel_left:d},{wheel_right:d}", r"\{wheel_left\}: its smallest step is 1, .* does 5"),
+        ("{linear_x}{angular_z}", r"\{linear_x\} and \{angular_z\} touch"),
+        ("{linear_x}0{angular_z}", r"\{linear_x\} and \{angular_z\} touch"),
     ],
 )
-def test_a_wheel_that_the_base_does_not_have_is_refused(
+def test_a_command_that_does_not_fit_the_body_is_refused(
+    tmp_path: Path, command: str, complaint: str
+) -> None:
+    text = BARE.replace("{linear_x:.3f},{angular_z:.3f}", command)
+    with pytest.raises(ConfigError, match=r"robot\.yaml:12: real\.command: " + complaint):
+        loaded(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    "command", ["{linear_x|mm/s:d},{linear_y},{angular_z}", "{linear_x:+.2f}{angular_z:+.2f}"]
+)
+def test_a_command_that_fits_the_body_is_taken(tmp_path: Path, command: str) -> None:
+    loaded(tmp_path, BARE.replace("{linear_x:.3f},{angular_z:.3f}", command))
+
+
+@pytest.mark.parametrize(
+    ("state", "complaint"),
+    [
+        (["{battery_percentage}"], r": nothing in it says how the body moves; expected \{linear_x"),
+        (["{linear_x}"], r": nothing in it says \{angular_z\}"),
+        (["{wheel_left_position}", "B,{wheel_right_position}"], r"\[0\]: .*in one line"),
+        (["{x},{y}", "B,{yaw}"], r"\[0\]: \{x\}, \{y\} and \{yaw\} must stand in one line"),
+        (["{linear_x},{angular_z}", "{x},{y},{yaw}", "{_}"], r"\[2\]: \{_\} alone says nothing"),
+        (["{linear_x},{angular_z}", "{x},{y}"], r"\[1\]: its lines look like those of state\[0"),
+        (["{linear_x}{angular_z}"], r"\[0\]: \{linear_x\} and \{angular_z\} touch"),
+    ],
+)
+def test_a_state_that_does_not_say_how_the_body_moves_is_refused(
+    tmp_path: Path, state: list[str], complaint: str
+) -> None:
+    with pytest.raises(ConfigError, match=r"robot\.yaml:13: real\.state" + complaint):
+        loaded(tmp_path, with_state(state))
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        ["{wheel_left_velocity},{wheel_right_velocity}"],
+        ["{wheel_left_velocity}", "B,{wheel_right_velocity}"],
+        ["{linear_x},{wheel_left_position},{wheel_right_position}"],
+        ["{linear_x},{angular_z}", "B,{battery_percentage},{_}"],
+    ],
+)
+def test_a_state_that_says_how_the_body_moves_is_taken(tmp_path: Path, state: list[str]) -> None:
+    loaded(tmp_path, with_state(state))
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "complaint"),
+    [
+        ("wheel_radius: 0.08", "wheel_radius: 0", r":13: real\.state\[0\]: .* its wheel_radius at"),
+        ("wheel_separation: 0.5\n", "", r":12: real\.state\[0\]: .* its wheel_separation at"),
+        ("drive_type: differential", "drive_type: mecanum", r":13: .* its wheel_base at the top"),
+        ("  driver: line\n", "", r":9: real: missing field 'driver'"),
+        ("driver: line", "drivr: line", r":10: unknown field 'drivr'; did you mean 'driver'"),
+        ("driver: line", "driver: lin", r":10: no driver 'lin'; did you mean 'line'"),
+        ("driver: line", "driver: 5", r":10: real\.driver: expected a string, got 5"),
+        ('port: "{port}"', 'port: ""', r":11: real\.port: expected a path"),
+        ("  command:", "  scan: {driver: ld20}\n  command:", r":12: no lidar 'ld20'; did you mean"),
+        ("  command:", '  scan: {driver: ld19, port: "{port}"}\n  command:', r":12: .*of the base"),
+        (
+            "  command:",
+            "  scan: {driver: ld19, port: Auto}\n  command:",
+            r":12: real\.scan\.port: ",
+        ),
+        (
+            "  command:",
+            "  scan: {driver: ld19}\n"
+            "  lidar: {beams: 5000, rate_hz: 10, range_min: 0.1, range_max: 12}\n  command:",
+            r":12: real\.scan: its lidar has 5000 beams, .* 450 in each",
+        ),
+    ],
+)
+def test_what_does_not_fit_together_is_refused_with_file_and_line(
     tmp_path: Path, right: str, wrong: str, complaint: str
 ) -> None:
-    mine = tmp_path / "robot.yaml"
-    mine.write_text(BARE.replace(right, wrong))
-    with pytest.raises(ConfigError, match=complaint):
-        catalog.make_driver(str(mine), Run(folder=tmp_path, link="real"))
+    assert right in BARE
+    with pytest.raises(ConfigError, match=r"robot\.yaml" + complaint):
+        loaded(tmp_path, BARE.replace(right, wrong, 1))
+
+
+def loaded(folder: Path, text: str) -> None:
+    mine = folder / "robot.yaml"
+    mine.write_text(text)
+    catalog.make_driver(str(mine), Run(folder=folder, link="real"))
+
+
+def with_state(lines: list[str]) -> str:
+    ended = ", ".join(f'"{line}\\n"' for line in lines)
+    return BARE.replace(f"[{STATE}]", f"[{ended}]").replace(
+        "  flags: [watchdog, estop, bumper_left, bumper_right]\n", ""
+    )
 
 
 def test_a_third_base_takes_fewer_than_twenty_lines() -> None:
@@ -100,7 +193,7 @@ def test_the_third_base_stands_in_the_docs_as_it_is_here() -> None:
 def test_the_third_base_turns_metres_into_revolutions() -> None:
     _, driver = catalog.make_driver(str(THIRD), Run(folder=THIRD.parent, link="real"))
     assert isinstance(driver, LineDriver)
-    line = driver._command.encode({"wheel_left": 1.0, "wheel_right": -2.0})
+    line = driver._command.template.encode({"wheel_left": 1.0, "wheel_right": -2.0})
     assert line == b"$MOT,9.5,-19.1*4E\r\n"
 
 

@@ -85,6 +85,38 @@ def test_the_wheels_speeds_are_the_velocity() -> None:
     assert it.velocity().angular_z == pytest.approx(0.16)
 
 
+def test_where_there_are_wheel_speeds_alone_the_pose_is_their_integral() -> None:
+    it = report()
+    for n in range(1, 52):
+        it.take({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * n * MS)
+    assert it.pose.yaw == pytest.approx(0.16)
+    assert it.pose.x == pytest.approx(0.75 * math.sin(0.16), abs=1e-4)  # 0.12 / 0.16 m of radius
+    assert it.joints()[1].position == pytest.approx(2.0)
+
+
+def test_wheel_speeds_may_come_line_by_line() -> None:
+    it = report()
+    for n in range(1, 52):
+        it.take({"wheel_left_velocity": 1.0}, (20 * n - 10) * MS)
+        it.take({"wheel_right_velocity": 1.0}, 20 * n * MS)
+    assert (it.pose.x, it.pose.yaw) == pytest.approx((0.08, 0.0), abs=0.001)
+
+
+def test_each_part_of_the_velocity_comes_from_where_it_is_known() -> None:
+    it = report()
+    for n in range(11):
+        it.take({"linear_x": 0.25, **wheels(0.0, 0.05 * n)}, (20 + 20 * n) * MS)
+    assert it.velocity().linear_x == 0.25
+    assert it.velocity().angular_z == pytest.approx(0.4)  # 2.5 rad/s * 0.08 / 0.5
+
+
+def test_a_line_that_says_nothing_of_motion_is_told_apart() -> None:
+    it = report()
+    assert not it.take({"battery_voltage": 12.0}, 20 * MS)
+    assert it.take(wheels(0.0, 0.0), 40 * MS)
+    assert it.take({"wheel_left_velocity": 0.0}, 60 * MS)
+
+
 @pytest.mark.parametrize(
     ("volts", "percent"), [(9.9, 0), (11.25, 50), (12.6, 100), (14, 100), (5, 0)]
 )

@@ -10,7 +10,7 @@ import pytest
 import serial
 
 from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.links import ports
+from gigabrain_drivers.links import port_name, ports
 from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.links.serial_link import SerialLink, open_port
 from gigabrain_drivers.links.tcp_link import TcpLink
@@ -205,12 +205,33 @@ async def test_auto_takes_the_port_that_answers(
 
 
 def test_a_usb_port_is_named_by_its_numbers() -> None:
-    assert ports.usb_id("usb:0483:5740") == (0x0483, 0x5740, "")
-    assert ports.usb_id("usb:10c4:ea60:0001") == (0x10C4, 0xEA60, "0001")
+    assert port_name.usb_id("usb:0483:5740") == (0x0483, 0x5740, "")
+    assert port_name.usb_id("usb:10c4:ea60:0001") == (0x10C4, 0xEA60, "0001")
     with pytest.raises(ValueError, match="expected usb:VID:PID"):
-        ports.usb_id("usb:0483")
+        port_name.usb_id("usb:0483")
     with pytest.raises(ValueError, match="hexadecimal"):
-        ports.usb_id("usb:048x:5740")
+        port_name.usb_id("usb:048x:5740")
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("usb:12345:0043", "up to four hexadecimal digits"),
+        ("usb:2341:-43", "up to four hexadecimal digits"),
+        ("USB:2341:0043", "did you mean 'usb:2341:0043'"),
+        ("Auto", "did you mean 'auto'"),
+        ("", "expected a path"),
+        ("tcp://1.2.3.4:5", "expected a path"),
+    ],
+)
+def test_what_can_be_no_serial_port_is_refused_with_its_field(name: str, said: str) -> None:
+    with pytest.raises(ValueError, match=f"^port: .*{said}"):
+        port_name.check_port(name)
+
+
+@pytest.mark.parametrize("name", ["auto", "usb:2341:0043", "usb:2341:43:A-1", "/dev/ttyUSB0"])
+def test_what_may_be_a_serial_port_is_taken(name: str) -> None:
+    port_name.check_port(name)
 
 
 def test_what_is_wrong_with_a_port_says_what_to_do() -> None:

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import Grid, clearance, free_ahead, outline_of
-from gigabrain_zenoh.navigation.models import answer, feasible, lag_of, model_of
+from gigabrain_zenoh.navigation.models import answer, feasible, lag_of, model_of, slowed
 from gigabrain_zenoh.navigation.mppi import past_of
 from gigabrain_zenoh.navigation.window import Place, Window
 from tests.local_rig import CAR, WAFFLE, wall
@@ -44,6 +44,20 @@ def test_a_wheel_is_never_planned_to_be_faster_than_it_can_be() -> None:
 def test_a_slower_speed_can_be_asked_for() -> None:
     assert model_of(WAFFLE, 0.1).forward == 0.1
     assert model_of(WAFFLE, 9.0).forward == 0.26
+
+
+@pytest.mark.parametrize("late", [0.02, 0.1, 0.5])
+def test_a_body_that_reacts_later_is_driven_so_that_it_needs_no_longer_to_stop(late: float) -> None:
+    model = model_of(WAFFLE)
+    slow = slowed(model, late)
+
+    def way(speed: float, reaction: float) -> float:
+        return speed * reaction + speed**2 / (2 * 0.9)
+
+    assert way(slow.forward, 0.22 + late) == pytest.approx(way(0.26, 0.22))
+    assert slow.forward / model.forward == pytest.approx(slow.turning / model.turning)
+    assert slow.forward < model.forward
+    assert slowed(model, 0.0) is model
 
 
 def test_a_lag_closes_the_gap_by_the_same_share_in_each_step() -> None:

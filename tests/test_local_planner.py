@@ -7,9 +7,10 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Obstacle, Response
 from gigabrain_zenoh.navigation.local import Goal, LocalPlanner, Moment, Sent
-from tests.local_rig import CAR, QUICK, WAFFLE, Drive, wall
+from tests.local_rig import CAR, OMNI, QUICK, WAFFLE, Drive, wall
 
 NOTHING = np.empty((0, 2))
 LATE = Response(delay=0.1, lag=0.15)
@@ -25,6 +26,27 @@ def test_a_goal_is_reached_with_its_yaw() -> None:
     assert math.hypot(drive.pose.x - 0.8, drive.pose.y - 0.4) < 0.12
     assert abs(drive.pose.yaw + 1.0) < 0.15
     assert drive.plans[-1].twist == Velocity()
+
+
+@pytest.mark.parametrize("body", [WAFFLE, TRIKE, OMNI])
+@pytest.mark.parametrize("yaw", [-0.4, 3.0])
+def test_who_is_there_and_looks_elsewhere_turns_at_once(body: BodyDescription, yaw: float) -> None:
+    drive = Drive(body, Goal(x=0.0, y=0.05, yaw=yaw), NOTHING, response=LATE)
+    assert drive.go(6.0).arrived
+    assert abs(math.remainder(drive.pose.yaw - yaw, math.tau)) < 0.13
+    assert math.hypot(drive.pose.x, drive.pose.y - 0.05) < 0.13
+    assert "turning in place: at the goal" in {plan.reason for plan in drive.plans}
+
+
+def test_an_omnidirectional_body_goes_sideways_through_a_gap_too_narrow_for_its_front() -> None:
+    gap = np.concatenate([wall((0.2, 0.9), (1.6, 0.9)), wall((-0.2, 0.9), (-1.6, 0.9))])
+    drive = Drive(OMNI, Goal(x=0.0, y=1.8, yaw=0.0), gap, response=LATE)
+    assert drive.go(12.0).arrived
+    assert drive.least > 0.0
+    assert max(plan.twist.linear_y for plan in drive.plans) > 0.4
+    assert max(abs(pose.yaw) for pose in drive.poses if 0.6 < pose.y < 1.2) < 0.5
+    assert math.hypot(drive.pose.x, drive.pose.y - 1.8) < 0.13
+    assert abs(drive.pose.yaw) < 0.13
 
 
 def test_a_narrow_door_is_passed() -> None:

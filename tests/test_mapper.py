@@ -3,6 +3,7 @@
 import asyncio
 import functools
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pytest
@@ -37,6 +38,11 @@ class Robot(Bench):
     def __init__(self, config: PerceptionConfig = SLAM) -> None:
         super().__init__(functools.partial(perception.run, config))
         self.rooms, self.tick, self.boot = Rooms(HOUSE), 0, 7
+
+    async def __aenter__(self) -> Self:
+        await super().__aenter__()
+        await self.ready()
+        return self
 
     def say(self) -> None:
         self.send(BODY, body(boot=self.boot))
@@ -119,12 +125,14 @@ async def test_bad_scans_are_left_out_and_told_once(caplog: pytest.LogCaptureFix
             robot.send(SCAN, scan(np.full(200, 2.0), robot.tick))  # of wrong length
         robot.send(SCAN, replace(good, basis=good.basis + 1000))  # from the future
         robot.drive(2)
-        assert robot.bus.counters["scans_left_out"] == 3
+        assert robot.bus.counters["scans_left_out"] == 4
         poses: list[PoseInMap] = robot.sent(POSE)
     assert [pose.basis for pose in poses] == [5, 10, 15, 20]
     told = [record.message for record in caplog.records if "left out" in record.message]
     assert told == [
         "a scan is left out of the map: the scan has 200 beams, the body's lidar 360",
+        "a scan is left out of the map: "
+        "it claims to be of tick 1010, which had not come by tick 15",
     ]
 
 

@@ -52,6 +52,7 @@ REQUIRED: dict[str, set[str]] = {
     "MapReply": {"ok", "text"},
     "TaskRequest": {"do"},
     "TaskReply": {"ok", "text"},
+    "Granted": {"service", "request"},
     "TaskStatus": set(),
     "ParamRequest": set(),
     "ParamReply": {"ok", "text"},
@@ -81,6 +82,7 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/button": ("ButtonState", 20),
         "robot/log": ("LogRecord", 10),
         "robot/task": ("TaskStatus", 5),
+        "robot/granted": ("Granted", 10),
         "robot/audit": ("AuditRecord", 10),
     }
     assert [service.at("*") for service in SERVICES] == [
@@ -109,6 +111,7 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/button": 200_000_000,
         "robot/log": 500_000_000,
         "robot/task": 1_000_000_000,
+        "robot/granted": 500_000_000,
         "robot/audit": 500_000_000,
     }
 
@@ -147,7 +150,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in golden.FOLDER.iterdir()}
     assert stored == golden.files()
-    assert len(stored) == 72
+    assert len(stored) == 74
 
 
 @by_name

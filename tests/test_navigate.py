@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 from gigabrain_schemas.base import Cause, Velocity
+from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest, TaskRequest
 from gigabrain_schemas.topics import GOAL, MISSION, SAFETY, TASK_CHANGE
+from gigabrain_zenoh.navigating import Navigating
 from gigabrain_zenoh.settings import DecisionConfig
-from tests.brain_rig import BOOT
+from tests.brain_rig import BOOT, state
+from tests.bus_rig import Net
 from tests.plane_rig import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
@@ -160,6 +163,33 @@ async def test_it_stands_while_its_scans_come_too_late_to_drive_by() -> None:
         assert plane.intent.reason.startswith("going to (4.00, 0.80): ")
 
 
+async def test_it_drives_more_slowly_while_its_scans_come_late_and_says_why() -> None:
+    async with Plane(CELLS, at=(0.6, 1.5, 0.0)) as plane:
+        await plane.go(0.2)
+        await plane.ask_at_once(GOAL, GoalRequest(x=4.5, y=1.5))
+        await plane.go(1.5)
+        assert "busy" not in plane.intent.reason
+        in_time = await fastest(plane, 1.5)
+        plane.late_ticks = 7
+        await plane.go(1.0)
+        assert plane.intent.reason.endswith("; slower, this host is busy: 0.10 s late")
+        late = await fastest(plane, 1.5)
+        plane.late_ticks = 0
+        await plane.go(3.0)
+        assert "busy" not in plane.intent.reason
+        assert in_time > 0.24
+        assert 0.1 < late < 0.23
+        await plane.until("succeeded", seconds=60)
+
+
+async def fastest(plane: Plane, seconds: float) -> float:
+    speeds = []
+    for _ in range(round(seconds * 50)):
+        await plane.go(0.02)
+        speeds.append(plane.velocity.linear_x)
+    return max(speeds)
+
+
 async def test_a_driver_that_starts_anew_does_not_end_what_there_is_to_do() -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
@@ -257,3 +287,40 @@ async def test_who_roams_explores_and_then_visits_places_until_it_is_sent_elsewh
         await plane.ask_at_once(GOAL, GoalRequest(x=1.5, y=1.2))
         await plane.go(0.5)
         assert plane.status.done[0].reason == "replaced by goal-2"
+
+
+async def test_who_was_told_to_do_nothing_does_not_roam_after_a_restart_of_decision(
+    tmp_path: Path,
+) -> None:
+    config = DecisionConfig(behaviour="navigate", begin="roam", state_dir=str(tmp_path))
+    async with Plane(CELLS, config=config) as plane:
+        await plane.go(0.5)
+        await plane.ask(TASK_CHANGE, TaskRequest(do="cancel", task="all", source="ann"))
+        await plane.go(0.5)
+        assert plane.intent.reason == "waiting: for a goal"
+        while b'"jobs":[]' not in (tmp_path / "tasks.json").read_bytes():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        await plane.restart()
+        await plane.go(1.0)
+        assert plane.intent.reason == "waiting: for a goal"
+        plane.driver_starts_anew()
+        await plane.restart()
+        await plane.go(1.0)
+        assert plane.status.current
+        assert plane.status.current.label == "roaming"
+
+
+async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_that_is() -> None:
+    net = Net()
+    senses = Navigating(DecisionConfig(behaviour="navigate"), net.one)
+    states = [state(tick, v=0.01 * tick, pose=(0.1 * tick, 0.0, 0.0)) for tick in range(1, 8)]
+    for one in states:
+        senses.see(one)
+    seen = WorldModel(scan_ok=True, obstacle_ahead=False, boot=BOOT, tick=5, basis=5)
+    now = senses.situation(states[-1], seen, False)
+    assert now.bearings
+    assert (now.pose.x, now.bearings.velocity.linear_x) == (0.5, 0.05)
+    assert now.bearings.late_ticks == 2
+    await senses.close()
+    await net.one.close()
+    await net.two.close()

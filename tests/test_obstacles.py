@@ -49,7 +49,7 @@ def measured(
 
 
 class Watch:
-    """A lidar on a robot, ten scans a second, with noise of 1 cm, and the tracker."""
+    """A lidar on a robot, ten scans a second, with noise, and the tracker."""
 
     def __init__(
         self,
@@ -59,8 +59,11 @@ class Watch:
         fov: float = math.tau,
         hz: float = 10.0,
         seed: int = 1,
+        noise: float = 0.01,
+        lost: float = 0.0,
     ) -> None:
         self.lidar, self.walls, self.fov, self.hz = lidar, walls, fov, hz
+        self.noise, self.lost = noise, lost  # [m], share of the beams
         self.tracker, self.tick, self.t = ObstacleTracker(), 0, 0.0
         self._random = np.random.default_rng(seed)
 
@@ -69,9 +72,11 @@ class Watch:
         self.tick += round(50 / self.hz)
         self.t = self.tick * 0.02
         ranges, angles = measured(self.lidar, pose, self.walls, discs, self.fov)
-        ranges += 0.01 * self._random.standard_normal(len(ranges))
+        ranges += self.noise * self._random.standard_normal(len(ranges))
         ranges = ranges.astype("f4").astype(float)
         hit = ranges < self.lidar.range_max
+        if self.lost:
+            hit &= self._random.random(len(ranges)) >= self.lost
         x = self.lidar.x + ranges[hit] * np.cos(angles[hit])
         y = self.lidar.y + ranges[hit] * np.sin(angles[hit])
         spacing = self.fov / self.lidar.beams
@@ -265,6 +270,17 @@ def test_the_discs_of_dynabarn_are_seen_in_their_size_with_720_beams() -> None:
         assert (one.x, one.y) == pytest.approx((x, y), abs=0.08)
         assert (one.velocity_x, one.velocity_y) == pytest.approx((vx, vy), abs=0.12)
         assert one.radius == pytest.approx(radius, abs=0.06)
+
+
+def test_noise_of_3_cm_and_lost_beams_break_nothing_into_pieces() -> None:
+    watch = Watch(JACKAL, (), fov=math.radians(270), hz=25, noise=0.03, lost=0.1)
+    for i in range(50):
+        y = -1.0 + 0.04 * (i + 1)
+        obstacles = watch.scan((3.0, y, 0.5), (6.0, -y, 0.5))
+        if i >= 25:
+            assert len(obstacles) == 2
+            assert nearest(obstacles, 3.0, y).radius == pytest.approx(0.5, abs=0.06)
+            assert speed(nearest(obstacles, 3.0, y)) == pytest.approx(1.0, abs=0.2)
 
 
 def test_the_covariance_says_how_far_off_it_may_be() -> None:

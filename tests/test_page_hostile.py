@@ -1,10 +1,12 @@
 """What a WebSocket client may send to the page's server, and what becomes of it."""
 
 import asyncio
+import contextlib
 import re
 import signal
 import socket
 import struct
+import urllib.request
 from collections.abc import Iterator
 
 import pytest
@@ -94,6 +96,22 @@ async def test_a_flood_is_cut_off_and_others_go_on(robot: Robot) -> None:
         with pytest.raises(ConnectionClosed):
             await pour(flood)
         assert await asyncio.wait_for(other.recv(), 20)
+
+
+@pytest.mark.usefixtures("served")
+@pytest.mark.parametrize("begun", [b"", b"GET / HTTP/1.1\r\nHost: "], ids=["silent", "half"])
+async def test_those_who_connect_and_ask_for_nothing_keep_nobody_out(
+    robot: Robot, begun: bytes
+) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(100):
+            silent = socket.create_connection(("127.0.0.1", robot.port), timeout=20)
+            stack.enter_context(silent).sendall(begun)
+        page = await asyncio.to_thread(urllib.request.urlopen, robot.origin, timeout=20)
+        assert page.status == 200
+        page.close()
+        silent.settimeout(30)
+        assert await asyncio.to_thread(silent.recv, 1) == b""  # the last one is hung up on as well
 
 
 @pytest.mark.usefixtures("served")

@@ -20,7 +20,8 @@ class Handed:
     """What was handed on: the scan's tick, and x of its pose."""
 
     def __init__(self) -> None:
-        self.placed, self.all = PlacedScans(self._take), list[tuple[int, float | None]]()
+        self.placed = PlacedScans(self._take, lambda scan: self.missed.append(scan.basis))
+        self.all, self.missed = list[tuple[int, float | None]](), list[int]()
 
     def _take(self, of: LaserScan, pose: Pose | None) -> None:
         self.all.append((of.basis, pose.x if pose else None))
@@ -47,7 +48,7 @@ def test_a_scan_of_a_tick_whose_state_is_still_on_its_way_waits_for_it() -> None
     assert handed.all == []
     handed.state(5, 0.5)
     handed.state(6, 0.6)
-    assert handed.all == [(5, 0.5)]
+    assert (handed.all, handed.missed) == ([(5, 0.5)], [])
 
 
 def test_a_scan_from_the_future_waits_until_the_next_takes_its_place() -> None:
@@ -56,7 +57,7 @@ def test_a_scan_from_the_future_waits_until_the_next_takes_its_place() -> None:
     handed.scan(5000)
     handed.scan(5)
     handed.state(6)
-    assert handed.all == [(5, 0.0)]
+    assert (handed.all, handed.missed) == ([(5, 0.0)], [5000])
 
 
 def test_of_a_tick_long_past_the_place_is_not_known() -> None:

@@ -14,15 +14,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_schemas.examples import EXAMPLES, example
 from gigabrain_schemas.sensors import Image
-from gigabrain_schemas.topics import IMAGE, MAP, SCAN, STATE, TOPICS
+from gigabrain_schemas.topics import IMAGE, INTENT, MAP, SCAN, STATE, TOPICS
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording import bagfile, tape
 from gigabrain_zenoh.recording.bagfile import BagFile
 from gigabrain_zenoh.recording.info import info
+from gigabrain_zenoh.recording.intake import Intake
 from gigabrain_zenoh.recording.node import chosen, listening, run
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.recorder import Recorder, Status
@@ -190,9 +192,10 @@ def test_whoever_hands_messages_over_never_waits_for_the_disk(
     with Recorder(tmp_path / "stuck.mcap", config) as recorder:
         for seq in range(1, 1001):
             recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
-        assert recorder.status().seen == 1000  # all were taken while the disk stood still
-        assert recorder.status().dropped > 900
+        stuck = recorder.status()
         gate.set()
+    assert stuck.seen == 1000  # all were taken while the disk stood still
+    assert stuck.dropped > 850  # twice the queue's room at most was not
     status = recorder.status()
     assert status.written + status.dropped == 1000
 
@@ -356,3 +359,35 @@ def test_a_file_that_exists_or_cannot_be_made_is_refused_before_anything_is_reco
     assert there.read_text() == "mine"
     with pytest.raises(ConfigError, match=r"there.mcap exists; choose another"):
         Recorder(there / "x.mcap", QUICK).begin()
+
+
+def test_messages_that_gathered_bear_the_times_of_their_own_stamps() -> None:
+    intake = Intake(1 << 20, lambda: 1_000_000_000)
+    for ago_ms in (50, 30, 10, 70, -5):
+        state = replace(example(STATE.type), stamp_ns=(1_000 - ago_ms) * 1_000_000)
+        intake.take("robot/state", "", codec.encode(state))
+    times = [arrival.log_ns for arrival in intake.hand_over()]
+    assert times == [950_000_000, 970_000_000, 990_000_000, 1_000_000_000, 1_000_000_001]
+
+
+def test_what_is_dropped_is_not_missing_nor_a_new_sender() -> None:
+    intake = Intake(5000, lambda: 1)
+    for seq in range(1, 6):  # of 1.5 kB each: three fit
+        intake.take("robot/scan", "", bag_rig.scan(seq))
+    assert (intake.counts(), len(intake.hand_over())) == ((5, 2, 0), 3)
+    assert not intake.gaps.restarts
+
+
+def test_viewers_get_every_second_state_and_each_thought_once(tmp_path: Path) -> None:
+    file = BagFile(tmp_path / "a.mcap", viewers=True, notes={})
+    for tick in range(50):  # one second
+        for topic in (STATE, INTENT):
+            said = replace(example(topic.type), seq=tick + 1, tick=tick, basis=tick // 5)
+            file.add(bag_rig.arrival(tick * 20_000_000, topic.key, codec.encode(said)))
+    file.finish()
+    file.close()
+    drawn = Counter(channel.topic for channel, _, _ in Bag(file.path).messages())
+    assert {name: drawn[name] for name in ("robot/state", "/viz/tf", "/viz/state_numbers")} == {
+        "robot/state": 50, "/viz/tf": 25, "/viz/state_numbers": 25,
+    }  # fmt: skip
+    assert (drawn["robot/intent"], drawn["/viz/path"]) == (50, 10)

@@ -1,17 +1,31 @@
 """Process replay: the recorded drive of each world through the processes as they are now."""
 
+import asyncio
+import functools
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
+from msgspec.structs import replace
 
-from gigabrain_schemas.topics import INTENT
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.tasks import GoalReply, GoalRequest, Granted, TaskRequest
+from gigabrain_schemas.topics import GOAL, GRANTED, INTENT, STATE, TASK, TASK_CHANGE, WORLD, Topic
+from gigabrain_zenoh import codec, decision
+from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.drives import DRIVES, file_of
 from gigabrain_zenoh.recording.fields import message_of
-from gigabrain_zenoh.recording.process_replay import SAYS, replay_process, settings_for
+from gigabrain_zenoh.recording.process_replay import SAYS, placed, replay_process, settings_for
 from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.recorder import Recorder
+from gigabrain_zenoh.replay import ASKED, Event, record, replay
+from gigabrain_zenoh.settings import DecisionConfig, RecorderConfig
 from tests import bag_rig
+from tests.plane_rig import ROOM, Plane, drawn
 
 RECORDINGS = Path(__file__).parent / "recordings"
 RENEW = "was the change meant? then: make recordings"
@@ -70,3 +84,86 @@ def test_a_recording_without_the_process_is_refused(tmp_path: Path) -> None:
     bag_rig.write(path, bag_rig.drive(10))
     with pytest.raises(ConfigError, match="holds nothing that safety has said"):
         call("replay", "--check", str(path), "--process", "safety")
+
+
+def granted(service: str, tick: int, basis: int) -> bytes:
+    return codec.encode(Granted(service=service, request="{}", boot=7, tick=tick, basis=basis))
+
+
+def said(topic: Topic[Any], tick: int, boot: int = 7) -> Event:
+    message = replace(example(topic.type), boot=boot, tick=tick, basis=tick)
+    return tick * 20, topic.key, codec.encode(message)
+
+
+def test_a_request_is_fed_where_it_counted_and_not_where_its_record_came() -> None:
+    heard = [
+        said(STATE, 90, boot=6),  # of an earlier start of the driver, which counted further
+        said(STATE, 5),
+        said(WORLD, 5),
+        said(STATE, 6),
+        said(STATE, 7),
+        (150, GRANTED.key, granted("robot/goal", tick=6, basis=0)),
+        (151, GRANTED.key, granted("robot/mission", tick=6, basis=5)),
+    ]
+    order = [(at, key) for at, key, _ in placed(heard)]
+    assert order == [
+        (1800, "robot/state"),
+        (100, "robot/state"),
+        (100, "robot/goal"),  # that world had not been thought about
+        (100, "robot/world"),
+        (120, "robot/state"),
+        (140, "robot/mission"),
+        (140, "robot/state"),
+    ]
+
+
+async def test_a_replay_waits_for_the_node_and_for_its_answers() -> None:
+    told: list[str] = []
+
+    async def node(bus: Bus, ready: Callable[[], None]) -> None:
+        async def go(request: GoalRequest) -> GoalReply:
+            await asyncio.to_thread(lambda: told.append(f"goes to {request.x:g}"))
+            return GoalReply(ok=True, text="on the way")
+
+        await asyncio.to_thread(lambda: told.append("compiles"))
+        bus.serve(GOAL, go)
+        bus.subscribe(STATE, lambda _key, state: told.append(f"tick {state.tick}"))
+        ready()
+        await bus.failed
+
+    goal = codec.encode(GoalRequest(x=3.0, y=0.0))
+    await replay(node, [said(STATE, 1), (30, GOAL.key, goal), said(STATE, 2)])
+    assert told == ["compiles", "tick 1", "goes to 3", "tick 2"]
+
+
+def test_a_replay_runs_no_programs_and_remembers_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    notes = {"decision": '{"behaviour":"navigate","scripts":"/bin","state_dir":"/tmp"}'}
+    with Recorder(path, RecorderConfig(notes=notes, keep_free_mb=0)) as recorder:
+        recorder.intake.take(STATE.key, "", said(STATE, 1)[2])
+    settings = settings_for(path, "decision", None)
+    assert settings == {"behaviour": "navigate", "scripts": "", "state_dir": ""}
+
+
+async def test_a_decision_that_was_sent_to_a_place_does_the_same_again() -> None:
+    async with Plane(drawn(ROOM)) as plane:
+        events = record(plane.bench.network, plane.bench.clock)
+        await plane.go(1.0)
+        assert (await plane.ask(GOAL, GoalRequest(x=3.5, y=1.0, source="ann"))).ok
+        await plane.go(2.0)
+        assert (await plane.ask(TASK_CHANGE, TaskRequest(do="pause"))).ok
+        await plane.go(0.5)
+        assert (await plane.ask(TASK_CHANGE, TaskRequest(do="resume"))).ok
+        await plane.go(1.5)
+    own = (INTENT.key, TASK.key)
+    then = [(key, data) for _, key, data in events if key in own]
+    heard = placed([event for event in events if event[1] not in own])
+    assert [key for _, key, _ in heard if key in ASKED] == [GOAL.key, *2 * (TASK_CHANGE.key,)]
+    node = functools.partial(decision.run, DecisionConfig(behaviour="navigate"))
+    now = [(key, data) for key, data in await replay(node, heard) if key in own]
+    assert plane.travelled > 0.3
+    assert [unstamped(*one) for one in now] == [unstamped(*one) for one in then]
+
+
+def unstamped(key: str, payload: bytes) -> dict[str, Any]:
+    return dict(msgspec.msgpack.decode(payload)) | {"key": key, "stamp_ns": 0}

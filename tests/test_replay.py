@@ -3,6 +3,7 @@
 import asyncio
 import functools
 import math
+from collections.abc import Callable
 
 import msgspec
 import numpy as np
@@ -126,11 +127,12 @@ async def test_a_system_that_was_changed_sends_something_else() -> None:
 
 
 async def test_what_ends_a_node_ends_its_replay() -> None:
-    async def fragile(bus: Bus, ready: object) -> None:
+    async def fragile(bus: Bus, ready: Callable[[], None]) -> None:
         def break_down(_key: str, command: CmdVel) -> None:
             raise ArithmeticError("no such thing")
 
         bus.subscribe(CMD_VEL, break_down)
+        ready()
         await bus.failed
 
     command = msgspec.msgpack.encode(CmdVel(linear_x=0.0))

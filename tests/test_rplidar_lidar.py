@@ -61,7 +61,7 @@ async def test_a_scan_of_each_model_is_the_scan_of_the_simulation(
         missing = int(np.isnan(ranges(scan)).sum())
         assert missing <= (165 if kind == STANDARD and model == "a1" else 0)  # 200 samples a turn
         assert agree(scan, truth()) > 0.97 - missing / 360
-        assert listener.source.health.connected
+        await until(lambda: listener.source.health.connected)
         assert listener.source.health.errors == 0
 
 

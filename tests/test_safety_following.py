@@ -1,6 +1,8 @@
 """Odometry that does not follow the command: runaway, too slow, stuck, frozen."""
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Velocity
@@ -76,6 +78,43 @@ def test_a_body_that_creeps_does_not_move_for_two_seconds_and_is_stuck() -> None
 def test_frozen_telemetry_is_found_within_half_a_second() -> None:
     patrol = under_way()
     assert patrol.ticks_until("telemetry_frozen", 30, told=AHEAD, frozen=True) == 20
+
+
+def test_frozen_telemetry_is_frozen_until_a_value_changes() -> None:
+    patrol = under_way()
+    patrol.ticks_until("telemetry_frozen", 30, told=AHEAD, frozen=True)
+    assert patrol.go(500, told=REST, frozen=True, gate=IDLE) == ["telemetry_frozen"]
+    assert patrol.go(told=REST, moves=Velocity(linear_x=0.01), gate=IDLE) == []
+    assert patrol.go(300, told=REST, frozen=True, gate=IDLE) == []
+
+
+moments = st.tuples(
+    st.integers(min_value=1, max_value=40),  # ticks
+    st.sampled_from([REST, AHEAD, TURN, Velocity(linear_x=-0.2)]),
+    st.booleans(),  # whether the gate lets it through
+)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(moments, max_size=10))
+def test_a_body_whose_telemetry_is_known_to_be_frozen_is_never_told_to_move_again(
+    moments: list[tuple[int, Velocity, bool]],
+) -> None:
+    """Someone, or automatic resume, may enable it again and again, and command what they like."""
+    patrol, found, moved = under_way(), 0, 0
+    patrol.go(frozen=True, told=AHEAD)
+    for ticks, told, wanted in moments:
+        for _ in range(ticks):
+            enabled = wanted and patrol.verdict.verdict != "stop"
+            patrol.go(told=told, gate=DRIVING if enabled else IDLE, frozen=True)
+            found += found > 0 or "telemetry_frozen" in patrol.codes
+            moved = moved + 1 if moves(patrol.memory.following.told) else 0
+            assert moved <= 40
+            assert found <= 15 or not moved  # by then the ramp is over
+
+
+def moves(told: Velocity) -> bool:
+    return abs(told.linear_x) > 0.05 or abs(told.angular_z) > 0.3
 
 
 def test_a_body_at_rest_may_repeat_itself() -> None:

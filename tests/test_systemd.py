@@ -11,7 +11,8 @@ import jsonschema
 import pytest
 import yaml
 
-from gigabrain_zenoh.deployment import load_deployment
+from gigabrain_zenoh.config import loads
+from gigabrain_zenoh.deployment import Deployment, load_deployment
 from tests.onlooker import looking_on
 from tests.stack import ROOT, Home, endpoint_of, until
 
@@ -89,6 +90,20 @@ def test_the_compose_file_keeps_to_its_schema() -> None:
     document["services"]["robot"]["read_olny"] = True
     with pytest.raises(jsonschema.ValidationError, match="read_olny"):
         check.validate(document)
+
+
+def test_keys_can_be_mounted_as_the_compose_file_says() -> None:
+    schema = yaml.safe_load((ROOT / "tests" / "data" / "compose_spec.json").read_text())
+    text = (DOCKER / "compose.yaml").read_text().replace("# - ${KEYS}", "- ${KEYS}")
+    document = yaml.safe_load(text)
+    jsonschema.Draft201909Validator(schema).validate(document)
+    for name, service in document["services"].items():
+        assert f"${{KEYS}}/{name}:/etc/gigabrain/keys:ro" in service["volumes"]
+    site = (DOCKER / "deployment.yaml").read_text()
+    assert "insecure: true" in site
+    secure = loads(site.replace("insecure: true", "keys: keys"), Deployment, "deployment.yaml")
+    assert (secure.router, secure.keys) == ("tcp/robot:7447", "keys")
+    assert ".[sim,keys,fast]" in (DOCKER / "Dockerfile").read_text()
 
 
 def test_every_container_is_locked_up() -> None:

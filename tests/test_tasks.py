@@ -1,6 +1,8 @@
 """Tasks on the bus and on disk: what is asked, answered, told and remembered."""
 
 import asyncio
+import math
+import re
 from pathlib import Path
 
 import msgspec
@@ -10,13 +12,14 @@ from gigabrain_schemas.tasks import (
     Goal,
     GoalReply,
     GoalRequest,
+    Granted,
     MissionReply,
     MissionRequest,
     TaskReply,
     TaskRequest,
     TaskStatus,
 )
-from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE
+from gigabrain_schemas.topics import GOAL, GRANTED, MISSION, TASK, TASK_CHANGE
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.task_client import Tasks
 from gigabrain_zenoh.tasks.executive import Saved
@@ -308,6 +311,12 @@ async def test_a_script_is_told_who_is_missing() -> None:
         await Tasks(net.two).go_to(1.0, 0.0)
 
 
+@pytest.mark.parametrize("x", [math.nan, math.inf, -1e300])
+async def test_a_script_is_told_of_a_goal_that_is_no_place(x: float) -> None:
+    with pytest.raises(ConfigError, match=re.escape(f"numbers up to 1e+09, got {x:g} 0 1")):
+        await Tasks(Net().two).go_to(x, 0.0, 1.0)
+
+
 async def test_a_refusal_reaches_the_script(site: Site) -> None:
     await site.step()
     site.wall = "the goal is outside the map"
@@ -320,4 +329,25 @@ async def test_a_refusal_reaches_the_script(site: Site) -> None:
     assert await tasks.pause() == "mission-1 is paused"
     await site.step()
     assert (await tasks.status()).current
+    await site.end()
+
+
+async def test_what_was_granted_is_told_with_the_tick_and_the_world_from_which_it_counts(
+    site: Site,
+) -> None:
+    told: list[Granted] = []
+    site.net.two.subscribe(GRANTED, lambda _key, granted: told.append(granted))
+    await site.step()
+    site.service.step(state(7), None, basis=5)
+    site.net.one.time.see(state(7))
+    await site.go(3.0)
+    await site.change("pause")
+    site.wall = "the goal is inside a wall"
+    await site.go(4.0)
+    assert [(one.service, one.tick, one.basis) for one in told] == [
+        ("robot/goal", 7, 5),
+        ("robot/task_change", 7, 5),
+    ]
+    asked = msgspec.json.decode(told[0].request, type=GoalRequest)
+    assert (asked.x, asked.source) == (3.0, "ann")
     await site.end()

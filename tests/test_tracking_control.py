@@ -108,14 +108,24 @@ class Plant:
 
 
 def errors(
-    course: Course, plant: Plant, seconds: float, *, follow: bool = True, response: Response = SLOW
+    course: Course,
+    plant: Plant,
+    seconds: float,
+    *,
+    follow: bool = True,
+    response: Response = SLOW,
+    late: int = 1,
 ) -> list[float]:
-    """How far the body is from where it should be, tick by tick [m]; ten intents a second."""
+    """How far the body is from where it should be, tick by tick [m]; ten intents a second.
+
+    Decision takes its time: each intent is of `late` ticks before.
+    """
     found = []
     intent = None
     for i in range(round(seconds * 50)):
-        if i % 5 == 1:  # of the tick before: decision takes its time
-            intent = relocated(course.intent(plant.tick, response, follow=follow), course, plant)
+        if i % 5 == 1:
+            basis = max(0, plant.tick + 1 - late)
+            intent = relocated(course.intent(basis, response, follow=follow), course, plant)
         plant.go(intent)
         should, _ = course.at(plant.tick * 0.02 + 0.02)
         found.append(math.hypot(plant.pose.x - should.x, plant.pose.y - should.y))
@@ -172,6 +182,15 @@ def test_an_s_curve_is_driven_ten_times_as_exactly_as_with_a_twist_alone() -> No
 )
 def test_every_kind_of_body_keeps_to_its_trajectory(body: BodyDescription, path: Path) -> None:
     assert max(errors(Course(path, 9.0), Plant(body), 6.0)) < 0.015
+
+
+@pytest.mark.parametrize("late", [2, 5, 10])
+@pytest.mark.parametrize(("body", "path"), [(AGILE, ess), (SIDEWAYS, sideways)])
+def test_a_late_trajectory_begins_where_the_body_was_when_it_was_thought_of(
+    body: BodyDescription, path: Path, late: int
+) -> None:
+    found = errors(Course(path, 9.0), Plant(body), 6.0, late=late)
+    assert max(found[100:]) < 0.015  # the first of them comes when the course has begun
 
 
 def test_turning_on_the_spot_it_keeps_to_the_heading() -> None:

@@ -1,6 +1,7 @@
 """What goes over a line, in words: each frame beside its own bytes, whatever the pieces."""
 
 import logging
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,9 @@ from gigabrain_drivers.protocols.line import Decoder, Template, describe
 from gigabrain_drivers.protocols.line_fields import COMMAND
 from gigabrain_drivers.trace import run
 from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.cli.driver_kit import trace
 from gigabrain_zenoh.errors import ConfigError
-from tests.line_rig import bench
+from tests.line_rig import BARE, bench
 
 LINE = Template("V,{linear_x:.3f},{angular_z|deg/s:.1f}\n", COMMAND)
 FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [
@@ -141,3 +143,29 @@ async def test_a_real_body_is_not_moved_by_a_trace(tmp_path: Path) -> None:
             wanted=Velocity(linear_x=0.1),
             say=print,
         )
+
+
+async def test_a_trace_says_whether_anything_was_received(tmp_path: Path) -> None:
+    text = BARE.replace("{port}", str(tmp_path / "nothing"))
+    (tmp_path / "robot.yaml").write_text(text)
+    name, said = str(tmp_path / "robot.yaml"), list[str]()
+    received = await run(
+        name, "real", tmp_path, part="base", seconds=0.1, wanted=Velocity(), say=said.append
+    )
+    assert not received
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"seconds": math.nan}, "--seconds: expected a number above 0, got nan"),
+        ({"seconds": -1.0}, "--seconds: expected a number above 0, got -1"),
+        ({"linear_x": math.nan}, "--linear-x: expected a number, got nan"),
+        ({"linear_y": math.inf}, "--linear-y: expected a number, got inf"),
+    ],
+)
+def test_a_trace_for_no_time_or_at_no_speed_is_refused(
+    options: dict[str, float], complaint: str
+) -> None:
+    with pytest.raises(ConfigError, match=complaint):
+        trace("mycustombot", **options)  # type: ignore[arg-type]

@@ -18,6 +18,7 @@ from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 
 log = logging.getLogger(__name__)
 
+EARLY_NS = 2_000_000  # before its time an event loop may call, as its own clock is coarse
 STILL = 0.02  # [m/s], [rad/s]
 REST_LOOKS = 40  # 0.8 s: a supervisor that ends this process waits little longer
 
@@ -38,6 +39,10 @@ class Driver(abc.ABC):
     def __init__(self, robot: RobotFile, options: Any, run: Run) -> None:
         self.robot, self.options, self.run = robot, options, run
         self.emit: Emit = lambda topic, message: None  # the driver's process puts its own here
+
+    @classmethod  # noqa: B027 - most drivers fit any body
+    def check(cls, robot: RobotFile, options: Any) -> None:
+        """Raises ValueError, as `FIELD: ...`, where its options do not fit the body."""
 
     async def __aenter__(self) -> Self:
         try:
@@ -76,7 +81,7 @@ class Driver(abc.ABC):
         """Yield whenever time has gone on, and by how many ticks of 20 ms of the body's time."""
         start, told = clock.now_ns(), 0
         async for now_ns in clock.every(TICK_NS):
-            passed = (now_ns - start) // TICK_NS + 1 - told
+            passed = (now_ns - start + EARLY_NS) // TICK_NS + 1 - told
             if passed > 0:
                 told += passed
                 yield passed

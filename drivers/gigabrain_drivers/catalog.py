@@ -1,5 +1,6 @@
 """Finds robots and drivers by name: ours, those of installed packages, and people's own files."""
 
+import difflib
 import importlib
 import importlib.util
 from importlib import resources
@@ -12,10 +13,12 @@ from msgspec import Struct
 
 from gigabrain_drivers import DRIVERS
 from gigabrain_drivers.base import Driver
-from gigabrain_drivers.lidars.base import check_rate, source_class
+from gigabrain_drivers.lidars.base import check_turns, source_class
+from gigabrain_drivers.links.port_name import AUTO
 from gigabrain_drivers.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_zenoh import config
-from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.config_places import located
+from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
 from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.settings import LinkName
 
@@ -52,6 +55,11 @@ def robot_path(name: str) -> Path:
         return Path(name)
     known = robot_files()
     if name not in known:
+        package = Path(f"gigabrain-{name.replace('_', '-')}")  # as `gigabrain driver new` calls it
+        if package.is_dir():
+            raise UnknownName(
+                f"no robot {name!r} yet: its package has to be installed: pip install -e {package}"
+            )
         raise unknown("robot", name, known)
     return known[name]
 
@@ -123,32 +131,46 @@ def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions
         raise ConfigError(f"{robot.robot_type} has no link {run.link!r}; it has: {has}")
     borrowed = run.link == "emulated" and robot.emulated is None
     section: LinkName = "real" if borrowed else run.link
-    link = getattr(robot, section)
-    driver = driver_class(str(link.get("driver")))
+    driver = _driver_of(path, section, getattr(robot, section))
     # read once more, now that it is known what this driver's part looks like: errors name the line
-    exact = msgspec.defstruct(
-        "RobotFile",
-        [(section, link_options(driver, link))],
-        bases=(RobotFile,),
-        frozen=True,
-        kw_only=True,
-        forbid_unknown_fields=True,
-    )
+    try:
+        own = link_options(driver, robot, getattr(robot, section))
+    except ConfigError as error:
+        raise located(path, error) from None
+    exact = _with_section(section, own)
     options = getattr(config.load(path, exact), section)
     if options.lidar:
         robot = msgspec.structs.replace(robot, lidar=options.lidar)
-    if options.scan:
-        _check_lidar(path, options.scan.driver, robot)
     if borrowed:
         options = with_ports(options)
     return robot, driver, at_emulator(options, run.emulator), path.parent
 
 
-def _check_lidar(path: Path, name: str, robot: RobotFile) -> None:
+def _with_section(section: LinkName, type_: Any) -> type[RobotFile]:
+    """A robot's file in which it is known what one link may hold."""
+    exact = msgspec.defstruct(
+        "RobotFile",
+        [(section, type_)],
+        bases=(RobotFile,),
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+    )
+    return cast("type[RobotFile]", exact)
+
+
+def _driver_of(path: Path, section: LinkName, link: dict[str, Any]) -> type[Driver]:
+    """The driver that a link names. Raises ConfigError with file and line."""
+    if not isinstance(link.get("driver"), str):
+        others = [key for key in link if not difflib.get_close_matches(key, ["driver"])]
+        fields: list[tuple[str, Any] | tuple[str, Any, Any]] = [("driver", str)]
+        fields += [(key, Any, None) for key in others if key.isidentifier()]
+        named = msgspec.defstruct("Link", fields, kw_only=True, forbid_unknown_fields=True)
+        config.load(path, _with_section(section, named))  # which refuses it
     try:
-        check_rate(name, robot.lidar)
+        return driver_class(link["driver"])
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
+        raise located(path, error) from None
 
 
 def with_ports(options: LinkOptions) -> LinkOptions:
@@ -173,18 +195,39 @@ def at_emulator(options: Options, folder: str) -> Options:
     return msgspec.structs.replace(options, **changes)
 
 
-def link_options(driver: type[Driver], link: dict[str, Any]) -> type[LinkOptions]:
-    """What a link of `driver` may hold, down to the options of the lidar that it carries."""
+def link_options(driver: type[Driver], robot: RobotFile, link: dict[str, Any]) -> type[LinkOptions]:
+    """What a link of `driver` may hold, down to the lidar that it carries, on this very body."""
     scan = link.get("scan")
     name = scan.get("driver") if isinstance(scan, dict) else None
-    if not isinstance(name, str):
-        return driver.Options  # which refuses it, with the line
+    # where the lidar is not named, the driver's own options refuse it, with the line
+    fields = [("scan", source_class(name).Options)] if isinstance(name, str) else []
+
+    def fit(options: LinkOptions) -> None:
+        if own := getattr(driver.Options, "__post_init__", None):
+            own(options)
+        _check_scan(options, robot)
+        driver.check(robot, options)
+
     exact = msgspec.defstruct(
         driver.Options.__name__,
-        [("scan", source_class(name).Options)],
+        fields,
         bases=(driver.Options,),
+        namespace={"__post_init__": fit},
         frozen=True,
         kw_only=True,
         forbid_unknown_fields=True,
     )
     return cast("type[LinkOptions]", exact)
+
+
+def _check_scan(options: LinkOptions, robot: RobotFile) -> None:
+    """Raises ValueError where a lidar cannot be had as it is described."""
+    scan = options.scan
+    if scan is None:
+        return
+    if scan.port == getattr(options, "port", None) != AUTO:
+        raise ValueError(f"scan: {scan.port} is the port of the base; expected one of its own")
+    try:
+        check_turns(scan.driver, options.lidar or robot.lidar)
+    except ConfigError as error:
+        raise ValueError(f"scan: {error}") from None

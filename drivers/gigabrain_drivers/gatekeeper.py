@@ -5,11 +5,14 @@ import secrets
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from gigabrain_drivers.cause_watch import CauseWatch
 from gigabrain_drivers.latch import Latched, LatchFile
 from gigabrain_schemas.audit import What
+from gigabrain_schemas.base import TICK_NS, Cause
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
-from gigabrain_schemas.topics import ENABLE, ESTOP, RELEASE
+from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, RELEASE
 from gigabrain_zenoh import causes as why
 from gigabrain_zenoh import gate
 from gigabrain_zenoh.audit import AuditTrail
@@ -19,6 +22,7 @@ from gigabrain_zenoh.scribe import Scribe
 
 log = logging.getLogger(__name__)
 
+STEP_NS = TICK_NS // 2  # so long after a tick at least, the next one is no longer late
 EVERY_TICKS = 50  # once a second: what the disk did not take is tried again
 Stop = Callable[[], Awaitable[None]]
 
@@ -43,6 +47,7 @@ class Gatekeeper:
         latched = file.read()
         self._scribe: Scribe[Latched] = Scribe(lambda newest: file.keep(newest[-1]), room=1)
         self._latched, self._on_disk = latched, self._scribe.put(latched)
+        self._on_time_ns = -STEP_NS  # when the newest tick came that was not late
         self._forgetful = Fault(log, logging.ERROR)
         self.state = gate.GateState(
             boot=secrets.randbits(47) + 1,
@@ -58,6 +63,7 @@ class Gatekeeper:
         """Answer requests from now on; `stop` brings the body to rest."""
         self._stop = stop
         self._bus.serve(ESTOP, self._on_estop)
+        self._bus.subscribe(ESTOP_SAID, lambda _, said: self._told_to_stop(said), self._no_request)
         self._bus.serve(RELEASE, self._on_release)
         self._bus.serve(ENABLE, self._on_enable)
 
@@ -83,8 +89,23 @@ class Gatekeeper:
             self._trail.note("refused", source or "anonymous", text, code=reason, ok=False)
         return outcome
 
-    def every_tick(self) -> None:
-        """To be called once per tick."""
+    def ticks(self, passed: int, tick: gate.Tick) -> None:
+        """So many ticks have passed since the last call, all but one of them missed."""
+        for _ in range(passed):
+            late = self._is_late(tick.wall_ns)
+            self._bus.counters["late_ticks"] += late
+            self.step(replace(tick, late=True) if late else tick)
+            self._look_after_disk()
+
+    def _is_late(self, wall_ns: int | None) -> bool:
+        """Whether a tick comes in the wake of another one, to make up for lost time."""
+        if wall_ns is None:
+            return False
+        late = wall_ns - self._on_time_ns < STEP_NS
+        self._on_time_ns = self._on_time_ns if late else wall_ns
+        return late
+
+    def _look_after_disk(self) -> None:
         if self.state.tick % EVERY_TICKS == 0:
             self._trail.flush()
             if self._on_disk.done() and self._on_disk.result():
@@ -123,10 +144,18 @@ class Gatekeeper:
 
     def press(self, text: str) -> None:
         """The e-stop button of this robot is pressed."""
-        outcome = self.step(gate.Estop("button"))
+        self._told_to_stop(EstopRequest(source="button", reason=text))
+
+    def _told_to_stop(self, said: EstopRequest) -> None:
+        """Stop where nobody waits for an answer."""
+        outcome = self.step(gate.Estop(said.source))
         self._output_changed()
-        log.warning("e-stop by button: %s", text)
-        self._audit("estop", "button", outcome, text)
+        log.warning("e-stop by %s %s", said.source, said.reason)
+        self._audit("estop", said.source, outcome, said.reason)
+
+    def _no_request(self, payload: bytes) -> None:
+        if not payload:
+            self._told_to_stop(EstopRequest())
 
     async def _on_estop(self, request: EstopRequest) -> GateReply:
         outcome = self.step(gate.Estop(request.source))
@@ -169,5 +198,9 @@ def _differs(before: gate.GateState, now: gate.GateState) -> bool:
         or now.estop_generation != before.estop_generation
         or now.causes is not before.causes
         or now.faults is not before.faults
-        or now.safety is not before.safety
+        or _said(now) != _said(before)
     )
+
+
+def _said(state: gate.GateState) -> tuple[tuple[Cause, ...], ...]:
+    return (state.safety.causes, state.safety.warnings) if state.safety else ()

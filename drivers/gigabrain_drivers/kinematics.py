@@ -197,17 +197,28 @@ class Walker:
         return Twist(*(stride * gait.frequency for stride in strides))
 
 
+MEASURES = {  # of each drive type with wheels
+    "differential": ("wheel_radius", "wheel_separation"),
+    "mecanum": ("wheel_radius", "wheel_separation", "wheel_base"),
+    "omni": ("wheel_radius", "wheel_separation"),
+    "ackermann": ("wheel_radius", "wheel_base"),
+}
+
+
+def missing_measures(robot: RobotFile) -> list[str]:
+    """The measures of its wheels that a robot's file does not give."""
+    return [name for name in MEASURES.get(robot.drive_type, ()) if not getattr(robot, name)]
+
+
 def base_of(robot: RobotFile) -> Base | None:
     """The wheels of a robot's file, or None where it has none or does not give their measures."""
-    radius, across, along = robot.wheel_radius, robot.wheel_separation, robot.wheel_base
-    if not radius:
+    if robot.drive_type not in MEASURES or missing_measures(robot):
         return None
-    if robot.drive_type == "differential" and across:
+    radius, across, along = robot.wheel_radius, robot.wheel_separation, robot.wheel_base
+    if robot.drive_type == "differential":
         return Differential(radius, across)
-    if robot.drive_type == "mecanum" and across and along:
+    if robot.drive_type == "mecanum":
         return Mecanum(radius, across, along)
-    if robot.drive_type == "omni" and across:
+    if robot.drive_type == "omni":
         return Omni(radius, across / math.sqrt(3.0))
-    if robot.drive_type == "ackermann" and along:
-        return Ackermann(radius, along)
-    return None
+    return Ackermann(radius, along)

@@ -10,10 +10,12 @@ import time
 import serial
 from msgspec.structs import replace
 
+from gigabrain_drivers import line_check
 from gigabrain_drivers.base import Driver
-from gigabrain_drivers.kinematics import Twist, base_of
+from gigabrain_drivers.kinematics import base_of
 from gigabrain_drivers.lidars.base import ScanSource, carry
-from gigabrain_drivers.line_options import BITS_PER_BYTE, LineOptions, check_wheels
+from gigabrain_drivers.line_command import LineCommand, Spoken
+from gigabrain_drivers.line_options import BITS_PER_BYTE, LineOptions
 from gigabrain_drivers.line_report import LineReport
 from gigabrain_drivers.links.hearing import Hearing
 from gigabrain_drivers.links.serial_link import SerialLink
@@ -48,31 +50,34 @@ class LineDriver(Driver):
 
     def __init__(self, robot: RobotFile, options: LineOptions, run: Run) -> None:
         super().__init__(robot, options, run)
-        self._base = base_of(robot)
-        self._command = options.command_template()
+        base = base_of(robot)
+        self._command = LineCommand(options.command_template(), base)
         self._decoder = Decoder(options.state_templates())
-        check_wheels(options, robot, run.link, self._base)
-        self._by_wheels = any(name.startswith("wheel_") for name in self._command.names)
         self._clock = Clock()
         self.link = SerialLink(options.port, options.baud, self._clock, probe=self._is_ours)
         self.link.wording = Wording(
-            Spelling(Decoder([self._command]).feed, describe),
+            Spelling(Spoken(self._command.template, options.strings()).feed, str),
             Spelling(Decoder(options.state_templates()).feed, describe),
         )
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
-        self._report = LineReport(options, robot, self._base)
+        self._report = LineReport(options, robot, base)
         silent_ns = max(round(MISSED / options.state_hz * 1e9), LEAST_SILENT_NS)
         self._hearing = Hearing(self.link, self._clock, silent_ns, SENSELESS, log)
         self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
-        self._started = False  # whether the firmware has had its start string
-        self._sent = ZERO
+        self._started = False  # whether start went out and no stop since: then a stop is owed
+        self._wanted = self._as_sent = self._sent = ZERO  # the second is what the line keeps of it
         self._sent_ns = self._seq = 0
         self._open = False
         self._told_flags = 0
         self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
         self._lidar: ScanSource | None = None
         self._scan: LaserScan | None = None
+
+    @classmethod
+    def check(cls, robot: RobotFile, options: LineOptions) -> None:
+        """Raises ValueError where the lines do not fit the body."""
+        line_check.check(options, robot)
 
     async def open(self) -> None:
         """Begin to look for the body and its lidar; neither has to be there yet."""
@@ -87,18 +92,16 @@ class LineDriver(Driver):
         if self._open:
             await self.stop()
             if self.link.connected:  # what is still in the port when it is closed is lost
-                line_ns = round(self._command.longest() * BITS_PER_BYTE / self.options.baud * 1e9)
-                await self._clock.sleep_ns(LAST_WORD_NS + line_ns)
+                bits = self._command.template.longest() * BITS_PER_BYTE
+                await self._clock.sleep_ns(LAST_WORD_NS + round(bits / self.options.baud * 1e9))
         self._open = False
         await self.link.close()
         if self._lidar:
             await self._lidar.close()
 
     async def stop(self) -> None:
-        """A command of zero, and the stop string where the body has one."""
-        self._send(ZERO)
-        if self._started and self.options.stop:
-            self._started = not self.link.write(self.options.stop.encode())
+        """A command of zero, and the stop string where the body has one and may be going."""
+        self._still()
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
@@ -128,55 +131,38 @@ class LineDriver(Driver):
             raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}")
         return self._scan
 
+    def _still(self) -> None:
+        self._send(ZERO)
+        if self._started and self._hearing.heard:
+            stop = self.options.stop.encode()
+            self._started = bool(stop) and not self.link.write(stop)
+
     def _send(self, wanted: Velocity) -> None:
         """Write a command that is new, or due again; `_sent` is what the body then goes by."""
         if not self._hearing.heard:  # it may still be booting: nothing that could disturb it
             self._sent = ZERO
             return
         now_ns = self._clock.now_ns()
-        sent = self._rounded(wanted)
+        if wanted != self._wanted:
+            self._wanted, self._as_sent = wanted, self._command.sent(wanted)
+        sent = self._as_sent
         if sent == self._sent and now_ns - self._sent_ns < self._repeat_ns:
             return
         if sent != ZERO and not self._started:
             self._start()
-        line = self._command.encode(self._values(sent))
-        self._sent, self._sent_ns = (sent if self.link.write(line) else ZERO), now_ns
-
-    def _values(self, velocity: Velocity) -> dict[str, float]:
-        """All that a command line may hold."""
         self._seq = (self._seq + 1) % SEQUENCES
-        twist = Twist(velocity.linear_x, velocity.linear_y, velocity.angular_z)
-        values = {**twist._asdict(), "seq": float(self._seq)}
-        if self._base:
-            speeds = zip(self._base.wheels, self._base.to_wheels(twist), strict=True)
-            values.update({f"wheel_{name}": speed for name, speed in speeds})
-        return values
-
-    def _rounded(self, velocity: Velocity) -> Velocity:
-        """What is left of a velocity after it was written with the line's digits."""
-        return Velocity(
-            linear_x=self._kept("linear_x", velocity.linear_x),
-            linear_y=self._kept("linear_y", velocity.linear_y),
-            angular_z=self._kept("angular_z", velocity.angular_z),
-        )
-
-    def _kept(self, name: str, value: float) -> float:
-        if name in self._command.names:
-            return self._command.sent(name, value)
-        return value + 0.0 if self._by_wheels else 0.0
+        line = self._command.line(wanted, self._seq)
+        self._sent, self._sent_ns = (sent if self.link.write(line) else ZERO), now_ns
 
     def _start(self) -> None:
         start = self.options.start.encode()
         self._started = not start or self.link.write(start)
 
     def _opened(self) -> None:
-        """A new line: nothing from before counts. Some firmware speaks only when it is asked to."""
+        """A new line: nothing from before counts, and nothing is said before the body was heard."""
         self._decoder.clear()
         self._report.restart()
         self._hearing.forget()
-        self._started = False
-        if self.options.start:
-            self._start()
 
     def _lost(self, why: str) -> None:
         self._hearing.forget()
@@ -185,10 +171,12 @@ class LineDriver(Driver):
     def _received(self, data: bytes) -> None:
         now_ns = self._clock.now_ns()
         for values in self._decoder.feed(data):
-            self._report.take(values, now_ns)
-            if self._hearing.hear():  # it has booted: what it was told before is forgotten
-                self._sent_ns, self._started = 0, False
-                self._send(ZERO)
+            moves = self._report.take(values, now_ns)
+            if (
+                moves and self._hearing.hear()
+            ):  # after a boot or a loss: at rest, whatever it was told
+                self._sent_ns = 0
+                self._still()
             self._tell_flags()
         self.link.errors = self._decoder.errors
 

@@ -4,25 +4,22 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from gigabrain_drivers.kinematics import Base
-from gigabrain_drivers.links import ports
+from gigabrain_drivers.links.port_name import AUTO, check_port
 from gigabrain_drivers.protocols.line import LONGEST, Template
-from gigabrain_drivers.protocols.line_fields import COMMAND, STATE
-from gigabrain_drivers.robot import LinkOptions, RobotFile
+from gigabrain_drivers.protocols.line_fields import COMMAND, IGNORED, STATE
+from gigabrain_drivers.robot import LinkOptions
 from gigabrain_schemas.base import Name, Positive
-from gigabrain_zenoh.errors import ConfigError
 
 Text = Annotated[str, Meta(max_length=LONGEST)]
 Rate = Annotated[float, Meta(ge=10, le=200)]
 
 BITS_PER_BYTE = 10  # 8N1
-WHEEL_PARTS = ("_position", "_velocity", "_effort", "_temperature")
 
 
 class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is said to the body and what it says; see docs/firmware_line.md."""
 
-    port: str = ports.AUTO  # a path, usb:VID:PID[:SERIAL], or auto
+    port: str = AUTO  # a path, usb:VID:PID[:SERIAL], or auto
     baud: Annotated[int, Meta(ge=1200, le=4_000_000)] = 115200
     command: Text  # a template: how a velocity is written
     state: Annotated[tuple[Text, ...], Meta(min_length=1, max_length=8)]  # templates, any of which
@@ -43,7 +40,7 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
         state = self.state_templates()
         seen = frozenset().union(*(template.names for template in state))
         self._check_ends(command, state)
-        self._check_port()
+        check_port(self.port)
         self._check_battery(seen)
         self._check_flags(seen)
         self._check_baud(command, state)
@@ -59,21 +56,27 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
             _template(f"state[{i}]", text, STATE, turn) for i, text in enumerate(self.state)
         )
 
+    def strings(self) -> dict[bytes, str]:
+        """What is sent as it is, and what it is called."""
+        both = {self.start.encode(): "start", self.stop.encode(): "stop"}
+        return {text: name for text, name in both.items() if text}
+
     def _check_ends(self, command: Template, state: tuple[Template, ...]) -> None:
         for i, template in enumerate(state):
             if template.end != state[0].end:
                 raise ValueError(f"state[{i}]: it must end as the first one does")
+            if not template.names:
+                raise ValueError(f"state[{i}]: {{{IGNORED}}} alone says nothing; expected a field")
+            for earlier in range(i):
+                if state[earlier].reads_all_of(template):
+                    raise ValueError(
+                        f"state[{i}]: its lines look like those of state[{earlier}]; expected "
+                        "another beginning, or another number of fields"
+                    )
         for name in ("start", "stop"):
             text = getattr(self, name)
             if text and not text.endswith(("\n", "\r")):
                 raise ValueError(f"{name}: expected a newline (\\n) at its end")
-
-    def _check_port(self) -> None:
-        if self.port.startswith(ports.USB):
-            try:
-                ports.usb_id(self.port)
-            except ValueError as error:
-                raise ValueError(f"port: {error}") from None
 
     def _check_battery(self, seen: frozenset[str]) -> None:
         if self.battery_empty and self.battery_full and self.battery_empty >= self.battery_full:
@@ -96,22 +99,6 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
             if needed > self.baud:
                 raise ValueError(
                     f"baud: {name} lines of {longest} bytes at {rate:g} Hz need {needed:.0f}"
-                )
-
-
-def check_wheels(options: LineOptions, robot: RobotFile, link: str, base: Base | None) -> None:
-    """Raises ConfigError for a wheel that the base does not have."""
-    templates = {"command": options.command_template()}
-    templates |= {f"state[{i}]": t for i, t in enumerate(options.state_templates())}
-    has = base.wheels if base else ()
-    known = {f"wheel_{name}{part}" for name in has for part in ("", *WHEEL_PARTS)}
-    for field, template in templates.items():
-        for name in sorted(template.names):
-            if name.startswith("wheel_") and name not in known:
-                wheels = ", ".join(has) or "none, as the file does not give their measures"
-                raise ConfigError(
-                    f"{robot.robot_type}: {link}.{field}: no {name} on a {robot.drive_type} base; "
-                    f"its wheels: {wheels}"
                 )
 
 

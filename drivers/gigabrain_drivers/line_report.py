@@ -5,9 +5,10 @@ from collections import deque
 from collections.abc import Mapping
 
 from gigabrain_drivers.kinematics import Base, Twist
+from gigabrain_drivers.line_check import POSE, positions_of, speeds_of
 from gigabrain_drivers.line_options import LineOptions
 from gigabrain_drivers.odometry import advanced, between
-from gigabrain_drivers.protocols.line_fields import ANGLES
+from gigabrain_drivers.protocols.line_fields import ANGLES, BODY
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Battery, BodyDescription, Joint
 
@@ -31,6 +32,10 @@ class LineReport:
         self._options, self._body, self._base = options, body, base
         self._wheels = base.wheels if base else ()
         self._spans = _spans(options, self._wheels)
+        self._positions = positions_of(base) if base else ()
+        self._speeds = speeds_of(base) if base else ()
+        self._whole_pose = frozenset(POSE)
+        self._speaking = {*BODY, *self._speeds}
         self._values: dict[str, float] = {}
         self._angles: tuple[float, ...] | None = None  # the wheels', as reported last
         self._pose: Pose | None = None  # as reported last
@@ -44,22 +49,23 @@ class LineReport:
         """The bits that the firmware reports."""
         return int(self._values.get("flags", 0))
 
-    def take(self, values: Mapping[str, float], now_ns: int) -> None:
-        """One line has come."""
+    def take(self, values: Mapping[str, float], now_ns: int) -> bool:
+        """One line has come; whether it says how the body moves."""
         self._values.update(values)
-        if {"x", "y", "yaw"} <= values.keys():
+        if self._whole_pose <= values.keys():
             pose = Pose(x=values["x"], y=values["y"], yaw=values["yaw"])
             last, self._pose = self._pose or pose, pose
             step = between(last, pose)
             if self._after_gap(now_ns) and _length(between(ORIGIN, pose)) < _length(step):
                 step = between(ORIGIN, pose)
             self._move(step, now_ns)
-        elif (angles := self._of_wheels(values, "position")) and self._base:
+        elif (angles := _all_of(self._positions, values)) and self._base:
             self._roll(angles, now_ns)
-        elif self._pose is None and self._angles is None and "linear_x" in values:
-            seconds = min((now_ns - (self._now_ns or now_ns)) / 1e9, LONGEST_S)
-            v = self.velocity()
-            self._move(_scaled(Twist(v.linear_x, v.linear_y, v.angular_z), seconds), now_ns)
+        elif not self._speaking & values.keys():
+            return False
+        elif self._pose is None and self._angles is None:
+            self._go_on(now_ns)
+        return True
 
     def restart(self) -> None:
         """The line was cut: what comes next continues from here."""
@@ -68,17 +74,13 @@ class LineReport:
         self._steps.clear()
 
     def velocity(self) -> Velocity:
-        """As reported, or by the wheels' speeds, or by how the position has changed."""
-        values = self._values
-        if "linear_x" in values:
-            return Velocity(**{name: values.get(name, 0.0) for name in Velocity.__struct_fields__})
-        if self._base and (speeds := self._of_wheels(values, "velocity")):
-            return Velocity(**self._base.to_body(speeds)._asdict())
-        seconds = sum(took for took, _ in self._steps)
-        if not seconds:
-            return Velocity()
-        way = Twist(*map(sum, zip(*(step for _, step in self._steps), strict=True)))
-        return Velocity(**_scaled(way, 1 / seconds)._asdict())
+        """Each part as reported, or by the wheels' speeds, or by how the position has changed."""
+        own, (linear_x, linear_y, angular_z) = self._values, self._measured()
+        return Velocity(
+            linear_x=own.get("linear_x", linear_x),
+            linear_y=own.get("linear_y", linear_y),
+            angular_z=own.get("angular_z", angular_z),
+        )
 
     def joints(self) -> tuple[Joint, ...]:
         """The wheels of which anything is known."""
@@ -107,10 +109,25 @@ class LineReport:
             current=values.get("battery_current", 0.0),
         )
 
-    def _of_wheels(self, values: Mapping[str, float], what: str) -> tuple[float, ...]:
-        """What `values` say of all wheels, or nothing where one is missing."""
-        names = [f"wheel_{name}_{what}" for name in self._wheels]
-        return tuple(values[n] for n in names) if all(n in values for n in names) else ()
+    def _measured(self) -> Twist:
+        """The velocity by the wheels' speeds, or by the way of the newest lines."""
+        if self._base and (speeds := _all_of(self._speeds, self._values)):
+            return self._base.to_body(speeds)
+        seconds = sum(took for took, _ in self._steps)
+        if not seconds:
+            return STILL
+        way = Twist(*map(sum, zip(*(step for _, step in self._steps), strict=True)))
+        return _scaled(way, 1 / seconds)
+
+    def _go_on(self, now_ns: int) -> None:
+        """There are speeds alone: it has gone on as fast as it was said to."""
+        seconds = min((now_ns - (self._now_ns or now_ns)) / 1e9, LONGEST_S)
+        v = self.velocity()
+        self._move(_scaled(Twist(v.linear_x, v.linear_y, v.angular_z), seconds), now_ns)
+        speeds = _all_of(self._speeds, self._values)
+        for name, speed in zip(self._wheels if speeds else (), speeds, strict=True):
+            turned = self._turned[name] + speed * seconds
+            self._turned[name] = speed if name in ANGLES else turned
 
     def _roll(self, angles: tuple[float, ...], now_ns: int) -> None:
         """The wheels stand at these angles."""
@@ -152,6 +169,11 @@ class LineReport:
         while sum(took for took, _ in self._steps) - self._steps[0][0] >= VELOCITY_S:
             self._steps.popleft()
         return step is not STILL
+
+
+def _all_of(names: tuple[str, ...], values: Mapping[str, float]) -> tuple[float, ...]:
+    """The values of all these names, or nothing where one is missing."""
+    return tuple(values[n] for n in names) if all(n in values for n in names) else ()
 
 
 def _length(step: Twist) -> float:

@@ -117,10 +117,8 @@ class DriverProcess:
         state = await self._driver.read_state()
         button = self._button.faults() if self._button else ()
         faults = button if state.link.connected else (why.LINK_LOST, *button)
-        for _ in range(passed):
-            self._gatekeeper.step(gate.Tick(state.velocity, self._wall_ns(), faults))
+        self._gatekeeper.ticks(passed, gate.Tick(state.velocity, self._wall_ns(), faults))
         self._bus.time.tick = self._gate.tick
-        self._gatekeeper.every_tick()
         if self._lockstep:
             await self._in_step(self._lockstep, state)
         else:

@@ -5,6 +5,7 @@ from typing import Any
 
 from msgspec import Struct
 
+from gigabrain_drivers.links.port_name import AUTO, check_port
 from gigabrain_schemas.base import Finite, Name, NonNegative, Positive
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_zenoh.settings import LinkName
@@ -42,7 +43,10 @@ class ScanOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """A lidar on a line of its own; scan sources add their own fields."""
 
     driver: str  # one of gigabrain_drivers.lidars.SCAN_SOURCES
-    port: str = "auto"  # a path, usb:VID:PID[:SERIAL], or auto
+    port: str = AUTO  # a path, usb:VID:PID[:SERIAL], or auto
+
+    def __post_init__(self) -> None:
+        check_port(self.port)
 
 
 class LinkOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

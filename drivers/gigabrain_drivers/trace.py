@@ -30,6 +30,7 @@ class _Shown(logging.Handler):
         super().__init__(logging.DEBUG)
         self._base, self._wanted = link_of(driver), part == BASE
         self.lines: deque[str] = deque()
+        self.received = False  # whether anything has come
 
     def emit(self, record: logging.LogRecord) -> None:
         """One frame."""
@@ -37,6 +38,7 @@ class _Shown(logging.Handler):
             line, text = record.args
             if (line is self._base) is self._wanted:
                 self.lines.append(str(text))
+                self.received |= str(text).startswith("rx")
 
     def show(self, say: Callable[[str], None]) -> None:
         """All that has come since the last time."""
@@ -53,9 +55,10 @@ async def run(
     seconds: float,
     wanted: Velocity,
     say: Callable[[str], None],
-) -> None:
-    """Open the driver and command `wanted` for so long. Raises ConfigError.
+) -> bool:
+    """Open the driver and command `wanted` for so long; whether anything was received.
 
+    Raises ConfigError.
     `folder` is for the ports of the emulator, which runs here as well where the link is emulated.
     """
     if link == "real" and wanted != ZERO:
@@ -72,6 +75,7 @@ async def run(
             async with asyncio.timeout(seconds):
                 await _drive(driver, wanted, shown, say)
     shown.show(say)
+    return shown.received
 
 
 async def _drive(

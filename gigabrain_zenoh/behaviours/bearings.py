@@ -34,6 +34,7 @@ class Bearings:
 
     tick: int  # of the scan
     late_ticks: int  # how many have passed since
+    delayed: float  # [s], how much longer than usual scans have waited for their answer of late
     velocity: Velocity
     body: BodyDescription | None
     map_from_odom: Pose | None  # None while it is not known where in the map the robot is

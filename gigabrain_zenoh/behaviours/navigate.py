@@ -66,6 +66,7 @@ class Navigate:
             obstacles=world.obstacles,
             response=bearings.response,
             sent=bearings.sent,
+            delayed=bearings.delayed,
         )
         plan = self._planner_for(bearings).plan(moment)
         here = compose(bearings.map_from_odom, pose)
@@ -78,7 +79,7 @@ class Navigate:
             response=bearings.response,
             progress=self.outcome.progress,
             behaviour="navigate",
-            reason=f"{_headline(bearings.order, goal)}: {plan.reason}"[:500],
+            reason=f"{_headline(bearings.order, goal)}: {plan.reason}{_slowly(bearings)}"[:500],
         )
 
     def _tell(self, plan: local.LocalPlan, here: Pose, bearings: Bearings, route: Route) -> None:
@@ -135,6 +136,11 @@ def _why_not(situation: Situation) -> str:
 def _headline(order: Order | None, goal: Goal) -> str:
     """What it is at: the same for as long as that does not change."""
     return "exploring" if isinstance(order, Explore) else f"going to {where(goal)}"
+
+
+def _slowly(bearings: Bearings) -> str:
+    """Why it drives more slowly than it could, if it does."""
+    return f"; slower, this host is busy: {bearings.delayed:.2f} s late" if bearings.delayed else ""
 
 
 def _stand(reason: str) -> Intent:

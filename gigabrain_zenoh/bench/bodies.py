@@ -11,7 +11,8 @@ from msgspec import Struct
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.topics import CMD_VEL, STATE
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import CMD_VEL, HEALTH, STATE
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
@@ -46,6 +47,7 @@ class BodyFigures(Struct, frozen=True, kw_only=True):
     motions: int  # that this median is of
     reconnects: int
     stops: int  # how often the gate was shut meanwhile
+    driver_cpu: float | None  # [%] of a core; a body that the driver simulates is part of it
 
 
 class BodiesResult(Struct, frozen=True, kw_only=True):
@@ -71,6 +73,7 @@ class Onlooker:
         self.enabled_ticks = self.stops = 0
         self.state: RobotState | None = None
         self.latencies: list[int] = []
+        self.driver_cpu: list[float] = []  # of a core, each second
         self._commanded: list[float] = []
         self._measured: list[float] = []
         self._command: CmdVel | None = None
@@ -79,6 +82,7 @@ class Onlooker:
         self._open = False
         bus.subscribe(STATE, self._see)
         bus.subscribe(CMD_VEL, self._hear)
+        bus.subscribe(HEALTH, self._note_cpu)
 
     @property
     def commanded(self) -> float:
@@ -89,6 +93,10 @@ class Onlooker:
     def measured(self) -> float:
         """Mean of the measured speed forward [m/s]."""
         return statistics.fmean(self._measured) if self._measured else 0.0
+
+    def _note_cpu(self, _key: str, health: Health) -> None:
+        if self._open and health.process == "driver":
+            self.driver_cpu.append(health.cpu)
 
     def _hear(self, _key: str, command: CmdVel) -> None:
         self._command = command
@@ -226,7 +234,7 @@ def _figures(
         value = truth.get(name)
         return float(value) if isinstance(value, int | float) else None
 
-    contacts, late = number("contacts"), onlooker.latencies
+    contacts, late, cpu = number("contacts"), onlooker.latencies, onlooker.driver_cpu
     return BodyFigures(
         body=Path(body).stem if body.endswith((".yaml", ".yml")) else body,
         seconds=round(onlooker.enabled_ticks * TICK_S, 2),
@@ -239,4 +247,5 @@ def _figures(
         motions=len(late),
         reconnects=onlooker.state.link.reconnects if onlooker.state else 0,
         stops=onlooker.stops,
+        driver_cpu=round(100 * statistics.fmean(cpu), 1) if cpu else None,
     )

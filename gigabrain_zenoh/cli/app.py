@@ -39,6 +39,7 @@ COMMANDS = {
     "task resume": ("tasks:resume", "Have a task go on that waits for a person."),
     "keys new": ("keys:new", "Make a fleet's own authority, which issues identities."),
     "keys issue": ("keys:issue", "Make an identity: a folder to copy to its host."),
+    "keys revoke": ("keys:revoke", "Call back all identities of a role."),
     "keys list": ("keys:identities", "List identities, and when they expire."),
     "keys zenohd": ("keys:zenohd", "Print the configuration of a router for a larger site."),
     "teleop": ("teleop:teleop", "Drive by keys or by a gamepad."),

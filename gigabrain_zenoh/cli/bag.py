@@ -54,7 +54,7 @@ def check(file: Path) -> int:
     wrong = faults(found)
     for fault in wrong:
         print(f"{file}: {fault}")
-    if not found.finished:
+    if found.damages or not found.finished:
         print(f"mend it with: gigabrain bag recover {file}")
     if not wrong:
         print(f"{file}: whole, {found.messages} messages in {found.seconds:g} s")
@@ -78,6 +78,10 @@ def recover(file: Path, *, output: Annotated[Path | None, Parameter(alias="-o")]
     done = mend(file, output or file.with_name(f"{file.stem}_recovered{file.suffix}"))
     for damage in done.damages:
         print(f"{file}: byte {damage.offset}: {damage.what}")
+    if not done.messages:
+        done.path.unlink()
+        print(f"{file}: nothing could be saved")
+        return 1
     print(f"{done.path}: {done.messages} messages")
     return 0
 

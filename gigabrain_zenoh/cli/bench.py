@@ -138,10 +138,7 @@ def _progress(text: str) -> None:
 
 
 def _finish(page: RenderableType, result: msgspec.Struct, json: Path | None) -> None:
+    from gigabrain_zenoh import results
+
     Console().print(page)
-    if json is None:
-        return
-    try:
-        json.write_bytes(msgspec.json.format(msgspec.json.encode(result)) + b"\n")
-    except OSError as error:
-        raise ConfigError(f"cannot write {json}: {error.strerror}") from None
+    results.write(result, json)

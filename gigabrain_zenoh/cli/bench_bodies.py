@@ -44,12 +44,13 @@ def bodies(
     json
         Write all figures into this file.
     """
-    import msgspec
     from rich.console import Console
 
+    from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.bodies import measure_bodies
 
     above_zero("seconds", seconds)
+    results.check_place(json)
     chosen = names or find("gigabrain_drivers.catalog:simulated")(link)
     deployment = Deployment(
         link=link, world=world, seed=seed, resume="auto", router="tcp/127.0.0.1:0"
@@ -58,9 +59,8 @@ def bodies(
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder, console.status("") as status:
         measuring = measure_bodies(chosen, deployment, seconds, Path(folder), status.update)
         result = asyncio.run(measuring)
-    if json:
-        json.write_bytes(msgspec.json.format(msgspec.json.encode(result)))
     console.print(_table(result))
+    results.write(result, json)
     return 0 if result.ok else 1
 
 
@@ -85,6 +85,7 @@ def _table(result: "BodiesResult") -> "Table":
         ("least clearance [m]", "min_clearance_m"),
         ("command to motion, median [ticks]", "latency_ticks"),
         ("... of so many motions", "motions"),
+        ("CPU of the driver [% of a core]", "driver_cpu"),
         ("reconnects", "reconnects"),
         ("gate shut meanwhile", "stops"),
     )

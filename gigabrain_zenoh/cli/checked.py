@@ -1,5 +1,6 @@
 """Options of a command as a Struct, refused in one line that names the option."""
 
+import math
 from collections.abc import Mapping
 from typing import TypeVar
 
@@ -18,6 +19,13 @@ def checked(values: Mapping[str, object], type: type[T]) -> T:
         text, _, path = str(error).partition(" - at `$.")
         name = path.rstrip("`").replace("_", "-")
         raise ConfigError(f"--{name}: {text[0].lower()}{text[1:]}" if name else text) from None
+
+
+def finite(name: str, value: float) -> None:
+    """Raises ConfigError where the option `name` is no number."""
+    if not math.isfinite(value):
+        shown = name.replace("_", "-")
+        raise ConfigError(f"--{shown}: expected a number, got {value:g}")
 
 
 def above_zero(name: str, value: float | None) -> None:

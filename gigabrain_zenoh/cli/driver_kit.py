@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from gigabrain_zenoh.cli.checked import above_zero, finite
 from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import LinkName
 
@@ -66,6 +67,7 @@ def trace(
     part: Literal["base", "scan"] = "base",
     seconds: float = 2.0,
     linear_x: float = 0.0,
+    linear_y: float = 0.0,
     angular_z: float = 0.0,
 ) -> int:
     """Show the bytes on a body's line both ways, each frame decoded beside its hex.
@@ -75,6 +77,8 @@ def trace(
     It starts the driver itself: on an emulator of its own, or on the real port, which nobody else
     may have open then; a real body is commanded zero only. A driver that runs already writes the
     same lines to its log with: gigabrain driver run NAME --link real --level debug
+
+    Ends with 1 when nothing was received.
 
     Parameters
     ----------
@@ -88,11 +92,18 @@ def trace(
         How long [s].
     linear_x
         What an emulated body is commanded all the time [m/s].
+    linear_y
+        The same to its left [m/s].
     angular_z
         What an emulated body is commanded all the time [rad/s].
     """
     from gigabrain_schemas.base import Velocity
 
+    above_zero("seconds", seconds)
+    speeds = {"linear_x": linear_x, "linear_y": linear_y, "angular_z": angular_z}
+    for option, speed in speeds.items():
+        finite(option, speed)
+    received = False
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
         tracing = find("gigabrain_drivers.trace:run")(
             name,
@@ -100,14 +111,17 @@ def trace(
             Path(folder),
             part=part,
             seconds=seconds,
-            wanted=Velocity(linear_x=linear_x, angular_z=angular_z),
+            wanted=Velocity(**speeds),
             say=lambda line: print(line, flush=True),
         )
         try:
-            asyncio.run(tracing)
+            received = asyncio.run(tracing)
         except BrokenPipeError:  # whoever was reading has seen enough
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0
+            return 0
+    if not received:
+        print("nothing was received", file=sys.stderr)
+    return int(not received)
 
 
 def new(name: str, *, folder: Path = Path()) -> int:

@@ -3,6 +3,7 @@
 import asyncio
 from pathlib import Path
 
+from gigabrain_zenoh.cli.checked import checked
 from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import EmulatorConfig
 
@@ -28,7 +29,8 @@ def emulate(name: str, *, world: str = "arena", seed: int = 0, ports: Path | Non
         The folder in which its ports appear.
     """
     folder = ports or find("gigabrain_drivers.catalog:ports_folder")(name)
-    config = EmulatorConfig(body=name, world=world, seed=seed, folder=str(folder.absolute()))
+    values = {"body": name, "world": world, "seed": seed, "folder": str(folder.absolute())}
+    config = checked(values, EmulatorConfig)
     asyncio.run(find("gigabrain_drivers.emulators.process:emulate")(config, _say))
     return 0
 

@@ -5,10 +5,14 @@ import logging
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+
+from gigabrain_zenoh.cli.where import show
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.process import find
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,6 +29,7 @@ def faults(
     repeat: Annotated[int, Parameter(validator=Number(gte=1))] = 1,
     body: str = "",
     world: str = "arena",
+    behaviour: Literal["avoid", "navigate"] = "avoid",
     long: Annotated[bool, Parameter(negative=())] = False,
     json: Path | None = None,
 ) -> int:
@@ -47,14 +52,16 @@ def faults(
         Which robot, instead of the one that each test has.
     world
         Where it drives.
+    behaviour
+        What drives it: navigate explores and visits places, with a map (tests 1 to 6, 18, 19, 45).
     long
         The long forms, for a release: soak, load, all orders of deaths.
     json
         Write all results into this file.
     """
-    import msgspec
     from rich.console import Console
 
+    from gigabrain_zenoh import results
     from gigabrain_zenoh.faults.rig import Options
     from gigabrain_zenoh.faults.suite import failed, run_suite
     from gigabrain_zenoh.faults.table import choose
@@ -63,8 +70,10 @@ def faults(
     logging.getLogger("gigabrain_zenoh").addHandler(logging.NullHandler())
     chosen, console = choose(only), Console()
     if list_:
-        console.print(_plan(chosen))
+        show(_plan(chosen))
         return 0
+    _check(body, world)
+    results.check_place(json)
     done: list[str] = []
     with tempfile.TemporaryDirectory(prefix="gb-") as folder, console.status("") as status:
 
@@ -76,13 +85,23 @@ def faults(
             console.print(_line(result))
 
         running = run_suite(
-            chosen, Options(body, world, long), Path(folder), repeat, begun, ended
+            chosen, Options(body, world, behaviour, long), Path(folder), repeat, begun, ended
         )  # fmt: skip
-        results = asyncio.run(running)
-    if json:
-        json.write_bytes(msgspec.json.format(msgspec.json.encode(results)))
-    console.print(_table(results, chosen))
-    return 1 if failed(results) else 0
+        judged = asyncio.run(running)
+    show(_table(judged, chosen))
+    results.write(judged, json)
+    return 1 if failed(judged) else 0
+
+
+def _check(body: str, world: str) -> None:
+    """Raises ConfigError for what the suite cannot be run with."""
+    find("gigabrain_drivers.sim.worlds:load_world")(world, 0)
+    if not body:
+        return
+    sim = find("gigabrain_drivers.catalog:load_robot")(body).sim
+    if not sim or sim.get("driver") != "mujoco":
+        able = ", ".join(find("gigabrain_drivers.catalog:simulated")("sim"))
+        raise ConfigError(f"--body {body}: no physics knows what becomes of it; choose of: {able}")
 
 
 def _line(result: "Result") -> str:
@@ -95,7 +114,7 @@ def _plan(chosen: "Sequence[Fault]") -> "Table":
 
     table = Table(title="fault tests")
     for name in ("no.", "fault", "group", "criterion", "needs"):
-        table.add_column(name, overflow="fold")
+        table.add_column(name, overflow="fold", no_wrap=name == "fault")
     for fault in chosen:
         needs = ", ".join(fault.needs)
         table.add_row(str(fault.number), fault.name, fault.group, fault.criterion, needs)
@@ -112,7 +131,7 @@ def _table(results: "Sequence[Result]", chosen: "Sequence[Fault]") -> "Table":
     passed = sum(result.verdict == "passed" for result in results)
     table = Table(title=f"{passed} of {len(results)} passed")
     for name in ("no.", "fault", "criterion", "worst", "runs", "verdict"):
-        table.add_column(name, overflow="fold")
+        table.add_column(name, overflow="fold", no_wrap=name == "fault")
     for result in results:
         told = f"[{COLOURS[result.verdict]}]{result.verdict}[/]"
         if result.reason:

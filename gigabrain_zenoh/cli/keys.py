@@ -1,6 +1,7 @@
 """`gigabrain keys`: a fleet's own authority, and identities for its hosts and people."""
 
 import datetime
+import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,8 @@ from typing import Any
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 from gigabrain_zenoh.keys.checks import INSTALL
 from gigabrain_zenoh.keys.files import CA_KEY, CERTIFICATE
-from gigabrain_zenoh.keys.roles import Role
+from gigabrain_zenoh.keys.list_file import generations_in
+from gigabrain_zenoh.keys.roles import Role, common_name
 from gigabrain_zenoh.process import find
 
 SOON_DAYS = 30
@@ -29,7 +31,7 @@ def new(fleet: str, *, dir: Path | None = None) -> None:
     folder = dir or Path(fleet)
     _find("authority:new_fleet")(fleet, folder)
     print(f"{folder / CA_KEY}: keep it on this machine; whoever has it can be anybody")
-    print(f"next: gigabrain keys issue robot --host ADDRESS --dir {folder}")
+    print(f"next: gigabrain keys issue robot --host ADDRESS --dir {_quoted(folder)}")
 
 
 def issue(
@@ -65,10 +67,35 @@ def issue(
         _fleet(dir), role, robot=robot, name=name, hosts=host, days=days
     )
     print(f"{folder}: copy it to its host, and let nobody else read it")
-    if role == "operator":
-        print(f"next: gigabrain estop --connect tls/ADDRESS:7447 --keys {folder}")
-    else:
-        print(f"next: `keys: {folder.name}` in the deployment file that lies beside it")
+    print(f"next: {_use(role, robot, folder)}")
+
+
+def revoke(role: Role, *, robot: str = "", dir: Path | None = None) -> None:
+    """Call back all identities of a role, such as those of a lost laptop. New ones are good again.
+
+    Example: gigabrain keys revoke operator
+
+    Routers refuse them once they have the new list and were started again.
+
+    Parameters
+    ----------
+    role
+        brain, operator or viewer.
+    robot
+        The robot's namespace, where the identities name one.
+    dir
+        The fleet's folder; without it, the only one here.
+    """
+    folder = _fleet(dir)
+    lists = _find("revoked:revoke")(folder, role, robot)
+    for path in lists:
+        print(
+            f"{path}: copy it into that identity's folder on its host, and start its router again"
+        )
+    if not lists:
+        print("no router's identity here: whoever is issued one from now on has the list")
+    of = f" --robot {robot}" if robot else ""
+    print(f"next, for those who stay: gigabrain keys issue {role}{of} --dir {_quoted(folder)}")
 
 
 def identities(*, dir: Path | None = None) -> int:
@@ -94,6 +121,7 @@ def zenohd(
     robot: tuple[str, ...] = (),
     keys: Path = Path("/etc/gigabrain/keys"),
     listen: str = "tls/0.0.0.0:7447",
+    dir: Path | None = None,
 ) -> None:
     """Print the configuration of a router for a larger site.
 
@@ -107,14 +135,32 @@ def zenohd(
         The folder of its identity on its host.
     listen
         The Zenoh endpoint to listen on.
+    dir
+        The fleet's folder, where some of its identities were revoked.
     """
-    print(_find("zenohd:configuration")(robot or ("",), str(keys), listen), end="")
+    generations = generations_in(_fleet(dir)) if dir else {}
+    print(_find("zenohd:configuration")(robot or ("",), str(keys), listen, generations), end="")
+
+
+def _use(role: Role, robot: str, folder: Path) -> str:
+    """The command with which an identity is used first."""
+    keys, of = _quoted(folder), f" --namespace {robot}" if robot else ""
+    if role == "router":
+        return f"gigabrain router --listen tls/0.0.0.0:7447 --fleet NAMESPACE --keys {keys}"
+    if role in ("operator", "viewer"):
+        tool = "estop" if role == "operator" else "topic list"
+        return f"gigabrain {tool} --connect tls/ADDRESS:7447{of} --keys {keys}"
+    return f"gigabrain up FILE --host HOST --keys {keys}, where FILE has a line `keys:`"
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
 
 
 def _listed(folder: Path) -> Iterator[tuple[str, bool]]:
     """A line for each identity in a fleet's folder, or for the only one, and whether it is good."""
     places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
-    now = datetime.datetime.now(datetime.UTC)
+    now, generations = datetime.datetime.now(datetime.UTC), generations_in(folder)
     for place in places:
         if not (place / CERTIFICATE).exists():
             continue
@@ -122,6 +168,10 @@ def _listed(folder: Path) -> Iterator[tuple[str, bool]]:
             identity = _find("identity:load")(place, now)
         except GigabrainError as error:
             yield f"{place.name:<20} {error}", False
+            continue
+        good = generations.get(common_name(identity.role, identity.robot), 1)
+        if identity.generation < good:
+            yield f"{place.name:<20} {identity.name} was revoked; delete it", False
             continue
         left = identity.days_left(now)
         soon = "  SOON" if left < SOON_DAYS else ""

@@ -81,6 +81,7 @@ async def _follow(at: Which, wanted: "Wanted", tell: "Callable[[Line], None]") -
     from gigabrain_zenoh.stop_signals import stop_signals
     from gigabrain_zenoh.tools.hearing import NAME
     from gigabrain_zenoh.tools.log_reading import as_line
+    from gigabrain_zenoh.tools.reader import ended_with_reader
 
     async with joined(at.where(), NAME) as (bus, _):
 
@@ -90,7 +91,7 @@ async def _follow(at: Which, wanted: "Wanted", tell: "Callable[[Line], None]") -
                 tell(line)
 
         bus.subscribe(LOG, hear)
-        with stop_signals() as stop:
+        with stop_signals() as stop, ended_with_reader(stop):
             stopped = asyncio.ensure_future(stop.wait())
             await asyncio.wait((stopped, bus.failed), return_when=asyncio.FIRST_COMPLETED)
             stopped.cancel()

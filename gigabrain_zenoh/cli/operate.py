@@ -9,7 +9,7 @@ from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.client import Robot
 from gigabrain_zenoh.client import connect as connect_robot
-from gigabrain_zenoh.errors import BusError, NotConfirmed
+from gigabrain_zenoh.errors import GigabrainError, NotConfirmed
 from gigabrain_zenoh.estop import BY_HAND
 from gigabrain_zenoh.gate import BRAIN
 
@@ -29,7 +29,9 @@ def estop(*, at: Which = HERE, reason: str = "") -> int:
     """
     try:
         return _ask(at, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False)
-    except BusError as error:
+    except NotConfirmed:
+        raise
+    except GigabrainError as error:  # whatever keeps it from being pressed
         raise NotConfirmed(f"NOT CONFIRMED: {error}; {BY_HAND}") from None
 
 

@@ -1,5 +1,6 @@
 """One command per process, for whoever starts them one by one, or on several hosts."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -8,13 +9,22 @@ import msgspec
 from cyclopts import Parameter
 
 from gigabrain_zenoh import behaviours
+from gigabrain_zenoh.addresses import exposed
 from gigabrain_zenoh.cli.checked import checked
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.checks import identity_in
 from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.process import find, run
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.running import find_endpoint
-from gigabrain_zenoh.settings import DecisionConfig, DriverConfig, Endpoint, LinkName, Resume
+from gigabrain_zenoh.settings import (
+    ButtonConfig,
+    DecisionConfig,
+    DriverConfig,
+    Endpoint,
+    LinkName,
+    Resume,
+)
 from gigabrain_zenoh.zenoh_config import router_config, secured
 
 ROUTER = "tcp/127.0.0.1:7447"
@@ -44,6 +54,7 @@ def router(
     *,
     listen: tuple[str, ...] = (ROUTER,),
     fleet: tuple[str, ...] = (),
+    insecure: bool = False,
     place: Annotated[Place, Parameter(show=False)] = HERE,
 ) -> int:
     """Start the router that joins the other processes.
@@ -56,13 +67,17 @@ def router(
         The Zenoh endpoints to listen on.
     fleet
         The namespaces of the robots that it serves, where it has keys.
+    insecure
+        Let anybody on the network drive: listen beyond loopback without keys.
     """
     keys = _keys(place)
     if keys:
         identity_in(Path(keys))
-    endpoint = Endpoint(listen=listen, namespace=place.namespace, keys=keys, fleet=fleet)
+    endpoint = secured(Endpoint(listen=listen, namespace=place.namespace, keys=keys, fleet=fleet))
+    if not keys and not insecure:
+        _refuse_exposed(listen)
     settings = router_config(endpoint, state_dir() / "robots" / (place.namespace or "router"))
-    return _run("router", place, msgspec.to_builtins(settings), secured(endpoint))
+    return _run("router", place, msgspec.to_builtins(settings), endpoint)
 
 
 def perception(*, place: Place = HERE) -> int:
@@ -187,7 +202,23 @@ def button(*, port: str, place: Place = HERE) -> int:
     port
         The adapter: a path, or usb:VID:PID[:SERIAL].
     """
-    return _run("button", place, {"port": port})
+    settings = checked({"port": port}, ButtonConfig)
+    if problem := find("gigabrain_drivers.links.ports:absent")(port):
+        # the process itself says so only where it has a robot to stop
+        print(f"gigabrain: {problem} Waiting for it.", file=sys.stderr)
+    return _run("button", place, msgspec.to_builtins(settings))
+
+
+def _refuse_exposed(listen: tuple[str, ...]) -> None:
+    try:
+        seen = exposed(listen)
+    except ValueError as error:
+        raise ConfigError(f"--listen: {error}") from None
+    if seen:
+        raise ConfigError(
+            f"--listen: {seen} can be reached by anybody on the network; name --keys, "
+            "use a loopback address, or say --insecure"
+        )
 
 
 def _keys(place: Place) -> str:

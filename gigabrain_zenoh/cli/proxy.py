@@ -8,6 +8,7 @@ from typing import Protocol
 
 import msgspec
 
+from gigabrain_zenoh.addresses import is_loopback
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.faults.call import Address
 from gigabrain_zenoh.faults.chaos import CALM, WAYS, Chaos, Told, Way, told
@@ -26,6 +27,7 @@ def proxy(
     baud: int = 115200,
     chaos: str = "",
     seed: int = 0,
+    insecure: bool = False,
 ) -> int:
     """Stand in front of a router or of a body's port, and spoil the line, until Ctrl-C.
 
@@ -48,13 +50,15 @@ def proxy(
         What goes wrong from the start, in the same words.
     seed
         For what is left to chance.
+    insecure
+        Let others on the network reach it too, and through it what is behind.
     """
     begin = told(chaos)
     if to.startswith("/"):
         line_proxy = find("gigabrain_drivers.links.line_proxy:LineProxy")
         made: Spoiled = line_proxy(to, _path(listen), baud=baud, seed=seed)
     else:
-        made = TcpProxy(_address(to), _address(listen), seed=seed)
+        made = TcpProxy(_address(to), _own(listen, insecure), seed=seed)
     asyncio.run(_stand(made, begin))
     return 0
 
@@ -109,6 +113,16 @@ def _path(listen: str) -> Path:
     if "/" not in listen or listen.startswith("tcp/"):
         raise ConfigError(f"--listen: expected the path of the new port, got {listen!r}")
     return Path(listen)
+
+
+def _own(listen: str, insecure: bool) -> Address:
+    address = _address(listen)
+    if not insecure and not is_loopback(address[0]):
+        raise ConfigError(
+            f"--listen: {listen} can be reached by anybody on the network, and so can what is "
+            "behind it; use a loopback address, or say --insecure"
+        )
+    return address
 
 
 def _address(text: str) -> Address:

@@ -36,9 +36,13 @@ def progress(name: str, status: TaskStatus) -> str:
         return f"{name}: waits, {place} in the queue" if place else f"{name}: accepted"
     if current.state == "paused":
         return f"{name}: paused, {current.reason}"
+    if not status.doing:
+        return f"{name}: accepted"
     parts = [f"{name}: {status.doing}", f"{100 * status.progress:.0f} %"]
     if status.distance_remaining is not None:
         parts.append(f"{status.distance_remaining:.1f} m")
     if status.eta is not None:
         parts.append(f"{status.eta:.0f} s")
-    return ", ".join((*parts, current.reason))
+    if current.reason != status.doing:
+        parts.append(current.reason)
+    return ", ".join(parts)

@@ -19,6 +19,8 @@ Wait = Annotated[bool, Parameter(help="Wait for the end; Ctrl-C cancels the task
 HowOption = Annotated[
     How, Parameter(help="In place of all there is to do, after it, or before it.")
 ]
+Named = Annotated[str, Parameter(help="Which one; without, what it is at.")]
+NamedOrAll = Annotated[str, Parameter(help="Which one, or `all`; without, what it is at.")]
 
 
 def goto(
@@ -132,41 +134,26 @@ def list_(*, at: Which = HERE) -> int:
     return _with(at, show)
 
 
-def cancel(task: str = "", /, *, at: Which = HERE) -> int:
+def cancel(task: NamedOrAll = "", /, *, at: Which = HERE) -> int:
     """End what it is at, or another task.
 
     Example: gigabrain task cancel goal-7
-
-    Parameters
-    ----------
-    task
-        Which one, or `all`; without, what it is at.
     """
     return _with(at, lambda tasks: _told(tasks.cancel(task)))
 
 
-def pause(task: str = "", /, *, at: Which = HERE) -> int:
+def pause(task: Named = "", /, *, at: Which = HERE) -> int:
     """Have a task wait.
 
     Example: gigabrain task pause
-
-    Parameters
-    ----------
-    task
-        Which one; without, what it is at.
     """
     return _with(at, lambda tasks: _told(tasks.pause(task)))
 
 
-def resume(task: str = "", /, *, at: Which = HERE) -> int:
+def resume(task: Named = "", /, *, at: Which = HERE) -> int:
     """Have a task go on that waits for a person.
 
     Example: gigabrain task resume
-
-    Parameters
-    ----------
-    task
-        Which one; without, what it is at.
     """
     return _with(at, lambda tasks: _told(tasks.resume(task)))
 

@@ -83,7 +83,7 @@ def echo(
     how = Shown(json=json, fields=chosen, count=count, within_s=within)
 
     async def run() -> int:
-        async with aimed(at.where(), topic) as (bus, aim):
+        async with aimed(at.where(), topic, looks_on=True) as (bus, aim):
             return await run_echo(bus, aim, how, say)
 
     return asyncio.run(run())

@@ -7,7 +7,7 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, STATE
 from gigabrain_zenoh import gate
-from gigabrain_zenoh.bus import Latest
+from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.deployment import client_endpoint
 from gigabrain_zenoh.faults.bodies import description_of
@@ -15,7 +15,7 @@ from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.forger import forging
 from gigabrain_zenoh.faults.open_gate import OpenGate
 from gigabrain_zenoh.faults.rig import Rig, deployment_of
-from gigabrain_zenoh.faults.skewed import drift, other_host
+from gigabrain_zenoh.faults.skewed import Shift, drift, other_host
 from gigabrain_zenoh.faults.smooth import stops
 from gigabrain_zenoh.faults.stopping import creep
 from gigabrain_zenoh.faults.subject import Subject
@@ -128,42 +128,45 @@ async def hosts_with_other_clocks(rig: Rig) -> Measured:
     """The brain's host is five seconds ahead and 200 ppm too fast; ages are the same there."""
     ticks = LONG_APART_TICKS if rig.long else APART_TICKS
     stopped = await _driven_with(rig, "other-host", BRAIN_HOST, ticks)
-    return {"stops": stopped, "tick age error": await _age_error_ms(await rig.robot("sim"))}
+    subject = await rig.robot("sim")
+    error_ms = await age_error_ms(subject.onlooker.bus, OtherHost(), APART_TICKS)
+    return {"stops": stopped, "tick age error": error_ms}
 
 
 class OtherHost(Clock):
-    """The clocks of a host that is five seconds ahead and 200 ppm too fast."""
+    """The clocks of a host that is five seconds ahead, and as a rule 200 ppm too fast."""
 
-    def __init__(self) -> None:
-        self._start_ns = super().now_ns()
+    def __init__(self, gains: Shift = drift) -> None:
+        self._start_ns, self._gains = super().now_ns(), gains
 
     def now_ns(self) -> int:
         """As that host has it, which has been up for longer."""
         now_ns = super().now_ns()
-        return now_ns + 10**12 + drift(now_ns - self._start_ns)
+        return now_ns + 10**12 + self._gains(now_ns - self._start_ns)
 
     def unix_ns(self) -> int:
         """As that host has it."""
         return super().unix_ns() + other_host(super().now_ns() - self._start_ns)
 
 
-async def _age_error_ms(subject: Subject) -> float:
-    """How far two hosts differ at most about the age of the newest state [ms]."""
-    bus, worst_ns = subject.onlooker.bus, 0
-    here = Latest(STATE, Clock(), bus.time)
-    there = Latest(STATE, OtherHost(), bus.time)
+async def age_error_ms(bus: Bus, clock: Clock, looks: int) -> float:
+    """How far one by this `clock` is off about the age of the newest state, at most [ms]."""
+    worst_ns = 0
+    # this machine may stand still between two of these calls
+    earlier, there, later = (Latest(STATE, by, bus.time) for by in (Clock(), clock, Clock()))
 
     def hear(_key: str, state: RobotState) -> None:
-        here.take(state)
-        there.take(state)
+        for each in (earlier, there, later):
+            each.take(state)
 
     close = bus.subscribe(STATE, hear)
     try:
-        for _ in range(APART_TICKS):
+        for _ in range(looks):
             await asyncio.sleep(0.02)
-            ages = here.age_ns(), there.age_ns()
+            ages = later.age_ns(), there.age_ns(), earlier.age_ns()
+            least, age, most = (each or 0 for each in ages)
             if None not in ages:
-                worst_ns = max(worst_ns, abs((ages[1] or 0) - (ages[0] or 0)))
+                worst_ns = max(worst_ns, least - age, age - most)
     finally:
         close()
     return worst_ns / 1e6

@@ -15,7 +15,8 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.faults.estop import Presses
 from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.flooder import NAME
-from gigabrain_zenoh.faults.helpers import helper, helpers, open_files, rss_mb
+from gigabrain_zenoh.faults.growth import Growth
+from gigabrain_zenoh.faults.helpers import helper, helpers, rss_mb
 from gigabrain_zenoh.faults.rig import Rig
 from gigabrain_zenoh.faults.smooth import stops_in_time
 from gigabrain_zenoh.faults.stopping import stop_by
@@ -156,7 +157,7 @@ async def soak(rig: Rig) -> Measured:
     await subject.drive()
     await asyncio.sleep(WARM_S)
     pids = [subject.pid(name) for name in subject.supervisor.statuses]
-    memory, files = [rss_mb(pid) for pid in pids], [open_files(pid) for pid in pids]
+    growth = Growth(pids)
 
     def see(key: str, _encoding: str, payload: bytes) -> None:
         gaps.see(key, header_of(payload))
@@ -173,11 +174,9 @@ async def soak(rig: Rig) -> Measured:
         close()
     if pids != [subject.pid(name) for name in subject.supervisor.statuses]:
         raise Failed("a process has died")
-    grown = max(rss_mb(pid) - before for pid, before in zip(pids, memory, strict=True))
-    more = max(open_files(pid) - before for pid, before in zip(pids, files, strict=True))
     return {
         "unexplained stops": stopped,
-        "memory grown": max(0.0, grown) / max(1.0, seconds / 3600.0),
-        "open files grown": max(0, more),
+        "memory grown": growth.memory_mb() / max(1.0, seconds / 3600.0),
+        "open files grown": growth.open_files(),
         "lost": gaps.missing.total(),
     }

@@ -21,7 +21,7 @@ from gigabrain_zenoh.faults.hostile import codec_of, hostile_payloads
 from gigabrain_zenoh.faults.hostile import hostile_values as damaged
 from gigabrain_zenoh.faults.open_gate import COMMANDER, OpenGate
 from gigabrain_zenoh.faults.rig import Rig, deployment_of
-from gigabrain_zenoh.faults.smooth import stops
+from gigabrain_zenoh.faults.smooth import stops_in_time
 from gigabrain_zenoh.faults.stopping import TICK_MS
 from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
@@ -137,7 +137,8 @@ def sensed(body: BodyDescription, count: int) -> None:
 async def _flooded(rig: Rig, ticks: int) -> int:
     """Stops of a driving robot, and speeds beyond its limits, while nonsense comes on each key.
 
-    In lock-step, where time waits for the brain: a stop is the flood's, and not the machine's.
+    In lock-step, where time waits for the brain, though not for ever: where a machine has no time
+    for it, ticks pass without a command, and that stop is the machine's.
     """
     await rig.give_up()
     deployment = msgspec.structs.replace(deployment_of(rig.options, "sim"), speed=LOCKSTEP)
@@ -152,7 +153,7 @@ async def _flooded(rig: Rig, ticks: int) -> int:
         states = [s for s in onlooker.states if s.boot == start.boot and s.tick > start.tick]
         await subject.check()
     fast = sum(not abs(s.velocity.linear_x) <= most for s in states)
-    return fast + len(stops(onlooker, start))
+    return fast + stops_in_time(onlooker, start)
 
 
 async def _pour(subject: Subject, ticks: int) -> None:

@@ -11,7 +11,7 @@ from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.faults.fault import Skipped, Stage
 from gigabrain_zenoh.faults.subject import TIRELESS, Change, Subject
 from gigabrain_zenoh.process import find
-from gigabrain_zenoh.settings import DecisionConfig, LinkName, Resume
+from gigabrain_zenoh.settings import DecisionConfig, LinkName, PerceptionConfig, Resume
 
 SPEED = 0.26  # [m/s], of all tests that do not say otherwise
 BODIES: dict[Stage, str] = {
@@ -29,6 +29,7 @@ class Options:
 
     body: str = ""  # instead of the one that each stage has
     world: str = "arena"
+    behaviour: Literal["avoid", "navigate"] = "avoid"
     long: bool = False  # the forms for a release, instead of those for every change
 
 
@@ -116,5 +117,8 @@ def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> 
         world=options.world,
         resume="auto" if stage == "auto" else resume,
         router="tcp/127.0.0.1:0",
-        decision=DecisionConfig(linear_speed=SPEED),
+        perception=PerceptionConfig(mapping="slam" if options.behaviour == "navigate" else "off"),
+        decision=DecisionConfig(
+            behaviour=options.behaviour, linear_speed=SPEED, speed_limit=SPEED, begin="roam"
+        ),
     )

@@ -12,7 +12,6 @@ from gigabrain_zenoh.faults.waiting import until
 
 SLOWER = 0.01  # [m/s], half of what a body brakes in a tick
 TICK_MS = TICK_NS / 1e6
-SETTLE_TICKS = 2  # what a dying process has said arrives by then
 
 
 class Stop(NamedTuple):
@@ -33,7 +32,7 @@ async def stop_by(subject: Subject, fault: Callable[[], object], victim: str = "
     before_m = await subject.distance()
     start = onlooker.state
     fault()
-    await onlooker.ticks(SETTLE_TICKS)
+    await until(lambda: onlooker.state.gate.mode != "enabled", "the gate begins to shut")
     begin = max(start.tick, _last_word(onlooker, victim, start))
     await until(lambda: onlooker.state.gate.mode in ("idle", "latched"), "the gate shuts")
     if not any(s.gate.causes for s in onlooker.states if s.tick > start.tick):
@@ -45,7 +44,11 @@ async def stop_by(subject: Subject, fault: Callable[[], object], victim: str = "
 
 
 def _last_word(onlooker: Onlooker, victim: str, start: RobotState) -> int:
-    """The newest tick that the victim has answered."""
+    """The newest tick that the victim has answered.
+
+    Asked once the gate shuts: by then all of it has come, however busy this machine is, and nobody
+    has started the victim again yet.
+    """
     said = {
         "decision": onlooker.intent.current,
         "safety": onlooker.safety.current,

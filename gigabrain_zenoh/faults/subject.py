@@ -30,8 +30,9 @@ Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
 TIRELESS = Backoff(factor=1.0, deaths=10_000)
 FAULTS_FILE = "faults.json"  # as the emulator's process reads it
 STOP_S = 1.5
-NEARLY_STRAIGHT = 0.1  # [rad/s]; legs sway
-FULL_SHARE = 0.96  # of a speed counts as having reached it
+START_S = 300.0  # far more than it takes to compile what a navigating robot calls
+NEARLY_STRAIGHT = {"avoid": 0.1, "navigate": 0.3}  # [rad/s]; legs sway, and ways have bends
+FULL_SHARE = {"avoid": 0.96, "navigate": 0.6}  # of a speed; a busy host drives more slowly
 
 
 class Subject:
@@ -148,7 +149,7 @@ class Subject:
                 raise Failed(f"{', '.join(self.supervisor.given_up)} cannot be started")
             return all(status.state == "ready" for status in statuses)
 
-        await until(all_ready, "all processes are ready")
+        await until(all_ready, "all processes are ready", START_S)
 
     def _refusal(self) -> str:
         said = [r for r in self.records if r.get("event") == "failed"]
@@ -157,7 +158,9 @@ class Subject:
     async def restarted(self, name: str, pid: int) -> None:
         """Wait until a process that had this pid is ready under another one."""
         status = self.supervisor.statuses[name]
-        await until(lambda: status.state == "ready" and status.pid != pid, f"{name}'s restart")
+        await until(
+            lambda: status.state == "ready" and status.pid != pid, f"{name}'s restart", START_S
+        )
 
     async def break_body(self, **faults: Mapping[str, Any]) -> None:
         """Have these faults of an emulated body, by station, and no others.
@@ -204,8 +207,9 @@ class Subject:
         await until(lambda: onlooker.bodies.current, "the driver says what its body is")
         body = onlooker.bodies.current
         most = body.description.max_linear_speed if body else 0.0
-        speed = FULL_SHARE * min(self.deployment.decision.linear_speed, most)
-        await onlooker.straight(speed, room, NEARLY_STRAIGHT, by_hand=True)
+        decision = self.deployment.decision
+        speed = FULL_SHARE[decision.behaviour] * min(decision.linear_speed, most)
+        await onlooker.straight(speed, room, NEARLY_STRAIGHT[decision.behaviour], by_hand=True)
 
     async def release(self) -> None:
         """As a person: let go of a latched gate, as soon as that is possible."""

@@ -19,14 +19,6 @@ STAGES = ("sim", "auto", "serial", "tcp", "")
 Say = Callable[[Result], None]
 
 
-def find_test(fault: Fault) -> Test:
-    """The function that carries a fault out. Raises Skipped where there is none."""
-    try:
-        return find(fault.path)  # type: ignore[no-any-return]
-    except (ModuleNotFoundError, AttributeError):
-        raise Skipped("not written yet") from None
-
-
 async def run_suite(
     faults: Iterable[Fault],
     options: Options,
@@ -110,7 +102,7 @@ async def _judged(fault: Fault, rig: Rig) -> Run:
 
 
 async def _run(fault: Fault, rig: Rig) -> Measured:
-    test = find_test(fault)
+    test: Test = find(fault.path)
     async with asyncio.timeout(None if rig.long else LIMIT_S):
         measured = await test(rig)
         await rig.check()

@@ -165,6 +165,6 @@ def choose(wanted: Iterable[str]) -> tuple[Fault, ...]:
     for text in wanted:
         found = numbers.get(text) or names.get(text)
         if not found:
-            raise unknown("fault", text, names)
+            raise unknown(f"fault (a name, or a number from 1 to {len(FAULTS)})", text, names)
         chosen.add(found.number)
     return tuple(fault for fault in FAULTS if not chosen or fault.number in chosen)

@@ -15,7 +15,9 @@ from gigabrain_schemas.topics import (
     DESCRIBE,
     ENABLE,
     ESTOP,
+    ESTOP_SAID,
     GOAL,
+    GRANTED,
     HEALTH,
     INTENT,
     JOINT_CMD,
@@ -34,10 +36,11 @@ from gigabrain_schemas.topics import (
     Service,
     Topic,
 )
-from gigabrain_zenoh.keys.roles import Role, common_name
+from gigabrain_zenoh.keys.roles import Role, common_name, of_generation
 
 ALL = "robot/**"  # all that there is of one robot
 HEARD = ("put", "query", "reply", "declare_queryable")
+FIRST: Mapping[str, int] = {}  # nobody has been called back
 LOCAL = "local"  # who comes by the router's Unix socket, which only this user can open
 
 
@@ -52,13 +55,13 @@ class Rights:
 
 
 BRAIN = Rights(
-    says=(WORLD, POSE, MAP, INTENT, TASK, HEALTH, LOG),
+    says=(WORLD, POSE, MAP, INTENT, TASK, GRANTED, HEALTH, LOG, ESTOP_SAID),
     asks=(DESCRIBE, ESTOP),
     answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
     names=("perception", "decision", "relay"),
 )
 OPERATOR = Rights(
-    says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG),
+    says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG, ESTOP_SAID),
     asks=(
         DESCRIBE,
         AUDIT_LOG,
@@ -84,8 +87,12 @@ RIGHTS: Mapping[Role, Rights | None] = {
 }
 
 
-def access_control(robots: Sequence[str], own: str = "") -> dict[str, Any]:
+def access_control(
+    robots: Sequence[str], own: str = "", generations: Mapping[str, int] = FIRST
+) -> dict[str, Any]:
     """Zenoh's `access_control` for a router of these robots (their namespaces); deny by default.
+
+    Of each name only one of the `generations` has rights, the first unless told otherwise.
 
     Whoever comes by the Unix socket is the robot `own`: only the user who runs it can, and could
     read its key as well. Beside a router of no robot it is an operator of all.
@@ -99,7 +106,7 @@ def access_control(robots: Sequence[str], own: str = "") -> dict[str, Any]:
         ids = [rule["id"] for own_name in own_names for rule in of[own_name]]
         if name in FLEET_WIDE:
             ids.append(FLEET_LISTENS["id"])
-        subjects.append({"id": name, "cert_common_names": [name]})
+        subjects.append({"id": name, "cert_common_names": [_good(name, generations)]})
         policies.append({"subjects": [name], "rules": ids})
     subjects.append({"id": LOCAL, "link_protocols": ["unixsock-stream"]})
     near = [common_name("operator", robot) for robot in robots]
@@ -116,9 +123,13 @@ def access_control(robots: Sequence[str], own: str = "") -> dict[str, Any]:
     }
 
 
-def known_names(robots: Sequence[str]) -> tuple[str, ...]:
-    """The common names that a router of these robots knows."""
-    return tuple(name for name, _ in _known(robots))
+def known_names(robots: Sequence[str], generations: Mapping[str, int] = FIRST) -> tuple[str, ...]:
+    """The common names that have rights at a router of these robots."""
+    return tuple(_good(name, generations) for name, _ in _known(robots))
+
+
+def _good(name: str, generations: Mapping[str, int]) -> str:
+    return of_generation(name, generations.get(name, 1))
 
 
 def _known(robots: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:

@@ -17,15 +17,17 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from gigabrain_zenoh.addresses import host_and_port, is_host, is_ip
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.files import CA, CA_KEY, CERTIFICATE, KEY
 from gigabrain_zenoh.keys.identity import read_certificate, read_key
-from gigabrain_zenoh.keys.roles import LONGEST, Role, common_name
+from gigabrain_zenoh.keys.list_file import generations_in
+from gigabrain_zenoh.keys.revoked import write_list
+from gigabrain_zenoh.keys.roles import LONGEST, SERVERS, Role, common_name
 
 CA_DAYS, DAYS = 3650, 365
 EARLY = datetime.timedelta(days=1)  # clocks of hosts differ
 LOCAL = ("localhost", "127.0.0.1", "::1")
-SERVERS: tuple[Role, ...] = ("robot", "router")  # only they may be a router
 
 
 def new_fleet(fleet: str, folder: Path) -> None:
@@ -58,7 +60,7 @@ def issue(
     robot: str = "",
     name: str = "",
     hosts: Sequence[str] = (),
-    days: float = DAYS,
+    days: int = DAYS,
 ) -> Path:
     """Make an identity; returns its folder, which is to be copied to its host.
 
@@ -66,8 +68,10 @@ def issue(
     """
     if hosts and role not in SERVERS:
         raise ConfigError(f"--host: only a {' or a '.join(SERVERS)} is connected to")
-    subject = common_name(role, robot)
+    generations = generations_in(fleet_folder)
+    subject = common_name(role, robot, generations.get(common_name(role, robot), 1))
     authority = read_certificate(fleet_folder / CA)
+    _check_days(days, authority)
     key = ec.generate_private_key(ec.SECP256R1())
     names = list(authority.subject.get_attributes_for_oid(NameOID.ORGANIZATION_NAME))
     names.append(x509.NameAttribute(NameOID.COMMON_NAME, subject))
@@ -83,15 +87,17 @@ def issue(
         .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
         .sign(read_key(fleet_folder / CA_KEY), hashes.SHA256())
     )
-    folder = fleet_folder / (name or subject.replace("/", "-"))
+    folder = fleet_folder / (name or subject.replace("/", "-").replace("~", "-"))
     with _new_folder(folder) as made:
         contents = {KEY: _pem(key), CERTIFICATE: _text(certificate), CA: _text(authority)}
         _write(made, contents)
+        if role in SERVERS and generations:
+            write_list(made, generations)
     return folder
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: float
+    subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: int
 ) -> x509.CertificateBuilder:
     now = datetime.datetime.now(datetime.UTC)
     return (
@@ -103,6 +109,19 @@ def _builder(
         .not_valid_before(now - EARLY)
         .not_valid_after(now + datetime.timedelta(days=days))
     )
+
+
+def _check_days(days: int, authority: x509.Certificate) -> None:
+    if not 1 <= days <= CA_DAYS:
+        raise ConfigError(f"--days {days}: expected 1 to {CA_DAYS}")
+    end = authority.not_valid_after_utc
+    left = (end - datetime.datetime.now(datetime.UTC)).days
+    if days > left:
+        at_most = f"say --days {left} at most, or " if left > 0 else ""
+        raise ConfigError(
+            f"--days {days}: the fleet's own certificate ends on {end:%Y-%m-%d}; {at_most}"
+            "make a new fleet with `gigabrain keys new`"
+        )
 
 
 def _usage(*, authority: bool) -> x509.KeyUsage:
@@ -120,14 +139,19 @@ def _usage(*, authority: bool) -> x509.KeyUsage:
 
 
 def _place(host: str) -> x509.GeneralName:
-    try:
-        return x509.IPAddress(ipaddress.ip_address(host.strip("[]")))
-    except ValueError:
-        pass
-    try:
+    bare = host.strip("[]")
+    if is_ip(bare):
+        return x509.IPAddress(ipaddress.ip_address(bare))
+    if is_host(host):
         return x509.DNSName(host)
-    except ValueError:
-        raise ConfigError(f"--host {host}: expected an address or a host name") from None
+    for endpoint in (host, f"tcp/{host}"):  # what others connect to, or that without its protocol
+        try:
+            alone, _ = host_and_port(endpoint)
+        except ValueError:
+            continue
+        if alone:
+            raise ConfigError(f"--host {host}: give the address alone: {alone}")
+    raise ConfigError(f"--host {host!r}: expected an IP address or a host name")
 
 
 def _text(certificate: x509.Certificate) -> bytes:

@@ -1,10 +1,10 @@
 """Whether an identity can be used, and for what a host is to run."""
 
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gigabrain_zenoh.addresses import host_and_port
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.keys.roles import Role, common_name
 from gigabrain_zenoh.settings import Endpoint
@@ -48,8 +48,8 @@ def check_identity(folder: Path, processes: Iterable[str], namespace: str, route
     if identity.robot != namespace and (identity.robot or identity.role in ("robot", "brain")):
         wanted = common_name(identity.role, namespace)
         raise ConfigError(f"{folder} is the identity of {identity.name}; expected {wanted}")
-    host = _host(router)
-    if "router" in processes and host not in identity.hosts:
+    host, _ = host_and_port(router)
+    if "router" in processes and host and host not in identity.hosts:
         raise ConfigError(
             f"{folder} is for a router at {', '.join(identity.hosts)}, not at {host}; "
             f"issue one with --host {host}"
@@ -68,9 +68,3 @@ def no_router(endpoint: Endpoint) -> BusError:
 def may_not_ask(keys: str) -> str:
     """What else may be the reason for silence: a router does not say what it denies."""
     return f"; or {identity_in(Path(keys)).name} may not ask for it" if keys else ""
-
-
-def _host(endpoint: str) -> str:
-    """The host in tls/192.168.1.10:7447."""
-    named = re.fullmatch(r"\w+/\[?([^\]]+?)\]?:\d+.*", endpoint)
-    return named[1] if named else endpoint

@@ -31,6 +31,7 @@ class Identity(Struct, frozen=True, kw_only=True):
     name: str  # the common name, such as robot@red
     role: Role
     robot: str  # its namespace; empty for the only one, or for all
+    generation: int  # of all who have had this role
     hosts: tuple[str, ...]  # where it can be connected to
     expires: datetime.datetime
 
@@ -72,13 +73,14 @@ def read(folder: Path) -> tuple[Identity, x509.Certificate]:
     check_files(folder)
     certificate = read_certificate(folder / CERTIFICATE)
     name = _attribute(certificate, NameOID.COMMON_NAME)
-    role, robot = parse(name)
+    role, robot, generation = parse(name)
     identity = Identity(
         folder=folder,
         fleet=_attribute(certificate, NameOID.ORGANIZATION_NAME),
         name=name,
         role=role,
         robot=robot,
+        generation=generation,
         hosts=_hosts(certificate),
         expires=certificate.not_valid_after_utc,
     )

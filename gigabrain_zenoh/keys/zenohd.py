@@ -4,8 +4,9 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gigabrain_zenoh.keys.acl import FIRST
 from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_config import security, session_settings
+from gigabrain_zenoh.zenoh_config import secured, security, session_settings
 
 HEADER = """\
 // A router for several robots on a host of its own. Written by:
@@ -14,10 +15,12 @@ HEADER = """\
 """
 
 
-def configuration(robots: Sequence[str], keys: str, listen: str) -> str:
+def configuration(
+    robots: Sequence[str], keys: str, listen: str, generations: Mapping[str, int] = FIRST
+) -> str:
     """A file for `zenohd --config`; `keys` is the folder of its identity on its own host."""
-    endpoint = Endpoint(listen=(listen,), keys=keys, fleet=tuple(robots))
-    settings = session_settings(endpoint) | security(endpoint)
+    endpoint = secured(Endpoint(listen=(listen,), keys=keys, fleet=tuple(robots)))
+    settings = session_settings(endpoint) | security(endpoint, generations)
     options = "".join(f" --robot {robot}" for robot in robots if robot)
     return HEADER.format(options=options) + json.dumps(_nested(settings), indent=2) + "\n"
 

@@ -81,7 +81,9 @@ class Costmap:
 def inflation(body: BodyDescription, unknown: Unknown = "avoid") -> Inflation:
     """How obstacles weigh for `body`, with the room beside it that safety keeps as well."""
     edges, margin = sweep.box(body.footprint), body.thresholds.side_margin
-    fits = max(edges.left, -edges.right) + margin
+    aside, ahead = max(edges.left, -edges.right), max(edges.front, -edges.rear)
+    sideways = body.max_lateral_speed > 0 and body.drive_type != "ackermann"
+    fits = (min(aside, ahead) if sideways else aside) + margin
     return Inflation(fits=fits, turns=sweep.radius(body.footprint) + margin, unknown=unknown)
 
 

@@ -11,7 +11,7 @@ from gigabrain_schemas.brain import Obstacle, TrajectoryPoint
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import clearance, outline_of
 from gigabrain_zenoh.navigation.manner import kind_of, reason_of
-from gigabrain_zenoh.navigation.models import lag_of, model_of
+from gigabrain_zenoh.navigation.models import lag_of, model_of, slowed
 from gigabrain_zenoh.navigation.moment import Goal, LocalPlan, LocalSettings, Moment, Sent
 from gigabrain_zenoh.navigation.mppi import Planned, Sampler, past_of, step_of
 from gigabrain_zenoh.navigation.rating import Scene, Weights, distance_in
@@ -72,7 +72,11 @@ class LocalPlanner:
             return _standing("arrived: at the goal", arrived=True)
         scene = self._scene(moment, discs)
         planned = self._sampler.plan(
-            self._outline, self._weights, scene, self._start(moment, place)
+            slowed(self._model, moment.delayed),
+            self._outline,
+            self._weights,
+            scene,
+            self._start(moment, place),
         )
         return self._answer(moment, scene, planned)
 
@@ -81,8 +85,8 @@ class LocalPlanner:
         grid = self._window.grid(moment.tick, moment.known, discs)
         field = self._costs.field(grid, self._half_width, (goal.x, goal.y), moment.path)
         yaw = math.nan if goal.yaw is None else goal.yaw
-        tolerance = self._settings.position_tolerance
-        return Scene(grid, field, discs, goal.x, goal.y, yaw, tolerance)
+        near, turned = self._settings.position_tolerance, self._settings.yaw_tolerance
+        return Scene(grid, field, discs, goal.x, goal.y, yaw, near, turned)
 
     def _start(self, moment: Moment, place: Place) -> Start:
         v, sent, dt = moment.velocity, moment.sent, self._sampler.dt

@@ -13,6 +13,7 @@ Floats = NDArray[np.float64]
 SOON_S = 1.0  # what the body does within this time is what it is said to do
 STILL = 0.08  # share of the largest speed that counts as standing
 NEAR_M = 1.5  # [m], what moves within this is named
+THERE_M = 0.2  # [m], so little is left where only standing and turning are
 ASIDE_M = 0.15  # [m], so far off the straight way is round something
 
 
@@ -33,6 +34,8 @@ def kind_of(model: Model, track: Floats, dt: float, goal: Goal) -> Kind:
 def reason_of(kind: Kind, track: Floats, discs: Floats, room: float, left: float) -> str:
     """Why, with what is in the way: `room` [m] round the body, `left` [m] to go."""
     moving = _nearest_moving(track, discs)
+    if left < THERE_M and not moving and kind in ("waiting", "turning in place"):
+        return f"{kind}: at the goal"
     if kind == "waiting":
         return f"waiting: {moving}" if moving else f"waiting: no way on, {room:.2f} m of room"
     if kind == "going round":

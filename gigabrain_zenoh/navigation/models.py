@@ -54,6 +54,23 @@ def model_of(body: BodyDescription, speed: float | None = None) -> Model:
     )
 
 
+def slowed(model: Model, seconds: float) -> Model:
+    """The model of a body that reacts so much later: its way to a stop stays as long as it was."""
+    if seconds <= 0.0:
+        return model
+    reaction, brake = model.reaction_time + seconds, model.deceleration
+    way = model.forward * model.reaction_time + model.forward**2 / (2.0 * brake)
+    fastest = math.sqrt((brake * reaction) ** 2 + 2.0 * brake * way) - brake * reaction
+    share = fastest / model.forward
+    return model._replace(
+        forward=fastest,
+        backward=share * model.backward,
+        lateral=share * model.lateral,
+        turning=share * model.turning,
+        reaction_time=reaction,
+    )
+
+
 @kernel
 def toward(before: float, target: float, up: float, down: float) -> float:
     """`target`, or as near to it as one step from `before` gets.

@@ -62,6 +62,7 @@ class Moment:
     obstacles: tuple[Obstacle, ...] = ()
     response: Response = field(default_factory=Response)
     sent: tuple[Sent, ...] = ()  # oldest first; those of the last 0.5 s are enough
+    delayed: float = 0.0  # [s], how much later than usual what is planned will be obeyed
 
 
 @dataclass(frozen=True, kw_only=True)

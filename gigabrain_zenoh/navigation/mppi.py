@@ -41,7 +41,7 @@ class Sampler:
     """Plans by sampling; the same seed and the same questions give the same plans."""
 
     def __init__(self, model: Model, samples: int, steps: int, dt: float, seed: int) -> None:
-        self._model, self.dt, self._turn = model, dt, 0
+        self.dt, self._turn = dt, 0
         random = np.random.default_rng(seed)
         self._noise = _noise(random, (SETS, samples, steps, 3), model)
         self._simple = _simple(random, SETS, samples, steps, model)
@@ -59,9 +59,11 @@ class Sampler:
         whole = np.arange(len(self.last))
         self.last = np.stack([np.interp(at, whole, axis) for axis in self.last.T], axis=1)
 
-    def plan(self, outline: Outline, weights: Weights, scene: Scene, start: Start) -> Planned:
-        """The best that was found."""
-        model, dt, plans, costs = self._model, self.dt, self._plans, self._costs
+    def plan(
+        self, model: Model, outline: Outline, weights: Weights, scene: Scene, start: Start
+    ) -> Planned:
+        """The best that was found for a body that can move like `model`."""
+        dt, plans, costs = self.dt, self._plans, self._costs
         _propose(plans, self.last, self._noise[self._turn], self._simple[self._turn])
         self._turn = (self._turn + 1) % SETS
         _score(model, outline, weights, scene, start, dt, plans, costs)

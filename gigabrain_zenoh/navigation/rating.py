@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import kernel
-from gigabrain_zenoh.navigation.footprint import Grid, Outline, distance_at, free_ahead
+from gigabrain_zenoh.navigation.footprint import ROOM, Grid, Outline, distance_at, free_ahead
 from gigabrain_zenoh.navigation.models import Model
 
 Floats = NDArray[np.float64]
@@ -17,6 +17,7 @@ LOOK_AHEAD = 0.25  # [m], from where the last pose's heading is judged
 NEAR_GOAL = 0.2  # [m], nearer the field is too coarse
 SLOW = 0.05  # [m/s], slower than this it always stops in time
 NO_DISC = 1e3  # [m], where nothing moves
+DISC_ROOM = 1.5  # [m], what moves farther away makes no difference
 TOO_FAST = 16.0  # per second at full speed where it cannot stop in time, by the square of the share
 
 
@@ -30,6 +31,7 @@ class Scene(NamedTuple):
     goal_y: float
     goal_yaw: float  # [rad]; nan where any will do
     tolerance: float  # [m]
+    yaw_tolerance: float  # [rad]
 
 
 class Weights(NamedTuple):
@@ -51,22 +53,38 @@ class Weights(NamedTuple):
 
 @kernel
 def of_place(
-    model: Model, weights: Weights, scene: Scene, room: float, away: float, x: float, y: float
+    weights: Weights, scene: Scene, room: float, away: float, x: float, y: float, yaw: float
 ) -> float:
-    """What it costs to be here for a second, with obstacles and moving things so far away [m]."""
-    cost = weights.near * math.exp((weights.margin - room) / weights.near_over)
+    """What it costs to be here for a second, with obstacles and moving things so far away [m].
+
+    A second before it has arrived costs, or it would put off the last turn for ever.
+    """
+    cost = 0.0
+    if room < ROOM:
+        cost += weights.near * math.exp((weights.margin - room) / weights.near_over)
     if away < NO_DISC:
         cost += weights.disc * math.exp(-away / weights.disc_over)
-    if math.hypot(x - scene.goal_x, y - scene.goal_y) > scene.tolerance:
+    if not _arrived(scene, x, y, yaw):
         cost += 0.5 * SECOND
     return cost
+
+
+@kernel
+def _arrived(scene: Scene, x: float, y: float, yaw: float) -> bool:
+    dx, dy = x - scene.goal_x, y - scene.goal_y
+    if dx * dx + dy * dy > scene.tolerance * scene.tolerance:
+        return False
+    any_yaw = math.isnan(scene.goal_yaw)
+    return any_yaw or _turn_between(yaw, scene.goal_yaw) <= scene.yaw_tolerance
 
 
 @kernel
 def of_motion(weights: Weights, room: float, vx: float, vy: float, w: float) -> float:
     """What it costs to move so for a second."""
     cost = weights.turning * w * w
-    over = math.hypot(vx, vy) - (weights.tight_speed + weights.tight_rate * (room - weights.margin))
+    over = math.sqrt(vx * vx + vy * vy) - (
+        weights.tight_speed + weights.tight_rate * (room - weights.margin)
+    )
     if over > 0.0:
         cost += weights.tight * over * over
     if vx < 0.0:
@@ -80,7 +98,7 @@ def of_braking(
     cosine: float, sine: float, vx: float, vy: float,
 ) -> float:  # fmt: skip
     """What it costs to be faster for a second than what is ahead allows: safety would step in."""
-    speed = math.hypot(vx, vy)
+    speed = math.sqrt(vx * vx + vy * vy)
     brake, t = model.deceleration, model.reaction_time
     needs = speed * t + speed * speed / (2.0 * brake) + model.margin
     if speed < SLOW or room >= needs:
@@ -145,14 +163,20 @@ def _turn_between(one: float, other: float) -> float:
 def from_discs(
     discs: Floats, outline: Outline, x: float, y: float, cosine: float, sine: float, t: float
 ) -> float:
-    """How far the body's box is from the nearest disc, `t` [s] from now [m]."""
+    """How far the body's box is from the nearest disc, `t` [s] from now [m].
+
+    Discs that are DISC_ROOM away or more do not count.
+    """
     nearest = NO_DISC
     for i in range(discs.shape[0]):
         dx = discs[i, 0] + discs[i, 2] * t - x
         dy = discs[i, 1] + discs[i, 3] * t - y
+        reach = outline.far + discs[i, 4] + discs[i, 5] * t + min(nearest, DISC_ROOM)
+        if dx * dx + dy * dy >= reach * reach:
+            continue
         ahead, aside = cosine * dx + sine * dy, cosine * dy - sine * dx
         out_x = max(outline.rear - ahead, 0.0, ahead - outline.front)
         out_y = max(outline.right - aside, 0.0, aside - outline.left)
-        away = math.hypot(out_x, out_y) - discs[i, 4] - discs[i, 5] * t
+        away = math.sqrt(out_x * out_x + out_y * out_y) - discs[i, 4] - discs[i, 5] * t
         nearest = min(nearest, away)
     return nearest

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import kernel
-from gigabrain_zenoh.navigation.footprint import Outline, clearance
+from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance
 from gigabrain_zenoh.navigation.models import Lag, Model, answer, feasible
 from gigabrain_zenoh.navigation.rating import (
     Scene,
@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 TOUCHED, TOUCHED_DISC = 300.0, 200.0  # what a contact costs
 IMPACT = 50.0  # per m/s of a contact
 BRAKE_EVERY = 3  # steps
+AT_EASE = 0.25  # [m], room of more than that is not looked at anew before it can have gone
 
 
 class Start(NamedTuple):
@@ -82,6 +83,7 @@ def drive(
     least, least_disc = min(weights.margin, least), min(weights.disc_margin, least_disc)
     turning = model.turning * min(1.0, start.gain)
     cost, alive, noted = 0.0, True, len(track) > 0
+    room, slack = ROOM, 0.0
     _note(track, 0, x, y, yaw, vx, vy, w)
     for t in range(steps):
         w_wanted = max(-turning, min(turning, plan[t, 2]))
@@ -98,7 +100,10 @@ def drive(
         _note(track, t + 1, x, y, yaw, vx, vy, w)
         if not alive:
             continue
-        room = clearance(scene.grid, outline, x, y, cosine, sine)
+        slack -= abs(ahead) + abs(aside) + outline.far * abs(turned)
+        if slack < 0.0:
+            room = clearance(scene.grid, outline, x, y, cosine, sine)
+            slack = room - AT_EASE
         away = from_discs(scene.discs, outline, x, y, cosine, sine, (t + 1) * dt)
         late = (t + 1.0) / steps
         if room < least:
@@ -109,7 +114,7 @@ def drive(
             cost += TOUCHED_DISC * (1.0 - 0.6 * late) + rest(model, scene, x, y)
             alive = False
         else:
-            cost += dt * of_place(model, weights, scene, room, away, x, y)
+            cost += dt * of_place(weights, scene, room, away, x, y, yaw)
             cost += dt * of_motion(weights, room, vx, vy, w)
             if t % BRAKE_EVERY == 0:
                 cost += (

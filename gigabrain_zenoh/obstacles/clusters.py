@@ -22,6 +22,8 @@ FARTHEST_M = 10.0  # things beyond are left alone
 FEWEST = 3  # hits; fewer may be chance
 GRAZING_RAD = math.radians(10.0)  # surfaces met at less than that fall into single hits
 LEAST_GAP_M, MOST_GAP_M = 0.10, 0.35  # between two things
+NOISE_GAP = 5.0  # standard deviations of what noise alone puts between two neighbours
+TO_DEVIATION = math.sqrt(2.0) / (0.6745 * math.sqrt(6.0))  # from the median of second differences
 LOST_GAP_M, LOST_BEAMS = 0.10, 6.5  # so near, few beams may be lost on one thing
 MISSING_BEAMS = 2.5  # neighbours so many beams apart are two things
 LARGEST_M = 1.2  # what is longer is a wall
@@ -82,8 +84,20 @@ def _breaks(
     steps = np.minimum(turned, GRAZING_RAD / 2)
     most = nearer * np.sin(steps) / np.sin(GRAZING_RAD - steps)
     empty = turned > MISSING_BEAMS * spacing
-    ended = empty & ((apart > LOST_GAP_M) | (turned > LOST_BEAMS * spacing))
-    return ended | (apart > np.clip(most, LEAST_GAP_M, MOST_GAP_M)), empty
+    least = max(LEAST_GAP_M, NOISE_GAP * _roughness(ranges))
+    ended = empty & ((apart > max(LOST_GAP_M, least)) | (turned > LOST_BEAMS * spacing))
+    return ended | (apart > np.clip(most, least, MOST_GAP_M)), empty
+
+
+def _roughness(ranges: Floats) -> float:
+    """How much ranges differ from beam to beam [m], as a standard deviation, where nothing ends.
+
+    What a surface does to them is much the same on both sides of a beam; noise is not.
+    """
+    if len(ranges) < FEWEST:
+        return 0.0
+    bends = np.abs(ranges[:-2] - 2 * ranges[1:-1] + ranges[2:])
+    return float(np.median(bends)) * TO_DEVIATION
 
 
 def _in_front(ranges: Floats, empty: Bools, first: Indices, last: Indices, reach: float) -> Bools:

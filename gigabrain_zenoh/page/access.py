@@ -1,7 +1,6 @@
 """Who may open the page, and what for: tokens, and the names under which it is asked for."""
 
 import hmac
-import ipaddress
 import os
 import secrets
 from collections.abc import Mapping
@@ -11,6 +10,7 @@ from typing import Literal
 import msgspec
 from msgspec import Struct
 
+from gigabrain_zenoh.addresses import is_loopback
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.files import check_private
@@ -33,24 +33,16 @@ class Tokens(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
             raise ValueError("two tokens of 16 characters or more are expected")
 
 
-def on_loopback(listen: str) -> bool:
-    """Whether only this machine reaches the address."""
-    try:
-        return listen == "localhost" or ipaddress.ip_address(listen).is_loopback
-    except ValueError:
-        return False
-
-
 def wants_login(config: PageConfig) -> bool:
     """Whether somebody who opens the page has to have a token."""
-    return config.login or not on_loopback(config.listen)
+    return config.login or not is_loopback(config.listen)
 
 
 def check(config: PageConfig) -> None:
     """Raises ConfigError for a page that others can reach without TLS."""
     if bool(config.certificate) != bool(config.certificate_key):
         raise ConfigError("page: a certificate and its key belong together")
-    if not on_loopback(config.listen) and not config.certificate:
+    if not is_loopback(config.listen) and not config.certificate:
         raise ConfigError(
             f"page: {config.listen} can be reached from the network; name a certificate and its "
             "key (PEM files), or leave it on 127.0.0.1 and use an SSH tunnel"
@@ -93,7 +85,7 @@ class Access:
 
     def __init__(self, config: PageConfig, port: int) -> None:
         self._tokens = tokens(token_file(config.tokens))[0] if wants_login(config) else None
-        names = LOOPBACK_NAMES if on_loopback(config.listen) else (config.listen,)
+        names = LOOPBACK_NAMES if is_loopback(config.listen) else (config.listen,)
         hosts = {f"{name}:{port}" for name in (*names, *config.names)}
         if config.certificate and port == 443:
             hosts |= {*names, *config.names}  # browsers leave out the port that goes without saying

@@ -20,6 +20,7 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.page.access import Access, check, token_file, wants_login
 from gigabrain_zenoh.page.operator import Operator
+from gigabrain_zenoh.page.patience import Impatient
 from gigabrain_zenoh.page.scene import Scene
 from gigabrain_zenoh.page.sessions import Sessions
 from gigabrain_zenoh.seat import Seat
@@ -28,6 +29,7 @@ from gigabrain_zenoh.settings import PageConfig
 log = logging.getLogger(__name__)
 
 STATIC = Path(__file__).parent / "static"
+MOST = 512  # connections of all kinds
 FRAME_NS = 100_000_000  # viewers see ten moments a second
 HEADERS = {
     b"content-security-policy": b"default-src 'self'; connect-src 'self'; img-src 'self' blob: "
@@ -120,11 +122,12 @@ def _server(config: PageConfig, access: Access, sessions: Sessions) -> _Server:
             log_level="warning",
             access_log=False,
             lifespan="off",
+            http=Impatient,
             ws="websockets-sansio",
             ws_max_size=4096,
             ws_per_message_deflate=False,
             timeout_graceful_shutdown=1,
-            limit_concurrency=64,
+            limit_concurrency=MOST,
             server_header=False,
             ssl_certfile=config.certificate or None,
             ssl_keyfile=config.certificate_key or None,

@@ -21,6 +21,7 @@ LOGIN_S = 5.0  # until a browser has to have said who it is
 WRONG_S = 0.5  # how long a wrong token waits for its answer
 MOST = 16  # viewers at a time
 WAITING = 8  # requests of one viewer that are under way; e-stops do not count
+LONGEST = 120  # bytes of a reason for closing
 BAD, STRANGER, FULL = 1008, 4401, 4429  # why a WebSocket is closed (RFC 6455 7.4)
 
 
@@ -58,7 +59,7 @@ class Sessions:
         """One browser, from its login to its end."""
         if not self._access.own_page(socket.headers):
             log.warning("a page of another origin was refused")
-            await socket.close(BAD)
+            await socket.close(BAD, "this page is not of this server")
             return
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect):
@@ -123,7 +124,7 @@ class Sessions:
                 self._take(viewer, message.get("bytes") or b"")
             except ValueError as error:
                 log.warning("viewer %d was cut off: %s", viewer.number, str(error)[:200])
-                await socket.close(BAD)
+                await socket.close(BAD, str(error).encode()[:LONGEST].decode(errors="ignore"))
                 return
 
     def _take(self, viewer: Viewer, frame: bytes) -> None:

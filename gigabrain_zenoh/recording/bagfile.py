@@ -9,7 +9,7 @@ from foxglove import Schema
 from mcap.well_known import MessageEncoding
 from mcap.writer import CompressionType, IndexType, Writer
 
-from gigabrain_schemas.topics import TOPICS, Topic
+from gigabrain_schemas.topics import CMD_VEL, INTENT, STATE, TOPICS, Topic
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn, json_schema
@@ -21,6 +21,8 @@ CHUNK_BYTES = 1 << 20
 PROFILE = "gigabrain"
 RAW, VIEW = "raw", "view"  # what a channel is for, under the name "kind" in its metadata
 BY_KEY = {topic.key: topic for topic in TOPICS}
+THINNED = {topic.key for topic in (STATE, CMD_VEL)}  # of which viewers are drawn every second one
+DRAWN_NS = 30_000_000  # at least between two of them
 
 
 def topic_of(key: str) -> Topic[Any] | None:
@@ -50,6 +52,8 @@ class BagFile:
         self._decoders = {t.type: Codec(t.type, t.max_bytes).decode for t in TOPICS}
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
+        self._drawn_ns: dict[str, int] = {}  # when a thinned key was drawn last
+        self._thought = (0, -1)  # boot and basis of the intent that was drawn last
         self.pending: Counter[str] = Counter()  # per key, what is not on the disk yet
         self.written = 0  # messages that are
         self.first_ns = 0
@@ -132,7 +136,7 @@ class BagFile:
 
     def _draw(self, drawer: Drawer, arrival: Arrival) -> None:
         topic = topic_of(arrival.key)
-        if topic is None or not drawer.draws(topic):
+        if topic is None or not drawer.draws(topic) or not self._worth_drawing(arrival):
             return
         try:
             message = self._decoders[topic.type](arrival.payload)
@@ -142,6 +146,17 @@ class BagFile:
         for drawn in drawer.draw(topic, message, arrival.key.rpartition("/")[2]):
             channel = self._view_channel(drawn)
             self._writer.add_message(channel, arrival.log_ns, drawn.data, stamp_ns)
+
+    def _worth_drawing(self, arrival: Arrival) -> bool:
+        """Whether it shows more than the one before; told before it is decoded."""
+        key, header = arrival.key, arrival.header
+        if key == INTENT.key:  # said again with every tick
+            before, self._thought = self._thought, (header.boot, header.basis)
+            return before != self._thought
+        if key in THINNED and arrival.log_ns - self._drawn_ns.get(key, 0) < DRAWN_NS:
+            return False
+        self._drawn_ns[key] = arrival.log_ns
+        return True
 
     def _view_channel(self, drawn: Drawn) -> int:
         place = drawn.topic, drawn.encoding

@@ -23,7 +23,7 @@ LOOK_S = 0.5
 async def record(config: RecorderConfig, where: Where, seconds: float | None) -> int:
     """Record until Ctrl-C or for `seconds`; the exit code. Raises GigabrainError."""
     path = path_of(config)
-    async with joined(where, "record") as (bus, _):
+    async with joined(where, "record", looks_on=True) as (bus, _):
         recorder = Recorder(path, config)
         recorder.begin()
         recover_others(path.parent)

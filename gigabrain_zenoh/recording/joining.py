@@ -5,13 +5,14 @@ import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.keys.checks import no_router
 from gigabrain_zenoh.process import ZENOH_RUNTIME
 from gigabrain_zenoh.running import find_endpoint
+from gigabrain_zenoh.unobtrusive import NAP_S, step_aside
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 ROUTER_S = 3.0  # how long a router may take to answer
@@ -26,9 +27,17 @@ class Where(Struct, frozen=True, kw_only=True):
 
 
 @asynccontextmanager
-async def joined(where: Where, name: str) -> AsyncIterator[tuple[Bus, ZenohTransport]]:
-    """A bus of a robot, and the transport below it. Raises BusError where there is none."""
+async def joined(
+    where: Where, name: str, *, looks_on: bool = False
+) -> AsyncIterator[tuple[Bus, ZenohTransport]]:
+    """A bus of a robot, and the transport below it. Raises BusError where there is none.
+
+    Who `looks_on` lets what he listens to gather, and the robot's own processes go first.
+    """
     endpoint = find_endpoint(where.connect, where.namespace, where.keys)
+    if looks_on:
+        step_aside()
+        endpoint = structs.replace(endpoint, nap_s=NAP_S)
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
     try:
         transport = await asyncio.wait_for(ZenohTransport.open(endpoint), ROUTER_S)

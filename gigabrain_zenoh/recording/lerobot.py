@@ -19,7 +19,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.fields import message_of
-from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.reading import Bag, samples
 
 FPS, TICKS = 10, 5  # frames a second, ticks a frame
 VERSION, TASK = "v3.0", "drive"
@@ -44,7 +44,7 @@ class Frame(Struct, frozen=True, kw_only=True):
 def frames(path: Path) -> Iterator[Frame]:
     """Every fifth state while the gate was enabled, with the newest scan and command."""
     scan, action = np.empty(0, np.float32), np.zeros(3, np.float32)
-    for sample in Bag(path):
+    for sample in samples(path):
         message = message_of(sample)
         if isinstance(message, LaserScan):
             seen = np.minimum(ranges(message), np.float32(message.range_max))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.recording.fields import message_of, row
-from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.reading import samples
 
 Series = tuple[list[float], list[float]]  # times since the first message [s], values
 
@@ -16,7 +16,7 @@ def series(path: Path, fields: Sequence[str]) -> dict[str, Series]:
     wanted = {field: _split(field) for field in fields}
     known: set[str] = set()
     first_ns = 0
-    for sample in Bag(path):
+    for sample in samples(path):
         first_ns = first_ns or sample.log_ns
         short = sample.key.removeprefix("robot/")
         asked = [field for field, (topic, _) in wanted.items() if topic == short]

@@ -6,7 +6,7 @@ basis are one word, of which the last counts: which of two inputs within a tick 
 how often it is repeated.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,19 @@ from msgspec import Struct
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.topics import CMD_VEL, INTENT, JOINT_CMD, MAP, POSE, SAFETY, WORLD, Topic
+from gigabrain_schemas.tasks import Granted
+from gigabrain_schemas.topics import (
+    CMD_VEL,
+    GRANTED,
+    INTENT,
+    JOINT_CMD,
+    MAP,
+    POSE,
+    SAFETY,
+    STATE,
+    WORLD,
+    Topic,
+)
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.deployment import deployment_path, load_deployment
 from gigabrain_zenoh.errors import ConfigError
@@ -23,7 +35,8 @@ from gigabrain_zenoh.gate import BRAIN
 from gigabrain_zenoh.process import node_of
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.recording.fields import message_of, row
-from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.gaps import header_of
+from gigabrain_zenoh.recording.reading import Bag, samples
 from gigabrain_zenoh.replay import Event, replay
 from gigabrain_zenoh.safety import host
 from gigabrain_zenoh.settings import Endpoint
@@ -35,6 +48,8 @@ SAYS: dict[str, tuple[Topic[Any], ...]] = {
     "safety": (SAFETY,),
 }
 ASIDE = ("stamp_ns", "seq")
+NOWHERE = {"scripts": "", "state_dir": ""}  # a replay runs no programs, and remembers nothing
+_granted = Codec(GRANTED.type, GRANTED.max_bytes)
 
 ELSEWHEN = 0.1  # share of words that may be said in one of the two alone
 # A process that is busy for a tick passes over a state; a replay has all the time in the world.
@@ -78,7 +93,7 @@ def load(path: Path, process: str) -> tuple[list[Event], dict[Word, Message]]:
     said: list[tuple[str, Message]] = []
     keys = {topic.key for topic in SAYS[process]}
     first_ns = 0
-    for sample in Bag(path):
+    for sample in samples(path):
         first_ns = first_ns or sample.log_ns
         message = message_of(sample) if sample.key in keys else None
         if message and getattr(message, "source", BRAIN) == BRAIN:
@@ -87,7 +102,36 @@ def load(path: Path, process: str) -> tuple[list[Event], dict[Word, Message]]:
             heard.append((sample.log_ns - first_ns, sample.key, sample.payload))
     if not said:
         raise ConfigError(f"{path} holds nothing that {process} has said")
-    return heard, _words(said)
+    return placed(heard), _words(said)
+
+
+def placed(heard: Sequence[Event]) -> list[Event]:
+    """The same with what was granted as requests, each where it counted.
+
+    That is before the first message which its process had not heard by then; on the wire both come
+    by ways of their own.
+    """
+    order = [((i, 1), event) for i, event in enumerate(heard)]
+    for i, (_, key, payload) in enumerate(heard):
+        if key != GRANTED.key:
+            continue
+        granted = _granted.decode(payload)
+        later = (j for j, event in enumerate(heard) if _after(granted, event, here=j > i))
+        there = next(later, len(heard) - 1)
+        at_ns, request = heard[there][0], granted.request.encode()
+        order[i] = ((there, 0), (at_ns, granted.service, request))
+    return [event for _, event in sorted(order, key=lambda one: one[0])]
+
+
+def _after(granted: Granted, event: Event, *, here: bool) -> bool:
+    """Whether `event`, recorded later or not, had not been heard when a request was granted."""
+    _, key, payload = event
+    if key not in (STATE.key, WORLD.key):
+        return False
+    header = header_of(payload)
+    if header.boot != granted.boot:
+        return here
+    return header.tick > granted.tick if key == STATE.key else header.basis > granted.basis
 
 
 def _words(said: Iterable[tuple[str, Message]]) -> dict[Word, Message]:
@@ -155,8 +199,10 @@ def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, 
     if deployment:
         loaded = load_deployment(deployment_path(deployment))
         told = {"perception": loaded.perception, "decision": loaded.decision}
-        return dict(msgspec.to_builtins(told.get(process, {})))
-    return dict(msgspec.json.decode(notes(path).get(process, "{}")))
+        settings = dict(msgspec.to_builtins(told.get(process, {})))
+    else:
+        settings = dict(msgspec.json.decode(notes(path).get(process, "{}")))
+    return settings | NOWHERE if process == "decision" else settings
 
 
 async def replay_file(path: Path, process: str, deployment: str | None) -> int:

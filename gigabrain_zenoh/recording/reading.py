@@ -1,5 +1,6 @@
 """A bag as people think of it: messages that came on keys, in order of their arrival."""
 
+import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -8,6 +9,8 @@ from mcap.records import Channel, Metadata, Schema
 
 from gigabrain_zenoh.recording.gaps import Header, header_of
 from gigabrain_zenoh.recording.records import Damage, Finished, Message, read
+
+log = logging.getLogger(__name__)
 
 RAW = "raw"
 
@@ -68,3 +71,15 @@ class Bag:
                 self.damages.append(item)
             elif isinstance(item, Finished):
                 self.finished, self.index_ok = True, item.index_ok
+
+
+def samples(path: Path) -> Iterator[Sample]:
+    """All that came over the bus, and a word about what is missing of it.
+
+    Raises ConfigError for a file that is no bag.
+    """
+    bag = Bag(path)
+    yield from bag
+    wrong = bag.damages[0].what if bag.damages else "" if bag.finished else "it was cut off"
+    if wrong:
+        log.warning("%s: %s; mend it with: gigabrain bag recover %s", path, wrong, path)

@@ -7,7 +7,7 @@ from pathlib import Path
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.fields import message_of, row
 from gigabrain_zenoh.recording.info import Info
-from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.reading import Bag, samples
 
 HEAD = (
     f"{'key':<28} {'message':<14} {'messages':>8} {'hz':>7} {'kB':>9} {'missing':>8} "
@@ -18,12 +18,15 @@ HEAD = (
 def print_info(found: Info) -> None:
     """Print what is in a recording."""
     when = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(found.start_ns / 1e9))
+    held = (
+        f"{when}, {found.seconds:.1f} s, {found.messages} messages" if found.messages else "empty"
+    )
     state = "finished" if found.finished else "unfinished or damaged"
     about = "  ".join(
         f"{k} {v}" for k, v in found.notes.get("gigabrain", {}).items() if v[:1] != "{"
     )
     print(f"{found.path}: {found.bytes / 1e6:.2f} MB, {state}  {about}".rstrip())
-    print(f"{when}, {found.seconds:.1f} s, {found.messages} messages")
+    print(held)
     print(HEAD)
     for key in found.keys:
         gap = f"{key.longest_gap_s:.2f} s"
@@ -38,7 +41,7 @@ def print_info(found: Info) -> None:
 def write_csv(path: Path, folder: Path) -> list[Path]:
     """One file per key, a row per message; the files. Raises ConfigError."""
     columns: dict[str, dict[str, None]] = {}  # in the order in which they first appear
-    for sample in Bag(path):
+    for sample in samples(path):
         if message := message_of(sample):
             columns.setdefault(sample.key, {}).update(dict.fromkeys(row(message)))
     if not columns:

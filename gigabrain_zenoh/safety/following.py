@@ -61,6 +61,7 @@ def look(
     telemetry = (state.pose, state.velocity, state.joints, state.imu)
     moving = _moves(body, told)
     still = moving and _rests(body, state.velocity)
+    same = telemetry == before.telemetry
     return Following(
         told=told,
         recent=recent,
@@ -71,7 +72,9 @@ def look(
         ),
         slow_ticks=held(before.slow_ticks, active and _too_slow(bands, state.velocity), elapsed),
         stuck_ticks=held(before.stuck_ticks, active and still, elapsed),
-        frozen_ticks=held(before.frozen_ticks, moving and telemetry == before.telemetry, elapsed),
+        frozen_ticks=held(
+            before.frozen_ticks, same and (moving or _is_frozen(body, before)), elapsed
+        ),
     )
 
 
@@ -81,13 +84,22 @@ def causes(body: BodyDescription, now: Following) -> tuple[Cause, ...]:
     found = []
     if now.runaway_ticks >= ticks_of(limits.follow_sustain):
         found.append(say("runaway"))
-    if now.frozen_ticks >= ticks_of(limits.frozen_sustain):
+    if _is_frozen(body, now):
         found.append(say("telemetry_frozen"))
     if now.slow_ticks >= ticks_of(limits.follow_sustain):
         found.append(say("not_following"))
     if now.stuck_ticks >= ticks_of(limits.stuck_sustain):
         found.append(say("stuck"))
     return tuple(found)
+
+
+def _is_frozen(body: BodyDescription, now: Following) -> bool:
+    """Whether the body has repeated itself for too long.
+
+    Once that is so only a new value ends it. A body that was stopped for it would otherwise be told
+    to go on again, blindly, and for as long as it takes to find out anew.
+    """
+    return now.frozen_ticks >= ticks_of(body.thresholds.frozen_sustain)
 
 
 def _target(

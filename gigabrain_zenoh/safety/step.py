@@ -121,6 +121,13 @@ def _starting(body: BodyDescription, memory: Memory) -> tuple[Cause, ...]:
     return (say("starting"),) if body.lidar and memory.field.scans < SCANS_TO_START else ()
 
 
+def _of_the_future(inputs: Inputs) -> str:
+    scan, tick = inputs.scan, inputs.state.tick
+    if scan is None or scan.basis <= tick:
+        return ""
+    return f"; the newest claims to be of tick {scan.basis}, and it is tick {tick}"
+
+
 def _blind(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause, ...]:
     """A scan must have come of late, by its arrival and by its own tick, and be believable.
 
@@ -133,7 +140,8 @@ def _blind(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause
     limit_ns = scan_limit_ns(body)
     looked_ns = (inputs.state.tick - memory.field.basis) * TICK_NS if memory.field.scans else 0
     if max(inputs.scan_age_ns, looked_ns) > limit_ns:
-        return (say("scan_lost", f"no scan for more than {limit_ns // 1_000_000} ms"),)
+        lost = f"no scan for more than {limit_ns // 1_000_000} ms"
+        return (say("scan_lost", f"{lost}{_of_the_future(inputs)}"),)
     if memory.field.problem:
         return (say("scan_blind", memory.field.problem),)
     return ()

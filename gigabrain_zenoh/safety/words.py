@@ -79,7 +79,7 @@ CAUSES: dict[str, Cause] = {
         Cause(
             code="telemetry_frozen",
             text="the body repeats the same values although it should move",
-            remedy="restart the body's controller, and look at its link",
+            remedy="look at its link, then restart its controller or push it until a value changes",
         ),
         Cause(
             code="tilted",

@@ -101,6 +101,10 @@ class Executive:
             outcome, seconds = None, 0.0
         return None
 
+    def knows(self, boot: int) -> bool:
+        """Whether this start of the driver is the one that it, or the disk, was last at work in."""
+        return self._boot == boot
+
     @property
     def idle(self) -> bool:
         """Whether there is nothing to do."""

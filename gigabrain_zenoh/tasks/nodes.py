@@ -32,9 +32,12 @@ class Leaf(Behaviour):
 class Drive(Leaf):
     """Gives an order to whoever drives, and waits for what becomes of it."""
 
-    def __init__(self, name: str, moment: "Moment", order: Callable[[int], Order]) -> None:
+    def __init__(
+        self, name: str, moment: "Moment", order: Callable[[int], Order], place: str = ""
+    ) -> None:
         super().__init__(name, moment)
         self._make, self._order = order, order(0)
+        self._whose = f"{place}: " if place else ""
 
     def initialise(self) -> None:
         """A new order."""
@@ -45,14 +48,15 @@ class Drive(Leaf):
         outcome, self.moment.doing = self.moment.outcome, self.name
         if outcome and outcome.number == self._order.number and outcome.state != "running":
             done = outcome.state == "done"
-            return Status.SUCCESS if done else self.failed(outcome.reason)
+            return Status.SUCCESS if done else self.failed(self._whose + outcome.reason)
         self.moment.order = self._order
         return Status.RUNNING
 
 
 def go_to(goal: "Goal", name: str, moment: "Moment") -> Drive:
     """Be at a place; `name` is what people call it."""
-    return Drive(f"going to {name or where(goal)}", moment, lambda number: GoTo(number, goal))
+    doing = f"going to {name or where(goal)}"
+    return Drive(doing, moment, lambda number: GoTo(number, goal), name)
 
 
 def explore(moment: "Moment") -> Drive:
@@ -79,9 +83,11 @@ class Wait(Leaf):
     def update(self) -> Status:
         """Whether the time is over."""
         left_s = self._until_s - self.moment.now_s
-        self.moment.doing, self.moment.left_s = self.name, max(0.0, left_s)
-        self.moment.progress = min(1.0, 1.0 - left_s / self._seconds)
-        return Status.RUNNING if left_s > 1e-9 else Status.SUCCESS
+        if left_s <= 1e-9:
+            return Status.SUCCESS
+        self.moment.doing, self.moment.left_s = self.name, left_s
+        self.moment.progress = 1.0 - left_s / self._seconds
+        return Status.RUNNING
 
 
 class WaitUntil(Leaf):

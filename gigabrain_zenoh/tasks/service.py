@@ -1,19 +1,22 @@
 """Tasks on the bus: what is asked for is queued, what becomes of it is told and written down."""
 
 import logging
-from typing import Protocol
+from typing import Any, Protocol
+
+import msgspec
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.tasks import (
     Goal,
     GoalReply,
     GoalRequest,
+    Granted,
     MissionReply,
     MissionRequest,
     TaskReply,
     TaskRequest,
 )
-from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE
+from gigabrain_schemas.topics import GOAL, GRANTED, MISSION, TASK, TASK_CHANGE, Service
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.logs import Fault
@@ -55,17 +58,17 @@ class TaskService:
         self._tasks = Executive(self._watched.read, self._scripts.start, saved)
         self._scribe: Scribe[Saved] = Scribe(file.write, 1)
         self._written, self._unwritable = saved, Fault(log)
-        self._boot = self._tick = self._told_tick = 0
+        self._boot = self._tick = self._told_tick = self._basis = 0
         self._said: dict[str, str] = {}
         bus.serve(GOAL, self._goal)
         bus.serve(MISSION, self._mission)
         bus.serve(TASK_CHANGE, self._change)
 
-    def step(self, state: RobotState, outcome: Outcome | None) -> Order | None:
-        """Go on; what is wanted of whoever drives."""
+    def step(self, state: RobotState, outcome: Outcome | None, basis: int = 0) -> Order | None:
+        """Go on, with the world of tick `basis`; what is wanted of whoever drives."""
         again = state.boot == self._boot
         seconds = max(0, state.tick - self._tick) * 0.02 if again else 0.0
-        self._boot, self._tick = state.boot, state.tick
+        self._boot, self._tick, self._basis = state.boot, state.tick, basis
         if not again:
             self._tasks.meet(state.boot)
             self._told_tick = 0
@@ -75,9 +78,9 @@ class TaskService:
             self._tell()
         return order
 
-    def begin(self, mission: Mission, label: str) -> None:
-        """Something to do where nobody wants anything yet."""
-        if self._tasks.idle:
+    def begin(self, mission: Mission, label: str, boot: int) -> None:
+        """Something to do where nobody has wanted anything yet since this start of the driver."""
+        if self._tasks.idle and not self._tasks.knows(boot):
             self._tasks.carry_out(mission, label, "queue", "itself")
 
     async def close(self) -> None:
@@ -117,7 +120,7 @@ class TaskService:
         except GigabrainError as error:
             self._refuse("goal", request.source, error)
             return GoalReply(ok=False, text=str(error)[:500])
-        self._accept(name, request.source)
+        self._accept(name, GOAL, request)
         return GoalReply(ok=True, text=f"{name}: {way}"[:500], goal=name)
 
     async def _mission(self, request: MissionRequest) -> MissionReply:
@@ -132,7 +135,7 @@ class TaskService:
         except GigabrainError as error:
             self._refuse("mission", request.source, error)
             return MissionReply(ok=False, text=str(error)[:500])
-        self._accept(name, request.source)
+        self._accept(name, MISSION, request)
         return MissionReply(ok=True, text=f"{name}: {label}"[:500], task=name)
 
     async def _change(self, request: TaskRequest) -> TaskReply:
@@ -146,12 +149,22 @@ class TaskService:
         except GigabrainError as error:
             return TaskReply(ok=False, text=str(error)[:500], task=request.task)
         log.info("%s, says %s", text, request.source, extra={"data": {"event": "task"}})
-        self._tell()
+        self._grant(TASK_CHANGE, request)
         return TaskReply(ok=True, text=text[:500], task=request.task)
 
-    def _accept(self, name: str, source: str) -> None:
-        data = {"event": "task", "task": name, "source": source}
-        log.info("%s is wanted by %s", name, source, extra={"data": data})
+    def _accept(
+        self, name: str, of: Service[Any, Any], request: GoalRequest | MissionRequest
+    ) -> None:
+        data = {"event": "task", "task": name, "source": request.source}
+        log.info("%s is wanted by %s", name, request.source, extra={"data": data})
+        self._grant(of, request)
+
+    def _grant(
+        self, of: Service[Any, Any], request: GoalRequest | MissionRequest | TaskRequest
+    ) -> None:
+        """Tell from when on a request counts, so that a recording holds all that we go by."""
+        text = msgspec.json.encode(request).decode()
+        self._bus.publish(GRANTED, Granted(service=of.key, request=text), basis=self._basis)
         self._tell()
 
     def _refuse(self, what: str, source: str, error: GigabrainError) -> None:

@@ -57,9 +57,11 @@ async def look(bus: Bus, pattern: str = OPEN, seconds: float = LOOK_S) -> Look:
 
 
 @asynccontextmanager
-async def aimed(where: Where, name: str) -> AsyncIterator[tuple[Bus, Target]]:
+async def aimed(
+    where: Where, name: str, *, looks_on: bool = False
+) -> AsyncIterator[tuple[Bus, Target]]:
     """A bus, and the topic that people call `name`. Raises BusError, and UnknownName."""
-    async with joined(where, NAME) as (bus, _):
+    async with joined(where, NAME, looks_on=looks_on) as (bus, _):
         found = target(name)
         if found is None:
             alive = (await look(bus, everything(where))).alive

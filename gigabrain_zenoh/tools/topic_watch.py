@@ -14,6 +14,7 @@ from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.tools.hearing import Heard, messages
 from gigabrain_zenoh.tools.names import Target
 from gigabrain_zenoh.tools.readable import as_json, in_a_line, lines, pick, read
+from gigabrain_zenoh.tools.reader import ended_with_reader
 from gigabrain_zenoh.tools.roll_call import receivers, roll_call, senders
 from gigabrain_zenoh.tools.tally import Figures, tallied
 
@@ -131,9 +132,9 @@ async def _complain(bus: Bus, aim: Target, first: asyncio.Event, within_s: float
 
 
 async def _until_stopped(work: Coroutine[Any, Any, None], beside: Coroutine[Any, Any, None]) -> int:
-    """Until `work` is done or a signal comes; what either raises is raised."""
+    """Until `work` is done, a signal comes or nobody reads on; what either raises is raised."""
     tasks = [asyncio.ensure_future(work), asyncio.ensure_future(beside)]
-    with stop_signals() as stop:
+    with stop_signals() as stop, ended_with_reader(stop):
         stopped = asyncio.ensure_future(stop.wait())
         pending = {*tasks, stopped}
         while tasks[0] in pending and stopped in pending:

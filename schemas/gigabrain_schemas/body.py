@@ -22,8 +22,13 @@ from gigabrain_schemas.sensors import ImuData
 GateMode = Literal["latched", "idle", "enabled", "stopping"]
 DriveType = Literal["differential", "omni", "mecanum", "ackermann", "quadruped", "arm"]
 SafeState = Literal["stop", "hold", "park", "limp"]
-PositivePercentage = Annotated[float, Meta(gt=0.0, le=100.0)]
-Sustain = Annotated[float, Meta(gt=0.0, le=60.0)]  # [s]; 0, which would switch it off, is refused
+# Of thresholds: what would as good as switch a monitor off, or is in another unit, is refused.
+PerCent = Annotated[float, Meta(ge=1.0, le=100.0)]
+Celsius = Annotated[float, Meta(ge=20.0, le=120.0)]
+Sustain = Annotated[float, Meta(ge=0.02, le=10.0)]  # [s]
+Age = Annotated[float, Meta(ge=0.02, le=2.0)]  # [s]
+Shock = Annotated[float, Meta(ge=1.0, le=200.0)]  # [m/s2]
+Margin = Annotated[float, Meta(ge=0.01, le=10.0)]  # [m]
 Key = Annotated[str, Meta(pattern=r"^\w+(/\w+)*$", max_length=128)]
 
 
@@ -111,38 +116,43 @@ class ControlGains(Record, frozen=True, kw_only=True):
 class Thresholds(Record, frozen=True, kw_only=True):
     """When safety speaks up. None of them can be switched off."""
 
-    battery_warn: PositivePercentage = 15.0  # [%], charge it soon
-    battery_return: PositivePercentage = 7.0  # [%], decision comes to rest
-    battery_stop: PositivePercentage = 5.0  # [%], it stops and latches
+    battery_warn: PerCent = 15.0  # [%], charge it soon
+    battery_return: PerCent = 7.0  # [%], decision comes to rest
+    battery_stop: PerCent = 5.0  # [%], it stops and latches
     battery_sustain: Sustain = 2.0  # [s], how long it must be so low; sags do not count
-    motor_warn: Finite = 60.0  # [deg C]
-    motor_stop: Finite = 70.0  # [deg C], it stops and latches
+    motor_warn: Celsius = 60.0  # [deg C]
+    motor_stop: Celsius = 70.0  # [deg C], it stops and latches
     motor_sustain: Sustain = 0.5  # [s]
     missing_after: Sustain = 2.0  # [s] without a value that the body has shown to measure
-    scan_age: Sustain = 0.25  # [s], or 1.5 scans where that is longer
-    heartbeat: Sustain = 0.15  # [s] without an answer from one of the three systems
-    round_trip: Sustain = 0.1  # [s], 99 of 100 commands echo a tick younger than this
+    scan_age: Age = 0.25  # [s], or 1.5 scans where that is longer
+    heartbeat: Age = 0.15  # [s] without an answer from one of the three systems
+    round_trip: Age = 0.1  # [s], 99 of 100 commands echo a tick younger than this
     round_trip_sustain: Sustain = 1.0  # [s]
     follow_linear: Positive = 0.05  # [m/s], measured speed off what was commanded
     follow_angular: Positive = 0.3  # [rad/s]
     follow_sustain: Sustain = 0.3  # [s]
     stuck_sustain: Sustain = 2.0  # [s] without moving at all
     frozen_sustain: Sustain = 0.4  # [s] of values that do not change while it should move
-    tilt_stop: Annotated[float, Meta(gt=0.0, le=90.0)] = 30.0  # [deg], it stops and latches
-    shock_stop: Positive = 40.0  # [m/s2], horizontally; it stops and latches
+    tilt_stop: Annotated[float, Meta(ge=5.0, le=90.0)] = 30.0  # [deg], it stops and latches
+    shock_stop: Annotated[float, Meta(ge=1.0, le=200.0)] = (
+        40.0  # [m/s2], horizontally; it stops and latches
+    )
     disk_warn: Positive = 500.0  # [MB] left where safety runs
-    cpu_warn: PositivePercentage = 95.0  # [%] of all cores, over ten seconds
-    memory_warn: PositivePercentage = 95.0  # [%] in use
-    reaction_time: Sustain = 0.22  # [s], scan period + bus + gate + drive
-    stop_margin: Positive = 0.08  # [m], kept free in front of a stopped robot
-    resume_margin: Positive = 0.10  # [m], more than the stop zone before the body may go on
-    side_margin: Positive = 0.03  # [m], kept free beside the body as it moves on
+    cpu_warn: PerCent = 95.0  # [%] of all cores, over ten seconds
+    memory_warn: PerCent = 95.0  # [%] in use
+    reaction_time: Age = 0.22  # [s], scan period + bus + gate + drive
+    stop_margin: Margin = 0.08  # [m], kept free in front of a stopped robot
+    resume_margin: Margin = 0.10  # [m], more than the stop zone before the body may go on
+    side_margin: Margin = 0.03  # [m], kept free beside the body as it moves on
 
     def __post_init__(self) -> None:
         if not self.battery_stop <= self.battery_return <= self.battery_warn:
             raise ValueError("battery_stop, battery_return and battery_warn must ascend")
         if self.motor_stop < self.motor_warn:
             raise ValueError("motor_stop must not be below motor_warn")
+
+
+DEFAULT = Thresholds()
 
 
 class BodyDescription(Record, frozen=True, kw_only=True):
@@ -162,7 +172,7 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     max_rim_speed: Positive | None = None
     # [m/s], of a wheel of a differential base; None: it has its largest speeds both at once
     lidar: Lidar | None = None
-    thresholds: Thresholds = Thresholds()
+    thresholds: Thresholds = DEFAULT
     control: ControlGains = ControlGains()
     safe_state: SafeState = "stop"
     control_topic: Key = "robot/cmd_vel"  # the key that its driver obeys
@@ -170,6 +180,16 @@ class BodyDescription(Record, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if _area(self.footprint) < LEAST_AREA:
             raise ValueError("footprint: it must enclose an area, its corners in order")
+        for name, speed in (
+            ("follow_linear", self.max_linear_speed),
+            ("follow_angular", self.max_angular_speed),
+        ):
+            off = getattr(self.thresholds, name)
+            if off > max(speed, getattr(DEFAULT, name)):
+                raise ValueError(
+                    f"thresholds: {name}: it is never so far off as {off:g}, "
+                    f"for its largest speed is {speed:g}"
+                )
         if self.lidar is None:
             return
         needs = self.stopping_distance(self.max_linear_speed)

@@ -50,6 +50,7 @@ from gigabrain_schemas.tasks import (
     Goal,
     GoalReply,
     GoalRequest,
+    Granted,
     MissionReply,
     MissionRequest,
     Task,
@@ -309,6 +310,10 @@ TASKS: tuple[Message, ...] = (
     MissionReply(ok=False, text="mission:2: do[0].goto: no place 'kitchen'"),
     TaskRequest(stamp_ns=STAMP_NS, seq=1, do="cancel", task="goal-7", source="ann"),
     TaskReply(ok=True, text="goal-7 is cancelled", task="goal-7"),
+    Granted(
+        stamp_ns=STAMP_NS, seq=3, boot=BOOT, tick=205, basis=200,
+        service="robot/goal", request='{"x":3.0,"y":1.5,"how":"preempt","source":"ann"}',
+    ),
     TaskStatus(
         stamp_ns=STAMP_NS, seq=91, boot=BOOT, tick=206, basis=205,
         current=Task(

@@ -9,6 +9,7 @@ from gigabrain_schemas.base import Finite, Fraction, Message, Name, NonNegative,
 How = Literal["replace", "queue", "preempt"]
 # in place of all that there is to do; after it; or before it, which goes on afterwards
 TaskState = Literal["queued", "active", "paused", "succeeded", "failed", "cancelled"]
+LONGEST = 96 * 1024  # of a request as text: a mission of the longest, quoted
 MOST_POINTS = 256  # of a path that is only drawn
 
 
@@ -69,6 +70,16 @@ class TaskReply(Message, frozen=True, kw_only=True):
     ok: bool
     text: Text
     task: Name = ""
+
+
+class Granted(Message, frozen=True, kw_only=True):
+    """What somebody asked for, at the moment from which it counts: an input like any message.
+
+    `tick` and `basis` are the newest that had been heard and thought about before it.
+    """
+
+    service: Name  # the key that it was asked on, such as robot/goal
+    request: Annotated[str, Meta(max_length=LONGEST)]  # JSON, with who asked
 
 
 class Task(Record, frozen=True, kw_only=True):

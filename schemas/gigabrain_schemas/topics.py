@@ -89,6 +89,7 @@ BUTTON = Topic(
     max_bytes=KB,
 )  # fmt: skip
 TASK = Topic("robot/task", tasks.TaskStatus, 5, keep=True, max_bytes=64 * KB)
+GRANTED = Topic("robot/granted", tasks.Granted, 10, depth=256, max_bytes=128 * KB)
 AUDIT = Topic("robot/audit", audit.AuditRecord, 10, depth=256)
 
 
@@ -99,10 +100,15 @@ def command_topic(of: body.BodyDescription) -> Topic[brain.CmdVel]:
 
 TOPICS: tuple[Topic[Any], ...] = (
     SCAN, IMU, STATE, BODY, IMAGE, WORLD, POSE, MAP, INTENT, TELEOP, CMD_VEL, JOINT_CMD, SAFETY,
-    BUTTON, HEALTH, LOG, TASK, AUDIT,
+    BUTTON, HEALTH, LOG, TASK, GRANTED, AUDIT,
 )  # fmt: skip
 
 ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time")
+# for clients that can say, but not ask: it stops just the same, and nothing is confirmed
+ESTOP_SAID = Topic(
+    ESTOP.key, requests.EstopRequest, 10, priority="real_time", congestion="block", express=True,
+    depth=16, max_bytes=KB,
+)  # fmt: skip
 RELEASE = Service("robot/release", requests.ReleaseRequest, requests.GateReply)
 ENABLE = Service("robot/enable", requests.EnableRequest, requests.GateReply)
 GOAL = Service("robot/goal", tasks.GoalRequest, tasks.GoalReply)

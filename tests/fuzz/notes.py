@@ -10,7 +10,7 @@ import msgspec
 
 from gigabrain_drivers.catalog import load_robot
 from gigabrain_drivers.latch import LatchFile
-from gigabrain_drivers.links import ports
+from gigabrain_drivers.links import port_name
 from gigabrain_drivers.links.address import address
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import GateStatus
@@ -65,7 +65,7 @@ def typed(data: bytes) -> None:
 
 
 CONFIG = gate.GateConfig(limits=limits_of(load_robot("mock")))
-PARSERS: tuple[Callable[[str], object], ...] = (told, address, ports.usb_id)
+PARSERS: tuple[Callable[[str], object], ...] = (told, address, port_name.usb_id)
 CHECKS = {"latch": latch, "note": note, "record": record, "typed": typed}
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from gigabrain_drivers.alpha import AlphaOptions
-from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
+from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Snapshot, Wire
 from gigabrain_drivers.emulators.tcp import TcpPort
 from gigabrain_drivers.kinematics import Gait, Twist
 from gigabrain_drivers.legs.gait import WALKER, sound
@@ -22,7 +22,7 @@ KEPT = 1000  # commands, for tests to look at
 
 
 class Alpha(Device):
-    """Obeys sound commands newer than the last; stops by itself; reports 100 times a second.
+    """Obeys sound commands newer than the last; stops by itself; reports each step of its body.
 
     After silence the first sound command begins a new count.
     """
@@ -49,7 +49,8 @@ class Alpha(Device):
         self._last: int | None = None  # sequence of the newest command
         self._obeyed_ns: int | None = None  # when it came
         self._now_ns = 0
-        self._began_ns: int | None = None
+        self.body.fresh()  # what was measured before is none of its business
+        self._began_ns = self.body.snapshot.time_ns
         self._silent, self._on = True, True
         self._gait, self._up_ns = REST, 0
         self.body.walk(REST)
@@ -81,14 +82,13 @@ class Alpha(Device):
             self._on = on
         if not on:
             return
-        if self._began_ns is None:
-            self._began_ns = now_ns
         self._now_ns = now_ns
         if self._obeyed_ns is None or now_ns - self._obeyed_ns >= self.watchdog_ns:
             self._silent, self._last = True, None
             self._walk(LYING if self.parked else REST)
-        self._sent += 1
-        self.wire.write(alpha.state(self._report(), self._sent))
+        for sample in self.body.fresh() or [self.body.snapshot]:
+            self._sent += 1
+            self.wire.write(alpha.state(self._report(sample), self._sent))
 
     def _wanted(self, frame: Frame) -> Gait | None:
         """What a frame asks for, or None where it is not a sound, new and fresh command."""
@@ -101,12 +101,12 @@ class Alpha(Device):
             return None
         if self._last is not None and not alpha.newer(frame.sequence, self._last):
             return None
-        return None if alpha.stale(command.seen, self._milliseconds) else command.gait
+        now_ms = self._milliseconds(self.body.snapshot)
+        return None if alpha.stale(command.seen, now_ms) else command.gait
 
-    @property
-    def _milliseconds(self) -> int:
-        """The firmware's clock."""
-        return 0 if self._began_ns is None else (self._now_ns - self._began_ns) // 1_000_000
+    def _milliseconds(self, sample: Snapshot) -> int:
+        """The firmware's clock is the body's: it stands still where a busy host holds both up."""
+        return max(0, sample.time_ns - self._began_ns) // 1_000_000
 
     def _obey(self, gait: Gait, sequence: int) -> None:
         self._last = self._echo = sequence
@@ -124,8 +124,7 @@ class Alpha(Device):
             self._gait = gait
             self.body.walk(gait)
 
-    def _report(self) -> State:
-        now = self.body.snapshot
+    def _report(self, now: Snapshot) -> State:
         flags = alpha.SILENT if self._silent else 0
         flags |= alpha.PARKED if self.parked else 0
         flags |= alpha.FALLEN if now.fallen else 0
@@ -133,7 +132,7 @@ class Alpha(Device):
         angles = iter([motor.position for motor in now.wheels])
         rates = iter([motor.velocity for motor in now.wheels])
         return State(
-            milliseconds=self._milliseconds,
+            milliseconds=self._milliseconds(now),
             echo=self._echo,
             refused=self._refused,
             flags=flags,

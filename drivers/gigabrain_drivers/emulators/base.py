@@ -4,6 +4,7 @@ import abc
 import asyncio
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -14,10 +15,13 @@ from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.kinematics import Gait, Twist, base_of
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.sim.account import account_of
 from gigabrain_drivers.sim.pace import Pace
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry, Simulation
 from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_zenoh.errors import BodyLost
+
+KEPT_STEPS = 25  # of 10 ms
 
 
 class Snapshot(NamedTuple):
@@ -61,6 +65,7 @@ class EmulatedBody:
         self._faulted_ns = 0  # when what is wrong with it last changed
         self._broken = Broken()
         self.snapshot = self._look()
+        self._untaken: deque[Snapshot] = deque(maxlen=KEPT_STEPS)
 
     def start(self) -> None:
         """Let time begin."""
@@ -91,6 +96,13 @@ class EmulatedBody:
         linear_x, linear_y, angular_z = WALKER.to_body(gait)
         return linear_x, linear_y, angular_z
 
+    def fresh(self) -> list[Snapshot]:
+        """What was measured since this was last asked for, oldest first; of a quarter of a second.
+
+        A device that reports every step must not leave out those in which the loop was held up.
+        """
+        return [self._untaken.popleft() for _ in range(len(self._untaken))]
+
     def break_down(self, broken: "Broken") -> None:
         """Have its motors or sensors fail from the next step on; `Broken()` mends them."""
         self._broken, self._faulted_ns = broken, self._simulation.time_ns
@@ -102,16 +114,7 @@ class EmulatedBody:
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far."""
-        truth = self._simulation.truth
-        return {
-            "body": self.robot.robot_type,
-            "world": self.run.world,
-            "seed": self.run.seed,
-            "sim_seconds": round(self._simulation.time_ns / 1e9, 2),
-            "distance_m": round(truth.distance_m, 3),
-            "contacts": truth.contacts,
-            "min_clearance_m": round(truth.min_clearance_m, 3),
-            "true_speed": round(truth.speed()[0], 4),
+        return account_of(self._simulation, self.robot, self.run) | {
             "motors_moved_s": round(self._moved_ns / 1e9, 2),
             "faulted_s": round(self._faulted_ns / 1e9, 2),
             "physics_cpu_s": round(self._cpu_s, 3),
@@ -142,6 +145,7 @@ class EmulatedBody:
         snapshot = self._look()
         if not broken.frozen_values:
             self.snapshot = snapshot
+            self._untaken.append(snapshot)
         for tell in self.on_step:
             tell(snapshot)
 

@@ -1,5 +1,6 @@
 """A whole emulated robot: one body in MuJoCo, a station for each of its links."""
 
+import contextlib
 import functools
 import importlib
 from collections.abc import Mapping
@@ -13,13 +14,14 @@ import msgspec
 from gigabrain_drivers import catalog
 from gigabrain_drivers.emulators import DEVICES
 from gigabrain_drivers.emulators.base import Broken, Device, EmulatedBody
-from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.claim import claimed, no_ports
+from gigabrain_drivers.emulators.faults import NONE, Faults, faults_in
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.emulators.station import Station
 from gigabrain_drivers.emulators.tcp import TcpPort
 from gigabrain_drivers.robot import LinkOptions, Run
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.errors import unknown
 
 BASE, SCAN = "base", "scan"
 
@@ -33,7 +35,8 @@ class Emulator:
     def __init__(self, name: str, run: Run) -> None:
         _, _, options, _ = catalog.load_link(name, msgspec.structs.replace(run, link="emulated"))
         self.body: EmulatedBody = emulated_body(name, run)
-        self.ports = _ports(options)
+        self.ports, self._folder = _ports(options), run.emulator
+        self._claim = contextlib.ExitStack()
         clock = Clock()
         self.stations: dict[str, Station] = {}
         for station, its in _parts(options).items():
@@ -42,9 +45,16 @@ class Emulator:
             self.stations[station] = Station(make, device.port(its), clock)
 
     async def __aenter__(self) -> Self:
+        folder = Path(self._folder)
+        if self._folder:
+            self._claim.enter_context(claimed(folder))
+        try:
+            for station in self.stations.values():
+                station.start()
+        except OSError as error:
+            await self._end()
+            raise no_ports(folder, error) from None
         self.body.start()
-        for station in self.stations.values():
-            station.start()
         return self
 
     async def __aexit__(
@@ -53,9 +63,13 @@ class Emulator:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        await self._end()
+
+    async def _end(self) -> None:
         for station in self.stations.values():
             await station.close()
         await self.body.close()
+        self._claim.close()
 
     def set(self, faults: Mapping[str, Faults]) -> None:
         """Have these faults, by station, and no others."""
@@ -71,6 +85,11 @@ class Emulator:
         late_s = max(station.late_s for station in self.stations.values())
         return {**self.body.report(), "firmware_late_s": round(late_s, 4)}
 
+    def told(self) -> str:
+        """The faults that it has now, in the words of `faults_of`."""
+        parts = [f"{name} {s.faults}" for name, s in self.stations.items() if s.faults != NONE]
+        return "; ".join(parts) or "none"
+
     def faults_of(self, words: str) -> dict[str, Faults]:
         """The faults in `[STATION] FAULT[=VALUE] ...`; for all stations where none is named.
 
@@ -80,15 +99,7 @@ class Emulator:
         wanted = list(self.stations)
         if named and named[0] in self.stations:
             wanted = [named.pop(0)]
-        values = dict(word.partition("=")[::2] for word in named if word != "off")
-        given = {name: value or "true" for name, value in values.items()}
-        for name in given:
-            if name not in Faults.__struct_fields__:
-                raise unknown("fault", name, [*Faults.__struct_fields__, *self.stations, "off"])
-        try:
-            faults = msgspec.convert(given, Faults, strict=False)
-        except msgspec.ValidationError as error:
-            raise ConfigError(f"{words!r}: {error}; a number goes like bit_errors=0.001") from None
+        faults = faults_in(named, self.stations)
         now = {name: station.faults for name, station in self.stations.items()}
         return {**now, **dict.fromkeys(wanted, faults)}
 

@@ -1,12 +1,15 @@
 """Faults on demand, between a device and its wire."""
 
 import random
+from collections.abc import Iterable
 from typing import Annotated
 
+import msgspec
 from msgspec import Meta, Struct
 
 from gigabrain_drivers.emulators.base import Wire
 from gigabrain_schemas.base import Finite, NonNegative
+from gigabrain_zenoh.errors import ConfigError, unknown
 
 Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 
@@ -29,8 +32,43 @@ class Faults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     runaway: Finite = 0.0  # [m/s], what the wheels do whatever they are told
     stuck_wheel: bool = False  # the first one does not turn
 
+    def __str__(self) -> str:
+        """The words for those that there are."""
+        words = []
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if value:
+                words.append(name if value is True else f"{name}={value:g}")
+        return " ".join(words)
+
 
 NONE = Faults()
+NUMBERS = {  # what is expected of those that take one
+    "garbage": "from 0 to 1, such as garbage=0.1",
+    "bit_errors": "from 0 to 1, such as bit_errors=0.001",
+    "half_frames": "from 0 to 1, such as half_frames=0.1",
+    "brown_out": "of volts from 0, such as brown_out=6",
+    "runaway": "of m/s, such as runaway=0.1",
+}
+
+
+def faults_in(words: Iterable[str], stations: Iterable[str]) -> Faults:
+    """The faults that words such as `silence` and `garbage=0.1` ask for. Raises ConfigError."""
+    faults = NONE
+    for word in words:
+        name, given, value = word.partition("=")
+        if word == "off":
+            continue
+        if name not in Faults.__struct_fields__:
+            raise unknown("fault", name, [*Faults.__struct_fields__, *stations, "off"])
+        if name not in NUMBERS and given:
+            raise ConfigError(f"{name} takes no number: say {name}, and off to end it")
+        try:
+            change = msgspec.convert({name: value if given else True}, Faults, strict=False)
+        except msgspec.ValidationError:
+            raise ConfigError(f"{name} needs a number {NUMBERS[name]}") from None
+        faults = msgspec.structs.replace(faults, **{name: getattr(change, name)})
+    return faults
 
 
 class FaultyWire:

@@ -10,9 +10,11 @@ from typing import Any
 
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
 from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.kinematics import Twist, base_of
+from gigabrain_drivers.kinematics import base_of
+from gigabrain_drivers.line_command import LineCommand
 from gigabrain_drivers.line_options import LineOptions
-from gigabrain_drivers.protocols.line import LONGEST, Field
+from gigabrain_drivers.protocols.line import LONGEST
+from gigabrain_drivers.protocols.line_number import Field
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.limits import clamp, limits_of
 
@@ -35,8 +37,9 @@ class LineBase(Device):
         super().__init__(body, options, wire)
         self._options: LineOptions = options
         self._command = options.command_template()
+        self._said = LineCommand(self._command, base_of(body.robot))
         self._state = options.state_templates()
-        self._base, self._limits = base_of(body.robot), limits_of(body.robot)
+        self._limits = limits_of(body.robot)
         self._state_ns = round(1e9 / options.state_hz)
         self._start = options.start.encode().strip()
         self._stop = options.stop.encode().strip()
@@ -93,15 +96,9 @@ class LineBase(Device):
             self.body.command(0.0, 0.0, 0.0)
         elif self._enabled and (values := self._command.decode(line)) is not None:
             self._obeyed_ns = self._now_ns
-            wanted = clamp(self._wanted(values), self._limits)
+            wanted = clamp(self._said.means(values), self._limits)
             self.executed.append(wanted)
             self.body.command(wanted.linear_x, wanted.linear_y, wanted.angular_z)
-
-    def _wanted(self, values: dict[str, float]) -> Velocity:
-        if self._base and f"wheel_{self._base.wheels[0]}" in values:
-            wheels = tuple(values.get(f"wheel_{name}", 0.0) for name in self._base.wheels)
-            return Velocity(**self._base.to_body(wheels)._asdict())
-        return Velocity(**{k: v for k, v in values.items() if k in Twist._fields})
 
     def _silent(self) -> bool:
         """Whether the last command will be too old by the next step."""

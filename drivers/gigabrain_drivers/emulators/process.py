@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 
 import msgspec
@@ -13,6 +13,7 @@ from gigabrain_drivers.robot import Run
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 from gigabrain_zenoh.settings import EmulatorConfig
+from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.typed import typed_lines
 
 log = logging.getLogger(__name__)
@@ -30,14 +31,33 @@ async def run(config: EmulatorConfig, bus: Bus, ready: Callable[[], None]) -> No
 
 
 async def emulate(config: EmulatorConfig, say: Callable[[str], None]) -> None:
-    """Be the body until cancelled; faults are read from standard input, line by line."""
-    async with emulator_of(config) as emulator:
-        for name, port in emulator.ports.items():
-            say(f"{config.body} in {config.world}: {name} at {where(port)}")
-        say(f"faults, one line each: [{'|'.join(emulator.stations)}] "
-            f"{' '.join(Faults.__struct_fields__)}; off ends them")  # fmt: skip
-        with typed_lines(lambda line: _told(emulator, line, say)):
-            await watch(emulator, Path(config.folder) / FAULTS_FILE)
+    """Be the body until it is asked to end; faults are read from standard input, line by line."""
+    with stop_signals() as stop:
+        async with emulator_of(config) as emulator:
+            await _until(stop, _obeying(emulator, config, say))
+
+
+async def _obeying(emulator: Emulator, config: EmulatorConfig, say: Callable[[str], None]) -> None:
+    """For ever. Raises BodyLost with the physics."""
+    for name, port in emulator.ports.items():
+        say(f"{config.body} in {config.world}: {name} at {where(port)}")
+    say(f"faults, one line each: [{'|'.join(emulator.stations)}] "
+        f"{' '.join(Faults.__struct_fields__)}; off ends them")  # fmt: skip
+    with typed_lines(lambda line: _told(emulator, line, say)):
+        await watch(emulator, Path(config.folder) / FAULTS_FILE)
+
+
+async def _until(stop: asyncio.Event, work: Coroutine[None, None, None]) -> None:
+    """Work until it raises, or until `stop` is set."""
+    working, stopping = asyncio.ensure_future(work), asyncio.ensure_future(stop.wait())
+    try:
+        await asyncio.wait((working, stopping), return_when=asyncio.FIRST_COMPLETED)
+        if working.done():
+            await working
+    finally:
+        for task in (working, stopping):
+            task.cancel()
+        await asyncio.gather(working, stopping, return_exceptions=True)
 
 
 def where(port: str) -> str:
@@ -93,3 +113,4 @@ def _told(emulator: Emulator, line: str, say: Callable[[str], None]) -> None:
         emulator.set(emulator.faults_of(line))
     except ConfigError as error:
         say(str(error))
+    say(f"faults now: {emulator.told()}")

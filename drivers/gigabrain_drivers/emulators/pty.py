@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 import os
 import tty
 from collections.abc import Callable
@@ -40,6 +41,8 @@ class Pty:
         os.set_blocking(self._master, False)
         asyncio.get_running_loop().add_reader(self._master, self._readable)
         self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists() and not self.path.is_symlink():
+            raise OSError(errno.EEXIST, f"{self.path.name} is there and is no emulator's")
         fresh = self.path.with_name(f".{self.path.name}.new")
         fresh.unlink(missing_ok=True)
         fresh.symlink_to(os.ttyname(self._slave))
@@ -50,7 +53,8 @@ class Pty:
         if self._master is None or self._slave is None:
             return
         asyncio.get_running_loop().remove_reader(self._master)
-        self.path.unlink(missing_ok=True)
+        if self.path.is_symlink() and os.readlink(self.path) == os.ttyname(self._slave):
+            self.path.unlink(missing_ok=True)  # another's, by now, is left
         os.close(self._master)
         os.close(self._slave)
         self._master = self._slave = None

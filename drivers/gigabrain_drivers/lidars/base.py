@@ -25,6 +25,7 @@ class ScanSource(abc.ABC):
 
     Options: ClassVar[type[ScanOptions]] = ScanOptions  # its part of a robot's file
     turns_hz: ClassVar[float | None] = None  # turns a second, where nobody can change them
+    samples_hz: ClassVar[float | None] = None  # samples a second, where that is known
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         self.options, self.lidar, self.clock = options, lidar, clock
@@ -58,13 +59,19 @@ def source_class(name: str) -> type[ScanSource]:
     return cast("type[ScanSource]", getattr(importlib.import_module(module), attribute))
 
 
-def check_rate(name: str, lidar: Lidar | None) -> None:
-    """Raise ConfigError where the lidar called `name` does not turn as fast as `lidar` says."""
-    turns_hz = source_class(name).turns_hz
+def check_turns(name: str, lidar: Lidar | None) -> None:
+    """Raise ConfigError where the lidar called `name` cannot make the turns that `lidar` says."""
+    source = source_class(name)
+    turns_hz, samples_hz = source.turns_hz, source.samples_hz
     if lidar and turns_hz and lidar.rate_hz != turns_hz:
         raise ConfigError(
             f"its lidar has rate_hz {lidar.rate_hz:g}, but an {name} makes {turns_hz:g} turns a "
             f"second; beside its `scan` write `lidar:` with rate_hz: {turns_hz:g}"
+        )
+    if lidar and samples_hz and lidar.beams > samples_hz / lidar.rate_hz:
+        raise ConfigError(
+            f"its lidar has {lidar.beams} beams, but an {name} at {lidar.rate_hz:g} turns a second "
+            f"measures {samples_hz / lidar.rate_hz:.0f} in each; expected no more"
         )
 
 

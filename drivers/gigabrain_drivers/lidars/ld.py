@@ -1,17 +1,50 @@
 """LDROBOT's lidars: they turn and send by themselves as soon as they have power."""
 
+import math
+from collections.abc import Callable
 from typing import Any, ClassVar
 
+import numpy as np
 import serial
 
 from gigabrain_drivers.lidars.serial_source import SerialSource
+from gigabrain_drivers.lidars.turn import Gathered, Samples
 from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_drivers.protocols import ld
 from gigabrain_schemas.body import Lidar
+from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import Clock
 
+Place = Callable[[Samples, Samples], tuple[Samples, Samples]]
+
+POINTS, WHOLE = np.arange(ld.POINTS), slice(None)
 PROBE_BYTES = 300  # at least five frames
 PROBE_FRAMES = 3
+
+
+class Frames(Gathered[tuple[bytes, slice]]):
+    """A turn in frames; of the first and of the last one perhaps a part only."""
+
+    def __init__(self, lidar: Lidar, place: Place) -> None:
+        super().__init__(lidar)
+        self._place = place
+
+    def unpack(self, pieces: list[tuple[bytes, slice]]) -> tuple[Samples, Samples]:
+        """All frames at once."""
+        angles, distances = self._place(*ld.points(b"".join(raw for raw, _ in pieces)))
+        kept = np.concatenate([POINTS[part] + n * ld.POINTS for n, (_, part) in enumerate(pieces)])
+        return angles[kept], distances[kept]
+
+    def take(self, raw: bytes, turn_at: int | None, now_ns: int) -> LaserScan | None:
+        """A frame more; `turn_at` is its first point in a new turn, whose end is a scan."""
+        if turn_at is None:
+            self.add((raw, WHOLE), ld.POINTS, now_ns)
+            return None
+        if turn_at:
+            self.add((raw, slice(turn_at)), turn_at, now_ns)
+        scan = self.finish(now_ns)
+        self.add((raw, slice(turn_at, None)), ld.POINTS - turn_at, now_ns)
+        return scan
 
 
 class Ld(SerialSource):
@@ -21,33 +54,34 @@ class Ld(SerialSource):
     says `no_return: unknown` of it where that matters.
     """
 
+    samples_hz = 4500.0
     rate_baud: ClassVar[int]
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         super().__init__(options, lidar, clock, self.rate_baud)
         self.link.wording = Wording(received=Spelling(ld.Decoder().feed, ld.describe))
         self._decoder = ld.Decoder()
-        self._last: float | None = None  # [deg], of the newest sample
+        self._frames = Frames(lidar, self.place)
+        self._last: int | None = None  # [0.01 deg], of the newest sample
         self._understood = False
 
-    def place(self, frame: ld.Frame) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Angles [deg], clockwise, and distances [mm] of a frame's samples, (12,) each."""
-        return frame.angles(), frame.distances
+    def place(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
+        """Angles (n,) [deg], clockwise, and distances (n,) [mm], as they are seen from the axis."""
+        return angles, distances
 
     def connected(self) -> None:
         """A new stream."""
         self._decoder.clear()
+        self._frames.clear()
         self._last, self._understood = None, False
 
     def received(self, data: bytes) -> None:
         """Frames, or parts of them."""
         now_ns = self.clock.now_ns()
-        for frame in self._decoder.feed(data):
+        for raw in self._decoder.cut(data):
             self._understood = True
-            raw = frame.angles()
-            turn_at, self._last = turn_start(raw, self._last), raw[-1] % 360
-            angles, distances = self.place(frame)
-            self.finished(self.turn.clockwise(angles, distances, turn_at, now_ns))
+            turn_at, self._last = turn_start(raw, self._last), raw.end
+            self.finished(self._frames.take(raw.data, turn_at, now_ns))
         self.link.errors = self._decoder.errors
 
     def understands(self) -> bool:
@@ -71,8 +105,11 @@ class Ld19(Ld):
     name, rate_baud = "LD19", 230_400
 
 
-def turn_start(angles: tuple[float, ...], last: float | None) -> int | None:
-    """Index of the first of `angles` (n,) [deg], rising, that is in another turn than `last`."""
-    if last is not None and angles[0] % 360 < last - 180:
+def turn_start(raw: ld.Raw, last: int | None) -> int | None:
+    """Index of the first point of a frame that is in another turn than `last` [0.01 deg]."""
+    if last is not None and raw.start < last - ld.TURN // 2:
         return 0
-    return next((n for n, angle in enumerate(angles) if angle >= 360), None)
+    if raw.end >= raw.start:
+        return None
+    step = (raw.end - raw.start) % ld.TURN / (ld.POINTS - 1)
+    return min(math.ceil((ld.TURN - raw.start) / step), ld.POINTS - 1)

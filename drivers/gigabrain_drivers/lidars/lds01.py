@@ -20,7 +20,7 @@ class Lds01(SerialSource):
     """Turns from its start command to its stop command."""
 
     name = "LDS-01"
-    turns_hz = 5.0  # 300 rpm; it takes no speed
+    samples_hz, turns_hz = 1800.0, 5.0  # 300 rpm; it takes no speed
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         super().__init__(options, lidar, clock, lds01.BAUD)

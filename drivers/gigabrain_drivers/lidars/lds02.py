@@ -1,9 +1,9 @@
 """LDS-02 (LDROBOT LD08), the lidar of most TurtleBot3: LD frames of a lens beside the axis."""
 
-import math
+import numpy as np
 
 from gigabrain_drivers.lidars.ld import Ld
-from gigabrain_drivers.protocols import ld
+from gigabrain_drivers.lidars.turn import Samples
 
 OFFSET_X, OFFSET_Y = 5.9, -20.14  # [mm], of the lens
 SLANT = 0.11923  # of the beam against the direction that the lidar tells
@@ -13,20 +13,19 @@ class Lds02(Ld):
     """Starts with its power. It measures from its lens, which goes round the axis."""
 
     name, rate_baud = "LDS-02", 115_200
+    samples_hz = 2300.0
 
-    def place(self, frame: ld.Frame) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Angles [deg], clockwise, and distances [mm], both seen from the axis, (12,) each."""
-        pairs = zip(frame.angles(), frame.distances, strict=True)
-        placed = [from_axis(angle, distance) for angle, distance in pairs]
-        return tuple(angle for angle, _ in placed), tuple(distance for _, distance in placed)
+    def place(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
+        """Both seen from the axis."""
+        return from_axis(angles, distances)
 
 
-def from_axis(angle: float, distance: float) -> tuple[float, float]:
-    """A measurement from the lens ([deg] clockwise, [mm]) as it is seen from the axis.
+def from_axis(angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
+    """Measurements (n,) from the lens ([deg] clockwise, [mm]) as they are seen from the axis.
 
     Source: the vendor's ld08_driver, `SlTransform`. No return (0 mm) stays where it is.
     """
-    if not distance:
-        return angle, distance
-    x, y = distance + OFFSET_X, SLANT * distance + OFFSET_Y
-    return angle - math.degrees(math.atan2(y, x)), math.hypot(x, y)
+    x, y = distances + OFFSET_X, SLANT * distances + OFFSET_Y
+    seen = distances != 0
+    turned = angles - np.degrees(np.arctan2(y, x))
+    return np.where(seen, turned, angles), np.where(seen, np.hypot(x, y), distances)

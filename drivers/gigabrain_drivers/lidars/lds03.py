@@ -25,6 +25,7 @@ class Lds03(SerialSource):
     """Turns from its start command to its stop command."""
 
     name = "LDS-03"
+    samples_hz = 4000.0
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         super().__init__(options, lidar, clock, lds03.BAUD)

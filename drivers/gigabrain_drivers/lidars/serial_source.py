@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 LOOK_NS = 100_000_000  # how often it is looked at whether scans come
 PATIENCE_NS = 2_000_000_000  # without a scan, until something is said
 REOPEN_NS = 5_000_000_000  # without a scan, until the port is opened anew
+GATHER_S = 0.01  # a turn takes ten times as long; its bytes come hundreds of times a second
+GATHER_BAUD = 460_800  # what comes faster fills the 4 KB of a port too soon
 LAST_WORDS_S = 0.02
 NEWEST = 256  # bytes, kept to say what else may be sending there
 
@@ -142,6 +144,7 @@ class SerialSource(ScanSource):
 
     def _on_open(self) -> None:
         self._opened_ns = self.clock.now_ns()
+        self.link.gather_s = GATHER_S if self.link.baud <= GATHER_BAUD else 0.0
         self._newest = b""
         self.turn.clear()
         self.connected()

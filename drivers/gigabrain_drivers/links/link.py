@@ -32,6 +32,7 @@ class Link(abc.ABC):
     """
 
     quiet_ns: int | None = None  # after so long without a byte, the peer counts as lost
+    gather_s = 0.0  # bytes that come within so long are taken together; each wake-up has its price
 
     def __init__(self, clock: Clock) -> None:
         self.on_bytes: Callable[[bytes], None] = _ignore
@@ -45,6 +46,7 @@ class Link(abc.ABC):
         self._clock = clock
         self._heard_ns = clock.now_ns()
         self._fd: int | None = None
+        self._gathering: asyncio.TimerHandle | None = None
         self._opened_once = False
         self._ended = asyncio.Event()
         self._keeper: asyncio.Task[None] | None = None
@@ -98,6 +100,8 @@ class Link(abc.ABC):
             return
         fd, self._fd, self.problem = self._fd, None, reason
         asyncio.get_running_loop().remove_reader(fd)
+        if self._gathering:
+            self._gathering.cancel()
         self._shut()
         self._ended.set()
         self.on_lost(reason)
@@ -167,19 +171,41 @@ class Link(abc.ABC):
     def _readable(self) -> None:
         if self._fd is None:
             return
-        try:
-            data = os.read(self._fd, READ_BYTES)
-        except BlockingIOError:
+        if not self.gather_s:
+            self._read(self._fd)
             return
+        asyncio.get_running_loop().remove_reader(self._fd)
+        self._gather()
+
+    def _gather(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._gathering = loop.call_later(self.gather_s, self._gathered)
+
+    def _gathered(self) -> None:
+        """Take what has come, and go on like that for as long as something does."""
+        if self._fd is None:
+            return
+        if self._read(self._fd):
+            self._gather()
+        elif self._fd is not None:
+            asyncio.get_running_loop().add_reader(self._fd, self._readable)
+
+    def _read(self, fd: int) -> bool:
+        """Whether there was anything."""
+        try:
+            data = os.read(fd, READ_BYTES)
+        except BlockingIOError:
+            return False
         except OSError as error:
             self.drop(why(error))
-            return
+            return False
         if not data:  # the other end is gone; left in the loop, this would spin
             self.drop("the other end is gone: unplugged?")
-            return
+            return False
         self._heard_ns = self._clock.now_ns()
         self._tell("rx", data)
         self.on_bytes(data)
+        return True
 
 
 def why(error: Exception) -> str:

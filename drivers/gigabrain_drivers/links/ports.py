@@ -7,8 +7,8 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
-AUTO = "auto"
-USB = "usb:"
+from gigabrain_drivers.links.port_name import AUTO, USB, usb_id
+
 NO_PORT = (errno.ENOTTY, errno.EINVAL, errno.EISDIR)  # a file, a folder, another device
 
 
@@ -26,24 +26,17 @@ def candidates(port: str) -> list[str]:
     )
 
 
-def usb_id(port: str) -> tuple[int, int, str]:
-    """(vendor, product, serial number or "") of `usb:VID:PID[:SERIAL]`. Raises ValueError."""
-    parts = port.removeprefix(USB).split(":", 2)
-    if len(parts) < 2:
-        raise ValueError(f"expected usb:VID:PID or usb:VID:PID:SERIAL, got {port!r}")
-    try:
-        vendor, product = int(parts[0], 16), int(parts[1], 16)
-    except ValueError:
-        raise ValueError(f"expected hexadecimal VID and PID, got {port!r}") from None
-    return vendor, product, parts[2] if len(parts) > 2 else ""
-
-
 def missing(port: str) -> str:
     """What to say when there is no such device."""
     if port == AUTO:
         return "no serial port at all: is it plugged in?"
     what = "USB device " if port.startswith(USB) else ""
     return f"no {what}{port}: is it plugged in?"
+
+
+def absent(port: str) -> str:
+    """What to say of a port that is not there now; nothing where it is. Raises ValueError."""
+    return "" if any(Path(path).exists() for path in candidates(port)) else missing(port)
 
 
 def refused(path: str, error: OSError) -> str:

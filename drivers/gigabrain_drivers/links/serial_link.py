@@ -12,6 +12,7 @@ import serial
 
 from gigabrain_drivers.links import ports
 from gigabrain_drivers.links.link import Link, LinkProblem
+from gigabrain_drivers.links.port_name import AUTO
 from gigabrain_zenoh.clock import Clock
 
 Probe = Callable[[serial.Serial], bool]
@@ -67,7 +68,7 @@ class SerialLink(Link):
         paths = ports.candidates(self._port)
         if not paths:
             raise LinkProblem(ports.missing(self._port))
-        if self._port != ports.AUTO:
+        if self._port != AUTO:
             self.path = paths[0]
             return ready(open_port(self.path, self.baud))
         for self.path in paths:

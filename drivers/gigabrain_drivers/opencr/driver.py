@@ -14,6 +14,7 @@ from gigabrain_drivers.base import Driver
 from gigabrain_drivers.kinematics import Differential, Twist, base_of
 from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_drivers.links.link import Link
+from gigabrain_drivers.links.port_name import check_port
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_drivers.odometry import Encoders, Odometry
 from gigabrain_drivers.opencr.board import Board, is_opencr
@@ -40,6 +41,9 @@ class OpenCrOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_field
     """The board's part of a robot's file."""
 
     port: str = f"usb:{opencr.USB_ID}"  # a path, usb:VID:PID[:SERIAL], or auto
+
+    def __post_init__(self) -> None:
+        check_port(self.port)
 
 
 class OpenCrDriver(Driver):

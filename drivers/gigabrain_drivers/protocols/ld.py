@@ -8,13 +8,22 @@ Angles run clockwise. Source: LDROBOT's LD06 and LD19 development manuals.
 import struct
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 POINTS = 12  # per frame
 SIZE = 47  # bytes
 HEADER, VERSIONS = 0x54, (0x2C, 0xEC)  # low five bits of the second byte: 12 points
 TURN = 36_000  # [0.01 deg]
 LEAST_SAMPLES_HZ = 2300  # of the slowest of these lidars; none spreads its points wider
+_POINT = np.dtype([("distance", "<u2"), ("confidence", "u1")])
 SLACK = 1.5  # on the width of a frame, as the vendor's driver allows
 _LAYOUT = struct.Struct("<BBHH" + "HB" * POINTS + "HHB")
+_HEAD, _END, _END_AT = struct.Struct("<BBHH"), struct.Struct("<H"), SIZE - 5
+_FRAMES = np.dtype(
+    {"names": ["start", "points", "end"], "formats": ["<u2", (_POINT, POINTS), "<u2"],
+     "offsets": [4, _HEAD.size, _END_AT], "itemsize": SIZE}
+)  # fmt: skip
 
 
 def _table() -> bytes:
@@ -49,8 +58,8 @@ class Frame(NamedTuple):
 
     def angles(self) -> tuple[float, ...]:
         """The points' angles (12,) [deg], clockwise, from `start` on and so up to 720."""
-        step = (self.end - self.start) % TURN / (POINTS - 1)
-        return tuple((self.start + n * step) / 100 for n in range(POINTS))
+        start, step = self.start, (self.end - self.start) % TURN / (POINTS - 1)
+        return tuple([(start + n * step) / 100 for n in range(POINTS)])
 
 
 def encode(frame: Frame) -> bytes:
@@ -63,7 +72,15 @@ def encode(frame: Frame) -> bytes:
     return head + bytes([crc8(head)])
 
 
-def decode(data: bytes) -> Frame | None:
+class Raw(NamedTuple):
+    """A frame as it came, and where it starts and ends."""
+
+    start: int  # [0.01 deg], clockwise
+    end: int  # [0.01 deg], of the last point
+    data: bytes  # (47,)
+
+
+def whole(data: bytes) -> Raw | None:
     """The frame in exactly 47 bytes, or None when they cannot be one.
 
     CRC-8 lets one in 256 heavily damaged frames through, so what a turning lidar cannot say is
@@ -71,15 +88,37 @@ def decode(data: bytes) -> Frame | None:
     million frames with 0.1 % of all bytes wrong, 954060 came out right and 4 wrong; with 5 %, of
     60000 frames 5225 right and 144 wrong. A wrong frame bends twelve samples of one turn.
     """
-    if crc8(data[:-1]) != data[-1]:
+    if crc8(data):  # of all bytes with their own at the end it is 0
         return None
-    fields = _LAYOUT.unpack(data)
-    _, version, speed, start = fields[:4]
-    end, time_ms = fields[-3:-1]
+    _, version, speed, start = _HEAD.unpack_from(data)
+    (end,) = _END.unpack_from(data, _END_AT)
     widest = SLACK * speed * 100 * POINTS / LEAST_SAMPLES_HZ
     if version not in VERSIONS or max(start, end) >= TURN or (end - start) % TURN > widest:
         return None
+    return Raw(start, end, data)
+
+
+def decode(data: bytes) -> Frame | None:
+    """The same, with all that it says."""
+    if whole(data) is None:
+        return None
+    fields = _LAYOUT.unpack(data)
+    _, _, speed, start = fields[:4]
+    end, time_ms = fields[-3:-1]
     return Frame(speed, start, end, fields[4:-3:2], fields[5:-3:2], time_ms)
+
+
+def points(frames: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """All points of whole frames, one after the other.
+
+    Angles (n,) [deg], clockwise, each frame's from its start on and so up to 720, and distances
+    (n,) [mm].
+    """
+    found = np.frombuffer(frames, _FRAMES)
+    start, end = found["start"].astype(np.int64), found["end"].astype(np.int64)
+    step = (end - start) % TURN / (POINTS - 1)
+    angles = (start[:, None] + np.arange(POINTS) * step[:, None]) / 100
+    return angles.ravel(), found["points"]["distance"].ravel().astype(np.float64)
 
 
 def describe(frame: Frame) -> str:
@@ -102,7 +141,11 @@ class Decoder:
 
     def feed(self, data: bytes) -> list[Frame]:
         """The frames that `data` completes. Fewer than 47 bytes are kept for the next call."""
-        buffer, frames, at = self._buffer, list[Frame](), 0
+        return [frame for raw in self.cut(data) if (frame := decode(raw.data))]
+
+    def cut(self, data: bytes) -> list[Raw]:
+        """The same, as they came."""
+        buffer, frames, at = self._buffer, list[Raw](), 0
         buffer += data
         while (found := self._find(at)) >= 0:
             if found > at:
@@ -110,7 +153,7 @@ class Decoder:
             at = found
             if len(buffer) - at < SIZE:
                 break
-            frame = decode(bytes(buffer[at : at + SIZE]))
+            frame = whole(bytes(buffer[at : at + SIZE]))
             if frame:
                 frames.append(frame)
                 self._in_step = True

@@ -8,52 +8,15 @@ without a `$` at the beginning and without a `*` right before the checksum.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 from gigabrain_drivers.protocols.checks import CHECKS
-from gigabrain_drivers.protocols.line_fields import (
-    COMMAND,
-    DEFAULT_FORMATS,
-    IGNORED,
-    STATE,
-    UNITS,
-    factor,
-)
-from gigabrain_zenoh.errors import unknown
+from gigabrain_drivers.protocols.line_fields import COMMAND, IGNORED, STATE, UNITS
+from gigabrain_drivers.protocols.line_number import field_of
 
 LONGEST = 256  # bytes of a line
 MOST = 1e8  # in SI units; beyond, either way, no number is a measurement. Counters may count on.
+DIGITS = "0123456789."  # what is no end of a number
 _FIELD = re.compile(r"\{([^{}|:]*)(?:\|([^{}|:]*))?(?::([^{}]*))?\}")
-_FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.([0-9]))?f|d|[xX])")
-_ANY_NUMBER = r" *[-+]?[0-9]{1,12}(?:\.[0-9]{0,9})?"
-
-
-@dataclass(frozen=True)
-class Field:
-    """One number of a line."""
-
-    name: str
-    unit: str
-    factor: float  # wire * factor is in SI units
-    format: str  # of Python's format(); whole numbers and hexadecimals are rounded first
-    pattern: str  # of a regular expression
-
-    @property
-    def counts(self) -> bool:
-        """Whether it is a counter or a set of flags, which may be as large as they like."""
-        return self.unit.endswith("tick") or self.format[-1] in "xX"
-
-    def write(self, value: float) -> str:
-        """The text for a value in SI units; zero has no sign."""
-        wire = value / self.factor
-        if self.format[-1] != "f":
-            return format(round(wire), self.format)
-        text = format(wire, self.format)
-        return format(0.0, self.format) if float(text) == 0 else text
-
-    def read(self, text: str) -> float:
-        """The value in SI units of a text that fits the pattern."""
-        return (int(text, 16) if self.format[-1] in "xX" else float(text)) * self.factor + 0.0
 
 
 class Template:
@@ -76,9 +39,10 @@ class Template:
             raise ValueError(f"the checksum {{{self.check}}} must stand last in the line")
         if any("{" in part or "}" in part for part in self._texts):
             raise ValueError("a brace without its partner; expected {FIELD|UNIT:FORMAT}")
-        self.fields = tuple(_field(*triple, known, ticks_per_turn) for triple in triples)
+        self.fields = tuple(field_of(*triple, known, ticks_per_turn) for triple in triples)
         if not self.fields:
             raise ValueError(f"there is no field in it; known: {', '.join(known)}")
+        self._check_gaps()
         names = [field.name for field in self.fields if field.name != IGNORED]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
@@ -120,9 +84,24 @@ class Template:
                 return field.read(field.write(value))
         return value
 
+    def reads_all_of(self, other: "Template") -> bool:
+        """Whether lines of the other template can be read as lines of this one."""
+        nothing = other.encode({}).strip(b"\r\n")
+        return self.decode(nothing) is not None
+
     def longest(self) -> int:
         """About how many bytes a line has."""
         return len(self.encode({field.name: -5.0 * field.factor for field in self.fields}))
+
+    def _check_gaps(self) -> None:
+        """Numbers that touch cannot be told apart."""
+        pairs = zip(self.fields, self.fields[1:], self._texts[1:], strict=False)
+        for before, after, between in pairs:
+            if not between.strip(DIGITS) and not after.format.startswith("+"):
+                raise ValueError(
+                    f"{{{before.name}}} and {{{after.name}}} touch: expected something between "
+                    "them that is no digit, such as a comma"
+                )
 
     def _sum(self, text: str) -> str:
         check = CHECKS[self.check]
@@ -147,42 +126,6 @@ def _check_text(text: str) -> None:
         raise ValueError("expected printable ASCII")
     if len(text) > LONGEST:
         raise ValueError(f"expected at most {LONGEST} characters, got {len(text)}")
-
-
-def _field(
-    name: str, unit: str | None, form: str | None, known: Mapping[str, str], turn: float | None
-) -> Field:
-    if name in CHECKS:
-        raise ValueError(f"the checksum {{{name}}} must stand last in the line")
-    if name not in known:
-        raise ValueError(str(unknown("field", name, [*known, *CHECKS])))
-    quantity, unit = known[name], (unit or "").strip()
-    try:
-        scale = factor(quantity, unit, turn)
-    except ValueError as error:
-        raise ValueError(f"{{{name}}}: {error}") from None
-    if form is None:
-        pattern = "[0-9A-Fa-f]{1,8}" if quantity == "flags" else _ANY_NUMBER
-        plain = "d" if unit.lstrip("-") in ("tick", "tick/s") else ".3f"
-        return Field(name, unit, scale, DEFAULT_FORMATS.get(quantity, plain), pattern)
-    given = _FORMAT.fullmatch(form)
-    if given is None:
-        raise ValueError(f"{{{name}}}: expected a format such as .3f, d or 02x, got {form!r}")
-    if form[-1] in "xX" and quantity not in DEFAULT_FORMATS:
-        raise ValueError(f"{{{name}}}: a {quantity} has a sign; expected .3f or d, got {form!r}")
-    return Field(name, unit, scale, form, _pattern(form, given[1]))
-
-
-def _pattern(form: str, decimals: str | None) -> str:
-    """What a number of this format looks like, and nothing else."""
-    sign = "[-+]" if form.startswith("+") else "-?"
-    padding = " *" if len(form.rstrip("fdxX").partition(".")[0].lstrip("+0")) else ""
-    if form[-1] in "xX":
-        return f"{padding}[0-9A-Fa-f]{{1,8}}"
-    if form[-1] == "d":
-        return f"{padding}{sign}[0-9]{{1,12}}"
-    places = int(decimals) if decimals else 6 if "." not in form else 0
-    return rf"{padding}{sign}[0-9]{{1,12}}" + (rf"\.[0-9]{{{places}}}" if places else "")
 
 
 def describe(values: Mapping[str, float]) -> str:

@@ -10,6 +10,7 @@ from typing import NamedTuple, TypeVar
 
 from gigabrain_drivers.base import Driver
 from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.sim.account import account_of
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_drivers.sim.pace import Pace
 from gigabrain_drivers.sim.physics import Simulation
@@ -141,19 +142,8 @@ class MujocoDriver(Driver):
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far."""
-        truth = self._simulation.truth
-        return {
-            "body": self.robot.robot_type,
-            "world": self.run.world,
-            "seed": self.run.seed,
-            "sim_seconds": round(self._simulation.time_ns / 1e9, 2),
-            "distance_m": round(truth.distance_m, 3),
-            "contacts": truth.contacts,
-            "min_clearance_m": round(truth.min_clearance_m, 3),
-            "person_stood": self._simulation.person_stood,
-            "true_speed": round(truth.speed()[0], 4),
-            "physics_cpu_s": round(self._physics_s, 3),
-        }
+        account = account_of(self._simulation, self.robot, self.run)
+        return account | {"physics_cpu_s": round(self._physics_s, 3)}
 
     def _take(self, reading: Reading) -> None:
         self._state = reading.state or self._state

@@ -35,7 +35,10 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
     try:
         model = path.read_text(encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}; `model` names its MJCF file") from None
+        raise ConfigError(
+            f"{path}: {error.strerror}; the robot's MJCF model belongs there, "
+            "its own or that of a body like it; `model` names it"
+        ) from None
     lidar = _sim_lidar(robot, options)
     if robot.drive_type == "quadruped":
         battery = replace(

@@ -1,0 +1,94 @@
+"""What is wrong between the fields of a file is said with the line of the field that is wrong."""
+
+import pytest
+
+from gigabrain_schemas.body import Thresholds
+from gigabrain_zenoh import config
+from gigabrain_zenoh.cli.process import button
+from gigabrain_zenoh.deployment import Deployment, host_of
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.settings import ButtonConfig
+
+PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "body: mock\n\nlink: sim\n\nrouter: tcp/0.0.0.0:7447",
+            "f:5: router: tcp/0.0.0.0:7447 can",
+        ),
+        (
+            "body: mock\nrouter: tcp/127.0.0.1:99999",
+            "f:2: router: 'tcp/127.0.0.1:99999' is not a Zenoh endpoint; expected one like tcp/1",
+        ),
+        ("body: mock\nrouter: localhost", "f:2: router: 'localhost' is not a Zenoh endpoint"),
+        (
+            "hosts:\n  a: [router]\n  b: [driver]\nrouter: tcp/127.0.0.1:0",
+            "f:4: router: tcp/127.0.0.1:0: several hosts must know its port",
+        ),
+        (
+            "body: mock\nhosts:\n  a: [driver]\n  b: [driver]",
+            "f:2: hosts: driver must run once, on one host",
+        ),
+        ("link: emulated\nspeed: 2", "f:2: speed is for the simulation"),
+        ("body: mock\nbutton:\n  port: ''", f"f:3: button.port: {PORT} ''"),
+        ("body: mock\nbutton:\n  port: usb:xyz", f"f:3: button.port: {PORT} 'usb:xyz'"),
+    ],
+)
+def test_a_deployment_is_refused_at_the_line_that_is_wrong(text: str, said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        config.loads(text, Deployment, "f")
+    assert str(error.value).startswith(said)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            "scan_age: 0.3\nbattery_warn: 5",
+            "f:2: battery_stop, battery_return and battery_warn must ascend",
+        ),
+        ("scan_age: 0.3\nmotor_warn: 99", "f:2: motor_stop must not be below motor_warn"),
+    ],
+)
+def test_thresholds_that_contradict_each_other_are_refused_where_they_stand(
+    text: str, said: str
+) -> None:
+    with pytest.raises(ConfigError) as error:
+        config.loads(text, Thresholds, "f")
+    assert str(error.value) == said
+
+
+def test_a_host_that_is_like_no_other_gets_no_suggestion() -> None:
+    with pytest.raises(ConfigError) as error:
+        host_of(Deployment(), "nobody")
+    assert str(error.value) == "no host 'nobody'; known: robot"
+    with pytest.raises(ConfigError, match=r"no host 'robto'; did you mean 'robot'\?"):
+        host_of(Deployment(), "robto")
+
+
+@pytest.mark.parametrize("port", ["", " ", "usb:", "usb:0403", "usb:04x3:6001"])
+def test_a_button_that_can_be_nowhere_is_refused(port: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        button(port=port)
+    assert str(error.value) == f"port: {PORT} {port!r}"
+    with pytest.raises(ValueError, match="port: expected a path"):
+        ButtonConfig(port=port)
+
+
+@pytest.mark.parametrize("port", ["/dev/ttyUSB0", "auto", "usb:0403:6001", "usb:10C4:ea60:A 1"])
+def test_a_button_may_be_at_any_port(port: str) -> None:
+    assert ButtonConfig(port=port).port == port
+
+
+def test_a_button_whose_adapter_is_missing_is_told_of_before_there_is_a_robot(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("gigabrain_zenoh.cli.process.run", lambda config: 0)
+    assert button(port="/dev/nope") == 0
+    said = "gigabrain: no /dev/nope: is it plugged in? Waiting for it.\n"
+    assert capsys.readouterr().err == said
+    assert button(port="/dev/null") == 0
+    assert capsys.readouterr().err == ""

@@ -1,0 +1,83 @@
+"""A process on its way to its router, where names of hosts are not known, or not yet."""
+
+import asyncio
+import logging
+import socket
+
+import pytest
+
+from gigabrain_zenoh import meeting
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.meeting import join, unknown_host
+from gigabrain_zenoh.settings import Endpoint
+from tests.bus_rig import until
+from tests.zenoh_rig import free_endpoint
+
+NOBODY = "nobody here knows a host {!r}; waiting for its name (is it spelt right?)"
+
+
+class Resolver:
+    """Stands in for the system's: knows no name until it is told to."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self.knows = False
+
+    def __call__(self, host: str, *_: object) -> list[object]:
+        self.asked.append(host)
+        if not self.knows:
+            raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+        return []
+
+
+@pytest.fixture
+def resolver(monkeypatch: pytest.MonkeyPatch) -> Resolver:
+    """No name leaves this machine."""
+    made = Resolver()
+    monkeypatch.setattr(socket, "getaddrinfo", made)
+    monkeypatch.setattr(meeting, "AGAIN_S", 0.01)
+    monkeypatch.setattr(meeting, "PATIENCE_S", 0.01)
+    return made
+
+
+def told(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
+
+
+async def test_only_names_are_looked_up(resolver: Resolver) -> None:
+    addresses = ("tcp/127.0.0.1:1", "tls/[::1]:2", "unixsock-stream//x")
+    assert await unknown_host(addresses) == ""
+    assert resolver.asked == []
+    assert await unknown_host((*addresses, "tcp/robot.lan:3")) == "robot.lan"
+    resolver.knows = True
+    assert await unknown_host(("tcp/robot.lan:3",)) == ""
+
+
+async def test_a_router_waits_for_its_own_name_and_says_so_once(
+    resolver: Resolver, caplog: pytest.LogCaptureFixture
+) -> None:
+    here = free_endpoint().replace("127.0.0.1", "localhost")
+    joining = asyncio.ensure_future(join(Endpoint(listen=(here,))))
+    await until(lambda: len(resolver.asked) > 2)
+    assert told(caplog) == [NOBODY.format("localhost")]
+    resolver.knows = True
+    transport = await joining
+    await transport.close()
+    assert len([text for text in told(caplog) if "nobody" in text]) == 1
+
+
+async def test_who_waits_for_a_router_that_has_no_known_name_says_which(
+    resolver: Resolver, caplog: pytest.LogCaptureFixture
+) -> None:
+    elsewhere = free_endpoint().replace("127.0.0.1", "localhost")
+    joining = asyncio.ensure_future(join(Endpoint(connect=(elsewhere,))))
+    await until(lambda: bool(told(caplog)))
+    assert told(caplog) == [NOBODY.format("localhost")]
+    joining.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await joining
+
+
+async def test_what_is_no_endpoint_is_not_waited_for() -> None:
+    with pytest.raises(ConfigError, match="is not a Zenoh endpoint"):
+        await join(Endpoint(listen=("tcp/bad host!:7447",)))

@@ -1,0 +1,72 @@
+"""The files of missions and patrols: what may be in them, and how they are refused."""
+
+from pathlib import Path
+
+import pytest
+
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.tasks import checks
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("do: []", "m:1: do: expected a list of length >= 1, got a list of 0"),
+        ("do:\n- gotoo: a", "m:2: unknown field 'gotoo'; did you mean 'goto'? known: "),
+        ("do:\n- goto: a", "m:2: do[0].goto: no place 'a'; known: none"),
+        (
+            "places: {kitchen: [1, 2]}\ndo:\n- wait: 1\n- patrol: {points: [kichen]}",
+            "m:4: do[1].patrol.points[0]: no place 'kichen'; did you mean 'kitchen'?",
+        ),
+        ("do:\n- goto: [1, .nan]", "m:2: .nan is not allowed; expected a finite number"),
+        ("do:\n- goto: [1]", "m:2: do[0].goto: expected "),
+        ("do:\n- wait: 1\n  goto: [1, 2]", "m:2: do[0].wait: a step is one thing"),
+        ("do:\n- explore:", "m:2: do[0]: a step that does nothing; expected one of goto, "),
+        ("do:\n- tree: b", "m:2: do[0].tree: no tree 'b'; known: none"),
+        (
+            "trees:\n  a: [{tree: b}]\n  b: [{retry: {times: 2, do: [{tree: a}]}}]\n"
+            "do: [{tree: a}]",
+            "m:2: trees.a: goes round in a circle: a → b → a",
+        ),
+        (
+            "trees:\n  a: [{tree: a}]\ndo: [{wait: 1}]",
+            "m:2: trees.a: goes round in a circle: a → a",
+        ),
+        ("do:\n- check: nonsense", "m:2: do[0].check: expected a field, one of < <= > >= == != "),
+        (
+            "do:\n- wait_until: battery.percentag < 3",
+            "m:2: do[0].wait_until: no field 'percentag'; did you mean 'percentage'?",
+        ),
+        ("do:\n- check: pose.x == here", "pose.x is a number; it cannot be compared with 'here'"),
+        ("do:\n- check: gate.mode < idle", "gate.mode is a word; expected == or !=, got <"),
+        ("do:\n- check: pose.x < nan", "pose.x is a number; it cannot be compared with 'nan'"),
+        ("do:\n- check: robot.legs < 4", "no field 'robot'"),
+        ("do:\n- check: map.cells == 3", "map.cells is no number, word or truth value"),
+        ("", "m:1: the file is empty"),
+    ],
+)
+def test_a_mission_that_cannot_be_carried_out_is_refused_with_its_line(
+    text: str, problem: str
+) -> None:
+    with pytest.raises(ConfigError) as refused:
+        checks.loads(text, "m")
+    assert problem in str(refused.value)
+
+
+def test_trees_that_multiply_are_refused() -> None:
+    trees = "".join(f"  t{i}: [{{tree: t{i + 1}}}, {{tree: t{i + 1}}}]\n" for i in range(30))
+    text = f"trees:\n{trees}  t30: [{{wait: 1}}]\ndo: [{{tree: t0}}]"
+    with pytest.raises(ConfigError, match="more than 2000 steps once every tree is written out"):
+        checks.loads(text, "m")
+
+
+def test_a_file_says_which_mission_and_which_programs_it_needs(tmp_path: Path) -> None:
+    file = tmp_path / "m.yaml"
+    file.write_text("do: [{script: {run: beep}}, {wait: 3}]")
+    mission, text = checks.load(file)
+    assert list(checks.scripts(mission)) == ["beep"]
+    assert not checks.drives(mission)
+    assert text == file.read_text()
+    file.write_text("points: [[1, 2], b]")
+    with pytest.raises(ConfigError, match=r"m.yaml:1: points\[1\]: no place 'b'"):
+        checks.load_patrol(file)

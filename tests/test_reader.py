@@ -1,0 +1,43 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+QUIET = """
+import asyncio
+from gigabrain_zenoh.tools.reader import ended_with_reader
+
+async def quiet():
+    stop = asyncio.Event()
+    with ended_with_reader(stop):
+        print("one word and no more", end="", flush=True)
+        await asyncio.wait_for(stop.wait(), float("{patience_s}"))
+
+asyncio.run(quiet())
+"""
+
+
+def test_who_prints_into_a_pipe_learns_at_once_that_nobody_reads_on() -> None:
+    read, write = os.pipe()
+    with subprocess.Popen(
+        [sys.executable, "-c", QUIET.format(patience_s=60)], stdout=write
+    ) as command:
+        os.close(write)
+        os.read(read, 1)
+        os.close(read)
+    assert command.returncode == 0
+
+
+@pytest.mark.parametrize("kind", ["pipe", "file"])
+def test_who_is_read_is_left_alone(kind: str, tmp_path: Path) -> None:
+    with (tmp_path / "out").open("wb") as file:
+        command = subprocess.run(
+            [sys.executable, "-c", QUIET.format(patience_s=0.3)],
+            stdout=subprocess.PIPE if kind == "pipe" else file,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert command.stderr.endswith("TimeoutError\n")

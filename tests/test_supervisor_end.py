@@ -1,0 +1,135 @@
+import asyncio
+import os
+import signal
+import sys
+
+import pytest
+
+from gigabrain_zenoh.supervisor import Backoff, Supervisor
+from tests.supervisor_rig import (
+    CHILD,
+    HANG,
+    QUICK,
+    SERVE,
+    Records,
+    alive,
+    another_supervisor,
+    freeze,
+    running,
+    spec,
+    until,
+)
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts")
+
+
+async def test_all_end_also_those_that_hang_or_are_frozen_and_the_router_last() -> None:
+    # waits for the signal in the open: a handler must not write while a write goes on
+    obedient = """
+signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+say('ready')
+signal.sigwait({signal.SIGTERM})
+say('bye')
+"""
+    names = ("router", "driver", "control", "safety")
+    async with running(
+        spec("router", obedient, stop_last=True),
+        spec("driver", obedient),
+        spec("control", HANG),
+        spec("safety", SERVE),
+    ) as (supervisor, records):
+        await until(lambda: all(s.state == "ready" for s in supervisor.statuses.values()))
+        await freeze(supervisor.statuses["safety"].pid)
+        await supervisor.stop(within_s=2.0)
+        assert [supervisor.statuses[name].state for name in names] == ["stopped"] * 4
+        assert sorted(records.texts("killed")) == [
+            "control did not end when asked and is killed",
+            "safety did not end when asked and is killed",
+        ]
+        order = records.events()
+        assert order.index(("driver", "bye")) < order.index(("control", "killed"))
+        assert order[-1] == ("router", "bye")
+        assert supervisor.deaths == 0
+
+
+async def test_all_end_also_while_they_wait_start_or_back_off() -> None:
+    async with running(
+        spec("starting", "wait()"),
+        spec("waiting", SERVE, "starting"),
+        spec("dying", "sys.exit(1)"),
+        backoff=Backoff(first_s=60.0, longest_s=60.0),
+    ) as (supervisor, _):
+        await until(lambda: supervisor.statuses["dying"].state == "backing off")
+        await supervisor.stop(within_s=1.0)
+        assert {s.state for s in supervisor.statuses.values()} == {"stopped"}
+
+
+async def test_a_stop_at_any_moment_of_the_start_leaves_nothing_behind() -> None:
+    for turns in range(0, 12, 2):
+        supervisor = Supervisor([spec("one"), spec("two")], Records(), QUICK)
+        task = asyncio.create_task(supervisor.run())
+        for _ in range(turns):
+            await asyncio.sleep(0)
+        await supervisor.stop(within_s=1.0)
+        await task
+        assert {status.pid for status in supervisor.statuses.values()} == {None}
+
+
+async def test_a_stop_before_the_start_starts_nothing() -> None:
+    records = Records()
+    async with Supervisor([spec("one")], records) as supervisor:
+        await supervisor.stop()
+        await supervisor.run()
+    assert records.all == []
+
+
+async def test_a_cancelled_run_ends_all() -> None:
+    supervisor = Supervisor([spec("one"), spec("two", HANG)], Records(), QUICK)
+    task = asyncio.create_task(supervisor.run())
+    await until(lambda: all(s.state == "ready" for s in supervisor.statuses.values()))
+    pids = [status.pid or 0 for status in supervisor.statuses.values()]
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert not any(alive(pid) for pid in pids)
+
+
+async def test_a_terminals_ctrl_c_does_not_reach_the_processes() -> None:
+    async with running(spec("one")) as (supervisor, _):
+        await until(lambda: supervisor.statuses["one"].state == "ready")
+        pid = supervisor.statuses["one"].pid or 0
+        assert os.getpgid(pid) == pid
+        assert os.getsid(pid) == pid
+
+
+async def test_what_a_dead_process_has_started_goes_with_it() -> None:
+    code = "p = subprocess.Popen(['sleep', '60']); say('ready', child_pid=p.pid); sys.exit(1)"
+    async with running(spec("driver", code)) as (supervisor, records):
+        await until(lambda: supervisor.deaths)
+        pid = next(r["child_pid"] for _, r in records.all if r["event"] == "ready")
+        await until(lambda: not alive(pid))
+
+
+TIED = CHILD + "lifeline.die_with_supervisor(); "
+
+
+async def test_nothing_is_left_when_the_supervisor_is_killed() -> None:
+    with another_supervisor(
+        obedient=TIED + SERVE,
+        hanging=TIED + HANG,
+        frozen=TIED + SERVE,
+        watched=CHILD + "lifeline.watch_parent(os.getppid()); " + HANG,
+    ) as (parent, pids):
+        if sys.platform == "linux":
+            await freeze(pids["frozen"])
+        parent.kill()
+        await until(lambda: not any(alive(pid) for pid in pids.values()))
+
+
+async def test_an_impatient_second_ctrl_c_leaves_nothing_behind() -> None:
+    with another_supervisor(hanging=CHILD + HANG, other=CHILD + HANG) as (parent, pids):
+        parent.send_signal(signal.SIGINT)
+        await asyncio.sleep(0.1)
+        parent.send_signal(signal.SIGINT)
+        await until(lambda: not any(alive(pid) for pid in pids.values()))
+        await until(lambda: parent.poll() is not None)

@@ -1,0 +1,119 @@
+"""What waits, what goes first, what is cancelled, and what a restart leaves of it all."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.errors import Refused
+from tests.tasks_rig import Robot, one_robot
+
+
+@pytest.fixture
+def robot() -> Iterator[Robot]:
+    with one_robot() as made:
+        yield made
+
+
+def test_goals_wait_in_a_queue_or_go_first_or_stand_in_for_all(robot: Robot) -> None:
+    tasks = robot.tasks
+    tasks.go_to(Goal(x=1.0, y=0.0), "replace", "ann")
+    tasks.go_to(Goal(x=2.0, y=0.0), "queue", "ann")
+    assert robot.step() == 1.0
+    tasks.go_to(Goal(x=3.0, y=0.0), "preempt", "bob")
+    assert robot.step() == 3.0
+    waiting = [(task.id, task.state, task.reason) for task in robot.status.queue]
+    assert waiting == [("goal-1", "paused", "until goal-3 is done"), ("goal-2", "queued", "")]
+    assert robot.reached() == 1.0
+    assert robot.reached() == 2.0
+    tasks.go_to(Goal(x=4.0, y=0.0), "replace", "bob")
+    assert robot.step() == 4.0
+    assert robot.last == ("cancelled", "replaced by goal-4")
+
+
+def test_cancelling_goes_by_name_and_all_at_once(robot: Robot) -> None:
+    for x in (1.0, 2.0, 3.0):
+        robot.tasks.go_to(Goal(x=x, y=0.0), "queue", "ann")
+    assert robot.tasks.cancel("goal-2", "bob") == "goal-2 is cancelled"
+    assert robot.tasks.cancel("", "bob") == "goal-1 is cancelled"
+    assert robot.last == ("cancelled", "cancelled by bob")
+    assert robot.step() == 3.0
+    assert robot.tasks.cancel("all", "bob") == "1 task is cancelled"
+    assert robot.step() is None
+    with pytest.raises(Refused, match="there is nothing to do, so nothing to change"):
+        robot.tasks.cancel("", "bob")
+
+
+def test_a_task_that_is_not_there_is_named_with_those_that_are(robot: Robot) -> None:
+    robot.tasks.go_to(Goal(x=1.0, y=0.0), "queue", "ann")
+    with pytest.raises(Refused, match="no task 'goal-7' any more; there is: goal-1"):
+        robot.tasks.cancel("goal-7", "bob")
+    with pytest.raises(Refused, match="goal-1 is not paused"):
+        robot.tasks.resume("goal-1")
+
+
+def test_no_more_than_32_tasks_wait(robot: Robot) -> None:
+    for _ in range(33):
+        robot.tasks.go_to(Goal(x=1.0, y=0.0), "queue", "ann")
+    with pytest.raises(Refused, match="32 tasks wait already; cancel some first"):
+        robot.tasks.go_to(Goal(x=1.0, y=0.0), "queue", "ann")
+    assert len(robot.status.queue) == 32
+
+
+ROUND = (
+    "do:\n- goto: c\n- retry:\n    times: 3\n    do:\n"
+    "    - repeat: {times: 3, do: [{goto: a}, {goto: b}]}\n"
+)
+
+
+def test_after_a_restart_a_mission_goes_on_with_the_step_it_was_at(robot: Robot) -> None:
+    robot.tasks.meet(7)
+    robot.carry_out(ROUND)
+    robot.tasks.go_to(Goal(x=9.0, y=0.0), "queue", "ann")
+    assert robot.step() == 3.0
+    robot.reached()
+    robot.failed()  # a, in the first of three attempts
+    assert robot.step() == 1.0
+    assert robot.reached() == 2.0  # b, in the first of three rounds
+    robot.reached()
+    assert robot.step() == 1.0
+    assert robot.reached() == 2.0  # b, in the second
+    again = Robot(robot.tasks.saved)
+    again.tasks.meet(7)
+    assert again.step() == 2.0
+    again.reached()
+    seen = [again.step(), again.reached(), again.reached()]
+    assert seen == [1.0, 2.0, 9.0]  # the third round, and what waited
+    assert again.tasks.go_to(Goal(x=1.0, y=0.0), "queue", "ann") == "goal-3"
+
+
+def test_after_a_restart_two_failures_are_still_two(robot: Robot) -> None:
+    robot.carry_out("do: [{retry: {times: 3, do: [{goto: a}]}}]")
+    robot.step()
+    robot.failed()
+    robot.step()
+    robot.failed()
+    robot.step()
+    again = Robot(robot.tasks.saved)
+    again.step()
+    again.failed()
+    assert again.last == ("failed", "a: no way")
+
+
+def test_after_a_start_of_the_whole_robot_tasks_wait_for_a_person(robot: Robot) -> None:
+    robot.tasks.meet(7)
+    robot.carry_out("do: [{goto: a}]")
+    robot.step()
+    again = Robot(robot.tasks.saved)
+    again.tasks.meet(8)
+    assert again.step() is None
+    current = again.status.current
+    assert current
+    assert (current.state, current.reason) == (
+        "paused",
+        "the robot was started anew; resume it, or cancel it",
+    )
+    assert again.tasks.resume("") == "mission-1 goes on"
+    assert again.step() == 1.0
+    again.tasks.meet(9)  # a driver that starts anew alone: the gate asks for a person already
+    assert again.step() == 1.0

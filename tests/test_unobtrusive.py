@@ -1,0 +1,75 @@
+"""Those who only look on wake seldom, and push nobody aside."""
+
+import os
+
+import pytest
+
+from gigabrain_zenoh.process import PROGRAMS
+from gigabrain_zenoh.unobtrusive import Nap, step_aside
+from tests.bus_rig import in_thread
+
+
+class Thread:
+    """One that receives, in a time of its own."""
+
+    def __init__(self) -> None:
+        self.now_s, self.slept_s, self.got = 100.0, list[float](), list[str]()
+        nap = Nap(0.04, lambda: self.now_s, self._sleep)
+        self._take = nap.after_each(self.got.append)
+
+    def _sleep(self, seconds: float) -> None:
+        self.slept_s.append(seconds)
+        self.now_s += seconds
+
+    def receive(self, sample: str, after_s: float) -> None:
+        self.now_s += after_s
+        self._take(sample)
+
+
+def test_a_message_that_finds_the_thread_idle_is_taken_at_once_and_slept_after() -> None:
+    thread = Thread()
+    thread.receive("one", after_s=0.01)
+    assert (thread.got, thread.slept_s) == (["one"], [0.04])
+
+
+def test_what_has_gathered_meanwhile_is_taken_without_a_nap_between() -> None:
+    thread = Thread()
+    for sample, after_s in (("one", 0.01), ("two", 0.0001), ("three", 0.0001)):
+        thread.receive(sample, after_s)
+    assert (thread.got, thread.slept_s) == (["one", "two", "three"], [0.04])
+
+
+def test_a_flood_finds_a_thread_that_never_sleeps() -> None:
+    thread = Thread()
+    for _ in range(1000):
+        thread.receive("more", after_s=0.0002)
+    assert thread.slept_s == []
+
+
+def test_320_messages_a_second_wake_the_thread_50_times() -> None:
+    thread, began_s, wakes = Thread(), 100.0, 0
+    for i in range(320):  # a second's messages, evenly
+        due_s = began_s + i / 320
+        waits = max(0.0, due_s - thread.now_s)
+        wakes += waits > 0
+        thread.receive("one", after_s=waits)
+    assert len(thread.slept_s) + wakes == 50  # of each 13 messages, one; and the end of its nap
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="only Linux has it")
+def test_whoever_steps_aside_does_so_for_all_threads_that_it_starts() -> None:
+    found = []
+
+    def work() -> None:
+        step_aside()
+        in_thread(lambda: found.append(os.sched_getscheduler(0))).join()
+
+    before = os.sched_getscheduler(0)
+    in_thread(work).join()
+    assert found == [os.SCHED_BATCH]
+    assert os.sched_getscheduler(0) == before
+
+
+def test_only_those_without_whom_the_robot_drives_look_on() -> None:
+    looks_on = {name for name, program in PROGRAMS.items() if program.looks_on}
+    assert looks_on == {"recorder", "page", "foxglove"}
