@@ -10,6 +10,7 @@ import msgspec
 from cyclopts import Parameter
 from rich.console import Console, RenderableType
 
+from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.errors import ConfigError
 
@@ -44,6 +45,7 @@ def chain(
     """
     from gigabrain_zenoh.bench.chain import measure_chain
 
+    results.check_place(json)
     above_zero("seconds", seconds)
     above_zero("rounds", rounds)
     for rate in rates:
@@ -95,6 +97,7 @@ def stack(
     from gigabrain_zenoh.bench.stack import measure_stack
     from gigabrain_zenoh.bench.tables import stack_page
 
+    results.check_place(json)
     above_zero("seconds", seconds)
     result = asyncio.run(measure_stack(body, world, seconds, _progress))
     _finish(stack_page(result), result, json)
@@ -126,6 +129,7 @@ def estop(
     from gigabrain_zenoh.bench.estop import measure_estop
     from gigabrain_zenoh.bench.tables import estop_page
 
+    results.check_place(json)
     above_zero("driving", driving)
     above_zero("latched", latched)
     result = asyncio.run(measure_estop(body, driving, latched, _progress))
@@ -138,7 +142,5 @@ def _progress(text: str) -> None:
 
 
 def _finish(page: RenderableType, result: msgspec.Struct, json: Path | None) -> None:
-    from gigabrain_zenoh import results
-
     Console().print(page)
     results.write(result, json)

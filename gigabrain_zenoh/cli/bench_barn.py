@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from gigabrain_zenoh.cli.checked import above_zero
-from gigabrain_zenoh.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -52,22 +51,19 @@ def barn(
     json
         Write all trials into this file.
     """
-    import msgspec
     from rich.console import Console
 
+    from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.barn import measure_barn
     from gigabrain_zenoh.bench.barn_worlds import choose, read_worlds
 
     for name, value in (("trials", trials), ("samples", samples), ("jobs", jobs)):
         above_zero(name, value)
+    results.check_place(json)
     chosen = choose(read_worlds(worlds, dynamic), only)
     result = measure_barn(chosen, trials, plant, samples, jobs, _progress)
     Console().print(_table(result, worlds.name, plant))
-    if json is not None:
-        try:
-            json.write_bytes(msgspec.json.format(msgspec.json.encode(result)) + b"\n")
-        except OSError as error:
-            raise ConfigError(f"cannot write {json}: {error.strerror}") from None
+    results.write(result, json)
     return 0
 
 

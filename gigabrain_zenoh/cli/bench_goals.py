@@ -59,25 +59,25 @@ def goals(
     logs
         Keep the logs of all processes in this folder.
     """
+    from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.goals import Course, measure_goals
 
     above_zero("goals", goals)
     above_zero("speed", speed)
+    results.check_place(json)
     course = Course(goals=goals, meetings=meetings, speed=speed, seed=seed, logs=logs)
     result = asyncio.run(measure_goals(bodies, worlds, course, _progress))
-    _show(result, json)
+    _show(result)
+    results.write(result, json)
     return 0 if result.ok else 1
 
 
-def _show(result: "GoalsResult", json: Path | None) -> None:
-    """The table, what was not reached and why; and all of it into a file."""
-    import msgspec
+def _show(result: "GoalsResult") -> None:
+    """The table, and what was not reached and why."""
     from rich.console import Console
 
     from gigabrain_zenoh.tasks.orders import where
 
-    if json:
-        json.write_bytes(msgspec.json.format(msgspec.json.encode(result)))
     console = Console()
     console = console if console.is_terminal else Console(width=WIDE)
     console.print(_table(result))

@@ -51,18 +51,18 @@ def plan(
     png
         Draw the last map and its paths into this file.
     """
-    import msgspec
     from rich.console import Console
 
+    from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.plan import measure_plan
 
     above_zero("queries", queries)
     if any(one < LEAST for one in size):
         raise ConfigError(f"--size: expected at least {LEAST}, got {min(size)}")
+    results.check_place(json)
     result = measure_plan(size, queries, seed, png, lambda text: print(text, file=sys.stderr))
     Console().print(_table(result))
-    if json:
-        json.write_bytes(msgspec.json.format(msgspec.json.encode(result)))
+    results.write(result, json)
     return 0 if result.ok else 1
 
 

@@ -57,22 +57,19 @@ def slam(
         from gigabrain_zenoh.cli.bench_slam_world import slam_world
 
         return slam_world(world, minutes, body, seed, png, json)
-    import msgspec
     from rich.console import Console
 
+    from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.slam import judged, total
     from gigabrain_zenoh.bench.slam_logs import load
     from gigabrain_zenoh.bench.slam_picture import draw
 
+    results.check_place(json)
     drives = _driven([load(path) for path in log])
     result = total([judged(one, driven) for one, driven in drives])
     if png:
         draw(drives, png)
-    if json:
-        try:
-            json.write_bytes(msgspec.json.format(msgspec.json.encode(result)) + b"\n")
-        except OSError as error:
-            raise ConfigError(f"cannot write {json}: {error.strerror}") from None
+    results.write(result, json)
     Console().print(_table(result))
     return 0
 

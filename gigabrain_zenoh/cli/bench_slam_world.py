@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gigabrain_zenoh.cli.checked import above_zero
-from gigabrain_zenoh.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -18,14 +17,15 @@ def slam_world(
     worlds: Sequence[str], minutes: float, body: str, seed: int, png: Path | None, json: Path | None
 ) -> int:
     """Let a robot roam each of the worlds, and show what its maps are worth."""
-    import msgspec
     from rich.console import Console
     from rich.progress import Progress
 
+    from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.slam_world import WorldsResult, tour
     from gigabrain_zenoh.bench.slam_world_picture import draw
 
     above_zero("minutes", minutes)
+    results.check_place(json)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         tasks = [progress.add_task(world, total=minutes) for world in worlds]
         toured = [
@@ -35,11 +35,7 @@ def slam_world(
     result = WorldsResult(worlds=tuple(one.result for one in toured))
     if png:
         draw(toured, png)
-    if json:
-        try:
-            json.write_bytes(msgspec.json.format(msgspec.json.encode(result)) + b"\n")
-        except OSError as error:
-            raise ConfigError(f"cannot write {json}: {error.strerror}") from None
+    results.write(result, json)
     Console().print(_table(result.worlds))
     return 0
 
