@@ -86,6 +86,13 @@ def test_a_recording_without_the_process_is_refused(tmp_path: Path) -> None:
         call("replay", "--check", str(path), "--process", "safety")
 
 
+def test_without_its_settings_a_process_is_not_replayed_as_another(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    bag_rig.write(path, bag_rig.drive(10))
+    with pytest.raises(ConfigError, match=r"not hold the settings of decision, .* --deployment F"):
+        call("replay", "--check", str(path), "--process", "decision")
+
+
 def granted(service: str, tick: int, basis: int) -> bytes:
     return codec.encode(Granted(service=service, request="{}", boot=7, tick=tick, basis=basis))
 

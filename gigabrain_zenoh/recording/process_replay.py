@@ -48,6 +48,7 @@ SAYS: dict[str, tuple[Topic[Any], ...]] = {
     "safety": (SAFETY,),
 }
 ASIDE = ("stamp_ns", "seq")
+WITH_SETTINGS = ("perception", "decision")
 NOWHERE = {"scripts": "", "state_dir": ""}  # a replay runs no programs, and remembers nothing
 _granted = Codec(GRANTED.type, GRANTED.max_bytes)
 
@@ -195,13 +196,22 @@ def notes(path: Path) -> Mapping[str, str]:
 
 
 def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, Any]:
-    """The settings of a process: of a deployment file, or those that the recording holds."""
+    """The settings of a process: of a deployment file, or those that the recording holds.
+
+    Raises ConfigError where the process has settings and neither tells them.
+    """
     if deployment:
         loaded = load_deployment(deployment_path(deployment))
         told = {"perception": loaded.perception, "decision": loaded.decision}
         settings = dict(msgspec.to_builtins(told.get(process, {})))
     else:
-        settings = dict(msgspec.json.decode(notes(path).get(process, "{}")))
+        held = notes(path)
+        if process in WITH_SETTINGS and process not in held:
+            raise ConfigError(
+                f"{path} does not hold the settings of {process}, as it was recorded from beside; "
+                "name the robot's deployment file: --deployment FILE"
+            )
+        settings = dict(msgspec.json.decode(held.get(process, "{}")))
     return settings | NOWHERE if process == "decision" else settings
 
 
