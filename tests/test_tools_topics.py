@@ -15,7 +15,7 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel, OccupancyGrid, WorldModel
 from gigabrain_schemas.examples import EXAMPLES, example
 from gigabrain_schemas.sensors import Image, LaserScan
-from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, STATE, TOPICS, WORLD
+from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, SERVICES, STATE, TOPICS, WORLD
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName
 from gigabrain_zenoh.health import answer_to_name, publish_health
@@ -76,6 +76,8 @@ def test_an_unknown_topic_is_answered_with_the_nearest_that_is_alive() -> None:
     assert target("wether/today", {"weather/today"}) is None
     assert "did you mean 'weather/today'" in str(not_found("wether/today", {"weather/today"}))
     assert "did you mean 'cmd_vel'" in str(not_found("cmdvel", ()))
+    for service in SERVICES:
+        assert "is a question, and no topic; ask it: gigabrain " in str(not_found(service.key, ()))
 
 
 def tally_of(times_ms: list[float], size: int = 4, delay_ms: float = 3.0) -> tuple[Tally, int]:

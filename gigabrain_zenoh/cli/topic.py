@@ -201,14 +201,15 @@ def pub(
     """
     from gigabrain_schemas.topics import CMD_VEL
     from gigabrain_zenoh.recording.joining import joined
-    from gigabrain_zenoh.tools.names import not_found, target
+    from gigabrain_zenoh.tools.names import COMMANDS, not_found, short, target
     from gigabrain_zenoh.tools.publishing import drive, send, typed_in
 
     above_zero("rate", rate)
     above_zero("count", count)
     aim = target(name)
     topic = aim.topic if aim else None
-    if (aim and "*" in aim.pattern) or (topic is None and "/" not in name):
+    nothing = "/" not in name or short(name) in COMMANDS
+    if (aim and "*" in aim.pattern) or (topic is None and nothing):
         raise not_found(name, ())
     if topic is None or topic is CMD_VEL:  # a key that is not ours may be what the body obeys
         seconds = None if rate and not count else (count or 1) / (rate or 1.0)

@@ -5,10 +5,15 @@ from collections.abc import Iterable
 from msgspec import Struct
 
 from gigabrain_schemas.topics import TOPICS, Topic
-from gigabrain_zenoh.errors import unknown
+from gigabrain_zenoh.errors import UnknownName, unknown
 from gigabrain_zenoh.tools.keyexpr import matches
 
 OURS = "robot/"
+COMMANDS = {  # what asks the questions that people take for topics
+    "estop": "estop", "release": "release", "enable": "enable", "goal": "goto X Y",
+    "mission": "mission FILE", "task_change": "task", "map_save": "map save",
+    "param": "param", "audit_log": "audit", "describe": "node info",
+}  # fmt: skip
 
 
 class Target(Struct, frozen=True):
@@ -51,5 +56,7 @@ def target(name: str, alive: Iterable[str] = ()) -> Target | None:
 
 
 def not_found(name: str, alive: Iterable[str]) -> Exception:
-    """The error for a name that is no topic, with the nearest."""
+    """The error for a name that is no topic, with the nearest, or with what asks that question."""
+    if command := COMMANDS.get(short(name)):
+        return UnknownName(f"{name} is a question, and no topic; ask it: gigabrain {command}")
     return unknown("topic", name, {*(short(t.key) for t in TOPICS), *map(short, alive)})
