@@ -90,6 +90,7 @@ def round_post(x: float, y: float) -> np.ndarray[tuple[int], np.dtype[np.float64
 async def drive(config: PerceptionConfig) -> list[tuple[float, float, float]]:
     """The robot drives 0.5 m/s past somebody who walks towards it at 0.5 m/s; what it follows."""
     async with Bench(functools.partial(perception.run, config)) as bench:
+        await bench.ready()
         bench.send(BODY, body())
         for tick in range(1, 101):
             x = 0.01 * tick

@@ -130,7 +130,7 @@ async def test_a_full_disk_is_told_once_and_stops_nobody(small_disk: Home) -> No
         )
         await until(lambda: full.search(up.out), "it says that the disk is full")
         await robot.ticks(100)
-        assert robot.state.gate.mode == "enabled"
+        await until(lambda: robot.state.gate.mode == "enabled", "it drives on")
         assert len(full.findall(up.out)) == 1
     up.send(signal.SIGINT)
     assert await up.ended() == 0

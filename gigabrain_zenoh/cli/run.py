@@ -17,6 +17,7 @@ from gigabrain_zenoh.deployment import (
     recorded,
 )
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import LinkName, Resume
 
 
@@ -78,6 +79,8 @@ def demo(
     from gigabrain_zenoh.page.beside import with_page
 
     behaviours.check(behaviour)
+    find("gigabrain_drivers.catalog:load_robot")(body)
+    find("gigabrain_drivers.sim.worlds:load_world")(world, 0)
     if record and record.exists():
         raise ConfigError(f"{record} exists; choose another file")
     above_zero("seconds", seconds)

@@ -117,11 +117,8 @@ def drive(
             cost += dt * of_place(weights, scene, room, away, x, y, yaw)
             cost += dt * of_motion(weights, room, vx, vy, w)
             if t % BRAKE_EVERY == 0:
-                cost += (
-                    dt
-                    * BRAKE_EVERY
-                    * of_braking(model, outline, scene, room, x, y, cosine, sine, vx, vy)
-                )
+                braking = of_braking(model, outline, scene, room, x, y, cosine, sine, vx, vy)
+                cost += dt * BRAKE_EVERY * braking
         if not (alive or noted):
             break
     if alive:

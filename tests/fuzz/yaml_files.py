@@ -1,6 +1,5 @@
 """What must hold for whatever stands in a robot's file or in a deployment file."""
 
-import functools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -54,12 +53,11 @@ def robot(text: str) -> RobotFile:
     for name in LINKS:
         link = getattr(found, name)
         if link is not None:
-            options = link_options(driver_class(str(link.get("driver"))), link)
+            options = link_options(driver_class(str(link.get("driver"))), found, link)
             found = loads(text, exact(name, options), "x.yaml")
     return found
 
 
-@functools.cache
 def exact(link: str, options: Any) -> type[RobotFile]:
     """A robot's file with the options of one link."""
     return msgspec.defstruct(
