@@ -182,3 +182,4 @@ def warm_up() -> None:
     points, grid = np.array([[1.0, 0.0]], np.float32), Grid()
     grid.draw(np.zeros(3), points, points)
     grid.percent()
+    grid.around(0.0, 0.0, CELL)

@@ -70,7 +70,7 @@ def build(
         np.concatenate([scan.normals for scan in scans]),
         np.array([len(scan.points) for scan in scans]),
         poses,
-        centre,
+        np.array(centre),  # numba compiles anew for one that may not be written
     )
     if not len(points):
         nothing = np.zeros((1, 1), np.uint8)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gigabrain_zenoh.mapping import grid, slam
-from gigabrain_zenoh.mapping.field import field_of
+from gigabrain_zenoh.mapping.field import contradiction, field_of
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.relocalize import search
 from gigabrain_zenoh.mapping.se2 import IDENTITY
@@ -20,5 +20,7 @@ def warm_up() -> None:
     drawn = grid.Grid()
     drawn.draw(IDENTITY, scan.points, scan.free)
     field = field_of(drawn.percent(), grid.CELL, (drawn.origin_x, drawn.origin_y))
-    search(field, scan.points, scan.free, IDENTITY[:2])
+    sensor = np.zeros(2)
+    search(field, scan.points, scan.free, sensor)
+    contradiction(field, scan.points, scan.free, sensor, np.zeros(3))
     slam.warm_up()

@@ -1,0 +1,35 @@
+import subprocess
+import sys
+
+DRIVE = """
+import importlib, pkgutil
+from numba.core.registry import CPUDispatcher
+from gigabrain_zenoh import mapping
+from gigabrain_zenoh.bench.slam_world import tour
+from gigabrain_zenoh.mapping.warm import warm_up
+
+def compiled():
+    inside = pkgutil.iter_modules(mapping.__path__, mapping.__name__ + ".")
+    names = [module.name for module in inside]
+    return {
+        (name, function.__name__, str(signature))
+        for name in names
+        for function in vars(importlib.import_module(name)).values()
+        if isinstance(function, CPUDispatcher)
+        for signature in function.signatures
+    }
+
+warm_up()
+before = compiled()
+tour("turtlebot3_waffle", "house", 0, 0.5, lambda _: None)
+print(len(before), sorted(compiled() - before))
+"""
+
+
+def test_a_map_is_made_without_compiling_anything_after_the_start() -> None:
+    drive = subprocess.run(
+        [sys.executable, "-c", DRIVE], capture_output=True, text=True, check=True
+    )
+    count, late = drive.stdout.split(maxsplit=1)
+    assert int(count) > 10
+    assert late == "[]\n"
