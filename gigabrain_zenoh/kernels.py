@@ -1,17 +1,22 @@
 """Functions compiled by numba, and where what was compiled is kept."""
 
 import hashlib
+import importlib
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
+import llvmlite.binding
 import numba
 
 F = TypeVar("F", bound=Callable[..., object])
 
 PACKAGE = Path(__file__).parent
 HOLDERS = ("mapping", "navigation", "obstacles", "bench")  # packages with kernels
+MAPPING = "gigabrain_zenoh.mapping.warm:warm_up"  # call all that is compiled for a process once
+DRIVING = "gigabrain_zenoh.navigating:warm_up"
 
 
 def kernel(function: F) -> F:
@@ -32,17 +37,52 @@ def cache_folder() -> Path | None:
 
     Numba notices a change in a kernel's own file and none in those that it calls.
     """
-    digest = hashlib.sha256()
-    for holder in HOLDERS:
-        for source in sorted((PACKAGE / holder).glob("*.py")):
-            digest.update(source.read_bytes())
     try:
         root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
         return None
-    return Path(root) / "gigabrain" / f"kernels-{digest.hexdigest()[:16]}"
+    return Path(root) / "gigabrain" / f"kernels-{_digest()}"
+
+
+def mark_of(warm_up: str) -> Path | None:
+    """The file that says that all of `warm_up` is kept, for this processor.
+
+    None where nothing can be kept.
+    """
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR", os.devnull))
+    machine = f"{numba.__version__}-{llvmlite.binding.get_host_cpu_name()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return folder / f"{warm_up.replace(':', '.')}-{_digest()}-{machine}"
+
+
+def _digest() -> str:
+    digest = hashlib.sha256()
+    for holder in HOLDERS:
+        for source in sorted((PACKAGE / holder).glob("*.py")):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _leave_blas_out() -> None:
+    """Numba looks for scipy's, whose import takes as long as loading all our kernels.
+
+    None of them does linear algebra.
+    """
+    name = "scipy.linalg"
+    if name in sys.modules:
+        return
+    modules: dict[str, Any] = sys.modules
+    modules[name] = None  # as if it were not installed
+    try:
+        importlib.import_module("numba.np.arraymath")
+    finally:
+        del modules[name]
 
 
 if folder := cache_folder():
     os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))
     numba.core.config.reload_config()
+_leave_blas_out()

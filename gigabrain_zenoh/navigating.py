@@ -21,6 +21,7 @@ from gigabrain_zenoh.compiling import compiled
 from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate_state import BRAIN
+from gigabrain_zenoh.kernels import DRIVING
 from gigabrain_zenoh.lateness import Lateness
 from gigabrain_zenoh.navigation import local, planner
 from gigabrain_zenoh.navigation.moment import Sent
@@ -75,7 +76,7 @@ class Navigating:
 
     async def warm_up(self) -> None:
         """Compile all that a driving robot calls."""
-        await compiled(warm_up)
+        await compiled(DRIVING)
 
     def see(self, state: RobotState) -> None:
         """Take note of each state."""
