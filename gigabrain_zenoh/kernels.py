@@ -1,21 +1,20 @@
 """Functions compiled by numba, and where what was compiled is kept."""
 
 import hashlib
-import importlib
 import os
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
-import llvmlite.binding
-import numba
+from gigabrain_zenoh import numba_alone
 
 F = TypeVar("F", bound=Callable[..., object])
 
+numba = numba_alone.load()
 PACKAGE = Path(__file__).parent
 HOLDERS = ("mapping", "navigation", "obstacles", "bench")  # packages with kernels
 MAPPING = "gigabrain_zenoh.mapping.warm:warm_up"  # call all that is compiled for a process once
+FINDING = "gigabrain_zenoh.mapping.warm:warm_up_finding"
 DRIVING = "gigabrain_zenoh.navigating:warm_up"
 
 
@@ -49,8 +48,10 @@ def mark_of(warm_up: str) -> Path | None:
 
     None where nothing can be kept.
     """
+    from llvmlite.binding import get_host_cpu_name
+
     folder = Path(os.environ.get("NUMBA_CACHE_DIR", os.devnull))
-    machine = f"{numba.__version__}-{llvmlite.binding.get_host_cpu_name()}"
+    machine = f"{numba.__version__}-{get_host_cpu_name()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -66,23 +67,6 @@ def _digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def _leave_blas_out() -> None:
-    """Numba looks for scipy's, whose import takes as long as loading all our kernels.
-
-    None of them does linear algebra.
-    """
-    name = "scipy.linalg"
-    if name in sys.modules:
-        return
-    modules: dict[str, Any] = sys.modules
-    modules[name] = None  # as if it were not installed
-    try:
-        importlib.import_module("numba.np.arraymath")
-    finally:
-        del modules[name]
-
-
 if folder := cache_folder():
     os.environ.setdefault("NUMBA_CACHE_DIR", str(folder))
     numba.core.config.reload_config()
-_leave_blas_out()

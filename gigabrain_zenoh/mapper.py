@@ -21,7 +21,6 @@ from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.fusion import Fusion, Moment, uncertainty
-from gigabrain_zenoh.mapping.growing import GrowingMap
 from gigabrain_zenoh.mapping.known import Chart, KnownMap
 from gigabrain_zenoh.mapping.localizer import Place, View
 from gigabrain_zenoh.mapping.points import Scan
@@ -46,6 +45,8 @@ def chart_of(config: PerceptionConfig) -> Chart:
         if path is None:
             raise ConfigError("perception: map: expected a saved map, as mapping is 'localize'")
         return KnownMap(map_file.load(path))
+    from gigabrain_zenoh.mapping.growing import GrowingMap  # and gtsam: only who makes maps pays
+
     return GrowingMap.thaw(map_file.load_graph(path)) if path else GrowingMap()
 
 

@@ -1,6 +1,7 @@
 """Compiling beforehand, in a process of its own."""
 
 import os
+import subprocess
 import sys
 import types
 from pathlib import Path
@@ -70,6 +71,37 @@ def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) 
     assert mark.exists()
 
 
-@pytest.mark.parametrize("warm_up", [kernels.MAPPING, kernels.DRIVING])
+@pytest.mark.parametrize("warm_up", [kernels.MAPPING, kernels.FINDING, kernels.DRIVING])
 def test_what_is_to_be_called_is_there(warm_up: str) -> None:
     assert isinstance(find(warm_up), types.FunctionType)
+
+
+ALONE = """
+import sys
+from gigabrain_zenoh import kernels
+@kernels.kernel
+def double(x):
+    return 2 * x
+double(21)
+print(*(name for name in ("coverage", "cffi", "scipy.linalg") if name in sys.modules))
+import cffi
+"""
+
+
+def test_numba_imports_nothing_that_we_do_not_use_and_hides_nothing_for_good() -> None:
+    done = subprocess.run((sys.executable, "-c", ALONE), capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
+
+
+FINDING = """
+import sys
+import gigabrain_zenoh.mapper
+from gigabrain_zenoh.mapping.warm import warm_up_finding
+warm_up_finding()
+print("gtsam" in sys.modules)
+"""
+
+
+def test_who_finds_its_way_in_a_saved_map_does_not_pay_for_making_one() -> None:
+    done = subprocess.run((sys.executable, "-c", FINDING), capture_output=True, text=True)
+    assert done.stdout == "False\n", done.stderr
