@@ -1,7 +1,7 @@
 """Numba without what it looks for and we do not use.
 
 Where these packages happen to be installed, their import takes as long as loading all our kernels:
-scipy's BLAS, coverage's measuring of compiled functions, calls of C through cffi.
+scipy's BLAS, and coverage's measuring of compiled functions.
 """
 
 import importlib
@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-UNUSED = ("scipy.linalg", "coverage", "cffi")
+UNUSED = ("scipy.linalg", "coverage")
 PARTS = ("numba", "numba.np.arraymath")  # the second looks for BLAS, at the first call otherwise
 
 
