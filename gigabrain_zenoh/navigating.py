@@ -3,6 +3,7 @@
 import asyncio
 import logging
 from collections import deque
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import numpy as np
 
@@ -66,7 +67,8 @@ class Navigating:
         self._service = TaskService(bus, self, folder=config.state_dir, scripts=config.scripts)
         self._guide = Guide(config.unknown)
         self._route: Route | None = None
-        self._thinking: asyncio.Future[Route] | None = None
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="routes")
+        self._thinking: Future[Route] | None = None
         self._thought: tuple[int, OccupancyGrid] | None = None  # when, and about which map
         self._outcome: Outcome | None = None
         self._driven: Driven | None = None
@@ -132,6 +134,7 @@ class Navigating:
     async def close(self) -> None:
         """Once all is written down."""
         await self._service.close()
+        self._beside.shutdown(cancel_futures=True)
 
     async def can_drive(self) -> None:
         """Raises Refused where nobody says where the robot is, with what to change."""
@@ -190,7 +193,7 @@ class Navigating:
         body: BodyDescription,
     ) -> None:
         """Have a route thought of where one is due; a finished one counts from now on."""
-        if self._thinking and self._thinking.done():
+        if self._thinking and self._bus.journal.in_time(self._thinking, 0.0):
             self._route, self._thinking = self._thinking.result(), None
         grid = self._grid(state.boot, world.basis)
         if order is None or grid is None or self._here is None or self._thinking:
@@ -211,7 +214,7 @@ class Navigating:
         if grid.width * grid.height <= SMALL:
             self._route = self._guide.think(asked)
         else:
-            self._thinking = asyncio.ensure_future(asyncio.to_thread(self._guide.think, asked))
+            self._thinking = self._beside.submit(self._guide.think, asked)
 
     def _due(self, order: Order, tick: int, grid: OccupancyGrid) -> bool:
         """Whether a new route is wanted."""

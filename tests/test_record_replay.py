@@ -19,7 +19,8 @@ from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.drives import DRIVES, file_of
 from gigabrain_zenoh.recording.fields import message_of
-from gigabrain_zenoh.recording.process_replay import SAYS, placed, replay_process, settings_for
+from gigabrain_zenoh.recording.placing import placed
+from gigabrain_zenoh.recording.process_replay import SAYS, replay_process, settings_for
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.recorder import Recorder
 from gigabrain_zenoh.replay import ASKED, Event, record, replay
