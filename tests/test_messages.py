@@ -53,7 +53,7 @@ REQUIRED: dict[str, set[str]] = {
     "TaskRequest": {"do"},
     "TaskReply": {"ok", "text"},
     "Granted": {"service", "request"},
-    "Heard": {"began_ns"},
+    "Heard": {"began_ns", "keys", "taken"},
     "TaskStatus": set(),
     "ParamRequest": set(),
     "ParamReply": {"ok", "text"},
@@ -153,7 +153,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in golden.FOLDER.iterdir()}
     assert stored == golden.files()
-    assert len(stored) == 74
+    assert len(stored) == 76
 
 
 @by_name

@@ -75,7 +75,7 @@ class Outcome(Struct, frozen=True, kw_only=True):
     only_then: int  # recorded, and not said now
     only_now: int
     difference: Difference | None
-    begun_late: bool  # the process had spoken before the recording began
+    begun_late: bool = False  # the process had spoken before the recording began
     real_time: bool = False  # not in lock-step, and nobody has said in which order it heard
     lost: int = 0  # messages that it went by, and the recording does not hold
 
@@ -93,6 +93,7 @@ class Past(Struct, frozen=True, kw_only=True):
     said: dict[Word, Message]
     exact: bool  # the process itself has said what it heard, and in which order
     lost: int = 0  # of that, what the recording does not hold
+    begun_late: bool  # it had spoken before
 
 
 def load(path: Path, process: str) -> Past:
@@ -108,12 +109,19 @@ def load(path: Path, process: str) -> Past:
             heard.append(sample)
     if not said:
         raise ConfigError(f"{path} holds nothing that {process} has said")
-    if own := hearing(heard, process):
-        began_ns, until_ns = own.began_ns, own.until_ns
-        said = [one for one in said if began_ns <= one[1].stamp_ns <= until_ns]
-        return Past(heard=own.events, said=_words(said), exact=True, lost=own.lost)
-    events = [(one.log_ns - heard[0].log_ns, one.key, one.payload) for one in heard]
-    return Past(heard=placed(events), said=_words(said), exact=False)
+    own = hearing(heard, process)
+    if own:
+        said = [one for one in said if own.began_ns <= one[1].stamp_ns <= own.until_ns]
+        events = own.events
+    else:
+        events = placed([(e.log_ns - heard[0].log_ns, e.key, e.payload) for e in heard])
+    return Past(
+        heard=events,
+        said=_words(said),
+        exact=own is not None,
+        lost=own.lost if own else 0,
+        begun_late=not said or said[0][1].seq > 1,
+    )
 
 
 def _words(said: Iterable[tuple[str, Message]]) -> dict[Word, Message]:
@@ -136,7 +144,6 @@ def compare(then: Mapping[Word, Message], now: Mapping[Word, Message]) -> Outcom
         only_then=len(then) - len(both),
         only_now=len(now.keys() - then.keys()),
         difference=next((each for each in found if each), None),
-        begun_late=next(iter(then.values())).seq > 1,
     )
 
 
@@ -165,7 +172,9 @@ async def replay_process(path: Path, process: str, settings: dict[str, Any]) -> 
     sent = await replay(node, past.heard)
     now = _words((key, kinds[key](data)) for key, data in sent if key in kinds)
     unsure = not past.exact and notes(path).get("speed", "1") == "1"
-    return msgspec.structs.replace(compare(past.said, now), real_time=unsure, lost=past.lost)
+    return msgspec.structs.replace(
+        compare(past.said, now), real_time=unsure, lost=past.lost, begun_late=past.begun_late
+    )
 
 
 def notes(path: Path) -> Mapping[str, str]:
@@ -221,7 +230,7 @@ def in_words(path: Path, process: str, outcome: Outcome) -> Iterator[str]:
         yield f"{path}: {process} does what it did: {said}"
     if not outcome.same and outcome.real_time:
         yield "it was recorded in real time: two messages within a tick may have changed places"
-    if outcome.lost:
+    if outcome.lost and not outcome.same:
         yield f"{outcome.lost} messages that it went by are not in the recording"
     if not outcome.same and outcome.begun_late:
         yield "the recording begins in the middle of a run, whose earlier part may be the reason"

@@ -27,8 +27,8 @@ class Heard(Message, frozen=True, kw_only=True):
     """
 
     began_ns: Count  # Unix time of the first entry, by the process's own clock
-    keys: Annotated[tuple[Key, ...], Meta(max_length=MOST)] = ()
-    taken: Annotated[tuple[Taken, ...], Meta(max_length=MOST)] = ()
+    keys: Annotated[tuple[Key, ...], Meta(max_length=MOST)]
+    taken: Annotated[tuple[Taken, ...], Meta(max_length=MOST)]
 
     def __post_init__(self) -> None:
         if any(one.key >= len(self.keys) for one in self.taken):
