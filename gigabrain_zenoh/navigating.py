@@ -71,7 +71,7 @@ class Navigating:
         self._service = TaskService(bus, self, folder=config.state_dir, scripts=config.scripts)
         self._guide = Guide(config.unknown)
         self._route: Route | None = None
-        self._beside = Background(PATIENCE_S)
+        self._beside = Background(PATIENCE_S, bus.journal.in_time)
         self._thought: tuple[int, OccupancyGrid] | None = None  # when, and about which map
         self._outcome: Outcome | None = None
         self._driven: Driven | None = None

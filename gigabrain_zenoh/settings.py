@@ -103,6 +103,7 @@ class PageConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     certificate_key: str = ""
     login: bool = False  # want a token on loopback as well
     tokens: str = ""  # the file that keeps them; one in the user's state folder without
+    tell_tokens: bool = False  # print them when they are made, for a person at a terminal
 
 
 class FoxgloveConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
