@@ -11,7 +11,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from gigabrain_zenoh.bench.slam import Drive, SlamResult
-    from gigabrain_zenoh.bench.slam_logs import Errors, Log
+    from gigabrain_zenoh.bench.slam_logs import Log
+
+WIDE = 140  # columns of what is not printed on a terminal
 
 
 def slam(
@@ -61,16 +63,21 @@ def slam(
 
     from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.slam import judged, total
-    from gigabrain_zenoh.bench.slam_logs import load
+    from gigabrain_zenoh.bench.slam_logs import load, relations
     from gigabrain_zenoh.bench.slam_picture import draw
 
     results.check_place(json)
-    drives = _driven([load(path) for path in log])
+    logs = [load(path) for path in log]
+    for one in logs:
+        relations(one)  # or it says at once what is wrong
+    drives = _driven(logs)
     result = total([judged(one, driven) for one, driven in drives])
     if png:
         draw(drives, png)
     results.write(result, json)
-    Console().print(_table(result))
+    console = Console()
+    console = console if console.is_terminal else Console(width=WIDE)
+    console.print(_table(result))
     return 0
 
 
@@ -98,30 +105,26 @@ def _table(result: "SlamResult") -> "Table":
     from rich.table import Table
 
     table = Table(
-        title="Errors of relations: mean ± standard deviation",
+        title="Errors of relations, mean ± standard deviation",
         caption=f"graph, mean of the logs {result.mean_m:.3f} m; memory at most "
         f"{result.peak_mb:.0f} MB. Times are of the CPU.",
     )
-    table.add_column("")
+    for title in ("log", "scans", "beams", "odometry", "front end", "graph"):
+        table.add_column(title, justify="left" if title == "log" else "right")
+    for title in ("loops", "not matched", "breaks", "scan p50, p99", "loop p99, max"):
+        table.add_column(title, justify="right")
     for one in result.logs:
-        table.add_column(one.log, justify="right")
-    rows = {
-        "scans, of so many beams": [f"{one.scans}, {one.beams}" for one in result.logs],
-        "keyframes": [str(one.keyframes) for one in result.logs],
-        "odometry": [_errors(one.odometry) for one in result.logs],
-        "front end": [_errors(one.front_end) for one in result.logs],
-        "graph": [_errors(one.graph) for one in result.logs],
-        "loops closed": [str(one.loops) for one in result.logs],
-        "scans that ICP could not match": [str(one.unmatched) for one in result.logs],
-        "breaks in the sequence": [str(one.breaks) for one in result.logs],
-        "scan p50, p99 [ms]": [f"{o.scan.p50_ms:.1f}, {o.scan.p99_ms:.1f}" for o in result.logs],
-        "loops p50, p99 [ms]": [f"{o.loop.p50_ms:.1f}, {o.loop.p99_ms:.1f}" for o in result.logs],
-        "loops max [ms]": [f"{one.loop_max_ms:.1f}" for one in result.logs],
-    }
-    for title, cells in rows.items():
-        table.add_row(title.replace("[", "\\["), *cells)
+        table.add_row(
+            one.log,
+            str(one.scans),
+            str(one.beams),
+            f"{one.odometry.mean_m:.2f} m",
+            f"{one.front_end.mean_m:.2f} m",
+            f"{one.graph.mean_m:.3f} ± {one.graph.std_m:.3f} m, {one.graph.mean_deg:.2f}°",
+            str(one.loops),
+            str(one.unmatched),
+            str(one.breaks),
+            f"{one.scan.p50_ms:.1f}, {one.scan.p99_ms:.1f} ms",
+            f"{one.loop.p99_ms:.1f}, {one.loop_max_ms:.1f} ms",
+        )
     return table
-
-
-def _errors(errors: "Errors") -> str:
-    return f"{errors.mean_m:.3f} ± {errors.std_m:.3f} m, {errors.mean_deg:.2f}°"

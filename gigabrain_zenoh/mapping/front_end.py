@@ -36,6 +36,7 @@ SCORE = 0.35  # a search below it has failed
 LEAST_SCORE = 0.2  # of a search that ICP may begin from
 SURE_SCORE, SURE_INLIERS = 0.55, 0.6  # what it takes to believe a wide search
 WIDE = Window(1.0, 0.6)  # where to look when the scan does not fit where it should
+WIDELY = 45  # points of a scan are enough for that, as ICP and what is seen have to agree
 CLEAR = 0.85  # score, from here on nothing is doubted
 WRONG = 0.2  # share of what should be in view that is looked through: not the place
 CLEARER = 0.1  # so much less of it
@@ -173,7 +174,8 @@ class FrontEnd:
         It has to fit better than `least`, and contradict less than `wrong`, if that is known.
         """
         least = max(least, SURE_SCORE)
-        places = [search(local.image, scan.points, at, WIDE, least) for at in (guess, self.pose)]
+        points = thinned(scan.points, WIDELY)
+        places = [search(local.image, points, at, WIDE, least) for at in (guess, self.pose)]
         found = max(places, key=lambda place: place.score)
         if found.score < least:
             return None
