@@ -15,6 +15,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.freshness import CLOCK_KEYS, Latest, RobotTime
+from gigabrain_zenoh.journal import Journal
 from gigabrain_zenoh.params import Params
 from gigabrain_zenoh.rejections import Rejections
 from gigabrain_zenoh.transport import Close, OnLink, OnRaw, OnSample, Transport
@@ -43,6 +44,7 @@ class Bus:
         self.counters: Counter[str] = Counter()  # what a node counts of its own, for its health
         self.latency_ms: dict[str, float] = {}  # what a node measures, for its health
         self.report: Callable[[], Mapping[str, float | int | str | None]] = dict
+        self.journal = Journal()  # of what the node goes by
         self.params = Params()  # what may be changed while the process runs
         # changes for as long as work gets done: the loop's turns, where a node knows nothing better
         self.progress: Callable[[], int] = itertools.count().__next__
@@ -107,6 +109,7 @@ class Bus:
             self._rejections.accept(pattern)
             if moves_time:
                 self.time.see(message)
+            self.journal.note(key, message.seq)
             on_message(key, message)
             return True
 

@@ -1,19 +1,82 @@
-"""Compiling what a driving robot calls, before it drives."""
+"""Compiling what a driving robot calls, before it drives.
+
+In a process of its own, where it can be kept: a compiler leaves some 200 MB behind that are of no
+more use.
+"""
 
 import asyncio
+import contextlib
 import logging
-from collections.abc import Callable
+import os
+import sys
+from collections.abc import Awaitable
+
+from gigabrain_zenoh import lifeline
+from gigabrain_zenoh.process import find
 
 log = logging.getLogger(__name__)
 
 QUIET_S = 5.0  # of compiling, before people are told
 
 
-async def compiled(warm_up: Callable[[], None]) -> None:
-    """Have `warm_up` call all that is to be compiled, beside the loop, and say so if that lasts."""
-    compiling = asyncio.ensure_future(asyncio.to_thread(warm_up))
-    done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
-    if not done:
-        told = {"event": "compiling"}
-        log.info("compiling: the first start takes about a minute", extra={"data": told})
-    await compiling
+async def compiled(warm_up: str) -> None:
+    """Have the function at "module:name" call all that is to be compiled, beside the loop.
+
+    Says so if that lasts.
+    """
+    from gigabrain_zenoh.kernels import mark_of  # numba: only who drives by kernels pays
+
+    mark = mark_of(warm_up)
+    if mark and not mark.exists():
+        await _told(_in_child(warm_up))
+    await _told(asyncio.to_thread(find(warm_up)))
+
+
+async def _told(work: Awaitable[None]) -> None:
+    compiling = asyncio.ensure_future(work)
+    try:
+        done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
+        if not done:
+            said = {"event": "compiling"}
+            log.info("compiling: the first start takes about a minute", extra={"data": said})
+        await compiling
+    finally:
+        compiling.cancel()
+
+
+async def _in_child(warm_up: str) -> None:
+    """Whatever it cannot do is done here afterwards."""
+    paths = os.pathsep.join(path for path in sys.path if path)
+    child = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-m",
+        __name__,
+        warm_up,
+        str(os.getpid()),
+        env={**os.environ, "PYTHONPATH": paths},
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.DEVNULL,
+    )
+    try:
+        await child.wait()
+    finally:
+        if child.returncode is None:
+            child.kill()
+            await child.wait()
+
+
+def compile_all(warm_up: str) -> None:
+    """Compile here, and mark it as done where it is kept. Raises ModuleNotFoundError."""
+    from gigabrain_zenoh.kernels import mark_of
+
+    find(warm_up)()
+    mark = mark_of(warm_up)
+    if mark:
+        with contextlib.suppress(OSError):  # a folder that can be read only: as if nothing was kept
+            mark.touch()
+
+
+if __name__ == "__main__":
+    lifeline.die_with_parent(int(sys.argv[2]))
+    compile_all(sys.argv[1])

@@ -27,6 +27,7 @@ from gigabrain_zenoh.supervisor import Supervisor
 from gigabrain_zenoh.watch import Watch
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
+SYSTEMS = ("perception", "decision", "control")
 LOOK_S = 0.1  # how often the run is looked at
 RELEASE_FIRST = (
     "a real body drives only when somebody has released and enabled it: while the demo runs, in "
@@ -62,6 +63,7 @@ class Demo:
         self._supervisor = Supervisor(specs, self._record)
         self._decisions: list[tuple[float, str]] = []
         self._failures: list[str] = []
+        self._compiling: set[str] = set()  # processes that have said so
         self._refusal = ""  # what a process said before it ended
         self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
         self._last_fault = ""  # before all were asked to end, the driver's first
@@ -122,6 +124,15 @@ class Demo:
         statuses = self._supervisor.statuses.values()
         return any(status.state in ("waiting", "starting") for status in statuses)
 
+    def _starting_up(self) -> str:
+        """Which of the three systems is not there yet, and why that takes long; or nothing."""
+        statuses = self._supervisor.statuses
+        late = [one for one in SYSTEMS if one in statuses and statuses[one].state == "starting"]
+        if not late:
+            return ""
+        why = ", compiling, once per installation" if self._compiling & set(late) else ""
+        return f"{' and '.join(late)} {'is' if len(late) == 1 else 'are'} getting ready{why}"
+
     def _over(self, watch: Watch) -> bool:
         seconds = self._options.seconds
         return seconds is not None and watch.seconds >= seconds - 1e-6
@@ -129,9 +140,11 @@ class Demo:
     def _view(self, watch: Watch) -> View:
         seconds, page = self._options.seconds, self._options.page
         if self._options.headless or not sys.stdout.isatty():
-            return HeadlessView(watch, seconds, page)
+            return HeadlessView(watch, seconds, page, self._starting_up)
         faults = self._faults
-        return LiveView(watch, self._supervisor, self._deployment, faults, seconds, page)
+        return LiveView(
+            watch, self._supervisor, self._deployment, faults, seconds, page, self._starting_up
+        )
 
     async def _ask_for_truth(self, watch: Watch, within_s: float) -> Report | None:
         statuses = self._supervisor.statuses
@@ -150,6 +163,8 @@ class Demo:
             decisions=tuple(self._decisions),
             deaths=self._supervisor.deaths,
             restarts=sum(status.restarts for status in statuses.values()),
+            mapped_m2=watch.mapped_m2,
+            tasks=watch.task.current,
             rejected=sum(int(report.get("rejected_messages") or 0) for report in answers.values()),
         )
         told_of_all = {key: value for report in answers.values() for key, value in report.items()}
@@ -163,6 +178,8 @@ class Demo:
             if self._decisions and self._decisions[-1][0] == decided[0]:
                 self._decisions.pop()  # the last word of a tick counts
             self._decisions.append(decided)
+        if event == "compiling":
+            self._compiling.add(str(record["process"]))
         if event == "failed":
             self._refusal = str(record.get("text", ""))
         if event in ("given up", "died"):

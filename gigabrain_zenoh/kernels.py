@@ -6,12 +6,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar, cast
 
-import numba
+from gigabrain_zenoh import numba_alone
 
 F = TypeVar("F", bound=Callable[..., object])
 
+numba = numba_alone.load()
 PACKAGE = Path(__file__).parent
 HOLDERS = ("mapping", "navigation", "obstacles", "bench")  # packages with kernels
+MAPPING = "gigabrain_zenoh.mapping.warm:warm_up"  # call all that is compiled for a process once
+FINDING = "gigabrain_zenoh.mapping.warm:warm_up_finding"
+DRIVING = "gigabrain_zenoh.navigating:warm_up"
 
 
 def kernel(function: F) -> F:
@@ -32,15 +36,35 @@ def cache_folder() -> Path | None:
 
     Numba notices a change in a kernel's own file and none in those that it calls.
     """
-    digest = hashlib.sha256()
-    for holder in HOLDERS:
-        for source in sorted((PACKAGE / holder).glob("*.py")):
-            digest.update(source.read_bytes())
     try:
         root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
         return None
-    return Path(root) / "gigabrain" / f"kernels-{digest.hexdigest()[:16]}"
+    return Path(root) / "gigabrain" / f"kernels-{_digest()}"
+
+
+def mark_of(warm_up: str) -> Path | None:
+    """The file that says that all of `warm_up` is kept, for this processor.
+
+    None where nothing can be kept.
+    """
+    from llvmlite.binding import get_host_cpu_name
+
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR", os.devnull))
+    machine = f"{numba.__version__}-{get_host_cpu_name()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return folder / f"{warm_up.replace(':', '.')}-{_digest()}-{machine}"
+
+
+def _digest() -> str:
+    digest = hashlib.sha256()
+    for holder in HOLDERS:
+        for source in sorted((PACKAGE / holder).glob("*.py")):
+            digest.update(source.read_bytes())
+    return digest.hexdigest()[:16]
 
 
 if folder := cache_folder():

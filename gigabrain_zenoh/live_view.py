@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Literal, Protocol, Self
 
@@ -21,6 +21,9 @@ FRAMES_HZ = 4
 FAULT_S = 30.0  # how long a fault stays on the page
 LINE_S = 10.0  # of the robot's time between two lines without a terminal
 GATE_COLOURS = {"enabled": "green", "idle": "yellow", "stopping": "yellow", "latched": "red"}
+
+
+Starting = Callable[[], str]  # who is not ready yet, in words; an empty text where all are
 
 
 class View(Protocol):
@@ -42,8 +45,14 @@ class View(Protocol):
 class HeadlessView:
     """A progress line on stderr: redrawn in place on a terminal, every ten seconds elsewhere."""
 
-    def __init__(self, watch: Watch, seconds: float | None, page: str = "") -> None:
-        self._watch, self._seconds, self._page = watch, seconds, page
+    def __init__(
+        self,
+        watch: Watch,
+        seconds: float | None,
+        page: str = "",
+        starting: Starting = str,
+    ) -> None:
+        self._watch, self._seconds, self._page, self._starting = watch, seconds, page, starting
         self._next = LINE_S
         self._in_place = sys.stderr.isatty()
 
@@ -64,7 +73,8 @@ class HeadlessView:
             return
         self._next = watch.seconds + LINE_S
         of = f"/{self._seconds:.0f}" if self._seconds else ""
-        line = f"{watch.seconds:6.1f}{of} s  {watch.distance_m:6.2f} m  {doing(watch)}"
+        does = doing(watch, self._starting())
+        line = f"{watch.seconds:6.1f}{of} s  {watch.distance_m:6.2f} m  {does}"
         if self._in_place:
             print(f"\r{line[:100]:<100}", end="", file=sys.stderr, flush=True)
         else:
@@ -82,7 +92,9 @@ class LiveView:
         faults: Sequence[tuple[float, str]],
         seconds: float | None,
         page: str = "",
+        starting: Starting = str,
     ) -> None:
+        self._starting = starting
         self._subtitle = f"{page} · Ctrl-C ends it" if page else "Ctrl-C ends it"
         self._watch, self._supervisor, self._deployment = watch, supervisor, deployment
         self._faults, self._seconds = faults, seconds
@@ -112,7 +124,7 @@ class LiveView:
         gate = watch.state.newest.gate.mode if watch.state.newest else "idle"
         headline = "bold cyan" if gate == "enabled" else f"bold {GATE_COLOURS[gate]}"
         parts: list[Text | Table] = [
-            _line(doing(watch), headline, "center"),
+            _line(doing(watch, self._starting()), headline, "center"),
             Text(),
             self._figures(),
             Text(),
@@ -173,14 +185,16 @@ def _line(text: str, style: str, justify: Literal["left", "center"] = "left") ->
     return Text(text, style=style, justify=justify, no_wrap=True, overflow="ellipsis")
 
 
-def doing(watch: Watch) -> str:
-    """What the robot is doing, in words."""
+def doing(watch: Watch, starting: str = "") -> str:
+    """What the robot is doing, in words; `starting` says who is not there yet."""
     state, intent = watch.state.fresh(), watch.intent.fresh()
     if state is None:
-        return "starting" if watch.state.newest is None else "the driver is silent"
+        return starting or "starting" if watch.state.newest is None else "the driver is silent"
     gate = state.gate
     if gate.mode == "enabled" and gate.commander != "control":
         return f"{gate.commander} drives"
+    if gate.mode != "enabled" and starting:
+        return starting
     if gate.mode != "enabled" and gate.causes:
         return f"{gate.mode}: {in_words(gate.causes)}"
     if gate.mode != "enabled":

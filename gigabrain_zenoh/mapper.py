@@ -19,9 +19,10 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.journal import done
 from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping.background import InTime
 from gigabrain_zenoh.mapping.fusion import Fusion, Moment, uncertainty
-from gigabrain_zenoh.mapping.growing import GrowingMap
 from gigabrain_zenoh.mapping.known import Chart, KnownMap
 from gigabrain_zenoh.mapping.localizer import Place, View
 from gigabrain_zenoh.mapping.points import Scan
@@ -39,14 +40,18 @@ SETTLE_NS, SETTLES = 20_000_000, 100  # a save waits for the work beside, and ho
 TIMED = 1000  # scans whose time is kept
 
 
-def chart_of(config: PerceptionConfig) -> Chart:
+def chart_of(config: PerceptionConfig, in_time: InTime = done) -> Chart:
     """The map that the settings ask for. Raises ConfigError."""
     path = map_file.path_of(config.map) if config.map else None
     if config.mapping == "localize":
         if path is None:
             raise ConfigError("perception: map: expected a saved map, as mapping is 'localize'")
-        return KnownMap(map_file.load(path))
-    return GrowingMap.thaw(map_file.load_graph(path)) if path else GrowingMap()
+        return KnownMap(map_file.load(path), in_time=in_time)
+    from gigabrain_zenoh.mapping.growing import GrowingMap  # and gtsam: only who makes maps pays
+
+    if path:
+        return GrowingMap.thaw(map_file.load_graph(path), in_time=in_time)
+    return GrowingMap(in_time=in_time)
 
 
 def view_of(lidar: Lidar, scan: LaserScan, ignore_below: float) -> View:
@@ -66,7 +71,7 @@ class Mapper:
 
     def __init__(self, config: PerceptionConfig, bus: Bus, bodies: Latest[Body]) -> None:
         self._config, self._bus, self._bodies = config, bus, bodies
-        self._chart = chart_of(config)
+        self._chart = chart_of(config, bus.journal.in_time)
         self._fusion, self._boot = Fusion(), 0
         self._last: Moment | None = None  # of the last scan that was taken
         self._blank = not config.map  # nothing is in the map yet

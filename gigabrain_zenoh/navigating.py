@@ -21,7 +21,9 @@ from gigabrain_zenoh.compiling import compiled
 from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate_state import BRAIN
+from gigabrain_zenoh.kernels import DRIVING
 from gigabrain_zenoh.lateness import Lateness
+from gigabrain_zenoh.mapping.background import Background, Take
 from gigabrain_zenoh.navigation import local, planner
 from gigabrain_zenoh.navigation.moment import Sent
 from gigabrain_zenoh.planar import compose, inverse
@@ -36,7 +38,10 @@ log = logging.getLogger(__name__)
 
 POSE_NS = 1_000_000_000  # so old may be what was last heard of the place
 SENT_TICKS = 25  # commands of the last half second are planned with
-SMALL = 250_000  # cells; plans in larger maps are made in a thread
+SMALL = 60_000  # cells; plans in larger maps are made in a thread,
+LARGE = 250_000  # and for each so many cells it may take a scan more than
+DUE_SCANS = 2
+PATIENCE_S = 0.05  # how long a scan waits for a plan that is due: control waits for no more
 AGAIN_TICKS = 25  # a route is looked at twice a second, whatever happens
 NO_MAP = "nobody says where in a map the robot is; set perception: {mapping: slam} in its file"
 PATIENCE_NS, LOOK_NS = 700_000_000, 50_000_000  # for the first word of the place, when asked
@@ -66,7 +71,7 @@ class Navigating:
         self._service = TaskService(bus, self, folder=config.state_dir, scripts=config.scripts)
         self._guide = Guide(config.unknown)
         self._route: Route | None = None
-        self._thinking: asyncio.Future[Route] | None = None
+        self._beside = Background(PATIENCE_S, bus.journal.in_time)
         self._thought: tuple[int, OccupancyGrid] | None = None  # when, and about which map
         self._outcome: Outcome | None = None
         self._driven: Driven | None = None
@@ -75,7 +80,7 @@ class Navigating:
 
     async def warm_up(self) -> None:
         """Compile all that a driving robot calls."""
-        await compiled(warm_up)
+        await compiled(DRIVING)
 
     def see(self, state: RobotState) -> None:
         """Take note of each state."""
@@ -101,6 +106,7 @@ class Navigating:
         self._outcome = None
         if world:
             self._lateness.thinks(state.tick, tick)
+            self._beside.at_scan()
         pose, place = self._history.at(state.boot, tick), self._place(state.boot, tick)
         body = self._bodies.current
         map_from_odom, lost = place if pose else (None, "the odometry of the scan is missing")
@@ -132,6 +138,7 @@ class Navigating:
     async def close(self) -> None:
         """Once all is written down."""
         await self._service.close()
+        self._beside.close()
 
     async def can_drive(self) -> None:
         """Raises Refused where nobody says where the robot is, with what to change."""
@@ -189,11 +196,9 @@ class Navigating:
         order: Order | None,
         body: BodyDescription,
     ) -> None:
-        """Have a route thought of where one is due; a finished one counts from now on."""
-        if self._thinking and self._thinking.done():
-            self._route, self._thinking = self._thinking.result(), None
+        """Have a route thought of where one is due."""
         grid = self._grid(state.boot, world.basis)
-        if order is None or grid is None or self._here is None or self._thinking:
+        if order is None or grid is None or self._here is None or not self._beside.idle:
             return
         if not self._due(order, world.basis, grid):
             return
@@ -208,10 +213,20 @@ class Navigating:
             driven=driven,
             seen=moved(self._here, hits(world).astype(np.float64)),
         )
-        if grid.width * grid.height <= SMALL:
+        cells = grid.width * grid.height
+        if cells <= SMALL:
             self._route = self._guide.think(asked)
         else:
-            self._thinking = asyncio.ensure_future(asyncio.to_thread(self._guide.think, asked))
+            self._beside.start(lambda: self._thought_of(asked), DUE_SCANS + cells // LARGE)
+
+    def _thought_of(self, asked: Asked) -> Take:
+        """In a thread of its own: the route, and what makes it count."""
+        route = self._guide.think(asked)
+
+        def take() -> None:
+            self._route = route
+
+        return take
 
     def _due(self, order: Order, tick: int, grid: OccupancyGrid) -> bool:
         """Whether a new route is wanted."""

@@ -161,10 +161,10 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         ready()
         await bus.failed
         return
-    from gigabrain_zenoh.mapper import Mapper  # numba and gtsam: only who makes maps pays
-    from gigabrain_zenoh.mapping.warm import warm_up
+    from gigabrain_zenoh.kernels import FINDING, MAPPING  # numba: only who has a map pays
+    from gigabrain_zenoh.mapper import Mapper
 
-    await compiled(warm_up)
+    await compiled(MAPPING if config.mapping == "slam" else FINDING)
     with closing(Mapper(config, bus, body)) as mapper:
         _follow(config, bus, body, mapper)
         ready()

@@ -18,13 +18,14 @@ from typing import Any
 
 import msgspec
 
-from gigabrain_schemas.topics import LOG
+from gigabrain_schemas.topics import HEARD, LOG
 from gigabrain_zenoh import lifeline, logs
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, unknown
 from gigabrain_zenoh.health import answer_to_name, publish_health
 from gigabrain_zenoh.heartbeat import beat
+from gigabrain_zenoh.journal import SaidJournal
 from gigabrain_zenoh.meeting import join
 from gigabrain_zenoh.param_service import serve_params
 from gigabrain_zenoh.process_config import ProcessConfig
@@ -48,6 +49,7 @@ class Program:
 
     run: str
     settings: str = ""
+    repeats: bool = False  # it can be replayed, and says what it goes by
     looks_on: bool = False  # the robot does without it: it naps, and lets the others go first
 
 
@@ -60,11 +62,13 @@ PROGRAMS = {
     ),
     "button": Program("gigabrain_drivers.button:run", "gigabrain_zenoh.settings:ButtonConfig"),
     "perception": Program(
-        "gigabrain_zenoh.perception:run", "gigabrain_zenoh.settings:PerceptionConfig"
+        "gigabrain_zenoh.perception:run", "gigabrain_zenoh.settings:PerceptionConfig", repeats=True
     ),
-    "decision": Program("gigabrain_zenoh.decision:run", "gigabrain_zenoh.settings:DecisionConfig"),
-    "control": Program("gigabrain_zenoh.control:run"),
-    "safety": Program("gigabrain_zenoh.safety:run"),
+    "decision": Program(
+        "gigabrain_zenoh.decision:run", "gigabrain_zenoh.settings:DecisionConfig", repeats=True
+    ),
+    "control": Program("gigabrain_zenoh.control:run", repeats=True),
+    "safety": Program("gigabrain_zenoh.safety:run", repeats=True),
     "recorder": Program(
         "gigabrain_zenoh.recording.node:run",
         "gigabrain_zenoh.settings:RecorderConfig",
@@ -154,6 +158,9 @@ async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
     bus = make_bus(await join(endpoint), Clock(), config.name)
     handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
     logging.getLogger().addHandler(handler)
+    if PROGRAMS[config.name].repeats:
+        say = functools.partial(bus.publish, HEARD, name=config.name)
+        bus.journal = SaidJournal(say, bus.clock.unix_ns)
     try:
         await answer_to_name(bus)
         serve_params(bus)
@@ -166,6 +173,7 @@ async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
         raise group.exceptions[0] from None
     finally:
         logging.getLogger().removeHandler(handler)
+        bus.journal.flush()
         await bus.close()
 
 

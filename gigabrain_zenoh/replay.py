@@ -2,17 +2,21 @@
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Sequence
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
+from gigabrain_schemas.heard import WAITED
 from gigabrain_schemas.topics import SERVICES
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.journal import PastJournal
 from gigabrain_zenoh.transport import Answer, LocalNetwork
 
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 Event = tuple[int, str, bytes]  # time since the start [ns], key, payload
 ASKED = {service.key for service in SERVICES}
+UNDONE = b"\0"  # of a wait: the work was not done in time
 PATIENCE_S = 30.0  # for an answer, which may take work beside the loop; it may wait for time, too
 
 
@@ -26,17 +30,19 @@ def record(network: LocalNetwork, clock: Clock) -> list[Event]:
 async def replay(node: Node, recording: Sequence[Event]) -> list[tuple[str, bytes]]:
     """Feed `recording` to `node` at its recorded times; return what the node itself sent.
 
-    An event on a service's key is a request, which is answered before time goes on. Raises
-    whatever ended the node, and ValueError for events that are not in order of time.
+    An event on a service's key is a request, which is answered before time goes on; one on WAITED
+    says how waiting for work beside had ended at the event before it. Raises whatever ended the
+    node, and ValueError for events that are not in order of time.
     """
     clock, network = FakeClock(), LocalNetwork()
     bus = Bus(network.transport(), clock)
+    bus.journal = past = PastJournal()
     ready = asyncio.Event()
     running = asyncio.ensure_future(node(bus, ready.set))
     try:
         await _either(running, ready)  # a node may compile, beside the loop
         await clock.advance(0)
-        for at_ns, key, payload in recording:
+        for (at_ns, key, payload), past.outcomes in _with_waits(recording):
             if at_ns < clock.now_ns():
                 raise ValueError(f"an event at {at_ns} ns follows one at {clock.now_ns()} ns")
             await clock.advance(at_ns - clock.now_ns())
@@ -52,6 +58,20 @@ async def replay(node: Node, recording: Sequence[Event]) -> list[tuple[str, byte
     if not running.cancelled():
         running.result()
     return network.sent
+
+
+def _with_waits(recording: Iterable[Event]) -> Iterator[tuple[Event, deque[bool]]]:
+    """Each event with the outcomes of the waits that follow it."""
+    event, outcomes = None, deque[bool]()
+    for one in recording:
+        if one[1] == WAITED:
+            outcomes.append(one[2] != UNDONE)
+            continue
+        if event:
+            yield event, outcomes
+        event, outcomes = one, deque()
+    if event:
+        yield event, outcomes
 
 
 async def _either(running: asyncio.Future[None], ready: asyncio.Event) -> None:

@@ -5,6 +5,8 @@ from typing import Any
 
 from msgspec import Struct
 
+from gigabrain_schemas.tasks import TaskStatus
+
 MOTION_M = 0.05  # less than this is no motion
 
 
@@ -28,6 +30,8 @@ class Observed(Struct, frozen=True, kw_only=True):
     deaths: int
     restarts: int
     rejected: int
+    mapped_m2: float | None = None  # where a map is made
+    tasks: TaskStatus | None = None  # where anybody has any
 
 
 class Report(Struct, frozen=True, kw_only=True):
@@ -52,6 +56,8 @@ class Report(Struct, frozen=True, kw_only=True):
     speed: float
     lockstep_timeouts: int
     decisions: tuple[tuple[float, str], ...]  # simulated time [s] and the decision in words
+    mapped_m2: float | None = None  # of the map, known to be free or taken
+    tasks_done: int = 0  # of the last 16 that ended: goals reached, missions carried out
     verdict: str  # "ok", or why not
 
     @property
@@ -79,8 +85,14 @@ def make_report(told: Mapping[str, Any], seen: Observed) -> Report:
         speed=seen.speed,
         lockstep_timeouts=told["lockstep_timeouts"],
         decisions=seen.decisions,
+        mapped_m2=None if seen.mapped_m2 is None else round(seen.mapped_m2, 1),
+        tasks_done=_succeeded(seen.tasks),
         verdict=_verdict(distance, contacts or 0, seen.deaths),
     )
+
+
+def _succeeded(status: TaskStatus | None) -> int:
+    return sum(task.state == "succeeded" for task in status.done) if status else 0
 
 
 def _verdict(distance_m: float, contacts: int, deaths: int) -> str:
@@ -99,11 +111,19 @@ def summary(report: Report) -> str:
     p50, p99 = report.scan_to_cmd_ms.p50 or 0.0, report.scan_to_cmd_ms.p99 or 0.0
     parts = [
         f"{report.verdict}: {report.distance_m:.2f} m in {report.sim_seconds:.0f} s",
-        _count(report.turns, "turn"),
+        *_done(report),
     ]
     if report.contacts is not None and report.min_clearance_m is not None:
         parts += [_count(report.contacts, "contact"), f"closest {report.min_clearance_m:.2f} m"]
     return ", ".join([*parts, f"scan to command {p50:.1f} ms (p99 {p99:.1f})"])
+
+
+def _done(report: Report) -> list[str]:
+    """What it has done: a robot that maps does not count its turns."""
+    if report.mapped_m2 is None:
+        return [_count(report.turns, "turn")]
+    done = [_count(report.tasks_done, "task") + " done"] if report.tasks_done else []
+    return [f"{report.mapped_m2:.0f} m² mapped", *done]
 
 
 def _count(number: int, what: str) -> str:

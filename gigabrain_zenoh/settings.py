@@ -60,7 +60,9 @@ class DecisionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     angular_speed: Annotated[float, Meta(gt=0, le=10)] = 0.5  # [rad/s]
     # of `navigate`, which needs a map (perception: {mapping: slam}):
     speed_limit: Annotated[float, Meta(gt=0, le=10)] | None = None  # [m/s]; also the body's own
-    unknown: Literal["avoid", "allow", "forbid"] = "avoid"  # ways through what no one has seen yet
+    # ways through what no one has seen yet; with `allow` also to places beyond the map
+    unknown: Literal["avoid", "allow", "forbid"] = "avoid"
+    samples: Annotated[int, Meta(ge=64, le=20_000)] = 1000  # plans to choose from, per scan
     begin: Literal["wait", "roam"] = "wait"  # roam: explore, then visit places, until it is sent
     scripts: str = ""  # the folder of the programs that missions may run; without, they run none
     state_dir: str = ""  # where it remembers what it is to do; nowhere without
@@ -101,6 +103,7 @@ class PageConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     certificate_key: str = ""
     login: bool = False  # want a token on loopback as well
     tokens: str = ""  # the file that keeps them; one in the user's state folder without
+    tell_tokens: bool = False  # print them when they are made, for a person at a terminal
 
 
 class FoxgloveConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

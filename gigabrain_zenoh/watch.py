@@ -6,10 +6,21 @@ import contextlib
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import Health
-from gigabrain_schemas.topics import CMD_VEL, DESCRIBE, HEALTH, INTENT, SAFETY, STATE, WORLD
+from gigabrain_schemas.topics import (
+    CMD_VEL,
+    DESCRIBE,
+    HEALTH,
+    INTENT,
+    MAP,
+    SAFETY,
+    STATE,
+    TASK,
+    WORLD,
+)
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import Refused
 
+UNKNOWN = b"\xff"  # a cell of which nothing is known
 ASK_S, PAUSE_S = 1.0, 0.1  # of one question, and until the next
 
 
@@ -23,6 +34,8 @@ class Watch:
         self.intent = bus.latest(INTENT)
         self.command = bus.latest(CMD_VEL)
         self.safety = bus.latest(SAFETY)
+        self.task = bus.latest(TASK)
+        self.map = bus.latest(MAP)
         self.health: dict[str, Health] = {}
         self.distance_m = 0.0  # by odometry
         self._last: RobotState | None = None
@@ -32,6 +45,14 @@ class Watch:
     def seconds(self) -> float:
         """Time of the robot since its driver's start [s]."""
         return self._bus.time.tick * 0.02
+
+    @property
+    def mapped_m2(self) -> float | None:
+        """How much is known of the map: free or taken [m2]; None where there is no map."""
+        grid = self.map.current
+        if grid is None:
+            return None
+        return (len(grid.cells) - grid.cells.count(UNKNOWN)) * grid.resolution**2
 
     async def describe(self, process: str, timeout_s: float = 0.3) -> Description | None:
         """What a process says of itself, or None when it does not answer.

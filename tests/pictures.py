@@ -7,48 +7,64 @@ from pathlib import Path
 
 from playwright.async_api import Page, async_playwright
 
+from gigabrain_zenoh.watch import Watch
 from tests.onlooker import looking_on
 from tests.page_rig import CHROMIUM, FLAGS, OPERATOR, Robot
 from tests.stack import Home, until
 
-DRIVEN_TICKS = 2000  # 40 s, so that there is something to see
-SIZES = {"light": (1280, 800), "dark": (1280, 800), "phone": (390, 844)}
+READY_S = 600.0  # a machine without compiled kernels compiles them first
+MAPPED_M2, MAP_S = 45.0, 300.0  # so much of the house is to be seen, and how long that may take
+NAVIGATES = {
+    "perception": {"mapping": "slam"},
+    "decision": {"behaviour": "navigate", "begin": "roam"},
+    "speed": 2.0,  # in lock-step, so that a busy machine does not make it stop
+}
+SIZES = {"light": (1280, 800), "phone": (390, 844), "dark": (1280, 800)}
 
 
 async def take(folder: Path) -> None:
-    """A house, driven through for a while; a log as well in the dark one."""
+    """A house, explored until there is something to see; the topics as well in the dark one."""
     with tempfile.TemporaryDirectory() as place:
         home = Home(Path(place) / "home")
         try:
-            robot = Robot(home, world="house", seed=1)
+            robot = Robot(home, world="house", seed=1, **NAVIGATES)
             async with looking_on(robot.endpoint) as seen:
-                await until(lambda: "page" in seen.health, "the page is served")
+                watch = Watch(seen.bus)
+                await until(lambda: "page" in seen.health, "the page is served", READY_S)
+                await until(lambda: watch.task.current, "decision is ready", READY_S)
+                await until(lambda: watch.mapped_m2, "a map", READY_S)
                 async with async_playwright() as playwright:
                     chromium = await playwright.chromium.launch(
                         executable_path=CHROMIUM, args=FLAGS
                     )
-                    pages = {
-                        name: await chromium.new_page(
-                            viewport={"width": width, "height": height},
-                            color_scheme="dark" if name == "dark" else "light",
-                        )
-                        for name, (width, height) in SIZES.items()
-                    }
-                    for page in pages.values():
-                        await page.goto(f"{robot.origin}/#{OPERATOR}")
-                    await seen.ticks(DRIVEN_TICKS)
-                    await pages["dark"].click("#tab-topics")
-                    for name, page in pages.items():
-                        await shoot(page, folder / f"page_{name}.png")
+                    page = await chromium.new_page()
+                    await page.goto(f"{robot.origin}/#{OPERATOR}")
+                    for name in SIZES:
+                        await dress(page, name)
+                        await until(lambda: worth_a_picture(watch), "a way in a map", MAP_S)
+                        await page.screenshot(path=folder / f"page_{name}.png")
                     await chromium.close()
         finally:
             home.close()
 
 
-async def shoot(page: Page, path: Path) -> None:
+def worth_a_picture(watch: Watch) -> bool:
+    """Whether the map has grown, and the robot drives to somewhere not too near."""
+    task, state = watch.task.current, watch.state.fresh()
+    far = task is not None and (task.distance_remaining or 0.0) > 2.0
+    drives = state is not None and state.gate.mode == "enabled" and state.velocity.linear_x > 0.1
+    return far and drives and (watch.mapped_m2 or 0.0) > MAPPED_M2
+
+
+async def dress(page: Page, name: str) -> None:
+    """One page is dressed anew for each picture: several at a time would slow the robot."""
+    width, height = SIZES[name]
+    await page.set_viewport_size({"width": width, "height": height})
+    await page.emulate_media(color_scheme="dark" if name == "dark" else "light")
+    if name == "dark":
+        await page.click("#tab-topics")
     await page.wait_for_selector("#link.live")
     await page.wait_for_timeout(1200)  # the tables are drawn once a second
-    await page.screenshot(path=path)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from tests.keys_rig import Site, make_fleet, raw, site
 from tests.zenoh_rig import Ear, repeat
 
 SAYS = {
-    "brain": "world pose map intent task granted health/perception log estop",
+    "brain": "world pose map intent task granted heard/perception health/perception log estop",
     "operator": "teleop cmd_vel joint_cmd button log estop",
     "viewer": "",
 }

@@ -7,15 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gigabrain_drivers.sim.jackal import Jackal
 from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.bench import barn_nodes
 from gigabrain_zenoh.bench.barn_drive import drive
 from gigabrain_zenoh.bench.barn_worlds import Moving, World, choose, read_worlds
-from gigabrain_zenoh.bench.plant import HARD, IDEAL, LIDAR, Conditions, Plant
+from gigabrain_zenoh.bench.plant import HARD, IDEAL, LIDAR, MUJOCO, Conditions, Plant
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.navigation.local import LocalSettings
 
 NONE = np.empty((0, 3))
-QUICK = LocalSettings(samples=128)
+QUICK = 128  # plans per cycle
 
 
 def field(posts: np.ndarray) -> World:
@@ -82,6 +83,60 @@ def test_posts_are_gone_round_on_the_hard_plant() -> None:
 def test_a_contact_ends_a_trial() -> None:
     trial = drive(field(np.array([(0.25, 0.0, 0.075)])), 0, HARD, QUICK)
     assert (trial.result, trial.score) == ("collision", 0.0)
+
+
+@pytest.mark.parametrize("plant", [HARD, MUJOCO])
+def test_the_robots_own_nodes_drive_a_world(plant: Conditions) -> None:
+    posts = np.array([(2.0, 0.1 * i, 0.075) for i in range(-3, 4)])
+    trial = barn_nodes.drive(field(posts), 0, plant, QUICK)
+    assert trial.result == "success"
+    assert 0.03 < trial.least_clearance < 0.6
+
+
+def test_driven_again_by_its_nodes_a_trial_is_the_same() -> None:
+    posts = np.array([(1.5, 0.3, 0.075), (1.5, -0.5, 0.075)])
+    one = barn_nodes.drive(field(posts), 1, HARD, QUICK)
+    assert one.result == "success"
+    assert barn_nodes.drive(field(posts), 1, HARD, QUICK) == one
+
+
+def jackal(*posts: tuple[float, float, float]) -> Jackal:
+    calm = Conditions(delay=0.1, drift=0.0, noise=0.0, dropouts=0.0, physics=True)
+    return Jackal(calm, (0.0, 0.0, 0.0), np.array(posts).reshape(-1, 3), 1)
+
+
+def told(body: Jackal, seconds: float, v: float, w: float) -> None:
+    for _ in range(round(seconds * 50)):
+        body.tick(Velocity(linear_x=v, angular_z=w))
+
+
+def test_in_mujoco_it_turns_less_than_its_wheels_say_on_the_spot_and_more_at_speed() -> None:
+    slow, quick = jackal(), jackal()
+    told(slow, 2.0, 0.0, 1.0)
+    told(quick, 2.0, 2.0, 1.0)
+    assert 0.6 < slow.velocity.angular_z < 0.85
+    assert 1.2 < quick.velocity.angular_z < 1.5
+    assert abs(slow.x) < 0.1
+    assert abs(slow.y) < 0.1
+
+
+def test_in_mujoco_it_is_as_fast_as_told_after_delay_and_lag() -> None:
+    body = jackal()
+    told(body, 0.1, 1.0, 0.0)
+    assert abs(body.velocity.linear_x) < 0.01
+    told(body, 2.0, 1.0, 0.0)
+    assert body.velocity.linear_x == pytest.approx(1.0, abs=0.02)
+    assert body.odometry.x == pytest.approx(body.x, abs=0.03)
+
+
+def test_in_mujoco_it_is_stopped_by_a_post_that_its_lidar_sees() -> None:
+    post = (1.0, 0.0, 0.075)
+    body, posts = jackal(post), np.array([post])
+    assert body.scan(LIDAR, posts)[359:361] == pytest.approx([0.87, 0.87], abs=1e-3)
+    assert body.clearance(posts) == pytest.approx(1.0 - 0.229 - 0.075)
+    told(body, 3.0, 0.5, 0.0)
+    assert body.x == pytest.approx(0.696, abs=0.03)
+    assert body.clearance(posts) < 0.01
 
 
 def test_moving_discs_go_from_key_to_key_over_and_over() -> None:

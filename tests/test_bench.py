@@ -281,7 +281,7 @@ def test_the_page_of_the_e_stop_shows_each_figure_beside_its_target() -> None:
     ]  # fmt: skip
 
 
-def beside() -> ToolsResult:
+def beside(again_ms: tuple[float, ...] = (1.0, 2.0, 9.0)) -> ToolsResult:
     return ToolsResult(
         seconds=10.0,
         recorded_hz=318.0,
@@ -289,7 +289,8 @@ def beside() -> ToolsResult:
             Beside(
                 rate_hz=10.0,
                 alone=(one(100, 0.6, 1.0), one(100, 0.7, 2.0), one(100, 0.8, 9.0)),
-                tools=(one(100, 0.7, 1.9), one(100, 0.8, 2.2), one(100, 0.9, 8.0)),
+                tools=(one(100, 0.7, 1.9), one(100, 0.8, 2.2), one(100, 0.9, 8.1)),
+                again=tuple(one(100, 0.7, p99) for p99 in again_ms),
             ),
         ),
         tools=(
@@ -301,13 +302,24 @@ def beside() -> ToolsResult:
 
 
 def test_what_tools_add_is_told_by_the_median_rounds() -> None:
-    assert beside().rates[0].added_p99 == pytest.approx(10.0)
+    assert beside().rates[0].added_p99 == pytest.approx((-10.0, 10.0, 90.0))
     page = shown(tools_page(beside()))
-    assert "+10 % (≤ 5)" in page
+    assert "+10 % (-10 to +90)" in page
+    assert "+0 % (+0 to +0)" in page
+    assert "too noisy" not in page
     assert "318 messages a second" in page
     rows = [line.split() for line in page.splitlines()]
     assert ["│", "recorder", "│", "3.4", "%", "│", "3", "%", "│"] in rows
     assert ["│", "topic", "echo", "│", "5.0", "%", "│", "│"] in rows
+
+
+def test_a_machine_that_does_more_by_itself_is_said_to_be_too_noisy() -> None:
+    noisy = beside((1.2, 2.0, 7.2))
+    assert noisy.rates[0].noise_p99 == pytest.approx((-20.0, 0.0, 20.0))
+    assert noisy.rates[0].added_p99[1] == pytest.approx(10.0)
+    page = " ".join(shown(tools_page(noisy)).split())
+    assert "+0 % (-20 to +20)" in page
+    assert "more than that here: too noisy to judge by" in page
 
 
 async def test_the_chain_is_timed_with_all_tools_beside_it(home: Home) -> None:

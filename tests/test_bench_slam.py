@@ -98,3 +98,13 @@ def test_edmonton_is_mapped_within_7_cm_of_its_reference() -> None:
     assert result.graph.mean_deg < 1.0
     assert result.breaks == 0
     assert total([result]).mean_m == result.graph.mean_m
+
+
+@pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
+def test_freiburg_is_mapped_where_its_odometry_has_the_wrong_sign() -> None:
+    """Of every fourth scan: a stretch of it is driven backwards, and odometry says forwards."""
+    dense = load(Path(str(DATA)) / "slam" / "freiburg-079.npz")
+    thin = Log("thin", *(a[:2000:4] for a in (dense.ranges, dense.reference, dense.odometry)))
+    result = judged(thin, drive(thin, lambda: None))
+    assert result.graph.mean_m < 0.07
+    assert result.breaks == 0

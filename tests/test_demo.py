@@ -9,10 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.tasks import Task, TaskStatus
+from gigabrain_schemas.topics import MAP
 from gigabrain_zenoh import demo as demo_module
 from gigabrain_zenoh.demo import Demo, DemoOptions, newest_fault
 from gigabrain_zenoh.deployment import Deployment
+from gigabrain_zenoh.live_view import doing
 from gigabrain_zenoh.report import Observed, make_report, summary
 from gigabrain_zenoh.watch import Watch
 from tests.bus_rig import Net
@@ -182,6 +187,42 @@ def test_a_run_is_judged_by_contacts_motion_and_deaths() -> None:
         "closest 0.00 m, scan to command 1.2 ms (p99 0.0)"
     )
     assert (report.rejected_messages, report.turns, report.sim_seconds) == (3, 1, 9.0)
+
+
+def test_of_a_robot_that_maps_the_area_and_its_tasks_are_told_instead_of_turns() -> None:
+    told = {
+        "distance_m": 4.0, "contacts": 0, "min_clearance_m": 0.4, "stale_commands_executed": 0,
+        "scan_to_cmd_p50_ms": 20.0, "scan_to_cmd_p99_ms": 30.0, "lockstep_timeouts": 0,
+    }  # fmt: skip
+    task = Task(id="goal-1", kind="goal", label="(1, 2)", source="ann", state="succeeded")
+    status = TaskStatus(done=(task, replace(task, id="goal-2", state="failed")))
+    seen = Observed(
+        body="waffle", world="house", seed=1, speed=1.0, seconds=20.0, distance_m=4.0,
+        decisions=((1.0, "exploring: going"),), deaths=0, restarts=0, rejected=0,
+        mapped_m2=33.61, tasks=status,
+    )  # fmt: skip
+    report = make_report(told, seen)
+    assert (report.mapped_m2, report.tasks_done) == (33.6, 1)
+    assert summary(report).startswith("ok: 4.00 m in 20 s, 34 m² mapped, 1 task done, 0 contacts")
+    assert ", 34 m² mapped, 0 contacts" in summary(make_report(told, replace(seen, tasks=None)))
+
+
+async def test_the_mapped_area_is_that_of_cells_known_to_be_free_or_taken() -> None:
+    net = Net()
+    watch = Watch(net.one)
+    assert watch.mapped_m2 is None
+    grid = OccupancyGrid(
+        width=3, height=2, resolution=0.5, origin_x=0.0, origin_y=0.0, cells=b"\x00\x64\xff" * 2
+    )
+    net.two.publish(MAP, grid)
+    assert watch.mapped_m2 == pytest.approx(1.0)
+
+
+async def test_a_process_on_its_way_is_named_until_the_gate_is_open() -> None:
+    watch = Watch(Net().one)
+    assert doing(watch) == "starting"
+    late = "decision is getting ready, compiling, once per installation"
+    assert doing(watch, late) == late
 
 
 async def test_a_report_that_cannot_be_written_is_refused_before_anything_starts(

@@ -53,6 +53,7 @@ REQUIRED: dict[str, set[str]] = {
     "TaskRequest": {"do"},
     "TaskReply": {"ok", "text"},
     "Granted": {"service", "request"},
+    "Heard": {"began_ns", "keys", "taken"},
     "TaskStatus": set(),
     "ParamRequest": set(),
     "ParamReply": {"ok", "text"},
@@ -83,6 +84,7 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/log": ("LogRecord", 10),
         "robot/task": ("TaskStatus", 5),
         "robot/granted": ("Granted", 10),
+        "robot/heard/*": ("Heard", 2),
         "robot/audit": ("AuditRecord", 10),
     }
     assert [service.at("*") for service in SERVICES] == [
@@ -112,6 +114,7 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/log": 500_000_000,
         "robot/task": 1_000_000_000,
         "robot/granted": 500_000_000,
+        "robot/heard": 2_500_000_000,
         "robot/audit": 500_000_000,
     }
 
@@ -146,7 +149,7 @@ def test_every_message_is_frozen_and_documented_and_carries_the_header(
 def test_the_golden_folder_holds_the_examples_byte_for_byte() -> None:
     stored = {path.name: path.read_bytes() for path in golden.FOLDER.iterdir()}
     assert stored == golden.files()
-    assert len(stored) == 74
+    assert len(stored) == 76
 
 
 @by_name

@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import time
 from pathlib import Path
 from typing import Literal
 
@@ -13,6 +14,9 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest, TaskRequest
 from gigabrain_schemas.topics import GOAL, MISSION, SAFETY, TASK_CHANGE
+from gigabrain_zenoh import navigating
+from gigabrain_zenoh.behaviours.bearings import Route
+from gigabrain_zenoh.behaviours.guide import Asked, Guide
 from gigabrain_zenoh.navigating import Navigating
 from gigabrain_zenoh.settings import DecisionConfig
 from tests.brain_rig import BOOT, state
@@ -188,6 +192,39 @@ async def fastest(plane: Plane, seconds: float) -> float:
         await plane.go(0.02)
         speeds.append(plane.velocity.linear_x)
     return max(speeds)
+
+
+LARGE = np.pad(CELLS, ((0, 300), (0, 300)), constant_values=100)
+
+
+async def ticks_to_a_way(monkeypatch: pytest.MonkeyPatch, thinks_s: float) -> list[int]:
+    """The ticks in which a way came and in which another place was driven to."""
+    think = Guide.think
+
+    def slowly(guide: Guide, asked: Asked) -> Route:
+        time.sleep(thinks_s)
+        return think(guide, asked)
+
+    monkeypatch.setattr(Guide, "think", slowly)
+    monkeypatch.setattr(navigating, "PATIENCE_S", 30.0)
+    ticks = []
+    async with Plane(LARGE) as plane:
+        await plane.go(0.2)
+        for x in (4.0, 1.5):
+            await plane.ask_at_once(GOAL, GoalRequest(x=x, y=0.8))
+            while not plane.intent.reason.startswith(f"going to ({x:.2f}, 0.80): "):
+                await plane.go(0.02)
+            ticks.append(plane.tick)
+    monkeypatch.setattr(Guide, "think", think)
+    return ticks
+
+
+async def test_in_a_large_map_a_way_counts_from_the_same_scan_however_long_it_takes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    quick = await ticks_to_a_way(monkeypatch, 0.0)
+    assert await ticks_to_a_way(monkeypatch, 0.1) == quick
+    assert quick[0] - 10 == 15
 
 
 async def test_a_driver_that_starts_anew_does_not_end_what_there_is_to_do() -> None:

@@ -1,5 +1,6 @@
 """Who may open the operator page, who steers, and what a slow browser gets."""
 
+import socket
 import stat
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,7 @@ from gigabrain_zenoh.page.access import Access, check, tokens
 from gigabrain_zenoh.page.beside import free_port
 from gigabrain_zenoh.page.operator import Operator
 from gigabrain_zenoh.page.scene import Scene
+from gigabrain_zenoh.page.server import run
 from gigabrain_zenoh.page.viewer import Viewer
 from gigabrain_zenoh.page.wire import Ask, GoalRequest
 from gigabrain_zenoh.seat import Seat
@@ -37,6 +39,24 @@ def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
     path.write_text('{"operator": "short", "viewer": "short"}')
     with pytest.raises(ConfigError, match="two tokens of 16 characters"):
         tokens(path)
+
+
+async def test_a_page_that_cannot_be_served_makes_no_tokens(tmp_path: Path) -> None:
+    path = tmp_path / "tokens.json"
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        config = PageConfig(port=taken.getsockname()[1], login=True, tokens=str(path))
+        with pytest.raises(ConfigError, match="cannot listen on 127"):
+            await run(config, Net().one, lambda: None)
+    assert not path.exists()
+
+
+def test_tokens_are_told_to_whoever_had_them_made(tmp_path: Path) -> None:
+    config = PageConfig(login=True, tokens=str(tmp_path / "tokens.json"))
+    first, second = Access(config, 8080), Access(config, 8080)
+    made, _ = tokens(tmp_path / "tokens.json")
+    assert first.told() == f"to drive: {made.operator}\nto look:  {made.viewer}"
+    assert second.told() == ""
+    assert Access(PageConfig(), 8080).told() == ""
 
 
 def test_beyond_loopback_it_wants_tls_and_a_token(tmp_path: Path) -> None:

@@ -391,3 +391,15 @@ def test_viewers_get_every_second_state_and_each_thought_once(tmp_path: Path) ->
         "robot/state": 50, "/viz/tf": 25, "/viz/state_numbers": 25,
     }  # fmt: skip
     assert (drawn["robot/intent"], drawn["/viz/path"]) == (50, 10)
+
+
+def test_the_writer_is_told_to_hurry_once_a_quarter_of_the_room_is_full() -> None:
+    told: list[int] = []
+    intake = Intake(4000, lambda: 1, lambda: told.append(1))
+    for expected in (0, 0, 1, 1):
+        intake.take("robot/scan", "", bytes(400))
+        assert len(told) == expected
+    intake.written(intake.hand_over())
+    for expected in (1, 1, 2):
+        intake.take("robot/scan", "", bytes(400))
+        assert len(told) == expected

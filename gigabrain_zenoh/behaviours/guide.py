@@ -1,7 +1,7 @@
 """From an order to a route: where to go next, which way through the map, and when to give up."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -11,6 +11,7 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.behaviours.bearings import Driven, Floats, Route
+from gigabrain_zenoh.behaviours.beyond import widened
 from gigabrain_zenoh.navigation.costmap import Costmap, Unknown, costmap, inflation
 from gigabrain_zenoh.navigation.frontiers import frontiers
 from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable
@@ -58,20 +59,27 @@ class Guide:
         if anew or asked.order.number != self._number:
             self._forget(asked.order.number, asked.tick)
         self._note(asked)
-        chart = self._chart(asked)
         if isinstance(asked.order, GoTo):
-            return self._to(asked.order.goal, asked, chart)
+            goal = asked.order.goal
+            asked = replace(asked, grid=self._with_room(asked.grid, goal))
+            return self._to(goal, asked, self._chart(asked))
+        chart = self._chart(asked)
         if isinstance(asked.order, Visit):
             return self._to(self._goal or self._anywhere(asked, chart), asked, chart)
         return self._onward(asked, chart)
 
     def check(self, grid: OccupancyGrid, body: BodyDescription, here: Pose, goal: Goal) -> str:
         """The way to a goal in words; `no: …` where there is none."""
-        chart = costmap(grid, inflation(body, self._unknown), before=None)
+        room = self._with_room(grid, goal)
+        chart = costmap(room, inflation(body, self._unknown), before=None)
         found = Planner().plan(chart, (here.x, here.y), (goal.x, goal.y))
         if isinstance(found, Unreachable):
             return f"no: {found.reason}"
         return f"on the way, {found.remaining[0]:.1f} m"
+
+    def _with_room(self, grid: OccupancyGrid, goal: Goal) -> OccupancyGrid:
+        """The map to look for a goal in: one who may go anywhere may also leave the map."""
+        return widened(grid, goal) if self._unknown == "allow" else grid
 
     def _forget(self, number: int, tick: int) -> None:
         self._number = number

@@ -109,7 +109,9 @@ class Navigate:
         body = bearings.body
         assert body
         if self._planner is None or body != self._body:
-            settings = local.LocalSettings(linear_speed=self._config.speed_limit)
+            settings = local.LocalSettings(
+                linear_speed=self._config.speed_limit, samples=self._config.samples
+            )
             self._planner, self._body = local.LocalPlanner(body, settings), body
         return self._planner
 

@@ -7,13 +7,13 @@ from multiprocessing import get_context
 
 from msgspec import Struct
 
-from gigabrain_zenoh.bench.barn_drive import Trial, drive
+from gigabrain_zenoh.bench import barn_drive, barn_nodes
 from gigabrain_zenoh.bench.barn_worlds import World
-from gigabrain_zenoh.bench.plant import HARD, IDEAL, Conditions
-from gigabrain_zenoh.navigation.local import LocalSettings
+from gigabrain_zenoh.bench.course import Trial
+from gigabrain_zenoh.bench.plant import HARD, IDEAL, MUJOCO, Conditions
 from gigabrain_zenoh.percentile import percentile
 
-PLANTS = {"hard": HARD, "ideal": IDEAL}
+PLANTS = {"hard": HARD, "ideal": IDEAL, "mujoco": MUJOCO}
 
 
 class BarnResult(Struct, frozen=True, kw_only=True):
@@ -56,13 +56,18 @@ def measure_barn(
     samples: int,
     jobs: int,
     progress: Callable[[Trial], None],
+    *,
+    nodes: bool,
 ) -> BarnResult:
-    """Drive `trials` times in each of `worlds`, in so many processes."""
-    settings = LocalSettings(samples=samples)
+    """Drive `trials` times in each of `worlds`, in so many processes.
+
+    With the robot's own `nodes`, or with the functions that they call.
+    """
+    drive = barn_nodes.drive if nodes else barn_drive.drive
     done = []
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
         waiting = [
-            pool.submit(drive, world, trial, PLANTS[plant], settings)
+            pool.submit(drive, world, trial, PLANTS[plant], samples)
             for world in worlds
             for trial in range(trials)
         ]

@@ -5,6 +5,7 @@ It knows the truth, which the robot never hears of.
 
 import math
 from collections import deque
+from typing import Protocol
 
 import numpy as np
 from msgspec import Struct
@@ -51,14 +52,42 @@ class Conditions(Struct, frozen=True, kw_only=True):
     drift: float = 0.02  # of the odometry, of the way and of the turns
     noise: float = 0.03  # [m], standard deviation of a range
     dropouts: float = 0.1  # share of the beams that see nothing
+    physics: bool = False  # MuJoCo's: what slips, and how quickly it speeds up, follows from it
 
 
 HARD = Conditions()
+MUJOCO = Conditions(slip=1.0, physics=True)
 IDEAL = Conditions(delay=0.0, lag=0.0, slip=1.0, drift=0.0, noise=0.01, dropouts=0.0)
 
 
+class Body(Protocol):
+    """One trial's body, in whatever world."""
+
+    x: float  # [m], the truth
+    y: float  # [m]
+    yaw: float  # [rad]
+    odometry: Pose
+
+    @property
+    def velocity(self) -> Velocity:
+        """As measured."""
+        ...
+
+    def tick(self, command: Velocity) -> None:
+        """20 ms with `command`."""
+        ...
+
+    def scan(self, lidar: Lidar, discs: Floats) -> NDArray[np.float32]:
+        """One turn of the lidar among `discs` (n, 3): (beams,) [m], inf where nothing is."""
+        ...
+
+    def clearance(self, discs: Floats) -> float:
+        """How far it is from the nearest of `discs`, exactly [m]; 0 or less in contact."""
+        ...
+
+
 class Plant:
-    """One trial's body."""
+    """One trial's body, by kinematics alone."""
 
     def __init__(
         self, conditions: Conditions, start: tuple[float, float, float], seed: int
@@ -119,11 +148,16 @@ class Plant:
 
     def clearance(self, discs: Floats) -> float:
         """How far the body is from the nearest of `discs`, exactly [m]; 0 or less in contact."""
-        dx, dy = discs[:, 0] - self.x, discs[:, 1] - self.y
-        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
-        corners = np.array(JACKAL.footprint)
-        here = np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx], axis=1)
-        return float((_to_polygon(corners, here) - discs[:, 2]).min(initial=np.inf))
+        return clearance(self, discs)
+
+
+def clearance(body: Body, discs: Floats) -> float:
+    """How far a body is from the nearest of `discs`, exactly [m]; 0 or less in contact."""
+    dx, dy = discs[:, 0] - body.x, discs[:, 1] - body.y
+    cosine, sine = math.cos(body.yaw), math.sin(body.yaw)
+    corners = np.array(JACKAL.footprint)
+    here = np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx], axis=1)
+    return float((_to_polygon(corners, here) - discs[:, 2]).min(initial=np.inf))
 
 
 def _to_polygon(corners: Floats, points: Floats) -> Floats:

@@ -44,8 +44,10 @@ def tools_page(result: ToolsResult) -> Group:
     table = _table("rate", "tools", "n", "p50 [ms]", "p99 [ms]", "added to p99")
     for one in result.rates:
         _figures(table, f"{one.rate_hz:g} Hz", "none", over_rounds(one.alone))
-        added = Text(f"{one.added_p99:+.0f} % (≤ {ADDED:g})", style=_style(one.added_p99, ADDED))
+        added = _added(one.added_p99)
+        added.stylize(_style(one.added_p99[1], ADDED))
         _figures(table, "", "all", over_rounds(one.tools), added)
+        _figures(table, "", "none again", over_rounds(one.again), _added(one.noise_p99))
         table.add_section()
     needs = _table("tool", "CPU of one core", "at most")
     for tool in result.tools:
@@ -58,10 +60,21 @@ def tools_page(result: ToolsResult) -> Group:
         "One viewer reads all that the page sends and another all that the bridge has; they draw "
         "nothing, and are not counted."
     )
+    noise = (
+        f"At most {ADDED:g} % may be added. What is added is told round by round against the chain "
+        "alone before and after it (least to most), and the chain alone against itself."
+    )
+    if any(one.noisy for one in result.rates):
+        noise += " The machine by itself does more than that here: too noisy to judge by."
     return Group(
-        _title(f"Scan to command with tools beside it ({runs})"), table, needs,
-        Text(about, style="dim"),
+        _title(f"Scan to command with tools beside it ({runs})"), table, Text(noise, style="dim"),
+        needs, Text(about, style="dim"),
     )  # fmt: skip
+
+
+def _added(spread: tuple[float, float, float]) -> Text:
+    least, median, most = spread
+    return Text(f"{median:+.0f} % ({least:+.0f} to {most:+.0f})")
 
 
 def _style(value: float, limit: float) -> str:

@@ -1,9 +1,13 @@
-"""`gigabrain bench chain --with tools`: the chain alone and with all tools beside it, in turns."""
+"""`gigabrain bench chain --with tools`: the chain alone and with all tools beside it, in turns.
+
+Each round times the chain alone before and after: how far these two lie apart is what the machine
+does by itself, and nothing smaller than that can be told of the tools.
+"""
 
 import statistics
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from msgspec import Struct
@@ -11,7 +15,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import HEALTH
-from gigabrain_zenoh.bench.figures import Figures, over_rounds
+from gigabrain_zenoh.bench.figures import Figures
 from gigabrain_zenoh.bench.onlookers import ECHO, Ports, looking_on
 from gigabrain_zenoh.bench.runs import brain, chain_figures, time_chain
 from gigabrain_zenoh.deployment import ROBOT, Deployment
@@ -36,11 +40,29 @@ class Beside(Struct, frozen=True, kw_only=True):
     rate_hz: float
     alone: tuple[Figures, ...]
     tools: tuple[Figures, ...]
+    again: tuple[Figures, ...]  # alone once more, after the tools
 
     @property
-    def added_p99(self) -> float:
-        """What the tools add to the p99 [%]."""
-        return 100 * (over_rounds(self.tools).p99_ms / over_rounds(self.alone).p99_ms - 1)
+    def added_p99(self) -> tuple[float, float, float]:
+        """What the tools add to the p99 of the runs before and after [%]: least, median, most."""
+        turns = zip(self.alone, self.tools, self.again, strict=True)
+        return _spread(2 * tools.p99_ms / (a.p99_ms + b.p99_ms) for a, tools, b in turns)
+
+    @property
+    def noise_p99(self) -> tuple[float, float, float]:
+        """The same of the second run alone, against the first."""
+        turns = zip(self.alone, self.again, strict=True)
+        return _spread(b.p99_ms / a.p99_ms for a, b in turns)
+
+    @property
+    def noisy(self) -> bool:
+        """Whether the machine by itself does more than tools may add, so that nothing is shown."""
+        return max(map(abs, self.noise_p99)) > ADDED
+
+
+def _spread(ratios: Iterable[float]) -> tuple[float, float, float]:
+    added = [100 * (ratio - 1) for ratio in ratios]
+    return min(added), statistics.median(added), max(added)
 
 
 class ToolsResult(Struct, frozen=True, kw_only=True):
@@ -67,14 +89,22 @@ async def measure_with_tools(
     compared, runs = [], list[_Run]()
     with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as name:
         for rate_hz in rates_hz:
-            alone, beside = [], list[_Run]()
+            alone, beside, again = [], list[_Run](), []
             for i in range(1, rounds + 1):
                 say(f"{rate_hz:g} Hz, round {i} of {rounds}: chain alone")
                 alone.append(await time_chain(rate_hz, seconds, Path(name)))
                 say(f"{rate_hz:g} Hz, round {i} of {rounds}: chain with tools")
                 beside.append(await _time_with_tools(rate_hz, seconds, Path(name)))
-            tools = tuple(run.figures for run in beside)
-            compared.append(Beside(rate_hz=rate_hz, alone=tuple(alone), tools=tools))
+                say(f"{rate_hz:g} Hz, round {i} of {rounds}: chain alone again")
+                again.append(await time_chain(rate_hz, seconds, Path(name)))
+            compared.append(
+                Beside(
+                    rate_hz=rate_hz,
+                    alone=tuple(alone),
+                    tools=tuple(run.figures for run in beside),
+                    again=tuple(again),
+                )
+            )
             runs += beside
     return ToolsResult(
         seconds=seconds,

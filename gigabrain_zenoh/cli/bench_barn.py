@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from gigabrain_zenoh.bench.barn import BarnResult
-    from gigabrain_zenoh.bench.barn_drive import Trial
+    from gigabrain_zenoh.bench.course import Trial
 
 
 def barn(
@@ -19,7 +19,8 @@ def barn(
     trials: int = 1,
     only: str = "",
     dynamic: bool = False,
-    plant: Literal["hard", "ideal"] = "hard",
+    plant: Literal["hard", "ideal", "mujoco"] = "hard",
+    nodes: bool = True,
     samples: int = 1000,
     jobs: int = 2,
     json: Path | None = None,
@@ -28,8 +29,9 @@ def barn(
 
     Example: gigabrain bench barn --worlds worlds.npz --trials 1 --only 1,7
 
-    Perception, planning, control and the gate's limits run in fake time, tick by tick, against a
-    plant with delay, lag, slip, drift and noise. Contacts are looked for in every tick.
+    The robot's own nodes, its gate and the safety process run in memory and in fake time, tick by
+    tick, against a plant with delay, lag, slip, drift and noise. Contacts are looked for in every
+    tick.
 
     Parameters
     ----------
@@ -44,6 +46,10 @@ def barn(
     plant
         hard: 100 ms delay, 150 ms lag, slip to 0.6, drift 2 %, 3 cm noise, 10 % dropouts.
         ideal: none of it but 1 cm noise.
+        mujoco: a skid-steer Jackal among solid posts, otherwise as hard; not with --dynamic.
+    nodes
+        Without them the functions that they call drive, with no map, bus or safety process; so
+        they do with --dynamic, where nothing stands still that a map could be made of.
     samples
         Plans per cycle.
     jobs
@@ -56,12 +62,17 @@ def barn(
     from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.barn import measure_barn
     from gigabrain_zenoh.bench.barn_worlds import choose, read_worlds
+    from gigabrain_zenoh.errors import ConfigError
 
     for name, value in (("trials", trials), ("samples", samples), ("jobs", jobs)):
         above_zero(name, value)
     results.check_place(json)
+    if dynamic and plant == "mujoco":
+        raise ConfigError("--plant mujoco has no moving obstacles; leave out --dynamic")
     chosen = choose(read_worlds(worlds, dynamic), only)
-    result = measure_barn(chosen, trials, plant, samples, jobs, _progress)
+    result = measure_barn(
+        chosen, trials, plant, samples, jobs, _progress, nodes=nodes and not dynamic
+    )
     Console().print(_table(result, worlds.name, plant))
     results.write(result, json)
     return 0

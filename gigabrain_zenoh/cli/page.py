@@ -47,7 +47,7 @@ def page(
 
     from gigabrain_zenoh.cli.checked import checked
     from gigabrain_zenoh.errors import ConfigError
-    from gigabrain_zenoh.page.access import check, token_file, tokens, wants_login
+    from gigabrain_zenoh.page.access import check
     from gigabrain_zenoh.page.node import INSTALL, installed
     from gigabrain_zenoh.process import run
     from gigabrain_zenoh.process_config import ProcessConfig
@@ -63,12 +63,9 @@ def page(
         "certificate": str(certificate or ""),
         "certificate_key": str(certificate_key or ""),
         "login": login,
+        "tell_tokens": True,
     }
     config = checked(values, PageConfig)
     check(config)
     endpoint = find_endpoint(connect, namespace, str(keys) if keys else "")
-    if wants_login(config):
-        made, new = tokens(token_file(config.tokens))
-        if new:
-            print(f"to drive: {made.operator}\nto look:  {made.viewer}", flush=True)
     return run(ProcessConfig(name="page", endpoint=endpoint, settings=msgspec.to_builtins(config)))

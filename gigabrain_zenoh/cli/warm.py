@@ -2,10 +2,7 @@
 
 import time
 
-STEPS = {
-    "mapping": "gigabrain_zenoh.mapping.warm:warm_up",
-    "planning and driving": "gigabrain_zenoh.navigating:warm_up",
-}
+STEPS = ("mapping", "planning and driving")
 
 
 def warm() -> None:
@@ -17,16 +14,22 @@ def warm() -> None:
     After an update it is done again, at the latest at the first start, while nothing drives.
     """
     from gigabrain_zenoh.errors import ConfigError
-    from gigabrain_zenoh.process import find
 
-    for name, path in STEPS.items():
+    for name in STEPS:
         print(f"{name} … ", end="", flush=True)
         began_s = time.monotonic()
         try:
-            find(path)()
+            _compile(name)
         except ModuleNotFoundError as error:
             print()
             raise ConfigError(
                 f"navigation needs {error.name}: pip install 'gigabrain-zenoh[nav]'"
             ) from None
         print(f"{time.monotonic() - began_s:.1f} s")
+
+
+def _compile(name: str) -> None:
+    from gigabrain_zenoh.compiling import compile_all
+    from gigabrain_zenoh.kernels import DRIVING, MAPPING
+
+    compile_all(MAPPING if name == "mapping" else DRIVING)

@@ -19,6 +19,7 @@ from gigabrain_schemas.topics import (
     GOAL,
     GRANTED,
     HEALTH,
+    HEARD,
     INTENT,
     JOINT_CMD,
     LOG,
@@ -39,7 +40,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.keys.roles import Role, common_name, of_generation
 
 ALL = "robot/**"  # all that there is of one robot
-HEARD = ("put", "query", "reply", "declare_queryable")
+TO_LISTENERS = ("put", "query", "reply", "declare_queryable")
 FIRST: Mapping[str, int] = {}  # nobody has been called back
 LOCAL = "local"  # who comes by the router's Unix socket, which only this user can open
 
@@ -55,7 +56,7 @@ class Rights:
 
 
 BRAIN = Rights(
-    says=(WORLD, POSE, MAP, INTENT, TASK, GRANTED, HEALTH, LOG, ESTOP_SAID),
+    says=(WORLD, POSE, MAP, INTENT, TASK, GRANTED, HEARD, HEALTH, LOG, ESTOP_SAID),
     asks=(DESCRIBE, ESTOP),
     answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
     names=("perception", "decision", "relay"),
@@ -146,7 +147,7 @@ def _rules(role: Role, robot: str) -> Iterator[Rule]:
     """One role's rules for one robot."""
     rights, who, everything = RIGHTS[role], common_name(role, robot), under(robot, [ALL])
     says, asks, answers = _keys(rights) if rights else ([ALL], [ALL], [ALL])
-    yield _rule(f"{who} hears", "egress", HEARD, everything)
+    yield _rule(f"{who} hears", "egress", TO_LISTENERS, everything)
     # that somebody listens is no secret: a fleet's operator may listen to `**`
     yield _rule(f"{who} is heard", "egress", ["declare_subscriber"], ["**"])
     yield _rule(f"{who} listens", "ingress", ["declare_subscriber"], everything)

@@ -5,21 +5,25 @@ So what follows from it does not depend on how fast this machine is, unless it i
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from gigabrain_zenoh.journal import done
 
 PATIENCE_S = 0.1  # how long a scan waits for a result that is due
 
 Take = Callable[[], None]  # makes the result count, in the scans' own thread
 Work = Callable[[], Take]
+InTime = Callable[[Future[Any], float], bool]  # whether work is done after so long [s]
 
 
 class Background:
     """One thread, and at most one piece of work at a time."""
 
-    def __init__(self, patience_s: float = PATIENCE_S) -> None:
+    def __init__(self, patience_s: float = PATIENCE_S, in_time: InTime = done) -> None:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="mapping")
         self._job: Future[Take] | None = None
         self._left = 0  # scans until the result is due
-        self._patience_s = patience_s
+        self._patience_s, self._in_time = patience_s, in_time
         self.late = 0  # how often a result was not there when it was due
 
     @property
@@ -38,13 +42,11 @@ class Background:
         self._left -= 1
         if self._left > 0:
             return
-        try:
-            take = self._job.result(self._patience_s)
-        except TimeoutError:
+        if not self._in_time(self._job, self._patience_s):
             self.late += 1
             return
-        self._job = None
-        take()
+        job, self._job = self._job, None
+        job.result()()
 
     def finish(self) -> None:
         """Take the result of what is under way, however long that takes."""

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from gigabrain_zenoh.mapping.adrift import UNKNOWN, Adrift
 from gigabrain_zenoh.mapping.local_map import LocalMap, build
 from gigabrain_zenoh.mapping.matching import Fit, Found, Window, icp, search, thinned
 from gigabrain_zenoh.mapping.points import Scan
@@ -21,6 +22,8 @@ from gigabrain_zenoh.mapping.se2 import (
     turned,
     wrapped,
 )
+from gigabrain_zenoh.mapping.spacing import Spacing
+from gigabrain_zenoh.mapping.visibility import seen_through
 
 Kind = Literal["matched", "searched", "recovered", "odometry", "broken"]
 
@@ -33,23 +36,16 @@ SCORE = 0.35  # a search below it has failed
 LEAST_SCORE = 0.2  # of a search that ICP may begin from
 SURE_SCORE, SURE_INLIERS = 0.55, 0.6  # what it takes to believe a wide search
 WIDE = Window(1.0, 0.6)  # where to look when the scan does not fit where it should
+CLEAR = 0.85  # score, from here on nothing is doubted
+WRONG = 0.2  # share of what should be in view that is looked through: not the place
+CLEARER = 0.1  # so much less of it
+BETTER = 0.1  # score: so much more, for a place that odometry does not lead to
+SLID = 0.3  # [m], a match so far from where odometry leads may have slid over what is known
+ENOUGH = 0.5  # of its inliers, for what odometry leads to instead
+LEAST_INLIERS = 0.15  # share of the points, to go by odometry and them
 FEW = 20  # points, with fewer there is nothing to match
-MISSES, MISSED_TRAVEL, MISSED_TURN = 3, 0.5, 0.5  # scans, [m], [rad]: after these it is broken,
-MISSES_STANDING = 30  # or after so many scans
 CONTRADICTED = 0.6  # squared deviations: a match that pulls odometry farther speaks against it
 UNMOVED = np.zeros((3, 3))
-UNKNOWN = np.diag((10.0, 10.0, np.pi)) ** 2  # covariance of a link that nothing is known of
-
-
-@dataclass(frozen=True, slots=True)
-class Spacing:
-    """When a scan becomes a keyframe, and how many of them the local map holds."""
-
-    travel: float = 0.2  # [m]
-    turn: float = 0.26  # [rad]
-    fewest: int = 8  # keyframes, however far apart they are
-    most: int = 20  # keyframes, however near
-    length: float = 4.0  # [m] of travel, between the two
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +72,7 @@ class FrontEnd:
         self._scans: list[Scan] = []
         self._poses: list[Floats] = []
         self._local: LocalMap | None = None
-        self._adrift = _Adrift()
+        self._adrift = Adrift()
         self._noise: Floats | None = UNMOVED  # of odometry since a scan was matched
         self.pose = pose
 
@@ -96,7 +92,7 @@ class FrontEnd:
         far = match.kind == "broken" or self._far_enough()
         if match.kind == "odometry":
             return match, self._adrift.far and far
-        self._adrift, self._noise = _Adrift(), UNMOVED
+        self._adrift, self._noise = Adrift(), UNMOVED
         return match, far
 
     def place(self, pose: Floats) -> None:
@@ -110,7 +106,7 @@ class FrontEnd:
 
     def restart(self, scans: Sequence[Scan], poses: Sequence[Floats]) -> None:
         """Match to these scans from now on, the nearest of them last."""
-        first = _first(np.array(poses), self._spacing)
+        first = self._spacing.first(np.array(poses))
         self._scans, self._poses = list(scans[first:]), list(poses[first:])
         self._local = build(self._scans, np.array(self._poses), self.pose, CELL, SIGMA)
 
@@ -123,25 +119,76 @@ class FrontEnd:
         if len(scan.points) < FEW:
             return Match(guess, self._adrift.covariance, "odometry", 0.0, 0.0)
         covariance = self._adrift.covariance
-        found = search(local.image, scan.points, guess, _window(self._adrift))
+        found = search(local.image, scan.points, guess, self._adrift.window)
         if self._noise is not None:
             known = turned(self._noise, float(guess[2]))
-            fit = _fit(local, scan, found, guess, known)
+            fit = _fit(local, scan, found.pose, guess, known)
             if fit.inliers >= INLIERS and _likely(fit.pose - guess, known):
                 return replace(_matched(fit, found, known, "matched"), guided=True)
-        fit = _fit(local, scan, found, guess, covariance)
-        near = found.score > LEAST_SCORE and _apart(fit.pose, found.pose) <= MOVED
-        if near and fit.inliers >= INLIERS:
-            return _matched(fit, found, covariance, "matched")
-        if found.score > SCORE:
-            return Match(wrapped(found.pose), covariance, "searched", found.score, fit.inliers)
-        return self._recover(local, scan, guess) or Match(
-            guess,
-            self._adrift.after_break() if self._adrift.broken else covariance,
-            "broken" if self._adrift.broken else "odometry",
-            found.score,
-            fit.inliers,
+        fit = _fit(local, scan, found.pose, guess, covariance)
+        match = _plain(fit, found, covariance)
+        if match and match.score > CLEAR:
+            return match
+        return self._doubted(local, scan, guess, found, match)
+
+    def _doubted(
+        self, local: LocalMap, scan: Scan, guess: Floats, found: Found, match: Match | None
+    ) -> Match:
+        """Where a scan lies of which little fits: where it looks through nothing that is there.
+
+        What fits best is no proof then, for a scan that shows much that is new fits the better the
+        farther it slides back over what is known. So odometry is followed until it is contradicted.
+        """
+        wrong = seen_through(
+            local.buckets.points, scan.points, match.pose if match else wrapped(guess)
         )
+        believed = match is not None and not wrong > WRONG
+        if match and believed and _apart(match.pose, guess) <= SLID:
+            return match
+        near = self._led(local, scan, guess, found)
+        if match and believed:
+            return near if near and near.inliers > ENOUGH * match.inliers else match
+        if near:
+            return near
+        if not wrong < WRONG:
+            least = match.score + BETTER if match else 0.0
+            match = self._recover(local, scan, guess, least, wrong) or match
+        return match or self._lost(guess, found)
+
+    def _led(self, local: LocalMap, scan: Scan, guess: Floats, found: Found) -> Match | None:
+        """Where odometry leads, unless the scan contradicts that or shows next to nothing known."""
+        covariance = self._adrift.covariance
+        fit = _fit(local, scan, guess, guess, covariance)
+        if fit.inliers < LEAST_INLIERS or _apart(fit.pose, guess) > MOVED:
+            return None
+        if not seen_through(local.buckets.points, scan.points, fit.pose) < WRONG:
+            return None
+        return _matched(fit, found, covariance, "matched")
+
+    def _recover(
+        self, local: LocalMap, scan: Scan, guess: Floats, least: float, wrong: float
+    ) -> Match | None:
+        """Where the scan fits beyond doubt, wide round the guess and where the robot was before.
+
+        It has to fit better than `least`, and contradict less than `wrong`, if that is known.
+        """
+        least = max(least, SURE_SCORE)
+        places = [search(local.image, scan.points, at, WIDE, least) for at in (guess, self.pose)]
+        found = max(places, key=lambda place: place.score)
+        if found.score < least:
+            return None
+        fit = _fit(local, scan, found.pose, found.pose, UNKNOWN)
+        if fit.inliers < SURE_INLIERS or _apart(fit.pose, found.pose) > MOVED:
+            return None
+        if seen_through(local.buckets.points, scan.points, fit.pose) > wrong - CLEARER:
+            return None
+        return _matched(fit, found, UNKNOWN, "recovered")
+
+    def _lost(self, guess: Floats, found: Found) -> Match:
+        """By odometry alone, as long as that goes."""
+        if self._adrift.broken:
+            return Match(guess, self._adrift.after_break(), "broken", found.score, 0.0)
+        return Match(guess, self._adrift.covariance, "odometry", found.score, 0.0)
 
     def _summed(self, noise: Floats | None, delta: Floats) -> Floats | None:
         """The odometry's covariance since a scan was matched, in the axes of the pose now."""
@@ -152,61 +199,11 @@ class FrontEnd:
         lever[0, 2], lever[1, 2] = -delta[1], delta[0]
         return np.asarray(turn @ (lever @ self._noise @ lever.T + noise) @ turn.T)
 
-    def _recover(self, local: LocalMap, scan: Scan, guess: Floats) -> Match | None:
-        """Where the scan fits beyond doubt, wide round the guess or round where it was before."""
-        for start in (guess, self.pose):
-            found = search(local.image, scan.points, start, WIDE)
-            if found.score < SURE_SCORE:
-                continue
-            fit = _fit(local, scan, found, found.pose, UNKNOWN)
-            if fit.inliers >= SURE_INLIERS and _apart(fit.pose, found.pose) <= MOVED:
-                return _matched(fit, found, UNKNOWN, "recovered")
-        return None
-
     def _far_enough(self) -> bool:
         if not self._poses:
             return True
         x, y, yaw = between(self._poses[-1], self.pose)
         return bool(np.hypot(x, y) > self._spacing.travel or abs(yaw) > self._spacing.turn)
-
-
-@dataclass(frozen=True, slots=True)
-class _Adrift:
-    """What odometry did since a scan was matched."""
-
-    misses: int = 0  # scans
-    travel: float = 0.0  # [m]
-    turn: float = 0.0  # [rad]
-    blind: bool = False  # there was nothing to match for a while, so odometry may be right
-
-    def moved(self, delta: Floats, blind: bool) -> "_Adrift":
-        travel = self.travel + float(np.hypot(delta[0], delta[1]))
-        turn = self.turn + abs(float(delta[2]))
-        return _Adrift(self.misses + (not blind), travel, turn, self.blind or blind)
-
-    @property
-    def covariance(self) -> Floats:
-        """Of the odometry since; generous, as wheels slip and bad odometry is common."""
-        away, turn = 0.1 + 0.2 * self.travel, 0.1 + 0.3 * self.turn
-        return np.diag((away**2, away**2, turn**2))
-
-    @property
-    def broken(self) -> bool:
-        return (self.misses >= MISSES and self.far) or self.misses >= MISSES_STANDING
-
-    @property
-    def far(self) -> bool:
-        """Whether what was matched last may be out of sight by now."""
-        return self.travel > MISSED_TRAVEL or self.turn > MISSED_TURN
-
-    def after_break(self) -> Floats:
-        return self.covariance if self.blind else UNKNOWN
-
-
-def _window(adrift: _Adrift) -> Window:
-    """The farther odometry has moved since the last match, the wider the search."""
-    effort = min(1.0, adrift.travel / 0.5 + adrift.turn / 0.3)
-    return Window(0.15 + 0.2 * effort, 0.12 + 0.23 * effort)
 
 
 def _likely(off: Floats, covariance: Floats) -> bool:
@@ -215,9 +212,19 @@ def _likely(off: Floats, covariance: Floats) -> bool:
     return bool(off @ inverse_of(covariance) @ off < CONTRADICTED)
 
 
-def _fit(local: LocalMap, scan: Scan, found: Found, guess: Floats, covariance: Floats) -> Fit:
+def _fit(local: LocalMap, scan: Scan, start: Floats, guess: Floats, covariance: Floats) -> Fit:
     points = thinned(scan.points, POINTS)
-    return icp(local.buckets, points, found.pose, GATE, inverse_of(covariance), guess)
+    return icp(local.buckets, points, start, GATE, inverse_of(covariance), guess)
+
+
+def _plain(fit: Fit, found: Found, covariance: Floats) -> Match | None:
+    """Where a search and ICP from there have put the scan, unless both have failed."""
+    near = found.score > LEAST_SCORE and _apart(fit.pose, found.pose) <= MOVED
+    if near and fit.inliers >= INLIERS:
+        return _matched(fit, found, covariance, "matched")
+    if found.score > SCORE:
+        return Match(wrapped(found.pose), covariance, "searched", found.score, fit.inliers)
+    return None
 
 
 def _matched(fit: Fit, found: Found, prior: Floats, kind: Kind) -> Match:
@@ -227,12 +234,3 @@ def _matched(fit: Fit, found: Found, prior: Floats, kind: Kind) -> Match:
 
 def _apart(one: Floats, other: Floats) -> float:
     return float(np.hypot(*(one - other)[:2]))
-
-
-def _first(poses: Floats, spacing: Spacing) -> int:
-    """The first of the poses (n, 3) that the local map still holds."""
-    steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-    behind = np.append(np.cumsum(steps[::-1])[::-1], 0.0)  # travel from each to the last
-    age = np.arange(len(poses))[::-1]
-    held = (age < spacing.fewest) | ((age < spacing.most) & (behind <= spacing.length))
-    return int(np.argmax(held))

@@ -6,7 +6,8 @@ import numpy as np
 
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.mapping.background import PATIENCE_S, Background, Take
+from gigabrain_zenoh.journal import done
+from gigabrain_zenoh.mapping.background import PATIENCE_S, Background, InTime, Take
 from gigabrain_zenoh.mapping.doubt import Doubt
 from gigabrain_zenoh.mapping.drift import Rates
 from gigabrain_zenoh.mapping.field import field_of
@@ -29,8 +30,8 @@ FITS = ("matched", "recovered")  # scans that were found otherwise are not drawn
 class GrowingMap:
     """See Chart in known.py."""
 
-    def __init__(self, patience_s: float = PATIENCE_S) -> None:
-        self._background = Background(patience_s)
+    def __init__(self, patience_s: float = PATIENCE_S, in_time: InTime = done) -> None:
+        self._background = Background(patience_s, in_time)
         self._slam, self._sweeps, self._grid = Slam(rates=RATES), Sweeps(), Grid()
         self._drawn: list[Floats] = []  # poses of keyframes, as they are in the grid
         self._waiting: list[Sweep] = []  # to be drawn
@@ -44,9 +45,11 @@ class GrowingMap:
         self._loops = self._renewals = 0
 
     @classmethod
-    def thaw(cls, arrays: Arrays, patience_s: float = PATIENCE_S) -> "GrowingMap":
+    def thaw(
+        cls, arrays: Arrays, patience_s: float = PATIENCE_S, in_time: InTime = done
+    ) -> "GrowingMap":
         """A saved map, to go on with. Raises ConfigError for arrays that are none."""
-        grown = cls(patience_s)
+        grown = cls(patience_s, in_time)
         try:
             grown._slam = Slam.thaw(arrays, rates=RATES)
             grown._sweeps = Sweeps.thaw(arrays, len(grown._slam.keyframes))

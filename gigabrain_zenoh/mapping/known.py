@@ -4,7 +4,8 @@ from typing import Protocol
 
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.mapping.background import PATIENCE_S, Background
+from gigabrain_zenoh.journal import done
+from gigabrain_zenoh.mapping.background import PATIENCE_S, Background, InTime
 from gigabrain_zenoh.mapping.field import field_of
 from gigabrain_zenoh.mapping.finder import Finder
 from gigabrain_zenoh.mapping.localizer import Place, View
@@ -40,8 +41,10 @@ class Chart(Protocol):
 class KnownMap:
     """A saved map, which stays as it is."""
 
-    def __init__(self, saved: SavedMap, patience_s: float = PATIENCE_S) -> None:
-        self._saved, self._background = saved, Background(patience_s)
+    def __init__(
+        self, saved: SavedMap, patience_s: float = PATIENCE_S, in_time: InTime = done
+    ) -> None:
+        self._saved, self._background = saved, Background(patience_s, in_time)
         field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
         self._finder = Finder(field, "looking for the robot in the map", self._background)
 

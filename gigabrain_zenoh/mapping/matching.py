@@ -58,8 +58,13 @@ def thinned(points: Points, most: int) -> Points:
     return points[np.linspace(0, len(points) - 1, most).astype(np.intp)]
 
 
-def search(image: Image, points: Points, guess: Floats, window: Window) -> Found:
-    """The pose within the window whose points fall on the likeliest cells."""
+def search(
+    image: Image, points: Points, guess: Floats, window: Window, least: float = -np.inf
+) -> Found:
+    """The pose within the window whose points fall on the likeliest cells.
+
+    The guess, with a score of 0, where none scores `least`, which saves most of the search.
+    """
     if not len(points):
         return Found(guess, 0.0)
     steps = int(np.ceil(window.away / image.cell))
@@ -67,7 +72,7 @@ def search(image: Image, points: Points, guess: Floats, window: Window) -> Found
     few = thinned(points, SEARCHED)
     at = _placed(few, guess, image.origin, image.cell, steps, turns, window.step)
     bounds = _bounds(image.coarse, at, steps)
-    score, t, i, j = _best(image.cells, at, bounds, steps)
+    score, t, i, j = _best(image.cells, at, bounds, steps, least)
     off = np.array(((j - steps) * image.cell, (i - steps) * image.cell, (t - turns) * window.step))
     return Found(guess + off, score)
 
@@ -124,10 +129,12 @@ def _bounds(coarse: Bytes, at: Ints, steps: int) -> Floats:
 
 
 @kernel
-def _best(cells: Bytes, at: Ints, bounds: Floats, steps: int) -> tuple[float, int, int, int]:
+def _best(
+    cells: Bytes, at: Ints, bounds: Floats, steps: int, least: float
+) -> tuple[float, int, int, int]:
     """Score, heading, row and column of the pose that is worth most; of equals, the first."""
-    (headings, blocks, _), best = bounds.shape, -np.inf
-    score, at_t, at_i, at_j = 0.0, headings, 0, 0
+    (headings, blocks, _), best = bounds.shape, least
+    score, at_t, at_i, at_j = 0.0, headings // 2, steps, steps
     likeliest = np.argmax(bounds)  # the sooner something good is found, the more can be left out
     for n in range(-1, bounds.size):
         block = likeliest if n < 0 else n

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.mapping.drift import Rates
-from gigabrain_zenoh.mapping.front_end import FrontEnd, Kind, Match, Spacing
+from gigabrain_zenoh.mapping.front_end import FrontEnd, Kind, Match
 from gigabrain_zenoh.mapping.frozen import (
     Arrays,
     freeze_edges,
@@ -25,6 +25,7 @@ from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.loops import LoopSearch, around
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, turned
+from gigabrain_zenoh.mapping.spacing import Spacing
 
 LINK = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance of a link beside that of its match,
 GUIDED = np.diag((0.02, 0.02, 0.005)) ** 2  # and where odometry was known to be good
@@ -60,6 +61,7 @@ def warm_up() -> None:
     slam = Slam()
     slam.add(scan, IDENTITY)
     slam.add(scan, IDENTITY)
+    slam.add(Scan.of(walls / 2), IDENTITY)  # fits nowhere
 
 
 class Slam:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gigabrain_zenoh.mapping import grid, slam
+from gigabrain_zenoh.mapping import grid
 from gigabrain_zenoh.mapping.field import contradiction, field_of
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.relocalize import search
@@ -12,7 +12,15 @@ BEAMS, ROOM_M = 60, 1.0
 
 
 def warm_up() -> None:
-    """Call every kernel once, in a room of 2 x 2 m."""
+    """Call every kernel of making a map once."""
+    from gigabrain_zenoh.mapping import slam  # and gtsam: only who makes maps pays
+
+    warm_up_finding()
+    slam.warm_up()
+
+
+def warm_up_finding() -> None:
+    """Call every kernel of finding the way in a map once, in a room of 2 x 2 m."""
     angles = np.linspace(0.0, 2 * np.pi, BEAMS, endpoint=False)
     ways = np.column_stack((np.cos(angles), np.sin(angles)))
     scan = Scan.of(ROOM_M * ways / np.abs(ways).max(axis=1, keepdims=True), ways[:1])
@@ -23,4 +31,3 @@ def warm_up() -> None:
     sensor = np.zeros(2)
     search(field, scan.points, scan.free, sensor)
     contradiction(field, scan.points, scan.free, sensor, np.zeros(3))
-    slam.warm_up()

@@ -84,13 +84,21 @@ class Access:
     """Decides who is let in."""
 
     def __init__(self, config: PageConfig, port: int) -> None:
-        self._tokens = tokens(token_file(config.tokens))[0] if wants_login(config) else None
+        self._tokens, self.made = None, False
+        if wants_login(config):
+            self._tokens, self.made = tokens(token_file(config.tokens))
         names = LOOPBACK_NAMES if is_loopback(config.listen) else (config.listen,)
         hosts = {f"{name}:{port}" for name in (*names, *config.names)}
         if config.certificate and port == 443:
             hosts |= {*names, *config.names}  # browsers leave out the port that goes without saying
         self._hosts = hosts
         self._scheme = "https" if config.certificate else "http"
+
+    def told(self) -> str:
+        """The tokens, for whoever has just had them made; else nothing."""
+        if self._tokens is None or not self.made:
+            return ""
+        return f"to drive: {self._tokens.operator}\nto look:  {self._tokens.viewer}"
 
     def role(self, token: str) -> Role | None:
         """What a token allows; None for a stranger's."""

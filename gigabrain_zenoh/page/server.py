@@ -98,6 +98,8 @@ async def run(config: PageConfig, bus: Bus, ready: Callable[[], None]) -> None:
         log.info("operator page at %s://%s:%d", scheme, host, port)
         if wants_login(config):
             log.info("it wants a token of %s", token_file(config.tokens))
+        if config.tell_tokens and access.made:
+            print(access.told(), flush=True)
         ready()
         try:
             ends = (serving, showing, bus.failed)

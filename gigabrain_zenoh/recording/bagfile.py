@@ -7,22 +7,25 @@ from typing import Any
 
 from foxglove import Schema
 from mcap.well_known import MessageEncoding
-from mcap.writer import CompressionType, IndexType, Writer
 
-from gigabrain_schemas.topics import CMD_VEL, INTENT, STATE, TOPICS, Topic
+from gigabrain_schemas.topics import CMD_VEL, INTENT, STATE, TASK, TOPICS, Topic
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn, json_schema
 from gigabrain_zenoh.recording.gaps import is_json
 from gigabrain_zenoh.recording.intake import Arrival
 from gigabrain_zenoh.recording.tape import Tape
+from gigabrain_zenoh.recording.writer import Writer
 
 CHUNK_BYTES = 1 << 20
 PROFILE = "gigabrain"
 RAW, VIEW = "raw", "view"  # what a channel is for, under the name "kind" in its metadata
 BY_KEY = {topic.key: topic for topic in TOPICS}
-THINNED = {topic.key for topic in (STATE, CMD_VEL)}  # of which viewers are drawn every second one
-DRAWN_NS = 30_000_000  # at least between two of them
+DRAWN_NS = {  # at least between two of which viewers are drawn one
+    STATE.key: 30_000_000,
+    CMD_VEL.key: 30_000_000,
+    TASK.key: 450_000_000,  # with the whole way to the goal
+}
 
 
 def topic_of(key: str) -> Topic[Any] | None:
@@ -38,8 +41,7 @@ class BagFile:
 
     def __init__(self, path: Path, *, viewers: bool, notes: Mapping[str, str]) -> None:
         self._tape = Tape(path)
-        indexes = IndexType.ALL if viewers else IndexType.ALL & ~IndexType.MESSAGE
-        self._writer = Writer(self._tape, CHUNK_BYTES, CompressionType.ZSTD, indexes)  # type: ignore[arg-type]
+        self._writer = Writer(self._tape, CHUNK_BYTES, message_index=viewers)
         try:
             self._writer.start(PROFILE, "gigabrain-zenoh")
             self._writer.add_metadata("gigabrain", dict(notes))
@@ -153,7 +155,7 @@ class BagFile:
         if key == INTENT.key:  # said again with every tick
             before, self._thought = self._thought, (header.boot, header.basis)
             return before != self._thought
-        if key in THINNED and arrival.log_ns - self._drawn_ns.get(key, 0) < DRAWN_NS:
+        if key in DRAWN_NS and arrival.log_ns - self._drawn_ns.get(key, 0) < DRAWN_NS[key]:
             return False
         self._drawn_ns[key] = arrival.log_ns
         return True

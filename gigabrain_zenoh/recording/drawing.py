@@ -27,7 +27,16 @@ from gigabrain_zenoh.recording.shapes import obstacle, pose_of, stamp, turn
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
 LIDAR = "base_scan"  # as LaserScan has it
-GREY = np.array([*(round(254 - 2.54 * cell) for cell in range(101)), *[128] * 155], np.uint8)
+GREY = [round(254 - 2.54 * cell) for cell in range(101)]  # by how sure it is that a cell is taken
+COLOURS = np.array(  # red, green, blue and alpha as one number; what is unknown is not drawn
+    [
+        *((grey, grey, grey, 255) for grey in GREY),
+        *[(128, 128, 128, 255)] * 154,
+        (128, 128, 128, 0),
+    ],
+    np.uint8,
+).view("<u4")[:, 0]
+PATH_STEP = 2  # of the trajectory's points one is drawn: five a second of the way ahead
 LEVELS = {
     "debug": fox.LogLevel.Debug,
     "info": fox.LogLevel.Info,
@@ -121,9 +130,6 @@ class Drawer:
 
     def _map(self, grid: OccupancyGrid, _: str) -> Iterable[Drawn]:
         cells = np.frombuffer(grid.cells, np.uint8)
-        colours = np.empty((len(cells), 4), np.uint8)
-        colours[:, :3] = GREY[cells][:, None]
-        colours[:, 3] = np.where(cells == 255, 0, 255)  # what is unknown is not drawn
         byte = fox.PackedElementFieldNumericType.Uint8
         names = enumerate(("red", "green", "blue", "alpha"))
         drawn = fox.Grid(
@@ -135,7 +141,7 @@ class Drawer:
             row_stride=grid.width * 4,
             cell_stride=4,
             fields=[fox.PackedElementField(name=n, offset=i, type=byte) for i, n in names],
-            data=colours.tobytes(),
+            data=COLOURS[cells].tobytes(),
         )
         yield of("map", drawn)
 
@@ -149,7 +155,8 @@ class Drawer:
         yield self._frame(pose, MAP, ODOM, Pose(x=x, y=y, yaw=yaw))
 
     def _path(self, intent: Intent, _: str) -> Iterable[Drawn]:
-        poses = [pose_of(point.x, point.y, point.yaw) for point in intent.trajectory]
+        shown = intent.trajectory[::PATH_STEP]
+        poses = [pose_of(point.x, point.y, point.yaw) for point in shown]
         yield of("path", fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses))
 
     def _obstacles(self, world: WorldModel, _: str) -> Iterable[Drawn]:

@@ -1,4 +1,4 @@
-"""A short drive in each world, for the process replay in the tests.
+"""A short drive in each world, and one with a map, for the process replay in the tests.
 
 `python -m gigabrain_zenoh.recording.drives FOLDER` records them anew after a change that is meant.
 """
@@ -7,37 +7,64 @@ import asyncio
 import sys
 from pathlib import Path
 
+from msgspec import Struct
+
 from gigabrain_zenoh.demo import Demo, DemoOptions
 from gigabrain_zenoh.deployment import ALL, Deployment
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.recording.process_replay import SAYS, replay_process, settings_for
-from gigabrain_zenoh.settings import RecorderConfig
+from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig, RecorderConfig
 
-# world and seed: each of these drives meets something to turn away from
-DRIVES = {"arena": 10, "house": 1, "warehouse": 10, "random:1": 6}
-SECONDS = 3.2
+AVOIDS = ("state", "body", "scan", "world", "intent", "cmd_vel", "safety")
+NAVIGATES = (*AVOIDS, "pose", "map", "task", "granted", "heard")
 ATTEMPTS = 5
-TOPICS = ("state", "body", "scan", "world", "intent", "cmd_vel", "safety")
 
 
-def file_of(folder: Path, world: str) -> Path:
-    """Where the drive in `world` is kept."""
-    return folder / f"{world.replace(':', '_')}.mcap"
+class Drive(Struct, frozen=True):
+    """What is driven, and what is recorded of it."""
+
+    world: str
+    seed: int
+    seconds: float = 3.2
+    topics: tuple[str, ...] = AVOIDS
+    perception: PerceptionConfig = PerceptionConfig()
+    decision: DecisionConfig = DecisionConfig()
 
 
-def record(world: str, to: Path) -> int:
+EXPLORES = Drive(
+    "house", 1, 3.2, NAVIGATES,
+    PerceptionConfig(mapping="slam"), DecisionConfig(behaviour="navigate", begin="roam"),
+)  # fmt: skip
+DRIVES = {  # each of the first four meets something to turn away from
+    "arena": Drive("arena", 10),
+    "house": Drive("house", 1),
+    "warehouse": Drive("warehouse", 10),
+    "random_1": Drive("random:1", 6),
+    "exploring": EXPLORES,
+}
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """Where a drive is kept."""
+    return folder / f"{name}.mcap"
+
+
+def record(drive: Drive, to: Path) -> int:
     """Drive, faster than in real time, and record what the brain hears and says; the exit code."""
-    recorder = RecorderConfig(file=str(to.absolute()), topics=TOPICS, viewers=False, flush_s=10.0)
+    file = str(to.absolute())
+    recorder = RecorderConfig(file=file, topics=drive.topics, viewers=False, flush_s=10.0)
     deployment = Deployment(
-        world=world,
-        seed=DRIVES[world],
+        world=drive.world,
+        seed=drive.seed,
         speed=2.0,
         resume="auto",
         router="tcp/127.0.0.1:0",
         hosts={"robot": ALL},
         recorder=recorder,
+        perception=drive.perception,
+        decision=drive.decision,
     )
-    return asyncio.run(Demo(deployment, DemoOptions(seconds=SECONDS, headless=True)).run())
+    return asyncio.run(Demo(deployment, DemoOptions(seconds=drive.seconds, headless=True)).run())
 
 
 def repeats(path: Path) -> bool:
@@ -46,21 +73,21 @@ def repeats(path: Path) -> bool:
     return all(outcome.same for outcome in outcomes)
 
 
-def renew(folder: Path, world: str) -> None:
+def renew(folder: Path, name: str) -> None:
     """Record one drive anew. Raises GigabrainError when it never went well."""
-    fresh = file_of(folder, world).with_suffix(".new")
+    fresh = file_of(folder, name).with_suffix(".new")
     for _ in range(ATTEMPTS):
         fresh.unlink(missing_ok=True)
-        if record(world, fresh) == 0 and repeats(fresh):
-            fresh.replace(file_of(folder, world))
+        if record(DRIVES[name], fresh) == 0 and repeats(fresh):
+            fresh.replace(file_of(folder, name))
             return
-    raise GigabrainError(f"{world}: none of {ATTEMPTS} drives can be repeated")
+    raise GigabrainError(f"{name}: none of {ATTEMPTS} drives can be repeated")
 
 
 def main(folder: Path) -> int:
     """Record all of them anew; the exit code."""
-    for world in DRIVES:
-        renew(folder, world)
+    for name in DRIVES:
+        renew(folder, name)
     return 0
 
 

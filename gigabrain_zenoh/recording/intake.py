@@ -21,14 +21,21 @@ class Arrival(NamedTuple):
     header: Header
 
 
+def _nobody() -> None:
+    """Nobody has to hurry."""
+
+
 class Intake:
     """Takes messages from any thread, and hands them to one writer, who looks into them.
 
-    What does not fit is dropped and counted: a slow disk costs messages, never time.
+    What does not fit is dropped and counted: a slow disk costs messages, never time. `hurry` is
+    called when a quarter of the room is full.
     """
 
-    def __init__(self, room_bytes: int, unix_ns: Callable[[], int]) -> None:
-        self._room, self._unix_ns = room_bytes, unix_ns
+    def __init__(
+        self, room_bytes: int, unix_ns: Callable[[], int], hurry: Callable[[], None] = _nobody
+    ) -> None:
+        self._room, self._unix_ns, self._hurry = room_bytes, unix_ns, hurry
         self._lock = threading.Lock()
         self._waiting: list[tuple[int, str, str, bytes]] = []
         self._looked: list[Arrival] = []  # the oldest of what waits, with their headers
@@ -48,8 +55,10 @@ class Intake:
                 self.gaps.see(key, header_of(payload))
                 self.dropped[key] += 1
                 return
-            self._held += size
+            before, self._held = self._held, self._held + size
             self._waiting.append((now_ns, key, encoding, payload))
+        if before < self._room // 4 <= before + size:
+            self._hurry()
 
     def hand_over(self) -> list[Arrival]:
         """All that waits, oldest first; it keeps its room until `written` is called."""

@@ -6,7 +6,7 @@ basis are one word, of which the last counts: which of two inputs within a tick 
 how often it is repeated.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,13 @@ from msgspec import Struct
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.tasks import Granted
 from gigabrain_schemas.topics import (
     CMD_VEL,
-    GRANTED,
     INTENT,
     JOINT_CMD,
     MAP,
     POSE,
     SAFETY,
-    STATE,
     WORLD,
     Topic,
 )
@@ -35,8 +32,9 @@ from gigabrain_zenoh.gate import BRAIN
 from gigabrain_zenoh.process import node_of
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.recording.fields import message_of, row
-from gigabrain_zenoh.recording.gaps import header_of
-from gigabrain_zenoh.recording.reading import Bag, samples
+from gigabrain_zenoh.recording.heard import hearing
+from gigabrain_zenoh.recording.placing import placed
+from gigabrain_zenoh.recording.reading import Bag, Sample, samples
 from gigabrain_zenoh.replay import Event, replay
 from gigabrain_zenoh.safety import host
 from gigabrain_zenoh.settings import Endpoint
@@ -50,7 +48,6 @@ SAYS: dict[str, tuple[Topic[Any], ...]] = {
 ASIDE = ("stamp_ns", "seq")
 WITH_SETTINGS = ("perception", "decision")
 NOWHERE = {"scripts": "", "state_dir": ""}  # a replay runs no programs, and remembers nothing
-_granted = Codec(GRANTED.type, GRANTED.max_bytes)
 
 ELSEWHEN = 0.1  # share of words that may be said in one of the two alone
 # A process that is busy for a tick passes over a state; a replay has all the time in the world.
@@ -78,8 +75,9 @@ class Outcome(Struct, frozen=True, kw_only=True):
     only_then: int  # recorded, and not said now
     only_now: int
     difference: Difference | None
-    begun_late: bool  # the process had spoken before the recording began
-    real_time: bool = False  # not in lock-step, where the order within a tick does not matter
+    begun_late: bool = False  # the process had spoken before the recording began
+    real_time: bool = False  # not in lock-step, and nobody has said in which order it heard
+    lost: int = 0  # messages that it went by, and the recording does not hold
 
     @property
     def same(self) -> bool:
@@ -88,51 +86,42 @@ class Outcome(Struct, frozen=True, kw_only=True):
         return self.difference is None and max(self.only_then, self.only_now) <= most
 
 
-def load(path: Path, process: str) -> tuple[list[Event], dict[Word, Message]]:
+class Past(Struct, frozen=True, kw_only=True):
+    """What a recording knows of a process."""
+
+    heard: list[Event]
+    said: dict[Word, Message]
+    exact: bool  # the process itself has said what it heard, and in which order
+    lost: int = 0  # of that, what the recording does not hold
+    begun_late: bool  # it had spoken before
+
+
+def load(path: Path, process: str) -> Past:
     """What the process heard, at which times [ns], and what it said. Raises ConfigError."""
-    heard: list[Event] = []
+    heard: list[Sample] = []
     said: list[tuple[str, Message]] = []
     keys = {topic.key for topic in SAYS[process]}
-    first_ns = 0
     for sample in samples(path):
-        first_ns = first_ns or sample.log_ns
         message = message_of(sample) if sample.key in keys else None
         if message and getattr(message, "source", BRAIN) == BRAIN:
             said.append((sample.key, message))
         else:
-            heard.append((sample.log_ns - first_ns, sample.key, sample.payload))
+            heard.append(sample)
     if not said:
         raise ConfigError(f"{path} holds nothing that {process} has said")
-    return placed(heard), _words(said)
-
-
-def placed(heard: Sequence[Event]) -> list[Event]:
-    """The same with what was granted as requests, each where it counted.
-
-    That is before the first message which its process had not heard by then; on the wire both come
-    by ways of their own.
-    """
-    order = [((i, 1), event) for i, event in enumerate(heard)]
-    for i, (_, key, payload) in enumerate(heard):
-        if key != GRANTED.key:
-            continue
-        granted = _granted.decode(payload)
-        later = (j for j, event in enumerate(heard) if _after(granted, event, here=j > i))
-        there = next(later, len(heard) - 1)
-        at_ns, request = heard[there][0], granted.request.encode()
-        order[i] = ((there, 0), (at_ns, granted.service, request))
-    return [event for _, event in sorted(order, key=lambda one: one[0])]
-
-
-def _after(granted: Granted, event: Event, *, here: bool) -> bool:
-    """Whether `event`, recorded later or not, had not been heard when a request was granted."""
-    _, key, payload = event
-    if key not in (STATE.key, WORLD.key):
-        return False
-    header = header_of(payload)
-    if header.boot != granted.boot:
-        return here
-    return header.tick > granted.tick if key == STATE.key else header.basis > granted.basis
+    own = hearing(heard, process)
+    if own:
+        said = [one for one in said if own.began_ns <= one[1].stamp_ns <= own.until_ns]
+        events = own.events
+    else:
+        events = placed([(e.log_ns - heard[0].log_ns, e.key, e.payload) for e in heard])
+    return Past(
+        heard=events,
+        said=_words(said),
+        exact=own is not None,
+        lost=own.lost if own else 0,
+        begun_late=not said or said[0][1].seq > 1,
+    )
 
 
 def _words(said: Iterable[tuple[str, Message]]) -> dict[Word, Message]:
@@ -155,7 +144,6 @@ def compare(then: Mapping[Word, Message], now: Mapping[Word, Message]) -> Outcom
         only_then=len(then) - len(both),
         only_now=len(now.keys() - then.keys()),
         difference=next((each for each in found if each), None),
-        begun_late=next(iter(then.values())).seq > 1,
     )
 
 
@@ -178,13 +166,15 @@ def _differs(word: Word, then: Message, now: Message) -> Difference | None:
 
 async def replay_process(path: Path, process: str, settings: dict[str, Any]) -> Outcome:
     """Feed a recording to a process as it is now. Raises ConfigError, and what ends the process."""
-    heard, then = load(path, process)
+    past = load(path, process)
     node = node_of(ProcessConfig(name=process, endpoint=Endpoint(), settings=settings))
     kinds = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in SAYS[process]}
-    sent = await replay(node, heard)
-    outcome = compare(then, _words((key, kinds[key](data)) for key, data in sent if key in kinds))
-    speed = notes(path).get("speed", "1")
-    return msgspec.structs.replace(outcome, real_time=speed == "1")
+    sent = await replay(node, past.heard)
+    now = _words((key, kinds[key](data)) for key, data in sent if key in kinds)
+    unsure = not past.exact and notes(path).get("speed", "1") == "1"
+    return msgspec.structs.replace(
+        compare(past.said, now), real_time=unsure, lost=past.lost, begun_late=past.begun_late
+    )
 
 
 def notes(path: Path) -> Mapping[str, str]:
@@ -240,5 +230,7 @@ def in_words(path: Path, process: str, outcome: Outcome) -> Iterator[str]:
         yield f"{path}: {process} does what it did: {said}"
     if not outcome.same and outcome.real_time:
         yield "it was recorded in real time: two messages within a tick may have changed places"
+    if outcome.lost and not outcome.same:
+        yield f"{outcome.lost} messages that it went by are not in the recording"
     if not outcome.same and outcome.begun_late:
         yield "the recording begins in the middle of a run, whose earlier part may be the reason"

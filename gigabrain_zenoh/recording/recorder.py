@@ -19,7 +19,7 @@ from gigabrain_zenoh.settings import RecorderConfig
 log = logging.getLogger(__name__)
 
 MB = 1_000_000
-LOOK_S = 0.1  # how often the queue is emptied
+LOOK_S = 0.25  # how often the queue is emptied, at least: every time costs cold caches
 RETRY_S = 1.0  # how often a full disk is tried again
 Open = Callable[[Path], BagFile]
 
@@ -46,14 +46,14 @@ class Recorder:
         self._open = open_file or self._default_open
         began_unix, began = time.time_ns(), time.monotonic_ns()
         room = round(config.queue_mb * MB)
-        self.intake = Intake(room, lambda: began_unix + time.monotonic_ns() - began)
+        self._wake, self._ended = threading.Event(), False
+        self.intake = Intake(room, lambda: began_unix + time.monotonic_ns() - began, self._wake.set)
         self._began_s = time.monotonic()
         self._count = self._done_bytes = self._written = 0
         self._file: BagFile | None = None
         self._kept: dict[str, Arrival] = {}  # newest of what late joiners ask for
         self._flushed_s, self._retry_s = time.monotonic(), 0.0
         self._fault_text, self._fault = "", Fault(log, logging.ERROR)
-        self._end = threading.Event()
         self._pool = ThreadPoolExecutor(1, "recorder")
         self.done: Future[None] | None = None  # settled early by a fault of ours alone
 
@@ -71,7 +71,8 @@ class Recorder:
 
     def __exit__(self, *_: object) -> None:
         """Write what is left and finish the file."""
-        self._end.set()
+        self._ended = True
+        self._wake.set()
         self._pool.shutdown()
 
     def status(self) -> Status:
@@ -103,7 +104,9 @@ class Recorder:
         return file
 
     def _run(self) -> None:
-        while not self._end.wait(LOOK_S):
+        while not self._ended:
+            self._wake.wait(LOOK_S)
+            self._wake.clear()
             self._turn()
         self._turn()
         self._finish()

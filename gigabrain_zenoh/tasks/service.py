@@ -164,7 +164,9 @@ class TaskService:
     ) -> None:
         """Tell from when on a request counts, so that a recording holds all that we go by."""
         text = msgspec.json.encode(request).decode()
-        self._bus.publish(GRANTED, Granted(service=of.key, request=text), basis=self._basis)
+        granted = Granted(service=of.key, request=text)
+        sent = self._bus.publish(GRANTED, granted, basis=self._basis)
+        self._bus.journal.note(GRANTED.key, sent.seq)
         self._tell()
 
     def _refuse(self, what: str, source: str, error: GigabrainError) -> None:

@@ -31,6 +31,7 @@ from gigabrain_schemas.brain import (
     WorldModel,
 )
 from gigabrain_schemas.button import ButtonState
+from gigabrain_schemas.heard import WAITED, Heard, Taken
 from gigabrain_schemas.requests import (
     DescribeRequest,
     Description,
@@ -336,9 +337,17 @@ TASKS: tuple[Message, ...] = (
     ),
 )  # fmt: skip
 
+HEARD: tuple[Message, ...] = (
+    Heard(
+        stamp_ns=STAMP_NS, seq=4, boot=BOOT, tick=206, basis=0, began_ns=STAMP_NS - 500_000_000,
+        keys=("robot/state", "robot/scan", WAITED),
+        taken=(Taken(0, 205, 0), Taken(1, 41, 1250), Taken(2, 1, 2100), Taken(0, 206, 20_020)),
+    ),
+)  # fmt: skip
+
 EXAMPLES: dict[str, Message] = {
     type(message).__name__: message
-    for message in (*SENSORS, *BODY, *BRAIN, *SAFETY, *AUDIT, *REQUESTS, *TASKS)
+    for message in (*SENSORS, *BODY, *BRAIN, *SAFETY, *AUDIT, *REQUESTS, *TASKS, *HEARD)
 }  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
-from gigabrain_schemas import audit, body, brain, button, requests, safety, sensors, tasks
+from gigabrain_schemas import audit, body, brain, button, heard, requests, safety, sensors, tasks
 from gigabrain_schemas.base import Message
 
 M = TypeVar("M", bound=Message)
@@ -89,6 +89,9 @@ BUTTON = Topic(
 )  # fmt: skip
 TASK = Topic("robot/task", tasks.TaskStatus, 5, keep=True, max_bytes=64 * KB)
 GRANTED = Topic("robot/granted", tasks.Granted, 10, depth=256, max_bytes=128 * KB)
+HEARD = Topic(
+    "robot/heard", heard.Heard, 2, priority="background", many=True, depth=32, max_bytes=64 * KB
+)
 AUDIT = Topic("robot/audit", audit.AuditRecord, 10, depth=256)
 
 
@@ -99,7 +102,7 @@ def command_topic(of: body.BodyDescription) -> Topic[brain.CmdVel]:
 
 TOPICS: tuple[Topic[Any], ...] = (
     SCAN, IMU, STATE, BODY, IMAGE, WORLD, POSE, MAP, INTENT, TELEOP, CMD_VEL, JOINT_CMD, SAFETY,
-    BUTTON, HEALTH, LOG, TASK, GRANTED, AUDIT,
+    BUTTON, HEALTH, LOG, TASK, GRANTED, HEARD, AUDIT,
 )  # fmt: skip
 
 ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time")

@@ -62,6 +62,7 @@ export function showFigures(state, moment) {
 function doing(state, moment) {
   if (!state) return 'the robot is silent'
   const { mode, commander } = state.gate
+  if (mode !== 'enabled' && compiling.size) return `getting ready: ${[...compiling].join(' and ')} is compiling, once per installation`
   if (mode !== 'enabled') return mode === 'idle' ? 'at rest, waiting to be enabled' : mode
   if (commander !== 'control') return `${commander} drives`
   if (moment.driving) return `steered by viewer ${moment.driving}`
@@ -97,7 +98,7 @@ function present({ current, doing, distance_remaining: left, eta, queue }) {
   const words = [current.state === 'paused' ? `paused: ${doing}` : doing || current.label]
   if (left != null) words.push(`${left.toFixed(1)} m left`)
   if (eta != null) words.push(`about ${since(eta)}`)
-  if (current.reason) words.push(current.reason)
+  if (current.reason && current.reason !== words[0]) words.push(current.reason)
   if (queue.length) words.push(`then ${queue.map((task) => task.label).join(', ')}`)
   return words.join(' · ')
 }
@@ -107,6 +108,7 @@ function lastTask(task) {
 }
 
 const healths = new Map() // process -> [health, when]
+const compiling = new Set() // processes that have said so, and not yet that they are ready
 
 export function hearHealth(health) {
   healths.set(health.process, [health, performance.now()])
@@ -165,6 +167,8 @@ function since(seconds) {
 }
 
 export function hearLine(line) {
+  if (line.event === 'compiling') compiling.add(line.process)
+  if (line.event === 'ready') compiling.delete(line.process)
   const list = $('log').firstElementChild, item = make('li', '', line.level)
   item.append(make('time', new Date(line.stamp_ns / 1e6).toLocaleTimeString()), make('span', line.process, 'p'), make('span', line.text))
   list.prepend(item)

@@ -1,0 +1,52 @@
+"""A goal beyond the edge of the map."""
+
+import numpy as np
+import pytest
+
+from gigabrain_schemas.arrays import cells
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.behaviours.beyond import widened
+
+
+def small() -> OccupancyGrid:
+    known = np.array([[0, 100, 0, 0], [0, 0, -1, 0]], np.int8)
+    return OccupancyGrid(
+        resolution=0.5, width=4, height=2, origin_x=-1.0, origin_y=-0.5, cells=known.tobytes()
+    )
+
+
+def test_a_map_that_holds_the_goal_stays_as_it_is() -> None:
+    grid = small()
+    assert widened(grid, Goal(x=0.9, y=0.4)) is grid
+
+
+@pytest.mark.parametrize(
+    ("goal", "size", "corner"),
+    [
+        ((3.0, 0.0), (12, 2), (-1.0, -0.5)),
+        ((-2.0, 0.0), (10, 2), (-4.0, -0.5)),
+        ((0.0, 3.0), (4, 11), (-1.0, -0.5)),
+        ((-1.5, -1.0), (9, 8), (-3.5, -3.0)),
+        ((1.0, 0.0), (8, 2), (-1.0, -0.5)),
+    ],
+)
+def test_it_grows_towards_the_goal_and_two_metres_on(
+    goal: tuple[float, float], size: tuple[int, int], corner: tuple[float, float]
+) -> None:
+    wide = widened(small(), Goal(x=goal[0], y=goal[1]))
+    assert (wide.width, wide.height) == size
+    assert (wide.origin_x, wide.origin_y) == corner
+
+
+def test_what_was_known_stays_in_its_place_and_all_else_is_unknown() -> None:
+    wide = widened(small(), Goal(x=-1.5, y=-1.0))
+    assert cells(wide)[5:7, 5:].tolist() == cells(small()).tolist()
+    assert (cells(wide)[:5] == -1).all()
+    assert (cells(wide)[:, :5] == -1).all()
+
+
+def test_no_map_is_made_for_a_goal_too_far_off() -> None:
+    grid = small()
+    assert widened(grid, Goal(x=1e6, y=1e6)) is grid
+    assert widened(grid, Goal(x=1e9, y=0.0)) is grid

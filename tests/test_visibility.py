@@ -1,0 +1,66 @@
+"""Where a scan may have been taken, by what its beams would have passed through."""
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between
+from gigabrain_zenoh.mapping.slam import Slam
+from gigabrain_zenoh.mapping.visibility import seen_through
+from tests.rooms import Lidar, box, drifting, line
+
+ROOM = np.array([*box(-3, -2, 6, 4), *box(1, 0.5, 0.6, 0.4)])
+# a corridor with doors and pillars at irregular distances
+CORRIDOR = np.array(
+    [
+        (-30.0, -1.0, 8.0, -1.0), (-30.0, 1.0, 8.0, 1.0), (8.0, -1.0, 8.0, 1.0),
+        (-30.0, -1.0, -30.0, 1.0),
+        *box(2.3, -1, 0.3, 0.3), *box(-1.2, 0.75, 0.4, 0.25), *box(-5.5, -1, 0.2, 0.4),
+        *box(-8.1, 0.8, 0.6, 0.2), *box(-12.4, -1, 0.5, 0.3), *box(-13.9, 0.7, 0.2, 0.3),
+        *box(-18.8, -1, 0.3, 0.5), *box(-23.3, 0.75, 0.4, 0.25),
+    ]
+)  # fmt: skip
+
+
+def scan(walls: Floats, pose: Floats) -> Scan:
+    return Lidar(180, reach=6.0).scan(walls, pose)
+
+
+def ahead(walls: Floats, pose: Floats) -> Scan:
+    """What is seen by a lidar that looks ahead only."""
+    lidar = Lidar(180, reach=6.0)
+    lidar.angles = np.radians(np.arange(-90.0, 90.0))
+    return lidar.scan(walls, pose)
+
+
+def test_a_scan_looks_through_nothing_where_it_was_taken() -> None:
+    shown, there = scan(ROOM, IDENTITY).points, np.array((0.4, -0.5, 0.6))
+    assert seen_through(shown, scan(ROOM, there).points, there) == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_scan_looks_through_the_walls_of_a_place_that_is_smaller() -> None:
+    shown = scan(np.array(box(-1.5, -1.5, 3, 3)), IDENTITY).points
+    assert seen_through(shown, scan(ROOM, IDENTITY).points, IDENTITY) > 0.5
+
+
+def test_what_lies_behind_a_wall_is_not_in_view() -> None:
+    shown = scan(ROOM, IDENTITY).points
+    near = scan(np.array(box(-1.5, -1.5, 3, 3)), IDENTITY).points
+    assert np.isnan(seen_through(shown, near, IDENTITY))
+
+
+def test_of_a_place_that_shows_nothing_nothing_is_said() -> None:
+    nothing = np.empty((0, 2), np.float32)
+    assert np.isnan(seen_through(nothing, scan(ROOM, IDENTITY).points, IDENTITY))
+    assert np.isnan(seen_through(scan(ROOM, IDENTITY).points, nothing, IDENTITY))
+
+
+def test_a_robot_that_backs_along_a_corridor_does_not_slide_back_over_what_it_knows() -> None:
+    """Half of each scan is new then: what fits best is a place too far ahead."""
+    poses = line(np.array((5.0, 0.0, 0.0)), np.array((-25.0, 0.1, 0.0)), 1.0)
+    slam = Slam(poses[0])
+    steps = np.concatenate((IDENTITY[None], drifting(poses, turn=0.01, scale=1.04)))
+    for pose, step in zip(poses, steps, strict=True):
+        estimate = slam.add(ahead(CORRIDOR, pose), step)
+    off = between(poses[-1], estimate.pose)
+    assert np.hypot(off[0], off[1]) < 1.5  # 5 % of the way, along which little tells it from others
