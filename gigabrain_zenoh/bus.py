@@ -97,7 +97,7 @@ class Bus:
         decode, pattern = Codec(topic.type, topic.max_bytes).decode, topic.at(name)
         moves_time = topic.key in CLOCK_KEYS
 
-        def receive(key: str, payload: bytes) -> None:
+        def receive(key: str, payload: bytes) -> bool:
             self.received[pattern] += 1
             try:
                 message = decode(payload)
@@ -105,12 +105,13 @@ class Bus:
                 self._rejections.reject(pattern, error)
                 if on_bad:
                     on_bad(payload)
-                return
+                return False
             self._rejections.accept(pattern)
             if moves_time:
                 self.time.see(message)
             self.journal.note(key, message.seq)
             on_message(key, message)
+            return True
 
         guarded = self._guard(receive)
         ends = self._transport.subscribe(pattern, guarded, topic.depth)
@@ -194,11 +195,12 @@ class Bus:
     def _guard(self, receive: OnSample) -> OnSample:
         """A fault in a node ends its process: `failed` carries it to whoever runs the node."""
 
-        def guarded(key: str, payload: bytes) -> None:
+        def guarded(key: str, payload: bytes) -> bool | None:
             try:
-                receive(key, payload)
+                return receive(key, payload)
             except Exception as error:  # noqa: BLE001 - handed on whole, to be raised by the runner
                 self._fail(error)
+                return None
 
         return guarded
 

@@ -9,12 +9,20 @@ from gigabrain_zenoh.bridge import Bridge
 T = TypeVar("T")
 
 
-class Mailbox(Generic[T]):
-    """Holds `depth` samples while the loop is busy; the oldest give way to newer ones."""
+SPARE = 8  # samples from which the newest that can be read is taken
 
-    def __init__(self, bridge: Bridge, on_sample: Callable[[T], None], depth: int) -> None:
+
+class Mailbox(Generic[T]):
+    """Holds `depth` samples while the loop is busy; the oldest give way to newer ones.
+
+    Where only the newest counts it is the newest that can be read (`on_sample` does not say False):
+    whoever sends nonsense must not push out what is good.
+    """
+
+    def __init__(self, bridge: Bridge, on_sample: Callable[[T], bool | None], depth: int) -> None:
         self._bridge, self._on_sample = bridge, on_sample
-        self._samples: deque[T] = deque(maxlen=depth)
+        self._newest_only = depth == 1
+        self._samples: deque[T] = deque(maxlen=SPARE if self._newest_only else depth)
         self._posted = False
 
     def put(self, sample: T) -> None:
@@ -26,5 +34,14 @@ class Mailbox(Generic[T]):
 
     def _deliver(self) -> None:
         self._posted = False  # before emptying: what comes now is posted again
+        if self._newest_only:
+            self._deliver_newest()
+            return
         for _ in range(len(self._samples)):
             self._on_sample(self._samples.popleft())
+
+    def _deliver_newest(self) -> None:
+        waiting = [self._samples.popleft() for _ in range(len(self._samples))]
+        for sample in reversed(waiting):
+            if self._on_sample(sample) is not False:
+                break

@@ -74,6 +74,7 @@ class Mapper:
         self._chart = chart_of(config, bus.journal.in_time)
         self._fusion, self._boot = Fusion(), 0
         self._last: Moment | None = None  # of the last scan that was taken
+        self._blank = not config.map  # nothing is in the map yet
         self._shown: OccupancyGrid | None = None
         self._shown_tick = 0
         self._said, self._left_out = "", ""
@@ -131,10 +132,15 @@ class Mapper:
         self._took_ms.add((time.perf_counter() - began) * 1e3)
 
     def _motion(self, moment: Moment) -> Floats:
-        """From the last scan to this one."""
+        """From the last scan to this one.
+
+        The first of a new map lies where odometry has it: should this process have died, places in
+        the map stay the same ones, but for what odometry has drifted since.
+        """
         last, self._last = self._last, moment
+        blank, self._blank = self._blank, False
         if last is None:
-            return IDENTITY
+            return moment.fused if blank else IDENTITY
         if last.jumps != moment.jumps:
             self._chart.lose("the odometry has jumped")
         return between(last.fused, moment.fused)

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.errors import GigabrainError
 
-OnSample = Callable[[str, bytes], None]  # key, payload
+OnSample = Callable[[str, bytes], bool | None]  # key, payload; False: it cannot be read
 OnRaw = Callable[[str, str, bytes], None]  # key, encoding, payload
 Answer = Callable[[bytes], Awaitable[tuple[bytes, str]]]  # payload; payload and its encoding
 Close = Callable[[], None]  # may be called twice
@@ -36,7 +36,10 @@ class Transport(Protocol):
         ...
 
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
-        """Call `on_sample` for what arrives on `key`; of what piles up the newest `depth` stay."""
+        """Call `on_sample` for what arrives on `key`; of what piles up the newest `depth` stay.
+
+        At a depth of one it is the newest for which `on_sample` does not say False.
+        """
         ...
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:

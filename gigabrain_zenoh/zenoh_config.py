@@ -7,17 +7,17 @@ from typing import Any
 
 from msgspec import structs
 
-from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.addresses import LOCAL_ENDPOINT, host_and_port
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.acl import access_control, known_names
 from gigabrain_zenoh.keys.files import CA, CERTIFICATE, KEY, check_files
 from gigabrain_zenoh.keys.list_file import generations_in
 from gigabrain_zenoh.settings import Endpoint, RouterConfig
+from gigabrain_zenoh.zenoh_bounds import bounds
 
 SECURE, PLAIN = "tls/", "tcp/"
+ROOMY = ("real_time", "interactive_high", "data_high", "data")
 PENDING = 4000  # links that may be on their way in; silent ones are dropped after a second
-FAR_TOO_LARGE = 4  # times a topic's bound
 
 
 def session_config(endpoint: Endpoint) -> dict[str, Any]:
@@ -61,34 +61,17 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
         "transport/link/tx/lease": 400,
         "transport/link/tx/keep_alive": 4,
         # small messages that are not batched take a place each
-        "transport/link/tx/queue/size": {"real_time": 16, "data_high": 16, "data": 16},
+        "transport/link/tx/queue/size": dict.fromkeys(ROOMY, 16),
         "transport/link/rx/max_message_size": 16 << 20,
         "transport/shared_memory/enabled": False,
     }
     if endpoint.listen and (endpoint.keys or endpoint.connect):
         config["adminspace/enabled"] = False
     if endpoint.listen:
-        config["low_pass_filter"] = [
-            _small(size) for size in sorted({topic.max_bytes for topic in TOPICS})
-        ]
+        config |= bounds()
     if endpoint.namespace:
         config["namespace"] = endpoint.namespace
     return config
-
-
-def _small(size: int) -> dict[str, Any]:
-    """Zenoh's low-pass filter: what is far too large ends at the router.
-
-    Readers refuse less than that themselves, and count it; but megabytes hold up what comes after
-    them on the same line, and an e-stop may be among it.
-    """
-    return {
-        "id": f"at most {size // 1024} KB",
-        "messages": ["put"],
-        "flows": ["ingress"],
-        "key_exprs": [f"**/{topic.key}/**" for topic in TOPICS if topic.max_bytes == size],
-        "size_limit": FAR_TOO_LARGE * size,
-    }
 
 
 def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, Any]:

@@ -68,8 +68,8 @@ class ZenohTransport:
         """Listen; samples that pile up while the loop is busy give way to newer ones."""
         fixed = "" if "*" in key else key
 
-        def deliver(sample: zenoh.Sample) -> None:
-            on_sample(fixed or str(sample.key_expr), sample.payload.to_bytes())
+        def deliver(sample: zenoh.Sample) -> bool | None:
+            return on_sample(fixed or str(sample.key_expr), sample.payload.to_bytes())
 
         mailbox = Mailbox(self._bridge, deliver, depth)
         return self._undeclare(self._session.declare_subscriber(key, mailbox.put))

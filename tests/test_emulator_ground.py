@@ -219,6 +219,36 @@ def test_a_driver_without_a_device_says_which_have_one() -> None:
         device_class("lime")
 
 
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs /proc")
+def test_the_port_of_an_emulator_that_was_killed_leads_nowhere(tmp_path: Path) -> None:
+    port = tmp_path / "base"
+    program = (
+        "import asyncio, os, pathlib, signal, sys\n"
+        "from gigabrain_drivers.emulators.pty import Pty\n"
+        "async def main():\n"
+        "    Pty(pathlib.Path(sys.argv[1])).plug()\n"
+        "    print(os.path.realpath(sys.argv[1]))\n"
+        "    sys.stdout.flush()\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "asyncio.run(main())\n"
+    )
+    ran = subprocess.run(
+        (sys.executable, "-c", program, str(port)), stdout=subprocess.PIPE, text=True, check=False
+    )
+    assert ran.stdout.startswith("/dev/")
+    name, opened = ran.stdout.strip(), list[int]()
+    try:
+        for _ in range(50):  # until the name is somebody else's
+            opened.extend(os.openpty())
+            if os.ttyname(opened[-1]) == name:
+                break
+        assert port.is_symlink()
+        assert not port.exists()
+    finally:
+        for descriptor in opened:
+            os.close(descriptor)
+
+
 async def test_a_port_that_is_another_emulators_by_now_is_left(tmp_path: Path) -> None:
     first, second = Pty(tmp_path / "base"), Pty(tmp_path / "base")
     first.plug()

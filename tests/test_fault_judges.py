@@ -20,6 +20,7 @@ from gigabrain_zenoh.faults.clock import OtherHost, age_error_ms
 from gigabrain_zenoh.faults.growth import Growth
 from gigabrain_zenoh.faults.onlooker import Onlooker
 from gigabrain_zenoh.faults.smooth import stops, stops_in_time
+from gigabrain_zenoh.faults.stopping import first_zero
 from gigabrain_zenoh.transport import LocalNetwork
 from tests.brain_rig import BOOT, DRIVING, state
 
@@ -93,6 +94,17 @@ def drive(modes: Sequence[str], commanded: Sequence[int]) -> Onlooker:
         onlooker.commands.append(CmdVel(linear_x=0.2, source="control", boot=BOOT, tick=tick))
         onlooker.arrivals.append(tick)
     return onlooker
+
+
+@pytest.mark.parametrize(("seen", "zero"), [(20, 20), (21, 20), (22, 20), (23, 21), (40, 31)])
+async def test_ticks_that_a_busy_machine_left_out_do_not_make_a_stop_later(
+    seen: int, zero: int
+) -> None:
+    onlooker = drive(["enabled"] * 30 + ["stopping"] * 15, [*range(1, 20), *range(seen, 45)])
+    for n, command in enumerate(onlooker.commands):
+        if command.tick >= seen:
+            onlooker.commands[n] = replace(command, linear_x=0.1)
+    assert first_zero(onlooker, onlooker.states[0], 15) == zero
 
 
 async def test_a_stop_is_unexplained_only_where_commands_came_in_time() -> None:

@@ -28,9 +28,9 @@ STALL_S = 0.2
 FAULT = Fault(1, "decision-killed", "process", "", "zero after <= 120 ms, travel <= 0.1 m")
 
 
-def test_the_table_has_all_44_faults_and_automatic_recovery() -> None:
-    assert [fault.number for fault in FAULTS] == list(range(1, 46))
-    assert len({fault.name for fault in FAULTS}) == 45
+def test_the_table_has_all_44_faults_and_two_recoveries() -> None:
+    assert [fault.number for fault in FAULTS] == list(range(1, 47))
+    assert len({fault.name for fault in FAULTS}) == 46
 
 
 def test_every_criterion_can_be_measured() -> None:
@@ -81,6 +81,14 @@ def test_a_body_without_the_line_in_question_is_skipped() -> None:
         deployment_of(Options(body="alpha"), "serial")
 
 
+def test_deaths_of_the_driver_are_judged_on_whatever_line_a_body_has() -> None:
+    assert [fault.number for fault in FAULTS if fault.stage == "line"] == [7, 8, 11]
+    assert deployment_of(Options(), "line") == deployment_of(Options(), "serial")
+    assert deployment_of(Options(body="alpha"), "line").link == "emulated"
+    with pytest.raises(Skipped, match="mock has no line"):
+        deployment_of(Options(body="mock"), "line")
+
+
 def test_the_same_robots_can_be_had_navigating() -> None:
     robot = deployment_of(Options(behaviour="navigate"), "serial")
     assert (robot.decision.behaviour, robot.decision.begin) == ("navigate", "roam")
@@ -89,7 +97,7 @@ def test_the_same_robots_can_be_had_navigating() -> None:
 
 
 async def test_what_cannot_run_is_skipped_and_says_why(tmp_path: Path) -> None:
-    (result,) = await run_suite(choose(["8"]), Options(body="alpha"), tmp_path)
+    (result,) = await run_suite(choose(["12"]), Options(body="alpha"), tmp_path)
     assert result.verdict == "skipped"
     assert result.reason == "alpha has no serial line"
 

@@ -36,6 +36,19 @@ async def test_a_mailbox_of_one_hands_a_busy_loop_the_newest_only(hand: Hand) ->
     assert hand.got == [99, 100]
 
 
+async def test_what_cannot_be_read_does_not_push_out_what_can(hand: Hand) -> None:
+    def read(number: int) -> bool:
+        hand.got.append(number)
+        return number < 3
+
+    mailbox = Mailbox(hand.bridge, read, 1)
+    for number in range(7):
+        mailbox.put(number)
+    await hand.until(5)
+    await asyncio.sleep(0)
+    assert hand.got == [6, 5, 4, 3, 2]
+
+
 async def test_a_deeper_mailbox_keeps_the_newest_in_order(hand: Hand) -> None:
     mailbox = Mailbox(hand.bridge, hand.got.append, 16)
     for number in range(100):

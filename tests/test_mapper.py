@@ -82,7 +82,7 @@ async def test_each_scan_gives_a_world_and_then_a_pose_that_rest_on_it() -> None
         poses = robot.sent(POSE)
     assert keys == [WORLD.key, POSE.key] * 3
     assert [pose.basis for pose in poses] == [5, 10, 15]
-    assert [pose.x for pose in poses] == pytest.approx([0.0, 0.02, 0.04], abs=0.01)
+    assert [pose.x for pose in poses] == pytest.approx([0.02, 0.04, 0.06], abs=0.01)
     assert all(pose.localized for pose in poses)
     assert len(poses[0].covariance) == 9
 
@@ -101,6 +101,19 @@ async def test_a_scan_that_was_quicker_than_the_state_of_its_tick_waits_for_it()
             poses.append([(pose.basis, pose.x, pose.y) for pose in robot.sent(POSE)])
     assert poses[0] == poses[1]
     assert [basis for basis, _, _ in poses[0]] == [5, 10]
+
+
+async def test_a_map_that_has_to_be_made_anew_has_its_places_where_the_old_one_had_them() -> None:
+    poses = []
+    for dead_until in (0, 100):  # a tick
+        async with Robot() as robot:
+            robot.say()
+            robot.tick = dead_until
+            robot.drive(22 - dead_until // 5)
+            poses.append(robot.sent(POSE)[-1])
+    old, new = poses
+    assert (new.x, new.y, new.yaw) == pytest.approx((old.x, old.y, old.yaw), abs=0.02)
+    assert old.x == pytest.approx(0.44, abs=0.02)
 
 
 async def test_the_map_comes_once_a_second_and_only_when_it_has_changed() -> None:

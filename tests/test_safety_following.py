@@ -88,6 +88,15 @@ def test_frozen_telemetry_is_frozen_until_a_value_changes() -> None:
     assert patrol.go(300, told=REST, frozen=True, gate=IDLE) == []
 
 
+def test_short_moves_with_frozen_telemetry_add_up() -> None:
+    patrol, moving = under_way(REST), 0
+    while "telemetry_frozen" not in patrol.codes and moving < 100:
+        told = AHEAD if patrol.tick % 40 < 8 else REST
+        patrol.go(told=told, frozen=True)
+        moving += moves(patrol.memory.following.told)
+    assert moving == 20
+
+
 moments = st.tuples(
     st.integers(min_value=1, max_value=40),  # ticks
     st.sampled_from([REST, AHEAD, TURN, Velocity(linear_x=-0.2)]),
@@ -108,9 +117,9 @@ def test_a_body_whose_telemetry_is_known_to_be_frozen_is_never_told_to_move_agai
             enabled = wanted and patrol.verdict.verdict != "stop"
             patrol.go(told=told, gate=DRIVING if enabled else IDLE, frozen=True)
             found += found > 0 or "telemetry_frozen" in patrol.codes
-            moved = moved + 1 if moves(patrol.memory.following.told) else 0
-            assert moved <= 40
-            assert found <= 15 or not moved  # by then the ramp is over
+            moved += moves(patrol.memory.following.told)
+            assert moved <= 35  # 0.4 s until it is found, and the ramp
+            assert found <= 15 or not moves(patrol.memory.following.told)  # the ramp is over
 
 
 def moves(told: Velocity) -> bool:

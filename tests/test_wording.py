@@ -15,6 +15,7 @@ from gigabrain_drivers.protocols.line import Decoder, Template, describe
 from gigabrain_drivers.protocols.line_fields import COMMAND
 from gigabrain_drivers.trace import run
 from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.cli import driver_kit
 from gigabrain_zenoh.cli.driver_kit import trace
 from gigabrain_zenoh.errors import ConfigError
 from tests.line_rig import BARE, bench
@@ -169,3 +170,22 @@ def test_a_trace_for_no_time_or_at_no_speed_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=complaint):
         trace("mycustombot", **options)  # type: ignore[arg-type]
+
+
+def test_the_kit_tells_in_one_line_what_it_has_broken_on_purpose(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def check(*_: object) -> list[object]:
+        for text in ("watchdog", "unplugged", "watchdog"):
+            logging.getLogger("somebody.elses.driver").warning("the firmware reports: %s", text)
+        return []
+
+    found = driver_kit.find
+    monkeypatch.setattr(
+        driver_kit, "find", lambda path: check if path.endswith("kit:check") else found(path)
+    )
+    assert driver_kit.test("mycustombot") == 0
+    assert capsys.readouterr().out.splitlines()[0] == (
+        "what was broken on purpose, in its own words: the firmware reports: watchdog (2 times); "
+        "the firmware reports: unplugged"
+    )

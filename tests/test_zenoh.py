@@ -91,7 +91,7 @@ async def test_each_topic_goes_out_with_the_quality_of_service_of_its_line(net: 
         return sample.priority, sample.congestion_control, sample.express, str(sample.encoding)
 
     drop, kind = zenoh.CongestionControl.DROP, "application/msgpack;gigabrain."
-    assert qos("robot/cmd_vel") == (zenoh.Priority.REAL_TIME, drop, True, kind + "CmdVel")
+    assert qos("robot/cmd_vel") == (zenoh.Priority.INTERACTIVE_HIGH, drop, False, kind + "CmdVel")
     assert qos("robot/teleop") == (zenoh.Priority.INTERACTIVE_HIGH, drop, False, kind + "Twist")
     assert qos("robot/intent") == (zenoh.Priority.DATA, drop, False, kind + "Intent")
     assert qos("robot/health/control") == (zenoh.Priority.BACKGROUND, drop, False, kind + "Health")
@@ -199,6 +199,29 @@ async def test_what_is_far_too_large_ends_at_the_router(net: Robot) -> None:
 
     await repeat(send, lambda: twists.newest)
     assert bus.rejected["robot/teleop"] == 0
+
+
+async def test_nobody_is_more_urgent_than_what_he_says(net: Robot) -> None:
+    samples: dict[str, zenoh.Sample] = {}
+    net.raw().declare_subscriber("red/**", lambda s: samples.update({str(s.key_expr): s}))
+    raw = net.raw()
+
+    def send() -> None:
+        for key in ("red/robot/cmd_vel", "red/robot/image/front", "red/robot/estop"):
+            raw.put(
+                key,
+                b"x",
+                priority=zenoh.Priority.REAL_TIME,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                express=True,
+            )
+
+    await repeat(send, lambda: len(samples) == 3)
+    assert {key: (s.priority, s.congestion_control, s.express) for key, s in samples.items()} == {
+        "red/robot/cmd_vel": (zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.DROP, False),
+        "red/robot/image/front": (zenoh.Priority.DATA, zenoh.CongestionControl.DROP, False),
+        "red/robot/estop": (zenoh.Priority.REAL_TIME, zenoh.CongestionControl.DROP, False),
+    }
 
 
 async def test_late_joiners_get_the_kept_value(net: Robot) -> None:

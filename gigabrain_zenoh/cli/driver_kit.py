@@ -1,11 +1,13 @@
 """`gigabrain driver test`, `new` and `trace`: for whoever writes drivers."""
 
 import asyncio
+import logging
 import os
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -15,6 +17,30 @@ from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import LinkName
 
 COLOURS = {"pass": "green", "fail": "bold red", "n/a": "dim"}
+
+
+class _Said(logging.Handler):
+    """Gathers the warnings of whatever is tried, instead of a line for each. Used as `with`."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.texts: Counter[str] = Counter()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Count it."""
+        self.texts[record.getMessage()] += 1
+
+    def __enter__(self) -> Self:
+        logging.getLogger().addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger().removeHandler(self)
+
+    def __str__(self) -> str:
+        return "; ".join(
+            f"{text} ({times} times)" if times > 1 else text for text, times in self.texts.items()
+        )
 
 
 def test(
@@ -50,12 +76,18 @@ def test(
     for title in ("check", "criterion", "measured", "verdict"):
         table.add_column(title)
     console = Console()
-    with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder, console.status("") as status:
+    said = _Said()
+    place = tempfile.TemporaryDirectory(prefix="gigabrain-")
+    with said, place as folder, console.status("") as status:
         running = find("gigabrain_drivers.conformance.kit:check")
         results = asyncio.run(running(name, chosen, Path(folder), status.update, repeat))
     for result in results:
         colour = COLOURS[result.verdict]
         table.add_row(*result[:-1], f"[{colour}]{result.verdict}[/]")
+    if said.texts:
+        console.print(
+            f"what was broken on purpose, in its own words: {said}", markup=False, soft_wrap=True
+        )
     console.print(table)
     return int(any(result.verdict == "fail" for result in results))
 

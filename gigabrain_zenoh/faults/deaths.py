@@ -30,7 +30,7 @@ OLD_COMMANDS = 25
 
 async def gate_killed(rig: Rig) -> Measured:
     """kill -9 of the gate, which is in the driver's process: it boots latched, as somebody new."""
-    subject = await rig.robot("serial")
+    subject = await rig.robot("line")
     onlooker, old = subject.onlooker, subject.onlooker.state.boot
     zero_ms, _ = await _without_driver(subject)
     await until(lambda: onlooker.state.boot != old, "the driver's restart")
@@ -55,7 +55,7 @@ async def gate_killed(rig: Rig) -> Measured:
 
 async def driver_killed(rig: Rig) -> Measured:
     """kill -9: nobody tells the body to stop, so it does that itself."""
-    zero_ms, travel_m = await _without_driver(await rig.robot("serial"))
+    zero_ms, travel_m = await _without_driver(await rig.robot("line"))
     return {"motors zero after": zero_ms, "travel": travel_m}
 
 
@@ -102,7 +102,7 @@ async def _command_of(subject: Subject, boot: int) -> None:
 
 async def every_process_and_pair_killed(rig: Rig) -> Measured:
     """kill -9 of each process, of pairs, of all in some order; all of them in the long form."""
-    subject = await rig.robot("serial")
+    subject = await rig.robot("line")
     trials = [await _trial(subject, victims) for victims in _plan(rig.long)]
     return {name: max(trial[name] for trial in trials) for name in trials[0]}
 

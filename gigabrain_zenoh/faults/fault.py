@@ -14,7 +14,7 @@ from gigabrain_zenoh.errors import GigabrainError
 if TYPE_CHECKING:
     from gigabrain_zenoh.faults.rig import Rig
 
-Stage = Literal["sim", "serial", "tcp", "auto", ""]
+Stage = Literal["sim", "auto", "line", "serial", "tcp", ""]
 Verdict = Literal["passed", "FAILED", "skipped"]
 Measured = Mapping[str, float]  # a figure for each limit of the criterion
 Test = Callable[["Rig"], Awaitable[Measured]]

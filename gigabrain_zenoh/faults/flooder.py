@@ -1,11 +1,14 @@
 """Somebody who may talk, and does not stop: commands by the thousand, and large messages.
 
+His commands call themselves the most urgent of all, and wait for nobody.
+
 For tests only. Started as `python -m gigabrain_zenoh.faults.flooder RATE_HZ LARGE_BYTES ENDPOINT`.
 """
 
 import asyncio
 import os
 import sys
+from dataclasses import replace
 
 import msgspec
 
@@ -18,6 +21,7 @@ from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 NAME = "flooder"
+URGENT = replace(CMD_VEL, priority="real_time", express=True)
 PERIOD_NS = 5_000_000
 LARGE_PERIODS = 100  # one large message in so many, on one of these keys after the other
 LARGE_KEYS = (IMAGE, SCAN, INTENT, TELEOP, CMD_VEL)
@@ -33,7 +37,7 @@ async def flood(rate_hz: int, large: bytes, endpoint: Endpoint) -> None:
     periods = 0
     async for _ in bus.clock.every(PERIOD_NS):
         for _ in range(at_once):
-            bus.publish(CMD_VEL, CmdVel(linear_x=0.2, source=NAME))
+            bus.publish(URGENT, CmdVel(linear_x=0.2, source=NAME))
         periods += 1
         if periods % LARGE_PERIODS == 0:
             topic = LARGE_KEYS[periods // LARGE_PERIODS % len(LARGE_KEYS)]

@@ -145,7 +145,7 @@ async def _sent(flooder: asyncio.subprocess.Process) -> int:
 
 async def _named(subject: Subject) -> bool:
     """Whether the audit log says whose commands are not obeyed."""
-    pages = await subject.onlooker.bus.ask(AUDIT_LOG, AuditRequest(newest=100), timeout_s=5.0)
+    pages = await subject.onlooker.bus.ask(AUDIT_LOG, AuditRequest(newest=1000), timeout_s=5.0)
     records = [record for page in pages for record in page.records]
     return any(record.what == "refused" and record.source == NAME for record in records)
 

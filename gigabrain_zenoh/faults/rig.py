@@ -17,6 +17,7 @@ SPEED = 0.26  # [m/s], of all tests that do not say otherwise
 BODIES: dict[Stage, str] = {
     "sim": "turtlebot3_waffle",
     "auto": "turtlebot3_waffle",
+    "line": "mycustombot",
     "serial": "mycustombot",
     "tcp": "alpha",
 }
@@ -39,7 +40,7 @@ class Rig:
     def __init__(self, options: Options, folder: Path) -> None:
         self.options, self.folder = options, folder
         self._numbers = itertools.count(1)
-        self._kept: tuple[Stage, Subject] | None = None
+        self._kept: tuple[Deployment, Subject] | None = None
 
     @property
     def late_s(self) -> float:
@@ -67,12 +68,11 @@ class Rig:
 
         Raises Skipped where the chosen body cannot play that part.
         """
-        kept = self._kept
-        if kept and (kept[0] != stage or not kept[1].unharmed):
+        kept, wanted = self._kept, deployment_of(self.options, stage)
+        if kept and (kept[0] != wanted or not kept[1].unharmed):
             await self.give_up()
         if self._kept is None:
-            subject = self.new(deployment_of(self.options, stage))
-            self._kept = stage, await subject.__aenter__()
+            self._kept = wanted, await self.new(wanted).__aenter__()
         _, subject = self._kept
         await subject.settle()
         return subject
@@ -109,8 +109,8 @@ def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> 
     body = options.body or BODIES[stage]
     link: LinkName = "sim" if stage in ("sim", "auto") else "emulated"
     wire: Literal["serial", "tcp", ""] = find(WIRES)(body) if link == "emulated" else ""
-    if link == "emulated" and wire != stage:
-        raise Skipped(f"{body} has no {stage} line")
+    if link == "emulated" and not (wire == stage or (wire and stage == "line")):
+        raise Skipped(f"{body} has no {stage} line" if stage != "line" else f"{body} has no line")
     return Deployment(
         body=body,
         link=link,

@@ -12,6 +12,7 @@ from gigabrain_zenoh.faults.waiting import until
 
 SLOWER = 0.01  # [m/s], half of what a body brakes in a tick
 TICK_MS = TICK_NS / 1e6
+LATE_TICKS = 2
 
 
 class Stop(NamedTuple):
@@ -39,7 +40,7 @@ async def stop_by(subject: Subject, fault: Callable[[], object], victim: str = "
         raise Failed("the gate does not say why it is shut")
     await onlooker.still()
     distance_m = await subject.distance()
-    zero = _first_zero(onlooker, start, begin)
+    zero = first_zero(onlooker, start, begin)
     return Stop((zero - begin) * TICK_MS, distance_m - before_m, distance_m)
 
 
@@ -57,8 +58,12 @@ def _last_word(onlooker: Onlooker, victim: str, start: RobotState) -> int:
     return said.tick if said and said.boot == start.boot else 0
 
 
-def _first_zero(onlooker: Onlooker, start: RobotState, begin: int) -> int:
-    """The first tick since `begin` that has slowed the body down."""
+def first_zero(onlooker: Onlooker, start: RobotState, begin: int) -> int:
+    """The first tick since `begin` that has slowed the body down.
+
+    Of ticks that control never answered, because this machine woke it too late, two at most do not
+    count: what it would have done in the first of them it has done in the first that it saw.
+    """
     shut = next(
         s.tick
         for s in onlooker.states
@@ -66,8 +71,13 @@ def _first_zero(onlooker: Onlooker, start: RobotState, begin: int) -> int:
     )
     ours = [c for c in onlooker.commands if c.boot == start.boot]
     speed = next((c.linear_x for c in reversed(ours) if c.tick <= begin), 0.0)
-    slower = (c.tick for c in ours if c.tick > begin and c.linear_x < speed - SLOWER)
-    return min(shut, next(slower, shut))
+    answered = begin
+    for command in ours:
+        if command.tick > begin and command.linear_x < speed - SLOWER:
+            late = min(LATE_TICKS, max(0, command.tick - answered - 1))
+            return min(shut, command.tick - late)
+        answered = max(answered, command.tick)
+    return shut
 
 
 async def creep(subject: Subject, ticks: int) -> float:

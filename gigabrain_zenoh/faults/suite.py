@@ -4,9 +4,19 @@ import asyncio
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.faults.fault import Fault, Measured, Result, Skipped, Test, Verdict, judge
+from gigabrain_zenoh.faults.fault import (
+    Fault,
+    Measured,
+    Result,
+    Skipped,
+    Stage,
+    Test,
+    Verdict,
+    judge,
+)
 from gigabrain_zenoh.faults.rig import Options, Rig
 from gigabrain_zenoh.faults.waiting import StallWatch
 from gigabrain_zenoh.process import find
@@ -14,7 +24,7 @@ from gigabrain_zenoh.process import find
 STALL_S = 0.03  # held up for longer, this machine and not the robot is to blame for a failure
 TRIES = 3  # runs that end in such a stall are run again so often
 LIMIT_S = 300.0  # for one run of one test in its short form
-STAGES = ("sim", "auto", "serial", "tcp", "")
+STAGES = get_args(Stage)
 
 Say = Callable[[Result], None]
 

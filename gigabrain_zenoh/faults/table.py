@@ -11,6 +11,7 @@ from gigabrain_zenoh.faults.fault import Fault
 
 PROCESS, DEATHS, LINK, NETWORK = "process", "deaths", "body_link", "network"
 DATA, CLOCK, LOAD, SECURITY, ESTOP = "data", "clock", "load", "security", "estop"
+ERRAND = "errand"
 STOP = "zero after <= 120 ms, travel <= 0.1 m"
 STILL = "moved again <= 0.005 m"  # before a person has enabled it again
 STALE = "stale executed <= 0"  # commands that rest on data older than 250 ms
@@ -29,12 +30,12 @@ FAULTS: tuple[Fault, ...] = (
         f"zero after <= 250 ms, travel <= 0.1 m, {STILL}, enabled without it <= 0",
     ),
     Fault(
-        7, "gate-killed", DEATHS, "serial",
+        7, "gate-killed", DEATHS, "line",
         f"motors zero after <= 150 ms, not latched at start <= 0, enabled while latched <= 0, "
         f"commands of the old boot obeyed <= 0, {STILL}",
     ),
     Fault(
-        8, "driver-killed", DEATHS, "serial", "motors zero after <= 150 ms, travel <= 0.1 m",
+        8, "driver-killed", DEATHS, "line", "motors zero after <= 150 ms, travel <= 0.1 m",
     ),
     Fault(
         9, "one-part-of-decision-hangs", PROCESS, "",
@@ -45,7 +46,7 @@ FAULTS: tuple[Fault, ...] = (
         "starts <= 5, wait too short <= 0 s, enabled without it <= 0, cpu added <= 5 %",
     ),
     Fault(
-        11, "every-process-and-pair-killed", DEATHS, "serial",
+        11, "every-process-and-pair-killed", DEATHS, "line",
         f"idle after <= 10 s, {STILL}",
     ),
     Fault(
@@ -150,6 +151,11 @@ FAULTS: tuple[Fault, ...] = (
     Fault(
         45, "automatic-recovery", DEATHS, "auto",
         "drives again after <= 3 s, stale executed <= 0, latches passed over <= 0",
+    ),
+    Fault(
+        46, "goal-goes-on", ERRAND, "",
+        "travel <= 0.15 m, moved without it <= 0.005 m, goes on after <= 5 s, given up <= 0, "
+        "off its goal <= 0.2 m", ("nav",),
     ),
 )  # fmt: skip
 

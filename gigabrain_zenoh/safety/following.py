@@ -34,7 +34,7 @@ class Following(msgspec.Struct, frozen=True, kw_only=True):
     runaway_ticks: int = 0
     slow_ticks: int = 0
     stuck_ticks: int = 0
-    frozen_ticks: int = 0
+    frozen_ticks: int = 0  # of motion, all together, since a value last changed
 
 
 def begin(state: RobotState) -> Following:
@@ -72,9 +72,7 @@ def look(
         ),
         slow_ticks=held(before.slow_ticks, active and _too_slow(bands, state.velocity), elapsed),
         stuck_ticks=held(before.stuck_ticks, active and still, elapsed),
-        frozen_ticks=held(
-            before.frozen_ticks, same and (moving or _is_frozen(body, before)), elapsed
-        ),
+        frozen_ticks=before.frozen_ticks + elapsed * moving if same else 0,
     )
 
 
@@ -94,10 +92,10 @@ def causes(body: BodyDescription, now: Following) -> tuple[Cause, ...]:
 
 
 def _is_frozen(body: BodyDescription, now: Following) -> bool:
-    """Whether the body has repeated itself for too long.
+    """Whether the body has repeated itself for too long while it was to move.
 
-    Once that is so only a new value ends it. A body that was stopped for it would otherwise be told
-    to go on again, blindly, and for as long as it takes to find out anew.
+    Only a new value ends that, however often the body rests in between: one that was stopped for
+    it, or is told to move in short moves, would otherwise be driven blindly.
     """
     return now.frozen_ticks >= ticks_of(body.thresholds.frozen_sustain)
 

@@ -71,19 +71,18 @@ MAP = Topic("robot/map", brain.OccupancyGrid, 1, keep=True, max_bytes=8 * 1024 *
 INTENT = Topic("robot/intent", brain.Intent, 50, echo_ns=150_000_000, max_bytes=16 * KB)
 TELEOP = Topic("robot/teleop", brain.Twist, 20, priority="interactive_high", max_bytes=KB)
 CMD_VEL = Topic(
-    "robot/cmd_vel", brain.CmdVel, 50, priority="real_time", express=True, depth=16, max_bytes=KB
+    "robot/cmd_vel", brain.CmdVel, 50, priority="interactive_high", depth=16, max_bytes=KB
 )
-JOINT_CMD = Topic(
-    "robot/joint_cmd", brain.JointCommand, 50, priority="real_time", express=True, depth=16
-)
+JOINT_CMD = Topic("robot/joint_cmd", brain.JointCommand, 50, priority="interactive_high", depth=16)
 SAFETY = Topic(
-    "robot/safety", safety.SafetyState, 20, missed=3, priority="real_time", express=True,
+    "robot/safety", safety.SafetyState, 20, missed=3, priority="interactive_high",
     max_bytes=16 * KB,
 )  # fmt: skip
 HEALTH = Topic(
     "robot/health", safety.Health, 1, priority="background", many=True, depth=32, max_bytes=16 * KB
 )
 LOG = Topic("robot/log", safety.LogRecord, 10, priority="background", depth=256, max_bytes=16 * KB)
+# real_time is for what stops the robot, and for nothing that anybody could send by the thousand
 BUTTON = Topic(
     "robot/button", button.ButtonState, 20, missed=4, priority="real_time", express=True,
     max_bytes=KB,

@@ -45,7 +45,7 @@ class Pty:
             raise OSError(errno.EEXIST, f"{self.path.name} is there and is no emulator's")
         fresh = self.path.with_name(f".{self.path.name}.new")
         fresh.unlink(missing_ok=True)
-        fresh.symlink_to(os.ttyname(self._slave))
+        fresh.symlink_to(_lasting(self._slave))
         os.replace(fresh, self.path)
 
     def unplug(self) -> None:
@@ -53,7 +53,7 @@ class Pty:
         if self._master is None or self._slave is None:
             return
         asyncio.get_running_loop().remove_reader(self._master)
-        if self.path.is_symlink() and os.readlink(self.path) == os.ttyname(self._slave):
+        if self.path.is_symlink() and os.readlink(self.path) == _lasting(self._slave):
             self.path.unlink(missing_ok=True)  # another's, by now, is left
         os.close(self._master)
         os.close(self._slave)
@@ -97,3 +97,12 @@ class Pty:
     def _take(self, plugged: int, data: bytes) -> None:
         if plugged == self._plugged and self._master is not None:
             self.on_bytes(data)
+
+
+def _lasting(terminal: int) -> str:
+    """A path of the terminal that leads nowhere once this process is dead, where there is one.
+
+    The name of a terminal is given away again: a driver must not write to somebody's shell.
+    """
+    of_process = f"/proc/{os.getpid()}/fd/{terminal}"  # Linux
+    return of_process if os.path.exists(of_process) else os.ttyname(terminal)
