@@ -48,7 +48,10 @@ class Thinker:
         self._config, self._behaviour = config, self._load(config)
 
     def think(
-        self, state: RobotState, world: WorldModel | None, *, must_charge: bool = False
+        self,
+        state: RobotState,
+        world: WorldModel | None,
+        verdict: SafetyState | None = None,
     ) -> None:
         """Form a new intent if there is anything new to go by."""
         if state.boot != self._boot:  # the driver has started anew, and with it the odometry
@@ -57,7 +60,7 @@ class Thinker:
             if world.basis == self.basis or world.basis > state.tick:
                 return
             self.basis = world.basis
-        situation = self._senses.situation(state, world, must_charge)
+        situation = self._senses.situation(state, world, verdict)
         self.intent = self._behaviour.step(situation)
         self._senses.heed(self._behaviour)
 
@@ -80,7 +83,7 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
         body = bodies.current
         world = worlds.fresh(scan_limit_ns(body.description) if body else None)
         verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
-        thinker.think(state, world, must_charge=_must_charge(verdict))
+        thinker.think(state, world, verdict)
         intent = thinker.intent
         bus.publish(INTENT, intent, basis=thinker.basis)
         phrase = intent.reason.partition(":")[0]
@@ -102,8 +105,3 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
         await bus.failed
     finally:
         await senses.close()
-
-
-def _must_charge(verdict: SafetyState | None) -> bool:
-    """Whether safety wants the robot to come to rest and be charged."""
-    return verdict is not None and any(w.code == "battery_return" for w in verdict.warnings)

@@ -10,9 +10,10 @@ from gigabrain_schemas.arrays import hits
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap, WorldModel
+from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.topics import BODY, MAP, POSE, command_topic
-from gigabrain_zenoh.behaviours import Behaviour, Situation
+from gigabrain_zenoh.behaviours import Behaviour, Situation, must_charge
 from gigabrain_zenoh.behaviours.bearings import Bearings, Driven, Route
 from gigabrain_zenoh.behaviours.guide import Asked, Guide
 from gigabrain_zenoh.behaviours.navigate import Navigate, moved
@@ -95,7 +96,7 @@ class Navigating:
             self._bus.subscribe(topic, lambda _key, command: self._response.command(command))
 
     def situation(
-        self, state: RobotState, world: WorldModel | None, must_charge: bool
+        self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
     ) -> Situation:
         """Where the robot is, what it is to do, and which way."""
         if self._config.begin == "roam" and not self._begun:
@@ -120,6 +121,7 @@ class Navigating:
             late_ticks=state.tick - tick,
             delayed=self._lateness.seconds,
             velocity=self._velocity(state, tick),
+            may_back=verdict is None or verdict.caps.backward != 0.0,
             body=body.description if body else None,
             map_from_odom=map_from_odom,
             lost=lost,
@@ -128,7 +130,7 @@ class Navigating:
             order=order,
             route=self._route,
         )
-        return Situation(world, pose or state.pose, must_charge, bearings)
+        return Situation(world, pose or state.pose, must_charge(verdict), bearings)
 
     def heed(self, behaviour: Behaviour) -> None:
         """What became of the order goes to the tasks, what became of the route to the guide."""

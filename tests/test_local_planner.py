@@ -55,6 +55,24 @@ def test_a_narrow_door_is_passed() -> None:
     assert drive.least > 0.0
 
 
+@pytest.mark.parametrize("may_back", [True, False])
+def test_who_may_not_back_plans_no_way_backwards(may_back: bool) -> None:
+    planner = LocalPlanner(WAFFLE)
+    ahead = wall((0.35, -0.5), (0.35, 0.5))
+    moment = Moment(
+        tick=1,
+        pose=Pose(x=0.0, y=0.0, yaw=0.0),
+        velocity=Velocity(),
+        goal=Goal(x=-0.6, y=0.0, yaw=0.0),
+        hits=ahead,
+        response=LATE,
+        may_back=may_back,
+    )
+    plan = planner.plan(moment)
+    backwards = [point.linear_x for point in plan.trajectory if point.linear_x < -0.02]
+    assert bool(backwards) == may_back
+
+
 def test_a_dead_end_is_left_backwards_or_by_turning() -> None:
     pocket = np.concatenate(
         [wall((0.3, -0.26), (0.3, 0.26)), wall((-0.5, 0.26), (0.3, 0.26)),

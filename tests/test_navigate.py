@@ -11,7 +11,7 @@ import pytest
 
 from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.brain import WorldModel
-from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest, TaskRequest
 from gigabrain_schemas.topics import GOAL, MISSION, SAFETY, TASK_CHANGE
 from gigabrain_zenoh import navigating
@@ -354,10 +354,15 @@ async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_th
     for one in states:
         senses.see(one)
     seen = WorldModel(scan_ok=True, obstacle_ahead=False, boot=BOOT, tick=5, basis=5)
-    now = senses.situation(states[-1], seen, False)
+    now = senses.situation(states[-1], seen, None)
     assert now.bearings
     assert (now.pose.x, now.bearings.velocity.linear_x) == (0.5, 0.05)
     assert now.bearings.late_ticks == 2
+    assert now.bearings.may_back
+    caps = SpeedCaps(backward=0.0)
+    held = senses.situation(states[-1], seen, SafetyState(verdict="slow", caps=caps))
+    assert held.bearings
+    assert not held.bearings.may_back
     await senses.close()
     await net.one.close()
     await net.two.close()

@@ -9,6 +9,7 @@ import msgspec
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent, WorldModel
+from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.settings import DecisionConfig
@@ -24,6 +25,11 @@ class Situation(msgspec.Struct, frozen=True):
     pose: Pose  # odometry of the same tick
     must_charge: bool = False  # safety says that the battery is nearly empty
     bearings: "Bearings | None" = None  # for a behaviour that is sent to places
+
+
+def must_charge(verdict: SafetyState | None) -> bool:
+    """Whether safety wants the robot to come to rest and be charged."""
+    return verdict is not None and any(w.code == "battery_return" for w in verdict.warnings)
 
 
 class Behaviour(Protocol):
@@ -48,7 +54,7 @@ class Senses(Protocol):
         ...
 
     def situation(
-        self, state: RobotState, world: WorldModel | None, must_charge: bool
+        self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
     ) -> Situation:
         """What the behaviour is to look at now."""
         ...
@@ -72,10 +78,10 @@ class Plain:
         """Nothing to note."""
 
     def situation(
-        self, state: RobotState, world: WorldModel | None, must_charge: bool
+        self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
     ) -> Situation:
         """The world and the odometry."""
-        return Situation(world, state.pose, must_charge)
+        return Situation(world, state.pose, must_charge(verdict))
 
     def heed(self, behaviour: Behaviour) -> None:
         """Nothing to note."""

@@ -36,6 +36,7 @@ class Bearings:
     late_ticks: int  # how many have passed since
     delayed: float  # [s], how much longer than usual scans have waited for their answer of late
     velocity: Velocity
+    may_back: bool  # whether safety lets it drive backwards at all
     body: BodyDescription | None
     map_from_odom: Pose | None  # None while it is not known where in the map the robot is
     lost: str  # why not, in words

@@ -67,6 +67,7 @@ class Navigate:
             response=bearings.response,
             sent=bearings.sent,
             delayed=bearings.delayed,
+            may_back=bearings.may_back,
         )
         plan = self._planner_for(bearings).plan(moment)
         here = compose(bearings.map_from_odom, pose)

@@ -71,8 +71,9 @@ class LocalPlanner:
         if self._arrived(moment):
             return _standing("arrived: at the goal", arrived=True)
         scene = self._scene(moment, discs)
+        model = slowed(self._model, moment.delayed)
         planned = self._sampler.plan(
-            slowed(self._model, moment.delayed),
+            model if moment.may_back else model._replace(backward=0.0),
             self._outline,
             self._weights,
             scene,

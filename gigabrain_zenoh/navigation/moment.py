@@ -63,6 +63,7 @@ class Moment:
     response: Response = field(default_factory=Response)
     sent: tuple[Sent, ...] = ()  # oldest first; those of the last 0.5 s are enough
     delayed: float = 0.0  # [s], how much later than usual what is planned will be obeyed
+    may_back: bool = True  # else something is behind it, or it cannot see there
 
 
 @dataclass(frozen=True, kw_only=True)
