@@ -20,8 +20,9 @@ twists = st.builds(Twist, st.floats(-0.5, 0.5), st.floats(-0.2, 0.2), st.floats(
 
 
 def angles_of(leg: int) -> st.SearchStrategy[Vector]:
+    """With the foot below the hip: one above it has been reached by another turn of the leg."""
     bend = GEOMETRY.legs[leg].bend
-    hips, knees = st.floats(-0.4, 1.2), st.floats(0.6, 2.5)
+    hips, knees = st.floats(-0.3, 1.2), st.floats(0.6, 2.5)
     return st.tuples(st.floats(-0.6, 0.6), hips, knees).map(
         lambda a: (a[0], -bend * a[1], bend * a[2])
     )
