@@ -53,7 +53,8 @@ def faults(
     world
         Where it drives.
     behaviour
-        What drives it: navigate explores and visits places, with a map (1 to 8, 11, 18, 19, 45).
+        What drives it: navigate explores and visits places, with a map (tried with 1 to 9, 18,
+        19, 43 and 45).
     long
         The long forms, for a release: soak, load, all orders of deaths.
     json
