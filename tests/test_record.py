@@ -179,25 +179,30 @@ def test_on_a_slow_disk_what_is_written_and_what_was_dropped_is_what_came(
 def test_whoever_hands_messages_over_never_waits_for_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gate = threading.Event()
+    stood, gate = threading.Event(), threading.Event()
 
     class StuckTape(tape.Tape):
         def write(self, data: bytes) -> int:
             if self.size > 1000:
+                stood.set()
                 gate.wait()
             return super().write(data)
 
     monkeypatch.setattr(bagfile, "Tape", StuckTape)
     config = RecorderConfig(viewers=False, flush_s=0.01, keep_free_mb=0, queue_mb=0.1)
     with Recorder(tmp_path / "stuck.mcap", config) as recorder:
-        for seq in range(1, 1001):
+        first = 0
+        while not stood.wait(0.01):  # until the disk stands still
+            first += 1
+            recorder.intake.take("robot/scan", "", bag_rig.scan(first))
+        for seq in range(first + 1, first + 1001):
             recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
         stuck = recorder.status()
         gate.set()
-    assert stuck.seen == 1000  # all were taken while the disk stood still
+    assert stuck.seen == first + 1000  # all were taken while the disk stood still
     assert stuck.dropped > 850  # twice the queue's room at most was not
     status = recorder.status()
-    assert status.written + status.dropped == 1000
+    assert status.written + status.dropped == first + 1000
 
 
 def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_file(
