@@ -292,6 +292,20 @@ async def test_something_new_in_the_way_is_gone_round() -> None:
         assert not np.array_equal(plane.known, wide)
 
 
+async def test_a_goal_that_turns_out_to_be_too_close_to_something_is_reached_beside_it() -> None:
+    wide = drawn("####################\n" + "#..................#\n" * 12 + "####################")
+    async with Plane(wide, at=(1.0, 1.6, 0.0)) as plane:
+        await plane.go(0.2)
+        assert (await plane.ask(GOAL, GoalRequest(x=4.0, y=1.6))).ok
+        plane.cells = wide.copy()
+        plane.cells[:, 83:86] = 100  # from x = 4.15 m on: the body does not fit at the goal
+        await plane.until("succeeded", seconds=90)
+        told = plane.status.done[0].reason
+        assert " m beside what was asked for: the goal is too close to something" in told
+        assert 0.1 < math.hypot(plane.x - 4.0, plane.y - 1.6) < 0.4
+        assert plane.closest > 0.1
+
+
 async def test_the_same_world_gives_the_same_drive() -> None:
     places = []
     for _ in range(2):

@@ -98,7 +98,7 @@ class Navigate:
         self.outcome = Outcome(
             number=order.number,
             state="done" if arrived else "running",
-            reason=f"at {where(goal)}" if arrived else plan.reason,
+            reason=_at(route, goal) if arrived else plan.reason,
             progress=1.0 if arrived else 1.0 - min(1.0, distance / self._longest),
             distance=distance,
             eta=distance / speed,
@@ -139,6 +139,11 @@ def _why_not(situation: Situation) -> str:
 def _headline(order: Order | None, goal: Goal) -> str:
     """What it is at: the same for as long as that does not change."""
     return "exploring" if isinstance(order, Explore) else f"going to {where(goal)}"
+
+
+def _at(route: Route, goal: Goal) -> str:
+    """Where it has arrived, and why that is not what was asked for, if it is not."""
+    return f"at {where(goal)}, {route.reason}" if route.reason else f"at {where(goal)}"
 
 
 def _slowly(bearings: Bearings) -> str:
