@@ -72,7 +72,7 @@ def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) 
     assert mark.exists()
 
 
-@pytest.mark.parametrize("warm_up", [kernels.MAPPING, kernels.FINDING, kernels.DRIVING])
+@pytest.mark.parametrize("warm_up", [compiling.MAPPING, compiling.FINDING, compiling.DRIVING])
 def test_what_is_to_be_called_is_there(warm_up: str) -> None:
     assert isinstance(find(warm_up), types.FunctionType)
 
