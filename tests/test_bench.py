@@ -15,9 +15,9 @@ from gigabrain_zenoh.bench.chain import ChainResult, Compared
 from gigabrain_zenoh.bench.costs import Hop, Timed
 from gigabrain_zenoh.bench.estop import EstopResult, Presses
 from gigabrain_zenoh.bench.figures import Figures, figures, over_rounds
+from gigabrain_zenoh.bench.first_goal import FirstGoal
 from gigabrain_zenoh.bench.listening import Heard, median_ms
 from gigabrain_zenoh.bench.runs import relay_roles
-from gigabrain_zenoh.bench.first_goal import FirstGoal
 from gigabrain_zenoh.bench.stack import Process, StackResult, physics_share, targets
 from gigabrain_zenoh.bench.tables import chain_page, estop_page, stack_page, tools_page
 from gigabrain_zenoh.bench.with_tools import Beside, Tool, ToolsResult
