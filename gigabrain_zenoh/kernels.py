@@ -13,9 +13,6 @@ F = TypeVar("F", bound=Callable[..., object])
 numba = numba_alone.load()
 PACKAGE = Path(__file__).parent
 HOLDERS = ("mapping", "navigation", "obstacles", "bench")  # packages with kernels
-MAPPING = "gigabrain_zenoh.mapping.warm:warm_up"  # call all that is compiled for a process once
-FINDING = "gigabrain_zenoh.mapping.warm:warm_up_finding"
-DRIVING = "gigabrain_zenoh.navigating:warm_up"
 
 
 def kernel(function: F) -> F:

@@ -14,7 +14,7 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest, TaskRequest
 from gigabrain_schemas.topics import GOAL, MISSION, SAFETY, TASK_CHANGE
-from gigabrain_zenoh import navigating
+from gigabrain_zenoh import steering
 from gigabrain_zenoh.behaviours.bearings import Route
 from gigabrain_zenoh.behaviours.guide import Asked, Guide
 from gigabrain_zenoh.navigating import Navigating
@@ -206,7 +206,7 @@ async def ticks_to_a_way(monkeypatch: pytest.MonkeyPatch, thinks_s: float) -> li
         return think(guide, asked)
 
     monkeypatch.setattr(Guide, "think", slowly)
-    monkeypatch.setattr(navigating, "PATIENCE_S", 30.0)
+    monkeypatch.setattr(steering, "PATIENCE_S", 30.0)
     ticks = []
     async with Plane(LARGE) as plane:
         await plane.go(0.2)
@@ -364,6 +364,7 @@ async def test_who_was_told_to_do_nothing_does_not_roam_after_a_restart_of_decis
 async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_that_is() -> None:
     net = Net()
     senses = Navigating(DecisionConfig(behaviour="navigate"), net.one)
+    await senses.warm_up()
     states = [state(tick, v=0.01 * tick, pose=(0.1 * tick, 0.0, 0.0)) for tick in range(1, 8)]
     for one in states:
         senses.see(one)
