@@ -20,7 +20,7 @@ from gigabrain_drivers.sim.physics import Charge, ImuSample, Odometry, Wheel
 from gigabrain_schemas.base import Pose
 from gigabrain_zenoh.clock import Clock
 
-GENEROUS_S = 5.0
+GENEROUS_S = 60.0
 BARE = """\
 summary: a base for tests
 robot_type: tested

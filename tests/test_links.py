@@ -16,7 +16,7 @@ from gigabrain_drivers.links.serial_link import SerialLink, open_port
 from gigabrain_drivers.links.tcp_link import TcpLink
 from gigabrain_zenoh.clock import Clock
 
-GENEROUS_S = 5.0
+GENEROUS_S = 60.0
 
 
 async def until(condition: Callable[[], object]) -> None:

@@ -185,7 +185,7 @@ async def colour(page: Page, x: float, y: float) -> tuple[int, ...]:
 async def drawn(
     page: Page, x: float, y: float, is_it: Callable[[tuple[int, ...]], bool], what: str
 ) -> None:
-    for _ in range(100):
+    for _ in range(600):
         seen = await colour(page, x, y)
         if is_it(seen):
             return
@@ -226,6 +226,7 @@ async def test_map_robot_way_obstacle_and_goal_are_drawn_where_they_are(chromium
     await page.wait_for_selector('#goal:has-text("3.1 m left")')
     assert "about 16 s" in await page.inner_text("#goal")
     assert "then evening round" in await page.inner_text("#goal")
+    await drawn(page, 1.0, -1.5, blue, "the way")
     dashes = [await colour(page, 0.5, y / 100) for y in range(-140, -60, 2)]
     assert 5 < sum(blue(pixel) for pixel in dashes) < 35  # a dashed line
 
