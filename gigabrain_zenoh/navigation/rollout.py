@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import lean_kernel
-from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance
+from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance_of
 from gigabrain_zenoh.navigation.models import Lag, Model, answer, feasible
 from gigabrain_zenoh.navigation.rating import (
     Scene,
@@ -78,7 +78,8 @@ def drive(
     x, y, yaw, vx, vy, w = start.x, start.y, start.yaw, start.vx, start.vy, start.w
     before = start.before
     cosine, sine = math.cos(yaw), math.sin(yaw)
-    least = clearance(scene.grid, outline, x, y, cosine, sine) - 0.003
+    room, touches = clearance_of(scene.grid, outline, x, y, cosine, sine, 0)
+    least = room - 0.003
     least_disc = from_discs(scene.discs, outline, x, y, cosine, sine, 0.0) - 0.003
     least, least_disc = min(weights.margin, least), min(weights.disc_margin, least_disc)
     turning = model.turning * min(1.0, start.gain)
@@ -102,16 +103,15 @@ def drive(
             continue
         slack -= abs(ahead) + abs(aside) + outline.far * abs(turned)
         if slack < 0.0:
-            room = clearance(scene.grid, outline, x, y, cosine, sine)
+            room, touches = clearance_of(scene.grid, outline, x, y, cosine, sine, touches)
             slack = room - AT_EASE
         away = from_discs(scene.discs, outline, x, y, cosine, sine, (t + 1) * dt)
-        late = (t + 1.0) / steps
         if room < least:
-            cost += TOUCHED * (1.0 - 0.7 * late) + rest(model, scene, x, y)
+            cost += TOUCHED * (1.0 - 0.7 * (t + 1.0) / steps) + rest(model, scene, x, y)
             cost += IMPACT * math.hypot(vx, vy)
             alive = False
         elif away < least_disc:
-            cost += TOUCHED_DISC * (1.0 - 0.6 * late) + rest(model, scene, x, y)
+            cost += TOUCHED_DISC * (1.0 - 0.6 * (t + 1.0) / steps) + rest(model, scene, x, y)
             alive = False
         else:
             cost += dt * of_place(weights, scene, room, away, x, y, yaw)
@@ -130,8 +130,8 @@ def drive(
 def _turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
     """A direction turned by less than half a radian; Taylor's series is quicker than sin, cos."""
     square = angle * angle
-    c = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square / 720.0))
-    s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square / 5040.0)))
+    c = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0)))
+    s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0))))
     return cosine * c - sine * s, sine * c + cosine * s
 
 
