@@ -98,14 +98,25 @@ def clearance_of(
     grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float, first: int
 ) -> tuple[float, int]:
     """The clearance, and the group of points that has it: looked at `first`, it spares others."""
-    center_x = x + cosine * outline.center_x - sine * outline.center_y
-    center_y = y + sine * outline.center_x + cosine * outline.center_y
-    middle = distance_at(grid, center_x, center_y)
+    middle = _middle(grid, outline, x, y, cosine, sine)
     if middle >= outline.outer + ROOM:
         return ROOM, first
     nearest = min(ROOM, middle - outline.inner) if middle < outline.inner else ROOM
     found, group = _nearest(grid, outline, x, y, cosine, sine, np.float32(nearest), first)
     return min(nearest, found), group
+
+
+@lean_kernel
+def depth_of(grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float) -> float:
+    """What the clearance is no more than where an obstacle is well inside [m]; 0 elsewhere."""
+    return min(0.0, _middle(grid, outline, x, y, cosine, sine) - outline.inner)
+
+
+@lean_kernel
+def _middle(grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float) -> float:
+    center_x = x + cosine * outline.center_x - sine * outline.center_y
+    center_y = y + sine * outline.center_x + cosine * outline.center_y
+    return distance_at(grid, center_x, center_y)
 
 
 @lean_kernel
