@@ -102,7 +102,8 @@ class Window:
             cells = cells[((cells >= 0) & (cells < self.cells)).all(axis=1)]
             free[cells[:, 1], cells[:, 0]] = 0
         distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5)
-        np.minimum(distance * np.float32(CELL_M), np.float32(FAR), out=distance)
+        distance *= np.float32(CELL_M)
+        np.minimum(distance, np.float32(FAR), out=distance)
         return Grid(distance, CELL_M, self.x, self.y)
 
     def _follow(self, place: Place) -> None:
