@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import lean_kernel
+from gigabrain_zenoh.kernels import kernel, lean_kernel
 from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance_of, depth_of
 from gigabrain_zenoh.navigation.models import Lag, Model, answer, feasible
 from gigabrain_zenoh.navigation.rating import (
@@ -86,20 +86,37 @@ def drive(
     scene: Scene,
     start: Start,
     dt: float,
+    rooms: Floats,
     plan: Floats,
     states: Floats,
     limit: float,
 ) -> float:
     """The cost of `plan` (T, 3), which is first made feasible in place; inf for `limit` or more.
 
-    `states` (T + 1, STATE) takes what it leads to.
+    `rooms` are those of `first_rooms`. `states` (T + 1, STATE) takes what the plan leads to.
     """
-    move(model, outline.far, start, dt, plan, states)
-    return _rate(model, outline, weights, scene, dt, states, limit)
+    _move(model, outline.far, start, dt, plan, states)
+    return _rate(model, outline, weights, scene, dt, rooms, states, limit)
+
+
+@kernel
+def first_rooms(
+    model: Model, outline: Outline, scene: Scene, start: Start, dt: float, states: Floats
+) -> Floats:
+    """The clearances [m] from the start on, until a plan has any effect: (n,), n of 1 or more.
+
+    `states` (T + 1, STATE) is scribbled on.
+    """
+    rooms = np.empty(min(states.shape[0], start.past.shape[0]))
+    _move(model, outline.far, start, dt, np.zeros((len(rooms) - 1, 3)), states)
+    for t in range(len(rooms)):
+        at = _noted(states, t)
+        rooms[t] = clearance_of(scene.grid, outline, at.x, at.y, at.cosine, at.sine, 0)[0]
+    return rooms
 
 
 @lean_kernel
-def move(model: Model, far: float, start: Start, dt: float, plan: Floats, states: Floats) -> None:
+def _move(model: Model, far: float, start: Start, dt: float, plan: Floats, states: Floats) -> None:
     """Fill `states` with where `plan`, made feasible, takes a body that reaches so `far` [m]."""
     x, y, yaw, vx, vy, w = start.x, start.y, start.yaw, start.vx, start.vy, start.w
     before = start.before
@@ -124,33 +141,41 @@ def move(model: Model, far: float, start: Start, dt: float, plan: Floats, states
 
 @lean_kernel
 def _rate(
-    model: Model, outline: Outline, weights: Weights, scene: Scene, dt: float, states: Floats,
-    limit: float,
+    model: Model, outline: Outline, weights: Weights, scene: Scene, dt: float, rooms: Floats,
+    states: Floats, limit: float,
 ) -> float:  # fmt: skip
     """The cost of going through `states`, or inf as soon as it is clear that it reaches `limit`."""
     steps, grid, discs = states.shape[0] - 1, scene.grid, scene.discs
     at, last = _noted(states, 0), _noted(states, steps)
-    room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, 0)
     away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, 0.0)
-    least, least_disc = min(weights.margin, room - 0.003), min(weights.disc_margin, away - 0.003)
+    least, least_disc = (
+        min(weights.margin, rooms[0] - 0.003),
+        min(weights.disc_margin, away - 0.003),
+    )
     limit = _sound(model, scene, states, limit)
     end = of_end(model, weights, scene, last.x, last.y, last.yaw, last.vx, last.vy)
     to_come = end + dt * _anyway(outline, scene, states, least, limit)
-    cost, room, slack = 0.0, ROOM, 0.0
+    cost: float = 0.0
+    room, slack, touches = ROOM, 0.0, 0
     for t in range(1, steps + 1):
         if cost + to_come >= limit:
             return math.inf
         at = _noted(states, t)
         slack -= at.moved
         if slack < 0.0:
-            room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, touches)
+            if t < len(rooms):
+                room = rooms[t]
+            else:
+                room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, touches)
             slack = room - AT_EASE
         away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, t * dt)
         if room < least:
-            cost += TOUCHED * (1.0 - 0.7 * t / steps) + rest(model, scene, at.x, at.y)
-            return cost + IMPACT * math.hypot(at.vx, at.vy)
+            cost += TOUCHED * (1.0 - 0.7 * (t / steps)) + rest(model, scene, at.x, at.y)
+            cost += IMPACT * math.hypot(at.vx, at.vy)
+            return cost
         if away < least_disc:
-            return cost + TOUCHED_DISC * (1.0 - 0.6 * t / steps) + rest(model, scene, at.x, at.y)
+            cost += TOUCHED_DISC * (1.0 - 0.6 * (t / steps)) + rest(model, scene, at.x, at.y)
+            return cost
         cost += dt * of_place(weights, scene, room, away, at.x, at.y, at.yaw)
         cost += dt * of_motion(weights, room, at.vx, at.vy, at.w)
         to_come -= dt * of_time(scene, at.x, at.y, at.yaw)
