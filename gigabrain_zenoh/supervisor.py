@@ -71,8 +71,11 @@ class Supervisor:
             # a keeper ends when all are told to; before that it can only fail
             await asyncio.wait([halted, *self._tasks.values()], return_when="FIRST_EXCEPTION")
         finally:
-            await self.stop()
-            await halted
+            try:
+                await self.stop()
+                await halted
+            finally:  # a second Ctrl-C may come before the stop has begun
+                self._abandon()
 
     async def stop(self, within_s: float = 1.5) -> None:
         """End all processes within `within_s`, politely at first, also those that hang."""
@@ -97,9 +100,13 @@ class Supervisor:
                 if task.done():
                     task.result()
         finally:
-            for keeper in keepers:
-                if keeper.child:
-                    keeper.child.abandon()
+            self._abandon()
+
+    def _abandon(self) -> None:
+        """Whatever still runs is killed, and left to the kernel."""
+        for keeper in self._keepers.values():
+            if keeper.child:
+                keeper.child.abandon()
 
     async def _end(self, keepers: Sequence[Keeper], kill_s: float, leave_s: float) -> None:
         """Ask, kill at `kill_s` what has not ended, go on at `leave_s` regardless (loop times)."""

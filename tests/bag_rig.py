@@ -1,7 +1,9 @@
 """Recordings for tests, made without a robot."""
 
 import itertools
-from collections.abc import Iterator
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -15,7 +17,10 @@ from gigabrain_zenoh.recording.bagfile import BagFile, topic_of
 from gigabrain_zenoh.recording.gaps import header_of
 from gigabrain_zenoh.recording.intake import Arrival
 from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.recorder import Recorder, Status
+from gigabrain_zenoh.settings import RecorderConfig
 
+QUICK = RecorderConfig(viewers=False, flush_s=0.05, keep_free_mb=0)
 BEGIN_NS = 1_767_225_600_000_000_000
 NOISE = np.random.default_rng(0)
 
@@ -82,3 +87,17 @@ def write(
 def seqs(path: Path, key: str = "robot/state") -> list[int]:
     """The numbers of the messages on `key` that can be read."""
     return [sample.header.seq for sample in Bag(path) if sample.key == key]
+
+
+def kept(*paths: Path) -> Counter[str]:
+    """How many messages can be read from some files."""
+    return Counter(sample.key for path in paths for sample in Bag(path))
+
+
+def wait(recorder: Recorder, condition: Callable[[Status], bool]) -> None:
+    """Until its thread has come so far."""
+    for _ in range(6000):
+        if condition(recorder.status()):
+            return
+        time.sleep(0.01)
+    raise AssertionError(recorder.status())

@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from gigabrain_zenoh.journal import Journal, done
 from tests import disturbance
-from tests.stack import Home
+from tests.stack import PATIENCE_S, Home
 
 # how long an example takes says something of the machine, and nothing of the code
 settings.register_profile("gigabrain", deadline=None)
@@ -29,6 +30,14 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     again = {r.nodeid for r in reports if disturbance.AGAIN in dict(r.user_properties)}
     for name in sorted(again):
         terminalreporter.write_line(f"run again, the machine had stood still: {name}")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def patient_nodes() -> Iterator[None]:
+    """In the tests' own process work beside a node is in time, however slow this machine is."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Journal, "in_time", lambda _journal, job, _patience_s: done(job, PATIENCE_S))
+        yield
 
 
 @pytest.fixture

@@ -133,10 +133,10 @@ class Home:
         path.write_bytes(msgspec.json.encode({"router": router} | values))  # YAML as well
         return path
 
-    def processes(self) -> list[int]:
-        """The pids of all supervised processes that live here."""
-        mine = f'"run_dir":"{self.folder}'
-        return [pid for pid, arguments in _processes() if mine in arguments]
+    def processes(self, name: str = "") -> list[int]:
+        """The pids of all supervised processes that live here, or of those of this name."""
+        mine = f'"run_dir":"{self.folder}', f'"name":"{name}"' if name else ""
+        return [pid for pid, told in _processes() if all(part in told for part in mine)]
 
     def close(self) -> None:
         """End whatever is still there."""

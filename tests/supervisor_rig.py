@@ -65,7 +65,7 @@ async def running(
             os.kill(pid, 0)
 
 
-async def until(condition: Callable[[], object], within_s: float = 30.0) -> None:
+async def until(condition: Callable[[], object], within_s: float = 60.0) -> None:
     async with asyncio.timeout(within_s):
         while True:
             if condition():

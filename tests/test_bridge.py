@@ -220,7 +220,7 @@ async def test_closing_while_threads_post_leaves_nothing_open(kind: Callable[[],
         bench.bridge.close()
         for thread in threads:
             thread.join()
-    assert open_fds() == before
+    assert open_fds() <= before  # what others have left may be closed meanwhile
 
 
 async def test_a_full_socket_pair_is_readable_and_that_is_enough() -> None:

@@ -19,6 +19,16 @@ from tests.stack import AVOID, GIGABRAIN, Home, until
 AT_TERMINAL = "import os, sys; os.login_tty(0); os.execv(sys.argv[1], sys.argv[1:])"
 COLUMNS, ROWS = 80, 24
 HOME = "\x1b[H"
+TOLD = [
+    r"\d\.\d\d m in \d+ of 600 s",
+    r"\d+ %  1\d\.\d V",
+    *(
+        rf"│  {name} +ready +\d+ +\d+\.\d % +\d+ MB  \S"
+        for name in ("router", "driver", "perception", "decision", "control", "safety")
+    ),
+    r"decision .* (forward|turning right) · \d+%",
+    r"control .* [+-]\d\.\d\d m/s  [+-]\d\.\d\d rad/s",
+]
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]")
 
 
@@ -61,6 +71,10 @@ class Terminal:
         pages = self.shown.split(HOME)
         return CONTROL.sub("", pages[-2] if len(pages) > 2 else "").splitlines()
 
+    def text(self) -> str:
+        """The newest whole page."""
+        return "\n".join(self.page())
+
     def type(self, keys: str) -> None:
         """Press keys."""
         os.write(self._screen, keys.encode())
@@ -88,17 +102,12 @@ async def test_the_page_shows_the_whole_robot_and_ctrl_c_ends_it(
     home: Home, terminal: Terminal
 ) -> None:
     await until(lambda: terminal.shows("enabled") and terminal.shows(" ms (p99 "), "driving")
+    for told in TOLD:  # who has begun last is heard of last
+        await until(lambda told=told: terminal.running and re.search(told, terminal.text()), told)
     page = terminal.page()
     assert len(page) <= ROWS
     assert {cell_len(line) for line in page if line.strip()} == {COLUMNS}
-    text = "\n".join(page)
     assert "turtlebot3_waffle · house · seed 0" in page[0]
-    assert re.search(r"\d\.\d\d m in \d+ of 600 s", text)
-    assert re.search(r"100 %  1\d\.\d V", text)
-    for name in ("router", "driver", "perception", "decision", "control", "safety"):
-        assert re.search(rf"│  {name} +ready +\d+ +\d+\.\d % +\d+ MB  \S", text), text
-    assert re.search(r"decision .* (forward|turning right) · \d+%", text)
-    assert re.search(r"control .* [+-]\d\.\d\d m/s  [+-]\d\.\d\d rad/s", text)
     terminal.type("\x03")
     assert await terminal.ended() == 0
     assert home.processes() == []

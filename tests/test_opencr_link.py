@@ -170,7 +170,7 @@ def test_a_port_is_known_by_its_answer(answer: bytes, ours: bool) -> None:
 
 
 async def until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 15
+    deadline = time.monotonic() + 60
     while not true():
         assert time.monotonic() < deadline, "it never happened"
         await asyncio.sleep(0.005)
@@ -203,7 +203,9 @@ async def test_over_a_real_pty_it_drives_stops_and_survives_what_a_cable_can_do(
             await until(lambda: bool(states) and states[-1].link.connected)
             goal = 0.2
             await until(lambda: states[-1].pose.x > 0.05)
-            assert states[-1].pose.x == pytest.approx(body.snapshot.odometry.x, abs=0.02)
+            goal = 0.0
+            await until(lambda: abs(body.snapshot.odometry.linear_x) < 1e-3)
+            await until(lambda: abs(states[-1].pose.x - body.snapshot.odometry.x) < 0.02)
             station.set(Faults(unplugged=True))
             await until(lambda: not states[-1].link.connected)
             goal = 0.0

@@ -154,7 +154,7 @@ async def test_a_viewer_who_never_reads_slows_neither_robot_nor_others(robot: Ro
             frame = await asyncio.wait_for(other.recv(), 20)
             moments += frame[0] == wire.MOMENT
         assert seen.state.boot != 0
-        assert seen.state.tick - begin >= 200  # five seconds of moments, and of the robot's time
+        await until(lambda: seen.state.tick - begin >= 200, "the robot's time goes on as well")
     writer.close()
 
 

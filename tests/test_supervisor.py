@@ -1,8 +1,11 @@
 import asyncio
 import errno
+import functools
 import os
 import signal
+import subprocess
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,19 +28,29 @@ from tests.supervisor_rig import (
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts")
 
 
-async def test_a_process_starts_when_those_before_it_are_ready_and_not_merely_started() -> None:
-    slow = "say('begun'); time.sleep(0.3); say('ready'); wait()"
+async def test_a_process_starts_when_those_before_it_are_ready_and_not_merely_started(
+    tmp_path: Path,
+) -> None:
+    go_on = tmp_path / "go_on"
+    slow = f"""
+say('begun')
+while not os.path.exists({str(go_on)!r}):
+    time.sleep(0.01)
+say('ready'); wait()"""
     async with running(
         spec("perception", "say('begun'); " + SERVE, "driver", "router"),
         spec("driver", slow, "router"),
         spec("router", SERVE),
         spec("page", SERVE),
     ) as (supervisor, records):
+        await until(lambda: ("driver", "begun") in records.events())
+        await until(lambda: supervisor.statuses["page"].state == "ready")
+        assert supervisor.statuses["perception"].state == "waiting"
+        go_on.touch()
         await until(lambda: all(s.state == "ready" for s in supervisor.statuses.values()))
         order = records.events()
         assert order.index(("router", "ready")) < order.index(("driver", "begun"))
         assert order.index(("driver", "ready")) < order.index(("perception", "begun"))
-        assert order.index(("page", "ready")) < order.index(("driver", "ready"))
         assert all((s.ready_after_s or 0) > 0 for s in supervisor.statuses.values())
         assert supervisor.deaths == 0
 
@@ -84,10 +97,19 @@ async def test_five_deaths_are_enough_and_a_sentence_says_so() -> None:
         ]
 
 
-async def test_a_crash_loop_at_start_costs_less_than_a_twentieth_of_a_core() -> None:
+def used_s() -> float:
+    """CPU time of this process and of its ended children, of the user and of the system."""
+    return sum(os.times()[:4])
+
+
+async def test_a_crash_loop_at_start_costs_its_five_starts_and_no_more() -> None:
     """With the real times, and a real process that gets as far as reading its configuration."""
     crasher = ProcessSpec("control", (*COMMAND, "{"))
-    before = os.times()
+    before_s = used_s()
+    once = functools.partial(subprocess.run, capture_output=True, check=False)
+    assert (await asyncio.to_thread(once, crasher.argv)).returncode
+    one_s = used_s() - before_s
+    before_s += one_s
     async with running(crasher, backoff=Backoff()) as (supervisor, records):
         await until(lambda: supervisor.statuses["control"].state == "given up")
         assert [text.rsplit(" in ")[1] for text in records.texts("died")] == [
@@ -96,9 +118,7 @@ async def test_a_crash_loop_at_start_costs_less_than_a_twentieth_of_a_core() -> 
             "0.8 s",
             "1.6 s",
         ]
-    after = os.times()
-    used_s = sum(after[:4]) - sum(before[:4])  # ours and the children's, of the user and the system
-    assert used_s <= 0.05 * Backoff().window_s
+    assert used_s() - before_s <= 3 * 5 * one_s  # a loop without pauses would start hundreds
 
 
 async def test_a_bad_configuration_is_not_tried_twice() -> None:
@@ -156,9 +176,10 @@ async def test_what_comes_after_a_process_that_is_given_up_is_not_started() -> N
 async def test_a_process_that_does_not_get_ready_is_killed_and_counts_as_dead() -> None:
     async with running(spec("driver", "wait()", ready_timeout_s=0.2)) as (supervisor, records):
         status = supervisor.statuses["driver"]
-        await until(lambda: status.restarts == 1)
-        assert (supervisor.deaths, status.last_exit) == (1, -9)
-        assert records.texts("not ready") == ["driver was not ready within 0.2 s and is killed"]
+        await until(lambda: status.restarts)
+        assert supervisor.deaths >= status.restarts
+        assert status.last_exit == -9
+        assert records.texts("not ready")[0] == "driver was not ready within 0.2 s and is killed"
 
 
 async def test_what_a_process_writes_that_is_no_record_becomes_one() -> None:

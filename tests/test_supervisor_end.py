@@ -94,6 +94,22 @@ async def test_a_cancelled_run_ends_all() -> None:
     assert not any(alive(pid) for pid in pids)
 
 
+async def test_a_run_that_is_cancelled_again_before_its_stop_has_begun_ends_all() -> None:
+    """As by a second Ctrl-C, when all that asyncio runs is cancelled."""
+    supervisor = Supervisor([spec("one"), spec("two", HANG)], Records(), QUICK)
+    before = asyncio.all_tasks()
+    task = asyncio.create_task(supervisor.run())
+    await until(lambda: all(s.state == "ready" for s in supervisor.statuses.values()))
+    pids = [status.pid or 0 for status in supervisor.statuses.values()]
+    task.cancel()
+    await asyncio.sleep(0)  # the stop is wanted, and has not begun
+    left = asyncio.all_tasks() - before
+    for each in left:
+        each.cancel()
+    await asyncio.gather(*left, return_exceptions=True)
+    await until(lambda: not any(alive(pid) for pid in pids))
+
+
 async def test_a_terminals_ctrl_c_does_not_reach_the_processes() -> None:
     async with running(spec("one")) as (supervisor, _):
         await until(lambda: supervisor.statuses["one"].state == "ready")

@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -24,10 +23,6 @@ READY = re.compile(r"^\S+ (\w+) +info +ready pid=\d+$", re.MULTILINE)
 def ready(command: Command) -> list[str]:
     """The processes that have said so, in the order in which they did."""
     return READY.findall(command.out)
-
-
-def started(command: Command, process: str, times: int) -> bool:
-    return ready(command).count(process) == times
 
 
 async def test_it_starts_in_readiness_order_restarts_what_dies_and_ends_cleanly(
@@ -57,9 +52,13 @@ async def test_after_five_deaths_within_a_minute_a_process_is_given_up_in_one_li
 ) -> None:
     up = home.start("up", str(home.deployment()))
     async with looking_on(await robot_of(home, up)) as robot:
-        for death in range(5):
-            await until(partial(started, up, "decision", death + 1), f"start {death + 1}")
-            os.kill(await robot.pid("decision"), signal.SIGKILL)
+        killed = {await robot.pid("decision")}
+        os.kill(*killed, signal.SIGKILL)
+        while len(killed) < 5:  # each at once: on a busy machine five starts may take a minute
+            for pid in set(home.processes("decision")) - killed:
+                killed.add(pid)
+                os.kill(pid, signal.SIGKILL)
+            await asyncio.sleep(0.01)
         given_up = "decision ended with signal 9 (Killed) and is given up: 5 deaths within 60 s"
         await until(lambda: given_up in up.out, "it is given up")
         assert len([line for line in up.out.splitlines() if given_up in line]) == 1

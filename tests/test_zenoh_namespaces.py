@@ -70,7 +70,8 @@ async def test_a_router_in_a_namespace_is_one_of_the_robots_processes(net: Robot
     assert heard[0][0] == "robot/health/router"
     assert of_fleet.heard[0][0] == "red/robot/health/router"
     router.serve(DESCRIBE, describe, name="router")
-    assert await red.ask(DESCRIBE, DescribeRequest(), name="router", timeout_s=20)
+    while not await red.ask(DESCRIBE, DescribeRequest(), name="router", timeout_s=20):
+        pass
 
     blue, blue_ear = await net.client("blue"), Ear(await net.client("blue"), "robot/*")
     await repeat(lambda: blue.publish(TELEOP, "robot/teleop", b"b", ""), lambda: blue_ear.heard)

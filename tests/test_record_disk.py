@@ -1,0 +1,236 @@
+"""The recorder's disk: slow, full, or gone with the process, it never makes the robot wait."""
+
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.topics import MAP
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.recording import bagfile, tape
+from gigabrain_zenoh.recording.info import info
+from gigabrain_zenoh.recording.recorder import Recorder
+from gigabrain_zenoh.settings import RecorderConfig
+from tests import bag_rig
+from tests.bag_rig import QUICK, kept, wait
+
+
+class SlowTape(tape.Tape):
+    """A disk that takes 1 MB a second."""
+
+    def write(self, data: bytes) -> int:
+        time.sleep(len(data) / 1e6)
+        return super().write(data)
+
+
+class FullTape(tape.Tape):
+    """A disk that is full from time to time."""
+
+    full = False
+
+    def write(self, data: bytes) -> int:
+        if self.full:
+            super().write(data[: len(data) // 2])
+            self.size -= len(data) // 2
+            os.ftruncate(self._fd, self.size)
+            os.lseek(self._fd, self.size, os.SEEK_SET)
+            raise OSError(28, "No space left on device")
+        return super().write(data)
+
+
+def test_on_a_slow_disk_what_is_written_and_what_was_dropped_is_what_came(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bagfile, "Tape", SlowTape)
+    path = tmp_path / "slow.mcap"
+    config = RecorderConfig(viewers=False, flush_s=0.05, keep_free_mb=0, queue_mb=0.3)
+    with Recorder(path, config) as recorder:
+        count = 0
+        while recorder.status().dropped < 500:  # of 1.5 kB that do not compress
+            count += 1
+            recorder.intake.take("robot/scan", "", bag_rig.scan(count))
+    status = recorder.status()
+    assert status.seen == count
+    assert status.written + status.dropped == count
+    assert kept(path)["robot/scan"] == status.written
+    found = info(path)
+    assert found.keys[0].missing == bag_rig.seqs(path, "robot/scan")[-1] - status.written
+    assert found.notes["gigabrain.recorded"]["dropped"] == str(status.dropped)
+
+
+def test_whoever_hands_messages_over_never_waits_for_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stood, gate = threading.Event(), threading.Event()
+
+    class StuckTape(tape.Tape):
+        def write(self, data: bytes) -> int:
+            if self.size > 1000:
+                stood.set()
+                gate.wait()
+            return super().write(data)
+
+    monkeypatch.setattr(bagfile, "Tape", StuckTape)
+    config = RecorderConfig(viewers=False, flush_s=0.01, keep_free_mb=0, queue_mb=0.1)
+    with Recorder(tmp_path / "stuck.mcap", config) as recorder:
+        first = 0
+        while not stood.wait(0.01):  # until the disk stands still
+            first += 1
+            recorder.intake.take("robot/scan", "", bag_rig.scan(first))
+        for seq in range(first + 1, first + 1001):
+            recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
+        stuck = recorder.status()
+        gate.set()
+    assert stuck.seen == first + 1000  # all were taken while the disk stood still
+    assert stuck.dropped > 850  # twice the queue's room at most was not
+    status = recorder.status()
+    assert status.written + status.dropped == first + 1000
+
+
+def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bagfile, "Tape", FullTape)
+    monkeypatch.setattr("gigabrain_zenoh.recording.recorder.RETRY_S", 0.02)
+    path = tmp_path / "full.mcap"
+
+    def send(first: int, count: int) -> None:
+        for seq in range(first, first + count):
+            recorder.intake.take("robot/state", "", bag_rig.state(seq))
+
+    with Recorder(path, QUICK) as recorder:
+        send(1, 100)
+        wait(recorder, lambda now: now.written == 100)
+        FullTape.full = True
+        try:
+            send(101, 100)
+            wait(recorder, lambda now: now.written + now.dropped == 200)
+            wait(
+                recorder, lambda now: "No space left on device" in now.fault
+            )  # it tries again and again
+        finally:
+            FullTape.full = False
+        time.sleep(0.05)
+        send(201, 100)
+        wait(recorder, lambda now: now.written >= 200)
+    status = recorder.status()
+    assert status.seen == 300 == status.written + status.dropped
+    assert status.fault == ""
+    second = tmp_path / "full_1.mcap"
+    assert bag_rig.seqs(path) == list(range(1, 101))
+    assert bag_rig.seqs(second)[-100:] == list(range(201, 301))
+    assert info(second).finished
+
+
+def test_what_must_stay_free_of_the_disk_stays_free(tmp_path: Path) -> None:
+    config = RecorderConfig(viewers=False, flush_s=0.02, keep_free_mb=1e9)
+    with Recorder(tmp_path / "a.mcap", config) as recorder:
+        recorder.intake.take("robot/state", "", bag_rig.state(1))
+        wait(recorder, lambda now: "less than 1e+09 MB are free" in now.fault)
+    assert recorder.status().dropped == 1
+    assert recorder.status().written == 0
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_is_split_by_size_and_each_part_has_the_map(tmp_path: Path) -> None:
+    config = RecorderConfig(viewers=False, flush_s=0, keep_free_mb=0, split_mb=0.08, queue_mb=0.1)
+    grid = codec.encode(example(MAP.type))
+    with Recorder(tmp_path / "s.mcap", config) as recorder:
+        recorder.intake.take("robot/map", "", grid)
+        for seq in range(1, 301):
+            recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
+            if seq % 20 == 0:  # 30 kB, more than a quarter of the queue, so it is written at once
+                wait(recorder, lambda now, seq=seq: now.written > seq - 10)
+    paths = [tmp_path / name for name in ("s.mcap", "s_1.mcap", "s_2.mcap", "s_3.mcap")]
+    assert recorder.status().files >= 4
+    assert recorder.status().written == 301
+    for path in paths[: recorder.status().files]:
+        assert info(path).finished
+        assert kept(path)["robot/map"] == 1
+    seqs = [seq for path in sorted(tmp_path.iterdir()) for seq in bag_rig.seqs(path, "robot/scan")]
+    assert sorted(seqs) == list(range(1, 301))
+
+
+def test_a_recording_is_split_by_time(tmp_path: Path) -> None:
+    config = RecorderConfig(viewers=False, flush_s=0.01, keep_free_mb=0, split_s=0.2)
+    with Recorder(tmp_path / "s.mcap", config) as recorder:
+        for seq in range(1, 61):
+            recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
+            time.sleep(0.01)
+    assert recorder.status().files >= 3
+    assert sum(kept(path)["robot/scan"] for path in tmp_path.iterdir()) == 60
+
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from gigabrain_zenoh.recording.recorder import Recorder
+from gigabrain_zenoh.settings import RecorderConfig
+from tests import bag_rig
+with Recorder(Path(sys.argv[1]), RecorderConfig(viewers=False, keep_free_mb=0)) as recorder:
+    for seq in range(1, 10_000):
+        recorder.intake.take("robot/state", "", bag_rig.state(seq))
+        print(seq, flush=True)
+        time.sleep(0.005)
+"""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_killed_at_any_moment_it_loses_less_than_half_a_second(tmp_path: Path, seed: int) -> None:
+    """Of messages that come 5 ms apart or, on a busy machine, more."""
+    path = tmp_path / "killed.mcap"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with subprocess.Popen(
+        (sys.executable, "-c", WRITER, str(path)), stdout=subprocess.PIPE, env=environment
+    ) as process:
+        assert process.stdout
+        stop = 150 + random.Random(seed).randrange(100)
+        for line in process.stdout:
+            told = int(line)
+            if told == stop:
+                process.send_signal(signal.SIGKILL)
+    seqs = bag_rig.seqs(path)
+    assert seqs == list(range(1, seqs[-1] + 1))
+    assert told - seqs[-1] <= 100
+
+
+LIMITED = """
+import resource, sys
+from pathlib import Path
+resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
+from gigabrain_zenoh.recording import recorder as module
+from gigabrain_zenoh.recording.recorder import Recorder
+from gigabrain_zenoh.settings import RecorderConfig
+from tests import bag_rig
+module.RETRY_S = 1e9  # no second file
+config = RecorderConfig(viewers=False, keep_free_mb=0, flush_s=0)
+with Recorder(Path(sys.argv[1]), config) as recorder:
+    for seq in range(1, 101):
+        recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
+        if seq % 25 == 0:
+            bag_rig.wait(recorder, lambda now: now.written + now.dropped == seq)
+now = recorder.status()
+print(now.seen, now.written, now.dropped)
+"""
+
+
+@pytest.mark.skipif(not hasattr(resource, "RLIMIT_FSIZE"), reason="no limit on file sizes here")
+def test_a_disk_that_truly_takes_no_more_is_survived(tmp_path: Path) -> None:
+    path = tmp_path / "limited.mcap"
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    told = subprocess.run(
+        (sys.executable, "-c", LIMITED, str(path)),
+        capture_output=True, text=True, env=environment,
+    )  # fmt: skip
+    assert "cannot write" in told.stderr
+    seen, written, dropped = map(int, told.stdout.split())
+    assert seen == 100 == written + dropped
+    assert 20 < len(bag_rig.seqs(path, "robot/scan")) == written < 100
