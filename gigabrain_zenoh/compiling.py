@@ -12,24 +12,45 @@ import sys
 from collections.abc import Awaitable
 
 from gigabrain_zenoh import lifeline
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.process import find
 
 log = logging.getLogger(__name__)
 
+MAPPING = "gigabrain_zenoh.mapping.warm:warm_up"  # call all that is compiled for a process once
+FINDING = "gigabrain_zenoh.mapping.warm:warm_up_finding"
+DRIVING = "gigabrain_zenoh.steering:warm_up"
 QUIET_S = 5.0  # of compiling, before people are told
 
 
 async def compiled(warm_up: str) -> None:
     """Have the function at "module:name" call all that is to be compiled, beside the loop.
 
-    Says so if that lasts.
+    Says so if that lasts. Raises ConfigError where something for it is not installed.
     """
+    try:
+        if await asyncio.to_thread(_missing, warm_up):
+            await _told(_in_child(warm_up))
+        await _told(asyncio.to_thread(_call, warm_up))
+    except ModuleNotFoundError as error:
+        raise needs(error) from None
+
+
+def needs(error: ModuleNotFoundError) -> ConfigError:
+    """What to install."""
+    return ConfigError(f"navigation needs {error.name}: pip install 'gigabrain-zenoh[nav]'")
+
+
+def _missing(warm_up: str) -> bool:
+    """Whether something of it is still to be compiled, and can be kept."""
     from gigabrain_zenoh.kernels import mark_of  # numba: only who drives by kernels pays
 
     mark = mark_of(warm_up)
-    if mark and not mark.exists():
-        await _told(_in_child(warm_up))
-    await _told(asyncio.to_thread(find(warm_up)))
+    return mark is not None and not mark.exists()
+
+
+def _call(warm_up: str) -> None:
+    find(warm_up)()  # imports too
 
 
 async def _told(work: Awaitable[None]) -> None:

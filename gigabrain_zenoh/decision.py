@@ -68,7 +68,16 @@ class Thinker:
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """An intent per world, as soon as it comes; repeated with the newest tick at each state."""
     senses = behaviours.senses(config, bus)
-    await senses.warm_up()
+    try:
+        await senses.warm_up()
+        _think(config, bus, senses)
+        ready()
+        await bus.failed
+    finally:
+        await senses.close()
+
+
+def _think(config: DecisionConfig, bus: Bus, senses: Senses) -> None:
     thinker, said = Thinker(config, senses), ""
     for name, expected in CHANGEABLE.items():
         bus.params.add_field(name, expected, lambda: thinker.config, thinker.configure)
@@ -100,8 +109,3 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
     states = bus.latest(STATE, decide)
     worlds = bus.latest(WORLD, see)
     bus.latest(SAFETY, verdicts.receive)
-    ready()
-    try:
-        await bus.failed
-    finally:
-        await senses.close()

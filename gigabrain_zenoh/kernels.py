@@ -13,9 +13,6 @@ F = TypeVar("F", bound=Callable[..., object])
 numba = numba_alone.load()
 PACKAGE = Path(__file__).parent
 HOLDERS = ("mapping", "navigation", "obstacles", "bench")  # packages with kernels
-MAPPING = "gigabrain_zenoh.mapping.warm:warm_up"  # call all that is compiled for a process once
-FINDING = "gigabrain_zenoh.mapping.warm:warm_up_finding"
-DRIVING = "gigabrain_zenoh.navigating:warm_up"
 
 
 def kernel(function: F) -> F:
@@ -24,10 +21,23 @@ def kernel(function: F) -> F:
     What was compiled is kept in NUMBA_CACHE_DIR, or in the user's cache folder; where neither can
     be written it is compiled anew in each process.
     """
+    return _compiled(function, counting=True)
+
+
+def lean_kernel(function: F) -> F:
+    """Compile a `function` that makes no arrays and is called very often, mostly by kernels.
+
+    It does not count references to the arrays that it is given: with several of them in a tuple,
+    that took a third of a short function's time. One that makes arrays is refused by numba.
+    """
+    return _compiled(function, counting=False)
+
+
+def _compiled(function: F, *, counting: bool) -> F:
     try:
-        compiled = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+        compiled = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=counting)(function)
     except RuntimeError:  # numba: no locator available
-        compiled = numba.njit(nogil=True, error_model="numpy")(function)
+        compiled = numba.njit(nogil=True, error_model="numpy", _nrt=counting)(function)
     return cast("F", compiled)
 
 

@@ -1,99 +1,66 @@
-"""What decision hears and serves when its robot is sent to places."""
+"""What decision serves when its robot is sent to places.
+
+Goals are taken from the start; what it takes to drive there is got ready meanwhile.
+"""
 
 import asyncio
-import logging
-from collections import deque
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from gigabrain_schemas.arrays import hits
-from gigabrain_schemas.base import Pose, Velocity
-from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_schemas.brain import OccupancyGrid, PoseInMap, WorldModel
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import Goal
-from gigabrain_schemas.topics import BODY, MAP, POSE, command_topic
-from gigabrain_zenoh.behaviours import Behaviour, Situation, must_charge
-from gigabrain_zenoh.behaviours.bearings import Bearings, Driven, Route
-from gigabrain_zenoh.behaviours.guide import Asked, Guide
-from gigabrain_zenoh.behaviours.navigate import Navigate, moved
+from gigabrain_zenoh.behaviours import Behaviour, Situation
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.compiling import compiled
-from gigabrain_zenoh.earlier import Earlier
+from gigabrain_zenoh.compiling import DRIVING, compiled
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.gate_state import BRAIN
-from gigabrain_zenoh.kernels import DRIVING
-from gigabrain_zenoh.lateness import Lateness
-from gigabrain_zenoh.mapping.background import Background, Take
-from gigabrain_zenoh.navigation import local, planner
-from gigabrain_zenoh.navigation.moment import Sent
-from gigabrain_zenoh.planar import compose, inverse
-from gigabrain_zenoh.pose_history import PoseHistory
-from gigabrain_zenoh.response import ResponseEstimator
+from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import DecisionConfig
 from gigabrain_zenoh.tasks.mission import roaming
-from gigabrain_zenoh.tasks.orders import Order, Outcome
+from gigabrain_zenoh.tasks.orders import Outcome
 from gigabrain_zenoh.tasks.service import TaskService
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from gigabrain_zenoh.steering import Steering
 
-POSE_NS = 1_000_000_000  # so old may be what was last heard of the place
-SENT_TICKS = 25  # commands of the last half second are planned with
-SMALL = 60_000  # cells; plans in larger maps are made in a thread,
-LARGE = 250_000  # and for each so many cells it may take a scan more than
-DUE_SCANS = 2
-PATIENCE_S = 0.05  # how long a scan waits for a plan that is due: control waits for no more
-AGAIN_TICKS = 25  # a route is looked at twice a second, whatever happens
-NO_MAP = "nobody says where in a map the robot is; set perception: {mapping: slam} in its file"
+STEERING = "gigabrain_zenoh.steering:Steering"
+GETTING_READY = "it is getting ready"
+TOLD_NS = 200_000_000  # from one word about that to the next
 PATIENCE_NS, LOOK_NS = 700_000_000, 50_000_000  # for the first word of the place, when asked
-
-ANY_BODY = BodyDescription(
-    robot_type="any", drive_type="differential",
-    footprint=((0.1, 0.1), (-0.1, 0.1), (-0.1, -0.1), (0.1, -0.1)),
-    max_linear_speed=1.0, max_angular_speed=1.0, max_linear_acceleration=1.0,
-    max_linear_deceleration=1.0, max_angular_acceleration=1.0,
-)  # fmt: skip
 
 
 class Navigating:
-    """The senses of the behaviour `navigate`: its place, its orders, its routes."""
+    """The senses of the behaviour `navigate`: its orders, and by what it carries them out."""
 
     def __init__(self, config: DecisionConfig, bus: Bus) -> None:
         self._bus, self._config = bus, config
-        self._response, self._history = ResponseEstimator(), PoseHistory()
-        self._states: deque[RobotState] = deque(maxlen=SENT_TICKS)
-        self._lateness = Lateness()
-        self._places: Earlier[PoseInMap] = Earlier()
-        self._maps: deque[OccupancyGrid] = deque(maxlen=2)
-        self._bodies = bus.latest(BODY)
-        bus.latest(POSE, self._places.receive)
-        bus.latest(MAP, self._maps.append)
-        self._hears_commands = False
         self._service = TaskService(bus, self, folder=config.state_dir, scripts=config.scripts)
-        self._guide = Guide(config.unknown)
-        self._route: Route | None = None
-        self._beside = Background(PATIENCE_S, bus.journal.in_time)
-        self._thought: tuple[int, OccupancyGrid] | None = None  # when, and about which map
+        self._ready: Steering | None = None
         self._outcome: Outcome | None = None
-        self._driven: Driven | None = None
-        self._here: Pose | None = None
         self._begun = False
 
     async def warm_up(self) -> None:
-        """Compile all that a driving robot calls."""
-        await compiled(DRIVING)
+        """Import and compile all that a driving robot calls. Raises ConfigError."""
+        telling = asyncio.ensure_future(self._tell())
+        try:
+            await compiled(DRIVING)
+        finally:
+            telling.cancel()
+        self._ready = find(STEERING)(self._config, self._bus)
+
+    async def _tell(self) -> None:
+        while True:
+            self._service.tell(f"waiting: {GETTING_READY}")
+            await self._bus.clock.sleep_ns(TOLD_NS)
+
+    @property
+    def _steering(self) -> "Steering":
+        assert self._ready
+        return self._ready
 
     def see(self, state: RobotState) -> None:
         """Take note of each state."""
-        self._history = self._history.then(state)
-        self._states.append(state)
-        self._lateness.sees(state.boot, state.tick)
-        self._response.state(state)
-        body = self._bodies.current
-        if body and not self._hears_commands:
-            self._hears_commands = True
-            topic = command_topic(body.description)
-            self._bus.subscribe(topic, lambda _key, command: self._response.command(command))
+        self._steering.see(state)
 
     def situation(
         self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
@@ -105,142 +72,32 @@ class Navigating:
         tick = world.basis if world else state.tick
         order = self._service.step(state, self._outcome, tick)
         self._outcome = None
-        if world:
-            self._lateness.thinks(state.tick, tick)
-            self._beside.at_scan()
-        pose, place = self._history.at(state.boot, tick), self._place(state.boot, tick)
-        body = self._bodies.current
-        map_from_odom, lost = place if pose else (None, "the odometry of the scan is missing")
-        if world and pose and map_from_odom and body:
-            self._here = compose(map_from_odom, pose)
-            self._steer(state, world, map_from_odom, order, body.description)
-        else:
-            self._here = None
-        bearings = Bearings(
-            tick=tick,
-            late_ticks=state.tick - tick,
-            delayed=self._lateness.seconds,
-            velocity=self._velocity(state, tick),
-            may_back=verdict is None or verdict.caps.backward != 0.0,
-            body=body.description if body else None,
-            map_from_odom=map_from_odom,
-            lost=lost,
-            response=self._response.response,
-            sent=tuple(Sent(*one) for one in self._response.sent(tick - SENT_TICKS, tick - 1)),
-            order=order,
-            route=self._route,
-        )
-        return Situation(world, pose or state.pose, must_charge(verdict), bearings)
+        return self._steering.situation(state, world, verdict, order)
 
     def heed(self, behaviour: Behaviour) -> None:
-        """What became of the order goes to the tasks, what became of the route to the guide."""
-        if isinstance(behaviour, Navigate):
-            self._outcome, self._driven = behaviour.outcome, behaviour.driven or self._driven
+        """What became of the order goes to the tasks."""
+        self._outcome = self._steering.heed(behaviour)
 
     async def close(self) -> None:
         """Once all is written down."""
         await self._service.close()
-        self._beside.close()
+        if self._ready:
+            self._ready.close()
 
     async def can_drive(self) -> None:
         """Raises Refused where nobody says where the robot is, with what to change."""
         for _ in range(PATIENCE_NS // LOOK_NS):
-            if self._here:
+            if self._waits or self._steering.placed:
                 return
             await self._bus.clock.sleep_ns(LOOK_NS)
-        raise Refused(self._lost())
+        raise Refused(self._steering.lost)
 
     async def can_reach(self, goal: Goal) -> str:
-        """How it would get there, in words. Raises Refused, and why."""
+        """How it would get there, or what that waits for, in words. Raises Refused, and why."""
         await self.can_drive()
-        grid = self._grid(self._bus.time.boot, self._bus.time.tick + 1)
-        body = self._bodies.current
-        if grid is None or body is None or self._here is None:
-            raise Refused(self._lost())
-        # beside whatever the guide is at: it has a memory of its own
-        guide = Guide(self._config.unknown)
-        told = await asyncio.to_thread(guide.check, grid, body.description, self._here, goal)
-        if told.startswith("no: "):
-            raise Refused(told.removeprefix("no: "))
-        return told
+        waits = self._waits
+        return f"accepted; {waits}" if waits else await self._steering.way_to(goal)
 
-    def _lost(self) -> str:
-        _, why = self._place(self._bus.time.boot, self._bus.time.tick)
-        return why or "nobody has sent a map yet; try again"
-
-    def _velocity(self, state: RobotState, tick: int) -> Velocity:
-        """The speed measured at a tick, or last before it; of a scan long past, the newest."""
-        known = (one for one in reversed(self._states) if one.boot == state.boot)
-        return next((one.velocity for one in known if one.tick <= tick), state.velocity)
-
-    def _place(self, boot: int, tick: int) -> tuple[Pose | None, str]:
-        """The odometry's frame in the map, or why that is not known."""
-        place = self._places.at(boot, tick, POSE_NS)
-        if place is None:
-            return None, NO_MAP
-        if not place.localized:
-            return None, "it is not sure where in the map it is"
-        then = self._history.at(boot, place.basis)
-        if then is None:
-            return None, "the odometry of its last place is missing"
-        return compose(Pose(x=place.x, y=place.y, yaw=place.yaw), inverse(then)), ""
-
-    def _grid(self, boot: int, tick: int) -> OccupancyGrid | None:
-        """The newest map of before a tick: it is sent when it changes, and outlives the driver."""
-        earlier = (one for one in reversed(self._maps) if one.boot != boot or one.tick < tick)
-        return next(earlier, None)
-
-    def _steer(
-        self,
-        state: RobotState,
-        world: WorldModel,
-        map_from_odom: Pose,
-        order: Order | None,
-        body: BodyDescription,
-    ) -> None:
-        """Have a route thought of where one is due."""
-        grid = self._grid(state.boot, world.basis)
-        if order is None or grid is None or self._here is None or not self._beside.idle:
-            return
-        if not self._due(order, world.basis, grid):
-            return
-        self._thought, driven, self._driven = (world.basis, grid), self._driven, None
-        asked = Asked(
-            tick=world.basis,
-            driving=state.gate.mode == "enabled" and state.gate.commander == BRAIN,
-            order=order,
-            here=self._here,
-            grid=grid,
-            body=body,
-            driven=driven,
-            seen=moved(self._here, hits(world).astype(np.float64)),
-        )
-        cells = grid.width * grid.height
-        if cells <= SMALL:
-            self._route = self._guide.think(asked)
-        else:
-            self._beside.start(lambda: self._thought_of(asked), DUE_SCANS + cells // LARGE)
-
-    def _thought_of(self, asked: Asked) -> Take:
-        """In a thread of its own: the route, and what makes it count."""
-        route = self._guide.think(asked)
-
-        def take() -> None:
-            self._route = route
-
-        return take
-
-    def _due(self, order: Order, tick: int, grid: OccupancyGrid) -> bool:
-        """Whether a new route is wanted."""
-        if self._route is None or self._thought is None or self._route.number != order.number:
-            return True
-        before, known = self._thought
-        if self._driven and self._driven.arrived and self._driven.version == self._route.version:
-            return True
-        return grid is not known or not 0 <= tick - before < AGAIN_TICKS
-
-
-def warm_up() -> None:
-    """Call every kernel of planning and driving once."""
-    planner.warm_up()
-    local.warm_up(ANY_BODY)
+    @property
+    def _waits(self) -> str:
+        return self._ready.waits if self._ready else GETTING_READY

@@ -1,7 +1,7 @@
 """Numba without what it looks for and we do not use.
 
 Where these packages happen to be installed, their import takes as long as loading all our kernels:
-scipy's BLAS, and coverage's measuring of compiled functions.
+scipy's BLAS, coverage's measuring of compiled functions, and cffi with its parser of C.
 """
 
 import importlib
@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-UNUSED = ("scipy.linalg", "coverage")
-PARTS = ("numba", "numba.np.arraymath")  # the second looks for BLAS, at the first call otherwise
+UNUSED = ("scipy.linalg", "coverage", "cffi")
+# the others look for BLAS and for cffi, at the first call otherwise
+PARTS = ("numba", "numba.np.arraymath", "numba.core.typing.cffi_utils")
 
 
 def load() -> Any:

@@ -16,7 +16,7 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
 from gigabrain_zenoh.bus import Bus, Latest
-from gigabrain_zenoh.compiling import compiled
+from gigabrain_zenoh.compiling import FINDING, MAPPING, compiled
 from gigabrain_zenoh.obstacles.surroundings import Surroundings
 from gigabrain_zenoh.placed_scans import PlacedScans
 from gigabrain_zenoh.settings import PerceptionConfig
@@ -161,10 +161,9 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         ready()
         await bus.failed
         return
-    from gigabrain_zenoh.kernels import FINDING, MAPPING  # numba: only who has a map pays
-    from gigabrain_zenoh.mapper import Mapper
-
     await compiled(MAPPING if config.mapping == "slam" else FINDING)
+    from gigabrain_zenoh.mapper import Mapper  # and numba: only who has a map pays
+
     with closing(Mapper(config, bus, body)) as mapper:
         _follow(config, bus, body, mapper)
         ready()

@@ -15,6 +15,7 @@ from gigabrain_zenoh.bench.chain import ChainResult, Compared
 from gigabrain_zenoh.bench.costs import Hop, Timed
 from gigabrain_zenoh.bench.estop import EstopResult, Presses
 from gigabrain_zenoh.bench.figures import Figures, figures, over_rounds
+from gigabrain_zenoh.bench.first_goal import FirstGoal
 from gigabrain_zenoh.bench.listening import Heard, median_ms
 from gigabrain_zenoh.bench.runs import relay_roles
 from gigabrain_zenoh.bench.stack import Process, StackResult, physics_share, targets
@@ -195,6 +196,12 @@ def test_targets_are_held_against_the_figures() -> None:
     assert [t.ok for t in targets(stack(ready_s=1.6, physics_cpu=0.06))] == [
         False, True, False, True,
     ]  # fmt: skip
+    goal = FirstGoal(
+        accepted_s=1.9, accepted_cpu_s=1.7, told="goal-1: accepted", drives_s=4.0, drives_cpu_s=5.1
+    )
+    held = {target.name: target for target in targets(stack(first_goal=goal))}
+    assert held["first goal accepted after"].ok
+    assert not msgspec.structs.replace(held["first goal accepted after"], value=2.1).ok
     without_mujoco = targets(stack(physics_cpu=None))
     assert [t.name for t in without_mujoco][1:] == [
         "CPU without physics",
@@ -218,6 +225,13 @@ def test_the_pages_say_it_all() -> None:
     page = shown(stack_page(stack(ready_s=1.6)))
     for text in ("perception", "2.5%", "56 MB", "1.60 s", "over", "17.25 %"):
         assert text in page
+    assert "first goal" not in page
+    goal = FirstGoal(
+        accepted_s=1.95, accepted_cpu_s=1.7, told="goal-1: ok", drives_s=4.0, drives_cpu_s=5.1
+    )
+    page = shown(stack_page(stack(first_goal=goal)))
+    for text in ("1.95 s", "after 1.70 s of CPU (goal-1: ok)", "4.00 s with 5.10 s of CPU"):
+        assert text in " ".join(page.split())
 
 
 async def test_the_chain_is_timed_beside_a_bare_relay(home: Home, tmp_path: Path) -> None:
@@ -239,8 +253,9 @@ async def test_the_chain_is_timed_beside_a_bare_relay(home: Home, tmp_path: Path
 
 async def test_a_whole_robot_is_measured(home: Home, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
+    pytest.importorskip("gtsam")
     report = tmp_path / "stack.json"
-    command = await home.run("bench", "stack", "--seconds", "2", "--json", str(report))
+    command = await home.run("bench", "stack", "--seconds", "2", "--goal", "--json", str(report))
     assert await command.ended() == 0, command.err
     result = json.loads(report.read_bytes())
     names = [process["name"] for process in result["processes"]]
@@ -248,6 +263,10 @@ async def test_a_whole_robot_is_measured(home: Home, tmp_path: Path) -> None:
     assert all(process["rss_bytes"] > 1e7 for process in result["processes"])
     assert result["ready_s"] > 0
     assert result["physics_cpu"] > 0
+    goal = result["first_goal"]
+    assert goal["told"].startswith("goal-1: ")
+    assert 0 < goal["accepted_s"] < goal["drives_s"]
+    assert 0 < goal["accepted_cpu_s"] <= goal["drives_cpu_s"]
     assert "physics and lidar" in command.out
 
 

@@ -72,7 +72,7 @@ def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) 
     assert mark.exists()
 
 
-@pytest.mark.parametrize("warm_up", [kernels.MAPPING, kernels.FINDING, kernels.DRIVING])
+@pytest.mark.parametrize("warm_up", [compiling.MAPPING, compiling.FINDING, compiling.DRIVING])
 def test_what_is_to_be_called_is_there(warm_up: str) -> None:
     assert isinstance(find(warm_up), types.FunctionType)
 
@@ -84,12 +84,12 @@ from gigabrain_zenoh import kernels
 def double(x):
     return 2 * x
 double(21)
-print(*(name for name in ("coverage", "scipy.linalg") if name in sys.modules))
-import coverage, scipy.linalg
+print(*(name for name in ("coverage", "scipy.linalg", "cffi") if name in sys.modules))
+import coverage, scipy.linalg, cffi
 """
 
 
-@pytest.mark.skipif(not find_spec("scipy") or not find_spec("coverage"), reason="not installed")
+@pytest.mark.skipif(not all(map(find_spec, ("scipy", "coverage", "cffi"))), reason="not installed")
 def test_numba_imports_nothing_that_we_do_not_use_and_hides_nothing_for_good() -> None:
     done = subprocess.run((sys.executable, "-c", ALONE), capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, "\n"), done.stderr

@@ -14,7 +14,7 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest, TaskRequest
 from gigabrain_schemas.topics import GOAL, MISSION, SAFETY, TASK_CHANGE
-from gigabrain_zenoh import navigating
+from gigabrain_zenoh import steering
 from gigabrain_zenoh.behaviours.bearings import Route
 from gigabrain_zenoh.behaviours.guide import Asked, Guide
 from gigabrain_zenoh.navigating import Navigating
@@ -206,7 +206,7 @@ async def ticks_to_a_way(monkeypatch: pytest.MonkeyPatch, thinks_s: float) -> li
         return think(guide, asked)
 
     monkeypatch.setattr(Guide, "think", slowly)
-    monkeypatch.setattr(navigating, "PATIENCE_S", 30.0)
+    monkeypatch.setattr(steering, "PATIENCE_S", 30.0)
     ticks = []
     async with Plane(LARGE) as plane:
         await plane.go(0.2)
@@ -292,6 +292,20 @@ async def test_something_new_in_the_way_is_gone_round() -> None:
         assert not np.array_equal(plane.known, wide)
 
 
+async def test_a_goal_that_turns_out_to_be_too_close_to_something_is_reached_beside_it() -> None:
+    wide = drawn("####################\n" + "#..................#\n" * 12 + "####################")
+    async with Plane(wide, at=(1.0, 1.6, 0.0)) as plane:
+        await plane.go(0.2)
+        assert (await plane.ask(GOAL, GoalRequest(x=4.0, y=1.6))).ok
+        plane.cells = wide.copy()
+        plane.cells[:, 83:86] = 100  # from x = 4.15 m on: the body does not fit at the goal
+        await plane.until("succeeded", seconds=90)
+        told = plane.status.done[0].reason
+        assert " m beside what was asked for: the goal is too close to something" in told
+        assert 0.1 < math.hypot(plane.x - 4.0, plane.y - 1.6) < 0.4
+        assert plane.closest > 0.1
+
+
 async def test_the_same_world_gives_the_same_drive() -> None:
     places = []
     for _ in range(2):
@@ -350,6 +364,7 @@ async def test_who_was_told_to_do_nothing_does_not_roam_after_a_restart_of_decis
 async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_that_is() -> None:
     net = Net()
     senses = Navigating(DecisionConfig(behaviour="navigate"), net.one)
+    await senses.warm_up()
     states = [state(tick, v=0.01 * tick, pose=(0.1 * tick, 0.0, 0.0)) for tick in range(1, 8)]
     for one in states:
         senses.see(one)

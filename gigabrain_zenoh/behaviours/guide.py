@@ -24,6 +24,7 @@ REMEMBERED_TICKS = 500  # 10 s, that what was in the way stays in the plans
 MUCH_BETTER_M = 1.5  # so much better has another frontier to be, or it goes to and fro
 OPEN, FAR_M = 2.0, 1.5  # cost of a place worth visiting, and the way there at least [m]
 SURE_TICKS = 125  # 2.5 s: the map comes once a second
+BESIDE_M = 0.25  # so near will do, for a goal that was free when it was asked for: maps shift
 SAME_M = 0.6  # a frontier so near is the same one: it moves as the map grows
 
 
@@ -113,8 +114,14 @@ class Guide:
         return self._costmap
 
     def _to(self, goal: Goal, asked: Asked, chart: Costmap) -> Route:
-        first = self._goal is None
+        first, beside = self._goal is None, ""
         found = self._plan(goal, asked.here, chart)
+        if isinstance(found, Unreachable) and not first and found.distance <= BESIDE_M:
+            assert found.nearest
+            fault = found.reason.partition(";")[0]
+            beside = f"{found.distance:.1f} m beside what was asked for: {fault}"
+            goal = Goal(x=found.nearest[0], y=found.nearest[1], yaw=goal.yaw)
+            found = self._planner.plan(chart, (asked.here.x, asked.here.y), found.nearest)
         if isinstance(found, Unreachable):
             if first or self._stuck(asked, GIVE_UP_TICKS):
                 return self._ended("failed", found.reason)
@@ -123,7 +130,7 @@ class Guide:
         if self._stuck(asked, GIVE_UP_TICKS):
             left = f"{found.remaining[0]:.1f} m before the goal"
             return self._ended("failed", f"no nearer for 30 s, {left}: something is in the way")
-        return self._going(goal, found)
+        return self._going(goal, found, beside)
 
     def _anywhere(self, asked: Asked, chart: Costmap) -> Goal:
         """A place in the open that can be reached; where it is, if there is no other."""
@@ -205,8 +212,9 @@ class Guide:
         self._nearest, self._nearest_tick = math.inf, tick
         self._version += 1
 
-    def _going(self, goal: Goal, path: Path) -> Route:
-        return Route(number=self._number, version=self._version, goal=goal, points=path.points)
+    def _going(self, goal: Goal, path: Path, reason: str = "") -> Route:
+        number, version = self._number, self._version
+        return Route(number=number, version=version, goal=goal, points=path.points, reason=reason)
 
     def _waiting(self, reason: str) -> Route:
         return Route(number=self._number, version=self._version, reason=reason)

@@ -35,19 +35,25 @@ class Navigate:
         self.outcome = self.driven = None
         world, bearings = situation.world, situation.bearings
         why = _why_not(situation)
+        order = bearings.order if bearings else None
         if why or world is None or bearings is None:
-            return _stand(why)
-        order, route = bearings.order, bearings.route
+            return self._wait(order, why)
+        route = bearings.route
         if order is None:
             return _stand("waiting: for a goal")
         if route is None or route.number != order.number:
-            return _stand("waiting: for a way through the map")
+            return self._wait(order, "waiting: for a way through the map")
         if order.number != self._number:
             self._number, self._longest = order.number, 0.0
         if route.goal is None or route.points is None:
             self.outcome = Outcome(number=order.number, state=route.state, reason=route.reason)
             return _stand(f"waiting: {route.reason}")
         return self._drive(situation.pose, world, bearings, route)
+
+    def _wait(self, order: Order | None, why: str) -> Intent:
+        if order:
+            self.outcome = Outcome(number=order.number, reason=why[:500])
+        return _stand(why)
 
     def _drive(self, pose: Pose, world: WorldModel, bearings: Bearings, route: Route) -> Intent:
         assert bearings.map_from_odom
@@ -98,7 +104,7 @@ class Navigate:
         self.outcome = Outcome(
             number=order.number,
             state="done" if arrived else "running",
-            reason=f"at {where(goal)}" if arrived else plan.reason,
+            reason=_at(route, goal) if arrived else plan.reason,
             progress=1.0 if arrived else 1.0 - min(1.0, distance / self._longest),
             distance=distance,
             eta=distance / speed,
@@ -139,6 +145,11 @@ def _why_not(situation: Situation) -> str:
 def _headline(order: Order | None, goal: Goal) -> str:
     """What it is at: the same for as long as that does not change."""
     return "exploring" if isinstance(order, Explore) else f"going to {where(goal)}"
+
+
+def _at(route: Route, goal: Goal) -> str:
+    """Where it has arrived, and why that is not what was asked for, if it is not."""
+    return f"at {where(goal)}, {route.reason}" if route.reason else f"at {where(goal)}"
 
 
 def _slowly(bearings: Bearings) -> str:

@@ -1,8 +1,10 @@
 """A group of processes that runs for one measurement, under the supervisor that `up` uses."""
 
 import asyncio
+import os
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 from gigabrain_schemas.requests import DescribeRequest
@@ -36,7 +38,18 @@ class Group:
         if record.get("level") in ("error", "critical") and not self._fault:
             self._fault = str(record.get("text", ""))
         if not self.ready_s and self.ready:
-            self.ready_s = asyncio.get_running_loop().time() - self._began_s
+            self.ready_s = self.seconds
+
+    @property
+    def seconds(self) -> float:
+        """Since the first start."""
+        return asyncio.get_running_loop().time() - self._began_s
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU time that all processes have used so far."""
+        pids = (status.pid for status in self.supervisor.statuses.values())
+        return sum(cpu_s(pid) for pid in pids if pid)
 
     @property
     def ready(self) -> bool:
@@ -67,20 +80,37 @@ class Group:
             raise GigabrainError(f"a process died while it was measured: {self._fault}")
 
 
+def cpu_s(pid: int) -> float:
+    """CPU time that a process has used so far, from proc(5); 0 where there is none."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return 0.0
+    user, system = stat.rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+
+
+@asynccontextmanager
+async def starting(specs: Sequence[ProcessSpec]) -> AsyncIterator[Group]:
+    """Run `specs` while the block lasts, which begins with their start; none is left after it."""
+    group = Group(specs)
+    async with group.supervisor:
+        work = asyncio.create_task(group.supervisor.run())
+        try:
+            yield group
+        finally:
+            await group.supervisor.stop(STOP_S)
+            await work
+
+
 @asynccontextmanager
 async def running(
     specs: Sequence[ProcessSpec], within_s: float = PATIENCE_S
 ) -> AsyncIterator[Group]:
     """Run `specs` while the block lasts; all are ready when it begins, none is left after it."""
-    group = Group(specs)
-    async with group.supervisor:
-        work = asyncio.create_task(group.supervisor.run())
-        try:
-            await group.until(lambda: group.ready, within_s)
-            yield group
-        finally:
-            await group.supervisor.stop(STOP_S)
-            await work
+    async with starting(specs) as group:
+        await group.until(lambda: group.ready, within_s)
+        yield group
 
 
 @asynccontextmanager

@@ -3,16 +3,15 @@
 import asyncio
 import contextlib
 import json
-import os
 import sys
 from asyncio.subprocess import DEVNULL, Process
 from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import NamedTuple
 
 from websockets.asyncio.client import connect
 from websockets.typing import Origin, Subprotocol
 
+from gigabrain_zenoh.bench.group import cpu_s
 from gigabrain_zenoh.page import wire
 from gigabrain_zenoh.page.beside import HOST, free_port
 
@@ -47,13 +46,8 @@ class Echo:
         self._process = process
 
     def cpu_s(self) -> float:
-        """CPU time that it has used so far, from proc(5); 0 where there is none."""
-        try:
-            stat = Path(f"/proc/{self._process.pid}/stat").read_text()
-        except OSError:
-            return 0.0
-        user, system = stat.rpartition(")")[2].split()[11:13]
-        return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+        """CPU time that it has used so far."""
+        return cpu_s(self._process.pid)
 
 
 @contextlib.asynccontextmanager

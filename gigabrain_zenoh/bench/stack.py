@@ -10,6 +10,7 @@ from msgspec import Struct
 
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import HEALTH
+from gigabrain_zenoh.bench.first_goal import ACCEPTED_S, FirstGoal, measure_first_goal
 from gigabrain_zenoh.bench.group import client, driver_report, running
 from gigabrain_zenoh.bench.runs import LOOPBACK
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
@@ -38,6 +39,7 @@ class StackResult(Struct, frozen=True, kw_only=True):
     ready_s: float  # from the start of the first process until the last was ready
     physics_cpu: float | None  # of one core, with the lidar's rays; None for a body without physics
     processes: tuple[Process, ...]
+    first_goal: FirstGoal | None = None  # of the same robot, started anew and making a map
 
     @property
     def cpu_without_physics(self) -> float:
@@ -75,6 +77,9 @@ def targets(result: StackResult) -> list[Target]:
         found.append(
             Target(name="physics and lidar", value=percent, limit=PHYSICS_PERCENT, unit="%")
         )
+    if goal := result.first_goal:
+        name = "first goal accepted after"
+        found.append(Target(name=name, value=goal.accepted_s, limit=ACCEPTED_S, unit="s"))
     small = [p for p in result.processes if p.name != SIMULATOR or result.physics_cpu is None]
     largest = max(small, key=lambda process: process.rss_bytes)
     found.append(
@@ -89,9 +94,12 @@ def targets(result: StackResult) -> list[Target]:
 
 
 async def measure_stack(
-    body: str, world: str, seconds: float, say: Callable[[str], None]
+    body: str, world: str, seconds: float, say: Callable[[str], None], *, goal: bool = False
 ) -> StackResult:
-    """Run a robot as the demo does. Raises GigabrainError when a process dies on the way."""
+    """Run a robot that avoids, and then perhaps one that navigates, for its first `goal`.
+
+    Raises GigabrainError when a process dies on the way.
+    """
     deployment = with_free_port(Deployment(body=body, world=world, resume="auto", router=LOOPBACK))
     with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as name:
         folder = Path(name)
@@ -107,6 +115,7 @@ async def measure_stack(
             close()
             after, ended_ns = await driver_report(bus), bus.clock.now_ns()
             await group.until(lambda: len(told) >= len(specs))
+    first_goal = await measure_first_goal(body, world, say) if goal else None
     return StackResult(
         body=body,
         world=world,
@@ -114,6 +123,7 @@ async def measure_stack(
         ready_s=group.ready_s,
         physics_cpu=physics_share(before, after, (ended_ns - began_ns) / 1e9),
         processes=tuple(_process(spec.name, told[spec.name]) for spec in specs),
+        first_goal=first_goal,
     )
 
 

@@ -8,6 +8,7 @@ from gigabrain_zenoh.bench.chain import TARGET_P50, TARGET_P99, ChainResult, Com
 from gigabrain_zenoh.bench.costs import Hop
 from gigabrain_zenoh.bench.estop import MAX_MS, P99_MS, TRAVEL_M, EstopResult
 from gigabrain_zenoh.bench.figures import Figures, over_rounds
+from gigabrain_zenoh.bench.first_goal import FirstGoal
 from gigabrain_zenoh.bench.stack import StackResult, Target, targets
 from gigabrain_zenoh.bench.with_tools import ADDED, ToolsResult
 
@@ -118,7 +119,17 @@ def stack_page(result: StackResult) -> Group:
     held = _table("figure", "measured", "at most", "")
     for target in targets(result):
         held.add_row(*_target(target))
-    return Group(_title(title), table, _title("Targets (CPU of one core)"), held)
+    page = Group(_title(title), table, _title("Targets (CPU of one core)"), held)
+    if goal := result.first_goal:
+        page.renderables.append(Text(_told(goal), style="dim"))
+    return page
+
+
+def _told(goal: FirstGoal) -> str:
+    return (
+        f"The first goal was accepted after {goal.accepted_cpu_s:.2f} s of CPU ({goal.told}), and "
+        f"driven to after {goal.drives_s:.2f} s with {goal.drives_cpu_s:.2f} s of CPU."
+    )
 
 
 def estop_page(result: EstopResult) -> Group:

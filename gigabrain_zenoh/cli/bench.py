@@ -77,11 +77,12 @@ def stack(
     seconds: float = 20.0,
     body: str = "turtlebot3_waffle",
     world: str = "arena",
+    goal: bool = False,
     json: Path | None = None,
 ) -> int:
     """Measure what a whole robot needs: CPU, memory, and time to start.
 
-    Example: gigabrain bench stack --seconds 20 --world house
+    Example: gigabrain bench stack --seconds 20 --world house --goal
 
     Parameters
     ----------
@@ -91,6 +92,8 @@ def stack(
         Which robot; see `gigabrain robots`.
     world
         Where it drives; see `gigabrain worlds`.
+    goal
+        Start it once more, with a map, and time how soon it may be sent to a place.
     json
         Write all figures into this file.
     """
@@ -99,7 +102,7 @@ def stack(
 
     results.check_place(json)
     above_zero("seconds", seconds)
-    result = asyncio.run(measure_stack(body, world, seconds, _progress))
+    result = asyncio.run(measure_stack(body, world, seconds, _progress, goal=goal))
     _finish(stack_page(result), result, json)
     return 0
 

@@ -37,7 +37,7 @@ def progress(name: str, status: TaskStatus) -> str:
     if current.state == "paused":
         return f"{name}: paused, {current.reason}"
     if not status.doing:
-        return f"{name}: accepted"
+        return f"{name}: accepted, {current.reason}" if current.reason else f"{name}: accepted"
     parts = [f"{name}: {status.doing}", f"{100 * status.progress:.0f} %"]
     if status.distance_remaining is not None:
         parts.append(f"{status.distance_remaining:.1f} m")

@@ -13,7 +13,7 @@ def warm() -> None:
     What was compiled is kept in the user's cache folder, or in NUMBA_CACHE_DIR where that is set.
     After an update it is done again, at the latest at the first start, while nothing drives.
     """
-    from gigabrain_zenoh.errors import ConfigError
+    from gigabrain_zenoh.compiling import needs
 
     for name in STEPS:
         print(f"{name} … ", end="", flush=True)
@@ -22,14 +22,11 @@ def warm() -> None:
             _compile(name)
         except ModuleNotFoundError as error:
             print()
-            raise ConfigError(
-                f"navigation needs {error.name}: pip install 'gigabrain-zenoh[nav]'"
-            ) from None
+            raise needs(error) from None
         print(f"{time.monotonic() - began_s:.1f} s")
 
 
 def _compile(name: str) -> None:
-    from gigabrain_zenoh.compiling import compile_all
-    from gigabrain_zenoh.kernels import DRIVING, MAPPING
+    from gigabrain_zenoh.compiling import DRIVING, MAPPING, compile_all
 
     compile_all(MAPPING if name == "mapping" else DRIVING)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels import lean_kernel
 from gigabrain_zenoh.sweep import Corners, box
 
 SPACING = 0.05  # [m], between points on the outline at most
@@ -57,7 +57,7 @@ def outline_of(footprint: Corners) -> Outline:
     return Outline(points, x, y, inner, outer, front, rear, left, right, far)
 
 
-@kernel
+@lean_kernel
 def distance_at(grid: Grid, x: float, y: float) -> float:
     """The distance [m] from (x, y) to the nearest obstacle."""
     rows, columns = grid.distance.shape
@@ -74,7 +74,7 @@ def distance_at(grid: Grid, x: float, y: float) -> float:
     return found
 
 
-@kernel
+@lean_kernel
 def clearance(
     grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float
 ) -> float:
@@ -91,7 +91,7 @@ def clearance(
     return min(nearest, _nearest(grid, outline.points, x, y, cosine, sine))
 
 
-@kernel
+@lean_kernel
 def _nearest(
     grid: Grid, points: NDArray[np.float32], x: float, y: float, cosine: float, sine: float
 ) -> float:
@@ -119,7 +119,7 @@ def _nearest(
     return float(nearest)
 
 
-@kernel
+@lean_kernel
 def free_ahead(
     grid: Grid,
     outline: Outline,

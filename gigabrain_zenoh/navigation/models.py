@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels import lean_kernel
 from gigabrain_zenoh.limits import limits_of
 
 RESERVE = 0.9  # of the body's accelerations: what is planned must be possible on a bad floor too
@@ -71,7 +71,7 @@ def slowed(model: Model, seconds: float) -> Model:
     )
 
 
-@kernel
+@lean_kernel
 def toward(before: float, target: float, up: float, down: float) -> float:
     """`target`, or as near to it as one step from `before` gets.
 
@@ -82,7 +82,7 @@ def toward(before: float, target: float, up: float, down: float) -> float:
     return max(lowest, min(highest, target))
 
 
-@kernel
+@lean_kernel
 def feasible(
     model: Model, before: tuple[float, float, float], target: tuple[float, float, float], dt: float
 ) -> tuple[float, float, float]:
@@ -119,7 +119,7 @@ def lag_of(seconds: float, dt: float) -> Lag:
     return Lag(decay, seconds * (1.0 - decay))
 
 
-@kernel
+@lean_kernel
 def answer(velocity: float, command: float, lag: Lag, dt: float) -> tuple[float, float]:
     """A body's velocity after a step with `command`, and the way that it has made."""
     off = velocity - command

@@ -34,7 +34,7 @@ class Unreachable:
 
     reason: str
     nearest: Point | None = None
-    distance: float | None = None  # [m] from there to the goal, straight
+    distance: float = math.inf  # [m] from there to the goal, straight
 
 
 class Planner:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels import lean_kernel
 from gigabrain_zenoh.navigation.footprint import ROOM, Grid, Outline, distance_at, free_ahead
 from gigabrain_zenoh.navigation.models import Model
 
@@ -51,7 +51,7 @@ class Weights(NamedTuple):
     disc_margin: float = 0.02  # [m]
 
 
-@kernel
+@lean_kernel
 def of_place(
     weights: Weights, scene: Scene, room: float, away: float, x: float, y: float, yaw: float
 ) -> float:
@@ -69,7 +69,7 @@ def of_place(
     return cost
 
 
-@kernel
+@lean_kernel
 def _arrived(scene: Scene, x: float, y: float, yaw: float) -> bool:
     dx, dy = x - scene.goal_x, y - scene.goal_y
     if dx * dx + dy * dy > scene.tolerance * scene.tolerance:
@@ -78,7 +78,7 @@ def _arrived(scene: Scene, x: float, y: float, yaw: float) -> bool:
     return any_yaw or _turn_between(yaw, scene.goal_yaw) <= scene.yaw_tolerance
 
 
-@kernel
+@lean_kernel
 def of_motion(weights: Weights, room: float, vx: float, vy: float, w: float) -> float:
     """What it costs to move so for a second."""
     cost = weights.turning * w * w
@@ -92,7 +92,7 @@ def of_motion(weights: Weights, room: float, vx: float, vy: float, w: float) -> 
     return cost
 
 
-@kernel
+@lean_kernel
 def of_braking(
     model: Model, outline: Outline, scene: Scene, room: float, x: float, y: float,
     cosine: float, sine: float, vx: float, vy: float,
@@ -110,7 +110,7 @@ def of_braking(
     return TOO_FAST * over * over
 
 
-@kernel
+@lean_kernel
 def rest(model: Model, scene: Scene, x: float, y: float) -> float:
     """The cost of the way from (x, y) to the goal."""
     away = math.hypot(x - scene.goal_x, y - scene.goal_y)
@@ -118,7 +118,7 @@ def rest(model: Model, scene: Scene, x: float, y: float) -> float:
     return SECOND * way / model.forward
 
 
-@kernel
+@lean_kernel
 def distance_in(field: Grid, x: float, y: float) -> float:
     """The cost to go from (x, y) [m]; beyond the rim that of the rim."""
     rows, columns = field.distance.shape
@@ -128,7 +128,7 @@ def distance_in(field: Grid, x: float, y: float) -> float:
     return distance_at(field, inner_x, inner_y)
 
 
-@kernel
+@lean_kernel
 def of_end(
     model: Model, weights: Weights, scene: Scene, x: float, y: float, yaw: float,
     vx: float, vy: float,
@@ -152,14 +152,14 @@ def of_end(
     return cost + SECOND * weights.heading * turn / model.turning
 
 
-@kernel
+@lean_kernel
 def _turn_between(one: float, other: float) -> float:
     """The angle between two directions [rad], 0 to pi."""
     turn = one - other
     return abs(turn - math.tau * math.floor(turn / math.tau + 0.5))
 
 
-@kernel
+@lean_kernel
 def from_discs(
     discs: Floats, outline: Outline, x: float, y: float, cosine: float, sine: float, t: float
 ) -> float:

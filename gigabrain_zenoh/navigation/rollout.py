@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels import lean_kernel
 from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance
 from gigabrain_zenoh.navigation.models import Lag, Model, answer, feasible
 from gigabrain_zenoh.navigation.rating import (
@@ -48,7 +48,7 @@ class Start(NamedTuple):
     gain: float  # of the yaw rate: no more than so much of its largest can be had
 
 
-@kernel
+@lean_kernel
 def effective(start: Start, plan: Floats, t: int, axis: int) -> float:
     """The mean command [m/s or rad/s] that rules the body in step `t`."""
     delayed = start.past.shape[0]
@@ -59,7 +59,7 @@ def effective(start: Start, plan: Floats, t: int, axis: int) -> float:
     return mean
 
 
-@kernel
+@lean_kernel
 def drive(
     model: Model,
     outline: Outline,
@@ -126,7 +126,7 @@ def drive(
     return cost
 
 
-@kernel
+@lean_kernel
 def _turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
     """A direction turned by less than half a radian; Taylor's series is quicker than sin, cos."""
     square = angle * angle
@@ -135,7 +135,7 @@ def _turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
     return cosine * c - sine * s, sine * c + cosine * s
 
 
-@kernel
+@lean_kernel
 def _note(
     track: Floats, t: int, x: float, y: float, yaw: float, vx: float, vy: float, w: float
 ) -> None:

@@ -3,6 +3,8 @@
 import logging
 from typing import Any, Protocol
 
+from msgspec.structs import replace
+
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.tasks import (
     Goal,
@@ -12,6 +14,7 @@ from gigabrain_schemas.tasks import (
     MissionRequest,
     TaskReply,
     TaskRequest,
+    TaskStatus,
 )
 from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Service
 from gigabrain_zenoh.bus import Bus
@@ -58,12 +61,19 @@ class TaskService:
         self._written, self._unwritable = saved, Fault(log)
         self._boot = self._tick = self._told_tick = self._basis = 0
         self._said: dict[str, str] = {}
+        self._waits = ""  # what all wait for, before the first step
         bus.serve(GOAL, self._goal)
         bus.serve(MISSION, self._mission)
         bus.serve(TASK_CHANGE, self._change)
 
+    def tell(self, waits: str) -> None:
+        """Say how it stands before there is anybody to drive, and what that `waits` for."""
+        self._waits = waits
+        self._tell()
+
     def step(self, state: RobotState, outcome: Outcome | None, basis: int = 0) -> Order | None:
         """Go on, with the world of tick `basis`; what is wanted of whoever drives."""
+        self._waits = ""
         again = state.boot == self._boot
         seconds = max(0, state.tick - self._tick) * 0.02 if again else 0.0
         self._boot, self._tick, self._basis = state.boot, state.tick, basis
@@ -92,7 +102,7 @@ class TaskService:
     def _tell(self) -> None:
         """Say how it stands, and write it down where it has changed."""
         self._told_tick = self._tick
-        status = self._bus.publish(TASK, self._tasks.status)
+        status = self._bus.publish(TASK, self._status())
         for task in reversed(status.done):
             if task.id not in self._said:
                 data = {"event": "task", "task": task.id, "state": task.state}
@@ -103,6 +113,12 @@ class TaskService:
         if saved != self._written:
             self._written = saved
             self._scribe.put(saved).add_done_callback(lambda written: self._note(written.result()))
+
+    def _status(self) -> TaskStatus:
+        status = self._tasks.status
+        if not self._waits or status.current is None or status.current.state != "active":
+            return status
+        return replace(status, current=replace(status.current, reason=self._waits))
 
     def _note(self, problem: str) -> None:
         if problem:

@@ -1,0 +1,105 @@
+"""Goals that are given before the robot has got ready: taken at once, driven to afterwards."""
+
+import asyncio
+import functools
+import subprocess
+import sys
+
+import pytest
+
+from gigabrain_schemas.tasks import GoalReply, GoalRequest, MissionRequest, TaskStatus
+from gigabrain_schemas.topics import GOAL, INTENT, MISSION, TASK
+from gigabrain_zenoh import decision, navigating
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.cli.task_line import progress
+from gigabrain_zenoh.compiling import compiled
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.settings import DecisionConfig
+from tests.brain_rig import Bench
+from tests.plane_rig import ROOM, Plane, drawn
+
+CELLS = drawn(ROOM)
+NAVIGATE = DecisionConfig(behaviour="navigate")
+
+
+async def test_a_goal_is_taken_while_decision_still_gets_ready(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    warm = asyncio.Event()
+
+    async def compiled_later(warm_up: str) -> None:
+        await warm.wait()
+        await compiled(warm_up)
+
+    monkeypatch.setattr(navigating, "compiled", compiled_later)
+    told: list[TaskStatus] = []
+    async with Bench(functools.partial(decision.run, NAVIGATE)) as bench:
+        operator = Bus(bench.network.transport(), bench.clock, "operator")
+        operator.subscribe(TASK, lambda _key, status: told.append(status))
+        replies = await operator.ask(GOAL, GoalRequest(x=4.0, y=0.8, source="ann"))
+        assert replies == [GoalReply(ok=True, text="goal-1: accepted; it is getting ready",
+                                     goal="goal-1")]  # fmt: skip
+        for _ in range(3):
+            await bench.clock.advance(200_000_000)
+        assert len(told) >= 3
+        assert progress("goal-1", told[-1]) == "goal-1: accepted, waiting: it is getting ready"
+        assert not bench.sent(INTENT)
+        warm.set()
+        await bench.ready()
+        await operator.close()
+
+
+async def test_a_goal_that_was_given_before_there_was_a_map_is_driven_to() -> None:
+    async with Plane(CELLS) as plane:
+        reply = await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
+        assert reply.text == "goal-1: accepted; perception is getting ready"
+        assert (await plane.ask_at_once(MISSION, MissionRequest(mission="do: [{goto: [1, 2]}]"))).ok
+        await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
+        await plane.until("succeeded", seconds=60)
+
+
+async def test_a_goal_in_a_wall_that_was_given_before_there_was_a_map_fails_with_the_reason() -> (
+    None
+):
+    async with Plane(CELLS) as plane:
+        assert (await plane.ask_at_once(GOAL, GoalRequest(x=2.6, y=0.5))).ok
+        await plane.until("failed", seconds=2)
+        reason = plane.status.done[0].reason
+        assert reason.startswith("the goal is inside something; nearest reachable point is ")
+        assert plane.travelled == 0.0
+
+
+async def test_a_goal_waits_until_it_is_sure_for_the_first_time_where_it_is() -> None:
+    async with Plane(CELLS) as plane:
+        plane.localized = False
+        await plane.go(0.3)
+        reply = await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
+        assert reply.text == "goal-1: accepted; it is not sure where in the map it is"
+        await plane.go(1.0)
+        assert plane.travelled == 0.0
+        assert progress("goal-1", plane.status) == (
+            "goal-1: going to (4.00, 0.80), 0 %, waiting: it is not sure where in the map it is"
+        )
+        plane.localized = True
+        await plane.until("succeeded", seconds=60)
+
+
+async def test_what_is_missing_is_named_with_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("gigabrain_zenoh.kernels", "numba"):
+        monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ConfigError, match=r"pip install 'gigabrain-zenoh\[nav\]'"):
+        await compiled("gigabrain_zenoh.kernels:kernel")
+
+
+SERVES = """
+import sys
+import gigabrain_zenoh.navigating
+print(*(name for name in ("numpy", "numba", "cv2", "scipy") if name in sys.modules))
+"""
+
+
+def test_goals_are_served_before_anything_heavy_is_imported() -> None:
+    done = subprocess.run((sys.executable, "-c", SERVES), capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
