@@ -171,6 +171,19 @@ def test_a_slow_robot_keeps_one_scan_in_ten() -> None:
     assert estimates[-1].pose == pytest.approx(poses[-1], abs=0.03)
 
 
+def test_noise_on_two_walls_turns_the_robot_to_neither_side() -> None:
+    corridor = np.array([(-40.0, 1.0, 140.0, 1.0), (-40.0, -1.0, 140.0, -1.0)])
+    poses = line(np.zeros(3), np.array((100.0, 0.0, 0.0)), 0.5)
+    turns = []
+    for seed in range(2):
+        lidar = Lidar(180, reach=25.0, noise=0.02, seed=seed)
+        lidar.angles = lidar.angles / 2 - np.pi / 2  # ahead
+        slam = Slam()
+        feed(slam, look(corridor, poses, lidar), stepped(poses, 0.0, 1.0))
+        turns.append(np.degrees(slam.smooth[2]))
+    assert np.abs(turns) == pytest.approx(0.0, abs=1.5)  # where it is turned: 5 and more
+
+
 def test_a_robot_that_is_carried_away_says_so_until_it_is_told_where_it_is() -> None:
     poses = lap()[:60]
     lidar = Lidar(180, reach=6.0)

@@ -62,8 +62,10 @@ def build(
 ) -> LocalMap:
     """The map of `scans` at `poses` (m, 3) within reach of `centre`.
 
-    The likelihood of a hit is exp(-d²/2s²): d to the nearest point, s `sigma`. Where several points
-    share a cell, the last is laid onto.
+    The likelihood of a hit is exp(-d²/2s²): d to the nearest point, s `sigma`. Scans are laid onto
+    the means of what shares a cell. To choose one of it by the order of the beams would be wrong:
+    of those along a wall the later are the nearer on one side and the farther on the other, and a
+    robot between two walls would be turned a little by each scan.
     """
     points, normals, low, high = _placed(
         np.concatenate([scan.points for scan in scans]),
@@ -79,10 +81,10 @@ def build(
     origin = low.astype(np.float64) - len(blob) * cell
     width, height = ((high - origin) / cell).astype(int) + len(blob)
     cells = np.zeros((height, width), np.uint8)
-    last = _stamp(cells, points, origin, cell, blob)
+    _stamp(cells, points, origin, cell, blob)
     coarse = cv2.dilate(cells, np.ones((BLOCK, BLOCK), np.uint8), anchor=(0, 0))
     image = Image(cells, np.asarray(coarse, np.uint8), origin, cell)
-    return LocalMap(image, _buckets(points, normals, last))
+    return LocalMap(image, _buckets(*_merged(points, normals, origin, cell, height, width)))
 
 
 @kernel
@@ -113,9 +115,7 @@ def _placed(
     return moved[:n], turned[:n], low, high
 
 
-def _buckets(points: Points, normals: Points, last: NDArray[np.bool_]) -> Buckets:
-    """Those of the points that are `last` in their cells, and have a normal."""
-    points, normals, low, high = _chosen(points, normals, last)
+def _buckets(points: Points, normals: Points, low: Points, high: Points) -> Buckets:
     if not len(points):
         return EMPTY
     origin = low.astype(np.float64)
@@ -125,24 +125,37 @@ def _buckets(points: Points, normals: Points, last: NDArray[np.bool_]) -> Bucket
 
 
 @kernel
-def _chosen(
-    points: Points, normals: Points, last: NDArray[np.bool_]
+def _merged(
+    points: Points, normals: Points, origin: Floats, cell: float, height: int, width: int
 ) -> tuple[Points, Points, Points, Points]:
-    """Some of the points with their normals, and where they lie between."""
-    those = np.empty(len(points), np.int32)
+    """The mean of the points with a normal in each cell, its normal, and where they lie between."""
+    held = np.zeros((height, width), np.int32)  # which of the sums, counted from 1
+    sums = np.zeros((len(points), 5))  # x, y, normal, how many
     n = 0
     for k in range(len(points)):
-        if last[k] and (normals[k, 0] != 0 or normals[k, 1] != 0):
-            those[n] = k
+        (x, y), (nx, ny) = points[k], normals[k]
+        if nx == 0 and ny == 0:
+            continue
+        row, column = int((y - origin[1]) / cell), int((x - origin[0]) / cell)
+        if not held[row, column]:
             n += 1
-    kept, along = np.empty((n, 2), np.float32), np.empty((n, 2), np.float32)
+            held[row, column] = n
+        at = held[row, column] - 1
+        side = 1.0 if sums[at, 2] * nx + sums[at, 3] * ny >= 0 else -1.0  # signs say nothing
+        sums[at, 0] += x
+        sums[at, 1] += y
+        sums[at, 2] += side * nx
+        sums[at, 3] += side * ny
+        sums[at, 4] += 1.0
+    means, along = np.empty((n, 2), np.float32), np.empty((n, 2), np.float32)
     low, high = np.full(2, np.inf, np.float32), np.full(2, -np.inf, np.float32)
     for i in range(n):
+        length = np.sqrt(sums[i, 2] ** 2 + sums[i, 3] ** 2)
         for axis in range(2):
-            value = points[those[i], axis]
-            kept[i, axis], along[i, axis] = value, normals[those[i], axis]
-            low[axis], high[axis] = min(low[axis], value), max(high[axis], value)
-    return kept, along, low, high
+            means[i, axis] = sums[i, axis] / sums[i, 4]
+            along[i, axis] = sums[i, 2 + axis] / length
+            low[axis], high[axis] = min(low[axis], means[i, axis]), max(high[axis], means[i, axis])
+    return means, along, low, high
 
 
 @kernel
@@ -176,24 +189,15 @@ def _blob(cell: float, sigma: float) -> Bytes:
 
 
 @kernel
-def _stamp(
-    cells: Bytes,
-    points: Points,
-    origin: Floats,
-    cell: float,
-    blob: Bytes,
-) -> NDArray[np.bool_]:
-    """Put the blob on every cell that holds a point, the likelier counts; who is last in a cell."""
+def _stamp(cells: Bytes, points: Points, origin: Floats, cell: float, blob: Bytes) -> None:
+    """Put the blob on every cell that holds a point; the likelier counts."""
     side = len(blob)
-    last = np.zeros(len(points), np.bool_)
-    for k in range(len(points) - 1, -1, -1):
+    for k in range(len(points)):
         column = int((points[k, 0] - origin[0]) / cell)
         row = int((points[k, 1] - origin[1]) / cell)
         if cells[row, column] == 255:  # stamped before
             continue
-        last[k] = True
         left, top = column - side // 2, row - side // 2
         for i in range(side):
             for j in range(side):
                 cells[top + i, left + j] = max(cells[top + i, left + j], blob[i, j])
-    return last
