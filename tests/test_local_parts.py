@@ -2,12 +2,21 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_zenoh.navigation.chamfer import Chamfer
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
-from gigabrain_zenoh.navigation.footprint import Grid, clearance, free_ahead, outline_of
+from gigabrain_zenoh.navigation.footprint import (
+    Grid,
+    clearance,
+    clearance_of,
+    free_ahead,
+    outline_of,
+)
 from gigabrain_zenoh.navigation.models import answer, feasible, lag_of, model_of, slowed
 from gigabrain_zenoh.navigation.mppi import past_of
 from gigabrain_zenoh.navigation.window import Place, Window
@@ -101,6 +110,45 @@ def _exact(points: np.ndarray, x: float, y: float, yaw: float) -> float:
     return float(out.min())
 
 
+def test_distances_are_those_of_opencv_and_no_more_than_asked_for() -> None:
+    random = np.random.default_rng(4)
+    chamfer = Chamfer(90, 0.025, 0.8)
+    for share in (0.5, 0.01, 0.001, 0.0):
+        free = (random.random((90, 90)) >= share).astype(np.uint8)
+        want = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * 0.025
+        np.testing.assert_allclose(chamfer.distance(free), np.minimum(want, 0.8), atol=1e-5)
+
+
+@pytest.mark.parametrize("body", [WAFFLE, CAR])
+def test_no_point_of_the_outline_that_is_left_out_would_have_been_nearer(
+    body: BodyDescription,
+) -> None:
+    random = np.random.default_rng(5)
+    free = (random.random((120, 120)) > 0.003).astype(np.uint8)
+    distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * np.float32(0.025)
+    grid, outline = Grid(distance, 0.025, -1.5, -1.5), outline_of(body.footprint)
+    points = np.stack([outline.groups[:, :3].ravel(), outline.groups[:, 3:6].ravel()])
+    group = 0
+    for x, y, yaw in random.uniform((-1.0, -1.0, -3.0), (1.0, 1.0, 3.0), (2000, 3)).tolist():
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        room, group = clearance_of(grid, outline, x, y, cosine, sine, group)
+        center = np.array([(outline.center_x,), (outline.center_y,)], dtype=np.float32)
+        turn = np.array([(cosine, -sine), (sine, cosine)])
+        at = turn @ np.hstack([points, center]) + np.array([(x + 1.5,), (y + 1.5,)])
+        *around, middle = _bilinear(distance, at).tolist()
+        inside = middle - outline.inner if middle < outline.inner else math.inf
+        assert room == pytest.approx(min(0.4, *around, inside), abs=1e-5)
+
+
+def _bilinear(distance: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Of cells of 25 mm, at points (2, n) [m] from their corner; beyond the rim as on it."""
+    v, u = np.clip(at[::-1] / 0.025 - 0.5, 0.0, np.array(distance.shape)[:, None] - 2.0)
+    i, j = v.astype(int), u.astype(int)
+    low = distance[i, j] + (u - j) * (distance[i, j + 1] - distance[i, j])
+    high = distance[i + 1, j] + (u - j) * (distance[i + 1, j + 1] - distance[i + 1, j])
+    return np.asarray(low + (v - i) * (high - low))
+
+
 def test_what_is_inside_the_body_leaves_no_clearance() -> None:
     distance = np.full((80, 80), 3.0, dtype=np.float32)
     distance[30:50, 30:50] = 0.0
@@ -145,6 +193,27 @@ def test_the_window_goes_with_the_robot_and_keeps_what_it_saw() -> None:
     for x, y in ((1.0, 0.5), (-0.7, 0.0)):
         row, column = int((y - grid.y) / 0.025), int((x - grid.x) / 0.025)
         assert grid.distance[row, column] < 0.03
+
+
+@pytest.mark.parametrize(("x", "y"), [(3.5, 0.0), (0.0, -3.5), (-2.5, 2.0), (9.0, 0.0)])
+def test_what_leaves_the_window_is_forgotten(x: float, y: float) -> None:
+    window, around = Window(4.0, 10.0), np.random.default_rng(6).uniform(-1.9, 1.9, (200, 2))
+    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), around)
+    there = _occupied(window.grid(1, NOTHING, NOBODY))
+    window.see(2, Place(x, y, 0.0), (0.0, 0.0), NOTHING)
+    kept = {(a, b) for a, b in there if abs(a - 40 * x) <= 80 and abs(b - 40 * y) <= 80}
+    assert _occupied(window.grid(2, NOTHING, NOBODY)) == kept
+    window.see(3, Place(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    assert _occupied(window.grid(3, NOTHING, NOBODY)) == kept < there
+
+
+def _occupied(grid: Grid) -> set[tuple[float, float]]:
+    """The middles of the occupied cells, in cells from the frame's origin."""
+    rows, columns = np.nonzero(grid.distance == 0.0)
+    x, y = round(grid.x / 0.025), round(grid.y / 0.025)
+    return {
+        (c + x + 0.5, r + y + 0.5) for r, c in zip(rows.tolist(), columns.tolist(), strict=True)
+    }
 
 
 def test_known_points_of_the_map_count_and_are_not_remembered() -> None:
