@@ -22,7 +22,6 @@ from gigabrain_zenoh.settings import RecorderConfig
 
 QUICK = RecorderConfig(viewers=False, flush_s=0.05, keep_free_mb=0)
 BEGIN_NS = 1_767_225_600_000_000_000
-NOISE = np.random.default_rng(0)
 
 
 def state(seq: int, boot: int = 7) -> bytes:
@@ -41,8 +40,8 @@ def state(seq: int, boot: int = 7) -> bytes:
 
 
 def scan(seq: int) -> bytes:
-    """A LaserScan of 360 beams that does not compress."""
-    ranges = ranges_bytes(NOISE.uniform(0.2, 3.4, 360))
+    """A LaserScan of 360 beams that does not compress; the same for the same number."""
+    ranges = ranges_bytes(np.random.default_rng(seq).uniform(0.2, 3.4, 360))
     message = LaserScan(
         seq=seq, boot=7, tick=seq, basis=seq,
         angle_min=0.0, angle_increment=0.01745, range_min=0.1, range_max=3.5, ranges=ranges,

@@ -18,6 +18,7 @@ from gigabrain_zenoh.recording.bagfile import BagFile
 from gigabrain_zenoh.recording.gaps import Gaps, Header, header_of
 from gigabrain_zenoh.recording.info import faults, info
 from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.records import ZSTD_NAME
 from gigabrain_zenoh.recording.recover import recover, recover_all, unfinished
 from gigabrain_zenoh.recording.schema import flat_schema
 from tests import bag_rig
@@ -144,7 +145,7 @@ def test_a_flipped_byte_costs_its_chunk_and_no_other(
 ) -> None:
     path = tmp_path / "flipped.mcap"
     content = bytearray(whole.read_bytes())
-    content[len(content) // 2] ^= 0x10
+    content[content.index(ZSTD_NAME, len(content) // 2) + 100] ^= 0x10  # in what is compressed
     path.write_bytes(content)
     found = info(path)
     assert found.messages == 600 - 12
