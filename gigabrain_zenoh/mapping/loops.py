@@ -40,7 +40,7 @@ SMALL = np.array((0.3, 0.3, 0.1))  # [m], [m], [rad]: a loop that changes less n
 AGREE = np.array((0.2, 0.2, 0.05))  # [m], [m], [rad], between two witnesses
 MEMORY = 10.0  # [m] of travel, a witness is heard so long
 LOOP = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance beside that of ICP
-OPEN = 0.02  # of what holds the best direction: a place that holds another less is an aisle
+OPEN = 0.05  # of what holds the best direction: a place that holds another less is an aisle
 
 
 class LoopSearch:
