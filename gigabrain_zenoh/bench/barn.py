@@ -10,7 +10,8 @@ from msgspec import Struct
 from gigabrain_zenoh.bench import barn_drive, barn_nodes
 from gigabrain_zenoh.bench.barn_worlds import World
 from gigabrain_zenoh.bench.course import Trial
-from gigabrain_zenoh.bench.plant import HARD, IDEAL, MUJOCO, Conditions
+from gigabrain_zenoh.bench.plant import HARD, IDEAL, JACKAL, MUJOCO, Conditions
+from gigabrain_zenoh.navigation import local
 from gigabrain_zenoh.percentile import percentile
 
 PLANTS = {"hard": HARD, "ideal": IDEAL, "mujoco": MUJOCO}
@@ -65,7 +66,8 @@ def measure_barn(
     """
     drive = barn_nodes.drive if nodes else barn_drive.drive
     done = []
-    with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
+    spawn, warm = get_context("spawn"), local.warm_up  # as a robot is that drives
+    with ProcessPoolExecutor(jobs, spawn, initializer=warm, initargs=(JACKAL,)) as pool:
         waiting = [
             pool.submit(drive, world, trial, PLANTS[plant], samples)
             for world in worlds
