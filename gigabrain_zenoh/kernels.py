@@ -21,23 +21,25 @@ def kernel(function: F) -> F:
     What was compiled is kept in NUMBA_CACHE_DIR, or in the user's cache folder; where neither can
     be written it is compiled anew in each process.
     """
-    return _compiled(function, counting=True)
+    return _compiled(function, lean=False)
 
 
 def lean_kernel(function: F) -> F:
-    """Compile a `function` that makes no arrays and is called very often, mostly by kernels.
+    """Compile a `function` that makes no arrays and is called very often, by kernels.
 
-    It does not count references to the arrays that it is given: with several of them in a tuple,
-    that took a third of a short function's time. One that makes arrays is refused by numba.
+    It is compiled into those that call it, and does not count references to the arrays that it is
+    given: with some of them in tuples both took longer than the work. One that makes arrays is
+    refused by numba.
     """
-    return _compiled(function, counting=False)
+    return _compiled(function, lean=True)
 
 
-def _compiled(function: F, *, counting: bool) -> F:
+def _compiled(function: F, *, lean: bool) -> F:
+    options = {"nogil": True, "error_model": "numpy", "_nrt": not lean, "forceinline": lean}
     try:
-        compiled = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=counting)(function)
+        compiled = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # numba: no locator available
-        compiled = numba.njit(nogil=True, error_model="numpy", _nrt=counting)(function)
+        compiled = numba.njit(**options)(function)
     return cast("F", compiled)
 
 

@@ -2,12 +2,20 @@
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
+from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
-from gigabrain_zenoh.navigation.footprint import Grid, clearance, free_ahead, outline_of
+from gigabrain_zenoh.navigation.footprint import (
+    Grid,
+    clearance,
+    clearance_of,
+    free_ahead,
+    outline_of,
+)
 from gigabrain_zenoh.navigation.models import answer, feasible, lag_of, model_of, slowed
 from gigabrain_zenoh.navigation.mppi import past_of
 from gigabrain_zenoh.navigation.window import Place, Window
@@ -99,6 +107,35 @@ def _exact(points: np.ndarray, x: float, y: float, yaw: float) -> float:
         np.maximum(np.abs(aside) - 0.155, 0.0),
     )
     return float(out.min())
+
+
+@pytest.mark.parametrize("body", [WAFFLE, CAR])
+def test_no_point_of_the_outline_that_is_left_out_would_have_been_nearer(
+    body: BodyDescription,
+) -> None:
+    random = np.random.default_rng(5)
+    free = (random.random((120, 120)) > 0.003).astype(np.uint8)
+    distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * np.float32(0.025)
+    grid, outline = Grid(distance, 0.025, -1.5, -1.5), outline_of(body.footprint)
+    group = 0
+    for x, y, yaw in random.uniform((-1.0, -1.0, -3.0), (1.0, 1.0, 3.0), (2000, 3)).tolist():
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        room, group = clearance_of(grid, outline, x, y, cosine, sine, group)
+        center = np.array([(outline.center_x,), (outline.center_y,)], dtype=np.float32)
+        turn = np.array([(cosine, -sine), (sine, cosine)])
+        at = turn @ np.hstack([outline.points, center]) + np.array([(x + 1.5,), (y + 1.5,)])
+        *around, middle = _bilinear(distance, at).tolist()
+        inside = middle - outline.inner if middle < outline.inner else math.inf
+        assert room == pytest.approx(min(0.4, *around, inside), abs=1e-5)
+
+
+def _bilinear(distance: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Of cells of 25 mm, at points (2, n) [m] from their corner; beyond the rim as on it."""
+    v, u = np.clip(at[::-1] / 0.025 - 0.5, 0.0, np.array(distance.shape)[:, None] - 2.0)
+    i, j = v.astype(int), u.astype(int)
+    low = distance[i, j] + (u - j) * (distance[i, j + 1] - distance[i, j])
+    high = distance[i + 1, j] + (u - j) * (distance[i + 1, j + 1] - distance[i + 1, j])
+    return np.asarray(low + (v - i) * (high - low))
 
 
 def test_what_is_inside_the_body_leaves_no_clearance() -> None:

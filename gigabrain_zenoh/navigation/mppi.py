@@ -13,11 +13,13 @@ from gigabrain_zenoh.kernels import kernel
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.models import Model
 from gigabrain_zenoh.navigation.rating import Scene, Weights
-from gigabrain_zenoh.navigation.rollout import Start, drive
+from gigabrain_zenoh.navigation.rollout import STATE, Start, drive
 
 Floats = NDArray[np.float64]
 
 TEMPERATURE = 0.6  # how much worse than the best still counts
+LEAST_SHARE = 1e-6  # in units of the best one's; what would have less has none
+WORTHLESS = -TEMPERATURE * math.log(LEAST_SHARE) + 1e-3  # so much worse than the best has less
 WORSE = 0.3  # a mean this much worse than the best has run into what its parts went round
 SETS = 8  # of noise, drawn once and taken in turn
 KEPT, FRESH = 0.85, 0.53  # of the noise from step to step
@@ -34,7 +36,6 @@ class Planned(NamedTuple):
     track: Floats  # (T + 1, 6): x, y, yaw, vx, vy, w at the end of each step
     cost: float
     standing_cost: float  # of braking and staying
-    spread: float  # of the costs of the plans that count: how far they differ
 
 
 class Sampler:
@@ -46,6 +47,7 @@ class Sampler:
         self._noise = _noise(random, (SETS, samples, steps, 3), model)
         self._simple = _simple(random, SETS, samples, steps, model)
         self._plans = np.empty((samples, steps, 3))
+        self._states = np.empty((steps + 1, STATE))
         self._costs = np.empty(samples)
         self.last = np.zeros((steps, 3))
 
@@ -66,18 +68,18 @@ class Sampler:
         dt, plans, costs = self.dt, self._plans, self._costs
         _propose(plans, self.last, self._noise[self._turn], self._simple[self._turn])
         self._turn = (self._turn + 1) % SETS
-        _score(model, outline, weights, scene, start, dt, plans, costs)
+        _score(model, outline, weights, scene, start, dt, plans, self._states, costs)
         best = int(np.argmin(costs))
         share = np.exp((costs[best] - costs) / TEMPERATURE)
-        share[share < 1e-6] = 0.0
+        share[share < LEAST_SHARE] = 0.0
         commands = np.tensordot(share, plans, axes=1) / share.sum()
-        track = np.empty((len(commands) + 1, 6))
-        cost = drive(model, outline, weights, scene, start, dt, commands, track)
+        states = self._states
+        cost = drive(model, outline, weights, scene, start, dt, commands, states, math.inf)
         if cost > costs[best] + WORSE:
             commands = plans[best].copy()
-            cost = drive(model, outline, weights, scene, start, dt, commands, track)
+            cost = drive(model, outline, weights, scene, start, dt, commands, states, math.inf)
         self.last = commands
-        return Planned(commands, track, cost, float(costs[STANDING]), float(costs.std()))
+        return Planned(commands, states[:, :6].copy(), cost, float(costs[STANDING]))
 
 
 def _noise(
@@ -146,12 +148,16 @@ def _score(
     scene: Scene,
     start: Start,
     dt: float,
-    plans: NDArray[np.float64],
+    plans: Floats,
+    states: Floats,
     costs: Floats,
 ) -> None:
-    none = np.empty((0, 6))
+    """The `costs` of all plans, inf for those that are worthless beside one before them."""
+    best = math.inf
     for k in range(plans.shape[0]):
-        costs[k] = drive(model, outline, weights, scene, start, dt, plans[k], none)
+        limit = math.inf if k == STANDING else best + WORTHLESS
+        cost = drive(model, outline, weights, scene, start, dt, plans[k], states, limit)
+        costs[k], best = cost, min(best, cost)
 
 
 def step_of(model: Model) -> float:

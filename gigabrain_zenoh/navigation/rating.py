@@ -55,18 +55,19 @@ class Weights(NamedTuple):
 def of_place(
     weights: Weights, scene: Scene, room: float, away: float, x: float, y: float, yaw: float
 ) -> float:
-    """What it costs to be here for a second, with obstacles and moving things so far away [m].
-
-    A second before it has arrived costs, or it would put off the last turn for ever.
-    """
+    """What it costs to be here for a second, with obstacles and moving things so far away [m]."""
     cost = 0.0
     if room < ROOM:
         cost += weights.near * math.exp((weights.margin - room) / weights.near_over)
     if away < NO_DISC:
         cost += weights.disc * math.exp(-away / weights.disc_over)
-    if not _arrived(scene, x, y, yaw):
-        cost += 0.5 * SECOND
-    return cost
+    return cost + of_time(scene, x, y, yaw)
+
+
+@lean_kernel
+def of_time(scene: Scene, x: float, y: float, yaw: float) -> float:
+    """What a second costs wherever it is; or it would put off the last turn for ever."""
+    return 0.0 if _arrived(scene, x, y, yaw) else 0.5 * SECOND
 
 
 @lean_kernel

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import lean_kernel
-from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance
+from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance_of, depth_of
 from gigabrain_zenoh.navigation.models import Lag, Model, answer, feasible
 from gigabrain_zenoh.navigation.rating import (
     Scene,
@@ -21,15 +21,34 @@ from gigabrain_zenoh.navigation.rating import (
     of_end,
     of_motion,
     of_place,
+    of_time,
     rest,
 )
 
 Floats = NDArray[np.float64]
 
 TOUCHED, TOUCHED_DISC = 300.0, 200.0  # what a contact costs
+LEAST_TOUCHED = 80.0  # of both, in the last step
 IMPACT = 50.0  # per m/s of a contact
 BRAKE_EVERY = 3  # steps
 AT_EASE = 0.25  # [m], room of more than that is not looked at anew before it can have gone
+
+
+class State(NamedTuple):
+    """Where the body is in one moment of a plan, and how it moves."""
+
+    x: float  # [m]
+    y: float
+    yaw: float  # [rad]
+    vx: float  # [m/s]
+    vy: float
+    w: float  # [rad/s]
+    cosine: float  # of the yaw
+    sine: float
+    moved: float  # [m], no point of it has gone farther in the step before
+
+
+STATE = len(State._fields)
 
 
 class Start(NamedTuple):
@@ -68,24 +87,26 @@ def drive(
     start: Start,
     dt: float,
     plan: Floats,
-    track: Floats,
+    states: Floats,
+    limit: float,
 ) -> float:
-    """The cost of `plan` (T, 3), which is first made feasible in place.
+    """The cost of `plan` (T, 3), which is first made feasible in place; inf for `limit` or more.
 
-    Where there is room, `track` (T + 1, 6) takes the states: x, y, yaw, vx, vy, w.
+    `states` (T + 1, STATE) takes what it leads to.
     """
-    steps = plan.shape[0]
+    move(model, outline.far, start, dt, plan, states)
+    return _rate(model, outline, weights, scene, dt, states, limit)
+
+
+@lean_kernel
+def move(model: Model, far: float, start: Start, dt: float, plan: Floats, states: Floats) -> None:
+    """Fill `states` with where `plan`, made feasible, takes a body that reaches so `far` [m]."""
     x, y, yaw, vx, vy, w = start.x, start.y, start.yaw, start.vx, start.vy, start.w
     before = start.before
     cosine, sine = math.cos(yaw), math.sin(yaw)
-    least = clearance(scene.grid, outline, x, y, cosine, sine) - 0.003
-    least_disc = from_discs(scene.discs, outline, x, y, cosine, sine, 0.0) - 0.003
-    least, least_disc = min(weights.margin, least), min(weights.disc_margin, least_disc)
     turning = model.turning * min(1.0, start.gain)
-    cost, alive, noted = 0.0, True, len(track) > 0
-    room, slack = ROOM, 0.0
-    _note(track, 0, x, y, yaw, vx, vy, w)
-    for t in range(steps):
+    _note(states, 0, State(x, y, yaw, vx, vy, w, cosine, sine, 0.0))
+    for t in range(plan.shape[0]):
         w_wanted = max(-turning, min(turning, plan[t, 2]))
         before = feasible(model, before, (plan[t, 0], plan[t, 1], w_wanted), dt)
         plan[t, 0], plan[t, 1], plan[t, 2] = before
@@ -97,32 +118,78 @@ def drive(
         y += sine * ahead + cosine * aside
         cosine, sine = _turn(cosine, sine, 0.5 * turned)
         yaw += turned
-        _note(track, t + 1, x, y, yaw, vx, vy, w)
-        if not alive:
-            continue
-        slack -= abs(ahead) + abs(aside) + outline.far * abs(turned)
+        moved = abs(ahead) + abs(aside) + far * abs(turned)
+        _note(states, t + 1, State(x, y, yaw, vx, vy, w, cosine, sine, moved))
+
+
+@lean_kernel
+def _rate(
+    model: Model, outline: Outline, weights: Weights, scene: Scene, dt: float, states: Floats,
+    limit: float,
+) -> float:  # fmt: skip
+    """The cost of going through `states`, or inf as soon as it is clear that it reaches `limit`."""
+    steps, grid, discs = states.shape[0] - 1, scene.grid, scene.discs
+    at, last = _noted(states, 0), _noted(states, steps)
+    room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, 0)
+    away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, 0.0)
+    least, least_disc = min(weights.margin, room - 0.003), min(weights.disc_margin, away - 0.003)
+    limit = _sound(model, scene, states, limit)
+    end = of_end(model, weights, scene, last.x, last.y, last.yaw, last.vx, last.vy)
+    to_come = end + dt * _anyway(outline, scene, states, least, limit)
+    cost, room, slack = 0.0, ROOM, 0.0
+    for t in range(1, steps + 1):
+        if cost + to_come >= limit:
+            return math.inf
+        at = _noted(states, t)
+        slack -= at.moved
         if slack < 0.0:
-            room = clearance(scene.grid, outline, x, y, cosine, sine)
+            room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, touches)
             slack = room - AT_EASE
-        away = from_discs(scene.discs, outline, x, y, cosine, sine, (t + 1) * dt)
-        late = (t + 1.0) / steps
+        away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, t * dt)
         if room < least:
-            cost += TOUCHED * (1.0 - 0.7 * late) + rest(model, scene, x, y)
-            cost += IMPACT * math.hypot(vx, vy)
-            alive = False
-        elif away < least_disc:
-            cost += TOUCHED_DISC * (1.0 - 0.6 * late) + rest(model, scene, x, y)
-            alive = False
-        else:
-            cost += dt * of_place(weights, scene, room, away, x, y, yaw)
-            cost += dt * of_motion(weights, room, vx, vy, w)
-            if t % BRAKE_EVERY == 0:
-                braking = of_braking(model, outline, scene, room, x, y, cosine, sine, vx, vy)
-                cost += dt * BRAKE_EVERY * braking
-        if not (alive or noted):
-            break
-    if alive:
-        cost += of_end(model, weights, scene, x, y, yaw, vx, vy)
+            cost += TOUCHED * (1.0 - 0.7 * t / steps) + rest(model, scene, at.x, at.y)
+            return cost + IMPACT * math.hypot(at.vx, at.vy)
+        if away < least_disc:
+            return cost + TOUCHED_DISC * (1.0 - 0.6 * t / steps) + rest(model, scene, at.x, at.y)
+        cost += dt * of_place(weights, scene, room, away, at.x, at.y, at.yaw)
+        cost += dt * of_motion(weights, room, at.vx, at.vy, at.w)
+        to_come -= dt * of_time(scene, at.x, at.y, at.yaw)
+        if t % BRAKE_EVERY == 1:
+            braking = of_braking(
+                model, outline, scene, room, at.x, at.y, at.cosine, at.sine, at.vx, at.vy
+            )
+            cost += dt * BRAKE_EVERY * braking
+    return cost + end
+
+
+@lean_kernel
+def _sound(model: Model, scene: Scene, states: Floats, limit: float) -> float:
+    """The `limit`, if no contact on the way costs less; inf otherwise.
+
+    What a plan costs that touches nothing says nothing of one that does, and ends there.
+    """
+    if limit <= LEAST_TOUCHED or limit == math.inf:
+        return limit
+    for t in range(1, states.shape[0]):
+        if LEAST_TOUCHED + rest(model, scene, states[t, 0], states[t, 1]) < limit:
+            return math.inf
+    return limit
+
+
+@lean_kernel
+def _anyway(outline: Outline, scene: Scene, states: Floats, least: float, limit: float) -> float:
+    """What `states` cost per second, however near obstacles are; inf with one well inside the body.
+
+    Nobody looks for that where there is no `limit`.
+    """
+    cost, deepest = 0.0, min(0.0, least)
+    for t in range(1, states.shape[0]):
+        at = _noted(states, t)
+        if limit < math.inf:
+            depth = depth_of(scene.grid, outline, at.x, at.y, at.cosine, at.sine)
+            if depth < deepest:
+                return math.inf
+        cost += of_time(scene, at.x, at.y, at.yaw)
     return cost
 
 
@@ -130,15 +197,19 @@ def drive(
 def _turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
     """A direction turned by less than half a radian; Taylor's series is quicker than sin, cos."""
     square = angle * angle
-    c = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square / 720.0))
-    s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square / 5040.0)))
+    c = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0)))
+    s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0))))
     return cosine * c - sine * s, sine * c + cosine * s
 
 
 @lean_kernel
-def _note(
-    track: Floats, t: int, x: float, y: float, yaw: float, vx: float, vy: float, w: float
-) -> None:
-    if t < track.shape[0]:
-        track[t, 0], track[t, 1], track[t, 2] = x, y, yaw
-        track[t, 3], track[t, 4], track[t, 5] = vx, vy, w
+def _note(states: Floats, t: int, at: State) -> None:
+    one = states[t]
+    one[0], one[1], one[2], one[3], one[4], one[5] = at.x, at.y, at.yaw, at.vx, at.vy, at.w
+    one[6], one[7], one[8] = at.cosine, at.sine, at.moved
+
+
+@lean_kernel
+def _noted(states: Floats, t: int) -> State:
+    one = states[t]
+    return State(one[0], one[1], one[2], one[3], one[4], one[5], one[6], one[7], one[8])
