@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import lean_kernel
+from gigabrain_zenoh.navigation.among import near_discs
 from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance_of, depth_of
 from gigabrain_zenoh.navigation.models import Lag, Model, answer, feasible
 from gigabrain_zenoh.navigation.rating import (
@@ -133,10 +134,11 @@ def _rate(
     room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, 0)
     away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, 0.0)
     least, least_disc = min(weights.margin, room - 0.003), min(weights.disc_margin, away - 0.003)
-    limit = _sound(model, scene, states, limit)
+    limit = _sound(model, weights, scene, dt, states, limit)
     end = of_end(model, weights, scene, last.x, last.y, last.yaw, last.vx, last.vy)
     to_come = end + dt * _anyway(outline, scene, states, least, limit)
-    cost, room, slack = 0.0, ROOM, 0.0
+    room, slack = ROOM, 0.0
+    cost = close = 0.0
     for t in range(1, steps + 1):
         if cost + to_come >= limit:
             return math.inf
@@ -145,12 +147,18 @@ def _rate(
         if slack < 0.0:
             room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, touches)
             slack = room - AT_EASE
-        away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, t * dt)
+        if weights.trust > 0.0:
+            away, close = near_discs(
+                weights, discs, outline, at.x, at.y, at.cosine, at.sine, t * dt
+            )
+        else:
+            away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, t * dt)
         if room < least:
             cost += TOUCHED * (1.0 - 0.7 * t / steps) + rest(model, scene, at.x, at.y)
             return cost + IMPACT * math.hypot(at.vx, at.vy)
         if away < least_disc:
-            return cost + TOUCHED_DISC * (1.0 - 0.6 * t / steps) + rest(model, scene, at.x, at.y)
+            return cost + _of_disc(weights, dt, t, steps) + rest(model, scene, at.x, at.y)
+        cost += dt * close
         cost += dt * of_place(weights, scene, room, away, at.x, at.y, at.yaw)
         cost += dt * of_motion(weights, room, at.vx, at.vy, at.w)
         to_come -= dt * of_time(scene, at.x, at.y, at.yaw)
@@ -163,15 +171,27 @@ def _rate(
 
 
 @lean_kernel
-def _sound(model: Model, scene: Scene, states: Floats, limit: float) -> float:
+def _of_disc(weights: Weights, dt: float, t: int, steps: int) -> float:
+    """What a contact with a moving thing in step `t` costs, beside the way that is left."""
+    if weights.trust > 0.0:
+        return TOUCHED_DISC * math.exp(-t * dt / weights.trust)
+    return TOUCHED_DISC * (1.0 - 0.6 * t / steps)
+
+
+@lean_kernel
+def _sound(
+    model: Model, weights: Weights, scene: Scene, dt: float, states: Floats, limit: float
+) -> float:
     """The `limit`, if no contact on the way costs less; inf otherwise.
 
     What a plan costs that touches nothing says nothing of one that does, and ends there.
     """
-    if limit <= LEAST_TOUCHED or limit == math.inf:
+    steps = states.shape[0] - 1
+    least = min(LEAST_TOUCHED, _of_disc(weights, dt, steps, steps))
+    if limit <= least or limit == math.inf:
         return limit
     for t in range(1, states.shape[0]):
-        if LEAST_TOUCHED + rest(model, scene, states[t, 0], states[t, 1]) < limit:
+        if least + rest(model, scene, states[t, 0], states[t, 1]) < limit:
             return math.inf
     return limit
 

@@ -22,10 +22,12 @@ MARKED = 2  # of a cell that was just hit; each beam that passes takes one
 BEYOND_M = 0.1  # [m], how far past a cell a beam must go to have passed it
 STAYS_TICKS = 20  # a cell that was hit so long ago, and is now, belongs to what stands
 MOST_STAY = 0.5  # share of its cells that may, of a thing that moves
+LATE_TICKS = 10  # so much longer than it seems a disc may have been over a cell
 ROUND_DISC = 0.1  # [m], hits so near a moving thing are its own
 MOVES_AT = 0.05  # share of the window that the robot may be off its middle
 
 Floats = NDArray[np.float64]
+TICK_S = TICK_NS / 1e9
 T = TypeVar("T", bound=np.generic)
 
 
@@ -84,6 +86,12 @@ class Window:
         cells = Cells(self._level, self._seen, self._since, self.x, self.y)
         long_ago = tick - STAYS_TICKS
         return discs[[_stays(cells, disc, tick, long_ago) <= MOST_STAY for disc in discs]]
+
+    def take_back(self, tick: int, discs: Floats) -> None:
+        """Free what each of `discs` (n, 6) covered on its way here: nothing stands there."""
+        cells = Cells(self._level, self._seen, self._since, self.x, self.y)
+        for disc in discs:
+            _take_back(cells, disc, tick)
 
     def grid(self, tick: int, known: Floats, moving: Floats) -> Grid:
         """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m].
@@ -217,3 +225,26 @@ def _stays(cells: Cells, disc: Floats, tick: int, long_ago: int) -> float:
                 hit += 1
                 old += cells.since[i, j] <= long_ago
     return old / hit if hit else 0.0
+
+
+@kernel
+def _take_back(cells: Cells, disc: Floats, tick: int) -> None:
+    """Free the cells that were first hit after `disc` had come to be over them."""
+    x, y, vx, vy, radius = disc[0], disc[1], disc[2], disc[3], disc[4] + ROUND_DISC
+    rows, columns = cells.level.shape
+    square = max(vx * vx + vy * vy, 1e-6)
+    for i in range(max(0, int((y - radius - cells.y) / CELL_M)), rows):
+        down = cells.y + (i + 0.5) * CELL_M - y
+        if down > radius:
+            break
+        for j in range(max(0, int((x - radius - cells.x) / CELL_M)), columns):
+            right = cells.x + (j + 0.5) * CELL_M - x
+            if right > radius:
+                break
+            inside = radius * radius - right * right - down * down
+            if inside < 0.0 or cells.level[i, j] == 0:
+                continue
+            along = right * vx + down * vy
+            ago = (math.sqrt(along * along + square * inside) - along) / square / TICK_S
+            if cells.since[i, j] >= tick - ago - LATE_TICKS:
+                cells.level[i, j] = 0
