@@ -117,13 +117,14 @@ def test_no_point_of_the_outline_that_is_left_out_would_have_been_nearer(
     free = (random.random((120, 120)) > 0.003).astype(np.uint8)
     distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * np.float32(0.025)
     grid, outline = Grid(distance, 0.025, -1.5, -1.5), outline_of(body.footprint)
+    points = np.stack([outline.groups[:, :3].ravel(), outline.groups[:, 3:6].ravel()])
     group = 0
     for x, y, yaw in random.uniform((-1.0, -1.0, -3.0), (1.0, 1.0, 3.0), (2000, 3)).tolist():
         cosine, sine = math.cos(yaw), math.sin(yaw)
         room, group = clearance_of(grid, outline, x, y, cosine, sine, group)
         center = np.array([(outline.center_x,), (outline.center_y,)], dtype=np.float32)
         turn = np.array([(cosine, -sine), (sine, cosine)])
-        at = turn @ np.hstack([outline.points, center]) + np.array([(x + 1.5,), (y + 1.5,)])
+        at = turn @ np.hstack([points, center]) + np.array([(x + 1.5,), (y + 1.5,)])
         *around, middle = _bilinear(distance, at).tolist()
         inside = middle - outline.inner if middle < outline.inner else math.inf
         assert room == pytest.approx(min(0.4, *around, inside), abs=1e-5)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.kernels import lean_kernel
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.models import Model
-from gigabrain_zenoh.navigation.rating import NO_DISC, Weights
+from gigabrain_zenoh.navigation.rating import NO_DISC, Weights, from_discs
 
 Floats = NDArray[np.float64]
 
@@ -21,6 +21,7 @@ MOVES_QUICKLY = 0.3  # [m/s]
 HORIZON_S = 2.0  # of its plans
 LOOKS_S = 0.6  # before it first drives off: so long it takes to tell what moves
 GROWS_S = 0.5  # how long what is known of a thing fades
+TOUCHED_DISC = 200.0  # what a contact with a moving thing costs
 DECAYS = 4.0  # times the way over which the cost of being near decays; farther off is nothing
 WEIGHTS = Weights(disc=9.0, disc_lead=0.1, trust=0.7)
 
@@ -37,14 +38,33 @@ def moving_quickly(discs: Floats) -> Floats:
 
 
 @lean_kernel
-def near_discs(
+def of_contact(weights: Weights, seconds: float, share: float) -> float:
+    """What a contact with a moving thing costs, so late and after such a share of the plan."""
+    if weights.trust > 0.0:
+        return TOUCHED_DISC * math.exp(-seconds / weights.trust)
+    return TOUCHED_DISC * (1.0 - 0.6 * share)
+
+
+@lean_kernel
+def of_discs(
     weights: Weights, discs: Floats, outline: Outline, x: float, y: float, cosine: float,
     sine: float, t: float,
 ) -> tuple[float, float]:  # fmt: skip
     """How far the body's box is from the nearest of `discs` (m, 6) `t` [s] from now [m].
 
-    And what it costs to be so near to all of them for a second.
+    And what it costs for a second to be so near to each of them, where that is counted.
     """
+    if weights.trust > 0.0:
+        return near_discs(weights, discs, outline, x, y, cosine, sine, t)
+    return from_discs(discs, outline, x, y, cosine, sine, t), 0.0
+
+
+@lean_kernel
+def near_discs(
+    weights: Weights, discs: Floats, outline: Outline, x: float, y: float, cosine: float,
+    sine: float, t: float,
+) -> tuple[float, float]:  # fmt: skip
+    """How far it is from the nearest [m], and what it costs for a second to be near to them all."""
     nearest, cost = NO_DISC, 0.0
     for i in range(discs.shape[0]):
         vx, vy = discs[i, 2], discs[i, 3]

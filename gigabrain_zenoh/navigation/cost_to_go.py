@@ -66,11 +66,9 @@ def _seed(
         column, row = cells[last]
         seed[row, column] = 0.0
         return seed
-    rim = np.ones((side, side), dtype=bool)
-    rim[1:-1, 1:-1] = False
-    rows, columns = np.nonzero(rim)
-    x, y = corner[0] + (columns + 0.5) * cell, corner[1] + (rows + 0.5) * cell
-    seed[rows, columns] = np.hypot(x - points[-1, 0], y - points[-1, 1])
+    x, y = (np.add.outer(corner, (np.arange(side) + 0.5) * cell).T - points[-1]).T
+    for end in (0, -1):
+        seed[end], seed[:, end] = np.hypot(x, y[end]), np.hypot(x[end], y)
     return seed
 
 
@@ -100,7 +98,7 @@ def _sweep(
     as long as a row beside has changed: what Dijkstra's algorithm finds, in a quarter of its time.
     """
     rows = cost.shape[0]
-    stale = np.ones(rows, dtype=np.bool_)
+    stale, fresh = np.ones(rows, dtype=np.bool_), np.ones(rows, dtype=np.bool_)
     going, down = True, True
     while going:
         going = False
@@ -112,7 +110,9 @@ def _sweep(
             changed = i > 0 and _from_row(cost[i - 1], cost[i], field[i - 1], field[i], cell)
             if i < rows - 1:
                 changed |= _from_row(cost[i + 1], cost[i], field[i + 1], field[i], cell)
-            changed |= _along(cost[i], field[i], cell, span)
+            if changed or fresh[i]:
+                changed |= _along(cost[i], field[i], cell, span)
+                fresh[i] = False
             if changed:
                 going = True
                 stale[max(0, i - 1)] = stale[min(rows - 1, i + 1)] = True

@@ -10,18 +10,21 @@ from gigabrain_zenoh.kernels import lean_kernel
 from gigabrain_zenoh.sweep import Corners, box
 
 SPACING = 0.05  # [m], between points on the outline at most
-GROUP = 3  # neighbouring points that are left out together
+GROUP = 3  # neighbouring points that are left out together: two and one in the middle
 STRETCH = 1.02  # a distance in the grid differs by no more than so many times the way,
 UNSURE = 0.87  # and so many cells, between one that is looked up in the nearest cell and any other
 ROOM = 0.4  # [m], more than that round the body makes no difference
 FAR = 3.0  # [m], what is farther away, or beyond the window, does not matter
 
 
+Singles = NDArray[np.float32]
+
+
 class Outline(NamedTuple):
     """A footprint as compiled functions take it, in the body's frame."""
 
-    points: NDArray[np.float32]  # (2, n) [m], once round, the last repeated to fill its group
-    reach: NDArray[np.float32]  # (n // GROUP,) [m], from the middle of each group to its others
+    groups: Singles  # (n, 7) [m]: x and y of neighbours, and how far the outer two
+    # are from the middle one at most; once round, the last repeated to fill its group
     center_x: float  # [m], of the box around it
     center_y: float
     inner: float  # [m], radius of the largest circle round the center that is inside the box
@@ -36,7 +39,7 @@ class Outline(NamedTuple):
 class Grid(NamedTuple):
     """Distances to the nearest obstacle, bilinear between the centers of cells."""
 
-    distance: NDArray[np.float32]  # (rows, columns) [m]
+    distance: Singles  # (rows, columns) [m]
     cell: float  # [m]
     x: float  # [m], of the corner of cell (0, 0)
     y: float
@@ -58,11 +61,11 @@ def outline_of(footprint: Corners) -> Outline:
     inner = float(np.hypot(points[:, 0] - x, points[:, 1] - y).min())
     far = float(np.hypot(*corners.T).max())
     points = np.pad(points, ((0, -len(points) % GROUP), (0, 0)), mode="edge")
-    groups = points.reshape(-1, GROUP, 2)
-    away = groups - groups[:, GROUP // 2, None]
-    reach = np.hypot(away[..., 0], away[..., 1]).max(axis=1).astype(np.float32)
-    points = np.ascontiguousarray(points.T, dtype=np.float32)
-    return Outline(points, reach, x, y, inner, outer, front, rear, left, right, far)
+    threes = points.reshape(-1, GROUP, 2)
+    away = threes - threes[:, 1, None]
+    reach = np.hypot(away[..., 0], away[..., 1]).max(axis=1)
+    groups = np.column_stack([threes[..., 0], threes[..., 1], reach]).astype(np.float32)
+    return Outline(groups, x, y, inner, outer, front, rear, left, right, far)
 
 
 @lean_kernel
@@ -126,42 +129,57 @@ def _nearest(
 ) -> tuple[float, int]:  # fmt: skip
     """The least distance [m] of all points, if below `nearest`, and whose group it is.
 
-    A group is left out when what its middle says leaves no room for anything nearer. A point
-    beyond the window counts as if it were on its rim.
+    A group is left out when what its middle says leaves no room for anything nearer.
     """
-    points, reach = outline.points, outline.reach
-    rows, columns = grid.distance.shape
-    cells, per_cell = grid.distance, 1.0 / grid.cell
-    u0, v0 = np.float32((x - grid.x) * per_cell - 0.5), np.float32((y - grid.y) * per_cell - 0.5)
+    groups, cells, per_cell = outline.groups, grid.distance, 1.0 / grid.cell
+    u, v = np.float32((x - grid.x) * per_cell - 0.5), np.float32((y - grid.y) * per_cell - 0.5)
     c, s = np.float32(cosine * per_cell), np.float32(sine * per_cell)
-    zero, last_u, last_v = np.float32(0), np.float32(columns - 2), np.float32(rows - 2)
-    half, stretch = np.float32(0.5), np.float32(STRETCH)
-    unsure = np.float32(UNSURE * grid.cell)
-    one = np.uint32(1)  # unsigned: numba need not look for indices from the end
+    half, unsure = np.float32(0.5), np.float32(UNSURE * grid.cell)
     best = first
-    for at in range(-1, len(reach)):
-        group = first if at < 0 else at
-        if at == first:
+    nearest = _of_group(cells, groups[first], u, v, c, s, nearest)
+    for n in range(len(groups)):
+        if n == first:
             continue
-        if at >= 0:
-            px, py = points[0, GROUP * group + 1], points[1, GROUP * group + 1]
-            u = min(max(u0 + c * px - s * py, zero), last_u)
-            v = min(max(v0 + s * px + c * py, zero), last_v)
-            there = cells[np.uint32(v + half), np.uint32(u + half)]
-            if there - stretch * reach[group] - unsure >= nearest:
-                continue
-        for n in range(GROUP * group, GROUP * group + GROUP):
-            px, py = points[0, n], points[1, n]
-            u = min(max(u0 + c * px - s * py, zero), last_u)
-            v = min(max(v0 + s * px + c * py, zero), last_v)
-            i, j = np.uint32(v), np.uint32(u)
-            a, b = v - np.float32(i), u - np.float32(j)
-            low = cells[i, j] + b * (cells[i, j + one] - cells[i, j])
-            high = cells[i + one, j] + b * (cells[i + one, j + one] - cells[i + one, j])
-            d = low + a * (high - low)
-            if d < nearest:
-                nearest, best = d, group
+        group = groups[n]
+        column, row = _inside(cells, group[1], group[4], u, v, c, s)
+        there = cells[np.uint32(row + half), np.uint32(column + half)]
+        if there - np.float32(STRETCH) * group[6] - unsure < nearest:
+            found = _of_group(cells, group, u, v, c, s, nearest)
+            best = n if found < nearest else best
+            nearest = found
     return float(nearest), best
+
+
+@lean_kernel
+def _of_group(
+    cells: Singles, group: Singles, u: np.float32, v: np.float32, c: np.float32, s: np.float32,
+    nearest: np.float32,
+) -> np.float32:  # fmt: skip
+    """The least of `nearest` and the distances [m] of the points of a group, for a body at (u, v).
+
+    A point beyond the window counts as if it were on its rim.
+    """
+    one = np.uint32(1)  # unsigned: numba need not look for indices from the end
+    for n in range(GROUP):
+        column, row = _inside(cells, group[n], group[n + GROUP], u, v, c, s)
+        i, j = np.uint32(row), np.uint32(column)
+        a, b = row - np.float32(i), column - np.float32(j)
+        low = cells[i, j] + b * (cells[i, j + one] - cells[i, j])
+        high = cells[i + one, j] + b * (cells[i + one, j + one] - cells[i + one, j])
+        d = low + a * (high - low)
+        nearest = d if d < nearest else nearest
+    return nearest
+
+
+@lean_kernel
+def _inside(
+    cells: Singles, x: np.float32, y: np.float32, u: np.float32, v: np.float32, c: np.float32,
+    s: np.float32,
+) -> tuple[np.float32, np.float32]:  # fmt: skip
+    """Where the point (x, y) of a body at (u, v) is, in cells; on the rim for one beyond it."""
+    zero = np.float32(0)
+    last_u, last_v = np.float32(cells.shape[1] - 2), np.float32(cells.shape[0] - 2)
+    return min(max(u + c * x - s * y, zero), last_u), min(max(v + s * x + c * y, zero), last_v)
 
 
 @lean_kernel

@@ -13,7 +13,7 @@ from gigabrain_zenoh.kernels import kernel
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.models import Model
 from gigabrain_zenoh.navigation.rating import Scene, Weights
-from gigabrain_zenoh.navigation.rollout import STATE, Start, drive
+from gigabrain_zenoh.navigation.rollout import STATE, Start, drive, first_rooms
 
 Floats = NDArray[np.float64]
 
@@ -76,16 +76,18 @@ class Sampler:
         dt, plans, costs = self.dt, self._plans, self._costs
         _propose(plans, self.last, self._noise[self._turn], self._simple[self._turn])
         self._turn = (self._turn + 1) % SETS
-        _score(model, outline, weights, scene, start, dt, plans, self._states, costs)
+        states = self._states
+        rooms = first_rooms(model, outline, scene, start, dt, states)
+        _score(model, outline, weights, scene, start, dt, rooms, plans, states, costs)
         best = int(np.argmin(costs))
         share = np.exp((costs[best] - costs) / TEMPERATURE)
         share[share < LEAST_SHARE] = 0.0
         commands = np.tensordot(share, plans, axes=1) / share.sum()
-        states = self._states
-        cost = drive(model, outline, weights, scene, start, dt, commands, states, math.inf)
+        given = model, outline, weights, scene, start, dt, rooms
+        cost = drive(*given, commands, states, math.inf)
         if cost > costs[best] + WORSE:
             commands = plans[best].copy()
-            cost = drive(model, outline, weights, scene, start, dt, commands, states, math.inf)
+            cost = drive(*given, commands, states, math.inf)
         self.last = commands
         return Planned(commands, states[:, :6].copy(), cost, float(costs[STANDING]))
 
@@ -137,15 +139,15 @@ def _twists(random: np.random.Generator, shape: tuple[int, ...], model: Model) -
 def _propose(plans: Floats, last: Floats, noise: NDArray[np.float32], simple: Floats) -> None:
     samples, steps, axes = plans.shape
     for k in range(samples):
+        simply = k > 0 and k % SIMPLE_EVERY == 0
         for t in range(steps):
             second = 0 if t < simple[k, 6] else axes
             for a in range(axes):
-                if k == STANDING:
-                    plans[k, t, a] = 0.0
-                elif k > 0 and k % SIMPLE_EVERY == 0:
+                if simply:
                     plans[k, t, a] = simple[k, second + a]
                 else:
                     plans[k, t, a] = last[t, a] + (noise[k, t, a] if k > 0 else 0.0)
+    plans[STANDING] = 0.0
 
 
 @kernel
@@ -156,6 +158,7 @@ def _score(
     scene: Scene,
     start: Start,
     dt: float,
+    rooms: Floats,
     plans: Floats,
     states: Floats,
     costs: Floats,
@@ -164,7 +167,7 @@ def _score(
     best = math.inf
     for k in range(plans.shape[0]):
         limit = math.inf if k == STANDING else best + WORTHLESS
-        cost = drive(model, outline, weights, scene, start, dt, plans[k], states, limit)
+        cost = drive(model, outline, weights, scene, start, dt, rooms, plans[k], states, limit)
         costs[k], best = cost, min(best, cost)
 
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import lean_kernel
-from gigabrain_zenoh.navigation.among import near_discs
+from gigabrain_zenoh.kernels import kernel, lean_kernel
+from gigabrain_zenoh.navigation.among import of_contact, of_discs
 from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance_of, depth_of
 from gigabrain_zenoh.navigation.models import Lag, Model, answer, feasible
 from gigabrain_zenoh.navigation.rating import (
@@ -28,8 +28,8 @@ from gigabrain_zenoh.navigation.rating import (
 
 Floats = NDArray[np.float64]
 
-TOUCHED, TOUCHED_DISC = 300.0, 200.0  # what a contact costs
-LEAST_TOUCHED = 80.0  # of both, in the last step
+TOUCHED = 300.0  # what a contact costs
+LEAST_TOUCHED = 80.0  # or with what moves, in the last step
 IMPACT = 50.0  # per m/s of a contact
 BRAKE_EVERY = 3  # steps
 AT_EASE = 0.25  # [m], room of more than that is not looked at anew before it can have gone
@@ -87,20 +87,37 @@ def drive(
     scene: Scene,
     start: Start,
     dt: float,
+    rooms: Floats,
     plan: Floats,
     states: Floats,
     limit: float,
 ) -> float:
     """The cost of `plan` (T, 3), which is first made feasible in place; inf for `limit` or more.
 
-    `states` (T + 1, STATE) takes what it leads to.
+    `rooms` are those of `first_rooms`. `states` (T + 1, STATE) takes what the plan leads to.
     """
-    move(model, outline.far, start, dt, plan, states)
-    return _rate(model, outline, weights, scene, dt, states, limit)
+    _move(model, outline.far, start, dt, plan, states)
+    return _rate(model, outline, weights, scene, dt, rooms, states, limit)
+
+
+@kernel
+def first_rooms(
+    model: Model, outline: Outline, scene: Scene, start: Start, dt: float, states: Floats
+) -> Floats:
+    """The clearances [m] from the start on, until a plan has any effect: (n,), n of 1 or more.
+
+    `states` (T + 1, STATE) is scribbled on.
+    """
+    rooms = np.empty(min(states.shape[0], start.past.shape[0]))
+    _move(model, outline.far, start, dt, np.zeros((len(rooms) - 1, 3)), states)
+    for t in range(len(rooms)):
+        at = _noted(states, t)
+        rooms[t] = clearance_of(scene.grid, outline, at.x, at.y, at.cosine, at.sine, 0)[0]
+    return rooms
 
 
 @lean_kernel
-def move(model: Model, far: float, start: Start, dt: float, plan: Floats, states: Floats) -> None:
+def _move(model: Model, far: float, start: Start, dt: float, plan: Floats, states: Floats) -> None:
     """Fill `states` with where `plan`, made feasible, takes a body that reaches so `far` [m]."""
     x, y, yaw, vx, vy, w = start.x, start.y, start.yaw, start.vx, start.vy, start.w
     before = start.before
@@ -125,39 +142,41 @@ def move(model: Model, far: float, start: Start, dt: float, plan: Floats, states
 
 @lean_kernel
 def _rate(
-    model: Model, outline: Outline, weights: Weights, scene: Scene, dt: float, states: Floats,
-    limit: float,
+    model: Model, outline: Outline, weights: Weights, scene: Scene, dt: float, rooms: Floats,
+    states: Floats, limit: float,
 ) -> float:  # fmt: skip
     """The cost of going through `states`, or inf as soon as it is clear that it reaches `limit`."""
     steps, grid, discs = states.shape[0] - 1, scene.grid, scene.discs
     at, last = _noted(states, 0), _noted(states, steps)
-    room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, 0)
     away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, 0.0)
-    least, least_disc = min(weights.margin, room - 0.003), min(weights.disc_margin, away - 0.003)
+    least, least_disc = (
+        min(weights.margin, rooms[0] - 0.003),
+        min(weights.disc_margin, away - 0.003),
+    )
     limit = _sound(model, weights, scene, dt, states, limit)
     end = of_end(model, weights, scene, last.x, last.y, last.yaw, last.vx, last.vy)
     to_come = end + dt * _anyway(outline, scene, states, least, limit)
-    room, slack = ROOM, 0.0
-    cost = close = 0.0
+    cost: float = 0.0
+    room, slack, touches = ROOM, 0.0, 0
     for t in range(1, steps + 1):
         if cost + to_come >= limit:
             return math.inf
         at = _noted(states, t)
         slack -= at.moved
         if slack < 0.0:
-            room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, touches)
+            if t < len(rooms):
+                room = rooms[t]
+            else:
+                room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, touches)
             slack = room - AT_EASE
-        if weights.trust > 0.0:
-            away, close = near_discs(
-                weights, discs, outline, at.x, at.y, at.cosine, at.sine, t * dt
-            )
-        else:
-            away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, t * dt)
+        away, close = of_discs(weights, discs, outline, at.x, at.y, at.cosine, at.sine, t * dt)
         if room < least:
-            cost += TOUCHED * (1.0 - 0.7 * t / steps) + rest(model, scene, at.x, at.y)
-            return cost + IMPACT * math.hypot(at.vx, at.vy)
+            cost += TOUCHED * (1.0 - 0.7 * (t / steps)) + rest(model, scene, at.x, at.y)
+            cost += IMPACT * math.hypot(at.vx, at.vy)
+            return cost
         if away < least_disc:
-            return cost + _of_disc(weights, dt, t, steps) + rest(model, scene, at.x, at.y)
+            cost += of_contact(weights, t * dt, t / steps) + rest(model, scene, at.x, at.y)
+            return cost
         cost += dt * close
         cost += dt * of_place(weights, scene, room, away, at.x, at.y, at.yaw)
         cost += dt * of_motion(weights, room, at.vx, at.vy, at.w)
@@ -171,14 +190,6 @@ def _rate(
 
 
 @lean_kernel
-def _of_disc(weights: Weights, dt: float, t: int, steps: int) -> float:
-    """What a contact with a moving thing in step `t` costs, beside the way that is left."""
-    if weights.trust > 0.0:
-        return TOUCHED_DISC * math.exp(-t * dt / weights.trust)
-    return TOUCHED_DISC * (1.0 - 0.6 * t / steps)
-
-
-@lean_kernel
 def _sound(
     model: Model, weights: Weights, scene: Scene, dt: float, states: Floats, limit: float
 ) -> float:
@@ -186,8 +197,7 @@ def _sound(
 
     What a plan costs that touches nothing says nothing of one that does, and ends there.
     """
-    steps = states.shape[0] - 1
-    least = min(LEAST_TOUCHED, _of_disc(weights, dt, steps, steps))
+    least = min(LEAST_TOUCHED, of_contact(weights, (states.shape[0] - 1) * dt, 1.0))
     if limit <= least or limit == math.inf:
         return limit
     for t in range(1, states.shape[0]):

@@ -27,7 +27,6 @@ ROUND_DISC = 0.1  # [m], hits so near a moving thing are its own
 MOVES_AT = 0.05  # share of the window that the robot may be off its middle
 
 Floats = NDArray[np.float64]
-TICK_S = TICK_NS / 1e9
 T = TypeVar("T", bound=np.generic)
 
 
@@ -89,9 +88,8 @@ class Window:
 
     def take_back(self, tick: int, discs: Floats) -> None:
         """Free what each of `discs` (n, 6) covered on its way here: nothing stands there."""
-        cells = Cells(self._level, self._seen, self._since, self.x, self.y)
         for disc in discs:
-            _take_back(cells, disc, tick)
+            _take_back(Cells(self._level, self._seen, self._since, self.x, self.y), disc, tick)
 
     def grid(self, tick: int, known: Floats, moving: Floats) -> Grid:
         """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m].
@@ -110,7 +108,8 @@ class Window:
             cells = cells[((cells >= 0) & (cells < self.cells)).all(axis=1)]
             free[cells[:, 1], cells[:, 0]] = 0
         distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5)
-        np.minimum(distance * np.float32(CELL_M), np.float32(FAR), out=distance)
+        distance *= np.float32(CELL_M)
+        np.minimum(distance, np.float32(FAR), out=distance)
         return Grid(distance, CELL_M, self.x, self.y)
 
     def _follow(self, place: Place) -> None:
@@ -245,6 +244,6 @@ def _take_back(cells: Cells, disc: Floats, tick: int) -> None:
             if inside < 0.0 or cells.level[i, j] == 0:
                 continue
             along = right * vx + down * vy
-            ago = (math.sqrt(along * along + square * inside) - along) / square / TICK_S
+            ago = (math.sqrt(along * along + square * inside) - along) / square * 1e9 / TICK_NS
             if cells.since[i, j] >= tick - ago - LATE_TICKS:
                 cells.level[i, j] = 0
