@@ -26,6 +26,8 @@ def done(job: Job, patience_s: float | None) -> bool:
 class Journal:
     """Kept by nobody."""
 
+    live = True  # whether what the node does has effects beside the bus
+
     def note(self, key: str, seq: int) -> None:
         """A message is looked at."""
 
@@ -80,6 +82,8 @@ class SaidJournal(Journal):
 
 class PastJournal(Journal):
     """As it was: what was done in time then is waited for now, all else counts as undone."""
+
+    live = False
 
     def __init__(self) -> None:
         self.outcomes: deque[bool] = deque()  # of what is waited for at the present message

@@ -19,6 +19,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.granting import grant
 from gigabrain_zenoh.journal import done
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.background import InTime
@@ -173,6 +174,7 @@ class Mapper:
             log.warning("a scan is left out of the map: %s", why, extra={"data": {"event": "scan"}})
 
     async def _save(self, request: MapRequest) -> MapReply:
+        grant(self._bus, MAP_SAVE.key, request, self._last.tick if self._last else 0)
         path = map_file.path_of(request.name)
         same = bool(self._config.map) and path == map_file.path_of(self._config.map)
         try:
@@ -189,7 +191,8 @@ class Mapper:
                 break
             await self._bus.clock.sleep_ns(SETTLE_NS)
         saved, graph = self._chart.to_save()
-        await asyncio.to_thread(map_file.save, path, saved, graph, replace=replace)
+        if self._bus.journal.live:
+            await asyncio.to_thread(map_file.save, path, saved, graph, replace=replace)
         return f"saved {path}: {map_file.in_words(saved)}"
 
     def _report(self) -> dict[str, float | int | str | None]:

@@ -6,14 +6,17 @@ from gigabrain_schemas.requests import ParamReply, ParamRequest
 from gigabrain_schemas.topics import PARAM
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.granting import grant
 from gigabrain_zenoh.log_text import LEVELS
+
+LOG_LEVEL = "log_level"  # changes nothing that a process does
 
 log = logging.getLogger(__name__)
 
 
 def serve_params(bus: Bus) -> None:
     """Serve the parameters of this process, its log level among them."""
-    bus.params.add("log_level", f"one of: {', '.join(LEVELS)}", _level, _set_level)
+    bus.params.add(LOG_LEVEL, f"one of: {', '.join(LEVELS)}", _level, _set_level)
 
     async def answer(request: ParamRequest) -> ParamReply:
         if not request.name:
@@ -24,6 +27,8 @@ def serve_params(bus: Bus) -> None:
         except Refused as error:
             log.warning("param refused to %s: %s", request.source, error, extra={"data": data})
             return ParamReply(ok=False, text=str(error)[:500], params=bus.params.all())
+        if request.name != LOG_LEVEL:
+            grant(bus, PARAM.at(bus.process), request, bus.time.tick)
         text = f"{request.name} is {now} now, it was {before}"
         log.info("param by %s: %s", request.source, text, extra={"data": data})
         return ParamReply(ok=True, text=text, params=bus.params.all())

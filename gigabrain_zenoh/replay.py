@@ -6,16 +6,18 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
 from gigabrain_schemas.heard import WAITED
-from gigabrain_schemas.topics import SERVICES
+from gigabrain_schemas.topics import MAP_SAVE, SERVICES
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.journal import PastJournal
-from gigabrain_zenoh.transport import Answer, LocalNetwork
+from gigabrain_zenoh.param_service import serve_params
+from gigabrain_zenoh.transport import LocalNetwork
 
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 Event = tuple[int, str, bytes]  # time since the start [ns], key, payload
 ASKED = {service.key for service in SERVICES}
+GOES_ON = {MAP_SAVE.key}  # while it is answered, time does
 UNDONE = b"\0"  # of a wait: the work was not done in time
 PATIENCE_S = 30.0  # for an answer, which may take work beside the loop; it may wait for time, too
 
@@ -27,17 +29,21 @@ def record(network: LocalNetwork, clock: Clock) -> list[Event]:
     return events
 
 
-async def replay(node: Node, recording: Sequence[Event]) -> list[tuple[str, bytes]]:
+async def replay(
+    node: Node, recording: Sequence[Event], process: str = ""
+) -> list[tuple[str, bytes]]:
     """Feed `recording` to `node` at its recorded times; return what the node itself sent.
 
-    An event on a service's key is a request, which is answered before time goes on; one on WAITED
+    `process` is its name, by which it is asked for its parameters. An event on a service's key is a
+    request, which is answered before time goes on, but for saving a map; one on WAITED
     says how waiting for work beside had ended at the event before it. Raises whatever ended the
     node, and ValueError for events that are not in order of time.
     """
     clock, network = FakeClock(), LocalNetwork()
-    bus = Bus(network.transport(), clock)
+    bus = Bus(network.transport(), clock, process)
+    serve_params(bus)
     bus.journal = past = PastJournal()
-    ready = asyncio.Event()
+    ready, asked = asyncio.Event(), list[asyncio.Future[None]]()
     running = asyncio.ensure_future(node(bus, ready.set))
     try:
         await _either(running, ready)  # a node may compile, beside the loop
@@ -46,14 +52,16 @@ async def replay(node: Node, recording: Sequence[Event]) -> list[tuple[str, byte
             if at_ns < clock.now_ns():
                 raise ValueError(f"an event at {at_ns} ns follows one at {clock.now_ns()} ns")
             await clock.advance(at_ns - clock.now_ns())
-            if key in ASKED:
-                await _ask(network, key, payload)
+            if key in ASKED or key.rpartition("/")[0] in ASKED:
+                asked.append(asyncio.ensure_future(_ask(network, key, payload)))
+                await asyncio.wait(asked[-1:], timeout=0.0 if key in GOES_ON else PATIENCE_S)
             else:
                 network.deliver(key, payload)
         await clock.advance(0)
     finally:
-        running.cancel()
-        await asyncio.wait((running,))
+        for each in (running, *asked):
+            each.cancel()
+        await asyncio.wait((running, *asked))
         await bus.close()
     if not running.cancelled():
         running.result()
@@ -82,9 +90,5 @@ async def _either(running: asyncio.Future[None], ready: asyncio.Event) -> None:
 
 async def _ask(network: LocalNetwork, key: str, payload: bytes) -> None:
     for answer in network.servers(key):
-        await asyncio.wait((asyncio.ensure_future(_answered(answer, payload)),), timeout=PATIENCE_S)
-
-
-async def _answered(answer: Answer, payload: bytes) -> None:
-    with contextlib.suppress(GigabrainError):  # a refusal; what was granted then shows the change
-        await answer(payload)
+        with contextlib.suppress(GigabrainError):  # a refusal; what was granted shows the change
+            await answer(payload)

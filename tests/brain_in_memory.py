@@ -136,6 +136,10 @@ class Robot:
                 task.result()
         return self.body.speeds[before:]
 
+    def bus(self, name: str) -> Bus:
+        """That of one of the processes."""
+        return self._running[name][1]
+
     @property
     def mode(self) -> str:
         """The gate's."""

@@ -18,6 +18,7 @@ from gigabrain_drivers.odometry import advanced
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Odometry, Wheel
 from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
 
 GENEROUS_S = 60.0
@@ -118,6 +119,27 @@ class Bench:
         async with asyncio.timeout(GENEROUS_S):
             while await self.connected() is not wanted:  # noqa: ASYNC110
                 await asyncio.sleep(0.002)
+
+    async def drive_until(self, so: Callable[[RobotState], object], *velocity: float) -> None:
+        """The same until what it reports is so, as busy as this machine may be."""
+        async with asyncio.timeout(GENEROUS_S):
+            while not so(await self.driver.read_state()):
+                await self.drive(0.02, *velocity)
+
+    async def reported(self, so: Callable[[RobotState], object]) -> RobotState:
+        """What it reports once that is so."""
+        async with asyncio.timeout(GENEROUS_S):
+            while not so(state := await self.driver.read_state()):  # noqa: ASYNC110
+                await asyncio.sleep(0.005)
+        return state
+
+    async def at_rest(self) -> RobotState:
+        """What it reports once it stands and all of its way has been reported."""
+        await until(lambda: self.body.commanded == (0.0, 0.0, 0.0))
+        true = self.body.snapshot.odometry
+        return await self.reported(
+            lambda state: math.hypot(state.pose.x - true.x, state.pose.y - true.y) < 0.002
+        )
 
     async def drive(self, seconds: float, linear_x: float, angular_z: float = 0.0) -> None:
         """Command as the driver's process does: every 20 ms."""

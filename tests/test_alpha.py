@@ -6,179 +6,29 @@ import os
 import socket
 from collections.abc import AsyncIterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from gigabrain_drivers import catalog
 from gigabrain_drivers.alpha import AlphaDriver, AlphaOptions
 from gigabrain_drivers.emulators import tcp
 from gigabrain_drivers.emulators.alpha import REST, Alpha
-from gigabrain_drivers.emulators.base import Snapshot
 from gigabrain_drivers.emulators.faults import NONE, Faults
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.emulators.station import Station
 from gigabrain_drivers.emulators.tcp import TcpPort
-from gigabrain_drivers.kinematics import Gait, Twist
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.legs.geometry import JOINT_NAMES
 from gigabrain_drivers.links.address import address
 from gigabrain_drivers.protocols import alpha
-from gigabrain_drivers.protocols.alpha import Decoder, State, Walk
 from gigabrain_drivers.robot import Run
-from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry
 from gigabrain_schemas.topics import IMU
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
+from gigabrain_zenoh.errors import BodyLost, Unsupported
+from tests.bus_rig import until
 
-FORWARD = WALKER.to_gait(Twist(0.3, 0.0, 0.0))
 MS = 1_000_000
-STANDING = Snapshot(
-    time_ns=0,
-    odometry=Odometry(0, 0, 0, 0, 0),
-    wheels=tuple(Motor(name, 0.1, 0.0, 1.0, 30.0) for name in JOINT_NAMES),
-    imu=ImuSample((0, 0, 0, 1), (0, 0, 0), (0, 0, 9.81)),
-    battery=Charge(28.0, 90.0, 3.0),
-    bumper=False,
-    contacts=(True,) * 4,
-)
-
-
-class Firmware:
-    """The device alone, on a body that only remembers what it was told, in time that is counted."""
-
-    def __init__(self) -> None:
-        self.gaits: list[Gait] = []
-        self.bytes = bytearray()
-        self.untaken: list[Snapshot] = []
-        self.body = SimpleNamespace(snapshot=STANDING, walk=self.gaits.append, fresh=self._fresh)
-        wire = SimpleNamespace(write=self._write)
-        self.device = Alpha(self.body, AlphaOptions(driver="alpha"), wire)  # type: ignore[arg-type]
-        self._decoder, self.now_ns = Decoder(), 0
-        self.step(0)
-
-    def _write(self, data: bytes) -> bool:
-        self.bytes += data
-        return True
-
-    def _fresh(self) -> list[Snapshot]:
-        untaken, self.untaken = self.untaken, []
-        return untaken
-
-    def step(self, milliseconds: int) -> State:
-        self.now_ns += milliseconds * MS
-        self.body.snapshot = STANDING._replace(time_ns=self.now_ns)
-        self.device.step(self.now_ns)
-        frames, self.bytes = self._decoder.feed(bytes(self.bytes)), bytearray()
-        state = alpha.state_of(frames[-1])
-        assert state
-        return state
-
-    def walk(self, sequence: int, gait: Gait = FORWARD, seen: int | None = None) -> None:
-        now = self.now_ns // MS if seen is None else seen
-        self.device.feed(alpha.walk(Walk(now, gait), sequence))
-
-
-def test_it_starts_standing_and_reports_what_it_measures() -> None:
-    state = Firmware().step(10)
-    assert (state.flags, state.echo, state.milliseconds) == (alpha.SILENT, 0, 10)
-    assert state.voltage == 28.0
-    assert state.senses.contacts == (True,) * 4
-    assert state.temperatures == (30.0,) * 12
-
-
-def test_steps_in_which_it_was_held_up_are_reported_all_the_same() -> None:
-    firmware = Firmware()
-    firmware.untaken = [STANDING._replace(time_ns=ms * MS) for ms in (10, 20, 30)]
-    firmware.device.step(30 * MS)
-    frames = Decoder().feed(bytes(firmware.bytes))
-    reports = [alpha.state_of(frame) for frame in frames]
-    assert [report.milliseconds for report in reports if report] == [10, 20, 30]
-    assert [frame.sequence for frame in frames] == [2, 3, 4]
-
-
-def test_its_clock_stands_still_while_its_body_does() -> None:
-    firmware = Firmware()
-    firmware.step(10)
-    firmware.bytes.clear()
-    firmware.device.step(90 * MS)
-    [frame] = Decoder().feed(bytes(firmware.bytes))
-    report = alpha.state_of(frame)
-    assert report
-    assert report.milliseconds == 10
-
-
-def test_it_walks_as_told_and_says_which_command_that_was() -> None:
-    firmware = Firmware()
-    firmware.walk(41)
-    state = firmware.step(10)
-    assert WALKER.to_body(firmware.gaits[-1]) == pytest.approx((0.3, 0.0, 0.0), abs=1e-6)
-    assert (state.flags, state.echo) == (alpha.WALKING, 41)
-
-
-def test_it_stops_100_ms_after_the_last_command_and_not_before() -> None:
-    firmware = Firmware()
-    firmware.walk(1)
-    assert firmware.step(99).flags == alpha.WALKING
-    assert firmware.step(1).flags == alpha.SILENT
-    assert firmware.gaits[-1] == REST
-
-
-def test_what_is_refused_does_not_keep_it_walking() -> None:
-    firmware = Firmware()
-    firmware.walk(5)
-    firmware.step(60)
-    firmware.walk(5)
-    firmware.walk(4)
-    firmware.walk(6, FORWARD._replace(frequency=9.0))
-    firmware.walk(7, FORWARD._replace(stride_x=math.nan))
-    firmware.device.feed(alpha.walk(Walk(60, FORWARD), 8)[:-1] + b"\x00")
-    state = firmware.step(40)
-    assert (state.flags, state.echo, state.refused) == (alpha.SILENT, 5, 5)
-
-
-def test_a_command_that_knows_only_an_old_state_is_refused() -> None:
-    firmware = Firmware()
-    firmware.step(1000)
-    firmware.walk(1, seen=849)
-    assert firmware.step(0).refused == 1
-    firmware.walk(1, seen=850)
-    assert firmware.step(0).flags == alpha.WALKING
-
-
-def test_stop_is_always_obeyed() -> None:
-    firmware = Firmware()
-    firmware.walk(100)
-    firmware.device.feed(alpha.stop(3))
-    assert firmware.gaits[-1] == REST
-
-
-def test_after_silence_a_new_count_may_begin_anywhere() -> None:
-    firmware = Firmware()
-    firmware.walk(1000)
-    firmware.step(200)
-    firmware.walk(1)
-    assert firmware.step(10).echo == 1
-
-
-@settings(max_examples=60)
-@given(st.lists(st.binary(max_size=80), max_size=20))
-def test_no_bytes_make_it_walk_or_end(pieces: list[bytes]) -> None:
-    firmware = Firmware()
-    for piece in pieces:
-        firmware.device.feed(piece)
-        firmware.device.feed(alpha.MAGIC + piece)
-    assert firmware.step(10).flags == alpha.SILENT
-    assert set(firmware.gaits) == {REST}
-
-
-async def until(condition: object, seconds: float = 20.0) -> None:
-    async with asyncio.timeout(seconds):
-        while not condition():  # type: ignore[operator]  # noqa: ASYNC110
-            await asyncio.sleep(0.01)
 
 
 class Rig:
@@ -357,17 +207,6 @@ async def test_without_a_body_it_opens_says_so_and_closes(tmp_path: Path) -> Non
     await driver.close()
 
 
-@pytest.mark.parametrize("wrong", ["nowhere", "host:", ":8080", "host:99999", "host:80a"])
-def test_an_address_that_is_none_is_refused(wrong: str) -> None:
-    with pytest.raises(ConfigError, match="expected HOST:PORT"):
-        address(wrong)
-
-
-def test_addresses() -> None:
-    assert address("192.168.1.10:8080") == ("192.168.1.10", 8080)
-    assert address("[::1]:80\n") == ("::1", 80)
-
-
 def test_the_robot_has_all_three_links() -> None:
     robot, driver, options, _ = catalog.load_link("alpha", Run(folder=Path(), link="real"))
     assert driver is AlphaDriver
@@ -376,21 +215,6 @@ def test_the_robot_has_all_three_links() -> None:
     assert catalog.links_of(robot) == ["sim", "emulated", "real"]
     run = Run(folder=Path(), link="emulated", emulator="/ports")
     assert catalog.load_link("alpha", run)[2].port == "/ports/base"  # type: ignore[attr-defined]
-
-
-def test_it_parks_through_silence_and_stands_up_before_it_walks() -> None:
-    firmware = Firmware()
-    firmware.walk(1)
-    firmware.device.feed(alpha.park(2))
-    assert firmware.gaits[-1].height == 0.13
-    assert firmware.step(200).flags == alpha.SILENT | alpha.PARKED
-    assert firmware.gaits[-1].height == 0.13
-    for sequence in range(3, 39):  # 1.8 s
-        firmware.walk(sequence)
-        assert firmware.gaits[-1] == REST
-        firmware.step(50)
-    firmware.walk(39)
-    assert WALKER.to_body(firmware.gaits[-1]) == pytest.approx((0.3, 0.0, 0.0), abs=1e-6)
 
 
 async def test_parked_it_lies_and_a_new_driver_leaves_it_lying(rig: Rig) -> None:

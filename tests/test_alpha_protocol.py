@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from gigabrain_drivers.kinematics import Gait, Twist
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.legs.senses import Senses
+from gigabrain_drivers.links.address import address
 from gigabrain_drivers.protocols import alpha
 from gigabrain_drivers.protocols.alpha import Decoder, Frame, State, Walk
+from gigabrain_zenoh.errors import ConfigError
 
 # the vectors of docs/firmware_alpha.md
 STOP_1 = bytes.fromhex("a55a0000020101000000d58d9383")
@@ -191,3 +193,14 @@ def test_byte_errors_make_no_wrong_command(rate: float, least: float) -> None:
             assert frame.sequence == command.seen == command.gait.stride_x
             right += 1
     assert right > least * count
+
+
+@pytest.mark.parametrize("wrong", ["nowhere", "host:", ":8080", "host:99999", "host:80a"])
+def test_an_address_that_is_none_is_refused(wrong: str) -> None:
+    with pytest.raises(ConfigError, match="expected HOST:PORT"):
+        address(wrong)
+
+
+def test_addresses() -> None:
+    assert address("192.168.1.10:8080") == ("192.168.1.10", 8080)
+    assert address("[::1]:80\n") == ("::1", 80)

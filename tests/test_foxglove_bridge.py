@@ -17,7 +17,8 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
 
 from gigabrain_drivers.catalog import load_robot
-from gigabrain_schemas.base import Pose
+from gigabrain_schemas.arrays import hits_bytes
+from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Body, RobotState
 from gigabrain_schemas.brain import Obstacle, OccupancyGrid, PoseInMap, Twist, WorldModel
 from gigabrain_schemas.examples import EXAMPLES
@@ -152,6 +153,25 @@ async def test_an_obstacle_is_drawn_where_it_is_and_with_where_it_goes(bridge: B
         bridge.robot.publish(WORLD, world)
         entity = dict(fields(dict(fields(await viewer.message("/viz/obstacles")))[2]))
         assert (entity[2], entity[3]) == (b"odom", b"7")
+
+
+async def test_what_is_large_and_stands_is_drawn_as_what_was_seen_of_it(bridge: Bridge) -> None:
+    y = np.linspace(-1.0, 1.0, 41)
+    one = Obstacle(id=7, x=1.5, y=0.0, radius=1.0)
+    world = WorldModel(
+        scan_ok=True, obstacle_ahead=False, obstacles=(one,), hits=hits_bytes(0.0 * y + 1.5, y)
+    )
+    here = RobotState(robot_type="mock", pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity())
+    bridge.robot.publish(STATE, here)
+    bridge.robot.publish(WORLD, world)
+    async with bridge.viewer() as viewer:
+        await viewer.subscribe("/viz/obstacles")
+        bridge.robot.publish(WORLD, world)
+        entity = dict(fields(dict(fields(await viewer.message("/viz/obstacles")))[2]))
+    assert (entity[2], entity[3]) == (b"base_link", b"7")
+    assert 10 not in entity  # cylinders
+    points = [data for number, data in fields(entity[11]) if number == 5]
+    assert len(points) == 80  # both ends of 40 lines
 
 
 async def test_the_frames_join_map_and_robot(bridge: Bridge) -> None:

@@ -20,16 +20,15 @@ STARTED = BARE.replace(
 
 async def test_it_obeys_and_reports_what_its_wheels_did(tmp_path: Path) -> None:
     async with bench(tmp_path) as it:
-        await it.drive(0.5, 0.3, 0.6)
-        state = await it.driver.read_state()
-        assert it.body.commanded == (0.3, 0.0, 0.6)
-        assert state.velocity.linear_x == pytest.approx(0.3, abs=0.03)
-        assert state.velocity.angular_z == pytest.approx(0.6, abs=0.06)
+        await it.drive_until(
+            lambda state: it.body.commanded == (0.3, 0.0, 0.6)
+            and abs(state.velocity.linear_x - 0.3) < 0.03
+            and abs(state.velocity.angular_z - 0.6) < 0.06
+            and state.pose.x > 0.1,
+            0.3, 0.6,
+        )  # fmt: skip
         await it.driver.stop()
-        await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
-        await asyncio.sleep(0.05)
-        state, true = await it.driver.read_state(), it.body.snapshot.odometry
-        assert (state.pose.x, state.pose.y) == pytest.approx((true.x, true.y), abs=0.002)
+        state, true = await it.at_rest(), it.body.snapshot.odometry
         assert state.pose.yaw == pytest.approx(true.yaw, abs=0.005)
         assert [joint.name for joint in state.joints] == ["wheel_left_joint", "wheel_right_joint"]
         assert state.link.connected
@@ -91,8 +90,7 @@ async def test_an_unplugged_body_is_lost_at_once_and_comes_back_with_zero(tmp_pa
         await it.until_connected()
         await until(lambda: it.firmware.executed)
         assert it.firmware.executed[0] == ZERO
-        await it.drive(0.1, 0.2)
-        assert it.body.commanded == (0.2, 0.0, 0.0)
+        await it.drive_until(lambda _: it.body.commanded == (0.2, 0.0, 0.0), 0.2)
         assert (await it.driver.read_state()).link.reconnects == 1
 
 
@@ -113,21 +111,18 @@ async def test_garbage_and_half_lines_are_counted_and_nothing_comes_of_them(
 ) -> None:
     async with bench(tmp_path) as it:
         it.station.set(Faults(garbage=0.3, half_frames=0.2, bit_errors=0.005))
-        await it.drive(1.0, 0.2)
+        await it.drive_until(lambda state: state.link.errors > 5, 0.2)
         it.station.set(NONE)
         await it.until_connected()
-        state = await it.driver.read_state()
-        assert state.link.errors > 0
-        assert state.pose.x == pytest.approx(it.body.snapshot.odometry.x, abs=0.05)
+        await it.driver.stop()
+        await it.at_rest()
 
 
 async def test_a_reboot_does_not_move_the_pose(tmp_path: Path) -> None:
     async with bench(tmp_path) as it:
-        await it.drive(0.4, 0.4)
+        await it.drive_until(lambda state: state.pose.x > 0.1, 0.4)
         await it.driver.stop()
-        await asyncio.sleep(0.05)
-        before = (await it.driver.read_state()).pose.x
-        assert before > 0.1
+        before = (await it.at_rest()).pose.x
         it.station.set(Faults(reboot=True))
         await it.until_connected(False)
         it.station.set(NONE)  # banner, then counters from zero
@@ -157,14 +152,16 @@ async def test_flags_are_logged_once_and_bumpers_reported(
         await it.drive(0.1, 0.0)
         caplog.clear()
         it.body.bumper = True
-        await asyncio.sleep(0.3)  # and nobody commands: the firmware raises `watchdog`
-        assert (await it.driver.read_state()).bumpers == (True, False)
-        said = [record.message for record in caplog.records]
-        assert said.count("the firmware reports: watchdog") == 1
-        await it.drive(0.1, 0.0)
-        said = [record.message for record in caplog.records]
-        assert said.count("the firmware no longer reports: watchdog") == 1
-        assert not any("bumper" in text for text in said)
+        # and nobody commands: the firmware raises `watchdog`
+        await it.reported(lambda _: "the firmware reports: watchdog" in caplog.messages)
+        await it.reported(lambda state: state.bumpers == (True, False))
+        await asyncio.sleep(0.1)
+        await it.driver.read_state()
+        assert caplog.messages == ["the firmware reports: watchdog"]
+        no_longer = "the firmware no longer reports: watchdog"
+        await it.drive_until(lambda _: no_longer in caplog.messages, 0.0)
+        assert caplog.messages[1] == no_longer
+        assert not any("bumper" in text for text in caplog.messages)
 
 
 async def test_a_loss_is_said_once_with_the_reason_and_its_end_once(
@@ -190,10 +187,12 @@ async def test_an_unchanged_command_is_repeated_at_its_rate_and_a_new_one_goes_a
     async with bench(tmp_path) as it:
         written: list[bytes] = []
         it.driver.link.trace = lambda way, data: written.append(data) if way == "tx" else None
+        rate_ns, it.driver._repeat_ns = it.driver._repeat_ns, 60_000_000_000
         for _ in range(10):
             await it.driver.set_base_velocity(0.1, 0.0, 0.0)
         await it.driver.set_base_velocity(0.2, 0.0, 0.0)
         assert written == [b"V,0.100,0.000\n", b"V,0.200,0.000\n"]
+        it.driver._repeat_ns = rate_ns
         await it.drive(0.1, 0.2)
         assert 3 <= len(written) <= 7
 

@@ -12,6 +12,7 @@ def lingers(of: socket.socket) -> tuple[int, ...]:
 
 
 def test_the_tcp_sockets_of_this_process_no_longer_linger() -> None:
+    close_in_background()  # of whatever else this process has had open
     with socket.socket() as ours, socket.socket() as other:
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 10))
         before = len(os.listdir("/dev/fd"))

@@ -18,6 +18,8 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapper import chart_of
 from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.recording.placing import placed
+from gigabrain_zenoh.replay import record, replay
 from gigabrain_zenoh.settings import PerceptionConfig
 from tests.brain_rig import Bench, body, scan, state
 from tests.map_rig import HOUSE, Rooms, at, drawn
@@ -214,6 +216,26 @@ async def test_a_map_is_saved_and_found_in_again(own_maps: Path) -> None:
     assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
     assert grid.resolution == 0.05
     assert reply.text == "not saved: perception finds its way in a saved map, it makes none"
+
+
+async def test_a_replay_of_a_drive_with_a_save_says_the_same_and_saves_nothing(
+    own_maps: Path,
+) -> None:
+    async with Robot() as robot:
+        events = record(robot.network, robot.clock)
+        robot.say()
+        robot.drive(60)
+        assert (await robot.save("house")).ok
+        robot.drive(20)
+    (own_maps / "house.yaml").unlink()
+    own = (WORLD.key, POSE.key, MAP.key)
+    heard = placed([event for event in events if event[1] not in own])
+    assert sum(key == MAP_SAVE.key for _, key, _ in heard) == 1
+    now = await replay(functools.partial(perception.run, SLAM), heard, "perception")
+    then = [(key, data) for _, key, data in events if key in own]
+    assert [one for one in now if one[0] in own] == then
+    assert len(then) > 160
+    assert not (own_maps / "house.yaml").exists()
 
 
 async def test_a_saved_map_grows_on(own_maps: Path) -> None:

@@ -10,8 +10,9 @@ from gigabrain_zenoh import meeting
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.meeting import join, unknown_host
 from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.bus_rig import until
-from tests.zenoh_rig import free_endpoint
+from tests.zenoh_rig import free_endpoint, under_way
 
 NOBODY = "nobody here knows a host {!r}; waiting for its name (is it spelt right?)"
 
@@ -69,13 +70,18 @@ async def test_a_router_waits_for_its_own_name_and_says_so_once(
 async def test_who_waits_for_a_router_that_has_no_known_name_says_which(
     resolver: Resolver, caplog: pytest.LogCaptureFixture
 ) -> None:
-    elsewhere = free_endpoint().replace("127.0.0.1", "localhost")
+    others, here = under_way(), free_endpoint()
+    elsewhere = here.replace("127.0.0.1", "localhost")
     joining = asyncio.ensure_future(join(Endpoint(connect=(elsewhere,))))
     await until(lambda: bool(told(caplog)))
     assert told(caplog) == [NOBODY.format("localhost")]
     joining.cancel()
     with pytest.raises(asyncio.CancelledError):
         await joining
+    resolver.knows = True
+    router = await ZenohTransport.open(Endpoint(listen=(here,)))
+    await until(lambda: under_way() <= others)  # whoever was left waiting would wait for ever
+    await router.close()
 
 
 async def test_what_is_no_endpoint_is_not_waited_for() -> None:

@@ -11,12 +11,24 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.examples import example
+from gigabrain_schemas.requests import ParamRequest
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, Granted, TaskRequest
-from gigabrain_schemas.topics import GOAL, GRANTED, INTENT, STATE, TASK, TASK_CHANGE, WORLD, Topic
+from gigabrain_schemas.topics import (
+    GOAL,
+    GRANTED,
+    INTENT,
+    PARAM,
+    STATE,
+    TASK,
+    TASK_CHANGE,
+    WORLD,
+    Topic,
+)
 from gigabrain_zenoh import codec, decision
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.param_service import serve_params
 from gigabrain_zenoh.recording.drives import DRIVES, file_of
 from gigabrain_zenoh.recording.fields import message_of
 from gigabrain_zenoh.recording.placing import placed
@@ -26,6 +38,7 @@ from gigabrain_zenoh.recording.recorder import Recorder
 from gigabrain_zenoh.replay import ASKED, Event, record, replay
 from gigabrain_zenoh.settings import DecisionConfig, RecorderConfig
 from tests import bag_rig
+from tests.brain_in_memory import BRAIN, Robot
 from tests.plane_rig import ROOM, Plane, drawn
 
 RECORDINGS = Path(__file__).parent / "recordings"
@@ -179,6 +192,24 @@ async def test_a_decision_that_was_sent_to_a_place_does_the_same_again() -> None
     node = functools.partial(decision.run, DecisionConfig(behaviour="navigate"))
     now = [(key, data) for key, data in await replay(node, heard) if key in own]
     assert plane.travelled > 0.3
+    assert [unstamped(*one) for one in now] == [unstamped(*one) for one in then]
+
+
+async def test_a_parameter_that_was_changed_meanwhile_is_changed_again(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        events = record(robot.network, robot.clock)
+        serve_params(robot.bus("decision"))
+        await robot.go(100)
+        slower = ParamRequest(name="linear_speed", value="0.1", source="ann")
+        assert (await robot.operator.ask(PARAM, slower, name="decision"))[0].ok
+        speeds = await robot.go(100)
+    assert (round(speeds[0], 2), round(speeds[-1], 2)) == (0.26, 0.1)
+    then = [(key, data) for _, key, data in events if key == INTENT.key]
+    heard = placed([event for event in events if event[1] != INTENT.key])
+    assert [key for _, key, _ in heard if key.startswith(PARAM.key)] == [PARAM.at("decision")]
+    now = [
+        one for one in await replay(BRAIN["decision"], heard, "decision") if one[0] == INTENT.key
+    ]
     assert [unstamped(*one) for one in now] == [unstamped(*one) for one in then]
 
 

@@ -14,7 +14,7 @@ from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.bus_rig import until
-from tests.zenoh_rig import Ear, free_endpoint, repeat, robot, router_process
+from tests.zenoh_rig import Ear, free_endpoint, repeat, robot, router_process, under_way
 
 
 def client_of(endpoint: str) -> Awaitable[ZenohTransport]:
@@ -82,6 +82,7 @@ async def test_a_client_waits_for_its_router() -> None:
 
 
 async def test_waiting_for_a_router_may_be_given_up_and_its_session_is_closed() -> None:
+    others = under_way()
     async with robot() as net:
         opening = asyncio.ensure_future(client_of(net.endpoint))
         await asyncio.sleep(0.1)
@@ -90,10 +91,11 @@ async def test_waiting_for_a_router_may_be_given_up_and_its_session_is_closed() 
             await opening
         await net.router()
         # the thread that was left waiting finds the router, and lets go of it again
-        await until(lambda: "zenoh-session" not in {t.name for t in threading.enumerate()})
+        await until(lambda: under_way() <= others)
 
 
 async def test_a_session_that_opens_just_as_it_is_given_up_is_closed() -> None:
+    others = under_way()
     async with robot() as net:
         router = await net.router()
         for turns in range(40):
@@ -105,7 +107,7 @@ async def test_a_session_that_opens_just_as_it_is_given_up_is_closed() -> None:
                 await (await opening).close()
             except asyncio.CancelledError:
                 continue
-        await until(lambda: "zenoh-session" not in {t.name for t in threading.enumerate()})
+        await until(lambda: under_way() <= others)
         await until(lambda: not router._session.info.transports())
 
 
@@ -159,6 +161,7 @@ def stuck(sender: ZenohTransport) -> None:
 
 
 async def gone(router_is: str, use: Callable[[ZenohTransport], None]) -> None:
+    others = under_way()
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
         client = await client_of(endpoint)
@@ -171,7 +174,7 @@ async def gone(router_is: str, use: Callable[[ZenohTransport], None]) -> None:
         async with asyncio.timeout(5):  # Zenoh's own close takes ten
             await client.close()
             assert await asking == []
-    await until(lambda: "zenoh-session" not in {t.name for t in threading.enumerate()})
+    await until(lambda: under_way() <= others)
 
 
 @pytest.mark.parametrize("router_is", ["killed", "frozen"])
@@ -184,6 +187,7 @@ async def test_leaving_does_not_wait_for_a_link_that_is_stuck() -> None:
 
 
 async def test_publishing_into_a_stuck_link_does_not_stop_the_loop() -> None:
+    others = under_way()
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
         client = await client_of(endpoint)
@@ -192,7 +196,7 @@ async def test_publishing_into_a_stuck_link_does_not_stop_the_loop() -> None:
             stuck(client)
             await asyncio.sleep(0)
         await client.close()
-    await until(lambda: "zenoh-session" not in {t.name for t in threading.enumerate()})
+    await until(lambda: under_way() <= others)
 
 
 def handles() -> tuple[int, int]:

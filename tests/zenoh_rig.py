@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import AsyncIterator, Callable, Iterator
 
 import zenoh
@@ -114,6 +115,11 @@ async def robot() -> AsyncIterator[Robot]:
         yield made
     finally:
         await made.close()
+
+
+def under_way() -> set[threading.Thread]:
+    """The threads of this process in which a session is being opened or closed."""
+    return {thread for thread in threading.enumerate() if thread.name == "zenoh-session"}
 
 
 class Ear:

@@ -1,6 +1,7 @@
 """SLAM in a simulated world against the physics' truth, on what perception itself calls."""
 
 import time
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -86,12 +87,12 @@ def tour(body: str, world: str, seed: int, minutes: float, progress: Progress) -
         if count % TICKS_A_MINUTE == 0:
             memory = [memory[0] or rss_bytes(), rss_bytes()]
             progress()
-    if not run.poses:
+    if not len(run.poses):
         raise ConfigError(f"--minutes: {minutes:g} is too short for a scan")
     truth, report = roaming.simulation.truth, run.chart.report()
     grid = run.chart.grid()
     run.chart.close()
-    poses, seen, fused = np.array(run.poses), run.in_map(), np.array(run.fused)
+    poses, seen, fused = run.poses, run.in_map(), run.fused
     off = between(seen, poses)
     begun = compose(poses[0], inverse(fused[0]))
     result = WorldResult(
@@ -120,10 +121,9 @@ class _Run:
 
     def __init__(self, chart: GrowingMap) -> None:
         self.chart, self.fusion, self.not_localized = chart, Fusion(), 0
-        self.poses: list[Floats] = []
-        self.fused: list[Floats] = []
-        self.took_ms: list[float] = []
-        self._truth: list[Floats] = []  # in the world
+        # flat, so that an hour of them is next to nothing in the memory that is measured
+        self.took_ms, self._poses, self._fused = array("d"), array("d"), array("d")
+        self._truth = array("d")  # in the world
         self._last: Moment | None = None
 
     def scan(self, lidar: Lidar, scan: LaserScan, truth: Floats) -> None:
@@ -139,14 +139,24 @@ class _Run:
         self.took_ms.append((time.thread_time() - began) * 1e3)
         self._last = moment
         self.not_localized += not place.localized
-        self.poses.append(place.pose)
-        self.fused.append(moment.fused)
-        self._truth.append(truth)
+        self._poses.extend(place.pose)
+        self._fused.extend(moment.fused)
+        self._truth.extend(truth)
+
+    @property
+    def poses(self) -> Floats:
+        """As mapped (n, 3)."""
+        return np.array(self._poses).reshape(-1, 3)
+
+    @property
+    def fused(self) -> Floats:
+        """By odometry and gyro (n, 3)."""
+        return np.array(self._fused).reshape(-1, 3)
 
     def in_map(self) -> Floats:
         """The truth (n, 3), as seen from where the map began."""
-        begun = compose(self.poses[0], inverse(self._truth[0]))
-        return compose(begun, np.array(self._truth))
+        truth = np.array(self._truth).reshape(-1, 3)
+        return compose(compose(self.poses[0], inverse(truth[0])), truth)
 
 
 def _off(off: Floats) -> Off:

@@ -23,7 +23,7 @@ from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import CMD_VEL, INTENT, SAFETY, STATE, WORLD, Topic
 from gigabrain_zenoh.recording.schema import flat_schema
-from gigabrain_zenoh.recording.shapes import obstacle, pose_of, stamp, turn
+from gigabrain_zenoh.recording.shapes import pose_of, stamp, things, turn
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
 LIDAR = "base_scan"  # as LaserScan has it
@@ -160,7 +160,7 @@ class Drawer:
         yield of("path", fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses))
 
     def _obstacles(self, world: WorldModel, _: str) -> Iterable[Drawn]:
-        entities = [obstacle(world, one, ODOM) for one in world.obstacles]
+        entities = things(world, self._odometry, ODOM, BASE)
         yield of("obstacles", fox.SceneUpdate(entities=entities))
 
     def _task(self, status: TaskStatus, _: str) -> Iterable[Drawn]:

@@ -32,7 +32,7 @@ def hearing(samples: Sequence[Sample], process: str) -> Hearing | None:
     told = _last_life(_heard.decode(one.payload) for one in samples if one.key == key)
     if not told:
         return None
-    held = _by_number(samples)
+    held = _by_number(samples, process)
     events: list[Event] = []
     lost = 0
     for at_ns, name, seq in _entries(told):
@@ -62,10 +62,15 @@ def _entries(told: Iterable[Heard]) -> Iterator[tuple[int, str, int]]:
             yield newest_ns, word.keys[one.key], one.seq
 
 
-def _by_number(samples: Iterable[Sample]) -> dict[tuple[str, int], list[tuple[int, bytes]]]:
+def _by_number(
+    samples: Iterable[Sample], process: str
+) -> dict[tuple[str, int], list[tuple[int, bytes]]]:
+    """Time and payload of each message, but for what others were asked, by key and number."""
     held: dict[tuple[str, int], list[tuple[int, bytes]]] = defaultdict(list)
     for sample in samples:
-        held[sample.key, header_of(sample.payload).seq].append((sample.log_ns, sample.payload))
+        header = header_of(sample.payload)
+        if sample.key != GRANTED.key or header.process in ("", process):
+            held[sample.key, header.seq].append((sample.log_ns, sample.payload))
     return held
 
 

@@ -169,7 +169,7 @@ async def replay_process(path: Path, process: str, settings: dict[str, Any]) -> 
     past = load(path, process)
     node = node_of(ProcessConfig(name=process, endpoint=Endpoint(), settings=settings))
     kinds = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in SAYS[process]}
-    sent = await replay(node, past.heard)
+    sent = await replay(node, past.heard, process)
     now = _words((key, kinds[key](data)) for key, data in sent if key in kinds)
     unsure = not past.exact and notes(path).get("speed", "1") == "1"
     return msgspec.structs.replace(

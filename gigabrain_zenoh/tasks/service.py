@@ -3,7 +3,6 @@
 import logging
 from typing import Any, Protocol
 
-import msgspec
 from msgspec.structs import replace
 
 from gigabrain_schemas.body import RobotState
@@ -11,16 +10,16 @@ from gigabrain_schemas.tasks import (
     Goal,
     GoalReply,
     GoalRequest,
-    Granted,
     MissionReply,
     MissionRequest,
     TaskReply,
     TaskRequest,
     TaskStatus,
 )
-from gigabrain_schemas.topics import GOAL, GRANTED, MISSION, TASK, TASK_CHANGE, Service
+from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Service
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.granting import grant
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.scribe import Scribe
 from gigabrain_zenoh.tasks import checks
@@ -178,10 +177,7 @@ class TaskService:
         self, of: Service[Any, Any], request: GoalRequest | MissionRequest | TaskRequest
     ) -> None:
         """Tell from when on a request counts, so that a recording holds all that we go by."""
-        text = msgspec.json.encode(request).decode()
-        granted = Granted(service=of.key, request=text)
-        sent = self._bus.publish(GRANTED, granted, basis=self._basis)
-        self._bus.journal.note(GRANTED.key, sent.seq)
+        grant(self._bus, of.key, request, self._basis)
         self._tell()
 
     def _refuse(self, what: str, source: str, error: GigabrainError) -> None:

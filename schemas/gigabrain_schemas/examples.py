@@ -313,7 +313,8 @@ TASKS: tuple[Message, ...] = (
     TaskReply(ok=True, text="goal-7 is cancelled", task="goal-7"),
     Granted(
         stamp_ns=STAMP_NS, seq=3, boot=BOOT, tick=205, basis=200,
-        service="robot/goal", request='{"x":3.0,"y":1.5,"how":"preempt","source":"ann"}',
+        process="decision", service="robot/goal",
+        request='{"x":3.0,"y":1.5,"how":"preempt","source":"ann"}',
     ),
     TaskStatus(
         stamp_ns=STAMP_NS, seq=91, boot=BOOT, tick=206, basis=205,

@@ -78,6 +78,7 @@ class Granted(Message, frozen=True, kw_only=True):
     `tick` and `basis` are the newest that had been heard and thought about before it.
     """
 
+    process: Name = ""  # who was asked
     service: Name  # the key that it was asked on, such as robot/goal
     request: Annotated[str, Meta(max_length=LONGEST)]  # JSON, with who asked
 

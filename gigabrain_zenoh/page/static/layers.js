@@ -1,6 +1,7 @@
 // What is drawn in the robot's own frame. Each takes the pen and the map view.
 const TAU = 2 * Math.PI
 const AHEAD_S = 1, SLOW = 0.05 // how far ahead of a moving thing its line reaches; below [m/s] there is none
+const LARGE = 0.3, GAP = 0.25 // [m] radius of what is drawn as it was seen; between beams on one thing
 
 /** The nearest thing in each sector, as perception sees it. */
 function paintFree(pen, view) {
@@ -57,27 +58,52 @@ function paintRobot(pen, view) {
   pen.fill()
 }
 
-/** What perception follows from scan to scan; it is told in the frame of the odometry. */
+/** Points as seen from a pose. */
+const from = ({ x, y, yaw }) => {
+  const c = Math.cos(yaw), s = Math.sin(yaw)
+  return ([px, py]) => [c * (px - x) + s * (py - y), c * (py - y) - s * (px - x)]
+}
+
+/** What perception follows from scan to scan; it is told in the frame of the odometry.
+
+What is large and stands, such as a wall, is drawn as what was seen of it, and all else as a disc. */
 function paintThings(pen, view) {
-  const { world, state } = view.moment
-  if (!state) return
-  pen.save()
-  pen.rotate(-state.pose.yaw)
-  pen.translate(-state.pose.x, -state.pose.y)
+  const { world, state, pose } = view.moment
+  if (!state || !pose) return
+  const seen = (view.scan ?? []).map(from(pose)), here = from(state.pose), turned = from({ x: 0, y: 0, yaw: state.pose.yaw })
   for (const thing of world?.obstacles ?? []) {
-    pen.beginPath()
-    pen.arc(thing.x, thing.y, Math.max(thing.radius, 3 * view.pixel), 0, TAU)
-    pen.globalAlpha = 0.35
-    pen.fillStyle = view.colour.thing
-    pen.fill()
-    pen.globalAlpha = 1
-    if (Math.hypot(thing.velocity_x, thing.velocity_y) > SLOW) {
-      pen.moveTo(thing.x, thing.y)
-      pen.lineTo(thing.x + AHEAD_S * thing.velocity_x, thing.y + AHEAD_S * thing.velocity_y)
-    }
-    view.stroke(pen, view.colour.thing, 2)
+    const [x, y] = here([thing.x, thing.y]), moves = Math.hypot(thing.velocity_x, thing.velocity_y) > SLOW
+    const near = moves || thing.radius <= LARGE ? [] : seen.filter(([px, py]) => Math.hypot(px - x, py - y) < thing.radius + GAP)
+    if (near.length) paintSeen(pen, view, near)
+    else paintDisc(pen, view, x, y, thing.radius, moves ? turned([thing.velocity_x, thing.velocity_y]) : null)
   }
-  pen.restore()
+}
+
+function paintSeen(pen, view, points) {
+  pen.beginPath()
+  points.forEach(([x, y], i) => {
+    const joined = i && Math.hypot(x - points[i - 1][0], y - points[i - 1][1]) < GAP
+    if (joined) pen.lineTo(x, y)
+    else pen.moveTo(x, y)
+  })
+  pen.lineCap = pen.lineJoin = 'round'
+  pen.globalAlpha = 0.45
+  view.stroke(pen, view.colour.thing, 9)
+  pen.globalAlpha = 1
+}
+
+function paintDisc(pen, view, x, y, radius, velocity) {
+  pen.beginPath()
+  pen.arc(x, y, Math.max(radius, 3 * view.pixel), 0, TAU)
+  pen.globalAlpha = 0.35
+  pen.fillStyle = view.colour.thing
+  pen.fill()
+  pen.globalAlpha = 1
+  if (velocity) {
+    pen.moveTo(x, y)
+    pen.lineTo(x + AHEAD_S * velocity[0], y + AHEAD_S * velocity[1])
+  }
+  view.stroke(pen, view.colour.thing, 2)
 }
 
 export const ON_ROBOT = [paintFree, paintZones, paintThings, paintPlan, paintRobot]
