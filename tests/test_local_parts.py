@@ -8,6 +8,7 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.body import BodyDescription
+from gigabrain_zenoh.navigation.chamfer import Chamfer
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import (
     Grid,
@@ -107,6 +108,15 @@ def _exact(points: np.ndarray, x: float, y: float, yaw: float) -> float:
         np.maximum(np.abs(aside) - 0.155, 0.0),
     )
     return float(out.min())
+
+
+def test_distances_are_those_of_opencv_and_no_more_than_asked_for() -> None:
+    random = np.random.default_rng(4)
+    chamfer = Chamfer(90, 0.025, 0.8)
+    for share in (0.5, 0.01, 0.001, 0.0):
+        free = (random.random((90, 90)) >= share).astype(np.uint8)
+        want = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * 0.025
+        np.testing.assert_allclose(chamfer.distance(free), np.minimum(want, 0.8), atol=1e-5)
 
 
 @pytest.mark.parametrize("body", [WAFFLE, CAR])

@@ -18,7 +18,7 @@ BEYOND = 1e6  # cost of what is beside the window
 DIAGONAL = math.sqrt(2.0)
 
 Floats = NDArray[np.float64]
-Span = NDArray[np.float32]
+Spans = NDArray[np.float32]
 
 
 class CostToGo:
@@ -30,7 +30,7 @@ class CostToGo:
         self._field = np.empty((side, side), dtype=np.float32)
         self._padded = np.empty((side, side + 2), dtype=np.float32)
         self._cost = np.full((side, side + 2), np.float32(BEYOND), dtype=np.float32)
-        self._steps = np.empty(side + 1, dtype=np.float32)
+        self._spans = np.empty((3, side + 2), dtype=np.float32)
 
     def field(
         self, grid: Grid, half_width: float, goal: tuple[float, float], path: Floats | None
@@ -47,7 +47,7 @@ class CostToGo:
         seed = _seed(side, cell, (grid.x, grid.y), goal, path)
         self._cost[:, 1:-1], self._padded[:, 1:-1] = cost, seed
         self._padded[:, [0, -1]] = FARTHEST
-        _sweep(self._cost, np.float32(cell), self._padded, self._steps)
+        _sweep(self._cost, np.float32(cell), self._padded, self._spans)
         self._field[:] = self._padded[:, 1:-1]
         return Grid(self._field, cell, grid.x, grid.y)
 
@@ -90,7 +90,7 @@ def _cost(distance: NDArray[np.float32], half_width: np.float32) -> NDArray[np.f
 
 @kernel
 def _sweep(
-    cost: NDArray[np.float32], cell: np.float32, field: NDArray[np.float32], span: Span
+    cost: NDArray[np.float32], cell: np.float32, field: NDArray[np.float32], spans: Spans
 ) -> None:
     """Lower `field` until each cell is as cheap as by any of its eight neighbours.
 
@@ -111,7 +111,7 @@ def _sweep(
             if i < rows - 1:
                 changed |= _from_row(cost[i + 1], cost[i], field[i + 1], field[i], cell)
             if changed or fresh[i]:
-                changed |= _along(cost[i], field[i], cell, span)
+                changed |= _along(cost[i], field[i], cell, spans)
                 fresh[i] = False
             if changed:
                 going = True
@@ -152,24 +152,29 @@ def _from_row(
 
 @kernel
 def _along(
-    cost: NDArray[np.float32], row: NDArray[np.float32], cell: np.float32, steps: Span
+    cost: NDArray[np.float32], row: NDArray[np.float32], cell: np.float32, spans: Spans
 ) -> bool:
-    """Lower `row` by steps within it, to the right and to the left."""
+    """Lower `row` by steps within it, to the right and to the left; whether that changed it.
+
+    Both at the same time, for each waits for itself all the way.
+    """
     n = len(row)
     half = np.float32(0.5) * cell
     first, second = cost[: n - 1], cost[1:]
+    steps, right, left = spans[0, : n - 1], spans[1], spans[2]
     for j in range(n - 1):
         steps[j] = half * (first[j] + second[j])
-    changed = False
-    now = row[0]
+    forth, back = row[0], row[n - 1]
+    right[0], left[n - 1] = forth, back
     for j in range(n - 1):
-        found, known = now + steps[j], row[j + 1]
-        changed |= found < known
-        now = found if found < known else known
-        row[j + 1] = now
-    for j in range(n - 2, -1, -1):
-        found, known = now + steps[j], row[j]
-        changed |= found < known
-        now = found if found < known else known
-        row[j] = now
+        forth = min(forth + steps[j], row[j + 1])
+        right[j + 1] = forth
+        k = n - 2 - j
+        back = min(back + steps[k], row[k])
+        left[k] = back
+    changed = False
+    for j in range(n):
+        best = right[j] if right[j] < left[j] else left[j]
+        changed |= best < row[j]
+        row[j] = best
     return changed

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.navigation.chamfer import Chamfer
 from gigabrain_zenoh.navigation.footprint import FAR, Grid
 
 CELL_M = 0.025
@@ -53,10 +54,13 @@ class Window:
 
     def __init__(self, size: float, memory_s: float) -> None:
         self.cells = 2 * round(size / CELL_M / 2)
+        self._chamfer = Chamfer(self.cells, CELL_M, FAR)
         self._memory = round(memory_s * 1e9 / TICK_NS)
         self._level = np.zeros((self.cells, self.cells), dtype=np.uint8)
         self._seen = np.zeros((self.cells, self.cells), dtype=np.int64)  # last, by tick
         self._since = np.zeros((self.cells, self.cells), dtype=np.int64)  # marked without a break
+        self._spare_level = np.zeros_like(self._level)  # new memory takes longer than the move
+        self._spare_seen, self._spare_since = self._seen.copy(), self._since.copy()
         self._row = self._column = 0  # of cell (0, 0), counted from the frame's origin
         self._empty = True
 
@@ -107,10 +111,7 @@ class Window:
             cells = np.floor((known - (self.x, self.y)) / CELL_M).astype(np.int64)
             cells = cells[((cells >= 0) & (cells < self.cells)).all(axis=1)]
             free[cells[:, 1], cells[:, 0]] = 0
-        distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5)
-        distance *= np.float32(CELL_M)
-        np.minimum(distance, np.float32(FAR), out=distance)
-        return Grid(distance, CELL_M, self.x, self.y)
+        return Grid(self._chamfer.distance(free), CELL_M, self.x, self.y)
 
     def _follow(self, place: Place) -> None:
         """Keep the robot in the middle; what leaves the window is forgotten."""
@@ -120,23 +121,25 @@ class Window:
         down, right = row - self._row, column - self._column
         if max(abs(down), abs(right)) <= MOVES_AT * self.cells and not self._empty:
             return
-        self._level = _moved(self._level, down, right)
-        self._seen = _moved(self._seen, down, right)
-        self._since = _moved(self._since, down, right)
+        _move(self._level, self._spare_level, down, right)
+        _move(self._seen, self._spare_seen, down, right)
+        _move(self._since, self._spare_since, down, right)
+        self._level, self._spare_level = self._spare_level, self._level
+        self._seen, self._spare_seen = self._spare_seen, self._seen
+        self._since, self._spare_since = self._spare_since, self._since
         self._row, self._column, self._empty = row, column, False
 
 
-def _moved(cells: NDArray[T], down: int, right: int) -> NDArray[T]:
-    """What a window over `cells` sees that has moved on by so many of them."""
-    moved = np.zeros_like(cells)
+def _move(cells: NDArray[T], to: NDArray[T], down: int, right: int) -> None:
+    """Fill `to` with what a window over `cells` sees that has moved on by so many of them."""
+    to.fill(0)
     count = len(cells)
     if max(abs(down), abs(right)) < count:
         rows = slice(max(0, down), min(count, count + down))
         columns = slice(max(0, right), min(count, count + right))
         rows_to = slice(max(0, -down), min(count, count - down))
         columns_to = slice(max(0, -right), min(count, count - right))
-        moved[rows_to, columns_to] = cells[rows, columns]
-    return moved
+        to[rows_to, columns_to] = cells[rows, columns]
 
 
 @kernel
