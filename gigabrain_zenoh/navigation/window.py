@@ -233,8 +233,7 @@ def _stays(cells: Cells, disc: Floats, tick: int, long_ago: int) -> float:
 def _take_back(cells: Cells, disc: Floats, tick: int) -> None:
     """Free the cells that were first hit after `disc` had come to be over them."""
     x, y, vx, vy, radius = disc[0], disc[1], disc[2], disc[3], disc[4] + ROUND_DISC
-    rows, columns = cells.level.shape
-    square = max(vx * vx + vy * vy, 1e-6)
+    square, (rows, columns) = max(vx * vx + vy * vy, 1e-6), cells.level.shape
     for i in range(max(0, int((y - radius - cells.y) / CELL_M)), rows):
         down = cells.y + (i + 0.5) * CELL_M - y
         if down > radius:
@@ -243,10 +242,8 @@ def _take_back(cells: Cells, disc: Floats, tick: int) -> None:
             right = cells.x + (j + 0.5) * CELL_M - x
             if right > radius:
                 break
-            inside = radius * radius - right * right - down * down
-            if inside < 0.0 or cells.level[i, j] == 0:
-                continue
-            along = right * vx + down * vy
-            ago = (math.sqrt(along * along + square * inside) - along) / square * 1e9 / TICK_NS
-            if cells.since[i, j] >= tick - ago - LATE_TICKS:
-                cells.level[i, j] = 0
+            inside, along = radius**2 - right**2 - down**2, right * vx + down * vy
+            if inside >= 0.0 and cells.level[i, j] > 0:
+                ago = (math.sqrt(along**2 + square * inside) - along) / square * 1e9 / TICK_NS
+                if cells.since[i, j] >= tick - ago - LATE_TICKS:
+                    cells.level[i, j] = 0
