@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("numba")
 
 from gigabrain_zenoh import compiling, kernels
+from gigabrain_zenoh.cli.warm import warm
 from gigabrain_zenoh.process import find
 
 CALLS = """
@@ -75,6 +76,15 @@ def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) 
 @pytest.mark.parametrize("warm_up", [compiling.MAPPING, compiling.FINDING, compiling.DRIVING])
 def test_what_is_to_be_called_is_there(warm_up: str) -> None:
     assert isinstance(find(warm_up), types.FunctionType)
+
+
+def test_what_is_compiled_beforehand_is_what_each_process_calls(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    done: list[str] = []
+    monkeypatch.setattr(compiling, "compile_all", done.append)
+    warm()
+    assert sorted(done) == sorted((compiling.MAPPING, compiling.FINDING, compiling.DRIVING))
 
 
 ALONE = """

@@ -195,6 +195,27 @@ def test_the_window_goes_with_the_robot_and_keeps_what_it_saw() -> None:
         assert grid.distance[row, column] < 0.03
 
 
+@pytest.mark.parametrize(("x", "y"), [(3.5, 0.0), (0.0, -3.5), (-2.5, 2.0), (9.0, 0.0)])
+def test_what_leaves_the_window_is_forgotten(x: float, y: float) -> None:
+    window, around = Window(4.0, 10.0), np.random.default_rng(6).uniform(-1.9, 1.9, (200, 2))
+    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), around)
+    there = _occupied(window.grid(1, NOTHING, NOBODY))
+    window.see(2, Place(x, y, 0.0), (0.0, 0.0), NOTHING)
+    kept = {(a, b) for a, b in there if abs(a - 40 * x) <= 80 and abs(b - 40 * y) <= 80}
+    assert _occupied(window.grid(2, NOTHING, NOBODY)) == kept
+    window.see(3, Place(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    assert _occupied(window.grid(3, NOTHING, NOBODY)) == kept < there
+
+
+def _occupied(grid: Grid) -> set[tuple[float, float]]:
+    """The middles of the occupied cells, in cells from the frame's origin."""
+    rows, columns = np.nonzero(grid.distance == 0.0)
+    x, y = round(grid.x / 0.025), round(grid.y / 0.025)
+    return {
+        (c + x + 0.5, r + y + 0.5) for r, c in zip(rows.tolist(), columns.tolist(), strict=True)
+    }
+
+
 def test_known_points_of_the_map_count_and_are_not_remembered() -> None:
     window = Window(4.0, 10.0)
     window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)

@@ -43,7 +43,7 @@ def draw(drives: Sequence[tuple[Log, Drive]], to: Path) -> None:
 
 def _map(axes: "Axes", log: Log, driven: Drive) -> None:
     keyframes = zip(driven.slam.poses, driven.slam.keyframes, strict=True)
-    walls = np.concatenate([transform(pose, keyframe.scan.points) for pose, keyframe in keyframes])
+    walls = np.concatenate([transform(pose, keyframe.points) for pose, keyframe in keyframes])
     poses = driven.poses()
     reference = _onto(log.reference, poses)
     axes.set_axis_on()

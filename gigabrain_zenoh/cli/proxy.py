@@ -59,7 +59,7 @@ def proxy(
         made: Spoiled = line_proxy(to, _path(listen), baud=baud, seed=seed)
     else:
         made = TcpProxy(_address(to), _own(listen, insecure), seed=seed)
-    asyncio.run(_stand(made, begin))
+    asyncio.run(_stand(made, begin, to))
     return 0
 
 
@@ -81,10 +81,10 @@ class Spoiled(AbstractAsyncContextManager[object], Protocol):
         """Be gone."""
 
 
-async def _stand(proxy: Spoiled, begin: Told) -> None:
+async def _stand(proxy: Spoiled, begin: Told, to: str) -> None:
     async with proxy:
         await obey(proxy, begin)
-        _say(f"{proxy} leads to what is spoiled")
+        _say(f"{proxy} leads to {to}, and spoils it as it is told")
         _say(f"type [{'|'.join(WAYS)}] {' '.join(CALM.__struct_fields__)}; "
              "cut[=rst] unplug plug figures; off ends it")  # fmt: skip
         wishes: asyncio.Queue[str] = asyncio.Queue()

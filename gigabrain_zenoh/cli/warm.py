@@ -27,6 +27,7 @@ def warm() -> None:
 
 
 def _compile(name: str) -> None:
-    from gigabrain_zenoh.compiling import DRIVING, MAPPING, compile_all
+    from gigabrain_zenoh.compiling import DRIVING, FINDING, MAPPING, compile_all
 
-    compile_all(MAPPING if name == "mapping" else DRIVING)
+    for warm_up in (MAPPING, FINDING) if name == "mapping" else (DRIVING,):
+        compile_all(warm_up)

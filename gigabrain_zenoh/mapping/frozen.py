@@ -6,22 +6,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
-from gigabrain_zenoh.mapping.points import Points, Scan
+from gigabrain_zenoh.mapping.points import Points, pairs
 
 Arrays = Mapping[str, NDArray[np.generic]]
 
 
 def freeze_keyframes(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[np.generic]]:
-    """All of the keyframes; their normals are left out, as points give them."""
-    scans = [keyframe.scan for keyframe in keyframes]
+    """All of the keyframes."""
     return {
         **freeze_edges("link", [keyframe.link for keyframe in keyframes]),
         "travel": np.array([keyframe.travel for keyframe in keyframes]),
         "segment": np.array([keyframe.segment for keyframe in keyframes], np.int32),
-        "points": _joined(scan.points for scan in scans),
-        "points_each": np.array([len(scan.points) for scan in scans], np.int32),
-        "free": _joined(scan.free for scan in scans),
-        "free_each": np.array([len(scan.free) for scan in scans], np.int32),
+        "points": _joined(keyframe.points for keyframe in keyframes),
+        "points_each": np.array([len(keyframe.points) for keyframe in keyframes], np.int32),
+        "free": _joined(keyframe.free for keyframe in keyframes),
+        "free_each": np.array([len(keyframe.free) for keyframe in keyframes], np.int32),
     }
 
 
@@ -32,7 +31,7 @@ def thaw_keyframes(arrays: Arrays) -> list[Keyframe]:
     free = _split(arrays["free"], arrays["free_each"])
     rows = zip(links, points, free, arrays["travel"], arrays["segment"], strict=True)
     return [
-        Keyframe(Scan.of(hits, ends), link, float(travel), int(segment))
+        Keyframe(pairs("points", hits), pairs("free", ends), link, float(travel), int(segment))
         for link, hits, ends, travel, segment in rows
     ]
 

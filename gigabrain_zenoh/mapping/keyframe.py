@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.points import Points, Scan, normals
 from gigabrain_zenoh.mapping.se2 import Floats
 
 
@@ -21,7 +21,13 @@ class Edge:
 class Keyframe:
     """A scan that is kept, and the link by which it hangs on an earlier one."""
 
-    scan: Scan
+    points: Points  # as in Scan
+    free: Points
     link: Edge  # the first keyframe hangs on itself, `relative` being its pose in the map
     travel: float  # [m], driven until here
     segment: int  # parts of the drive between which the sequence broke
+
+    @property
+    def scan(self) -> Scan:
+        """The scan; its normals are found anew, as kept they would need as much room as points."""
+        return Scan(self.points, normals(self.points), self.free)

@@ -28,12 +28,13 @@ class Scan:
     @classmethod
     def of(cls, points: NDArray[np.floating], free: NDArray[np.floating] | None = None) -> "Scan":
         """The scan with these hits, (n, 2) in beam order; ValueError for another shape or NaN."""
-        kept = _pairs("points", points)
-        ends = np.empty((0, 2), np.float32) if free is None else _pairs("free", free)
+        kept = pairs("points", points)
+        ends = np.empty((0, 2), np.float32) if free is None else pairs("free", free)
         return cls(kept, normals(kept), ends)
 
 
-def _pairs(name: str, values: NDArray[np.floating]) -> Points:
+def pairs(name: str, values: NDArray[np.floating]) -> Points:
+    """A copy of `values` as (n, 2) points; ValueError for another shape or NaN."""
     if values.ndim != 2 or values.shape[1] != 2:
         raise ValueError(f"{name}: expected shape (n, 2), got {values.shape}")
     if not np.isfinite(values).all():

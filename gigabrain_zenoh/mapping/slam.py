@@ -171,7 +171,7 @@ class Slam:
 
     def freeze(self) -> dict[str, NDArray[np.generic]]:
         """All that it takes to go on later, in arrays. Not while `close_loops` runs."""
-        held = {id(keyframe.scan): k for k, keyframe in enumerate(self.keyframes)}
+        held = {id(keyframe.points): k for k, keyframe in enumerate(self.keyframes)}
         scans, placed = self._front.held
         return {
             **freeze_keyframes(self.keyframes),
@@ -181,7 +181,7 @@ class Slam:
             "behind": np.array(self.behind),
             "searched": np.array(self._search.searched),
             "driven": np.array(self._travel),
-            "local": np.array([held[id(scan)] for scan in scans], np.int32),
+            "local": np.array([held[id(scan.points)] for scan in scans], np.int32),
             "local_poses": np.array(placed).reshape(-1, 3),
             "front": self._front.pose,
             "anchor": np.array(self._anchor[0]),
@@ -235,7 +235,7 @@ class Slam:
         covariance = beside + turned(match.covariance, -float(match.pose[2]))
         doubtful = match.kind in ("odometry", "broken")
         link = Edge(self._anchor[0], here, relative if here else match.pose, covariance, doubtful)
-        self.keyframes.append(Keyframe(scan, link, self._travel, self._segment))
+        self.keyframes.append(Keyframe(scan.points, scan.free, link, self._travel, self._segment))
         self._poses.append(compose(self._poses[link.first], relative) if here else match.pose)
         self._anchor = (here, match.pose)
         self._front.keep(scan, alone=broken)

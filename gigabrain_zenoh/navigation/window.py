@@ -132,14 +132,17 @@ class Window:
 
 def _move(cells: NDArray[T], to: NDArray[T], down: int, right: int) -> None:
     """Fill `to` with what a window over `cells` sees that has moved on by so many of them."""
-    to.fill(0)
     count = len(cells)
-    if max(abs(down), abs(right)) < count:
-        rows = slice(max(0, down), min(count, count + down))
-        columns = slice(max(0, right), min(count, count + right))
-        rows_to = slice(max(0, -down), min(count, count - down))
-        columns_to = slice(max(0, -right), min(count, count - right))
-        to[rows_to, columns_to] = cells[rows, columns]
+    if max(abs(down), abs(right)) >= count:
+        to.fill(0)
+        return
+    rows = slice(max(0, down), min(count, count + down))
+    columns = slice(max(0, right), min(count, count + right))
+    top, left = max(0, -down), max(0, -right)
+    bottom, end = min(count, count - down), min(count, count - right)
+    to[top:bottom, left:end] = cells[rows, columns]
+    to[:top] = to[bottom:] = 0
+    to[:, :left] = to[:, end:] = 0
 
 
 @kernel

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from foxglove import Schema
 from mcap.well_known import MessageEncoding
@@ -36,6 +36,13 @@ def topic_of(key: str) -> Topic[Any] | None:
     return topic if topic and topic.many else None
 
 
+class Way(NamedTuple):
+    """What becomes of messages of one key and encoding."""
+
+    channel: int
+    drawn: Topic[Any] | None  # None where viewers see nothing of them
+
+
 class BagFile:
     """Raises ConfigError when it cannot be created, OSError when the disk takes no more."""
 
@@ -50,10 +57,11 @@ class BagFile:
             self._tape.close()
             path.unlink(missing_ok=True)
             raise ConfigError(f"cannot write {path}: {error.strerror}") from None
-        self._drawer = Drawer() if viewers else None
+        self._viewers, self._drawer = viewers, Drawer()
         self._decoders = {t.type: Codec(t.type, t.max_bytes).decode for t in TOPICS}
         self._schemas: dict[str, int] = {}
-        self._channels: dict[tuple[str, str], int] = {}
+        self._ways: dict[tuple[str, str, bool], Way] = {}
+        self._views: dict[tuple[str, str], int] = {}  # channels by topic and encoding
         self._drawn_ns: dict[str, int] = {}  # when a thinned key was drawn last
         self._thought = (0, -1)  # boot and basis of the intent that was drawn last
         self.pending: Counter[str] = Counter()  # per key, what is not on the disk yet
@@ -77,34 +85,31 @@ class BagFile:
 
     def add(self, arrival: Arrival, *, again: bool = False) -> None:
         """Append one message, and what viewers draw of it; `again` where it is in another file."""
-        count = 0 if again else 1
-        self.pending[arrival.key] += count
-        self.first_ns = self.first_ns or arrival.log_ns
-        channel = self._raw_channel(arrival)
+        log_ns, key, encoding, payload, header = arrival
+        if not again:
+            self.pending[key] += 1
+        self.first_ns = self.first_ns or log_ns
+        place = key, encoding, is_json(payload)
+        way = self._ways.get(place) or self._new_way(place)
+        stamp_ns = header.stamp_ns or log_ns
+        self._writer.add_message(way.channel, log_ns, payload, stamp_ns, header.seq & 0xFFFF_FFFF)
+        if way.drawn and self._worth_drawing(arrival):
+            self._draw(way.drawn, arrival)
         if self._tape.size != self._settled:
-            self._settle(Counter({arrival.key: count}))
-        header = arrival.header
-        stamp_ns = header.stamp_ns or arrival.log_ns
-        self._writer.add_message(
-            channel, arrival.log_ns, arrival.payload, stamp_ns, header.seq & 0xFFFF_FFFF
-        )
-        if self._drawer:
-            self._draw(self._drawer, arrival)
-        if self._tape.size != self._settled:
-            self._settle(Counter())
+            self._settle()
 
     def flush(self) -> None:
         """Bring all that was added to the disk."""
         self._writer.flush()
         if self._tape.size != self._settled:
-            self._settle(Counter())
+            self._settle()
         self._tape.sync()
 
-    def _settle(self, still: Counter[str]) -> None:
-        """The file has grown: all but `still` has been written."""
+    def _settle(self) -> None:
+        """The file has grown: all that was added has been written."""
         self._settled = self._tape.size
-        self.written += self.pending.total() - still.total()
-        self.pending = still
+        self.written += self.pending.total()
+        self.pending = Counter()
 
     def note(self, name: str, values: Mapping[str, str]) -> None:
         """Add a named set of words."""
@@ -119,33 +124,29 @@ class BagFile:
         """Let go of the file, finished or not."""
         self._tape.close()
 
-    def _raw_channel(self, arrival: Arrival) -> int:
-        form = MessageEncoding.JSON if is_json(arrival.payload) else "msgpack"
-        known = self._channels.get((arrival.key, form + arrival.encoding))
-        if known:
-            return known
-        topic = topic_of(arrival.key)
-        notes = {"kind": RAW, "zenoh_encoding": arrival.encoding}
+    def _new_way(self, place: tuple[str, str, bool]) -> Way:
+        key, encoding, json = place
+        topic = topic_of(key)
+        form = MessageEncoding.JSON if json else "msgpack"
+        notes = {"kind": RAW, "zenoh_encoding": encoding}
         schema = self._schema(json_schema(topic.type)) if topic else 0
-        channel = self._writer.register_channel(arrival.key, form, schema, notes)
-        self._channels[arrival.key, form + arrival.encoding] = channel
-        return channel
+        channel = self._writer.register_channel(key, form, schema, notes)
+        drawn = topic if topic and self._viewers and self._drawer.draws(topic) else None
+        self._ways[place] = Way(channel, drawn)
+        return self._ways[place]
 
     def _schema(self, of: Schema) -> int:
         if of.name not in self._schemas:
             self._schemas[of.name] = self._writer.register_schema(of.name, of.encoding, of.data)
         return self._schemas[of.name]
 
-    def _draw(self, drawer: Drawer, arrival: Arrival) -> None:
-        topic = topic_of(arrival.key)
-        if topic is None or not drawer.draws(topic) or not self._worth_drawing(arrival):
-            return
+    def _draw(self, topic: Topic[Any], arrival: Arrival) -> None:
         try:
             message = self._decoders[topic.type](arrival.payload)
         except ValueError:  # not a valid message: kept as it came, but there is nothing to see
             return
         stamp_ns = arrival.header.stamp_ns or arrival.log_ns
-        for drawn in drawer.draw(topic, message, arrival.key.rpartition("/")[2]):
+        for drawn in self._drawer.draw(topic, message, arrival.key.rpartition("/")[2]):
             channel = self._view_channel(drawn)
             self._writer.add_message(channel, arrival.log_ns, drawn.data, stamp_ns)
 
@@ -162,7 +163,7 @@ class BagFile:
 
     def _view_channel(self, drawn: Drawn) -> int:
         place = drawn.topic, drawn.encoding
-        if place not in self._channels:
+        if place not in self._views:
             schema = self._schema(drawn.schema())
-            self._channels[place] = self._writer.register_channel(*place, schema, {"kind": VIEW})
-        return self._channels[place]
+            self._views[place] = self._writer.register_channel(*place, schema, {"kind": VIEW})
+        return self._views[place]

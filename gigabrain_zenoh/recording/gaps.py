@@ -58,9 +58,12 @@ class Gaps:
         """
         if header.seq == 0:  # from somebody who does not count
             return 0
-        sender = key, str(header.process or header.source)[:64]
+        who = header.process or header.source
+        sender = key, str(who)[:64] if who else ""
         last, self._last[sender] = self._last.get(sender), header
         if last is None:
+            return 0
+        if header.seq == last.seq + 1 and header.boot == last.boot:  # as nearly always
             return 0
         if header.seq <= last.seq or self._new_driver(key, last, header):
             self.restarts[key] += 1

@@ -84,12 +84,12 @@ class Intake:
 
     def _look(self) -> None:
         """Read the headers of what waits: late, and of many in a row, which costs less."""
+        newest_ns, looked, see = self._newest_ns, self._looked, self.gaps.see
         for taken_ns, key, encoding, payload in self._waiting:
             header = header_of(payload)
-            self.gaps.see(key, header)
-            came_ns = taken_ns
-            if 0 < taken_ns - header.stamp_ns < WAITED_NS:
-                came_ns = header.stamp_ns
-            self._newest_ns = max(self._newest_ns + 1, came_ns)
-            self._looked.append(Arrival(self._newest_ns, key, encoding, payload, header))
+            see(key, header)
+            came_ns = header.stamp_ns if 0 < taken_ns - header.stamp_ns < WAITED_NS else taken_ns
+            newest_ns = came_ns if came_ns > newest_ns else newest_ns + 1
+            looked.append(Arrival(newest_ns, key, encoding, payload, header))
+        self._newest_ns = newest_ns
         self._waiting.clear()

@@ -19,7 +19,7 @@ from gigabrain_zenoh.settings import RecorderConfig
 log = logging.getLogger(__name__)
 
 MB = 1_000_000
-LOOK_S = 0.25  # how often the queue is emptied, at least: every time costs cold caches
+LOOK_S = 0.35  # how often the queue is emptied, at least: every time costs cold caches
 RETRY_S = 1.0  # how often a full disk is tried again
 Open = Callable[[Path], BagFile]
 
