@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Obstacle, TrajectoryPoint
+from gigabrain_zenoh.navigation import among
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import clearance, outline_of
 from gigabrain_zenoh.navigation.manner import kind_of, reason_of
@@ -47,6 +48,7 @@ class LocalPlanner:
             self._model, settings.samples, settings.steps, step_of(self._model), settings.seed
         )
         self._weights = Weights()
+        self._looks = among.LOOKS_S if among.is_quick(self._model) else 0.0
         self.reset()
 
     def reset(self) -> None:
@@ -55,6 +57,7 @@ class LocalPlanner:
         self._costs = CostToGo(self._window.cells)
         self._sampler.forget()
         self._tick: int | None = None
+        self._began = 0
         self._anchor, self._anchor_tick = Pose(x=0.0, y=0.0, yaw=0.0), 0
 
     def plan(self, moment: Moment) -> LocalPlan:
@@ -68,18 +71,31 @@ class LocalPlanner:
         hits = np.ascontiguousarray(moment.hits, dtype=np.float64)
         self._window.see(moment.tick, place, self._lidar, hits)
         discs = self._window.moving(moment.tick, discs)
+        weights = self._look_out(moment.tick, discs)
         if self._arrived(moment):
             return _standing("arrived: at the goal", arrived=True)
+        if (moment.tick - self._began) * TICK_S < self._looks:
+            return _standing("waiting: it looks round for what moves")
         scene = self._scene(moment, discs)
         model = slowed(self._model, moment.delayed)
         planned = self._sampler.plan(
             model if moment.may_back else model._replace(backward=0.0),
             self._outline,
-            self._weights,
+            weights,
             scene,
             self._start(moment, place),
         )
         return self._answer(moment, scene, planned)
+
+    def _look_out(self, tick: int, discs: Floats) -> Weights:
+        """Get ready for what moves: a quick body among quick things plans in another way."""
+        quick = among.moving_quickly(discs) if among.is_quick(self._model) else discs[:0]
+        if not len(quick):
+            self._sampler.step_by(step_of(self._model))
+            return self._weights
+        self._window.take_back(tick, quick)
+        self._sampler.step_by(among.HORIZON_S / self._settings.steps)
+        return among.WEIGHTS
 
     def _scene(self, moment: Moment, discs: Floats) -> Scene:
         goal = moment.goal
@@ -118,7 +134,9 @@ class LocalPlanner:
         )
 
     def _pass_time(self, moment: Moment) -> None:
-        if self._tick is not None and moment.tick > self._tick:
+        if self._tick is None:
+            self._began = moment.tick
+        elif moment.tick > self._tick:
             self._sampler.shift((moment.tick - self._tick) * TICK_S)
         self._tick = moment.tick
 
@@ -193,14 +211,15 @@ def warm_up(body: BodyDescription) -> None:
     """Compile all that a driving robot will call, with `body`'s own shapes."""
     goal, here = Goal(x=0.5, y=0.0), Pose(x=0.0, y=0.0, yaw=0.0)
     planner = LocalPlanner(body, LocalSettings(samples=64, steps=10, window=2.0))
-    somebody = Obstacle(id=1, x=0.9, y=0.0, velocity_x=1.0, radius=0.3)
-    planner.plan(
-        Moment(
-            tick=1,
-            pose=here,
-            velocity=Velocity(),
-            goal=goal,
-            hits=np.array([[0.9, 0.0]]),
-            obstacles=(somebody,),
+    for tick, x in ((1, 0.9), (51, 0.7)):  # once it has looked round
+        somebody = Obstacle(id=1, x=x, y=0.0, velocity_x=1.0, radius=0.3)
+        planner.plan(
+            Moment(
+                tick=tick,
+                pose=here,
+                velocity=Velocity(),
+                goal=goal,
+                hits=np.array([[x, 0.0]]),
+                obstacles=(somebody,),
+            )
         )
-    )

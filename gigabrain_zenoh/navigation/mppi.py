@@ -61,6 +61,14 @@ class Sampler:
         whole = np.arange(len(self.last))
         self.last = np.stack([np.interp(at, whole, axis) for axis in self.last.T], axis=1)
 
+    def step_by(self, dt: float) -> None:
+        """Plan in as many steps of this length [s] from now on."""
+        if dt != self.dt:
+            at = (np.arange(len(self.last)) + 0.5) * dt / self.dt - 0.5
+            whole = np.arange(len(self.last))
+            self.last = np.stack([np.interp(at, whole, axis) for axis in self.last.T], axis=1)
+            self.dt = dt
+
     def plan(
         self, model: Model, outline: Outline, weights: Weights, scene: Scene, start: Start
     ) -> Planned:

@@ -49,6 +49,8 @@ class Weights(NamedTuple):
     disc: float = 3.0  # of having moving things near, per second
     disc_over: float = 0.3  # [m]
     disc_margin: float = 0.02  # [m]
+    disc_lead: float = 0.0  # [s], so much farther per m/s of a thing's speed
+    trust: float = 0.0  # [s], over which what is foreseen of them fades; 0 where it does not
 
 
 @lean_kernel
@@ -59,7 +61,7 @@ def of_place(
     cost = 0.0
     if room < ROOM:
         cost += weights.near * _exp((weights.margin - room) / weights.near_over)
-    if away < NO_DISC:
+    if away < NO_DISC and weights.trust == 0.0:
         cost += weights.disc * math.exp(-away / weights.disc_over)
     return cost + of_time(scene, x, y, yaw)
 

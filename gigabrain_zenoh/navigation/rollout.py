@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import kernel, lean_kernel
+from gigabrain_zenoh.navigation.among import of_contact, of_discs
 from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance_of, depth_of
 from gigabrain_zenoh.navigation.models import Lag, Model, answer, feasible
 from gigabrain_zenoh.navigation.rating import (
@@ -27,8 +28,8 @@ from gigabrain_zenoh.navigation.rating import (
 
 Floats = NDArray[np.float64]
 
-TOUCHED, TOUCHED_DISC = 300.0, 200.0  # what a contact costs
-LEAST_TOUCHED = 80.0  # of both, in the last step
+TOUCHED = 300.0  # what a contact costs
+LEAST_TOUCHED = 80.0  # or with what moves, in the last step
 IMPACT = 50.0  # per m/s of a contact
 BRAKE_EVERY = 3  # steps
 AT_EASE = 0.25  # [m], room of more than that is not looked at anew before it can have gone
@@ -152,7 +153,7 @@ def _rate(
         min(weights.margin, rooms[0] - 0.003),
         min(weights.disc_margin, away - 0.003),
     )
-    limit = _sound(model, scene, states, limit)
+    limit = _sound(model, weights, scene, dt, states, limit)
     end = of_end(model, weights, scene, last.x, last.y, last.yaw, last.vx, last.vy)
     to_come = end + dt * _anyway(outline, scene, states, least, limit)
     cost: float = 0.0
@@ -168,14 +169,15 @@ def _rate(
             else:
                 room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, touches)
             slack = room - AT_EASE
-        away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, t * dt)
+        away, close = of_discs(weights, discs, outline, at.x, at.y, at.cosine, at.sine, t * dt)
         if room < least:
             cost += TOUCHED * (1.0 - 0.7 * (t / steps)) + rest(model, scene, at.x, at.y)
             cost += IMPACT * math.hypot(at.vx, at.vy)
             return cost
         if away < least_disc:
-            cost += TOUCHED_DISC * (1.0 - 0.6 * (t / steps)) + rest(model, scene, at.x, at.y)
+            cost += of_contact(weights, t * dt, t / steps) + rest(model, scene, at.x, at.y)
             return cost
+        cost += dt * close
         cost += dt * of_place(weights, scene, room, away, at.x, at.y, at.yaw)
         cost += dt * of_motion(weights, room, at.vx, at.vy, at.w)
         to_come -= dt * of_time(scene, at.x, at.y, at.yaw)
@@ -188,15 +190,18 @@ def _rate(
 
 
 @lean_kernel
-def _sound(model: Model, scene: Scene, states: Floats, limit: float) -> float:
+def _sound(
+    model: Model, weights: Weights, scene: Scene, dt: float, states: Floats, limit: float
+) -> float:
     """The `limit`, if no contact on the way costs less; inf otherwise.
 
     What a plan costs that touches nothing says nothing of one that does, and ends there.
     """
-    if limit <= LEAST_TOUCHED or limit == math.inf:
+    least = min(LEAST_TOUCHED, of_contact(weights, (states.shape[0] - 1) * dt, 1.0))
+    if limit <= least or limit == math.inf:
         return limit
     for t in range(1, states.shape[0]):
-        if LEAST_TOUCHED + rest(model, scene, states[t, 0], states[t, 1]) < limit:
+        if least + rest(model, scene, states[t, 0], states[t, 1]) < limit:
             return math.inf
     return limit
 

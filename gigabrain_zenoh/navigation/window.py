@@ -23,6 +23,7 @@ MARKED = 2  # of a cell that was just hit; each beam that passes takes one
 BEYOND_M = 0.1  # [m], how far past a cell a beam must go to have passed it
 STAYS_TICKS = 20  # a cell that was hit so long ago, and is now, belongs to what stands
 MOST_STAY = 0.5  # share of its cells that may, of a thing that moves
+LATE_TICKS = 10  # so much longer than it seems a disc may have been over a cell
 ROUND_DISC = 0.1  # [m], hits so near a moving thing are its own
 MOVES_AT = 0.05  # share of the window that the robot may be off its middle
 
@@ -88,6 +89,11 @@ class Window:
         cells = Cells(self._level, self._seen, self._since, self.x, self.y)
         long_ago = tick - STAYS_TICKS
         return discs[[_stays(cells, disc, tick, long_ago) <= MOST_STAY for disc in discs]]
+
+    def take_back(self, tick: int, discs: Floats) -> None:
+        """Free what each of `discs` (n, 6) covered on its way here: nothing stands there."""
+        for disc in discs:
+            _take_back(Cells(self._level, self._seen, self._since, self.x, self.y), disc, tick)
 
     def grid(self, tick: int, known: Floats, moving: Floats) -> Grid:
         """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m].
@@ -224,3 +230,23 @@ def _stays(cells: Cells, disc: Floats, tick: int, long_ago: int) -> float:
                 hit += 1
                 old += cells.since[i, j] <= long_ago
     return old / hit if hit else 0.0
+
+
+@kernel
+def _take_back(cells: Cells, disc: Floats, tick: int) -> None:
+    """Free the cells that were first hit after `disc` had come to be over them."""
+    x, y, vx, vy, radius = disc[0], disc[1], disc[2], disc[3], disc[4] + ROUND_DISC
+    square, (rows, columns) = max(vx * vx + vy * vy, 1e-6), cells.level.shape
+    for i in range(max(0, int((y - radius - cells.y) / CELL_M)), rows):
+        down = cells.y + (i + 0.5) * CELL_M - y
+        if down > radius:
+            break
+        for j in range(max(0, int((x - radius - cells.x) / CELL_M)), columns):
+            right = cells.x + (j + 0.5) * CELL_M - x
+            if right > radius:
+                break
+            inside, along = radius**2 - right**2 - down**2, right * vx + down * vy
+            if inside >= 0.0 and cells.level[i, j] > 0:
+                ago = (math.sqrt(along**2 + square * inside) - along) / square * 1e9 / TICK_NS
+                if cells.since[i, j] >= tick - ago - LATE_TICKS:
+                    cells.level[i, j] = 0

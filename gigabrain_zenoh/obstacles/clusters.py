@@ -28,6 +28,7 @@ LOST_GAP_M, LOST_BEAMS = 0.10, 6.5  # so near, few beams may be lost on one thin
 MISSING_BEAMS = 2.5  # neighbours so many beams apart are two things
 LARGEST_M = 1.2  # what is longer is a wall
 LARGEST_RADIUS_M = 0.75
+EDGE_BEAMS = 1.5  # so near to the end of the field of view a thing may go on beyond it
 IN_RANGE = 0.97  # of the lidar's range; what reaches beyond is cut off there
 NOISE_M = 0.01  # of a place, beside what the spacing of the beams leaves open
 
@@ -60,6 +61,7 @@ def find_clusters(hits: Floats, lidar: Lidar, spacing: float) -> list[Cluster]:
     last = np.flatnonzero(breaks)
     first = np.concatenate(([0], last[:-1] + 1))
     in_front = _in_front(ranges, empty, first, last, lidar.range_max * IN_RANGE)
+    in_front &= _inside(bearings, first, last, lidar.beams * spacing / 2, spacing)
     sized = _sized(points, ranges, first, last)
     return [
         _disc(ranges[a : b + 1], float(bearings[a]), float(bearings[b]), spacing, whole=whole)
@@ -108,6 +110,16 @@ def _in_front(ranges: Floats, empty: Bools, first: Indices, last: Indices, reach
     left = (free_before | (before > begins)) & (begins < reach)
     right = (free_after | (after > ends)) & (ends < reach)
     found: Bools = left & right
+    return found
+
+
+def _inside(bearings: Floats, first: Indices, last: Indices, half: float, spacing: float) -> Bools:
+    """Which clusters do not reach the end of the field of view, `half` [rad] to each side, (k,)."""
+    if half > math.pi - spacing:
+        return np.ones(len(first), dtype=np.bool_)
+    most = half - EDGE_BEAMS * spacing
+    begins, ends = (np.remainder(bearings[k] + math.pi, math.tau) - math.pi for k in (first, last))
+    found: Bools = (begins > -most) & (ends < most)
     return found
 
 

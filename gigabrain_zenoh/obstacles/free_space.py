@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 TICK_S = TICK_NS / 1e9
+MOVED_M = 0.4  # or by something quick, since it has gone so far
 BEFORE_S = 0.5  # what was seen so long ago is compared
 KEPT = 32  # scans
 MARGIN_M = 0.12  # beyond a point; noise and odometry do not reach so far
@@ -88,7 +89,9 @@ class FreeSpace:
     ) -> bool:
         """Whether a thing at (x, y) [m], which is said to move so fast [m/s], does."""
         now = self._scans[-1]
-        old = [scan for scan in self._scans if (now.tick - scan.tick) * TICK_S >= BEFORE_S]
+        speed = math.hypot(velocity_x, velocity_y)
+        long_ago = BEFORE_S if speed * BEFORE_S < MOVED_M else MOVED_M / speed
+        old = [scan for scan in self._scans if (now.tick - scan.tick) * TICK_S >= long_ago]
         before = old[-1] if old else self._scans[0]
         if before is now:
             return False

@@ -10,6 +10,9 @@ from gigabrain_schemas.brain import Obstacle
 
 ACCELERATION = 0.8  # [m/s2], standard deviation of what a walking person does from scan to scan
 FIRST_SPEED = 1.0  # [m/s], standard deviation of a speed of which nothing is known
+TURNS_S = 0.06  # since it was last seen it may have gone the other way, for so long at most
+TURNED = 16.0  # square of the standard deviations off that noise does not explain
+MOST_OFF, SHIFT_M, FARTHEST_M = 4.0, 0.05, 0.5  # deviations, [m]: what shows in part is so near
 RADIUS_SHARE = 0.25  # of a new radius in the filtered one
 MOVING_M, MOVING_SPEED = 0.15, 0.15  # [m], [m/s]: a thing must go so far, so fast, to count
 SURE = 2.5  # standard deviations that a speed must be off zero
@@ -48,11 +51,16 @@ class Track:
         self.velocity_variance += dt * dt * q
         self.unseen_s += dt
 
-    def correct(self, x: float, y: float, radius: float, noise: float) -> None:
-        """It was seen at (x, y) [m], with a standard deviation of `noise` [m]."""
+    def correct(
+        self, x: float, y: float, radius: float, noise: float, *, whole: bool = False
+    ) -> None:
+        """It was seen at (x, y) [m], as a `whole` or not, with a deviation of `noise` [m]."""
+        dx, dy = x - self.x, y - self.y
+        off = (dx * dx + dy * dy) / (self.position_variance + noise * noise)
+        if whole and self.moving and off > TURNED:
+            self._turn()
         innovation = self.position_variance + noise * noise
         k, kv = self.position_variance / innovation, self.covariance / innovation
-        dx, dy = x - self.x, y - self.y
         self.x += k * dx
         self.y += k * dy
         self.velocity_x += kv * dx
@@ -64,6 +72,28 @@ class Track:
         self.seen += 1
         self._stand(self.unseen_s)
         self.unseen_s = 0.0
+
+    def _turn(self) -> None:
+        """It is not where it should be: since it was last seen it goes another way, or stands."""
+        square = max(self.velocity_x**2 + self.velocity_y**2, FIRST_SPEED**2)
+        self.velocity_variance += square
+        self.covariance += self.unseen_s * square / 2
+        self.position_variance += self.unseen_s**2 * square / 3
+
+    def may_be_at(self, x: float, y: float, noise: float) -> bool:
+        """Whether it can be what was seen at (x, y) [m], with a deviation of `noise` [m]."""
+        most = SHIFT_M + MOST_OFF * math.sqrt(self.position_variance + noise * noise)
+        return math.hypot(x - self.x, y - self.y) < min(FARTHEST_M, most)
+
+    def covers(self, place: tuple[float, float]) -> bool:
+        """Whether a place [m] is within it."""
+        return math.hypot(place[0] - self.x, place[1] - self.y) < self.radius
+
+    @property
+    def may_be_off(self) -> float:
+        """How far it may be from where it should be, for it may have turned round [m]."""
+        speed = math.hypot(self.velocity_x, self.velocity_y)
+        return 2 * speed * min(self.unseen_s, TURNS_S) if self.moving else 0.0
 
     def seems_to_move(self) -> bool:
         """Whether it has gone so far and so fast that it must be told whether it moves."""

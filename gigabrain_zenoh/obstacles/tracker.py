@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle
+from gigabrain_zenoh.obstacles.arc import on_rim, place_of
 from gigabrain_zenoh.obstacles.clusters import Cluster, find_clusters
 from gigabrain_zenoh.obstacles.free_space import FreeSpace, Seen
 from gigabrain_zenoh.obstacles.track import Track
@@ -53,13 +54,13 @@ class ObstacleTracker:
         clusters = find_clusters(hits, lidar, abs(spacing)) if len(hits) else []
         places = [_place(cluster, lidar, pose, cluster.radius) for cluster in clusters]
         taken = self._match(clusters, places)
-        for i, j in taken.items():
-            self._correct(self._tracks[i], clusters[j], lidar, pose)
-        self._space.see(Seen(tick, _placed(hits, pose), lidar, abs(spacing), pose))
+        points = _placed(hits, pose)
+        parts = self._correct_all(clusters, taken, points, lidar, pose)
+        self._space.see(Seen(tick, points, lidar, abs(spacing), pose))
         self._judge()
         self._tracks = [track for track in self._tracks if self._lives(track)]
         for j in set(range(len(clusters))) - set(taken.values()):
-            if clusters[j].whole:
+            if clusters[j].whole and not any(track.covers(places[j]) for track in parts):
                 self._begin(clusters[j], places[j])
         return self._told(pose)
 
@@ -67,13 +68,16 @@ class ObstacleTracker:
         """Which track is which cluster: the best pairs first, within the gates."""
         if not clusters or not self._tracks:
             return {}
-        mine = np.array([(t.x, t.y, t.position_variance, t.radius) for t in self._tracks])
+        mine = np.array(
+            [(t.x, t.y, t.position_variance, t.radius, t.may_be_off) for t in self._tracks]
+        )
         seen = np.array([(*p, c.noise, c.radius) for p, c in zip(places, clusters, strict=True)])
         dx, dy = (mine[:, None, k] - seen[:, k] for k in (0, 1))
         squares = dx * dx + dy * dy
         variance = mine[:, None, 2] + (2 * seen[:, 2]) ** 2
         other_size = np.abs(mine[:, None, 3] - seen[:, 3])
-        fits = (squares < GATE**2 * variance) & (squares < (FARTHEST_JUMP_M + other_size) ** 2)
+        gates = np.maximum(GATE * np.sqrt(variance), mine[:, None, 4] + 2 * seen[:, 2])
+        fits = (squares < gates**2) & (squares < (FARTHEST_JUMP_M + other_size) ** 2)
         cost = squares / variance + (other_size / 0.2) ** 2
         pairs = np.argwhere(fits)
         taken: dict[int, int] = {}
@@ -84,10 +88,35 @@ class ObstacleTracker:
                 used.add(j)
         return taken
 
+    def _correct_all(
+        self, clusters: list[Cluster], taken: dict[int, int], points: Floats, lidar: Lidar,
+        pose: Pose,
+    ) -> list[Track]:  # fmt: skip
+        """Correct what was seen. Told are the moving things of which only a part was."""
+        whole, parts = [], []
+        for i, track in enumerate(self._tracks):
+            cluster = clusters[taken[i]] if i in taken else None
+            if track.moving and not (cluster and cluster.whole):
+                parts.append(track)
+            elif cluster:
+                self._correct(track, cluster, lidar, pose)
+                whole.append(track)
+        parts.sort(key=lambda track: track.position_variance)
+        for track in whole if parts else ():
+            points = points[~on_rim(points, track.x, track.y, track.radius)]
+        found = []
+        for track in parts:
+            place = place_of(points, track.x, track.y, track.radius)
+            if place and track.may_be_at(*place):
+                track.correct(place[0], place[1], track.radius, place[2])
+                points = points[~on_rim(points, track.x, track.y, track.radius)]
+                found.append(track)
+        return found
+
     def _correct(self, track: Track, cluster: Cluster, lidar: Lidar, pose: Pose) -> None:
         x, y = _place(cluster, lidar, pose, track.radius)
         if cluster.whole:
-            track.correct(x, y, cluster.radius, cluster.noise)
+            track.correct(x, y, cluster.radius, cluster.noise, whole=True)
         else:  # what is hidden of it is not missing from its size
             track.correct(x, y, track.radius, PARTLY * cluster.noise)
 

@@ -1,0 +1,147 @@
+"""A quick body among quick things; all others plan as if there were none of that."""
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.brain import Obstacle
+from gigabrain_zenoh.bench.barn_drive import drive
+from gigabrain_zenoh.bench.barn_worlds import Moving, World
+from gigabrain_zenoh.bench.plant import HARD, JACKAL
+from gigabrain_zenoh.navigation import among
+from gigabrain_zenoh.navigation.footprint import outline_of
+from gigabrain_zenoh.navigation.local import Goal, LocalPlan, LocalPlanner, LocalSettings, Moment
+from gigabrain_zenoh.navigation.models import model_of
+from gigabrain_zenoh.navigation.mppi import Sampler
+from gigabrain_zenoh.navigation.rating import Weights
+from gigabrain_zenoh.navigation.window import Place, Window
+from tests.local_rig import OMNI, WAFFLE, wall
+
+NOTHING = np.empty((0, 2))
+NOBODY = np.empty((0, 6))
+FEW = LocalSettings(samples=128, window=6.0)
+LOOKED = round(among.LOOKS_S / 0.02) + 1  # ticks
+
+
+def plans(body: BodyDescription, speed: float, cycles: int = 3) -> list[LocalPlan]:
+    """What is planned once it has looked round, somebody 1.5 m ahead crossing so fast [m/s]."""
+    planner, made = LocalPlanner(body, FEW), []
+    for tick in (1, *range(LOOKED, LOOKED + 4 * cycles, 4)):
+        y = -1.0 + speed * 0.02 * tick
+        away = math.hypot(1.5, y)
+        hit = np.array([(1.5, y)]) * (1.0 - 0.3 / away)
+        somebody = Obstacle(id=1, x=1.5, y=y, velocity_y=speed, radius=0.3)
+        made.append(
+            planner.plan(
+                Moment(
+                    tick=tick,
+                    pose=Pose(x=0.0, y=0.0, yaw=0.0),
+                    velocity=Velocity(),
+                    goal=Goal(x=2.5, y=0.0),
+                    hits=hit,
+                    obstacles=(somebody,),
+                )
+            )
+        )
+    return made[1:]
+
+
+@pytest.mark.parametrize(
+    ("body", "speed"), [(WAFFLE, 1.2), (OMNI, 1.2), (WAFFLE, 0.0), (JACKAL, 0.0), (JACKAL, 0.25)]
+)
+def test_slow_bodies_and_those_among_what_is_slow_plan_as_ever(
+    body: BodyDescription, speed: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = plans(body, speed)
+    monkeypatch.setattr(among, "moving_quickly", lambda discs: discs[:0])
+    assert plans(body, speed) == here
+
+
+def test_a_quick_body_among_quick_things_looks_two_seconds_ahead(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    here = plans(JACKAL, 1.2)
+    assert here[0].trajectory[-1].t == pytest.approx(2.0)
+    monkeypatch.setattr(among, "moving_quickly", lambda discs: discs[:0])
+    there = plans(JACKAL, 1.2)
+    assert there[0].trajectory[-1].t == pytest.approx(1.5)
+    assert there != here
+
+
+def test_a_quick_body_looks_round_before_it_first_drives_off() -> None:
+    planner = LocalPlanner(JACKAL, FEW)
+    moment = Moment(
+        tick=100,
+        pose=Pose(x=0.0, y=0.0, yaw=0.0),
+        velocity=Velocity(),
+        goal=Goal(x=2.5, y=0.0),
+        hits=NOTHING,
+    )
+    first, last = planner.plan(moment), planner.plan(replace(moment, tick=129))
+    for one in (first, last):
+        assert (one.twist, one.kind) == (Velocity(), "waiting")
+        assert one.reason == "waiting: it looks round for what moves"
+    assert planner.plan(replace(moment, tick=130)).twist.linear_x > 0.0
+    slow = LocalPlanner(WAFFLE, FEW)
+    assert slow.plan(moment).twist.linear_x > 0.0
+
+
+def test_who_is_faster_costs_more_from_the_same_distance() -> None:
+    outline = outline_of(JACKAL.footprint)
+    weights = Weights(disc=9.0, disc_over=0.3, disc_lead=0.1, trust=0.7)
+    near = partial(among.near_discs, weights, outline=outline, x=0.0, y=0.0, cosine=1.0, sine=0.0)
+    slow = np.array([(1.0, 0.0, 0.0, 0.0, 0.3, 0.0)])
+    quick = np.array([(1.0, -2.0, 0.0, 2.0, 0.3, 0.0)])
+    away, cost = near(discs=slow, t=1.0)
+    assert away == pytest.approx(1.0 - 0.229 - 0.3)
+    assert cost == pytest.approx(9.0 * math.exp(-0.471 / 0.3))
+    assert near(discs=quick, t=1.0) == pytest.approx((0.471, 9.0 * math.exp(-0.471 / 0.5)))
+    assert near(discs=np.vstack([slow, quick]), t=1.0)[1] == pytest.approx(
+        9.0 * (math.exp(-0.471 / 0.3) + math.exp(-0.471 / 0.5))
+    )
+    assert near(discs=quick, t=0.0)[0] == pytest.approx(math.hypot(0.771, 1.792) - 0.3)
+
+
+def test_a_plan_goes_on_as_it_was_where_its_steps_become_longer() -> None:
+    sampler = Sampler(model_of(JACKAL), 64, 30, 0.05, 0)
+    times = (np.arange(30) + 0.5) * 0.05
+    sampler.last = np.tile(times[:, None], 3)
+    sampler.step_by(2.0 / 30)
+    assert sampler.dt == pytest.approx(0.0667, abs=1e-4)
+    want = np.minimum((np.arange(30) + 0.5) * 2.0 / 30, times[-1])
+    assert sampler.last[:, 0] == pytest.approx(want)
+
+
+def test_what_moves_takes_its_hits_along_and_a_wall_beside_it_stays() -> None:
+    window, here = Window(4.0, 10.0), Place(0.0, 0.0, 0.0)
+    beside = wall((0.4, 0.38), (1.6, 0.38))
+    for tick in range(1, 40, 2):
+        x = 1.5 - 0.02 * tick  # 1 m/s, towards the lidar
+        front = wall((x - 0.3, -0.15), (x - 0.3, 0.15))
+        window.see(tick, here, (0.0, 0.0), np.concatenate([front, beside]))
+        moving = np.array([(x, 0.0, -1.0, 0.0, 0.3, 0.0)])
+        assert len(window.moving(tick, moving)) == 1
+        window.take_back(tick, moving)
+    left = window.grid(39, NOTHING, NOBODY).distance
+    assert left[80, 80 + 32] == pytest.approx(0.38, abs=0.04)
+    assert left[80 + 15, 80 + 32] < 0.03
+
+
+def test_a_stream_of_quick_discs_is_crossed_on_the_hard_plant() -> None:
+    lanes = [
+        Moving(8.0, np.array([(0.0, 3.0 + i % 2, s * 6.4), (8.0, 3.0 + i % 2, -s * 6.4)]), 0.5)
+        for i, s in enumerate((1.0, -1.0))
+    ]
+    later = [
+        Moving(8.0, np.roll(lane.keys, 0, axis=0) + np.array((0.0, 2.5, 0.0)), 0.5)
+        for lane in lanes
+    ]
+    world = World(5, np.empty((0, 3)), (*lanes, *later), (0.0, 0.0, 0.0), (9.0, 0.0), 9.0)
+    trial = drive(world, 0, HARD, 200)
+    assert trial.result == "success"
+    assert trial.least_clearance > 0.02

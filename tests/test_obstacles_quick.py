@@ -1,0 +1,77 @@
+"""Quick things that turn, and those of which only a part can be seen."""
+
+import math
+
+import numpy as np
+import pytest
+
+from gigabrain_schemas.brain import Obstacle
+from gigabrain_zenoh.obstacles.arc import place_of
+from tests.test_obstacles import JACKAL, Watch, nearest
+
+RADIUS = 0.5
+
+
+def rim(begin: float, end: float, count: int) -> np.ndarray:
+    """Points on a disc of RADIUS at (2.0, 1.0), between two bearings [degrees] from its middle."""
+    angles = np.radians(np.linspace(begin, end, count))
+    return np.column_stack((2.0 + RADIUS * np.cos(angles), 1.0 + RADIUS * np.sin(angles)))
+
+
+def off(one: Obstacle, vx: float, vy: float) -> float:
+    return math.hypot(one.velocity_x - vx, one.velocity_y - vy)
+
+
+def test_a_third_of_a_rim_says_where_the_middle_is() -> None:
+    place = place_of(rim(150, 270, 20), 2.1, 1.08, RADIUS)
+    assert place is not None
+    x, y, noise = place
+    assert (x, y) == pytest.approx((2.0, 1.0), abs=0.005)
+    assert noise < 0.01
+
+
+def test_the_less_of_a_rim_is_seen_the_less_sure_is_its_middle() -> None:
+    wide, narrow = (place_of(rim(210 - a, 210 + a, 20), 2.0, 1.0, RADIUS) for a in (60, 8))
+    assert wide is not None
+    assert narrow is not None
+    assert narrow[2] > 3 * wide[2]
+
+
+def test_a_wall_and_a_few_hits_are_no_rim() -> None:
+    straight = np.column_stack((np.linspace(1.0, 3.0, 60), np.full(60, 1.4)))
+    assert place_of(straight, 2.0, 1.0, RADIUS) is None
+    assert place_of(rim(150, 270, 3), 2.0, 1.0, RADIUS) is None
+
+
+def test_a_quick_thing_that_turns_back_is_believed_within_a_fifth_of_a_second() -> None:
+    watch = Watch(JACKAL, (), hz=25.0)
+    turn = 1.2
+    seen = watch.walk(lambda t: (3.0, -1.5 + 1.7 * (turn - abs(t - turn))), 36, RADIUS)
+    before, after = seen[28], seen[35]  # at 1.16 s and at 1.44 s
+    one, other = nearest(before, 3.0, 0.47), nearest(after, 3.0, 0.13)
+    assert off(one, 0.0, 1.7) < 0.2
+    assert off(other, 0.0, -1.7) < 0.4
+    assert other.id == one.id
+    assert len([o for o in after if math.hypot(o.velocity_x, o.velocity_y) > 0.3]) == 1
+
+
+def test_what_passes_behind_a_post_keeps_its_speed_though_only_a_part_of_it_is_seen() -> None:
+    watch, post = Watch(JACKAL, (), hz=25.0), (1.5, 0.0, 0.2)
+    for scan in range(1, 76):
+        y = -1.8 + 1.2 * scan / 25
+        obstacles = watch.scan(post, (3.0, y, RADIUS))
+        if scan > 20:
+            one = nearest(obstacles, 3.0, y)
+            assert off(one, 0.0, 1.2) < 0.3
+            assert math.hypot(one.x - 3.0, one.y - y) < 0.1
+
+
+def test_what_leaves_the_field_of_view_does_not_seem_to_turn() -> None:
+    watch = Watch(JACKAL, (), hz=25.0, fov=math.radians(270))
+    for scan in range(1, 66):
+        x = 1.5 - 1.5 * scan / 25  # past the robot and away behind it
+        obstacles = watch.scan((x, 1.4, RADIUS))
+        if scan > 20:
+            one = nearest(obstacles, x, 1.4)
+            assert off(one, -1.5, 0.0) < 0.3
+            assert math.hypot(one.x - x, one.y - 1.4) < 0.15
