@@ -77,8 +77,7 @@ class Window:
     def see(self, tick: int, place: Place, lidar: tuple[float, float], hits: Floats) -> None:
         """Take in a scan: `hits` (n, 2) [m] in the body's frame, the `lidar` at (x, y) in it."""
         self._follow(place)
-        cells = Cells(self._level, self._seen, self._since, self.x, self.y)
-        _observe(cells, place, lidar, hits, tick, tick - self._memory)
+        _observe(self._held, place, lidar, hits, tick, tick - self._memory)
 
     def moving(self, tick: int, discs: Floats) -> Floats:
         """Those of the `discs` (n, 6), x, y [m] first and the radius fifth, that really move.
@@ -86,14 +85,13 @@ class Window:
         What moves hits cells that were free a moment ago. Posts and corners can be taken for one
         another, and then seem to move; but they keep hitting the same cells.
         """
-        cells = Cells(self._level, self._seen, self._since, self.x, self.y)
-        long_ago = tick - STAYS_TICKS
-        return discs[[_stays(cells, disc, tick, long_ago) <= MOST_STAY for disc in discs]]
+        held, long_ago = self._held, tick - STAYS_TICKS
+        return discs[[_stays(held, disc, tick, long_ago) <= MOST_STAY for disc in discs]]
 
     def take_back(self, tick: int, discs: Floats) -> None:
         """Free what each of `discs` (n, 6) covered on its way here: nothing stands there."""
         for disc in discs:
-            _take_back(Cells(self._level, self._seen, self._since, self.x, self.y), disc, tick)
+            _take_back(self._held, disc, tick)
 
     def grid(self, tick: int, known: Floats, moving: Floats) -> Grid:
         """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m].
@@ -112,6 +110,10 @@ class Window:
             cells = cells[((cells >= 0) & (cells < self.cells)).all(axis=1)]
             free[cells[:, 1], cells[:, 0]] = 0
         return Grid(self._chamfer.distance(free), CELL_M, self.x, self.y)
+
+    @property
+    def _held(self) -> Cells:
+        return Cells(self._level, self._seen, self._since, self.x, self.y)
 
     def _follow(self, place: Place) -> None:
         """Keep the robot in the middle; what leaves the window is forgotten."""
@@ -147,12 +149,7 @@ def _move(cells: NDArray[T], to: NDArray[T], down: int, right: int) -> None:
 
 @kernel
 def _observe(
-    cells: Cells,
-    place: Place,
-    lidar: tuple[float, float],
-    hits: Floats,
-    tick: int,
-    oldest: int,
+    cells: Cells, place: Place, lidar: tuple[float, float], hits: Floats, tick: int, oldest: int
 ) -> None:
     """Forget what is older than `oldest`, take back what beams have passed, mark what they hit."""
     level, seen = cells.level, cells.seen
