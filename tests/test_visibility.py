@@ -26,13 +26,6 @@ def scan(walls: Floats, pose: Floats) -> Scan:
     return Lidar(180, reach=6.0).scan(walls, pose)
 
 
-def ahead(walls: Floats, pose: Floats) -> Scan:
-    """What is seen by a lidar that looks ahead only."""
-    lidar = Lidar(180, reach=6.0)
-    lidar.angles = np.radians(np.arange(-90.0, 90.0))
-    return lidar.scan(walls, pose)
-
-
 def test_a_scan_looks_through_nothing_where_it_was_taken() -> None:
     shown, there = scan(ROOM, IDENTITY).points, np.array((0.4, -0.5, 0.6))
     assert seen_through(shown, scan(ROOM, there).points, there) == pytest.approx(0.0, abs=0.02)
@@ -58,9 +51,13 @@ def test_of_a_place_that_shows_nothing_nothing_is_said() -> None:
 def test_a_robot_that_backs_along_a_corridor_does_not_slide_back_over_what_it_knows() -> None:
     """Half of each scan is new then: what fits best is a place too far ahead."""
     poses = line(np.array((5.0, 0.0, 0.0)), np.array((-25.0, 0.1, 0.0)), 1.0)
-    slam = Slam(poses[0])
     steps = np.concatenate((IDENTITY[None], drifting(poses, turn=0.01, scale=1.04)))
-    for pose, step in zip(poses, steps, strict=True):
-        estimate = slam.add(ahead(CORRIDOR, pose), step)
-    off = between(poses[-1], estimate.pose)
-    assert np.hypot(off[0], off[1]) < 1.5  # 5 % of the way, along which little tells it from others
+    off = []
+    for seed in range(1, 4):
+        lidar = Lidar(180, reach=6.0, seed=seed)
+        lidar.angles = np.radians(np.arange(-90.0, 90.0))  # it looks ahead only
+        slam = Slam(poses[0])
+        for pose, step in zip(poses, steps, strict=True):
+            estimate = slam.add(lidar.scan(CORRIDOR, pose), step)
+        off.append(np.hypot(*between(poses[-1], estimate.pose)[:2]))
+    assert np.mean(off) < 1.5  # 5 % of the way, along which little tells it from others
