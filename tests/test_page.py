@@ -172,12 +172,11 @@ async def test_on_a_phone_nothing_is_cut_off_and_the_joystick_drives(
     await ready_to_drive(page)
     await page.locator("#stick").scroll_into_view_if_needed()
     await page.evaluate("scrollBy(0, 150)")
+    await page.locator("#stick").hover()  # in its middle, once it stays where it is
+    await page.mouse.down()
     stick = await page.locator("#stick").bounding_box()
     assert stick
-    x, y = stick["x"] + stick["width"] / 2, stick["y"] + stick["height"] / 2
-    await page.mouse.move(x, y)
-    await page.mouse.down()
-    await page.mouse.move(x - stick["width"] / 2, y)
+    await page.mouse.move(stick["x"], stick["y"] + stick["height"] / 2)
     await turning(seen)
     await page.mouse.up()
     await seen.still()
