@@ -112,7 +112,8 @@ def _absent(samples: list[Sample], seen: Seen) -> int:
     there = {(s.key, s.header.boot, s.header.seq) for s in samples}
     first_ns, last_ns = samples[0].log_ns, samples[-1].log_ns
     margin_ns = round(MARGIN_S * 1e9)
-    due = (what for what, ns in seen.items() if first_ns + margin_ns < ns < last_ns - margin_ns)
+    until_now = seen.copy().items()  # it goes on being written, by another thread
+    due = (what for what, ns in until_now if first_ns + margin_ns < ns < last_ns - margin_ns)
     return sum(what not in there for what in due)
 
 
