@@ -34,11 +34,8 @@ lint: setup
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-# a file stays in one process: its robots are shared. What fails beside another file's robots is
-# judged by itself, with all cores: then it counts
 unit: setup
-	$(BIN)/pytest -n 2 --dist loadfile $(ARGS) || { [ $$? -eq 1 ] && \
-	  $(BIN)/pytest --last-failed --last-failed-no-failures none $(ARGS); }
+	$(BIN)/pytest -n 2 --dist loadfile $(ARGS)  # a file stays in one process: its robots are shared
 
 bench: setup
 	$(BIN)/gigabrain bench chain

@@ -60,4 +60,4 @@ def test_a_robot_that_backs_along_a_corridor_does_not_slide_back_over_what_it_kn
         for pose, step in zip(poses, steps, strict=True):
             estimate = slam.add(lidar.scan(CORRIDOR, pose), step)
         off.append(np.hypot(*between(poses[-1], estimate.pose)[:2]))
-    assert np.mean(off) < 1.5  # 5 % of the way, along which little tells it from others
+    assert max(off) < 1.5  # 5 % of the way, along which little tells it from others
