@@ -47,11 +47,18 @@ def chart_of(config: PerceptionConfig, in_time: InTime = done) -> Chart:
     if config.mapping == "localize":
         if path is None:
             raise ConfigError("perception: map: expected a saved map, as mapping is 'localize'")
-        return KnownMap(map_file.load(path), in_time=in_time)
+        saved = map_file.load(path)
+        if problem := map_file.what_is_wrong(saved):
+            raise ConfigError(f"{path}: {problem}; expected one to find the way in")
+        return KnownMap(saved, in_time=in_time)
     from gigabrain_zenoh.mapping.growing import GrowingMap  # and gtsam: only who makes maps pays
 
     if path:
-        return GrowingMap.thaw(map_file.load_graph(path), in_time=in_time)
+        graph = map_file.load_graph(path)
+        try:
+            return GrowingMap.thaw(graph, in_time=in_time)
+        except ConfigError as error:
+            raise ConfigError(f"{path.with_suffix(map_file.GRAPH)}: {error}") from None
     return GrowingMap(in_time=in_time)
 
 
@@ -80,6 +87,7 @@ class Mapper:
         self._shown_tick = 0
         self._said, self._left_out = "", ""
         self._took_ms = Newest(TIMED)
+        self._saving = asyncio.Lock()  # two at once would write into each other's files
         bus.serve(MAP_SAVE, self._save)
         bus.report = self._report
 
@@ -175,10 +183,11 @@ class Mapper:
 
     async def _save(self, request: MapRequest) -> MapReply:
         grant(self._bus, MAP_SAVE.key, request, self._last.tick if self._last else 0)
-        path = map_file.path_of(request.name)
+        path = map_file.saved_as(request.name)
         same = bool(self._config.map) and path == map_file.path_of(self._config.map)
         try:
-            text = await self._saved(path, replace=request.replace or same)
+            async with self._saving:
+                text = await self._saved(path, replace=request.replace or same)
         except Refused as error:
             log.warning("map for %s: %s", request.source, error, extra={"data": {"event": "map"}})
             return MapReply(ok=False, text=str(error)[:500])

@@ -5,6 +5,7 @@ import pytest
 
 from gigabrain_zenoh.mapping.field import field_of, fit
 from gigabrain_zenoh.mapping.known import KnownMap
+from gigabrain_zenoh.mapping.likeness import alike
 from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.relocalize import Candidate, search
 from tests.map_rig import (
@@ -103,7 +104,7 @@ def test_while_two_places_look_alike_neither_is_believed(corridor: SavedMap) -> 
     robot = walker(corridor, walls, 1.5, 0.7)
     place = robot.look(30)
     assert not place.localized
-    assert place.why == "2 places look like this"
+    assert place.why == "it could be in 2 places"
     assert not robot.go((2.5, 0.7)).localized  # not from there either
     place = robot.go((7.5, 0.8))
     assert place.localized
@@ -126,16 +127,36 @@ def test_a_place_that_is_mapped_whole_is_not_taken_for_one_that_is_mapped_half(x
     robot = walker(hall(9), HALL, x, 3.0)
     place = robot.look(16)
     assert not place.localized
-    assert place.why == "2 places look like this"
+    assert place.why == "it could be in 2 places"
+
+
+@pytest.mark.parametrize("reach", [9, 15])  # m of the hall that are mapped
+def test_in_a_hall_that_is_the_same_from_both_ends_neither_is_believed(reach: int) -> None:
+    saved, rooms = hall(reach), Rooms(HALL)
+    for k, x in enumerate((4.8, 6.5, 8.0, 9.2, 10.5, 11.0, 11.4, 11.8)):
+        robot = Walker(rooms, KnownMap(saved, PATIENCE_S), at(x, 2.8, 50 * k))
+        places = [robot.look(16), robot.go((8.5, 2.8)), robot.go((8.0, 2.0))]
+        wrong = [place for place in places if place.localized and error(place, robot.pose) > 0.3]
+        assert not wrong, x
+        assert places[-1].localized or places[-1].why.startswith("it could be in ")
+
+
+def test_a_hall_goes_on_as_itself_turned_about() -> None:
+    half = hall(9)
+    field = field_of(half.cells, half.resolution, (half.origin_x, half.origin_y))
+    assert alike(field, at(16.0, 6.0, 180))
+    assert not alike(field, at(15.0, 6.0, 180))
+    assert not alike(field, at(-3.5, 0.0))  # but for its long walls
+    assert not alike(field, at(-20.0, 0.0))  # nothing comes to lie on anything
 
 
 def test_where_it_was_known_to_be_last_stays_a_place_if_it_explains_what_is_seen() -> None:
-    saved, view = hall(8), Rooms(HALL).view(at(10.5, 3.0))
+    saved, view = hall(8), Rooms(HALL).view(at(12.0, 3.0))  # little of what is seen is mapped
     field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
     scan = view.scan.points, view.scan.free, view.sensor
-    assert ends(search(field, *scan)) == [5.5]  # the other end of the hall
-    assert ends(search(field, *scan, at(10.5, 3.0))) == [5.5, 10.5]
-    assert ends(search(field, *scan, at(3.0, 3.0))) == [5.5]
+    assert ends(search(field, *scan)) == [4.0, 11.4]  # the other end of the hall, and the next wall
+    assert ends(search(field, *scan, at(12.0, 3.0))) == [4.0, 11.4, 11.9]
+    assert ends(search(field, *scan, at(3.0, 3.0))) == [4.0, 11.4]
 
 
 def test_in_open_space_it_goes_on_by_odometry_until_that_is_too_vague(house: SavedMap) -> None:

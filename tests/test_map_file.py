@@ -1,10 +1,15 @@
 """Maps on disk: what was saved comes back, what is damaged is refused, a good map is never lost."""
 
+import math
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
+from gigabrain_schemas.requests import MapRequest
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.map_file import SavedMap
@@ -80,6 +85,10 @@ def ascii_pgm(image: bytes) -> bytes:
     return image.replace(b"P5", b"P2", 1)
 
 
+def endless(image: bytes) -> bytes:
+    return image.replace(b"120", b"1" * 5000, 1)
+
+
 def enormous(image: bytes) -> bytes:
     return image.replace(b"120 100", b"120000 100000", 1)
 
@@ -91,6 +100,7 @@ def enormous(image: bytes) -> bytes:
         (longer, "room.pgm: of another size: 12001 of 120 x 100 pixels are there"),
         (other_maxval, "room.pgm: a maxval of 65535; expected 255"),
         (ascii_pgm, "room.pgm: no binary PGM; expected a header such as 'P5 640 480 255'"),
+        (endless, "room.pgm: no binary PGM; expected a header such as 'P5 640 480 255'"),
         (enormous, "room.pgm: 120000 x 100000 pixels; expected 1 to 8000000 in all"),
     ],
 )
@@ -109,6 +119,8 @@ def test_a_damaged_image_is_refused_in_one_line(damage: object, told: str, path:
         ("origin: [-2.35, 1.1, 0.0]\n", "", "room.yaml:1: missing field 'origin'"),
         ("resolution: 0.05", "resolution: 0", "room.yaml:2: resolution"),
         ("resolution: 0.05", "resolution: .nan", "room.yaml:2: .nan is not allowed"),
+        ("resolution: 0.05", "resolution: 1e9", "room.yaml:2: resolution: expected a number >= 0."),
+        ("room.pgm", '"room\\0.pgm"', "room.yaml:1: image: expected a string matching"),
         ("0.0]", "0.7]", "room.yaml: origin: turned by 0.7 rad; expected yaw 0"),
         ("0.196", "0.7", "room.yaml: free_thresh must be below occupied_thresh"),
         ("room.pgm", "gone.pgm", "gone.pgm: the map's image: No such file or directory"),
@@ -132,6 +144,31 @@ def test_a_cut_graph_is_refused_in_one_line(keep: int, path: Path) -> None:
         map_file.load_graph(path)
     assert f"{graph}: cut or damaged" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("bad", [np.array([math.nan, 0.0]), np.array(["x"]), np.array([1e300])])
+def test_a_graph_of_something_else_than_numbers_is_refused_in_one_line(
+    bad: NDArray[Any], path: Path
+) -> None:
+    np.savez(path.with_suffix(".graph.npz"), poses=bad, allow_pickle=False)
+    with pytest.raises(ConfigError, match=r"npz: cut or damaged: poses holds something"):
+        map_file.load_graph(path)
+
+
+def test_a_graph_of_another_map_is_refused(path: Path) -> None:
+    other = SavedMap(np.roll(room().cells, 3, axis=1), 0.05, -2.35, 1.1)
+    elsewhere = path.with_name("other.yaml")
+    map_file.save(elsewhere, other, GRAPH)
+    elsewhere.with_suffix(".graph.npz").replace(path.with_suffix(".graph.npz"))
+    with pytest.raises(ConfigError, match=r"npz: belongs to another map than .*room"):
+        map_file.load_graph(path)
+
+
+def test_a_graph_without_its_grid_is_refused(path: Path) -> None:
+    image = path.with_suffix(".pgm")
+    image.write_bytes(cut(image.read_bytes()))
+    with pytest.raises(ConfigError, match="cut: 4985 of 120 x 100 pixels are there"):
+        map_file.load_graph(path)
 
 
 def empty() -> SavedMap:
@@ -175,6 +212,7 @@ def test_a_save_that_fails_half_way_leaves_the_old_map(
     with pytest.raises(Refused, match="No space left on device"):
         map_file.save(path, room(), GRAPH, replace=True)
     monkeypatch.undo()
+    assert len(list(path.parent.iterdir())) == 3  # what was begun does not fill the disk
     assert np.array_equal(map_file.load(path).cells, room().cells)
     map_file.save(path, room(), GRAPH, replace=True)
     assert len(list(path.parent.iterdir())) == 3
@@ -199,3 +237,10 @@ def test_a_name_is_a_file_in_the_state_folder_and_a_path_is_itself(
     assert map_file.path_of("office") == Path("/state/gigabrain/maps/office.yaml")
     assert map_file.path_of("maps/office.yaml") == Path("maps/office.yaml")
     assert map_file.path_of("office.yml") == Path("office.yml")
+
+
+@pytest.mark.parametrize("name", ["office.yaml", "a.yml", "office\n", ".hidden", "../x", ""])
+def test_a_map_is_not_saved_under_a_name_that_would_be_a_file_elsewhere(name: str) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert({"name": name}, MapRequest)
+    assert msgspec.convert({"name": "office-2.b"}, MapRequest).name == "office-2.b"

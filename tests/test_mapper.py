@@ -2,8 +2,9 @@
 
 import asyncio
 import functools
+import time
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
 from gigabrain_schemas.requests import MapReply, MapRequest
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, MAP, MAP_SAVE, POSE, SCAN, STATE, WORLD
-from gigabrain_zenoh import perception
+from gigabrain_zenoh import config, perception
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapper import chart_of
@@ -218,6 +219,28 @@ async def test_a_map_is_saved_and_found_in_again(own_maps: Path) -> None:
     assert reply.text == "not saved: perception finds its way in a saved map, it makes none"
 
 
+async def test_two_who_save_at_once_do_not_write_into_each_others_files(
+    own_maps: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, writing, most = map_file.save, [0], [0]
+
+    def slow(*args: Any, **how: Any) -> None:
+        writing[0] += 1
+        most[0] = max(most[0], writing[0])
+        time.sleep(0.05)
+        real(*args, **how)
+        writing[0] -= 1
+
+    monkeypatch.setattr(map_file, "save", slow)
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(80)
+        replies = await asyncio.gather(robot.save("house"), robot.save("house"))
+    assert most == [1]
+    assert sorted(reply.ok for reply in replies) == [False, True]
+    assert map_file.load_graph(own_maps / "house.yaml")["poses"].ndim == 2
+
+
 async def test_a_replay_of_a_drive_with_a_save_says_the_same_and_saves_nothing(
     own_maps: Path,
 ) -> None:
@@ -254,11 +277,25 @@ async def test_a_saved_map_grows_on(own_maps: Path) -> None:
     assert map_file.load(own_maps / "house.yaml").cells.size >= size
 
 
+def test_a_map_for_nothing_is_refused_with_its_line() -> None:
+    with pytest.raises(ConfigError, match="f:2: map: a map is for mapping: slam or localize;"):
+        config.loads("sectors: 8\nmap: house\n", PerceptionConfig, "f")
+    assert config.loads('mapping: "off"', PerceptionConfig, "f") == PerceptionConfig()
+
+
 def test_a_map_that_is_missing_or_not_named_is_told_at_the_start(own_maps: Path) -> None:
     with pytest.raises(ConfigError, match="expected a saved map, as mapping is 'localize'"):
         chart_of(PerceptionConfig(mapping="localize"))
     with pytest.raises(ConfigError, match=r"gone\.yaml: no such file"):
         chart_of(PerceptionConfig(mapping="localize", map="gone"))
+    own_maps.mkdir(parents=True)
+    (own_maps / "blank.pgm").write_bytes(b"P5\n9 9\n255\n" + bytes([205]) * 81)
+    (own_maps / "blank.yaml").write_text("image: blank.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    with pytest.raises(ConfigError, match=r"blank\.yaml: the map is empty: 0\.00 m² of it"):
+        chart_of(PerceptionConfig(mapping="localize", map="blank"))
+    np.savez(own_maps / "blank.graph.npz", front=np.zeros(3))
+    with pytest.raises(ConfigError, match=r"blank\.graph\.npz: no pose graph: it has no 'li"):
+        chart_of(PerceptionConfig(mapping="slam", map="blank"))
     with pytest.raises(ConfigError, match="the pose graph to go on with"):
         chart_of(PerceptionConfig(mapping="slam", map="gone"))
     map_file.save(own_maps / "bare.yaml", drawn(Rooms(HOUSE), START), {"poses": np.zeros((1, 3))})

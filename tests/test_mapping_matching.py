@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from gigabrain_zenoh.mapping.correlative import Window, search
 from gigabrain_zenoh.mapping.local_map import LocalMap, build
-from gigabrain_zenoh.mapping.matching import Window, icp, search
+from gigabrain_zenoh.mapping.matching import icp
 from gigabrain_zenoh.mapping.points import Scan, from_beams
 from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats
 from tests.rooms import Lidar, box

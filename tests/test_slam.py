@@ -163,6 +163,27 @@ def test_wheels_that_slip_are_found_out_however_good_odometry_says_it_is() -> No
     assert found.pose == pytest.approx(IDENTITY, abs=0.05)
 
 
+@pytest.mark.parametrize("turn", [0.1, 0.15, 0.2])
+def test_where_little_of_a_scan_is_known_doors_alike_are_not_taken_for_one_another(
+    turn: float,
+) -> None:
+    # backwards, two metres a scan, looking ahead; odometry turns too far at each
+    doors: list[tuple[float, float, float, float]] = []
+    for x, y, deep in [(2.0 * k + off, y, 1.35 * y) for k in range(18)
+                       for off, y in ((-4.0, 1.0), (-3.4, -1.0))]:  # fmt: skip
+        doors += [(x, y, x, deep), (x, deep, x + 0.9, deep), (x + 0.9, deep, x + 0.9, y)]
+        doors += [(x + 0.9, y, x + 2.0, y)]
+    lidar = Lidar(180, reach=25.0)
+    lidar.angles = lidar.angles / 2 - np.pi / 2
+    poses = line(np.array((28.0, 0.0, 0.0)), np.array((4.0, 0.0, 0.0)), 2.0)
+    poses[:, 2] = 0.0
+    steps = [IDENTITY] + [np.array((-2.0, -0.1, turn))] * (len(poses) - 1)
+    slam = Slam(pose=poses[0])
+    estimates = feed(slam, look(np.array(doors), poses, lidar), np.array(steps))
+    assert {estimate.kind for estimate in estimates} == {"matched"}
+    assert estimates[-1].pose == pytest.approx(poses[-1], abs=0.1)  # one door on is 2 m
+
+
 def test_a_slow_robot_keeps_one_scan_in_ten() -> None:
     poses = line(np.array((0.0, 0.0, 0.0)), np.array((8.0, 0.0, 0.0)), 0.02)
     slam = Slam()
@@ -251,5 +272,11 @@ def test_arrays_that_do_not_belong_together_are_refused() -> None:
         Slam.thaw({**frozen, "poses": frozen["poses"][:-1]})
     with pytest.raises(ValueError, match="points, got"):
         Slam.thaw({**frozen, "points": frozen["points"][:-1]})
+    with pytest.raises(ValueError, match="link: joins keyframes that there are not, of 6"):
+        Slam.thaw({**frozen, "link_ends": frozen["link_ends"] - 1})
+    with pytest.raises(ValueError, match="link: a covariance that is none"):
+        Slam.thaw({**frozen, "link_covariance": np.zeros((6, 3, 3))})
+    with pytest.raises(ValueError, match="front of shape"):
+        Slam.thaw({**frozen, "front": np.zeros(2)})
     with pytest.raises(KeyError):
         Slam.thaw({name: rows for name, rows in frozen.items() if name != "travel"})

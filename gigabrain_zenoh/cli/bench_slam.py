@@ -88,7 +88,7 @@ def _driven(logs: "list[Log]") -> "list[tuple[Log, Drive]]":
     from rich.progress import Progress
 
     from gigabrain_zenoh.bench.slam import drive
-    from gigabrain_zenoh.mapping.slam import warm_up
+    from gigabrain_zenoh.mapping.warm import warm_up
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         compiling = progress.add_task("compiling", total=None)

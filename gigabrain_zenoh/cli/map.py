@@ -34,7 +34,9 @@ def save(name: str, /, *, at: Which = HERE, replace: bool = False) -> int:
         fields = {"name": name, "replace": replace, "source": getpass.getuser()}
         request = msgspec.convert(fields, MapRequest)
     except msgspec.ValidationError:
-        raise ConfigError(f"no name for a map: {name!r}; expected letters, digits, - _ .") from None
+        raise ConfigError(
+            f"no name for a map: {name!r}; expected letters, digits, - _ . and no ending"
+        ) from None
 
     async def ask() -> None:
         async with joined(at.where(), NAME) as (bus, _):
@@ -65,10 +67,14 @@ def info(name: str, /) -> int:
 
     path = map_file.path_of(name)
     saved = map_file.load(path)
+    if problem := map_file.what_is_wrong(saved):
+        raise ConfigError(f"{path}: {problem}")
     say(f"{path}: {map_file.in_words(saved)}, {saved.resolution:g} m a cell")
     if path.with_suffix(map_file.GRAPH).exists():
         graph = map_file.load_graph(path)
-        say(f"pose graph: {len(graph.get('poses', ()))} keyframes; mapping can go on from it")
+        if (poses := graph.get("poses")) is None or poses.ndim != 2:
+            raise ConfigError(f"{path.with_suffix(map_file.GRAPH)}: no pose graph")
+        say(f"pose graph: {len(poses)} keyframes; mapping can go on from it")
     else:
         say("no pose graph: the robot can find its way in it, but not go on mapping")
     return 0

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gigabrain_zenoh.mapping.matching import Window
+from gigabrain_zenoh.mapping.correlative import Window
 from gigabrain_zenoh.mapping.se2 import Floats
 
 MISSES, MISSED_TRAVEL, MISSED_TURN = 3, 0.5, 0.5  # scans, [m], [rad]: after these it is broken,

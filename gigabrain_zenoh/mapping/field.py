@@ -42,6 +42,9 @@ class Fit(NamedTuple):
     pose: Floats  # (3,)
     information: Floats  # (3, 3), what the scan alone says of it, in the map's axes
     score: float  # 0 to 1: how near hits on what is shown are to walls, less pierced walls' share
+    shown: float  # 0 to 1, the hits that can be judged
+    likely: float  # as the score, but of what can be judged alone, however little that is
+    wrong: float  # 0 to 1, the share of beams that the map rules out, see `contradiction`
 
 
 def field_of(cells: NDArray[np.int8], cell: float, origin: tuple[float, float]) -> Field:
@@ -66,11 +69,19 @@ def fit(
     `hits` (n, 2) and `free` (m, 2) are ends of beams in the body's frame, `sensor` (2,) is where
     the beams start. `prior` (3, 3) is the information that holds the pose at its guess.
     """
-    pose, information, score = _fit(
+    pose, information, likely, judged = _fit(
         field.distance, field.shown, field.origin, field.cell, hits, guess, prior
     )
-    through = _pierced(field.distance, field.origin, field.cell, hits, free, sensor, pose)
-    return Fit(pose, information, score - through)
+    pierced = _pierced(field.distance, field.origin, field.cell, hits, free, sensor, pose)
+    amid = _amid(field.distance, field.free, field.origin, field.cell, hits, pose)
+    return Fit(
+        pose=pose,
+        information=information,
+        score=likely / max(judged, JUDGED * len(hits), 1) - pierced,
+        shown=judged / max(len(hits), 1),
+        likely=likely / max(judged, 1) - pierced,
+        wrong=pierced + amid / max(len(hits) + len(free), 1),
+    )
 
 
 def contradiction(field: Field, hits: Points, free: Points, sensor: Floats, pose: Floats) -> float:
@@ -79,6 +90,15 @@ def contradiction(field: Field, hits: Points, free: Points, sensor: Floats, pose
     through = _pierced(field.distance, field.origin, field.cell, hits, free, sensor, pose)
     amid = _amid(field.distance, field.free, field.origin, field.cell, hits, pose)
     return through + amid / max(count, 1)
+
+
+def clearance(field: Field, pose: Floats) -> float:
+    """How far the body at `pose` (3,) is from the nearest wall, to a cell [m]."""
+    column, row = np.floor((pose[:2] - field.origin) / field.cell).astype(int)
+    height, width = field.distance.shape
+    if not (0 <= row < height and 0 <= column < width):
+        return FAR
+    return float(field.distance[row, column])
 
 
 @kernel
@@ -133,11 +153,12 @@ def _fit(
     hits: Points,
     guess: Floats,
     prior: Floats,
-) -> tuple[Floats, Floats, float]:
+) -> tuple[Floats, Floats, float, int]:
     """Gauss and Newton on the distances, each weighted by how small it is."""
     pose, information, score, judged = guess.copy(), np.zeros((3, 3)), 0.0, 0
-    slope = np.zeros(3)
+    slope, step = np.zeros(3), np.zeros(3)
     for _ in range(ITERATIONS):
+        pose += step
         cos, sin = np.cos(pose[2]), np.sin(pose[2])
         information[:] = 0.0
         off, score, judged = np.zeros(3), 0.0, 0
@@ -160,10 +181,9 @@ def _fit(
         for i in range(3):  # `@` would call for a BLAS
             off[i] += (prior[i] * drift).sum()
         step = -solved(information + prior, off)
-        pose += step
         if np.abs(step).max() < ENOUGH:
             break
-    return pose, information, score / max(judged, JUDGED * len(hits), 1)
+    return pose, information, score, judged
 
 
 @kernel

@@ -4,15 +4,16 @@ It knows nothing of loops: its own frame is smooth and drifts, and a correction 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 
 from gigabrain_zenoh.mapping.adrift import UNKNOWN, Adrift
-from gigabrain_zenoh.mapping.local_map import LocalMap, build
-from gigabrain_zenoh.mapping.matching import Fit, Found, Window, icp, search, thinned
-from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.correlative import Found, Window, search
+from gigabrain_zenoh.mapping.local_map import LocalMap, build, room_for
+from gigabrain_zenoh.mapping.match import Kind, Match
+from gigabrain_zenoh.mapping.matching import Fit, icp
+from gigabrain_zenoh.mapping.points import Scan, thinned
 from gigabrain_zenoh.mapping.se2 import (
     Floats,
     between,
@@ -24,8 +25,6 @@ from gigabrain_zenoh.mapping.se2 import (
 )
 from gigabrain_zenoh.mapping.spacing import Spacing
 from gigabrain_zenoh.mapping.visibility import seen_through
-
-Kind = Literal["matched", "searched", "recovered", "odometry", "broken"]
 
 CELL, SIGMA = 0.05, 0.08  # [m], of the likelihood image
 GATE = 0.3  # [m]
@@ -44,25 +43,11 @@ BETTER = 0.1  # score: so much more, for a place that odometry does not lead to
 SLID = 0.3  # [m], a match so far from where odometry leads may have slid over what is known
 ENOUGH = 0.5  # of its inliers, for what odometry leads to instead
 LEAST_INLIERS = 0.15  # share of the points, to go by odometry and them
+TURNS = (-1.5, -0.75, 0.75, 1.5)  # standard deviations of odometry's turn, to begin ICP from
+LEAST_TURNED = 0.05  # share of the points, of the same after a turn
 FEW = 20  # points, with fewer there is nothing to match
 CONTRADICTED = 0.6  # squared deviations: a match that pulls odometry farther speaks against it
 UNMOVED = np.zeros((3, 3))
-
-
-@dataclass(frozen=True, slots=True)
-class Match:
-    """Where the front end puts a scan, and how it came to that.
-
-    matched: by ICP. searched: by search alone. recovered: far from where odometry had it.
-    odometry: by odometry alone. broken: no longer joined to what was before.
-    """
-
-    pose: Floats  # in the front end's own frame
-    covariance: Floats  # (3, 3), of x, y and yaw in that frame, against the local map
-    kind: Kind
-    score: float  # 0 to 1, of the search
-    inliers: float  # share of the points that ICP laid onto lines
-    guided: bool = False  # by odometry whose covariance is known, and does not speak against it
 
 
 class FrontEnd:
@@ -73,6 +58,7 @@ class FrontEnd:
         self._scans: list[Scan] = []
         self._poses: list[Floats] = []
         self._local: LocalMap | None = None
+        self._room = room_for(CELL)
         self._adrift = Adrift()
         self._noise: Floats | None = UNMOVED  # of odometry since a scan was matched
         self.pose = pose
@@ -109,7 +95,8 @@ class FrontEnd:
         """Match to these scans from now on, the nearest of them last."""
         first = self._spacing.first(np.array(poses))
         self._scans, self._poses = list(scans[first:]), list(poses[first:])
-        self._local = build(self._scans, np.array(self._poses), self.pose, CELL, SIGMA)
+        placed = np.array(self._poses)
+        self._local = build(self._scans, placed, self.pose, CELL, SIGMA, self._room)
 
     @property
     def held(self) -> tuple[list[Scan], list[Floats]]:
@@ -151,10 +138,35 @@ class FrontEnd:
             return near if near and near.inliers > ENOUGH * match.inliers else match
         if near:
             return near
+        if not match:
+            near, wrong = self._turned(local, scan, guess, found, wrong)
+            if near:
+                return near
         if not wrong < WRONG:
             least = match.score + BETTER if match else 0.0
             match = self._recover(local, scan, guess, least, wrong) or match
         return match or self._lost(guess, found)
+
+    def _turned(
+        self, local: LocalMap, scan: Scan, guess: Floats, found: Found, wrong: float
+    ) -> tuple[Match | None, float]:
+        """Where odometry leads if it is off by a turn, and the least that is looked through there.
+
+        A small turn takes what is far out of reach of ICP, and lets beams pass through walls.
+        """
+        covariance = self._adrift.covariance
+        turn = float(np.sqrt(covariance[2, 2]))
+        starts = (found.pose, *(np.add(guess, (0.0, 0.0, share * turn)) for share in TURNS))
+        best, least = None, wrong
+        for start in starts:
+            fit = _fit(local, scan, start, guess, covariance)
+            through = seen_through(local.buckets.points, scan.points, fit.pose)
+            if not through < WRONG or _apart(fit.pose, guess) > MOVED:
+                continue
+            least = min(through, least)
+            if fit.inliers >= max(best.inliers if best else 0.0, LEAST_TURNED):
+                best = fit
+        return (_matched(best, found, covariance, "matched") if best else None), least
 
     def _led(self, local: LocalMap, scan: Scan, guess: Floats, found: Found) -> Match | None:
         """Where odometry leads, unless the scan contradicts that or shows next to nothing known."""

@@ -51,10 +51,23 @@ def thaw_edges(name: str, arrays: Arrays) -> list[Edge]:
     ends = arrays[f"{name}_ends"].astype(int)
     relative = arrays[f"{name}_relative"].astype(np.float64)
     covariance = arrays[f"{name}_covariance"].astype(np.float64)
+    keyframes = len(arrays["link_ends"])
     if ends.ndim != 2 or relative.shape != (len(ends), 3) or covariance.shape != (len(ends), 3, 3):
         raise ValueError(f"{name}: {len(ends)} edges, but {len(relative)} poses")
+    if not ((ends >= 0) & (ends < keyframes)).all():
+        raise ValueError(f"{name}: joins keyframes that there are not, of {keyframes}")
+    if not (np.linalg.eigvalsh(covariance) > 0).all():
+        raise ValueError(f"{name}: a covariance that is none")
     rows = zip(ends, relative, covariance, arrays[f"{name}_doubtful"], strict=True)
     return [Edge(int(first), int(second), r, c, bool(d)) for (first, second), r, c, d in rows]
+
+
+def shaped(arrays: Arrays, name: str, *shape: int) -> NDArray[np.float64]:
+    """One of the arrays; KeyError without it, ValueError if it is of another shape."""
+    values = arrays[name].astype(np.float64)
+    if values.shape != shape:
+        raise ValueError(f"{name} of shape {values.shape}, expected {shape}")
+    return values
 
 
 def _joined(parts: Iterable[Points]) -> Points:

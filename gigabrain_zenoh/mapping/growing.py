@@ -53,8 +53,11 @@ class GrowingMap:
         try:
             grown._slam = Slam.thaw(arrays, rates=RATES)
             grown._sweeps = Sweeps.thaw(arrays, len(grown._slam.keyframes))
-        except (KeyError, ValueError, IndexError) as error:
-            raise ConfigError(f"no pose graph: {' '.join(str(error).split())}") from None
+        except KeyError as error:
+            raise ConfigError(f"no pose graph: it has no {error}") from None
+        except (ValueError, IndexError, TypeError, RuntimeError) as error:  # the last is gtsam's
+            text = " ".join(str(error).split())[:200]
+            raise ConfigError(f"no pose graph: {text}") from None
         grown._drawn = list(grown._slam.poses)
         grown._grid = _rendered(grown._sweeps.all(), grown._drawn)
         grown.lose("looking for the robot in the map")

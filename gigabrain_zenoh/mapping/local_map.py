@@ -2,18 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
-import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels import kernel, lean_kernel
 from gigabrain_zenoh.mapping.points import Points, Scan
 from gigabrain_zenoh.mapping.se2 import Floats
 
 BUCKET = 0.15  # [m]
 REACH = 30.0  # [m], points farther from the centre are left out
+MARGIN = 24  # cells, for what is stamped on a map's rim
 BLOCK = 4  # cells a side, of which only the likeliest counts at first
+HASH = 0x9E3779B1  # D. Knuth's multiplicative hash, of 32 bits
 
 Ints = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
@@ -57,15 +60,27 @@ EMPTY = Buckets(
 )
 
 
+def room_for(cell: float) -> Bytes:
+    """Memory for the images of one map after the other: new memory takes longer than drawing."""
+    side = int(2 * REACH / cell) + MARGIN
+    return np.empty(2 * side * side, np.uint8)
+
+
 def build(
-    scans: Sequence[Scan], poses: Floats, centre: Floats, cell: float, sigma: float
+    scans: Sequence[Scan],
+    poses: Floats,
+    centre: Floats,
+    cell: float,
+    sigma: float,
+    room: Bytes | None = None,
 ) -> LocalMap:
     """The map of `scans` at `poses` (m, 3) within reach of `centre`.
 
     The likelihood of a hit is exp(-d²/2s²): d to the nearest point, s `sigma`. Scans are laid onto
     the means of what shares a cell. To choose one of it by the order of the beams would be wrong:
     of those along a wall the later are the nearer on one side and the farther on the other, and a
-    robot between two walls would be turned a little by each scan.
+    robot between two walls would be turned a little by each scan. Its images are in `room`, see
+    room_for.
     """
     points, normals, low, high = _placed(
         np.concatenate([scan.points for scan in scans]),
@@ -77,14 +92,22 @@ def build(
     if not len(points):
         nothing = np.zeros((1, 1), np.uint8)
         return LocalMap(Image(nothing, nothing, np.zeros(2), cell), EMPTY)
-    blob = _blob(cell, sigma)
+    blob, wide = _blobs(cell, sigma)
     origin = low.astype(np.float64) - len(blob) * cell
     width, height = ((high - origin) / cell).astype(int) + len(blob)
-    cells = np.zeros((height, width), np.uint8)
-    _stamp(cells, points, origin, cell, blob)
-    coarse = cv2.dilate(cells, np.ones((BLOCK, BLOCK), np.uint8), anchor=(0, 0))
-    image = Image(cells, np.asarray(coarse, np.uint8), origin, cell)
-    return LocalMap(image, _buckets(*_merged(points, normals, origin, cell, height, width)))
+    cells, coarse = _blank(height, width, room)
+    _stamp(cells, coarse, points, origin, cell, blob, wide)
+    image = Image(cells, coarse, origin, cell)
+    return LocalMap(image, _buckets(*_merged(points, normals, origin, cell, width)))
+
+
+def _blank(height: int, width: int, room: Bytes | None) -> Bytes:
+    """Two images of zeros (2, height, width)."""
+    if room is None or room.size < 2 * height * width:
+        return np.zeros((2, height, width), np.uint8)
+    blank = room[: 2 * height * width].reshape(2, height, width)
+    blank.fill(0)
+    return blank
 
 
 @kernel
@@ -126,21 +149,28 @@ def _buckets(points: Points, normals: Points, low: Points, high: Points) -> Buck
 
 @kernel
 def _merged(
-    points: Points, normals: Points, origin: Floats, cell: float, height: int, width: int
+    points: Points, normals: Points, origin: Floats, cell: float, width: int
 ) -> tuple[Points, Points, Points, Points]:
     """The mean of the points with a normal in each cell, its normal, and where they lie between."""
-    held = np.zeros((height, width), np.int32)  # which of the sums, counted from 1
+    bits = 1
+    while 1 << bits < 2 * len(points):
+        bits += 1
+    last = (1 << bits) - 1
+    held = np.full((last + 1, 2), -1, np.int32)  # a cell, and which of the sums; cells by hash
     sums = np.zeros((len(points), 5))  # x, y, normal, how many
     n = 0
     for k in range(len(points)):
         (x, y), (nx, ny) = points[k], normals[k]
         if nx == 0 and ny == 0:
             continue
-        row, column = int((y - origin[1]) / cell), int((x - origin[0]) / cell)
-        if not held[row, column]:
+        at_cell = int((y - origin[1]) / cell) * width + int((x - origin[0]) / cell)
+        slot = (at_cell * HASH & 0xFFFFFFFF) >> (32 - bits)
+        while held[slot, 0] != at_cell and held[slot, 0] >= 0:
+            slot = (slot + 1) & last
+        if held[slot, 0] < 0:
+            held[slot, 0], held[slot, 1] = at_cell, n
             n += 1
-            held[row, column] = n
-        at = held[row, column] - 1
+        at = held[slot, 1]
         side = 1.0 if sums[at, 2] * nx + sums[at, 3] * ny >= 0 else -1.0  # signs say nothing
         sums[at, 0] += x
         sums[at, 1] += y
@@ -166,38 +196,53 @@ def _sorted(
     count = len(points)
     cell = np.empty(count, np.int32)
     starts = np.zeros(width * height + 1, np.int32)
+    starts[-1] = count
     for k in range(count):
         column = min(int((points[k, 0] - origin[0]) / size), width - 1)
         row = min(int((points[k, 1] - origin[1]) / size), height - 1)
         cell[k] = row * width + column
-        starts[cell[k] + 1] += 1
-    for b in range(width * height):
-        starts[b + 1] += starts[b]
-    filled = starts[:-1].copy()
+        starts[cell[k]] += 1
+    for b in range(1, width * height):
+        starts[b] += starts[b - 1]
     order = np.empty(count, np.int32)
-    for k in range(count):
-        order[filled[cell[k]]] = k
-        filled[cell[k]] += 1
+    for k in range(count - 1, -1, -1):  # from where a bucket ends to where it begins
+        starts[cell[k]] -= 1
+        order[starts[cell[k]]] = k
     return starts, order
 
 
-def _blob(cell: float, sigma: float) -> Bytes:
+@lru_cache(maxsize=4)
+def _blobs(cell: float, sigma: float) -> tuple[Bytes, Bytes]:
+    """How likely hits are round a point (n, n), and the most of each block there."""
     reach = int(np.ceil(2.5 * sigma / cell))
     along = np.arange(-reach, reach + 1) * cell
     likely = np.exp(-(along[:, None] ** 2 + along**2) / (2 * sigma**2))
-    return np.asarray(np.rint(255 * likely), dtype=np.uint8)
+    blob = np.asarray(np.rint(255 * likely), dtype=np.uint8)
+    blocks = sliding_window_view(np.pad(blob, BLOCK - 1), (BLOCK, BLOCK))
+    return blob, np.ascontiguousarray(blocks.max(axis=(2, 3)))
 
 
 @kernel
-def _stamp(cells: Bytes, points: Points, origin: Floats, cell: float, blob: Bytes) -> None:
-    """Put the blob on every cell that holds a point; the likelier counts."""
-    side = len(blob)
+def _stamp(
+    cells: Bytes, coarse: Bytes, points: Points, origin: Floats, cell: float, blob: Bytes,
+    wide: Bytes,
+) -> None:  # fmt: skip
+    """Put the blobs on every cell that holds a point; the likelier counts."""
+    half, rim = len(blob) // 2, BLOCK - 1
     for k in range(len(points)):
         column = int((points[k, 0] - origin[0]) / cell)
         row = int((points[k, 1] - origin[1]) / cell)
         if cells[row, column] == 255:  # stamped before
             continue
-        left, top = column - side // 2, row - side // 2
-        for i in range(side):
-            for j in range(side):
-                cells[top + i, left + j] = max(cells[top + i, left + j], blob[i, j])
+        left, top = column - half, row - half
+        _put(cells, blob, top, left)
+        _put(coarse, wide, top - rim, left - rim)
+
+
+@lean_kernel
+def _put(cells: Bytes, blob: Bytes, top: int, left: int) -> None:
+    for i in range(len(blob)):
+        row, n = np.uint32(top + i), np.uint32(i)  # unsigned: numba need not look from the end
+        for j in range(len(blob)):
+            column = np.uint32(left + j)
+            cells[row, column] = max(cells[row, column], blob[n, np.uint32(j)])

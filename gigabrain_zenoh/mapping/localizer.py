@@ -9,16 +9,22 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gigabrain_zenoh.mapping.field import Field, fit
+from gigabrain_zenoh.mapping.field import Field, clearance, fit
+from gigabrain_zenoh.mapping.likeness import alike
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.relocalize import FEWEST_POINTS, Candidate, apart
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, compose, turned
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, compose, inverse, turned
 
 LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somewhere else
 SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here
-TOLERANCE = 0.03  # a fit that is worse than the best by no more says nothing against a place,
-STILL_TOLERANCE, STILL_SCANS = 0.08, 5  # and while the robot stands, it takes more, and some scans
+TOLERANCE = 0.03  # of all beams ruled out, more than elsewhere, say nothing against a place,
+STILL_TOLERANCE, STILL_SCANS = 0.05, 5  # and while the robot stands, it takes more, and some scans
 AGAINST = 0.2  # that much in all speaks against it
+MOST_WRONG = 0.15  # of all beams ruled out, or it is not sure to be here
+DOUBTED_WRONG = 0.1  # ruled out, where the fit is bad as well, are enough against a place
+WALL_M = 0.08  # so near to a wall there is no body
+SHOWN = 0.1  # of the hits: of a place that the map shows less of, nothing can be said
+GONE_SCANS = 20  # after so many, it is asked whether that place is likely at all
 VIEW_M, VIEW_RAD = 0.1, math.radians(6)  # farther on, what is seen counts as seen elsewhere
 LOOSE_M, LOOSE_RAD = 0.5, math.radians(20)  # a deviation beyond that is no position
 SEARCH_SCANS = 10  # from one search of the whole map to the next
@@ -51,6 +57,8 @@ class Hypothesis:
     pose: Floats
     covariance: Floats
     score: float = 0.0
+    shown: float = 1.0  # of the hits, see Fit
+    wrong: float = 0.0  # beams that the map rules out, see Fit
     against: float = 0.0
     good: int = 0  # scans in a row that fit
     bad: int = 0  # scans in a row that do not
@@ -104,8 +112,7 @@ class Localizer:
             return
         there = [(compose(one.pose, moved), one.score) for one in candidates]
         self._places = [Hypothesis(pose, SPREAD, score) for pose, score in there]
-        places = {0: "no place in the map looks like this", 1: "one place looks like this"}
-        self.why = places.get(len(there), f"{len(there)} places look like this")
+        self.why = _in_words(len(there))
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
         """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
@@ -134,23 +141,45 @@ class Localizer:
 
     def _choose(self) -> None:
         """Drop places that what is seen speaks against; the last one is right."""
-        best = max(one.score for one in self._places)
         moved = math.hypot(self._moved[0], self._moved[1]) > VIEW_M
         moved = moved or abs(float(self._moved[2])) > VIEW_RAD
         self._still = 0 if moved else self._still + 1
         if moved or self._still % STILL_SCANS == 0:
-            bar = best - (TOLERANCE if moved else STILL_TOLERANCE)
+            least = min(one.wrong for one in self._places)
+            bar = least + (TOLERANCE if moved else STILL_TOLERANCE)
             self._moved = IDENTITY.copy() if moved else self._moved
             self._places = [_judged(one, bar) for one in self._places]
-        left = [one for one in self._places if one.against < AGAINST and one.bad < LOST_SCANS]
+        best = max(self._places, key=lambda one: one.score)
+        left = [one for one in self._places if _possible(one) and not self._gone(one, best)]
         self._places = []
         for one in sorted(left, key=lambda one: -one.score):
             if apart(one.pose, (other.pose for other in self._places)):
                 self._places.append(one)
-        if not self._places:
+        if all(one.bad >= LOST_SCANS for one in self._places):
             self.lose("no place in the map looks like this")
         elif len(self._places) == 1 and self._places[0].good >= SURE_SCANS:
             self._localized, self.why = True, ""
+        else:
+            self.why = _in_words(len(self._places))
+
+    def _gone(self, one: Hypothesis, best: Hypothesis) -> bool:
+        """Whether `one` has led off what is shown, to where the map gives no reason to be."""
+        if one.shown >= SHOWN or one.bad % GONE_SCANS != GONE_SCANS - 1 or not best.good:
+            return False
+        return not alike(self.map, compose(one.pose, inverse(best.pose)))
+
+
+def _possible(one: Hypothesis) -> bool:
+    """Whether neither beams rule the place out, nor some of them and a bad fit together.
+
+    A bad fit alone may come of walls that the map shows badly, as at its edge.
+    """
+    return one.against < AGAINST and (one.bad < LOST_SCANS or one.wrong < DOUBTED_WRONG)
+
+
+def _in_words(count: int) -> str:
+    places = {0: "no place in the map looks like this", 1: "one place looks like this"}
+    return places.get(count, f"it could be in {count} places")
 
 
 def _predicted(one: Hypothesis, motion: Floats, noise: Floats) -> Hypothesis:
@@ -168,20 +197,24 @@ def _followed(into: Field, one: Hypothesis, view: View | None) -> Hypothesis:
         return one
     prior = _inverse(one.covariance)
     found = fit(into, view.scan.points, view.scan.free, view.sensor, one.pose, prior)
+    seen = replace(one, score=found.score, shown=found.shown, wrong=found.wrong, good=0)
+    if clearance(into, one.pose) < WALL_M:
+        seen = replace(seen, against=AGAINST)
     if found.score < LOST_SCORE:
-        return replace(one, score=found.score, good=0, bad=one.bad + 1)
+        seen = replace(seen, bad=one.bad + 1)
+    if found.shown < SHOWN or found.likely < LOST_SCORE:
+        return seen
     return replace(
-        one,
+        seen,
         pose=found.pose,
         covariance=_inverse(prior + found.information),
-        score=found.score,
-        good=one.good + 1 if found.score >= SURE_SCORE else 0,
-        bad=0,
+        good=one.good + 1 if found.score >= SURE_SCORE and found.wrong < MOST_WRONG else 0,
+        bad=0 if found.score >= LOST_SCORE else seen.bad,
     )
 
 
 def _judged(one: Hypothesis, bar: float) -> Hypothesis:
-    return replace(one, against=one.against + max(bar - one.score, 0.0))
+    return replace(one, against=one.against + max(one.wrong - bar, 0.0))
 
 
 def _inverse(matrix: Floats) -> Floats:

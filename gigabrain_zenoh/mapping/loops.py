@@ -8,10 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gigabrain_zenoh.mapping.correlative import Window, search
 from gigabrain_zenoh.mapping.drift import Drift, Rates
 from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.local_map import build
-from gigabrain_zenoh.mapping.matching import Window, icp, search, thinned
+from gigabrain_zenoh.mapping.matching import icp
+from gigabrain_zenoh.mapping.points import thinned
 from gigabrain_zenoh.mapping.se2 import (
     IDENTITY,
     Floats,

@@ -5,9 +5,9 @@ renaming decides; whoever looks next finishes what a crash left between that and
 """
 
 import contextlib
+import hashlib
 import io
 import os
-import re
 import shutil
 import zipfile
 from collections.abc import Mapping
@@ -19,27 +19,28 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from gigabrain_schemas.base import Finite, Fraction, Positive
+from gigabrain_schemas.base import Finite, Fraction
 from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.logs import state_dir
+from gigabrain_zenoh.mapping import pgm
 
 Cells = NDArray[np.int8]
 Arrays = Mapping[str, NDArray[Any]]
 
-MOST_CELLS = 8_000_000  # what a message may carry
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values, as ROS's map_server writes them
 OCCUPIED_PERCENT, FREE_PERCENT = 65, 40  # from here on, and up to here
 LEAST_FREE_M2, LEAST_WALL_M = 1.0, 1.0  # less than that is no map
-HEADER = re.compile(rb"P5(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)(?:\s|#[^\n]*\n)+(\d+)\s")
 GRAPH = ".graph.npz"
+STAMP = "grid"  # in the graph's file: which grid it belongs to
+LARGEST = 1e9  # of any number in a graph, as on the bus
 
 
 class MapYaml(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """ROS's description of a map image."""
 
-    image: str
-    resolution: Positive  # [m] per pixel
+    image: Annotated[str, Meta(pattern=r"^[^\0]+$")]
+    resolution: Annotated[float, Meta(ge=0.001, le=1.0)]  # [m] per pixel
     origin: tuple[Finite, Finite, Finite]  # x, y [m] of the lower left corner, yaw [rad]
     negate: Annotated[int, Meta(ge=0, le=1)] = 0  # 1 where white is occupied
     occupied_thresh: Fraction = 0.65
@@ -61,6 +62,11 @@ def path_of(name: str) -> Path:
     """The YAML file of a map by its name, or by its path if it looks like one."""
     if "/" in name or name.endswith((".yaml", ".yml")):
         return Path(name)
+    return saved_as(name)
+
+
+def saved_as(name: str) -> Path:
+    """The YAML file of a map that was saved, or is to be, under a name."""
     return state_dir() / "maps" / f"{name}.yaml"
 
 
@@ -79,7 +85,7 @@ def load(path: Path) -> SavedMap:
         raise ConfigError(f"{path}: origin: turned by {about.origin[2]:g} rad; expected yaw 0")
     if about.free_thresh >= about.occupied_thresh:
         raise ConfigError(f"{path}: free_thresh must be below occupied_thresh")
-    grey = _pixels(path.parent / about.image)
+    grey = pgm.read(path.parent / about.image)
     share = grey / 255 if about.negate else (255 - grey.astype(np.float64)) / 255
     cells = np.full(grey.shape, -1, np.int8)
     cells[share > about.occupied_thresh] = 100
@@ -92,12 +98,19 @@ def load_graph(path: Path) -> dict[str, NDArray[Any]]:
     """The pose graph beside the YAML file `path`. Raises ConfigError, in one line."""
     _finish(path)
     file = path.with_suffix(GRAPH)
-    data = _bytes(file, "the pose graph to go on with; expected it beside the YAML file")
+    data = pgm.content(file, "the pose graph to go on with; expected it beside the YAML file")
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+            graph = {name: _numbers(name, arrays[name]) for name in arrays.files}
     except (ValueError, EOFError, KeyError, OSError, zipfile.BadZipFile, zipfile.error) as error:
         raise ConfigError(f"{file}: cut or damaged: {_line(error)}") from None
+    stamp = graph.pop(STAMP, None)
+    if stamp is not None and not np.array_equal(stamp, _stamp(load(path))):
+        raise ConfigError(
+            f"{file}: belongs to another map than {path}; bring back what was saved together, "
+            "or find the way in that map as it is (mapping: localize)"
+        )
+    return graph
 
 
 def save(path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False) -> None:
@@ -134,6 +147,22 @@ def _free(found: SavedMap) -> NDArray[np.bool_]:
     return (found.cells >= 0) & (found.cells <= FREE_PERCENT)
 
 
+def _stamp(found: SavedMap) -> NDArray[np.uint8]:
+    """Tells a grid from others, as it is when it has been saved."""
+    full = np.where(found.cells >= OCCUPIED_PERCENT, 100, -1)
+    place = f"{found.resolution:.12g} {found.origin_x:.12g} {found.origin_y:.12g}"
+    cells = np.where(_free(found), 0, full).astype(np.int8)
+    whole = f"{place} {cells.shape}".encode() + cells.tobytes()
+    return np.frombuffer(hashlib.sha256(whole).digest(), np.uint8)
+
+
+def _numbers(name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """The array, if it holds plain numbers; else ValueError."""
+    if values.dtype.kind not in "biuf" or not (np.abs(values.astype(float)) <= LARGEST).all():
+        raise ValueError(f"{name} holds something else than numbers up to {LARGEST:g}")
+    return values
+
+
 def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
     """What to write, by name."""
     height, width = found.cells.shape
@@ -142,7 +171,7 @@ def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
     grey[_free(found)] = FREE
     image = path.with_suffix(".pgm").name
     arrays = io.BytesIO()
-    np.savez_compressed(arrays, allow_pickle=False, **graph)
+    np.savez_compressed(arrays, allow_pickle=False, **{**graph, STAMP: _stamp(found)})
     about = (
         f"image: {image}\nresolution: {found.resolution:.12g}\n"
         f"origin: [{found.origin_x:.12g}, {found.origin_y:.12g}, 0.0]\n"
@@ -158,16 +187,25 @@ def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
 def _commit(path: Path, files: Mapping[str, bytes]) -> None:
     """Bring all `files` safely to disk; after that they will be in their places, come what may."""
     draft = path.with_name(f".{path.stem}.draft")
-    shutil.rmtree(draft, ignore_errors=True)  # of a save that was interrupted
+    if draft.exists():  # of a save that was interrupted
+        shutil.rmtree(draft)
     draft.mkdir()
+    try:
+        _write(draft, files)
+    except OSError:
+        shutil.rmtree(draft, ignore_errors=True)  # or a full disk would stay full
+        raise
+    draft.rename(_complete(path))
+    _sync(path.parent)
+
+
+def _write(folder: Path, files: Mapping[str, bytes]) -> None:
     for name, data in files.items():
-        with (draft / name).open("wb") as file:
+        with (folder / name).open("wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-    _sync(draft)
-    draft.rename(_complete(path))
-    _sync(path.parent)
+    _sync(folder)
 
 
 def _finish(path: Path) -> None:
@@ -180,6 +218,8 @@ def _finish(path: Path) -> None:
             file.rename(path.with_name(file.name))
         _sync(path.parent)
         complete.rmdir()
+    except FileNotFoundError:  # somebody else was quicker, and has finished it
+        return
     except OSError as error:
         raise ConfigError(f"{complete}: an unfinished save: {error.strerror}") from None
 
@@ -195,31 +235,6 @@ def _sync(folder: Path) -> None:
             os.fsync(fd)
         finally:
             os.close(fd)
-
-
-def _pixels(file: Path) -> NDArray[np.uint8]:
-    """The grey values of a PGM file (height, width), the top row first."""
-    data = _bytes(file, "the map's image")
-    header = HEADER.match(data)
-    if header is None:
-        raise ConfigError(f"{file}: no binary PGM; expected a header such as 'P5 640 480 255'")
-    width, height, most = (int(number) for number in header.groups())
-    if most != 255:
-        raise ConfigError(f"{file}: a maxval of {most}; expected 255")
-    if not 0 < width * height <= MOST_CELLS:
-        raise ConfigError(f"{file}: {width} x {height} pixels; expected 1 to {MOST_CELLS} in all")
-    there = len(data) - header.end()
-    if there != width * height:
-        what = "cut" if there < width * height else "of another size"
-        raise ConfigError(f"{file}: {what}: {there} of {width} x {height} pixels are there")
-    return np.frombuffer(data, np.uint8, offset=header.end()).reshape(height, width)
-
-
-def _bytes(file: Path, what: str) -> bytes:
-    try:
-        return file.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{file}: {what}: {error.strerror}") from None
 
 
 def _line(error: Exception) -> str:

@@ -1,7 +1,6 @@
-"""Matching a scan to a local map: correlative search, then point-to-line ICP from what it found.
+"""Matching a scan to a local map: point-to-line ICP, from where a search has found it to lie.
 
-E. Olson, Real-time correlative scan matching, ICRA 2009; A. Censi, An ICP variant using a
-point-to-line metric, ICRA 2008.
+A. Censi, An ICP variant using a point-to-line metric, ICRA 2008.
 """
 
 from dataclasses import dataclass
@@ -9,36 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
-from gigabrain_zenoh.mapping.local_map import BLOCK, BUCKET, Buckets, Bytes, Image, Ints
+from gigabrain_zenoh.kernels import kernel, lean_kernel
+from gigabrain_zenoh.mapping.local_map import BUCKET, Buckets
 from gigabrain_zenoh.mapping.points import Points
 from gigabrain_zenoh.mapping.se2 import Floats
 
-SEARCHED = 90  # points of a scan are enough to search with
-ASIDE = 0.01  # of the score, at the window's rim: of equals, the one nearest to the guess
 ITERATIONS = 25
 STILL = 1e-4  # [m] and [rad], a step this small ends ICP
 SHRINK = 0.6  # of the gate, each iteration
 GATE_LEAST = 0.12  # [m]
 SIGMA = 0.06  # [m], residuals beyond it lose their weight
 SOFT = 1e-9  # keeps the normal equations regular where the points say nothing
-
-
-@dataclass(frozen=True, slots=True)
-class Window:
-    """How far round the guess to search."""
-
-    away: float  # [m], to each side
-    turn: float  # [rad], to each side
-    step: float = 0.025  # [rad]
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """The likeliest pose of a search."""
-
-    pose: Floats
-    score: float  # 0 to 1, the mean likelihood of the hits
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,128 +29,6 @@ class Fit:
     information: Floats  # (3, 3), of x, y and yaw about the body, in the map's axes
     inliers: float  # share of the scan's points
     rms: float  # [m], of the inliers
-
-
-def thinned(points: Points, most: int) -> Points:
-    """At most so many of the points, evenly by beam."""
-    if len(points) <= most:
-        return points
-    return points[np.linspace(0, len(points) - 1, most).astype(np.intp)]
-
-
-def search(
-    image: Image, points: Points, guess: Floats, window: Window, least: float = -np.inf
-) -> Found:
-    """The pose within the window whose points fall on the likeliest cells.
-
-    The guess, with a score of 0, where none scores `least`, which saves most of the search.
-    """
-    if not len(points):
-        return Found(guess, 0.0)
-    steps = int(np.ceil(window.away / image.cell))
-    turns = int(np.ceil(window.turn / window.step))
-    few = thinned(points, SEARCHED)
-    at = _placed(few, guess, image.origin, image.cell, steps, turns, window.step)
-    bounds = _bounds(image.coarse, at, steps)
-    score, t, i, j = _best(image.cells, at, bounds, steps, least)
-    off = np.array(((j - steps) * image.cell, (i - steps) * image.cell, (t - turns) * window.step))
-    return Found(guess + off, score)
-
-
-@kernel
-def _placed(
-    points: Points,
-    guess: Floats,
-    origin: Floats,
-    cell: float,
-    steps: int,
-    turns: int,
-    turn: float,
-) -> Ints:
-    """The cell (row, column) of each point at each heading (2 turns + 1, n, 2), in the corner."""
-    at = np.empty((2 * turns + 1, len(points), 2), np.int32)
-    for t in range(len(at)):
-        yaw = guess[2] + (t - turns) * turn
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        for k in range(len(points)):
-            px = guess[0] + cos * points[k, 0] - sin * points[k, 1]
-            py = guess[1] + sin * points[k, 0] + cos * points[k, 1]
-            at[t, k, 0] = int(np.floor((py - origin[1]) / cell)) - steps
-            at[t, k, 1] = int(np.floor((px - origin[0]) / cell)) - steps
-    return at
-
-
-@kernel
-def _worth(total: int, count: int, down: int, right: int, t: int, steps: int, turns: int) -> float:
-    """What a pose so many cells and headings off the guess is worth, its points being so likely."""
-    away = (down * down + right * right) / (steps * steps + 1)
-    return total / (255 * count) - ASIDE * (away + t * t / (turns * turns + 1))
-
-
-@kernel
-def _bounds(coarse: Bytes, at: Ints, steps: int) -> Floats:
-    """What the poses of each block are worth at most (headings, blocks, blocks)."""
-    (height, width), (headings, count, _) = coarse.shape, at.shape
-    blocks, turns = 2 * steps // BLOCK + 1, headings // 2
-    bounds = np.empty((headings, blocks, blocks))
-    for t in range(headings):
-        for i in range(blocks):
-            for j in range(blocks):
-                total = 0
-                for k in range(count):
-                    row, column = at[t, k, 0] + i * BLOCK, at[t, k, 1] + j * BLOCK
-                    # a block that begins outside may end within
-                    if -BLOCK < row < height and -BLOCK < column < width:
-                        total += coarse[max(row, 0), max(column, 0)]
-                down = max(i * BLOCK - steps, steps - i * BLOCK - BLOCK + 1, 0)
-                right = max(j * BLOCK - steps, steps - j * BLOCK - BLOCK + 1, 0)
-                bounds[t, i, j] = _worth(total, count, down, right, t - turns, steps, turns)
-    return bounds
-
-
-@kernel
-def _best(
-    cells: Bytes, at: Ints, bounds: Floats, steps: int, least: float
-) -> tuple[float, int, int, int]:
-    """Score, heading, row and column of the pose that is worth most; of equals, the first."""
-    (headings, blocks, _), best = bounds.shape, least
-    score, at_t, at_i, at_j = 0.0, headings // 2, steps, steps
-    likeliest = np.argmax(bounds)  # the sooner something good is found, the more can be left out
-    for n in range(-1, bounds.size):
-        block = likeliest if n < 0 else n
-        t, row, column = block // (blocks * blocks), block // blocks % blocks, block % blocks
-        if bounds[t, row, column] < best:
-            continue
-        turn = t - headings // 2
-        worth, mean, i, j = _best_within(
-            cells, at[t], row * BLOCK, column * BLOCK, turn, steps, headings // 2
-        )
-        if worth > best or (worth == best and (t, i, j) < (at_t, at_i, at_j)):
-            best, score, at_t, at_i, at_j = worth, mean, t, i, j
-    return score, at_t, at_i, at_j
-
-
-@kernel
-def _best_within(
-    cells: Bytes, at: Ints, top: int, left: int, t: int, steps: int, turns: int
-) -> tuple[float, float, int, int]:
-    """The best pose of one block: its worth, score, row and column."""
-    (height, width), count = cells.shape, len(at)
-    sums = np.zeros((BLOCK, BLOCK), np.int64)
-    for k in range(count):
-        row, column = at[k, 0] + top, at[k, 1] + left
-        first, last = max(0, -column), min(BLOCK, width - column)
-        for i in range(max(0, -row), min(BLOCK, height - row)):
-            for j in range(first, last):
-                sums[i, j] += cells[row + i, column + j]
-    best, score, at_i, at_j = -np.inf, 0.0, 0, 0
-    for i in range(min(BLOCK, 2 * steps + 1 - top)):
-        for j in range(min(BLOCK, 2 * steps + 1 - left)):
-            worth = _worth(sums[i, j], count, top + i - steps, left + j - steps, t, steps, turns)
-            if worth > best:
-                best, score = worth, sums[i, j] / (255 * count)
-                at_i, at_j = top + i, left + j
-    return best, score, at_i, at_j
 
 
 def icp(
@@ -188,7 +46,7 @@ def icp(
     return Fit(pose, information, inliers, rms)
 
 
-@kernel
+@lean_kernel
 def _nearest(
     local: Points,
     starts: NDArray[np.int32],
@@ -197,23 +55,35 @@ def _nearest(
     x: float,
     y: float,
     gate: float,
+    known: int,
 ) -> int:
-    """The index of the nearest point within `gate`, or -1."""
+    """The index of the nearest point within `gate`, or -1; one that is `known` to be near helps."""
+    best, found = gate * gate, -1
+    if known >= 0:
+        away = _away(local, known, x, y)
+        if away < best:
+            best, found, gate = away, known, np.sqrt(away)
     height = (len(starts) - 1) // width
     left = max(int(np.floor((x - gate - origin[0]) / BUCKET)), 0)
     right = min(int(np.floor((x + gate - origin[0]) / BUCKET)), width - 1)
     top = max(int(np.floor((y - gate - origin[1]) / BUCKET)), 0)
     bottom = min(int(np.floor((y + gate - origin[1]) / BUCKET)), height - 1)
-    best, found = gate * gate, -1
     if left > right:
         return found
     for row in range(top, bottom + 1):
         for k in range(starts[row * width + left], starts[row * width + right + 1]):
-            dx, dy = local[k, 0] - x, local[k, 1] - y
-            away = dx * dx + dy * dy
+            away = _away(local, k, x, y)
             if away < best:
                 best, found = away, k
     return found
+
+
+@lean_kernel
+def _away(local: Points, k: int, x: float, y: float) -> float:
+    """The squared distance of a point from (x, y)."""
+    dx, dy = local[k, 0] - x, local[k, 1] - y
+    away: float = dx * dx + dy * dy
+    return away
 
 
 @kernel
@@ -241,18 +111,25 @@ def _lay(
     points: Points,
     pose: Floats,
     gate: float,
+    nearest: NDArray[np.int32],
     hessian: Floats,
     gradient: Floats,
 ) -> tuple[int, float]:
-    """Add the points at `pose` to the normal equations; how many have a line, and squares."""
-    inliers, squares = 0, 0.0
+    """Add the points at `pose` to the normal equations; how many have a line, and squares.
+
+    `nearest` are the points of `local` that they were laid onto before, or -1.
+    """
+    inliers, squares, near = 0, 0.0, -1
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     for k in range(len(points)):
         rx = cos * points[k, 0] - sin * points[k, 1]
         ry = sin * points[k, 0] + cos * points[k, 1]
-        j = _nearest(local, starts, width, origin, pose[0] + rx, pose[1] + ry, gate)
+        near = nearest[k] if nearest[k] >= 0 else near  # or that of the beam beside
+        j = _nearest(local, starts, width, origin, pose[0] + rx, pose[1] + ry, gate, near)
+        nearest[k] = j
         if j < 0:
             continue
+        near = j
         nx, ny = normals[j, 0], normals[j, 1]
         error = (pose[0] + rx - local[j, 0]) * nx + (pose[1] + ry - local[j, 1]) * ny
         weight = (SIGMA / (SIGMA * SIGMA + error * error)) ** 2  # divided by the variance
@@ -288,10 +165,11 @@ def _icp(
     pose = start.copy()
     hessian = np.zeros((3, 3))
     inliers, squares = 0, 0.0
+    nearest = np.full(len(points), -1, np.int32)
     for _ in range(ITERATIONS):
         hessian, gradient = np.zeros((3, 3)), np.zeros(3)
         inliers, squares = _lay(
-            local, normals, starts, width, origin, points, pose, gate, hessian, gradient
+            local, normals, starts, width, origin, points, pose, gate, nearest, hessian, gradient
         )
         off = pose - guess
         off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi

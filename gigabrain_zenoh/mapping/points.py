@@ -1,6 +1,7 @@
 """A scan as points with normals: what is matched, and what a map is drawn from."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,12 +59,26 @@ def from_beams(
     return Scan.of(ways[hit] * ranges[hit, None], ways[clear] * free_range)
 
 
+def thinned(points: Points, most: int) -> Points:
+    """At most so many of the points, evenly by beam."""
+    if len(points) <= most:
+        return points
+    return points[_evenly(len(points), most)]
+
+
+@lru_cache(maxsize=256)
+def _evenly(count: int, most: int) -> NDArray[np.intp]:
+    return np.linspace(0, count - 1, most).astype(np.intp)
+
+
 def normals(points: Points) -> Points:
     """The normal at each point, from the line through its neighbours in beam order."""
     if len(points) < FEWEST:
         return np.zeros_like(points)
     bearings = np.arctan2(points[:, 1], points[:, 0])
-    return _normals(points, float(np.median(np.abs(np.diff(bearings)))))
+    apart = np.sort(np.abs(np.diff(bearings)))
+    median = (apart[(len(apart) - 1) // 2] + apart[len(apart) // 2]) / 2
+    return _normals(points, float(median))
 
 
 @kernel

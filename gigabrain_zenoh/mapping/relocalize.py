@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import kernel
-from gigabrain_zenoh.mapping.field import Field, fit
+from gigabrain_zenoh.mapping.field import JUDGED, Field, Fit, fit
+from gigabrain_zenoh.mapping.likeness import alike
 from gigabrain_zenoh.mapping.points import Points
-from gigabrain_zenoh.mapping.se2 import Floats, wrap
+from gigabrain_zenoh.mapping.se2 import Floats, compose, inverse, wrap
 
 POINTS = 90  # of a scan, evenly chosen
 FEWEST_POINTS = 20
@@ -23,10 +24,16 @@ SIGMA = 0.15  # [m], wide enough for the steps between headings
 BLOCK = 8  # cells
 STEP_M, FINEST_RAD, COARSEST_RAD = 0.15, math.radians(1.0), math.radians(3.0)
 LEAST = 0.5  # a fit below that is none
-NEUTRAL = 0.65  # what a hit on what the map does not show counts: neither for a place nor against
-BAND = 0.15  # candidates that much worse than the best are not looked at
-MOST_BLOCKS, MOST_TRIED, MOST_FOUND = 40_000, 96, 24
+UNKNOWN = 191  # of 255, what a hit on what the map does not show counts: neither for nor against
+BAND = 0.2  # candidates that much worse than the best are not looked at
+LEAST_SHOWN = 0.9  # and that good where next to nothing is shown
+SHOWN = 0.2  # of the hits, at least, to make out a place
+CLEAR_SHOWN, CLEAR_SCORE, CLEAR_WRONG = 0.8, 0.8, 0.03  # a place beyond doubt, but for its likes
+AGAINST = 0.1  # beams that the map rules out, more than elsewhere: it is not there
+BEYOND_M = 3.0  # past the edge of what is known to be free
+MOST_BLOCKS, MOST_TRIED, MOST_FOUND = 40_000, 192, 24
 APART_M, APART_RAD = 0.3, math.radians(20)  # nearer ones are the same
+SLID_M = 0.25  # a fit that went farther from where it began has become another place
 WEAK = np.diag((1.0, 1.0, 1.0))  # information that holds a candidate where it was found
 
 Bytes = NDArray[np.uint8]
@@ -49,24 +56,10 @@ def search(
     """
     if len(hits) < FEWEST_POINTS or not field.free.any():
         return []
-    chosen = hits[np.linspace(0, len(hits) - 1, min(POINTS, len(hits))).astype(np.intp)]
-    likely = np.exp(-0.5 * (field.distance / SIGMA) ** 2)
-    likely[~field.shown] = NEUTRAL
-    image = np.round(255 * likely).astype(np.uint8)
-    bounds, headings = _bounds(field, image, chosen)
-    places = _best_blocks(bounds)
-    offsets = _turned(chosen, headings, field.cell)
-    scores, cells = _inside(image, field.free, offsets, places, bounds)
-    tried: list[Floats] = []
-    for k in np.argsort(-scores, kind="stable")[: 50 * MOST_TRIED]:
-        if scores[k] < max(LEAST, scores.max() - BAND) or len(tried) == MOST_TRIED:
-            break
-        xy = field.origin + (cells[k] + 0.5) * field.cell
-        pose = np.array((*xy, headings[places[k, 0]]))
-        if apart(pose, tried):
-            tried.append(pose)
+    tried = _likely(field, hits)
     fits = [fit(field, hits, free, sensor, pose, WEAK) for pose in tried]
-    found = _distinct([Candidate(one.pose, one.score) for one in fits])
+    stayed = [one for one, pose in zip(fits, tried, strict=True) if _near(one.pose, pose)]
+    found = [Candidate(one.pose, one.score) for one in _distinct(field, stayed)]
     if last is None:
         return found
     here = fit(field, hits, free, sensor, last, WEAK)
@@ -75,16 +68,41 @@ def search(
     return [*found, Candidate(here.pose, here.score)]
 
 
-def _bounds(field: Field, image: Bytes, points: Points) -> tuple[Bytes, Floats]:
+def _likely(field: Field, hits: Points) -> list[Floats]:
+    """Poses (3,) that put the hits near walls, the best first."""
+    chosen = hits[np.linspace(0, len(hits) - 1, min(POINTS, len(hits))).astype(np.intp)]
+    image = np.round(255 * np.exp(-0.5 * (field.distance / SIGMA) ** 2)).astype(np.uint8)
+    image[image == UNKNOWN] += 1
+    image[~field.shown] = UNKNOWN
+    standing = _standing(field)
+    bounds, headings = _bounds(image, standing, chosen, field.cell)
+    places = _best_blocks(bounds)
+    offsets = _turned(chosen, headings, field.cell)
+    scores, cells = _inside(image, standing, offsets, places, bounds)
+    tried: list[Floats] = []
+    for k in np.argsort(-scores, kind="stable")[: 50 * MOST_TRIED]:
+        if scores[k] < max(LEAST, scores.max() - BAND) or len(tried) == MOST_TRIED:
+            break
+        xy = field.origin + (cells[k] + 0.5) * field.cell
+        pose = np.array((*xy, headings[places[k, 0]]))
+        if apart(pose, tried):
+            tried.append(pose)
+    return tried
+
+
+def _bounds(
+    image: Bytes, standing: NDArray[np.bool_], points: Points, cell: float
+) -> tuple[Bytes, Floats]:
     """Upper bounds (headings, rows, columns) of blocks, 0 to 255, and the headings [rad]."""
     reach = float(np.percentile(np.hypot(points[:, 0], points[:, 1]), 75))
     finest = min(max(STEP_M / max(reach, STEP_M), FINEST_RAD), COARSEST_RAD)
     headings = np.arange(0.0, math.tau, math.tau / math.ceil(math.tau / finest))
     best_within = cv2.dilate(image, np.ones((BLOCK, BLOCK), np.uint8), anchor=(0, 0))
-    free = field.free.astype(np.uint8)
-    some_free = cv2.dilate(free, np.ones((BLOCK, BLOCK), np.uint8), anchor=(0, 0))
+    some_free = cv2.dilate(
+        standing.astype(np.uint8), np.ones((BLOCK, BLOCK), np.uint8), anchor=(0, 0)
+    )
     blocks = np.array(some_free[::BLOCK, ::BLOCK], np.uint8)
-    offsets = _turned(points, headings, field.cell)
+    offsets = _turned(points, headings, cell)
     return _coarse(np.array(best_within, np.uint8), blocks, offsets), headings
 
 
@@ -114,14 +132,44 @@ def apart(pose: Floats, others: Iterable[Floats]) -> bool:
     return True
 
 
-def _distinct(candidates: list[Candidate]) -> list[Candidate]:
-    """The best of those that lie together, the best first, down to the band below the best."""
-    found: list[Candidate] = []
-    for candidate in sorted(candidates, key=lambda one: -one.score):
-        good = candidate.score >= max(LEAST, found[0].score - BAND if found else LEAST)
-        if good and apart(candidate.pose, (one.pose for one in found)) and len(found) < MOST_FOUND:
-            found.append(candidate)
+def _near(one: Floats, other: Floats) -> bool:
+    return math.hypot(*(one - other)[:2]) <= SLID_M
+
+
+def _distinct(field: Field, fits: list[Fit]) -> list[Fit]:
+    """The best of those that lie together, the best first, but for what the scan speaks against."""
+    possible = [one for one in fits if one.shown >= SHOWN and one.likely >= _least(one.shown)]
+    most = min((one.wrong for one in possible), default=0.0) + AGAINST
+    found: list[Fit] = []
+    for one in sorted(possible, key=lambda one: -one.score):
+        new = one.wrong <= most and apart(one.pose, (other.pose for other in found))
+        if new and len(found) < MOST_FOUND and not _outdone(field, one, found):
+            found.append(one)
     return found
+
+
+def _outdone(field: Field, one: Fit, found: list[Fit]) -> bool:
+    """Whether little is shown of `one`, all of the best, and the map is not built alike there."""
+    if one.shown >= JUDGED or not found:
+        return False
+    best = found[0]
+    clear = best.shown >= CLEAR_SHOWN and best.score >= CLEAR_SCORE and best.wrong <= CLEAR_WRONG
+    return clear and not alike(field, compose(one.pose, inverse(best.pose)))
+
+
+def _least(shown: float) -> float:
+    """How well what is shown has to fit: the less that is, the better."""
+    return LEAST + (LEAST_SHOWN - LEAST) * max(0.0, 1.0 - shown / JUDGED)
+
+
+def _standing(field: Field) -> NDArray[np.bool_]:
+    """Where the body may be: on free ground, and past its edge where that is not shown."""
+    standing = field.free.astype(np.uint8)
+    open_ground = (field.free | ~field.shown).astype(np.uint8)
+    for _ in range(round(BEYOND_M / field.cell)):  # step by step, as walls are in the way
+        grown = cv2.dilate(standing, np.ones((3, 3), np.uint8))
+        standing = np.minimum(np.array(grown, np.uint8), open_ground)
+    return standing.astype(np.bool_)
 
 
 @kernel
@@ -129,7 +177,6 @@ def _coarse(image: Bytes, some_free: Bytes, offsets: NDArray[np.int64]) -> Bytes
     height, width = image.shape
     rows, columns = some_free.shape
     headings, count, _ = offsets.shape
-    neutral = round(255 * NEUTRAL)
     bounds = np.zeros((headings, rows, columns), np.uint8)
     for heading in range(headings):
         for row in range(rows):
@@ -142,9 +189,9 @@ def _coarse(image: Bytes, some_free: Bytes, offsets: NDArray[np.int64]) -> Bytes
                     y = row * BLOCK + offsets[heading, k, 1]
                     # a block that begins outside may end within
                     if -BLOCK < x < width and -BLOCK < y < height:
-                        total += max(neutral, image[max(y, 0), max(x, 0)])
+                        total += max(UNKNOWN, image[max(y, 0), max(x, 0)])
                     else:
-                        total += neutral
+                        total += UNKNOWN
                 bounds[heading, row, column] = total // count
     return bounds
 
@@ -179,15 +226,16 @@ def _inside(
 
 @kernel
 def _total(image: Bytes, offsets: NDArray[np.int64], x: int, y: int, enough: float) -> int:
-    """The sum over all points, or 0 as soon as `enough` is out of reach."""
+    """The sum over all points, or 0 as soon as `enough` is out of reach, or if few are shown."""
     height, width = image.shape
-    count, total = len(offsets), 0
+    count, total, shown = len(offsets), 0, 0
     for k in range(count):
         at_x, at_y = x + offsets[k, 0], y + offsets[k, 1]
+        likely = UNKNOWN
         if 0 <= at_x < width and 0 <= at_y < height:
-            total += image[at_y, at_x]
-        else:
-            total += round(255 * NEUTRAL)
+            likely = int(image[at_y, at_x])
+        total += likely
+        shown += likely != UNKNOWN
         if total + 255 * (count - 1 - k) < enough:
             return 0
-    return total
+    return total if shown >= SHOWN * count else 0

@@ -24,7 +24,7 @@ def compose(first: Floats, second: Floats) -> Floats:
     cos, sin = np.cos(first[..., 2]), np.sin(first[..., 2])
     x = first[..., 0] + cos * second[..., 0] - sin * second[..., 1]
     y = first[..., 1] + sin * second[..., 0] + cos * second[..., 1]
-    return np.stack((x, y, wrap(first[..., 2] + second[..., 2])), axis=-1)
+    return _of(x, y, wrap(first[..., 2] + second[..., 2]))
 
 
 def inverse(pose: Floats) -> Floats:
@@ -32,7 +32,12 @@ def inverse(pose: Floats) -> Floats:
     cos, sin = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x = -cos * pose[..., 0] - sin * pose[..., 1]
     y = sin * pose[..., 0] - cos * pose[..., 1]
-    return np.stack((x, y, wrap(-pose[..., 2])), axis=-1)
+    return _of(x, y, wrap(-pose[..., 2]))
+
+
+def _of(x: Floats, y: Floats, yaw: Floats) -> Floats:
+    # for a single pose np.stack takes longer than all the rest
+    return np.stack((x, y, yaw), axis=-1) if x.ndim else np.array((x, y, yaw))
 
 
 def between(first: Floats, second: Floats) -> Floats:

@@ -12,17 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.mapping.drift import Rates
-from gigabrain_zenoh.mapping.front_end import FrontEnd, Kind, Match
+from gigabrain_zenoh.mapping.front_end import FrontEnd
 from gigabrain_zenoh.mapping.frozen import (
     Arrays,
     freeze_edges,
     freeze_keyframes,
+    shaped,
     thaw_edges,
     thaw_keyframes,
 )
 from gigabrain_zenoh.mapping.graph import Graph
 from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.loops import LoopSearch, around
+from gigabrain_zenoh.mapping.match import Kind, Match
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, turned
 from gigabrain_zenoh.mapping.spacing import Spacing
@@ -53,17 +55,6 @@ class Correction:
     loops: tuple[Edge, ...]
 
 
-def warm_up() -> None:
-    """Compile whatever a driving robot calls: seconds when cold, then as good as nothing."""
-    along = np.linspace(-3.0, 3.0, 60)
-    walls = np.concatenate([np.c_[along, along * 0 + 3.0], np.c_[along * 0 + 3.0, along]])
-    scan = Scan.of(walls)
-    slam = Slam()
-    slam.add(scan, IDENTITY)
-    slam.add(scan, IDENTITY)
-    slam.add(Scan.of(walls / 2), IDENTITY)  # fits nowhere
-
-
 class Slam:
     """A map that grows. All but `close_loops` belongs to one thread."""
 
@@ -78,6 +69,7 @@ class Slam:
         self._travel = 0.0
         self._graph = Graph()
         self._search = LoopSearch(rates or Rates())
+        self._closing: tuple[Edge, ...] = ()  # loops that the graph has not settled with
         self.keyframes: list[Keyframe] = []  # only ever appended to
         self.revision = 0  # changes whenever poses of keyframes are corrected
 
@@ -92,7 +84,7 @@ class Slam:
 
     @property
     def smooth(self) -> Floats:
-        """Where the robot is in the front end's own frame, which drifts and never jumps."""
+        """Where the robot is in the front end's own frame, which never jumps."""
         return self._front.pose
 
     def add(self, scan: Scan, delta: Floats, noise: Floats | None = None) -> Estimate:
@@ -137,10 +129,12 @@ class Slam:
         self._segment = self.keyframes[nearest].segment
 
     def close_loops(self) -> Correction | None:
-        """Take in the next keyframe and look for a loop from it; None when that corrects nothing.
+        """Take in the next keyframe and look for a loop from it, or go on closing what was found.
 
-        Call it until `behind` is 0. At most one thread at a time, which may be any.
+        None when that corrects nothing. Call it until `behind` is 0; one thread at a time, any.
         """
+        if self._closing:
+            return self._closed(self._graph.settle())
         here = len(self._graph.poses)
         if here == len(self.keyframes):
             return None
@@ -151,13 +145,19 @@ class Slam:
         loops = self._search.find(keyframes, self._graph.poses)
         if not loops:
             return None
-        self._graph.close(loops)
-        return Correction(self._graph.poses, tuple(loops))
+        self._closing = tuple(loops)
+        return self._closed(self._graph.close(loops))
+
+    def _closed(self, settled: bool) -> Correction | None:
+        if not settled:
+            return None
+        loops, self._closing = self._closing, ()
+        return Correction(self._graph.poses, loops)
 
     @property
     def behind(self) -> int:
-        """Keyframes that no loop was looked for from yet."""
-        return len(self.keyframes) - len(self._graph.poses)
+        """Keyframes that no loop was looked for from yet, and loops that are not closed yet."""
+        return len(self.keyframes) - len(self._graph.poses) + bool(self._closing)
 
     def apply(self, correction: Correction) -> None:
         """Move the keyframes to where `close_loops` has found them to be."""
@@ -178,7 +178,7 @@ class Slam:
             **freeze_edges("loop", self._graph.loops),
             **freeze_edges("waiting", self._search.waiting),
             "poses": self.poses,
-            "behind": np.array(self.behind),
+            "behind": np.array(len(self.keyframes) - len(self._graph.poses)),
             "searched": np.array(self._search.searched),
             "driven": np.array(self._travel),
             "local": np.array([held[id(scan.points)] for scan in scans], np.int32),
@@ -193,7 +193,7 @@ class Slam:
         cls, arrays: Arrays, spacing: Spacing | None = None, rates: Rates | None = None
     ) -> "Slam":
         """Go on from what was frozen; KeyError or ValueError if it does not belong together."""
-        slam = cls(arrays["front"].astype(np.float64), spacing, rates)
+        slam = cls(shaped(arrays, "front", 3), spacing, rates)
         slam.keyframes = thaw_keyframes(arrays)
         poses = arrays["poses"].astype(np.float64)
         behind, anchor = int(arrays["behind"]), int(arrays["anchor"])
@@ -201,10 +201,10 @@ class Slam:
             raise ValueError(f"{len(slam.keyframes)} keyframes, but {len(poses)} poses")
         slam._poses = list(poses)
         slam._travel = float(arrays["driven"])
-        slam._anchor = (anchor, arrays["anchor_pose"].astype(np.float64))
+        slam._anchor = (anchor, shaped(arrays, "anchor_pose", 3))
         slam._segment = slam.keyframes[anchor].segment
         scans = [slam.keyframes[k].scan for k in arrays["local"].astype(int)]
-        slam._front.restart(scans, list(arrays["local_poses"].astype(np.float64)))
+        slam._front.restart(scans, list(shaped(arrays, "local_poses", len(scans), 3)))
         slam._thaw_graph(poses[: len(poses) - behind], arrays)
         return slam
 
@@ -215,8 +215,9 @@ class Slam:
             self._search.drift.linked(keyframe.link)
         for loop in loops:
             self._search.drift.closed(loop)
-        if loops:
-            self._graph.close(loops)
+        settled = not loops or self._graph.close(loops)
+        while not settled:
+            settled = self._graph.settle()
         self._search.waiting = thaw_edges("waiting", arrays)
         self._search.searched = float(arrays["searched"])
         self._join(loops)

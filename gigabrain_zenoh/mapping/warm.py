@@ -13,10 +13,15 @@ BEAMS, ROOM_M = 60, 1.0
 
 def warm_up() -> None:
     """Call every kernel of making a map once."""
-    from gigabrain_zenoh.mapping import slam  # and gtsam: only who makes maps pays
+    from gigabrain_zenoh.mapping.slam import Slam  # and gtsam: only who makes maps pays
 
     warm_up_finding()
-    slam.warm_up()
+    along = np.linspace(-3.0, 3.0, 60)
+    walls = np.concatenate([np.c_[along, along * 0 + 3.0], np.c_[along * 0 + 3.0, along]])
+    slam, scan = Slam(), Scan.of(walls)
+    slam.add(scan, IDENTITY)
+    slam.add(scan, IDENTITY)
+    slam.add(Scan.of(walls / 2), IDENTITY)  # fits nowhere
 
 
 def warm_up_finding() -> None:
