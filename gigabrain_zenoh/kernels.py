@@ -6,12 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar, cast
 
+import numpy as np
+
 from gigabrain_zenoh import numba_alone
 
 F = TypeVar("F", bound=Callable[..., object])
 
 numba = numba_alone.load()
 PACKAGE = Path(__file__).parent
+NONE, ONE, TWO = np.int64(0), np.int64(1), np.int64(2)  # as literals they are compiled for apart
 HOLDERS = ("mapping", "navigation", "obstacles", "bench")  # packages with kernels
 
 

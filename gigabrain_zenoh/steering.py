@@ -40,7 +40,7 @@ LARGE = 250_000  # and for each so many cells it may take a scan more than
 DUE_SCANS = 2
 PATIENCE_S = 0.05  # how long a scan waits for a plan that is due: control waits for no more
 AGAIN_TICKS = 25  # a route is looked at twice a second, whatever happens
-NO_MAP = "nobody says where in a map the robot is; set perception: {mapping: slam} in its file"
+NO_MAP = "nobody says yet where in a map the robot is; perception: {mapping: slam} would"
 
 ANY_BODY = BodyDescription(
     robot_type="any", drive_type="differential",

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -18,7 +17,8 @@ from gigabrain_zenoh.navigation.footprint import outline_of
 from gigabrain_zenoh.navigation.local import Goal, LocalPlan, LocalPlanner, LocalSettings, Moment
 from gigabrain_zenoh.navigation.models import model_of
 from gigabrain_zenoh.navigation.mppi import Sampler
-from gigabrain_zenoh.navigation.rating import Weights
+from gigabrain_zenoh.navigation.rating import NO_DISC, Weights
+from gigabrain_zenoh.navigation.rollout import AWAY, CLOSE, COSINE, LANES, STATE, X
 from gigabrain_zenoh.navigation.window import Place, Window
 from tests.local_rig import OMNI, WAFFLE, wall
 
@@ -91,20 +91,28 @@ def test_a_quick_body_looks_round_before_it_first_drives_off() -> None:
     assert slow.plan(moment).twist.linear_x > 0.0
 
 
-def test_who_is_faster_costs_more_from_the_same_distance() -> None:
-    outline = outline_of(JACKAL.footprint)
+def near(discs: list[tuple[float, ...]], seconds: float) -> tuple[float, float]:
+    """What a Jackal in its origin has near it, and what that costs."""
     weights = Weights(disc=9.0, disc_over=0.3, disc_lead=0.1, trust=0.7)
-    near = partial(among.near_discs, weights, outline=outline, x=0.0, y=0.0, cosine=1.0, sine=0.0)
-    slow = np.array([(1.0, 0.0, 0.0, 0.0, 0.3, 0.0)])
-    quick = np.array([(1.0, -2.0, 0.0, 2.0, 0.3, 0.0)])
-    away, cost = near(discs=slow, t=1.0)
+    state = np.zeros(STATE)
+    state[COSINE : COSINE + LANES] = 1.0
+    state[X : X + LANES - 1] = 50.0  # the others are elsewhere
+    among.near_discs(weights, np.array(discs), outline_of(JACKAL.footprint), seconds, state)
+    assert (state[AWAY], state[CLOSE]) == (NO_DISC, 0.0)
+    return float(state[AWAY + LANES - 1]), float(state[CLOSE + LANES - 1])
+
+
+def test_who_is_faster_costs_more_from_the_same_distance() -> None:
+    slow = (1.0, 0.0, 0.0, 0.0, 0.3, 0.0)
+    quick = (1.0, -2.0, 0.0, 2.0, 0.3, 0.0)
+    away, cost = near([slow], 1.0)
     assert away == pytest.approx(1.0 - 0.229 - 0.3)
     assert cost == pytest.approx(9.0 * math.exp(-0.471 / 0.3))
-    assert near(discs=quick, t=1.0) == pytest.approx((0.471, 9.0 * math.exp(-0.471 / 0.5)))
-    assert near(discs=np.vstack([slow, quick]), t=1.0)[1] == pytest.approx(
+    assert near([quick], 1.0) == pytest.approx((0.471, 9.0 * math.exp(-0.471 / 0.5)))
+    assert near([slow, quick], 1.0)[1] == pytest.approx(
         9.0 * (math.exp(-0.471 / 0.3) + math.exp(-0.471 / 0.5))
     )
-    assert near(discs=quick, t=0.0)[0] == pytest.approx(math.hypot(0.771, 1.792) - 0.3)
+    assert near([quick], 0.0)[0] == pytest.approx(math.hypot(0.771, 1.792) - 0.3)
 
 
 def test_a_plan_goes_on_as_it_was_where_its_steps_become_longer() -> None:

@@ -15,6 +15,7 @@ from gigabrain_zenoh.navigation.footprint import (
     clearance,
     clearance_of,
     free_ahead,
+    middle_of,
     outline_of,
 )
 from gigabrain_zenoh.navigation.models import answer, feasible, lag_of, model_of, slowed
@@ -131,7 +132,8 @@ def test_no_point_of_the_outline_that_is_left_out_would_have_been_nearer(
     group = 0
     for x, y, yaw in random.uniform((-1.0, -1.0, -3.0), (1.0, 1.0, 3.0), (2000, 3)).tolist():
         cosine, sine = math.cos(yaw), math.sin(yaw)
-        room, group = clearance_of(grid, outline, x, y, cosine, sine, group)
+        near = middle_of(grid, outline, x, y, cosine, sine)
+        room, group = clearance_of(grid, outline, x, y, cosine, sine, near, group)
         center = np.array([(outline.center_x,), (outline.center_y,)], dtype=np.float32)
         turn = np.array([(cosine, -sine), (sine, cosine)])
         at = turn @ np.hstack([points, center]) + np.array([(x + 1.5,), (y + 1.5,)])

@@ -107,8 +107,7 @@ async def test_without_a_map_it_says_what_to_change() -> None:
             reply = await plane.ask(service, request)  # type: ignore[arg-type]
             assert not reply.ok
             assert reply.text == (
-                "nobody says where in a map the robot is; set perception: {mapping: slam} "
-                "in its file"
+                "nobody says yet where in a map the robot is; perception: {mapping: slam} would"
             )
         assert (await plane.ask(MISSION, MissionRequest(mission="do: [{wait: 1}]"))).ok
 

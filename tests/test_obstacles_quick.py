@@ -7,6 +7,7 @@ import pytest
 
 from gigabrain_schemas.brain import Obstacle
 from gigabrain_zenoh.obstacles.arc import place_of
+from gigabrain_zenoh.obstacles.partly import discs_of
 from tests.test_obstacles import JACKAL, Watch, nearest
 
 RADIUS = 0.5
@@ -75,3 +76,42 @@ def test_what_leaves_the_field_of_view_does_not_seem_to_turn() -> None:
             one = nearest(obstacles, x, 1.4)
             assert off(one, -1.5, 0.0) < 0.3
             assert math.hypot(one.x - x, one.y - 1.4) < 0.15
+
+
+def test_a_half_of_a_rim_is_a_disc_as_large_as_others() -> None:
+    half = rim(206, 270, 20)  # seen from the origin: its left half is hidden
+    found = discs_of(half, (0.0, 0.0), RADIUS)
+    assert len(found) == 1
+    assert found[0][:2] == pytest.approx((2.0, 1.0), abs=0.03)
+    two = np.vstack((half, half - np.array((0.0, 3.0))))
+    assert len(discs_of(two, (0.0, 0.0), RADIUS)) == 2
+
+
+def test_a_wall_a_hollow_and_a_few_hits_are_no_disc() -> None:
+    straight = np.column_stack((np.full(60, 2.0), np.linspace(-1.0, 1.0, 60)))
+    assert discs_of(straight, (0.0, 0.0), RADIUS) == []
+    assert discs_of(rim(10, 100, 20), (0.0, 0.0), RADIUS) == []
+    assert discs_of(rim(206, 270, 7), (0.0, 0.0), RADIUS) == []
+    assert discs_of(np.empty((0, 2)), (0.0, 0.0), RADIUS) == []
+
+
+def test_what_goes_along_behind_another_is_followed_though_nobody_saw_the_whole_of_it() -> None:
+    watch = Watch(JACKAL, (), hz=25.0)
+    for scan in range(1, 41):
+        y = -1.4 + 1.2 * scan / 25
+        obstacles = watch.scan((2.2, y, RADIUS), (3.3, 1.5 * y + 0.45, RADIUS))
+        if scan > 20:
+            one = nearest(obstacles, 3.3, 1.5 * y + 0.45)
+            assert off(one, 0.0, 1.8) < 0.4
+            assert math.hypot(one.x - 3.3, one.y - 1.5 * y - 0.45) < 0.15
+
+
+@pytest.mark.parametrize(("speed", "known"), [(1.5, True), (0.45, False)])
+def test_behind_the_robot_what_is_quick_is_known_of_for_longer(speed: float, known: bool) -> None:
+    watch = Watch(JACKAL, (), hz=25.0, fov=math.radians(270))
+    hidden = 2.0 / speed + 1.3  # it is 1.2 m aside and begins 0.6 m ahead
+    for _ in range(round(25 * hidden)):
+        x = 0.6 - speed * (watch.t + 0.04)
+        obstacles = watch.scan((x, 1.2, 0.3))
+    near = [one for one in obstacles if math.hypot(one.x - x, one.y - 1.2) < 0.3]
+    assert bool(near) is known

@@ -95,7 +95,7 @@ async def _safety(bus: Bus, ready: Callable[[], None]) -> None:
 
 
 def nodes(body: Body, folder: Path) -> dict[str, Node]:
-    settings = DecisionConfig(behaviour="navigate", unknown="allow", samples=300)
+    settings = DecisionConfig(behaviour="navigate", unknown="allow")
     return {
         "perception": functools.partial(perception.run, PerceptionConfig(mapping="slam")),
         "decision": functools.partial(decision.run, settings),

@@ -10,6 +10,7 @@ from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.behaviours.aside import Courtesy
 from gigabrain_zenoh.behaviours.bearings import Driven, Floats, Route
 from gigabrain_zenoh.behaviours.beyond import widened
 from gigabrain_zenoh.navigation.costmap import Costmap, Unknown, costmap, inflation
@@ -25,6 +26,7 @@ MUCH_BETTER_M = 1.5  # so much better has another frontier to be, or it goes to 
 OPEN, FAR_M = 2.0, 1.5  # cost of a place worth visiting, and the way there at least [m]
 SURE_TICKS = 125  # 2.5 s: the map comes once a second
 BESIDE_M = 0.25  # so near will do, for a goal that was free when it was asked for: maps shift
+TAKEN_TICKS = 500  # 10 s without coming nearer to a goal where something is
 SAME_M = 0.6  # a frontier so near is the same one: it moves as the map grows
 
 
@@ -85,11 +87,13 @@ class Guide:
     def _forget(self, number: int, tick: int) -> None:
         self._number = number
         self._path: Path | None = None
+        self._found: Path | None = None  # the last way to this goal that there was
         self._goal: Goal | None = None
         self._been: list[tuple[float, float]] = []
         self._nearest, self._nearest_tick, self._last_tick = math.inf, tick, tick
         self._open_tick = tick  # when there was something left to be seen
         self._version += 1
+        self._courtesy = Courtesy()
 
     def _note(self, asked: Asked) -> None:
         """Take note of what became of the last route."""
@@ -116,6 +120,9 @@ class Guide:
     def _to(self, goal: Goal, asked: Asked, chart: Costmap) -> Route:
         first, beside = self._goal is None, ""
         found = self._plan(goal, asked.here, chart)
+        room = None if first else self._making_room(goal, asked, chart)
+        if room:
+            return room
         if isinstance(found, Unreachable) and not first and found.distance <= BESIDE_M:
             assert found.nearest
             fault = found.reason.partition(";")[0]
@@ -125,12 +132,28 @@ class Guide:
         if isinstance(found, Unreachable):
             if first or self._stuck(asked, GIVE_UP_TICKS):
                 return self._ended("failed", found.reason)
+            if self._found:  # noise closes narrow ways in the map; what is near shows up there
+                return self._going(goal, self._found)
             return self._waiting(found.reason)
+        self._found = found
         self._measure(found, asked.tick)
         if self._stuck(asked, GIVE_UP_TICKS):
             left = f"{found.remaining[0]:.1f} m before the goal"
             return self._ended("failed", f"no nearer for 30 s, {left}: something is in the way")
         return self._going(goal, found, beside)
+
+    def _making_room(self, goal: Goal, asked: Asked, chart: Costmap) -> Route | None:
+        """Out of the way of whoever stands at the goal, and may wait for the robot to leave."""
+        here, stuck = (asked.here.x, asked.here.y), self._stuck(asked, TAKEN_TICKS)
+        search = self._planner.search
+        if self._courtesy.look(goal, here, asked.tick, stuck, chart, search):
+            self._nearest, self._nearest_tick, self._found = math.inf, asked.tick, None
+            self._version += 1
+        place = self._courtesy.place
+        way = self._planner.plan(chart, here, (place.x, place.y)) if place else None
+        if place is None or not isinstance(way, Path):
+            return None
+        return replace(self._going(place, way, "making room: something is at the goal"), aside=True)
 
     def _anywhere(self, asked: Asked, chart: Costmap) -> Goal:
         """A place in the open that can be reached; where it is, if there is no other."""
@@ -208,7 +231,7 @@ class Guide:
 
     def _leave(self, tick: int) -> None:
         """This goal is done with; the next is another."""
-        self._goal = self._path = None
+        self._goal = self._path = self._found = None
         self._nearest, self._nearest_tick = math.inf, tick
         self._version += 1
 

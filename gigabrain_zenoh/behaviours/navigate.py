@@ -86,7 +86,7 @@ class Navigate:
             response=bearings.response,
             progress=self.outcome.progress,
             behaviour="navigate",
-            reason=f"{_headline(bearings.order, goal)}: {plan.reason}{_slowly(bearings)}"[:500],
+            reason=f"{_headline(bearings.order, route)}: {plan.reason}{_slowly(bearings)}"[:500],
         )
 
     def _tell(self, plan: local.LocalPlan, here: Pose, bearings: Bearings, route: Route) -> None:
@@ -99,7 +99,7 @@ class Navigate:
         distance = float(np.hypot(*np.diff(left, axis=0).T).sum())
         self._longest = max(self._longest, distance, 1e-6)
         self.driven = Driven(version=route.version, arrived=plan.arrived, blocked=plan.blocked)
-        arrived = plan.arrived and not isinstance(order, Explore)
+        arrived = plan.arrived and not isinstance(order, Explore) and not route.aside
         speed = min(self._config.speed_limit or math.inf, bearings.body.max_linear_speed)
         self.outcome = Outcome(
             number=order.number,
@@ -142,9 +142,12 @@ def _why_not(situation: Situation) -> str:
     return ""
 
 
-def _headline(order: Order | None, goal: Goal) -> str:
+def _headline(order: Order | None, route: Route) -> str:
     """What it is at: the same for as long as that does not change."""
-    return "exploring" if isinstance(order, Explore) else f"going to {where(goal)}"
+    assert route.goal
+    if route.aside:
+        return route.reason
+    return "exploring" if isinstance(order, Explore) else f"going to {where(route.goal)}"
 
 
 def _at(route: Route, goal: Goal) -> str:

@@ -1,5 +1,6 @@
 """BARN and DynaBARN: many worlds, many trials, and what they come to."""
 
+import gc
 import statistics
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -66,8 +67,7 @@ def measure_barn(
     """
     drive = barn_nodes.drive if nodes else barn_drive.drive
     done = []
-    spawn, warm = get_context("spawn"), local.warm_up  # as a robot is that drives
-    with ProcessPoolExecutor(jobs, spawn, initializer=warm, initargs=(JACKAL,)) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_get_ready) as pool:
         waiting = [
             pool.submit(drive, world, trial, PLANTS[plant], samples)
             for world in worlds
@@ -78,3 +78,10 @@ def measure_barn(
             progress(done[-1])
     done.sort(key=lambda one: (one.world, one.trial))
     return BarnResult(plant=PLANTS[plant], samples=samples, trials=tuple(done))
+
+
+def _get_ready() -> None:
+    """As a robot's process before it drives: all is compiled, and what is there no garbage."""
+    local.warm_up(JACKAL)
+    gc.collect()
+    gc.freeze()

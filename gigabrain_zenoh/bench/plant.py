@@ -12,7 +12,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
-from gigabrain_schemas.body import BodyDescription, Lidar
+from gigabrain_schemas.body import BodyDescription, Lidar, Thresholds
 from gigabrain_zenoh.kernels import kernel
 from gigabrain_zenoh.limits import ZERO
 
@@ -40,6 +40,9 @@ JACKAL = BodyDescription(
     max_linear_deceleration=ACCELERATION,
     max_angular_acceleration=ANGULAR_ACCELERATION,
     lidar=LIDAR,
+    # from a scan to its brake: till the next, a tick on the bus, the hard plant's delay and most of
+    # its lag, of which a body that brakes from a low speed feels the less
+    thresholds=Thresholds(reaction_time=0.26),
 )
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.kernels import lean_kernel
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.models import Model
-from gigabrain_zenoh.navigation.rating import NO_DISC, Weights, from_discs
+from gigabrain_zenoh.navigation.rating import DISC_ROOM, NO_DISC, Weights, exponential
+from gigabrain_zenoh.navigation.rollout import AWAY, CLOSE, COSINE, LANES, SINE, X, Y
 
 Floats = NDArray[np.float64]
 
@@ -46,38 +47,53 @@ def of_contact(weights: Weights, seconds: float, share: float) -> float:
 
 
 @lean_kernel
-def of_discs(
-    weights: Weights, discs: Floats, outline: Outline, x: float, y: float, cosine: float,
-    sine: float, t: float,
-) -> tuple[float, float]:  # fmt: skip
-    """How far the body's box is from the nearest of `discs` (m, 6) `t` [s] from now [m].
+def near_discs(
+    weights: Weights, discs: Floats, outline: Outline, seconds: float, state: Floats
+) -> None:
+    """How near the bodies of a `state` are to `discs` (m, 6), so many `seconds` from now.
 
-    And what it costs for a second to be so near to each of them, where that is counted.
+    AWAY takes how far each body's box is from the nearest [m], CLOSE, where that is counted, what
+    it costs for a second to be so near to them all.
     """
-    if weights.trust > 0.0:
-        return near_discs(weights, discs, outline, x, y, cosine, sine, t)
-    return from_discs(discs, outline, x, y, cosine, sine, t), 0.0
+    for lane in range(LANES):
+        state[AWAY + lane], state[CLOSE + lane] = NO_DISC, 0.0
+    fades = weights.trust > 0.0
+    for disc in discs:
+        vx, vy = disc[2], disc[3]
+        x, y = disc[0] + vx * seconds, disc[1] + vy * seconds
+        radius = disc[4] + disc[5] * (min(seconds, GROWS_S) if fades else seconds)
+        over = weights.disc_over + weights.disc_lead * math.sqrt(vx * vx + vy * vy)
+        room = DECAYS * over if fades else DISC_ROOM
+        if _any_near(state, x, y, outline.far + radius + room):
+            _add_disc(outline, x, y, radius, room, 1.0 / over if fades else 0.0, state)
+    if fades:
+        for lane in range(LANES):
+            state[CLOSE + lane] *= weights.disc
 
 
 @lean_kernel
-def near_discs(
-    weights: Weights, discs: Floats, outline: Outline, x: float, y: float, cosine: float,
-    sine: float, t: float,
-) -> tuple[float, float]:  # fmt: skip
-    """How far it is from the nearest [m], and what it costs for a second to be near to them all."""
-    nearest, cost = NO_DISC, 0.0
-    for i in range(discs.shape[0]):
-        vx, vy = discs[i, 2], discs[i, 3]
-        dx, dy = discs[i, 0] + vx * t - x, discs[i, 1] + vy * t - y
-        radius = discs[i, 4] + discs[i, 5] * min(t, GROWS_S)
-        over = weights.disc_over + weights.disc_lead * math.sqrt(vx * vx + vy * vy)
-        reach = outline.far + radius + DECAYS * over
-        if dx * dx + dy * dy >= reach * reach:
-            continue
+def _any_near(state: Floats, x: float, y: float, reach: float) -> bool:
+    near = False
+    for lane in range(LANES):
+        dx, dy = x - state[X + lane], y - state[Y + lane]
+        near |= dx * dx + dy * dy < reach * reach
+    return near
+
+
+@lean_kernel
+def _add_disc(
+    outline: Outline, x: float, y: float, radius: float, room: float, decay: float, state: Floats
+) -> None:
+    """One disc more. What is farther from it than `room` [m] takes no notice."""
+    reach = outline.far + radius + room
+    for lane in range(LANES):
+        dx, dy = x - state[X + lane], y - state[Y + lane]
+        cosine, sine = state[COSINE + lane], state[SINE + lane]
         ahead, aside = cosine * dx + sine * dy, cosine * dy - sine * dx
         out_x = max(outline.rear - ahead, 0.0, ahead - outline.front)
         out_y = max(outline.right - aside, 0.0, aside - outline.left)
         away = math.sqrt(out_x * out_x + out_y * out_y) - radius
-        nearest = min(nearest, away)
-        cost += math.exp(-max(0.0, away) / over)
-    return nearest, weights.disc * cost
+        near = dx * dx + dy * dy < reach * reach
+        cost = exponential(-decay * max(0.0, away)) if near and decay > 0.0 else 0.0
+        state[AWAY + lane] = min(state[AWAY + lane], away if near else NO_DISC)
+        state[CLOSE + lane] += cost

@@ -2,7 +2,6 @@
 
 import math
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,14 +10,20 @@ from gigabrain_zenoh.navigation.footprint import Grid
 
 COARSER = 2  # cells of the window per cell of the field, along each axis
 FARTHEST = 1e4  # [m], what cannot be reached
+UNIT = (
+    1e-5  # [m], of ways while they are compared: whole numbers are added in a quarter of the time
+)
 TIGHT, TIGHT_OVER = 12.0, 0.09  # cost of a place where the body just fits, and its decay [m]
 TOUCHING, INSIDE = 60.0, 400.0  # high and not infinite: whoever stands there must find out
 
-BEYOND = 1e6  # cost of what is beside the window
+BEYOND = 1e4  # cost of what is beside the window
 DIAGONAL = math.sqrt(2.0)
+HALVINGS = 5  # of an exponent, for the first terms of its series to do
+SECOND, THIRD, FOURTH = np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24)
 
 Floats = NDArray[np.float64]
-Spans = NDArray[np.float32]
+Singles = NDArray[np.float32]
+Units = NDArray[np.int32]
 
 
 class CostToGo:
@@ -26,11 +31,10 @@ class CostToGo:
 
     def __init__(self, cells: int) -> None:
         side = cells // COARSER
-        self._side = side
         self._field = np.empty((side, side), dtype=np.float32)
-        self._padded = np.empty((side, side + 2), dtype=np.float32)
-        self._cost = np.full((side, side + 2), np.float32(BEYOND), dtype=np.float32)
-        self._spans = np.empty((3, side + 2), dtype=np.float32)
+        self._padded = np.empty((side, side + 2), dtype=np.int32)
+        self._halves = np.empty((2, side, side + 2), dtype=np.int32)
+        self._spans = np.empty((3, side + 2), dtype=np.int32)
 
     def field(
         self, grid: Grid, half_width: float, goal: tuple[float, float], path: Floats | None
@@ -39,37 +43,32 @@ class CostToGo:
 
         Without a path, and with the goal outside, every place at the rim counts on free way beyond.
         """
-        side, cell = self._side, grid.cell * COARSER
-        distance = np.asarray(
-            cv2.resize(grid.distance, (side, side), interpolation=cv2.INTER_AREA), dtype=np.float32
-        )
-        cost = _cost(distance, np.float32(half_width))
-        seed = _seed(side, cell, (grid.x, grid.y), goal, path)
-        self._cost[:, 1:-1], self._padded[:, 1:-1] = cost, seed
-        self._padded[:, [0, -1]] = FARTHEST
-        _sweep(self._cost, np.float32(cell), self._padded, self._spans)
-        self._field[:] = self._padded[:, 1:-1]
+        cell = grid.cell * COARSER
+        _price(grid.distance, np.float32(half_width), np.float32(cell / 2.0 / UNIT), self._halves)
+        self._padded.fill(round(FARTHEST / UNIT))
+        _seed(self._padded[:, 1:-1], cell, (grid.x, grid.y), goal, path)
+        _sweep(self._halves, self._padded, self._spans)
+        np.multiply(self._padded[:, 1:-1], np.float32(UNIT), out=self._field, casting="unsafe")
         return Grid(self._field, cell, grid.x, grid.y)
 
 
 def _seed(
-    side: int, cell: float, corner: tuple[float, float], goal: tuple[float, float],
+    seed: Units, cell: float, corner: tuple[float, float], goal: tuple[float, float],
     path: Floats | None,
-) -> NDArray[np.float32]:  # fmt: skip
-    """What is known from the start: (side, side), FARTHEST elsewhere."""
-    seed = np.full((side, side), FARTHEST, dtype=np.float32)
+) -> None:  # fmt: skip
+    """Put what is known from the start into `seed` (side, side), in units; elsewhere stays."""
+    side = len(seed)
     points = np.array([goal]) if path is None else path
     cells = np.floor((points - corner) / cell).astype(np.int64)
     inside = np.asarray(((cells >= 1) & (cells < side - 1)).all(axis=1))
     if inside.any():
         last = _way_out(points, inside, np.add(corner, side * cell / 2))
         column, row = cells[last]
-        seed[row, column] = 0.0
-        return seed
+        seed[row, column] = 0
+        return
     x, y = (np.add.outer(corner, (np.arange(side) + 0.5) * cell).T - points[-1]).T
     for end in (0, -1):
-        seed[end], seed[:, end] = np.hypot(x, y[end]), np.hypot(x[end], y)
-    return seed
+        seed[end], seed[:, end] = np.hypot(x, y[end]) / UNIT, np.hypot(x[end], y) / UNIT
 
 
 def _way_out(points: Floats, inside: NDArray[np.bool_], robot: Floats) -> int:
@@ -80,24 +79,43 @@ def _way_out(points: Floats, inside: NDArray[np.bool_], robot: Floats) -> int:
     return nearest + int(outside[0]) - 1 if len(outside) else len(points) - 1
 
 
-def _cost(distance: NDArray[np.float32], half_width: np.float32) -> NDArray[np.float32]:
-    near = np.exp((half_width - distance) * np.float32(1.0 / TIGHT_OVER))
-    cost: NDArray[np.float32] = np.float32(1.0) + np.float32(TIGHT) * near
-    cost[distance < half_width] = TOUCHING
-    cost[distance < 0.6 * half_width] = INSIDE
-    return cost
+@kernel
+def _price(distance: Singles, half_width: np.float32, half: np.float32, halves: Units) -> None:
+    """Fill `halves` (2, side, side + 2): half the way over each cell, straight and aslant.
+
+    `half` is that way where it is free. From the mean distance of COARSER x COARSER cells; the
+    exponential function is written out: so it is vectorised.
+    """
+    side, slant = halves.shape[1], half * np.float32(DIAGONAL)
+    for row in range(side):
+        for end in (0, side + 1):
+            halves[0, row, end] = halves[1, row, end] = np.int32(BEYOND * half)
+    touching, inside = np.float32(TOUCHING), np.float32(INSIDE)
+    per_over, share = np.float32(1.0 / TIGHT_OVER / 2**HALVINGS), np.float32(1.0 / COARSER**2)
+    one, tight, well_in = np.float32(1.0), np.float32(TIGHT), np.float32(0.6) * half_width
+    for row in range(side):
+        first, second = distance[2 * row], distance[2 * row + 1]
+        straight, aslant = halves[0, row, 1 : side + 1], halves[1, row, 1 : side + 1]
+        for j in range(side):
+            away = (first[2 * j] + first[2 * j + 1] + second[2 * j] + second[2 * j + 1]) * share
+            y = (half_width - away) * per_over
+            near = one + y * (one + y * (SECOND + y * (THIRD + y * FOURTH)))
+            for _ in range(HALVINGS):
+                near *= near
+            price = one + tight * near
+            price = price if away >= half_width else touching
+            price = price if away >= well_in else inside
+            straight[j], aslant[j] = np.int32(price * half), np.int32(price * slant)
 
 
 @kernel
-def _sweep(
-    cost: NDArray[np.float32], cell: np.float32, field: NDArray[np.float32], spans: Spans
-) -> None:
+def _sweep(halves: Units, field: Units, spans: Units) -> None:
     """Lower `field` until each cell is as cheap as by any of its eight neighbours.
 
     The edge between two costs its length times the mean of their costs. Row by row, down and up,
     as long as a row beside has changed: what Dijkstra's algorithm finds, in a quarter of its time.
     """
-    rows = cost.shape[0]
+    rows = len(field)
     stale, fresh = np.ones(rows, dtype=np.bool_), np.ones(rows, dtype=np.bool_)
     going, down = True, True
     while going:
@@ -107,11 +125,11 @@ def _sweep(
             if not stale[i]:
                 continue
             stale[i] = False
-            changed = i > 0 and _from_row(cost[i - 1], cost[i], field[i - 1], field[i], cell)
+            changed = i > 0 and _from_row(halves, field, i - 1, i)
             if i < rows - 1:
-                changed |= _from_row(cost[i + 1], cost[i], field[i + 1], field[i], cell)
+                changed |= _from_row(halves, field, i + 1, i)
             if changed or fresh[i]:
-                changed |= _along(cost[i], field[i], cell, spans)
+                changed |= _along(halves[0, i], field[i], spans)
                 fresh[i] = False
             if changed:
                 going = True
@@ -121,60 +139,49 @@ def _sweep(
 
 
 @kernel
-def _from_row(
-    beside: NDArray[np.float32],
-    cost: NDArray[np.float32],
-    known: NDArray[np.float32],
-    row: NDArray[np.float32],
-    cell: np.float32,
-) -> bool:
-    """Lower `row` by steps from the row beside it; whether that changed it.
+def _from_row(halves: Units, field: Units, beside: int, i: int) -> bool:
+    """Lower row `i` by steps from the row beside it; whether that changed it.
 
     Slices, not indices: they are vectorised.
     """
-    n = len(row)
-    half = np.float32(0.5) * cell
-    slant = half * np.float32(DIAGONAL)
+    n = field.shape[1]
+    known, here = field[beside], field[i, 1 : n - 1]
+    mine, mine_aslant = halves[0, i, 1 : n - 1], halves[1, i, 1 : n - 1]
+    straight, aslant = halves[0, beside, 1 : n - 1], halves[1, beside]
+    a, b, c, p, r = known[: n - 2], known[1 : n - 1], known[2:], aslant[: n - 2], aslant[2:]
     changed = False
-    here, mine = row[1 : n - 1], cost[1 : n - 1]
-    a, b, c = known[: n - 2], known[1 : n - 1], known[2:]
-    p, q, r = beside[: n - 2], beside[1 : n - 1], beside[2:]
     for j in range(n - 2):
-        left = a[j] + slant * (p[j] + mine[j])
-        middle = b[j] + half * (q[j] + mine[j])
-        right = c[j] + slant * (r[j] + mine[j])
-        best = left if left < right else right
-        best = middle if middle < best else best
+        left, right = np.int32(a[j] + p[j]), np.int32(c[j] + r[j])
+        middle = np.int32(b[j] + straight[j] + mine[j])
+        best = np.int32(min(left, right) + mine_aslant[j])
+        best = min(middle, best)
         changed |= best < here[j]
-        here[j] = best if best < here[j] else here[j]
+        here[j] = min(best, here[j])
     return changed
 
 
 @kernel
-def _along(
-    cost: NDArray[np.float32], row: NDArray[np.float32], cell: np.float32, spans: Spans
-) -> bool:
+def _along(halves: Units, row: Units, spans: Units) -> bool:
     """Lower `row` by steps within it, to the right and to the left; whether that changed it.
 
     Both at the same time, for each waits for itself all the way.
     """
     n = len(row)
-    half = np.float32(0.5) * cell
-    first, second = cost[: n - 1], cost[1:]
+    first, second = halves[: n - 1], halves[1:]
     steps, right, left = spans[0, : n - 1], spans[1], spans[2]
     for j in range(n - 1):
-        steps[j] = half * (first[j] + second[j])
+        steps[j] = first[j] + second[j]
     forth, back = row[0], row[n - 1]
     right[0], left[n - 1] = forth, back
     for j in range(n - 1):
-        forth = min(forth + steps[j], row[j + 1])
+        forth = min(np.int32(forth + steps[j]), row[j + 1])
         right[j + 1] = forth
         k = n - 2 - j
-        back = min(back + steps[k], row[k])
+        back = min(np.int32(back + steps[k]), row[k])
         left[k] = back
     changed = False
     for j in range(n):
-        best = right[j] if right[j] < left[j] else left[j]
+        best = min(right[j], left[j])
         changed |= best < row[j]
-        row[j] = best
+        row[j] = min(best, row[j])
     return changed

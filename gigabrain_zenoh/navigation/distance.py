@@ -62,7 +62,9 @@ def _along_rows(out: Singles, cap: int) -> None:
             here[column] = square
         if not near:
             continue
-        padded[cap : cap + width] = here
+        middle = padded[cap : cap + width]
+        for column in range(width):  # to assign the slice takes numba seconds to compile
+            middle[column] = here[column]
         for aside in range(1, cap):
             left = padded[cap - aside : cap - aside + width]
             right = padded[cap + aside : cap + aside + width]

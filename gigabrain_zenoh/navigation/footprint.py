@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import lean_kernel
+from gigabrain_zenoh.kernels import NONE, lean_kernel
 from gigabrain_zenoh.sweep import Corners, box
 
 SPACING = 0.05  # [m], between points on the outline at most
@@ -71,16 +71,20 @@ def outline_of(footprint: Corners) -> Outline:
 @lean_kernel
 def distance_at(grid: Grid, x: float, y: float) -> float:
     """The distance [m] from (x, y) to the nearest obstacle."""
-    rows, columns = grid.distance.shape
     per_cell = 1.0 / grid.cell
-    u, v = (x - grid.x) * per_cell - 0.5, (y - grid.y) * per_cell - 0.5
+    return between(grid.distance, (x - grid.x) * per_cell - 0.5, (y - grid.y) * per_cell - 0.5)
+
+
+@lean_kernel
+def between(distance: Singles, u: float, v: float) -> float:
+    """What `distance` (rows, columns) says between the centers of its cells, (0, 0) first."""
+    rows, columns = distance.shape
     if u < 0.0 or v < 0.0 or u >= columns - 1 or v >= rows - 1:
         return FAR
     i, j, one = np.uint32(v), np.uint32(u), np.uint32(1)
     a, b = v - i, u - j
-    d = grid.distance
-    low = d[i, j] + b * (d[i, j + one] - d[i, j])
-    high = d[i + one, j] + b * (d[i + one, j + one] - d[i + one, j])
+    low = distance[i, j] + b * (distance[i, j + one] - distance[i, j])
+    high = distance[i + one, j] + b * (distance[i + one, j + one] - distance[i + one, j])
     found: float = low + a * (high - low)
     return found
 
@@ -93,15 +97,19 @@ def clearance(
 
     More than ROOM counts as ROOM.
     """
-    return clearance_of(grid, outline, x, y, cosine, sine, 0)[0]
+    middle = middle_of(grid, outline, x, y, cosine, sine)
+    return clearance_of(grid, outline, x, y, cosine, sine, middle, int(NONE))[0]
 
 
 @lean_kernel
 def clearance_of(
-    grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float, first: int
-) -> tuple[float, int]:
-    """The clearance, and the group of points that has it: looked at `first`, it spares others."""
-    middle = _middle(grid, outline, x, y, cosine, sine)
+    grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float, middle: float,
+    first: int,
+) -> tuple[float, int]:  # fmt: skip
+    """The clearance, and the group of points that has it: looked at `first`, it spares others.
+
+    `middle` is that of `middle_of`.
+    """
     if middle >= outline.outer + ROOM:
         return ROOM, first
     nearest = min(ROOM, middle - outline.inner) if middle < outline.inner else ROOM
@@ -110,13 +118,10 @@ def clearance_of(
 
 
 @lean_kernel
-def depth_of(grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float) -> float:
-    """What the clearance is no more than where an obstacle is well inside [m]; 0 elsewhere."""
-    return min(0.0, _middle(grid, outline, x, y, cosine, sine) - outline.inner)
-
-
-@lean_kernel
-def _middle(grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float) -> float:
+def middle_of(
+    grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float
+) -> float:
+    """How far the middle of the body's box is from the nearest obstacle [m]."""
     center_x = x + cosine * outline.center_x - sine * outline.center_y
     center_y = y + sine * outline.center_x + cosine * outline.center_y
     return distance_at(grid, center_x, center_y)

@@ -171,19 +171,19 @@ def _standing(reason: str, *, arrived: bool = False, blocked: bool = False) -> L
 
 def _trajectory(track: Floats, dt: float) -> tuple[TrajectoryPoint, ...]:
     """`track` (T + 1, 6) as seen from its first pose."""
-    x, y, yaw = track[0, :3]
+    rows = track.tolist()  # plain numbers are quicker where they are few
+    x, y, yaw, *_ = rows[0]
     cosine, sine = math.cos(yaw), math.sin(yaw)
-    dx, dy = track[:, 0] - x, track[:, 1] - y
-    here = np.column_stack(
-        (
-            np.arange(len(track)) * dt,
-            cosine * dx + sine * dy,
-            cosine * dy - sine * dx,
-            track[:, 2] - yaw,
-            track[:, 3:],
+    return tuple(
+        TrajectoryPoint(
+            n * dt,
+            cosine * (to_x - x) + sine * (to_y - y),
+            cosine * (to_y - y) - sine * (to_x - x),
+            to_yaw - yaw,
+            *velocity,
         )
+        for n, (to_x, to_y, to_yaw, *velocity) in enumerate(rows)
     )
-    return tuple(TrajectoryPoint(*row) for row in here.tolist())
 
 
 def _axes(of: Velocity) -> tuple[float, float, float]:

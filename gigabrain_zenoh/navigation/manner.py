@@ -20,7 +20,7 @@ ASIDE_M = 0.15  # [m], so far off the straight way is round something
 def kind_of(model: Model, track: Floats, dt: float, goal: Goal) -> Kind:
     """What `track` (T + 1, 6) amounts to within the next second."""
     soon = min(len(track) - 1, max(1, round(SOON_S / dt)))
-    begin, end = track[0], track[soon]
+    begin, end = track[0].tolist(), track[soon].tolist()  # plain numbers are quicker
     made = math.hypot(end[0] - begin[0], end[1] - begin[1])
     turned = abs(end[2] - begin[2])
     if made < STILL * model.forward * soon * dt:
@@ -72,9 +72,10 @@ def _side(bearing: float) -> str:
 
 def _aside(track: Floats, goal: Goal) -> float:
     """How far the track leaves the straight way to the goal [m]."""
-    dx, dy = goal.x - track[0, 0], goal.y - track[0, 1]
+    then: list[tuple[float, float]] = track[:, :2].tolist()
+    x, y = then[0]
+    dx, dy = goal.x - x, goal.y - y
     length = math.hypot(dx, dy)
     if length < ASIDE_M:
         return 0.0
-    across = ((track[:, 1] - track[0, 1]) * dx - (track[:, 0] - track[0, 0]) * dy) / length
-    return float(np.abs(across).max())
+    return max(abs((to_y - y) * dx - (to_x - x) * dy) for to_x, to_y in then) / length

@@ -9,24 +9,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels import NONE, kernel, lean_kernel
+from gigabrain_zenoh.navigation.draws import STANDING, noise_of, propose, simple_of
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.models import Model
+from gigabrain_zenoh.navigation.price import look_round, price, rooms_of
 from gigabrain_zenoh.navigation.rating import Scene, Weights
-from gigabrain_zenoh.navigation.rollout import STATE, Start, drive, first_rooms
+from gigabrain_zenoh.navigation.rollout import LANES, STATE, Start, move, obey
 
 Floats = NDArray[np.float64]
 
 TEMPERATURE = 0.6  # how much worse than the best still counts
-LEAST_SHARE = 1e-6  # in units of the best one's; what would have less has none
-WORTHLESS = -TEMPERATURE * math.log(LEAST_SHARE) + 1e-3  # so much worse than the best has less
+LEAST_SHARE = 1e-3  # in units of the best one's; what would have less has none: under 1 % of all
+WORTHLESS = -TEMPERATURE * math.log(LEAST_SHARE)  # so much worse than the best has less
 WORSE = 0.3  # a mean this much worse than the best has run into what its parts went round
 SETS = 8  # of noise, drawn once and taken in turn
-KEPT, FRESH = 0.85, 0.53  # of the noise from step to step
-SPREAD, TURNING_SPREAD = 0.175, 0.3  # of the noise, as a share of the largest speeds
-SIMPLE_EVERY = 4  # every so manieth plan is one twist and then another, and no noise
-STANDING = 2  # the plan that brakes
-SHARP = 0.3  # how much of the yaw rate simple plans take at high speed
 
 
 class Planned(NamedTuple):
@@ -38,17 +35,33 @@ class Planned(NamedTuple):
     standing_cost: float  # of braking and staying
 
 
+class Work(NamedTuple):
+    """Arrays that are used again, plans in lanes."""
+
+    plans: Floats  # (blocks + 1, T, 3, LANES); the last block is for what comes of the others
+    states: Floats  # (T + 1, STATE), of one block
+    costs: Floats  # (blocks, LANES)
+
+
 class Sampler:
-    """Plans by sampling; the same seed and the same questions give the same plans."""
+    """Plans by sampling; the same seed and the same questions give the same plans.
+
+    It takes as many `samples` as asked for or a few more, for all lanes to be full.
+    """
 
     def __init__(self, model: Model, samples: int, steps: int, dt: float, seed: int) -> None:
         self.dt, self._turn = dt, 0
         random = np.random.default_rng(seed)
-        self._noise = _noise(random, (SETS, samples, steps, 3), model)
-        self._simple = _simple(random, SETS, samples, steps, model)
-        self._plans = np.empty((samples, steps, 3))
-        self._states = np.empty((steps + 1, STATE))
-        self._costs = np.empty(samples)
+        blocks = math.ceil(samples / LANES)
+        noise = noise_of(random, (SETS, blocks * LANES, steps, 3), model)
+        lanes = noise.reshape(SETS, blocks, LANES, steps, 3).transpose(0, 1, 3, 4, 2)
+        self._noise = np.ascontiguousarray(lanes)
+        self._simple = simple_of(random, SETS, blocks * LANES, steps, model)
+        self._work = Work(
+            np.zeros((blocks + 1, steps, 3, LANES)),
+            np.empty((steps + 1, STATE)),
+            np.empty((blocks, LANES)),
+        )
         self.last = np.zeros((steps, 3))
 
     def forget(self) -> None:
@@ -57,118 +70,122 @@ class Sampler:
 
     def shift(self, seconds: float) -> None:
         """Let time pass: the last plan begins so much later."""
-        at = np.arange(len(self.last)) + seconds / self.dt
-        whole = np.arange(len(self.last))
-        self.last = np.stack([np.interp(at, whole, axis) for axis in self.last.T], axis=1)
+        self.last = _at(self.last, np.arange(len(self.last)) + seconds / self.dt)
 
     def step_by(self, dt: float) -> None:
         """Plan in as many steps of this length [s] from now on."""
         if dt != self.dt:
-            at = (np.arange(len(self.last)) + 0.5) * dt / self.dt - 0.5
-            whole = np.arange(len(self.last))
-            self.last = np.stack([np.interp(at, whole, axis) for axis in self.last.T], axis=1)
-            self.dt = dt
+            steps = np.arange(len(self.last))
+            self.last, self.dt = _at(self.last, (steps + 0.5) * dt / self.dt - 0.5), dt
 
     def plan(
         self, model: Model, outline: Outline, weights: Weights, scene: Scene, start: Start
     ) -> Planned:
         """The best that was found for a body that can move like `model`."""
-        dt, plans, costs = self.dt, self._plans, self._costs
-        _propose(plans, self.last, self._noise[self._turn], self._simple[self._turn])
+        noise, simple = self._noise[self._turn], self._simple[self._turn]
         self._turn = (self._turn + 1) % SETS
-        states = self._states
-        rooms = first_rooms(model, outline, scene, start, dt, states)
-        _score(model, outline, weights, scene, start, dt, rooms, plans, states, costs)
-        best = int(np.argmin(costs))
-        share = np.exp((costs[best] - costs) / TEMPERATURE)
-        share[share < LEAST_SHARE] = 0.0
-        commands = np.tensordot(share, plans, axes=1) / share.sum()
-        given = model, outline, weights, scene, start, dt, rooms
-        cost = drive(*given, commands, states, math.inf)
-        if cost > costs[best] + WORSE:
-            commands = plans[best].copy()
-            cost = drive(*given, commands, states, math.inf)
+        work, given = self._work, (model, outline, weights, scene, start, self.dt)
+        commands, track, cost, standing = _search(*given, self.last, noise, simple, work)
         self.last = commands
-        return Planned(commands, states[:, :6].copy(), cost, float(costs[STANDING]))
+        return Planned(commands, track, cost, standing)
 
 
-def _noise(
-    random: np.random.Generator, shape: tuple[int, ...], model: Model
-) -> NDArray[np.float32]:
-    """Autoregressive noise: neighbouring commands go together."""
-    noise = random.standard_normal(shape, dtype=np.float32)
-    for t in range(1, shape[2]):
-        noise[:, :, t] = KEPT * noise[:, :, t - 1] + FRESH * noise[:, :, t]
-    spread = (SPREAD * model.forward, SPREAD * model.lateral, TURNING_SPREAD * model.turning)
-    scaled: NDArray[np.float32] = noise * np.array(spread, dtype=np.float32)
-    return scaled
-
-
-def _simple(
-    random: np.random.Generator, sets: int, samples: int, steps: int, model: Model
-) -> Floats:
-    """Plans of two twists, (sets, samples, 7): both, and the step in which the second begins.
-
-    Of every three, one keeps its first twist, and one turns on the spot before it drives on.
-    """
-    first, second = (_twists(random, (sets, samples, 3), model) for _ in range(2))
-    turning = np.arange(samples) // SIMPLE_EVERY % 3
-    if model.radius == 0.0:
-        first[:, turning == 1, :2] = 0.0
-        second[:, turning == 1, 0] = model.forward * random.random(
-            (sets, int((turning == 1).sum()))
-        )
-        second[:, turning == 1, 2] = 0.0
-    when = random.uniform(1.0, steps, (sets, samples, 1))
-    when[:, turning == 0] = steps
-    return np.concatenate([first, second, when], axis=2)
-
-
-def _twists(random: np.random.Generator, shape: tuple[int, ...], model: Model) -> Floats:
-    """Any twists that the body can have; the faster, the less they turn."""
-    share = random.random(shape)
-    twists = np.empty(shape)
-    twists[..., 0] = -model.backward + (model.forward + model.backward) * share[..., 0]
-    twists[..., 1] = model.lateral * (2.0 * share[..., 1] - 1.0)
-    most = np.where(twists[..., 0] > 0.5 * model.forward, SHARP, 0.9)
-    twists[..., 2] = model.turning * most * (2.0 * share[..., 2] - 1.0)
-    return twists
+def _at(plan: Floats, steps: NDArray[np.floating]) -> Floats:
+    """The commands of `plan` (T, 3) at `steps` (T,) and between them; its ends go on for ever."""
+    inside = np.minimum(np.maximum(steps, 0.0), len(plan) - 1.0)
+    before = np.minimum(inside.astype(np.int64), len(plan) - 2)
+    first, second = plan[before], plan[before + 1]
+    found: Floats = first + (inside - before)[:, None] * (second - first)
+    return found
 
 
 @kernel
-def _propose(plans: Floats, last: Floats, noise: NDArray[np.float32], simple: Floats) -> None:
-    samples, steps, axes = plans.shape
-    for k in range(samples):
-        simply = k > 0 and k % SIMPLE_EVERY == 0
-        for t in range(steps):
-            second = 0 if t < simple[k, 6] else axes
-            for a in range(axes):
-                if simply:
-                    plans[k, t, a] = simple[k, second + a]
-                else:
-                    plans[k, t, a] = last[t, a] + (noise[k, t, a] if k > 0 else 0.0)
-    plans[STANDING] = 0.0
-
-
-@kernel
-def _score(
+def _search(
     model: Model,
     outline: Outline,
     weights: Weights,
     scene: Scene,
     start: Start,
     dt: float,
-    rooms: Floats,
-    plans: Floats,
-    states: Floats,
-    costs: Floats,
-) -> None:
-    """The `costs` of all plans, inf for those that are worthless beside one before them."""
-    best = math.inf
-    for k in range(plans.shape[0]):
-        limit = math.inf if k == STANDING else best + WORTHLESS
-        cost = drive(model, outline, weights, scene, start, dt, rooms, plans[k], states, limit)
-        costs[k], best = cost, min(best, cost)
+    last: Floats,
+    noise: NDArray[np.float32],
+    simple: Floats,
+    work: Work,
+) -> tuple[Floats, Floats, float, float]:
+    """The commands (T, 3) and the track (T + 1, 6) that were found, their cost, that of standing.
+
+    Costs are inf for plans that are worthless beside one before them. The last block holds the mean
+    of all that are not, and the best.
+    """
+    plans, states, costs = work
+    blocks, mean, best = len(costs), 0, 1
+    rooms = np.empty(min(len(states), len(start.past)))
+    found = np.full(LANES, math.inf)
+    propose(plans[:blocks], last, noise, simple)
+    least = math.inf
+    for block in range(blocks + 1):
+        if block == blocks:
+            _gather(plans, costs, found, mean, best)
+        obey(model, start, dt, plans[block])
+        move(model, outline.far, start, dt, plans[block], states)
+        look_round(weights, outline, scene, dt, states)
+        if block == 0:
+            rooms_of(scene, outline, states, rooms)
+        of = found if block == blocks else costs[block]
+        for lane in range(LANES if block < blocks else 2):
+            free = block == blocks or (block == 0 and lane == STANDING)
+            limit = math.inf if free else least + WORTHLESS
+            of[lane] = price(model, outline, weights, scene, dt, rooms, states, lane, limit)
+            least = min(least, of[lane])
+    taken = best if found[mean] > found[best] + WORSE else mean
+    commands, track = _of_lane(plans[blocks], states, taken)
+    return commands, track, found[taken], costs[0, STANDING]
+
+
+@kernel
+def _of_lane(plans: Floats, states: Floats, lane: int) -> tuple[Floats, Floats]:
+    """The commands (T, 3) and the track (T + 1, 6) of one lane."""
+    steps, axes, _ = plans.shape
+    commands, track = np.empty((steps, axes)), np.empty((steps + 1, 2 * axes))
+    for t in range(steps):
+        for axis in range(axes):
+            commands[t, axis] = plans[t, axis, lane]
+    for t in range(steps + 1):
+        for axis in range(2 * axes):
+            track[t, axis] = states[t, axis * LANES + lane]
+    return commands, track
+
+
+@lean_kernel
+def _gather(plans: Floats, costs: Floats, shares: Floats, mean: int, best: int) -> None:
+    """Put the weighted mean of the `plans`, and the best of them, into lanes of the last block.
+
+    The `shares` (LANES,) are scribbled on.
+    """
+    gathered, top, (steps, axes, _) = plans[-1], int(NONE), plans[-1].shape
+    for n in range(costs.size):
+        if costs[n // LANES, n % LANES] < costs[top // LANES, top % LANES]:
+            top = n
+    least, first, total = costs[top // LANES, top % LANES], True, 0.0
+    for block in range(len(costs)):
+        counts = False
+        for lane in range(LANES):
+            worse = costs[block, lane] - least
+            shares[lane] = math.exp(-worse / TEMPERATURE) if worse < WORTHLESS else 0.0
+            total += shares[lane]
+            counts |= worse < WORTHLESS
+        if counts:
+            for n in range(steps * axes):
+                one, sums = plans[block, n // axes, n % axes], gathered[n // axes, n % axes]
+                for lane in range(LANES):
+                    sums[lane] = (0.0 if first else sums[lane]) + shares[lane] * one[lane]
+            first = False
+    for n in range(steps * axes):
+        sums, amount = gathered[n // axes, n % axes], 0.0
+        for lane in range(LANES):
+            amount += sums[lane]
+        sums[mean] = amount / total
+        sums[best] = plans[top // LANES, n // axes, n % axes, top % LANES]
 
 
 def step_of(model: Model) -> float:
@@ -185,18 +202,8 @@ def past_of(
     each holds until the next, and `before` held before them all.
     """
     whole = math.floor(delay / dt + 1e-9)
-    past = np.empty((whole + 1, 3))
-    for i in range(whole + 1):
-        end = (i - whole) * dt
-        past[i] = _mean(sent, before, end - dt, end)
-    return past, delay / dt - whole
-
-
-def _mean(
-    sent: Floats, before: tuple[float, float, float], begin: float, end: float
-) -> tuple[float, float, float]:
+    ends = np.arange(-whole, 1) * dt
     times = np.concatenate(([-np.inf], sent[:, 0], [np.inf]))
-    values = np.concatenate(([before], sent[:, 1:]))
-    held = np.clip(times[1:], begin, end) - np.clip(times[:-1], begin, end)
-    vx, vy, w = (held @ values / (end - begin)).tolist()
-    return vx, vy, w
+    cut = np.minimum(np.maximum(times, (ends - dt)[:, None]), ends[:, None])
+    past = np.diff(cut, axis=1) @ np.concatenate(([before], sent[:, 1:])) / dt
+    return past, delay / dt - whole

@@ -60,14 +60,14 @@ def of_place(
     """What it costs to be here for a second, with obstacles and moving things so far away [m]."""
     cost = 0.0
     if room < ROOM:
-        cost += weights.near * _exp((weights.margin - room) / weights.near_over)
+        cost += weights.near * exponential((weights.margin - room) / weights.near_over)
     if away < NO_DISC and weights.trust == 0.0:
         cost += weights.disc * math.exp(-away / weights.disc_over)
     return cost + of_time(scene, x, y, yaw)
 
 
 @lean_kernel
-def _exp(x: float) -> float:
+def exponential(x: float) -> float:
     """The exponential function, to eight digits from -5 to 5: a call of math.exp takes longer."""
     y = x * (1.0 / 32.0)
     square = y * y
@@ -150,7 +150,7 @@ def distance_in(field: Grid, x: float, y: float) -> float:
 @lean_kernel
 def of_end(
     model: Model, weights: Weights, scene: Scene, x: float, y: float, yaw: float,
-    vx: float, vy: float,
+    cosine: float, sine: float, vx: float, vy: float,
 ) -> float:  # fmt: skip
     """What is left to do after the last step: to turn to the way, to drive it, to turn at its end.
 
@@ -165,7 +165,7 @@ def of_end(
     if near:
         return cost + 0.5 * SECOND * math.hypot(vx, vy) / model.forward
     here = distance_in(scene.field, x, y)
-    ahead = distance_in(scene.field, x + LOOK_AHEAD * math.cos(yaw), y + LOOK_AHEAD * math.sin(yaw))
+    ahead = distance_in(scene.field, x + LOOK_AHEAD * cosine, y + LOOK_AHEAD * sine)
     rise = max(-1.0, min(1.0, (ahead - here) / LOOK_AHEAD))
     turn = 0.5 * math.pi * (1.0 + rise)
     return cost + SECOND * weights.heading * turn / model.turning
@@ -176,26 +176,3 @@ def _turn_between(one: float, other: float) -> float:
     """The angle between two directions [rad], 0 to pi."""
     turn = one - other
     return abs(turn - math.tau * math.floor(turn / math.tau + 0.5))
-
-
-@lean_kernel
-def from_discs(
-    discs: Floats, outline: Outline, x: float, y: float, cosine: float, sine: float, t: float
-) -> float:
-    """How far the body's box is from the nearest disc, `t` [s] from now [m].
-
-    Discs that are DISC_ROOM away or more do not count.
-    """
-    nearest = NO_DISC
-    for i in range(discs.shape[0]):
-        dx = discs[i, 0] + discs[i, 2] * t - x
-        dy = discs[i, 1] + discs[i, 3] * t - y
-        reach = outline.far + discs[i, 4] + discs[i, 5] * t + min(nearest, DISC_ROOM)
-        if dx * dx + dy * dy >= reach * reach:
-            continue
-        ahead, aside = cosine * dx + sine * dy, cosine * dy - sine * dx
-        out_x = max(outline.rear - ahead, 0.0, ahead - outline.front)
-        out_y = max(outline.right - aside, 0.0, aside - outline.left)
-        away = math.sqrt(out_x * out_x + out_y * out_y) - discs[i, 4] - discs[i, 5] * t
-        nearest = min(nearest, away)
-    return nearest

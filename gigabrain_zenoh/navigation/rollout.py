@@ -1,4 +1,4 @@
-"""What a plan of commands leads to, and what that costs. Costs are such that a second is worth 8.
+"""Where plans of commands lead, as many at a time as the processor takes in one go.
 
 The body answers a command after its delay, and then as a first-order lag: what it does in the
 first moments was decided by commands that have already been sent.
@@ -10,46 +10,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel, lean_kernel
-from gigabrain_zenoh.navigation.among import of_contact, of_discs
-from gigabrain_zenoh.navigation.footprint import ROOM, Outline, clearance_of, depth_of
+from gigabrain_zenoh.kernels import lean_kernel
 from gigabrain_zenoh.navigation.models import Lag, Model, answer, feasible
-from gigabrain_zenoh.navigation.rating import (
-    Scene,
-    Weights,
-    from_discs,
-    of_braking,
-    of_end,
-    of_motion,
-    of_place,
-    of_time,
-    rest,
-)
 
 Floats = NDArray[np.float64]
 
-TOUCHED = 300.0  # what a contact costs
-LEAST_TOUCHED = 80.0  # or with what moves, in the last step
-IMPACT = 50.0  # per m/s of a contact
-BRAKE_EVERY = 3  # steps
-AT_EASE = 0.25  # [m], room of more than that is not looked at anew before it can have gone
-
-
-class State(NamedTuple):
-    """Where the body is in one moment of a plan, and how it moves."""
-
-    x: float  # [m]
-    y: float
-    yaw: float  # [rad]
-    vx: float  # [m/s]
-    vy: float
-    w: float  # [rad/s]
-    cosine: float  # of the yaw
-    sine: float
-    moved: float  # [m], no point of it has gone farther in the step before
-
-
-STATE = len(State._fields)
+LANES = 8  # plans at a time
+X, Y, YAW, VX, VY, W = range(0, 6 * LANES, LANES)  # where the lanes of each begin in a state:
+COSINE, SINE, MOVED = range(6 * LANES, 9 * LANES, LANES)  # its pose, velocity, and the way [m] that
+MIDDLE, SURE, AWAY, CLOSE = range(9 * LANES, 13 * LANES, LANES)  # no point exceeds; see price.py
+STATE = 13 * LANES
+SECOND_X, SECOND_Y, SECOND_TURN = range(3 * LANES, 6 * LANES, LANES)  # of two commands in a row
+COMMAND = 3 * LANES
 
 
 class Start(NamedTuple):
@@ -69,158 +41,79 @@ class Start(NamedTuple):
 
 
 @lean_kernel
-def effective(start: Start, plan: Floats, t: int, axis: int) -> float:
-    """The mean command [m/s or rad/s] that rules the body in step `t`."""
-    delayed = start.past.shape[0]
-    older, newer = t - delayed, t - delayed + 1
-    old = start.past[t, axis] if older < 0 else plan[older, axis]
-    new = start.past[t + 1, axis] if newer < 0 else plan[newer, axis]
-    mean: float = start.share * old + (1.0 - start.share) * new
-    return mean
+def obey(model: Model, start: Start, dt: float, plans: Floats) -> None:
+    """Make `plans` (T, 3, LANES) feasible in place.
 
-
-@lean_kernel
-def drive(
-    model: Model,
-    outline: Outline,
-    weights: Weights,
-    scene: Scene,
-    start: Start,
-    dt: float,
-    rooms: Floats,
-    plan: Floats,
-    states: Floats,
-    limit: float,
-) -> float:
-    """The cost of `plan` (T, 3), which is first made feasible in place; inf for `limit` or more.
-
-    `rooms` are those of `first_rooms`. `states` (T + 1, STATE) takes what the plan leads to.
+    In one array, and slices of it, all offsets are known: it is vectorised. So below.
     """
-    _move(model, outline.far, start, dt, plan, states)
-    return _rate(model, outline, weights, scene, dt, rooms, states, limit)
-
-
-@kernel
-def first_rooms(
-    model: Model, outline: Outline, scene: Scene, start: Start, dt: float, states: Floats
-) -> Floats:
-    """The clearances [m] from the start on, until a plan has any effect: (n,), n of 1 or more.
-
-    `states` (T + 1, STATE) is scribbled on.
-    """
-    rooms = np.empty(min(states.shape[0], start.past.shape[0]))
-    _move(model, outline.far, start, dt, np.zeros((len(rooms) - 1, 3)), states)
-    for t in range(len(rooms)):
-        at = _noted(states, t)
-        rooms[t] = clearance_of(scene.grid, outline, at.x, at.y, at.cosine, at.sine, 0)[0]
-    return rooms
-
-
-@lean_kernel
-def _move(model: Model, far: float, start: Start, dt: float, plan: Floats, states: Floats) -> None:
-    """Fill `states` with where `plan`, made feasible, takes a body that reaches so `far` [m]."""
-    x, y, yaw, vx, vy, w = start.x, start.y, start.yaw, start.vx, start.vy, start.w
-    before = start.before
-    cosine, sine = math.cos(yaw), math.sin(yaw)
     turning = model.turning * min(1.0, start.gain)
-    _note(states, 0, State(x, y, yaw, vx, vy, w, cosine, sine, 0.0))
-    for t in range(plan.shape[0]):
-        w_wanted = max(-turning, min(turning, plan[t, 2]))
-        before = feasible(model, before, (plan[t, 0], plan[t, 1], w_wanted), dt)
-        plan[t, 0], plan[t, 1], plan[t, 2] = before
-        vx, ahead = answer(vx, effective(start, plan, t, 0), start.lag, dt)
-        vy, aside = answer(vy, effective(start, plan, t, 1), start.lag, dt)
-        w, turned = answer(w, effective(start, plan, t, 2), start.lag, dt)
-        cosine, sine = _turn(cosine, sine, 0.5 * turned)
-        x += cosine * ahead - sine * aside
-        y += sine * ahead + cosine * aside
-        cosine, sine = _turn(cosine, sine, 0.5 * turned)
-        yaw += turned
-        moved = abs(ahead) + abs(aside) + far * abs(turned)
-        _note(states, t + 1, State(x, y, yaw, vx, vy, w, cosine, sine, moved))
+    flat = plans.reshape(-1)
+    for lane in range(LANES):
+        wanted = max(-turning, min(turning, flat[2 * LANES + lane]))
+        first = feasible(model, start.before, (flat[lane], flat[LANES + lane], wanted), dt)
+        flat[lane], flat[LANES + lane], flat[2 * LANES + lane] = first
+    for t in range(1, plans.shape[0]):
+        two = flat[(t - 1) * COMMAND : (t + 1) * COMMAND]
+        for lane in range(LANES):
+            before = two[lane], two[LANES + lane], two[2 * LANES + lane]
+            wanted = max(-turning, min(turning, two[SECOND_TURN + lane]))
+            then = feasible(model, before, (two[SECOND_X + lane], two[SECOND_Y + lane], wanted), dt)
+            two[SECOND_X + lane], two[SECOND_Y + lane], two[SECOND_TURN + lane] = then
 
 
 @lean_kernel
-def _rate(
-    model: Model, outline: Outline, weights: Weights, scene: Scene, dt: float, rooms: Floats,
-    states: Floats, limit: float,
-) -> float:  # fmt: skip
-    """The cost of going through `states`, or inf as soon as it is clear that it reaches `limit`."""
-    steps, grid, discs = states.shape[0] - 1, scene.grid, scene.discs
-    at, last = _noted(states, 0), _noted(states, steps)
-    away = from_discs(discs, outline, at.x, at.y, at.cosine, at.sine, 0.0)
-    least, least_disc = (
-        min(weights.margin, rooms[0] - 0.003),
-        min(weights.disc_margin, away - 0.003),
-    )
-    limit = _sound(model, weights, scene, dt, states, limit)
-    end = of_end(model, weights, scene, last.x, last.y, last.yaw, last.vx, last.vy)
-    to_come = end + dt * _anyway(outline, scene, states, least, limit)
-    cost: float = 0.0
-    room, slack, touches = ROOM, 0.0, 0
-    for t in range(1, steps + 1):
-        if cost + to_come >= limit:
-            return math.inf
-        at = _noted(states, t)
-        slack -= at.moved
-        if slack < 0.0:
-            if t < len(rooms):
-                room = rooms[t]
-            else:
-                room, touches = clearance_of(grid, outline, at.x, at.y, at.cosine, at.sine, touches)
-            slack = room - AT_EASE
-        away, close = of_discs(weights, discs, outline, at.x, at.y, at.cosine, at.sine, t * dt)
-        if room < least:
-            cost += TOUCHED * (1.0 - 0.7 * (t / steps)) + rest(model, scene, at.x, at.y)
-            cost += IMPACT * math.hypot(at.vx, at.vy)
-            return cost
-        if away < least_disc:
-            cost += of_contact(weights, t * dt, t / steps) + rest(model, scene, at.x, at.y)
-            return cost
-        cost += dt * close
-        cost += dt * of_place(weights, scene, room, away, at.x, at.y, at.yaw)
-        cost += dt * of_motion(weights, room, at.vx, at.vy, at.w)
-        to_come -= dt * of_time(scene, at.x, at.y, at.yaw)
-        if t % BRAKE_EVERY == 1:
-            braking = of_braking(
-                model, outline, scene, room, at.x, at.y, at.cosine, at.sine, at.vx, at.vy
-            )
-            cost += dt * BRAKE_EVERY * braking
-    return cost + end
+def move(model: Model, far: float, start: Start, dt: float, plans: Floats, states: Floats) -> None:
+    """Fill `states` (T + 1, STATE) with where feasible `plans` (T, 3, LANES) take the body.
 
-
-@lean_kernel
-def _sound(
-    model: Model, weights: Weights, scene: Scene, dt: float, states: Floats, limit: float
-) -> float:
-    """The `limit`, if no contact on the way costs less; inf otherwise.
-
-    What a plan costs that touches nothing says nothing of one that does, and ends there.
+    It reaches so `far` [m] from its origin.
     """
-    least = min(LEAST_TOUCHED, of_contact(weights, (states.shape[0] - 1) * dt, 1.0))
-    if limit <= least or limit == math.inf:
-        return limit
-    for t in range(1, states.shape[0]):
-        if least + rest(model, scene, states[t, 0], states[t, 1]) < limit:
-            return math.inf
-    return limit
+    _begin(start, states[0])
+    flat = states.reshape(-1)
+    for t in range(plans.shape[0]):
+        _rule(start, plans, t, states[t + 1])
+        s = flat[t * STATE : (t + 2) * STATE]
+        for lane in range(LANES):
+            n = STATE + lane
+            vx, ahead = answer(s[VX + lane], s[VX + n], start.lag, dt)
+            vy, aside = answer(s[VY + lane], s[VY + n], start.lag, dt)
+            w, turned = answer(s[W + lane], s[W + n], start.lag, dt)
+            cosine, sine = _turn(s[COSINE + lane], s[SINE + lane], 0.5 * turned)
+            s[X + n] = s[X + lane] + (cosine * ahead - sine * aside)
+            s[Y + n] = s[Y + lane] + (sine * ahead + cosine * aside)
+            s[YAW + n] = s[YAW + lane] + turned
+            s[VX + n], s[VY + n], s[W + n] = vx, vy, w
+            s[COSINE + n], s[SINE + n] = _turn(cosine, sine, 0.5 * turned)
+            s[MOVED + n] = abs(ahead) + abs(aside) + far * abs(turned)
 
 
 @lean_kernel
-def _anyway(outline: Outline, scene: Scene, states: Floats, least: float, limit: float) -> float:
-    """What `states` cost per second, however near obstacles are; inf with one well inside the body.
+def _begin(start: Start, state: Floats) -> None:
+    cosine, sine = math.cos(start.yaw), math.sin(start.yaw)
+    for lane in range(LANES):
+        state[X + lane], state[Y + lane], state[YAW + lane] = start.x, start.y, start.yaw
+        state[VX + lane], state[VY + lane], state[W + lane] = start.vx, start.vy, start.w
+        state[COSINE + lane], state[SINE + lane], state[MOVED + lane] = cosine, sine, 0.0
 
-    Nobody looks for that where there is no `limit`.
-    """
-    cost, deepest = 0.0, min(0.0, least)
-    for t in range(1, states.shape[0]):
-        at = _noted(states, t)
-        if limit < math.inf:
-            depth = depth_of(scene.grid, outline, at.x, at.y, at.cosine, at.sine)
-            if depth < deepest:
-                return math.inf
-        cost += of_time(scene, at.x, at.y, at.yaw)
-    return cost
+
+@lean_kernel
+def _rule(start: Start, plans: Floats, t: int, state: Floats) -> None:
+    """Put the mean commands [m/s and rad/s] that rule the body in step `t` in their places."""
+    older, newer = t - start.past.shape[0], t - start.past.shape[0] + 1
+    share, rest = start.share, 1.0 - start.share
+    for axis in range(3):
+        ruled = state[VX + axis * LANES : VX + (axis + 1) * LANES]
+        if newer < 0:
+            mean = share * start.past[t, axis] + rest * start.past[t + 1, axis]
+            for lane in range(LANES):
+                ruled[lane] = mean
+        elif older < 0:
+            old, new = share * start.past[t, axis], plans[newer, axis]
+            for lane in range(LANES):
+                ruled[lane] = old + rest * new[lane]
+        else:
+            before, new = plans[older, axis], plans[newer, axis]
+            for lane in range(LANES):
+                ruled[lane] = share * before[lane] + rest * new[lane]
 
 
 @lean_kernel
@@ -230,16 +123,3 @@ def _turn(cosine: float, sine: float, angle: float) -> tuple[float, float]:
     c = 1.0 - square * (0.5 - square * (1.0 / 24.0 - square * (1.0 / 720.0)))
     s = angle * (1.0 - square * (1.0 / 6.0 - square * (1.0 / 120.0 - square * (1.0 / 5040.0))))
     return cosine * c - sine * s, sine * c + cosine * s
-
-
-@lean_kernel
-def _note(states: Floats, t: int, at: State) -> None:
-    one = states[t]
-    one[0], one[1], one[2], one[3], one[4], one[5] = at.x, at.y, at.yaw, at.vx, at.vy, at.w
-    one[6], one[7], one[8] = at.cosine, at.sine, at.moved
-
-
-@lean_kernel
-def _noted(states: Floats, t: int) -> State:
-    one = states[t]
-    return State(one[0], one[1], one[2], one[3], one[4], one[5], one[6], one[7], one[8])

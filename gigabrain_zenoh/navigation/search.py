@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels import NONE, kernel
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
 
 DIAGONAL = math.sqrt(2.0)
@@ -115,7 +115,7 @@ def _search(
     at, best = start[0] * width + start[1], np.inf  # what the way to `target` costs, so far
     g[at], mark[at] = 0.0, turn + ROOT
     now = int(_least(start[0], start[1], target) * PER_UNIT)
-    _put(first, entries, 0, now, start[0], start[1])
+    _put(first, entries, int(NONE), now, start[0], start[1])
     free, used, count, settled = NOWHERE, 1, 1, 0
     while count:
         top = first[now % BUCKETS]

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels import NONE, kernel
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
 from gigabrain_zenoh.navigation.search import Floats
 
@@ -55,7 +55,7 @@ def pull(cost: Costs, points: Floats) -> Floats:
         x, y, to_x, to_y = points[i - 1, 0], points[i - 1, 1], points[i, 0], points[i, 1]
         mean = 0.5 * (cost[int(y), int(x)] + cost[int(to_y), int(to_x)])
         spent[i] = spent[i - 1] + mean * math.hypot(to_x - x, to_y - y)
-    kept, size, at = np.zeros(count, np.int64), 1, 0
+    kept, size, at = np.zeros(count, np.int64), 1, int(NONE)
     while at < count - 1:
         at = _farthest(cost, points, spent, at)
         kept[size] = at

@@ -24,6 +24,13 @@ def on_rim(points: Floats, x: float, y: float, radius: float) -> Bools:
     return found
 
 
+def off_rims(points: Floats, discs: Floats) -> Floats:
+    """Those of the `points` (n, 2) that are hits on none of `discs` (m, 3): x, y, radius [m]."""
+    away = np.hypot(points[:, :1] - discs[:, 0], points[:, 1:] - discs[:, 1])
+    found: Floats = points[(np.abs(away - discs[:, 2]) >= RIM_M).all(axis=1)]
+    return found
+
+
 def place_of(
     points: Floats, x: float, y: float, radius: float
 ) -> tuple[float, float, float] | None:

@@ -11,10 +11,11 @@ from gigabrain_schemas.brain import Obstacle
 ACCELERATION = 0.8  # [m/s2], standard deviation of what a walking person does from scan to scan
 FIRST_SPEED = 1.0  # [m/s], standard deviation of a speed of which nothing is known
 TURNS_S = 0.06  # since it was last seen it may have gone the other way, for so long at most
-TURNED = 16.0  # square of the standard deviations off that noise does not explain
+TURNED, TURNED_PARTLY = 10.0, 16.0  # squares of the deviations off that noise does not explain
 MOST_OFF, SHIFT_M, FARTHEST_M = 4.0, 0.05, 0.5  # deviations, [m]: what shows in part is so near
 RADIUS_SHARE = 0.25  # of a new radius in the filtered one
 MOVING_M, MOVING_SPEED = 0.15, 0.15  # [m], [m/s]: a thing must go so far, so fast, to count
+QUICK = 0.5  # [m/s]
 SURE = 2.5  # standard deviations that a speed must be off zero
 STANDING_SPEED, STANDING_S = 0.12, 0.6  # slower for so long, it stands
 
@@ -35,6 +36,7 @@ class Track:
     seen: int = 1  # scans
     unseen_s: float = 0.0
     moving: bool = False
+    partly: bool = False  # when it was first seen, only a part of it was
     standing_s: float = 0.0
     anchor_x: float = 0.0  # [m], where it last stood
     anchor_y: float = 0.0
@@ -52,12 +54,16 @@ class Track:
         self.unseen_s += dt
 
     def correct(
-        self, x: float, y: float, radius: float, noise: float, *, whole: bool = False
+        self, x: float, y: float, radius: float, noise: float, *, most_off: float = math.inf
     ) -> None:
-        """It was seen at (x, y) [m], as a `whole` or not, with a deviation of `noise` [m]."""
+        """It was seen at (x, y) [m] with a deviation of `noise` [m].
+
+        Where it is more than `most_off` from where it should be (squares of deviations), it has
+        turned.
+        """
         dx, dy = x - self.x, y - self.y
         off = (dx * dx + dy * dy) / (self.position_variance + noise * noise)
-        if whole and self.moving and off > TURNED:
+        if self.moving and off > most_off:
             self._turn()
         innovation = self.position_variance + noise * noise
         k, kv = self.position_variance / innovation, self.covariance / innovation
@@ -94,6 +100,11 @@ class Track:
         """How far it may be from where it should be, for it may have turned round [m]."""
         speed = math.hypot(self.velocity_x, self.velocity_y)
         return 2 * speed * min(self.unseen_s, TURNS_S) if self.moving else 0.0
+
+    @property
+    def moves_quickly(self) -> bool:
+        """Whether it moves, and not at a stroll."""
+        return self.moving and math.hypot(self.velocity_x, self.velocity_y) > QUICK
 
     def seems_to_move(self) -> bool:
         """Whether it has gone so far and so fast that it must be told whether it moves."""

@@ -8,10 +8,12 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle
-from gigabrain_zenoh.obstacles.arc import on_rim, place_of
+from gigabrain_zenoh.obstacles.arc import off_rims, on_rim, place_of
 from gigabrain_zenoh.obstacles.clusters import Cluster, find_clusters
 from gigabrain_zenoh.obstacles.free_space import FreeSpace, Seen
-from gigabrain_zenoh.obstacles.track import Track
+from gigabrain_zenoh.obstacles.partly import discs_of
+from gigabrain_zenoh.obstacles.track import TURNED, TURNED_PARTLY, Track
+from gigabrain_zenoh.planar import compose
 
 Floats = NDArray[np.float64]
 
@@ -21,6 +23,7 @@ FARTHEST_JUMP_M = 0.6
 PARTLY = 4.0  # times as far off may be what is partly hidden
 SEEN = 2  # scans, before others hear of it
 FORGET_S, FORGET_NEW_S = 1.0, 0.25  # without having been seen, for what may be hidden
+FORGET_QUICK_S = 1.5  # what is quick may be behind a body that does not look there
 FORGET_GONE_S = 0.45  # where beams go through the place
 LONGEST_GAP_S = 1.0  # between scans; after a longer one it begins anew
 MOST = 64  # obstacles, the nearest of which are told
@@ -59,6 +62,7 @@ class ObstacleTracker:
         self._space.see(Seen(tick, points, lidar, abs(spacing), pose))
         self._judge()
         self._tracks = [track for track in self._tracks if self._lives(track)]
+        self._begin_parts(points, lidar, pose)
         for j in set(range(len(clusters))) - set(taken.values()):
             if clusters[j].whole and not any(track.covers(places[j]) for track in parts):
                 self._begin(clusters[j], places[j])
@@ -96,19 +100,19 @@ class ObstacleTracker:
         whole, parts = [], []
         for i, track in enumerate(self._tracks):
             cluster = clusters[taken[i]] if i in taken else None
-            if track.moving and not (cluster and cluster.whole):
+            if (track.moving or track.partly) and not (cluster and cluster.whole):
                 parts.append(track)
             elif cluster:
                 self._correct(track, cluster, lidar, pose)
                 whole.append(track)
         parts.sort(key=lambda track: track.position_variance)
-        for track in whole if parts else ():
-            points = points[~on_rim(points, track.x, track.y, track.radius)]
+        if parts:
+            points = _beside(points, whole)
         found = []
         for track in parts:
             place = place_of(points, track.x, track.y, track.radius)
             if place and track.may_be_at(*place):
-                track.correct(place[0], place[1], track.radius, place[2])
+                track.correct(place[0], place[1], track.radius, place[2], most_off=TURNED_PARTLY)
                 points = points[~on_rim(points, track.x, track.y, track.radius)]
                 found.append(track)
         return found
@@ -116,7 +120,7 @@ class ObstacleTracker:
     def _correct(self, track: Track, cluster: Cluster, lidar: Lidar, pose: Pose) -> None:
         x, y = _place(cluster, lidar, pose, track.radius)
         if cluster.whole:
-            track.correct(x, y, cluster.radius, cluster.noise, whole=True)
+            track.correct(x, y, cluster.radius, cluster.noise, most_off=TURNED)
         else:  # what is hidden of it is not missing from its size
             track.correct(x, y, track.radius, PARTLY * cluster.noise)
 
@@ -128,21 +132,41 @@ class ObstacleTracker:
 
     def _lives(self, track: Track) -> bool:
         limit = FORGET_S if track.seen > SEEN else FORGET_NEW_S
+        if track.moves_quickly:
+            limit = FORGET_QUICK_S
         if FORGET_GONE_S <= track.unseen_s < limit and self._space.is_free(track.x, track.y):
             return False
         return track.unseen_s < limit
 
     def _begin(self, cluster: Cluster, place: tuple[float, float]) -> None:
+        self._add(*place, cluster.radius, cluster.noise, partly=False)
+
+    def _add(self, x: float, y: float, radius: float, noise: float, *, partly: bool) -> None:
         self._ids += 1
-        x, y = place
         self._tracks.append(
-            Track(self._ids, x, y, cluster.radius, cluster.noise**2, anchor_x=x, anchor_y=y)
+            Track(self._ids, x, y, radius, noise**2, anchor_x=x, anchor_y=y, partly=partly)
         )
+
+    def _begin_parts(self, points: Floats, lidar: Lidar, pose: Pose) -> None:
+        """Follow also what others hide in part, where things move: it is taken to be as large."""
+        sizes = [track.radius for track in self._tracks if track.moves_quickly]
+        if not sizes:
+            return
+        radius = float(np.median(sizes))
+        eye = compose(pose, Pose(x=lidar.x, y=lidar.y, yaw=0.0))
+        for x, y, noise in discs_of(_beside(points, self._tracks), (eye.x, eye.y), radius):
+            if not any(track.covers((x, y)) for track in self._tracks):
+                self._add(x, y, radius, noise, partly=True)
 
     def _told(self, pose: Pose) -> tuple[Obstacle, ...]:
         known = [track for track in self._tracks if track.seen >= SEEN]
         known.sort(key=lambda track: math.hypot(track.x - pose.x, track.y - pose.y))
         return tuple(track.obstacle() for track in known[:MOST])
+
+
+def _beside(points: Floats, tracks: list[Track]) -> Floats:
+    """Those of the `points` (n, 2) that are hits on none of the `tracks`."""
+    return off_rims(points, np.array([(t.x, t.y, t.radius) for t in tracks]).reshape(-1, 3))
 
 
 def _placed(hits: Floats, pose: Pose) -> Floats:

@@ -1,0 +1,136 @@
+"""From an order to a route, as the map changes under way."""
+
+import functools
+import math
+
+import numpy as np
+
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.behaviours.bearings import Route
+from gigabrain_zenoh.behaviours.guide import Asked, Guide
+from gigabrain_zenoh.tasks.orders import GoTo
+from tests.local_rig import WAFFLE
+from tests.navigation_rig import empty, grid_of
+
+OPEN = empty(6.0, 2.0)
+SHUT = OPEN.copy()
+SHUT[:, 30] = 100  # a wall right across at x = 3 m
+ROOM = empty(8.0, 6.0)
+TAKEN = ROOM.copy()
+TAKEN[28:32, 48:52] = 100  # somebody, round (5, 3)
+AHEAD = Goal(x=5.0, y=1.0)
+
+
+def think(
+    guide: Guide,
+    cells: np.ndarray,
+    *,
+    tick: int,
+    x: float = 1.0,
+    y: float = 1.0,
+    goal: Goal = AHEAD,
+) -> Route:
+    return guide.think(
+        Asked(
+            tick=tick,
+            driving=True,
+            order=GoTo(1, goal),
+            here=Pose(x=x, y=y, yaw=0.0),
+            grid=grid_of(cells),
+            body=WAFFLE,
+            driven=None,
+            seen=np.empty((0, 2)),
+        )
+    )
+
+
+def test_a_way_that_the_map_loses_is_kept_to_for_thirty_seconds() -> None:
+    guide = Guide()
+    first = think(guide, OPEN, tick=1)
+    assert first.points is not None
+    for tick in (50, 1501):
+        kept = think(guide, SHUT, tick=tick, x=2.5)
+        assert kept.state == "running"
+        assert kept.points is not None
+        assert np.array_equal(kept.points, first.points)
+    lost = think(guide, SHUT, tick=1502, x=2.5)
+    assert (lost.state, lost.points) == ("failed", None)
+    assert lost.reason.startswith("no way leads to the goal; nearest reachable point is ")
+
+
+def test_a_way_that_opens_again_is_planned_anew() -> None:
+    guide = Guide()
+    think(guide, OPEN, tick=1)
+    think(guide, SHUT, tick=50, x=2.0)
+    again = think(guide, OPEN, tick=1400, x=2.0)
+    assert again.points is not None
+    assert again.points[0].tolist() == [2.0, 1.0]
+    kept = think(guide, SHUT, tick=2900, x=2.0)
+    assert kept.state == "running"
+
+
+def test_what_no_way_has_ever_led_to_is_refused_at_once() -> None:
+    assert think(Guide(), SHUT, tick=1).state == "failed"
+
+
+def test_it_makes_room_when_somebody_stays_where_it_is_to_go() -> None:
+    guide = Guide()
+    goal = Goal(x=5.0, y=3.0)
+    ask = functools.partial(think, guide, goal=goal, x=4.0, y=3.0)
+    ask(ROOM, tick=1)
+    waits = ask(TAKEN, tick=50)
+    assert (waits.goal, waits.aside) == (goal, False)
+    assert not ask(TAKEN, tick=501).aside
+    leaves = ask(TAKEN, tick=502)
+    assert leaves.aside
+    assert leaves.reason == "making room: something is at the goal"
+    assert leaves.version != waits.version
+    assert leaves.goal
+    assert abs(leaves.goal.y - 3.0) >= 1.0  # beside the line on which the other is likely to go on
+    assert math.hypot(leaves.goal.x - 4.0, leaves.goal.y - 3.0) < 1.5
+    stays = ask(TAKEN, tick=1251, x=leaves.goal.x, y=leaves.goal.y)
+    assert (stays.aside, stays.goal, stays.version) == (True, leaves.goal, leaves.version)
+    goes = ask(ROOM, tick=1252, x=leaves.goal.x, y=leaves.goal.y)
+    assert (goes.goal, goes.aside, goes.state) == (goal, False, "running")
+    assert goes.version != leaves.version
+
+
+def test_what_stays_at_the_goal_for_ever_is_made_room_for_twice_and_then_told() -> None:
+    guide = Guide()
+    ask = functools.partial(think, guide, goal=Goal(x=5.0, y=3.0), x=4.0, y=3.0)
+    ask(ROOM, tick=1)
+    ticks = (502, 1251, 1252, 1752, 1753, 2502, 2503, 4003)
+    routes = [ask(TAKEN, tick=tick) for tick in ticks]
+    assert [one.aside for one in routes] == [True, True, False, False, True, True, False, False]
+    assert routes[4].goal
+    assert math.hypot(routes[4].goal.x - 5.0, routes[4].goal.y - 3.0) > 4.0  # far, the second time
+    told = ask(TAKEN, tick=4004)
+    assert told.state == "failed"
+    assert told.reason.startswith("the goal is inside something; nearest reachable point is ")
+
+
+def test_it_makes_room_for_who_keeps_it_from_the_place_beside_its_goal() -> None:
+    taken = ROOM.copy()
+    taken[28:32, 50:54] = 100  # the goal is too close to it, and what is 0.1 m beside is not
+    guide = Guide()
+    ask = functools.partial(think, guide, goal=Goal(x=4.85, y=3.0), x=4.0, y=3.0)
+    ask(ROOM, tick=1)
+    beside = ask(taken, tick=50)
+    assert beside.reason.startswith("0.1 m beside what was asked for: the goal is too close to ")
+    assert not beside.aside
+    assert ask(taken, tick=502).aside
+
+
+def test_a_robot_between_walls_goes_far_from_who_stands_at_its_goal() -> None:
+    aisle = empty(8.0, 1.0)
+    taken = aisle.copy()
+    taken[3:7, 48:52] = 100
+    guide = Guide()
+    ask = functools.partial(think, guide, goal=Goal(x=5.0, y=0.5), x=4.0, y=0.5)
+    ask(aisle, tick=1)
+    ask(taken, tick=50)
+    leaves = ask(taken, tick=502)
+    assert leaves.aside
+    assert leaves.goal
+    assert leaves.goal.x < 1.0

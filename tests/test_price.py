@@ -1,0 +1,79 @@
+"""What a plan costs: it may be left unlooked at only where it would cost as much as it may not."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.bench.plant import JACKAL
+from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.navigation.among import WEIGHTS
+from gigabrain_zenoh.navigation.footprint import Grid, Outline, outline_of
+from gigabrain_zenoh.navigation.models import Model, lag_of, model_of
+from gigabrain_zenoh.navigation.price import look_round, price, rooms_of
+from gigabrain_zenoh.navigation.rating import Scene, Weights
+from gigabrain_zenoh.navigation.rollout import LANES, STATE, Floats, Start, move, obey
+
+STEPS, DT, BLOCKS = 30, 0.05, 25
+NOBODY = np.empty((0, 6))
+SOMEBODY = np.array([(1.2, 0.6, 0.0, -0.8, 0.3, 0.05), (1.0, -1.5, 0.5, 1.0, 0.3, 0.05)])
+
+
+@kernel
+def prices(
+    model: Model, outline: Outline, weights: Weights, scene: Scene, start: Start, dt: float,
+    plans: Floats, states: Floats, limits: Floats, costs: Floats,
+) -> None:  # fmt: skip
+    """Fill `costs` (limits, blocks, LANES)."""
+    rooms = np.empty(len(start.past))
+    for block in range(len(plans)):
+        obey(model, start, dt, plans[block])
+        move(model, outline.far, start, dt, plans[block], states)
+        look_round(weights, outline, scene, dt, states)
+        rooms_of(scene, outline, states, rooms)
+        for n in range(len(limits)):
+            for lane in range(LANES):
+                costs[n, block, lane] = price(
+                    model, outline, weights, scene, dt, rooms, states, lane, limits[n]
+                )
+
+
+def scene(discs: Floats) -> Scene:
+    """Posts all over 8 x 8 m, some so near to one another that no body fits between."""
+    random = np.random.default_rng(3)
+    free = np.ones((320, 320), dtype=np.uint8)
+    for x, y in random.uniform(-4.0, 4.0, (60, 2)):
+        if math.hypot(x, y) > 0.6:
+            cv2.circle(free, (round((x + 4) / 0.025), round((y + 4) / 0.025)), 4, 0, cv2.FILLED)
+    distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * np.float32(0.025)
+    x, y = np.meshgrid(np.arange(160) * 0.05 - 4.0, np.arange(160) * 0.05 - 4.0)
+    to_go = (np.hypot(x - 3.0, y) * np.where(distance[::2, ::2] < 0.2, 20.0, 1.0)).astype(
+        np.float32
+    )
+    field = Grid(to_go, 0.05, -4.0, -4.0)
+    return Scene(Grid(distance, 0.025, -4.0, -4.0), field, discs, 3.0, 0.0, math.nan, 0.1, 0.1)
+
+
+@pytest.mark.parametrize(("weights", "discs"), [(Weights(), NOBODY), (WEIGHTS, SOMEBODY)])
+def test_a_plan_is_given_up_only_where_it_costs_as_much_as_the_limit(
+    weights: Weights, discs: Floats
+) -> None:
+    random = np.random.default_rng(1)
+    plans = np.cumsum(random.normal(0.0, 0.5, (BLOCKS, STEPS, 3, LANES)), axis=1)
+    plans[:, :, 0] += random.uniform(-0.5, 2.0, (BLOCKS, 1, LANES))
+    start = Start(
+        0.0, 0.0, 0.2, 0.8, 0.0, 0.3, (0.8, 0.0, 0.3), np.tile((0.8, 0.0, 0.3), (3, 1)), 0.4,
+        lag_of(0.15, DT), 1.0,
+    )  # fmt: skip
+    limits = np.array([math.inf, 40.0, 60.0, 100.0, 150.0])
+    costs = np.empty((len(limits), BLOCKS, LANES))
+    given = model_of(JACKAL), outline_of(JACKAL.footprint), weights, scene(discs), start, DT
+    prices(*given, plans, np.empty((STEPS + 1, STATE)), limits, costs)
+    whole = costs[0]
+    assert np.isfinite(whole).all()
+    for limit, found in zip(limits[1:], costs[1:], strict=True):
+        matters = whole < limit
+        assert 0 < matters.sum() < whole.size
+        assert found[matters].tolist() == whole[matters].tolist()
+        assert np.isinf(found[~matters]).any()
