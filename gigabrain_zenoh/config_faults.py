@@ -96,13 +96,14 @@ def _in_struct(
     fields = {f.encode_name: f for f in msgspec.structs.fields(type_)}
     config = type_.__struct_config__
     known = sorted([*fields, config.tag_field] if config.tag is not None else fields)
+    among = ", ".join(known) or "none"
     for entry in entries:
         if field := fields.get(entry.key):
             if fault := _find(entry.node, field.type, _join(path, entry.key), entry.line):
                 yield fault
         elif entry.key not in known and config.forbid_unknown_fields:
             hint = nearest(entry.key, known) or ";"
-            yield Fault(entry.line, f"unknown field {entry.key!r}{hint} known: {', '.join(known)}")
+            yield Fault(entry.line, f"unknown field {entry.key!r}{hint} known: {among}")
     for name, field in fields.items():
         if field.required and name not in node.value:
             text = f"missing field {name!r}; expected {expected(field.type)}"

@@ -50,6 +50,10 @@ class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     mapping: Literal["off", "slam", "localize"] = "off"  # make a map, or find its way in one
     map: str = ""  # a saved map's YAML file: to be found in, or with `slam` to go on with
 
+    def __post_init__(self) -> None:
+        if self.map and self.mapping == "off":
+            raise ValueError("map: a map is for mapping: slam or localize; expected one of them")
+
 
 class DecisionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The `decision` part of a deployment file."""

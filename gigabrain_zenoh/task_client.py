@@ -3,7 +3,9 @@
 import asyncio
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
+from gigabrain_schemas.base import Message
 from gigabrain_schemas.tasks import (
     GoalRequest,
     How,
@@ -12,7 +14,7 @@ from gigabrain_schemas.tasks import (
     TaskRequest,
     TaskStatus,
 )
-from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE
+from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Service
 from gigabrain_zenoh.asking import ANSWER_S
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
@@ -21,14 +23,28 @@ from gigabrain_zenoh.keys.checks import may_not_ask
 LARGEST = 1e9  # as on the bus
 PLAN_S = 5.0  # how long a way through a large map may take to be found
 SILENT_S = 5.0  # without a word of the tasks
+STARTING_S = 3.0  # how long a robot that starts may take until it serves goals
+AGAIN_S = 0.2
 OnNews = Callable[[TaskStatus], None]
+Q = TypeVar("Q", bound=Message)
+R = TypeVar("R", bound=Message)
+OnWait = Callable[[str], None]
 
 
 class Tasks:
     """What the robot was sent to do."""
 
-    def __init__(self, bus: Bus, keys: str = "") -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        keys: str = "",
+        *,
+        on_wait: OnWait | None = None,
+        starting_s: float = STARTING_S,
+    ) -> None:
+        """Who serves goals is waited for `starting_s`; `on_wait` is told so."""
         self._bus, self._keys = bus, keys
+        self._on_wait, self._starting_s = on_wait, starting_s
         self._news = asyncio.Event()
         self._newest: TaskStatus | None = None
         self._heard = False
@@ -46,12 +62,10 @@ class Tasks:
             raise ConfigError(f"a goal takes numbers up to {LARGEST:g}, got {numbers}")
         self._listen()
         request = GoalRequest(x=x, y=y, yaw=yaw, how=how, source=self._bus.process)
-        replies = await self._bus.ask(GOAL, request, timeout_s=PLAN_S)
-        if not replies:
-            raise self._nobody()
-        if not replies[0].ok:
-            raise Refused(replies[0].text)
-        return replies[0].goal
+        reply = await self._ask(GOAL, request, PLAN_S)
+        if not reply.ok:
+            raise Refused(reply.text)
+        return reply.goal
 
     async def carry_out(
         self, mission: str | Path, *, how: How = "replace", label: str = "mission"
@@ -61,20 +75,22 @@ class Tasks:
         Raises ConfigError for a file that is none, with its line, and Refused.
         """
         self._listen()
-        if isinstance(mission, Path):
-            from gigabrain_zenoh.tasks.checks import load  # takes a while: only when used
+        from gigabrain_zenoh.tasks.checks import load, refuse_long  # takes a while: only when used
 
+        if isinstance(mission, Path):
             label = mission.stem
             mission = load(mission)[1]
+        refuse_long(mission, label)
         request = MissionRequest(
-            mission=mission, how=how, source=self._bus.process, label=label[:64]
+            mission=mission,
+            how=how,
+            source=self._bus.process,
+            label=label.encode(errors="replace").decode()[:64],  # a file's name may be any bytes
         )
-        replies = await self._bus.ask(MISSION, request, timeout_s=PLAN_S)
-        if not replies:
-            raise self._nobody()
-        if not replies[0].ok:
-            raise Refused(replies[0].text)
-        return replies[0].task
+        reply = await self._ask(MISSION, request, PLAN_S)
+        if not reply.ok:
+            raise Refused(reply.text)
+        return reply.task
 
     async def explore(self, *, how: How = "replace") -> str:
         """Have the robot drive until nothing is left to be seen; the task's name."""
@@ -113,6 +129,23 @@ class Tasks:
                     on_news(status)
             await self._hear()
 
+    async def _ask(self, service: Service[Q, R], request: Q, timeout_s: float) -> R:
+        """The answer of who serves tasks, which a robot that starts does a moment later."""
+        now = asyncio.get_running_loop().time
+        until, waits = now() + self._starting_s, False
+        while True:
+            asked = now()
+            replies = await self._bus.ask(service, request, timeout_s=timeout_s)
+            if replies:
+                return replies[0]
+            # whoever has not answered in time may have heard it, and is not asked again
+            if now() >= min(until, asked + timeout_s) or may_not_ask(self._keys):
+                raise self._nobody()
+            if self._on_wait and not waits:
+                self._on_wait("waiting: nobody serves goals yet; is the robot just starting?")
+            waits = True
+            await asyncio.sleep(AGAIN_S)
+
     def _listen(self) -> None:
         if not self._heard:
             self._heard = True
@@ -130,12 +163,10 @@ class Tasks:
             raise self._nobody() from None
 
     async def _change(self, request: TaskRequest) -> str:
-        replies = await self._bus.ask(TASK_CHANGE, request, timeout_s=ANSWER_S)
-        if not replies:
-            raise self._nobody()
-        if not replies[0].ok:
-            raise Refused(replies[0].text)
-        return replies[0].text
+        reply = await self._ask(TASK_CHANGE, request, ANSWER_S)
+        if not reply.ok:
+            raise Refused(reply.text)
+        return reply.text
 
     def _nobody(self) -> BodyLost:
         doubt = may_not_ask(self._keys)

@@ -42,6 +42,15 @@ from gigabrain_zenoh.tasks import checks
         ("do:\n- check: pose.x < nan", "pose.x is a number; it cannot be compared with 'nan'"),
         ("do:\n- check: robot.legs < 4", "no field 'robot'"),
         ("do:\n- check: map.cells == 3", "map.cells is no number, word or truth value"),
+        (
+            f"do:\n- check: joints.{'9' * 5000}.position > 1",
+            "m:2: do[0].check: expected a string of length <= 200",
+        ),
+        (
+            "do:\n- battery_below: {percentage: 50, goto: [0, 0], until: 20, do: [{wait: 1}]}",
+            "m:2: do[0].battery_below.until: expected at least the 50 % below which it goes there",
+        ),
+        ("do:\n- explore: {speed: 1}", "m:2: unknown field 'speed'; known: none"),
         ("", "m:1: the file is empty"),
     ],
 )
@@ -60,6 +69,18 @@ def test_trees_that_multiply_are_refused() -> None:
         checks.loads(text, "m")
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_trees_that_lead_deeper_than_can_be_carried_out_are_refused(order: int) -> None:
+    def chain(count: int) -> str:
+        inner = [f"  t{i}: [{{tree: t{i + 1}}}]\n" for i in range(count)][::order]
+        return f"trees:\n{''.join(inner)}  t{count}: [{{wait: 1}}]\ndo: [{{tree: t0}}]"
+
+    assert checks.drives(checks.loads(chain(48), "m")) is False
+    for count in (49, 1900):
+        with pytest.raises(ConfigError, match="more than 50 steps within one another"):
+            checks.loads(chain(count), "m")
+
+
 def test_a_file_says_which_mission_and_which_programs_it_needs(tmp_path: Path) -> None:
     file = tmp_path / "m.yaml"
     file.write_text("do: [{script: {run: beep}}, {wait: 3}]")
@@ -67,6 +88,9 @@ def test_a_file_says_which_mission_and_which_programs_it_needs(tmp_path: Path) -
     assert list(checks.scripts(mission)) == ["beep"]
     assert not checks.drives(mission)
     assert text == file.read_text()
+    file.write_text(f"# {'x' * 60_000}\ndo: [{{wait: 3}}]")
+    with pytest.raises(ConfigError, match=r"m\.yaml: 60018 bytes; expected at most 60000"):
+        checks.load(file)
     file.write_text("points: [[1, 2], b]")
     with pytest.raises(ConfigError, match=r"m.yaml:1: points\[1\]: no place 'b'"):
         checks.load_patrol(file)

@@ -6,6 +6,7 @@ import pytest
 
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.tasks.orders import became
 from tests.tasks_rig import Robot, one_robot
 
 
@@ -29,6 +30,20 @@ def test_goals_wait_in_a_queue_or_go_first_or_stand_in_for_all(robot: Robot) -> 
     tasks.go_to(Goal(x=4.0, y=0.0), "replace", "bob")
     assert robot.step() == 4.0
     assert robot.last == ("cancelled", "replaced by goal-4")
+
+
+def test_how_a_task_ended_is_told_in_words(robot: Robot) -> None:
+    robot.carry_out("do: [{goto: a}]")
+    robot.carry_out("do: [{goto: b}]")
+    robot.step()
+    robot.failed()
+    assert [became(task) for task in robot.status.done] == [
+        "mission-2 has failed: b: no way",
+        "mission-1 was replaced by mission-2",
+    ]
+    robot.carry_out("do: [{goto: a}]")
+    robot.tasks.cancel("", "bob")
+    assert became(robot.status.done[0]) == "mission-3 was cancelled by bob"
 
 
 def test_cancelling_goes_by_name_and_all_at_once(robot: Robot) -> None:

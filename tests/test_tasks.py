@@ -3,6 +3,7 @@
 import asyncio
 import math
 import re
+import sys
 from pathlib import Path
 
 import msgspec
@@ -140,7 +141,7 @@ async def test_missions_are_checked_before_they_are_accepted(site: Site, tmp_pat
         reply = await site.carry_out(text)
         assert not reply.ok
         assert why in reply.text
-    site.lost = "nobody says where in a map the robot is; set perception: {mapping: slam}"
+    site.lost = "nobody says yet where in a map the robot is"
     assert (await site.carry_out("do: [{explore: {}}]")).text == site.lost
     assert (await site.carry_out("do: [{wait: 5}]")).ok
     await site.end()
@@ -260,6 +261,17 @@ async def test_a_program_that_fails_says_why(tmp_path: Path) -> None:
     assert await ended(run) == (False, "ended with exit code 3: no sound")
 
 
+def test_a_program_ends_on_uvloop_too(tmp_path: Path) -> None:
+    uvloop = pytest.importorskip("uvloop")
+    scripts = Scripts(program(tmp_path, "echo no sound; exit 3"))
+
+    async def run() -> tuple[bool, str]:
+        return await ended(scripts.start(Script(run="beep")))
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        assert runner.run(run()) == (False, "ended with exit code 3: no sound")
+
+
 async def test_a_program_that_takes_too_long_is_ended_with_all_it_has_started(
     tmp_path: Path,
 ) -> None:
@@ -268,6 +280,27 @@ async def test_a_program_that_takes_too_long_is_ended_with_all_it_has_started(
     run = scripts.start(Script(run="beep", seconds=0.5))
     assert await ended(run) == (False, "did not end within 0.5 s and was ended")
     child = int((tmp_path / "child").read_text())
+    await until(lambda: _gone(child))
+
+
+async def test_a_program_does_not_outlive_a_decision_that_is_killed(tmp_path: Path) -> None:
+    folder = program(tmp_path, f"sleep 600 & echo $! > {tmp_path}/child; wait")
+    text = (
+        "import asyncio\n"
+        "from gigabrain_zenoh.tasks.mission import Script\n"
+        "from gigabrain_zenoh.tasks.scripts import Scripts\n"
+        "async def main():\n"
+        f"    Scripts({folder!r}).start(Script(run='beep'))\n"
+        "    await asyncio.sleep(600)\n"
+        "asyncio.run(main())\n"
+    )
+    decision = await asyncio.create_subprocess_exec(sys.executable, "-c", text)
+    file = tmp_path / "child"
+    await until(lambda: file.exists() and file.read_text().strip())
+    child = int(file.read_text())
+    assert not _gone(child)
+    decision.kill()
+    await decision.wait()
     await until(lambda: _gone(child))
 
 
@@ -308,7 +341,22 @@ async def test_a_script_hears_how_its_goal_ended(site: Site) -> None:
 async def test_a_script_is_told_who_is_missing() -> None:
     net = Net()
     with pytest.raises(BodyLost, match="nobody serves goals; does decision run with behaviour: n"):
-        await Tasks(net.two).go_to(1.0, 0.0)
+        await Tasks(net.two, starting_s=0.0).go_to(1.0, 0.0)
+
+
+async def test_a_goal_that_comes_while_the_robot_starts_waits_for_who_serves_goals() -> None:
+    net, said = Net(), list[str]()
+    tasks = Tasks(net.two, on_wait=said.append, starting_s=60.0)
+    sending = asyncio.ensure_future(tasks.go_to(1.0, 0.0))
+    await until(lambda: said)
+    assert said == ["waiting: nobody serves goals yet; is the robot just starting?"]
+
+    async def answer(request: GoalRequest) -> GoalReply:
+        return GoalReply(ok=True, text="accepted", goal=f"goal to {request.x:g}")
+
+    net.one.serve(GOAL, answer)
+    assert await sending == "goal to 1"
+    assert len(said) == 1
 
 
 @pytest.mark.parametrize("x", [math.nan, math.inf, -1e300])

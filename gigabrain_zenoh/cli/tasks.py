@@ -81,9 +81,10 @@ def patrol(
     """
     from gigabrain_zenoh.errors import ConfigError
     from gigabrain_zenoh.tasks.checks import load_patrol, round_of
+    from gigabrain_zenoh.tasks.mission import MOST_LOOPS
 
-    if loops is not None and loops < 1:
-        raise ConfigError(f"--loops: expected 1 or more, got {loops}")
+    if loops is not None and not 1 <= loops <= MOST_LOOPS:
+        raise ConfigError(f"--loops: expected 1 to {MOST_LOOPS}, got {loops}")
     text = round_of(load_patrol(file), loops)
     return _send(at, lambda tasks: tasks.carry_out(text, how=how, label=file.stem), wait)
 
@@ -170,7 +171,7 @@ def _with(at: Which, do: "Callable[[Tasks], Awaitable[None]]") -> int:
 
     async def run() -> None:
         async with joined(at.where(), f"{getpass.getuser()}-cli") as (bus, _):
-            await do(Tasks(bus, at.folder))
+            await do(Tasks(bus, at.folder, on_wait=say))
 
     asyncio.run(run())
     return 0
@@ -198,7 +199,8 @@ def _send(at: Which, send: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> i
 
 
 def _tell(ended: "Task") -> None:
-    why = f": {ended.reason}" if ended.reason else ""
+    from gigabrain_zenoh.tasks.orders import became
+
     if ended.state != "succeeded":
-        raise Refused(f"{ended.id} has {ended.state}{why}")
-    say(f"{ended.id} has succeeded{why}")
+        raise Refused(became(ended))
+    say(became(ended))

@@ -12,15 +12,25 @@ from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.tasks import conditions
 from gigabrain_zenoh.tasks.mission import Mission, Patrol, PatrolFile, Place, Step
 
+LONGEST = 60_000  # bytes of a mission: what a robot takes at once
 MOST_STEPS = 2000  # with every `tree` written out
+MOST_LEVELS = 50  # of steps within steps, likewise: whoever carries them out goes down all of them
 DRIVING = ("goto", "patrol", "explore", "visit", "battery_below")
+TOO_DEEP = f"more than {MOST_LEVELS} steps within one another once every tree is written out"
 Way = tuple[str | int, ...]  # keys and numbers, from the top of the file
 
 
 def load(path: Path) -> tuple[Mission, str]:
     """The mission in a file, and its text. Raises ConfigError with file and line."""
     text = config.read(path)
+    refuse_long(text, str(path))
     return loads(text, str(path)), text
+
+
+def refuse_long(text: str, source: str) -> None:
+    """Raises ConfigError for a mission that is too long to be sent to a robot."""
+    if (size := len(text.encode())) > LONGEST:
+        raise ConfigError(f"{source}: {size} bytes; expected at most {LONGEST}")
 
 
 def loads(text: str, source: str) -> Mission:
@@ -62,10 +72,12 @@ def drives(mission: Mission) -> bool:
 def _problems(mission: Mission) -> Iterator[tuple[Way, str]]:
     for way, step in _steps(mission):
         yield from _in_step(way, step, mission)
-    good: set[str] = set()
+    levels: dict[str, int] = {}
     for name in mission.trees:
-        if chain := _cycle(name, mission, (), good):
-            yield ("trees", name), f"goes round in a circle: {' → '.join(chain)}"
+        if problem := _lead(name, mission, (), levels):
+            yield ("trees", name), problem
+    if _levels(mission.do, levels) > MOST_LEVELS:
+        yield ("do",), TOO_DEEP
     if _size(mission.do, mission, {}) > MOST_STEPS:
         yield ("do",), f"more than {MOST_STEPS} steps once every tree is written out"
 
@@ -134,17 +146,30 @@ def _inner(step: Step) -> Iterator[tuple[Way, tuple[Step, ...]]]:
                 yield (kind, name), getattr(value, name)
 
 
-def _cycle(name: str, mission: Mission, above: tuple[str, ...], good: set[str]) -> tuple[str, ...]:
-    """The trees that lead from `name` back to itself, or nothing; `good` are those that do not."""
+def _lead(name: str, mission: Mission, above: tuple[str, ...], levels: dict[str, int]) -> str:
+    """What is wrong with where a tree leads; `levels` has how deep those go that are right."""
     if name in above:
-        return (*above[above.index(name) :], name)
-    if name in good:
-        return ()
+        return f"goes round in a circle: {' → '.join((*above[above.index(name) :], name))}"
+    if name in levels:
+        return ""
+    if len(above) >= MOST_LEVELS:
+        return TOO_DEEP
     for _, step in _below((), mission.trees[name]):
-        if step.tree is not None and (chain := _cycle(step.tree, mission, (*above, name), good)):
-            return chain
-    good.add(name)
-    return ()
+        tree = step.tree
+        if tree is not None and (problem := _lead(tree, mission, (*above, name), levels)):
+            return problem
+    levels[name] = _levels(mission.trees[name], levels)
+    return TOO_DEEP if levels[name] > MOST_LEVELS else ""
+
+
+def _levels(steps: tuple[Step, ...], of_trees: dict[str, int]) -> int:
+    """How many steps lie within one another at most, with every tree written out."""
+    return 1 + max(
+        max((_levels(inner, of_trees) for _, inner in _inner(step)), default=0)
+        if step.tree is None
+        else of_trees[step.tree]
+        for step in steps
+    )
 
 
 def _size(steps: tuple[Step, ...], mission: Mission, known: dict[str, int]) -> int:

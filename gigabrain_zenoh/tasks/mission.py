@@ -11,7 +11,9 @@ Point = Annotated[tuple[Finite, ...], Meta(min_length=2, max_length=3)]  # [m], 
 Place = Name | Point
 Steps = Annotated[tuple["Step", ...], Meta(min_length=1)]
 Seconds = Annotated[float, Meta(gt=0, le=1e7)]
-Times = Annotated[int, Meta(ge=1, le=1_000_000)]
+MOST_LOOPS = 1_000_000
+Times = Annotated[int, Meta(ge=1, le=MOST_LOOPS)]
+Comparison = Annotated[str, Meta(max_length=200)]  # see conditions.py
 KINDS = (
     "goto", "patrol", "explore", "visit", "wait", "wait_until", "check", "script", "tree",
     "sequence", "fallback", "retry", "repeat", "timeout", "guard", "battery_below",
@@ -70,7 +72,7 @@ class Timeout(Part, frozen=True, kw_only=True):
 class Guard(Part, frozen=True, kw_only=True):
     """Do something else first whenever a condition holds, then go on where it was."""
 
-    when: str
+    when: Comparison
     then: Steps
     do: Steps
 
@@ -83,6 +85,13 @@ class BatteryBelow(Part, frozen=True, kw_only=True):
     until: Percentage | None = None  # charge to go on at; None: the mission ends there
     do: Steps
 
+    def __post_init__(self) -> None:
+        if self.until is not None and self.until < self.percentage:
+            raise ValueError(
+                f"until: expected at least the {self.percentage:g} % below which it goes there, "
+                f"got {self.until:g}"
+            )
+
 
 class Step(Part, frozen=True, kw_only=True):
     """One node of the tree. Exactly one field says what it is."""
@@ -92,8 +101,8 @@ class Step(Part, frozen=True, kw_only=True):
     explore: Explore | None = None
     visit: Visit | None = None
     wait: Seconds | None = None
-    wait_until: str | None = None  # a condition
-    check: str | None = None  # a condition: fails where it does not hold
+    wait_until: Comparison | None = None
+    check: Comparison | None = None  # fails where it does not hold
     script: Script | None = None
     tree: Name | None = None  # one of the mission's `trees`
     sequence: Steps | None = None

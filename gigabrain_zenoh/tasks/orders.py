@@ -4,7 +4,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from gigabrain_schemas.tasks import Goal
+from gigabrain_schemas.tasks import Goal, Task
 
 
 class GoTo(Struct, frozen=True):
@@ -46,3 +46,10 @@ def where(goal: Goal) -> str:
     """A place as people read it."""
     turned = "" if goal.yaw is None else f", {goal.yaw:.2f} rad"
     return f"({goal.x:.2f}, {goal.y:.2f}{turned})"
+
+
+def became(task: Task) -> str:
+    """How a task ended, as people read it, with the reason."""
+    if task.state == "cancelled":
+        return f"{task.id} was {task.reason or task.state}"  # its reason says by what or whom
+    return f"{task.id} has {task.state}{f': {task.reason}' if task.reason else ''}"

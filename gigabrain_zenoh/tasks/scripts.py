@@ -4,12 +4,15 @@ import asyncio
 import contextlib
 import os
 import signal
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
 from gigabrain_zenoh.tasks.mission import Script
 
 LAST = 200  # characters of what it wrote that are told
+# ends a process group, whose number it reads, once nobody holds the other end of its input
+LEASH = 'read -r group; read -r _; kill -s KILL -- "-$group"'
 
 
 class Scripts:
@@ -52,15 +55,35 @@ class Run:
     async def _run(self, scripts: Scripts, script: Script) -> None:
         try:
             path = scripts.path(script.run)
-            process = await asyncio.create_subprocess_exec(
-                path, *script.arguments, cwd=path.parent, start_new_session=True,
-                stdin=asyncio.subprocess.DEVNULL,
-                stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
-            )  # fmt: skip
+            async with _leash() as hold:
+                process = await asyncio.create_subprocess_exec(
+                    path, *script.arguments, cwd=path.parent, start_new_session=True,
+                    stdin=asyncio.subprocess.DEVNULL,
+                    stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+                )  # fmt: skip
+                hold(process.pid)
+                self.result = await _outcome(process, script.seconds)
         except (GigabrainError, OSError, ValueError) as error:
             self.result = False, f"cannot be run: {error}"
-            return
-        self.result = await _outcome(process, script.seconds)
+
+
+@contextlib.asynccontextmanager
+async def _leash() -> AsyncIterator[Callable[[int], object]]:
+    """Have a process group, once it is told, end with this process, even with SIGKILL."""
+    end, ours = os.pipe()
+    try:
+        guard = await asyncio.create_subprocess_exec(
+            "/bin/sh", "-c", LEASH, start_new_session=True, stdin=end,
+            stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            yield lambda group: os.write(ours, f"{group}\n".encode())
+        finally:
+            guard.kill()
+            await asyncio.shield(guard.wait())
+    finally:
+        os.close(end)
+        os.close(ours)
 
 
 async def _outcome(process: asyncio.subprocess.Process, seconds: float) -> tuple[bool, str]:

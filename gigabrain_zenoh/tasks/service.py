@@ -25,7 +25,7 @@ from gigabrain_zenoh.scribe import Scribe
 from gigabrain_zenoh.tasks import checks
 from gigabrain_zenoh.tasks.executive import Executive, Saved
 from gigabrain_zenoh.tasks.mission import Mission
-from gigabrain_zenoh.tasks.orders import Order, Outcome
+from gigabrain_zenoh.tasks.orders import Order, Outcome, became
 from gigabrain_zenoh.tasks.scripts import Scripts
 from gigabrain_zenoh.tasks.store import TaskFile
 from gigabrain_zenoh.tasks.watching import Watched
@@ -106,8 +106,7 @@ class TaskService:
         for task in reversed(status.done):
             if task.id not in self._said:
                 data = {"event": "task", "task": task.id, "state": task.state}
-                why = f": {task.reason}" if task.reason else ""
-                log.info("%s has %s%s", task.id, task.state, why, extra={"data": data})
+                log.info("%s", became(task), extra={"data": data})
         self._said = {task.id: task.state for task in status.done}
         saved = self._tasks.saved
         if saved != self._written:
