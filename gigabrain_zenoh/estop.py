@@ -9,6 +9,7 @@ from gigabrain_zenoh.errors import NotConfirmed, Refused
 
 FIRST_S, AGAIN_S = 0.15, 0.05  # until the request is repeated, and from then on
 GIVE_UP_S = 2.0
+LAST_LOOK_S = 0.05  # at answers that came while this process was held up
 BY_HAND = "press the hardware e-stop or cut the robot's power"
 
 Asks = set[asyncio.Task[list[GateReply]]]
@@ -27,6 +28,10 @@ async def press(bus: Bus, reason: str = "", *, within_s: float = GIVE_UP_S) -> G
             if reply:
                 return reply
             refused, pause_s = said or refused, AGAIN_S
+        reply, said = await _answer(asks, LAST_LOOK_S)
+        if reply:
+            return reply
+        refused = said or refused
     finally:
         for ask in asks:
             ask.cancel()

@@ -1,4 +1,4 @@
-"""The bus over Zenoh: with `zenoh_session` the only module that imports it."""
+"""The bus over Zenoh: with `zenoh_session` and `zenoh_line` all that imports it."""
 
 import asyncio
 from typing import Any
@@ -9,13 +9,13 @@ from zenoh.handlers import Callback
 from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.bridge import Bridge
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.linger import close_in_background
 from gigabrain_zenoh.mailbox import Mailbox
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.staying import stay
 from gigabrain_zenoh.transport import Answer, Close, Link, OnLink, OnRaw, OnSample
 from gigabrain_zenoh.unobtrusive import Nap
-from gigabrain_zenoh.zenoh_session import close_session, open_session
+from gigabrain_zenoh.zenoh_line import Lines
+from gigabrain_zenoh.zenoh_session import open_session
 
 PRIORITIES: dict[Priority, zenoh.Priority] = {
     "real_time": zenoh.Priority.REAL_TIME,
@@ -28,34 +28,31 @@ CONGESTION = {"drop": zenoh.CongestionControl.DROP, "block": zenoh.CongestionCon
 
 
 class ZenohTransport:
-    """One Zenoh session for the whole process."""
+    """One Zenoh session at a time for the whole process."""
 
-    def __init__(self, session: zenoh.Session, nap_s: float = 0.0) -> None:
-        self._session = session
-        self._nap = Nap(nap_s) if nap_s else None
+    def __init__(self, session: zenoh.Session, endpoint: Endpoint) -> None:
+        self._nap = Nap(endpoint.nap_s) if endpoint.nap_s else None
         self._bridge = Bridge()
         self._loop = asyncio.get_running_loop()
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._declared: list[Any] = []
         self._tasks: set[asyncio.Task[None]] = set()
         self._asking: set[asyncio.Future[None]] = set()
         self._closed = False
-        self._declared.append(
-            session.info.declare_link_events_listener(
-                lambda _event: close_in_background(), history=True
-            )
-        )
+        self._lines = Lines(session, endpoint, self._bridge, self._lost)
 
     @classmethod
     async def open(cls, endpoint: Endpoint) -> "ZenohTransport":
         """Join the network, waiting for its router. Raises BusError."""
-        return cls(await open_session(endpoint), endpoint.nap_s)
+        return cls(await open_session(endpoint), endpoint)
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes, encoding: str) -> None:
         """Send by the topic's QoS; a declared publisher sends nothing that nobody listens to."""
+        line = self._lines.now
+        if line is None:
+            return  # nobody is there who could hear it
         publisher = self._publishers.get(key)
         if publisher is None:
-            publisher = self._publishers[key] = self._session.declare_publisher(
+            publisher = self._publishers[key] = line.session.declare_publisher(
                 key,
                 encoding=encoding,
                 priority=PRIORITIES[topic.priority],
@@ -72,7 +69,9 @@ class ZenohTransport:
             return on_sample(fixed or str(sample.key_expr), sample.payload.to_bytes())
 
         mailbox = Mailbox(self._bridge, deliver, depth)
-        return self._undeclare(self._session.declare_subscriber(key, mailbox.put))
+        return self._lines.declare(
+            lambda line: line.session.declare_subscriber(key, line.take(mailbox.put))
+        )
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
         """Listen in Zenoh's own thread; nothing gives way to anything.
@@ -85,8 +84,11 @@ class ZenohTransport:
             on_raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes())
 
         take = self._nap.after_each(deliver) if self._nap else deliver
-        direct = Callback(take, indirect=False)
-        return self._undeclare(self._session.declare_subscriber(pattern, direct))
+        return self._lines.declare(
+            lambda line: line.session.declare_subscriber(
+                pattern, Callback(line.take(take), indirect=False)
+            )
+        )
 
     def serve(self, key: str, answer: Answer) -> Close:
         """Answer queries, each in a task of its own."""
@@ -105,15 +107,20 @@ class ZenohTransport:
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
-        declared = self._session.declare_queryable(
-            key, lambda query: self._bridge.post(start, query), complete=True
+        def post(query: zenoh.Query) -> None:
+            self._bridge.post(start, query)
+
+        return self._lines.declare(
+            lambda line: line.session.declare_queryable(key, line.take(post), complete=True)
         )
-        return self._undeclare(declared)
 
     async def query(
         self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
     ) -> list[bytes | str]:
         """Ask all who serve `key`. A direct callback: an indirect one costs a thread per query."""
+        line = await self._lines.within(timeout_s)
+        if line is None:
+            return []
         replies: list[zenoh.Reply] = []
         done = self._loop.create_future()
 
@@ -124,7 +131,7 @@ class ZenohTransport:
         handler = Callback(
             replies.append, drop=lambda: self._bridge.post(finish, None), indirect=False
         )
-        self._session.get(
+        line.session.get(
             key,
             handler,
             payload=payload,
@@ -152,10 +159,11 @@ class ZenohTransport:
             there = event.kind == zenoh.SampleKind.PUT
             on_link(Link(str(link.zid), name, str(link.dst), there))
 
-        listener = self._session.info.declare_link_events_listener(
-            lambda event: self._bridge.post(told, event), history=True
+        return self._lines.declare(
+            lambda line: line.session.info.declare_link_events_listener(
+                lambda event: self._bridge.post(told, event), history=True
+            )
         )
-        return self._undeclare(listener)
 
     async def close(self) -> None:
         """Close the session and stop delivering."""
@@ -165,20 +173,18 @@ class ZenohTransport:
         self._bridge.close()
         for task in self._tasks:
             task.cancel()
+        self._give_up_asking()
+        await self._lines.close()
+
+    def _lost(self) -> None:
+        """Nothing comes of what was told to the old line."""
+        self._publishers.clear()
+        self._give_up_asking()
+
+    def _give_up_asking(self) -> None:
         for done in self._asking:
             if not done.done():
                 done.set_result(None)
-        await close_session(self._session)
-
-    def _undeclare(self, declared: Any) -> Close:
-        self._declared.append(declared)
-
-        def close() -> None:
-            if declared in self._declared:
-                self._declared.remove(declared)
-                declared.undeclare()
-
-        return close
 
 
 def _unpack(reply: zenoh.Reply) -> bytes | str:

@@ -2,6 +2,7 @@
 
 import asyncio
 import re
+import time
 
 import pytest
 
@@ -67,6 +68,26 @@ async def test_what_nobody_confirms_says_what_a_person_has_to_do(
         await press(net.two, within_s=0.4)
     assert error.value.exit_code == 3
     assert 2 <= len(driver.asked) <= 6  # after 150 ms, and then every 50
+
+
+def hold_up(seconds: float) -> None:
+    """Hold up the whole process, as a machine does that stands still."""
+    time.sleep(seconds)
+
+
+async def test_what_was_confirmed_while_the_presser_itself_was_held_up_is_heard() -> None:
+    net = Net()
+
+    async def slow(_: EstopRequest) -> GateReply:
+        await asyncio.sleep(0.01)
+        return LATCHED
+
+    net.one.serve(ESTOP, slow)
+    pressed = asyncio.create_task(press(net.two, within_s=0.05))
+    for _ in range(5):  # the request is on its way
+        await asyncio.sleep(0)
+    hold_up(0.1)
+    assert await pressed == LATCHED
 
 
 async def test_where_nobody_is_at_all_it_is_not_confirmed_either() -> None:

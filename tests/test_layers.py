@@ -16,6 +16,7 @@ PACKAGES = {
 }
 ONLY_IN = {
     "zenoh": (
+        "gigabrain_zenoh/zenoh_line.py",
         "gigabrain_zenoh/zenoh_session.py",
         "gigabrain_zenoh/zenoh_transport.py",
         "gigabrain_zenoh/bench/relay.py",

@@ -108,7 +108,7 @@ async def test_a_session_that_opens_just_as_it_is_given_up_is_closed() -> None:
             except asyncio.CancelledError:
                 continue
         await until(lambda: under_way() <= others)
-        await until(lambda: not router._session.info.transports())
+        await until(lambda: not router._lines.now.session.info.transports())
 
 
 def test_a_process_that_gives_up_waiting_ends_by_itself() -> None:
@@ -152,6 +152,44 @@ async def test_a_router_that_is_killed_and_comes_back_carries_data_and_queries_a
         await sender.close()
         await receiver.close()
     assert b"lost" not in ear.payloads
+
+
+async def test_a_client_joins_again_with_a_session_of_which_its_router_knows_nothing() -> None:
+    endpoint = free_endpoint()
+    with router_process(endpoint) as router:
+        client = await client_of(endpoint)
+        ear = Ear(client, "robot/teleop")
+        first = client._lines.now
+        router.kill()
+        await until(lambda: client._lines.now is None)
+    with router_process(endpoint):
+        await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: ear.heard)
+        second = client._lines.now
+        assert first
+        assert second
+        assert str(first.session.zid()) != str(second.session.zid())
+        ear.close()  # ends what was declared on the second
+        heard = len(ear.heard)
+        other = Ear(client, "robot/teleop")
+        await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: other.heard)
+        assert len(ear.heard) == heard
+        await client.close()
+
+
+async def test_leaving_does_not_wait_to_join_again() -> None:
+    others = under_way()
+    endpoint = free_endpoint()
+    with router_process(endpoint) as router:
+        client = await client_of(endpoint)
+        router.kill()
+        await until(lambda: client._lines.now is None)
+        asking = asyncio.ensure_future(client.query("robot/goal", b"", "", 60.0, "data"))
+        await asyncio.sleep(0)
+        async with asyncio.timeout(5):
+            await client.close()
+            assert await asking == []
+    with router_process(endpoint):  # whoever still waits for one finds it, and leaves
+        await until(lambda: under_way() <= others)
 
 
 def stuck(sender: ZenohTransport) -> None:

@@ -1,0 +1,143 @@
+"""A process's session, and a new one whenever its link to the router was lost.
+
+A session of Zenoh 1.10 joins its router again by itself. But where one end notices the loss before
+the other, as short leases have it on a busy machine, the two may go on with what the old link had
+agreed on: messages come under the keys of others, or none come at all until the link is lost again
+(zenoh#2806 is of that kind). Of an old session nothing is left in a new one.
+"""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
+
+import zenoh
+
+from gigabrain_zenoh.bridge import Bridge
+from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.linger import close_in_background
+from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.transport import Close
+from gigabrain_zenoh.zenoh_session import close_session, open_session
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+AGAIN_S = 1.0  # until a session that cannot be opened is tried again
+
+
+class Line:
+    """A session, until a client's link to its router is lost."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.session = session
+        self.cut = False
+        self.watch: Any = None  # kept: it ends with its last holder
+
+    def take(self, deliver: Callable[[T], object]) -> Callable[[T], None]:
+        """`deliver`, for what comes before the loss; later it may come under a wrong key."""
+
+        def delivered(what: T) -> None:
+            if not self.cut:
+                deliver(what)
+
+        return delivered
+
+
+Make = Callable[[Line], Any]
+
+
+class Declared:
+    """What was declared, and how to do it again."""
+
+    def __init__(self, make: Make) -> None:
+        self.make = make
+        self.made: Any = None
+
+
+class Lines:
+    """The present line, and all that is declared on it. `on_lost` is called on the loop."""
+
+    def __init__(
+        self, session: zenoh.Session, endpoint: Endpoint, bridge: Bridge, on_lost: Close
+    ) -> None:
+        self.now: Line | None = None  # None until a new session has joined
+        self._endpoint, self._bridge, self._on_lost = endpoint, bridge, on_lost
+        self._declared: list[Declared] = []
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._joined = asyncio.Event()
+        self._join(session)
+
+    def declare(self, make: Make) -> Close:
+        """Declare something here and on every line to come; the returned function ends it."""
+        declared = Declared(make)
+        self._declared.append(declared)
+        if self.now:
+            declared.made = make(self.now)
+
+        def close() -> None:
+            if declared in self._declared:
+                self._declared.remove(declared)
+                if declared.made:
+                    declared.made.undeclare()
+
+        return close
+
+    async def within(self, timeout_s: float) -> Line | None:
+        """The line; None where there is none in time."""
+        if self.now is None:
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._joined.wait(), timeout_s)
+        return self.now
+
+    async def close(self) -> None:
+        """Close the session, and join no more."""
+        for task in self._tasks:
+            task.cancel()
+        line, self.now = self.now, None
+        self._joined.set()  # nobody waits for another
+        if line:
+            await close_session(line.session)
+
+    def _join(self, session: zenoh.Session) -> None:
+        self.now = line = Line(session)
+        renews = not self._endpoint.listen  # a router's links are those of others
+
+        def linked(event: zenoh.LinkEvent) -> None:
+            close_in_background()
+            if renews and event.kind == zenoh.SampleKind.DELETE:
+                line.cut = True
+                self._bridge.post(self._lost, line)
+
+        line.watch = session.info.declare_link_events_listener(linked, history=True)
+        for declared in self._declared:
+            declared.made = declared.make(line)
+        self._joined.set()
+
+    def _lost(self, line: Line) -> None:
+        if line is not self.now:
+            return
+        self.now = None
+        self._joined.clear()
+        for declared in self._declared:
+            declared.made = None
+        self._start(close_session(line.session))
+        self._on_lost()
+        self._start(self._renew())
+
+    async def _renew(self) -> None:
+        while True:
+            try:
+                session = await open_session(self._endpoint)
+            except GigabrainError as error:
+                log.warning("the router cannot be joined again: %s", error)
+                await asyncio.sleep(AGAIN_S)
+            else:
+                self._join(session)
+                return
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
