@@ -1,8 +1,9 @@
 """Whether this machine stood still while a test ran: then a failure says nothing of the robot.
 
 The fault suite throws such runs away; here the rest of the tests do the same. A test that failed
-while the machine stood still is run again with everything set up anew, twice at most, and the
-summary says so. What fails on a machine that keeps time has failed.
+while the machine stood still is run again with everything set up anew, twice at most, then while no
+other process runs a test, and the summary says so. What fails on a machine that keeps time has
+failed.
 """
 
 import threading
@@ -12,6 +13,8 @@ from contextlib import contextmanager
 
 import pytest
 from _pytest.runner import call_and_report
+
+from tests.turns import TURNS
 
 STALL_S = 0.05  # longer than anybody waits for two idle cores, and half of what stops a robot
 TRIES = 3
@@ -51,6 +54,10 @@ def run_test(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.Tes
     """The reports of a test, of its last try if it was run again."""
     once = item.get_closest_marker("once") is not None
     for tried in range(TRIES):
+        if tried:
+            TURNS.alone()
+        else:
+            TURNS.beside()
         with watching() as watch:
             reports = _try(item)
         disturbed = watch.longest_s >= STALL_S and any(report.failed for report in reports)
@@ -58,6 +65,7 @@ def run_test(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.Tes
         reports.append(
             call_and_report(item, "teardown", False, nextitem=nextitem if last else None)
         )
+        TURNS.leave()
         if last:
             break
     if tried:

@@ -97,7 +97,8 @@ async def freeze(pid: int | None) -> None:
 
 
 PARENT = f"""
-import asyncio, json, sys
+import asyncio, json, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, where tests run beside a shell
 sys.path[:0] = [{str(ROOT)!r}, {str(Path(__file__).parent)!r}]
 from gigabrain_zenoh.supervisor import ProcessSpec, Supervisor
 codes = json.loads(sys.argv[1])

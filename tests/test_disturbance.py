@@ -1,18 +1,26 @@
-"""A test that failed while the machine stood still is run again, and no other."""
+"""A test that failed while the machine stood still is run again alone, and no other."""
 
+import asyncio
+import fcntl
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
 
-from tests.stack import ROOT, SOURCES
+from tests.stack import ROOT, SOURCES, until
+from tests.turns import Turns
 
 CONFTEST = """
+from pathlib import Path
 import pytest
 from tests import disturbance
 from tests.conftest import pytest_runtest_protocol, pytest_terminal_summary
+from tests.turns import Turns
 disturbance.STALL_S = {stall_s}
+disturbance.TURNS = Turns(Path(__file__), Path(__file__).with_name("test_it.py"))
 """
 FRAGILE = """
 from pathlib import Path
@@ -69,3 +77,40 @@ def test_what_fails_on_a_machine_that_keeps_time_or_sees_to_it_itself_has_failed
     assert "1 failed, 1 passed" in said
     assert "stood still" not in said
     assert made == "1"
+
+
+async def test_who_wants_to_be_alone_waits_for_the_others_and_they_for_him(tmp_path: Path) -> None:
+    door, room = tmp_path / "door", tmp_path / "room"
+    door.touch()
+    room.touch()
+    said: list[str] = []
+
+    async def begin(turn: Callable[[], None], name: str) -> None:
+        await asyncio.to_thread(turn)
+        said.append(name)
+
+    with ExitStack() as stack:
+        one, two, wants = (stack.enter_context(closing(Turns(door, room))) for _ in range(3))
+        one.beside()
+        two.beside()  # not in the way of one another
+        alone = asyncio.create_task(begin(wants.alone, "alone"))
+        one.leave()
+        await until(lambda: shut(door), "the door is shut")
+        late = asyncio.create_task(begin(one.beside, "late"))
+        assert not said
+        two.leave()
+        await alone
+        assert said == ["alone"]
+        wants.leave()
+        await late
+        assert said == ["alone", "late"]
+
+
+def shut(door: Path) -> bool:
+    """Whether nobody may begin."""
+    with door.open() as mine:
+        try:
+            fcntl.flock(mine, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False

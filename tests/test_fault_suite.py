@@ -23,6 +23,7 @@ from gigabrain_zenoh.faults.table import FAULTS, choose
 from gigabrain_zenoh.process import find
 from gigabrain_zenoh.transport import LocalNetwork
 from tests.bus_rig import settle
+from tests.turns import TURNS
 
 STALL_S = 0.2
 FAULT = Fault(1, "decision-killed", "process", "", "zero after <= 120 ms, travel <= 0.1 m")
@@ -194,9 +195,24 @@ async def test_a_part_that_hangs_leaves_the_rest_of_its_process_running() -> Non
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Result]:
-    """What came of each fault; they share robots, so they run in one go."""
-    running = run_suite(FAULTS, Options(), tmp_path_factory.mktemp("faults"))
-    return {result.number: result for result in asyncio.run(running)}
+    """What came of each fault; they share robots, so they run in one go.
+
+    Those that failed while the machine stood still are run again while no other test runs.
+    """
+
+    def run(faults: Sequence[Fault], **turns: Callable[..., None]) -> dict[int, Result]:
+        done = asyncio.run(run_suite(faults, Options(), tmp_path_factory.mktemp("faults"), **turns))
+        return {result.number: result for result in done}
+
+    results = run(FAULTS, begun=lambda _: TURNS.beside(), ended=lambda _: TURNS.leave())
+    held_up = [fault for fault in FAULTS if disturbed(results[fault.number])]
+    TURNS.alone()
+    return results | run(held_up)
+
+
+def disturbed(result: Result) -> bool:
+    """Whether a failure says nothing of the robot."""
+    return result.verdict == "FAILED" and result.stall_ms >= suite.STALL_S * 1e3
 
 
 @pytest.mark.once

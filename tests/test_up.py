@@ -86,7 +86,9 @@ async def test_it_ends_cleanly_when_asked_or_when_its_terminal_has_gone(
     home: Home, number: signal.Signals
 ) -> None:
     terminal, side = os.openpty()
+    inherited = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored, where nohup runs the tests
     up = home.start("up", str(home.deployment()), stdout=side)
+    signal.signal(signal.SIGHUP, inherited)
     os.close(side)
     async with looking_on(await robot_of(home, up)) as robot:
         await robot.pids()

@@ -21,6 +21,7 @@ from gigabrain_zenoh.faults.rig import Rig
 from gigabrain_zenoh.faults.smooth import stops_in_time
 from gigabrain_zenoh.faults.stopping import stop_by
 from gigabrain_zenoh.faults.subject import Subject
+from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.percentile import percentile
 from gigabrain_zenoh.recording.gaps import Gaps, header_of
 
@@ -35,7 +36,8 @@ FLOODED_S, LONG_FLOODED_S = 8.0, 60.0
 RATE_HZ, LONG_RATE_HZ = 2000, 10_000  # of its commands
 LARGE_BYTES, LONG_LARGE_BYTES = 1_000_000, 10_000_000  # of a message twice a second
 LEAST_SHARE = 0.5  # of that rate, else it was no flood
-SOAK_S, LONG_SOAK_S, WARM_S = 20.0, 8 * 3600.0, 5.0
+SOAK_S, LONG_SOAK_S = 20.0, 8 * 3600.0
+WARM_TICKS = 1000  # 20 s; a robot that has just started still takes memory
 COUNTED = (STATE, SCAN, WORLD, CMD_VEL, SAFETY)
 
 
@@ -155,7 +157,7 @@ async def soak(rig: Rig) -> Measured:
     subject = await rig.robot("sim")
     onlooker, gaps = subject.onlooker, Gaps()
     await subject.drive()
-    await asyncio.sleep(WARM_S)
+    await until(lambda: onlooker.state.tick >= WARM_TICKS, "it is warm")
     pids = [subject.pid(name) for name in subject.supervisor.statuses]
     growth = Growth(pids)
 
