@@ -1,5 +1,6 @@
 """Fixtures that several tests share."""
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -54,6 +55,18 @@ def shared_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
     place = Home(tmp_path_factory.mktemp("home"))
     yield place
     place.close()
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder of packages; what was imported from it goes with it, as a test may run again."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(str(folder))
+    yield folder
+    for name, module in list(sys.modules.items()):
+        if folder in Path(getattr(module, "__file__", None) or "").parents:
+            del sys.modules[name]
 
 
 @pytest.fixture(scope="session")

@@ -28,12 +28,6 @@ def installed(folder: Path, site: Path) -> Path:
     return package.rename(site / package.name)
 
 
-@pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.syspath_prepend(str(tmp_path / "site"))
-    return tmp_path / "site"
-
-
 async def test_a_new_driver_passes_the_kit_by_its_name(tmp_path: Path, site: Path) -> None:
     folder = new.write("kit_probe", tmp_path)
     assert folder == tmp_path / "gigabrain-kit-probe"

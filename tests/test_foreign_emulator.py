@@ -37,10 +37,10 @@ ENTRY_POINTS = f"""[gigabrain.drivers]
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def package(site: Path) -> Path:
     """What pip makes of such a package; its folder."""
-    folder = tmp_path / f"{NAME}_driver"
-    info = tmp_path / f"{NAME}-1.0.dist-info"
+    folder = site / f"{NAME}_driver"
+    info = site / f"{NAME}-1.0.dist-info"
     folder.mkdir()
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {NAME}\nVersion: 1.0\n")
@@ -50,7 +50,6 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (folder / "model.xml").write_text((ours.parent / "model.xml").read_text())
     text = ours.read_text().replace("robot_type: mycustombot", f"robot_type: {NAME}")
     (folder / "robot.yaml").write_text(text.replace("driver: line", f"driver: {NAME}"))
-    monkeypatch.syspath_prepend(str(tmp_path))
     return folder
 
 
