@@ -22,7 +22,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.client import connect
 from gigabrain_zenoh.deployment import client_endpoint
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.faults.fault import Measured, Skipped
+from gigabrain_zenoh.faults.fault import Failed, Measured, Skipped
 from gigabrain_zenoh.faults.intruders import unauthorised_publisher
 from gigabrain_zenoh.faults.rig import Rig
 from gigabrain_zenoh.faults.spoiled import address_of
@@ -145,7 +145,11 @@ async def _period_ms(subject: Subject, meanwhile: Awaitable[None]) -> float:
     commands = subject.onlooker.commands
     ticks = [c.tick for c in commands if c.boot == start.boot and c.tick > start.tick]
     periods = sorted((b - a) * TICK_MS for a, b in itertools.pairwise(ticks))
-    return percentile(periods, 0.99) or float("nan")
+    p99_ms = percentile(periods, 0.99)
+    if p99_ms is None:
+        passed = subject.onlooker.state.tick - start.tick
+        raise Failed(f"{len(ticks)} commands were heard within {passed} ticks")
+    return p99_ms
 
 
 async def _noise(host: str, port: int, calls: int) -> None:
