@@ -4,15 +4,18 @@ import asyncio
 import contextlib
 import os
 import signal
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Iterator
 from pathlib import Path
 
 from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
 from gigabrain_zenoh.tasks.mission import Script
 
-LAST = 200  # characters of what it wrote that are told
-# ends a process group, whose number it reads, once nobody holds the other end of its input
-LEASH = 'read -r group; read -r _; kill -s KILL -- "-$group"'
+LAST = 200  # bytes of what it wrote that are told
+LINGER_S = 1.0  # for the rest of its words, once it has ended
+# becomes a program; ends all of its group, itself included, once nobody holds its input open
+LEASHED = """exec 3<&0 </dev/null
+{ read -r _ <&3; kill -s KILL 0; } >/dev/null 2>&1 &
+exec "$@" 3<&-"""
 
 
 class Scripts:
@@ -55,59 +58,52 @@ class Run:
     async def _run(self, scripts: Scripts, script: Script) -> None:
         try:
             path = scripts.path(script.run)
-            async with _leash() as hold:
+            with _leash() as end:
                 process = await asyncio.create_subprocess_exec(
-                    path, *script.arguments, cwd=path.parent, start_new_session=True,
-                    stdin=asyncio.subprocess.DEVNULL,
+                    "/bin/sh", "-c", LEASHED, "sh", path, *script.arguments,
+                    cwd=path.parent, start_new_session=True, stdin=end,
                     stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
                 )  # fmt: skip
-                hold(process.pid)
                 self.result = await _outcome(process, script.seconds)
         except (GigabrainError, OSError, ValueError) as error:
             self.result = False, f"cannot be run: {error}"
 
 
-@contextlib.asynccontextmanager
-async def _leash() -> AsyncIterator[Callable[[int], object]]:
-    """Have a process group, once it is told, end with this process, even with SIGKILL."""
+@contextlib.contextmanager
+def _leash() -> Iterator[int]:
+    """What can be read, and is at its end once this process is, even with SIGKILL."""
     end, ours = os.pipe()
     try:
-        guard = await asyncio.create_subprocess_exec(
-            "/bin/sh", "-c", LEASH, start_new_session=True, stdin=end,
-            stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
-        )  # fmt: skip
-        try:
-            yield lambda group: os.write(ours, f"{group}\n".encode())
-        finally:
-            guard.kill()
-            await asyncio.shield(guard.wait())
+        yield end
     finally:
         os.close(end)
         os.close(ours)
 
 
 async def _outcome(process: asyncio.subprocess.Process, seconds: float) -> tuple[bool, str]:
-    """Whether a program ended well, and what it said; nothing of it is left then."""
+    """Whether a program ended well, and what it said; nothing of its group is left then."""
+    said = bytearray()
+    listening = asyncio.ensure_future(_listen(process, said))
     try:
         async with asyncio.timeout(seconds):
-            said = await _last_words(process)
             code = await process.wait()
-        return code == 0, _in_words(code, said)
     except TimeoutError:
         return False, f"did not end within {seconds:g} s and was ended"
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        await asyncio.shield(process.communicate())
+        # whoever has left the group may hold its output open for ever
+        await asyncio.wait([listening, asyncio.ensure_future(process.wait())], timeout=LINGER_S)
+        listening.cancel()
+    return code == 0, _in_words(code, " ".join(said.decode(errors="replace").split()))
 
 
-async def _last_words(process: asyncio.subprocess.Process) -> str:
-    """The end of what a program writes, once it has ended."""
+async def _listen(process: asyncio.subprocess.Process, said: bytearray) -> None:
+    """Keep the end of what a program writes."""
     assert process.stdout
-    said = b""
     while chunk := await process.stdout.read(4096):
-        said = (said + chunk)[-LAST:]
-    return " ".join(said.decode(errors="replace").split())
+        said += chunk
+        del said[:-LAST]
 
 
 def _in_words(code: int, said: str) -> str:
