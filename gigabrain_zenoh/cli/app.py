@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError
 
+from gigabrain_zenoh.cli.whole import refuse_fractions
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 
 MODULES = "gigabrain_zenoh.cli"
@@ -115,6 +116,7 @@ def make_app(chosen: Sequence[str] = ()) -> App:
         help="A robot brain of three systems that any body can wear.",
         help_format="plaintext",  # the default, Markdown, takes twice as long to start
         version=_version,
+        config=refuse_fractions,
     )
     groups = {name: App(name=name, help=about) for name, about in GROUPS.items()}
     for group in groups.values():
