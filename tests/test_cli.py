@@ -83,6 +83,7 @@ async def test_the_version_is_that_of_the_package(home: Home) -> None:
         ("driver run mcok", "no robot 'mcok'; did you mean 'mock'? known: alpha, mock,"),
         ("driver run mock --speed 0", "--speed: expected `float` >= 0.1"),
         ("decision --behaviour avod", "no behaviour 'avod'; did you mean 'avoid'?"),
+        ("decision --scripts /nowhere/beeps", "no folder '/nowhere/beeps'; scripts: expected that"),
         ("up dmeo", "no deployment 'dmeo'; did you mean 'demo'? known: demo, three_hosts"),
         ("up", 'Command "up" parameter --deployment requires an argument.'),
         ("completion fihs", 'Invalid value "fihs" for SHELL.'),

@@ -7,12 +7,20 @@ import signal
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
-from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
+from gigabrain_zenoh.errors import ConfigError, GigabrainError, Refused, unknown
 from gigabrain_zenoh.tasks.mission import Script
 
 LAST = 200  # characters of what it wrote that are told
 # ends a process group, whose number it reads, once nobody holds the other end of its input
 LEASH = 'read -r group; read -r _; kill -s KILL -- "-$group"'
+
+
+def check_folder(folder: str) -> None:
+    """Whether the folder that `scripts` names is there, where it names one. Raises ConfigError."""
+    if folder and not Path(folder).expanduser().is_dir():
+        raise ConfigError(
+            f"no folder {folder!r}; scripts: expected that of the programs that missions may run"
+        )
 
 
 class Scripts:
