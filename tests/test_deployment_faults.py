@@ -7,7 +7,7 @@ import pytest
 from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh import config
 from gigabrain_zenoh.cli.process import button
-from gigabrain_zenoh.cli.run import up
+from gigabrain_zenoh.cli.up import up
 from gigabrain_zenoh.deployment import Deployment, host_of
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.settings import ButtonConfig

@@ -14,8 +14,8 @@ MODULES = "gigabrain_zenoh.cli"
 
 # command -> where it is, and what it does in a line
 COMMANDS = {
-    "demo": ("run:demo", "Drive a simulated robot round its world, until Ctrl-C."),
-    "up": ("run:up", "Start what a deployment file puts on this host, and keep it running."),
+    "demo": ("demo:demo", "Drive a simulated robot round its world, until Ctrl-C."),
+    "up": ("up:up", "Start what a deployment file puts on this host, and keep it running."),
     "router": ("process:router", "Start the router that joins the other processes."),
     "perception": ("process:perception", "Start perception."),
     "decision": ("process:decision", "Start decision."),
