@@ -255,7 +255,7 @@ async def test_a_whole_robot_is_measured(home: Home, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     pytest.importorskip("gtsam")
     report = tmp_path / "stack.json"
-    command = await home.run("bench", "stack", "--seconds", "2", "--goal", "--json", str(report))
+    command = home.start("bench", "stack", "--seconds", "2", "--goal", "--json", str(report))
     assert await command.ended(600.0) == 0, command.err  # where nothing is kept yet, it compiles
     result = json.loads(report.read_bytes())
     names = [process["name"] for process in result["processes"]]
