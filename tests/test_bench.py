@@ -1,4 +1,4 @@
-""""""
+"""The benches: what they make of figures, what they show, and the commands on a robot."""
 
 import io
 import json
