@@ -1,6 +1,8 @@
 """Somebody behind a proxy, who hears what comes through."""
 
 import asyncio
+import contextlib
+from collections.abc import AsyncIterator
 
 
 class Server:
@@ -21,3 +23,14 @@ class Server:
             self.ends.append("rst")
         finally:
             writer.close()
+
+
+@contextlib.asynccontextmanager
+async def serving() -> AsyncIterator[tuple[Server, int]]:
+    """A server, and the port that it listens at."""
+    served = Server()
+    listening = await asyncio.start_server(served.serve, "127.0.0.1", 0)
+    async with listening:
+        yield served, listening.sockets[0].getsockname()[1]
+    for writer in served.writers:
+        writer.close()

@@ -12,7 +12,7 @@ from gigabrain_zenoh.faults.chaos import CALM, Chaos
 from gigabrain_zenoh.faults.proxy import TcpProxy
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
-from tests.proxy_rig import Server
+from tests.proxy_rig import Server, serving
 from tests.stack import until
 from tests.zenoh_rig import Ear, repeat, robot
 
@@ -21,12 +21,8 @@ LONG = bytes(range(256)) * 400  # more than is read at once
 
 @pytest.fixture
 async def server() -> AsyncIterator[tuple[Server, int]]:
-    served = Server()
-    listening = await asyncio.start_server(served.serve, "127.0.0.1", 0)
-    async with listening:
-        yield served, listening.sockets[0].getsockname()[1]
-    for writer in served.writers:
-        writer.close()
+    async with serving() as made:
+        yield made
 
 
 @pytest.fixture

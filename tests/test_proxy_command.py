@@ -6,18 +6,14 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from tests.proxy_rig import Server
+from tests.proxy_rig import Server, serving
 from tests.stack import Home, until
 
 
 @pytest.fixture
 async def server() -> AsyncIterator[tuple[Server, int]]:
-    served = Server()
-    listening = await asyncio.start_server(served.serve, "127.0.0.1", 0)
-    async with listening:
-        yield served, listening.sockets[0].getsockname()[1]
-    for writer in served.writers:
-        writer.close()
+    async with serving() as made:
+        yield made
 
 
 async def test_the_command_spoils_a_line_as_it_is_told(
