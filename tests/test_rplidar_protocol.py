@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_drivers.protocols import rplidar
-from gigabrain_drivers.protocols.rplidar import Answer, Decoder, Info, Request, RequestDecoder
+from gigabrain_drivers.protocols.rplidar import Answer, Decoder, Info
+from gigabrain_drivers.protocols.rplidar_requests import Request, RequestDecoder
 from gigabrain_drivers.protocols.rplidar_scans import (
     Dense,
     Express,

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_drivers.protocols import rplidar
-from gigabrain_drivers.protocols.rplidar import Answer, Decoder, Info, RequestDecoder
+from gigabrain_drivers.protocols.rplidar import Answer, Decoder, Info
+from gigabrain_drivers.protocols.rplidar_requests import RequestDecoder
 from gigabrain_drivers.protocols.rplidar_scans import Dense, Samples, dense_capsule, node
 
 STANDARD = bytes.fromhex("a55a0500004081")
