@@ -17,6 +17,7 @@ from gigabrain_zenoh.sd_notify import Notifier
 from gigabrain_zenoh.specs import process_specs
 from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.supervisor import Supervisor
+from gigabrain_zenoh.tasks.scripts import check_folder
 
 STOP_S = 1.5
 LOOK_S = 0.1
@@ -32,6 +33,8 @@ async def up(
     BusError when the router cannot run, without which nothing else can.
     """
     check_keys(deployment, host)
+    if "decision" in deployment.hosts[host]:
+        check_folder(deployment.decision.scripts)
     deployment = with_free_port(deployment)
     label = deployment.namespace or deployment.body.replace("/", "-")
     notifier = Notifier.from_environment()

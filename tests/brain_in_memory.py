@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from gigabrain_drivers.catalog import load_robot
@@ -87,12 +86,7 @@ class Robot:
         self.start_driver()
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         for name in list(self._running):
             await self.kill(name)
         await self.operator.close()

@@ -1,18 +1,33 @@
-"""Somebody who carries out tasks, in memory: the executive, on time that the test counts."""
+"""Who carries out tasks, in memory: the executive on time that the test counts, the service."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.brain import PoseInMap
-from gigabrain_schemas.tasks import TaskStatus
-from gigabrain_schemas.topics import STATE, Topic
+from gigabrain_schemas.tasks import (
+    Goal,
+    GoalReply,
+    GoalRequest,
+    MissionReply,
+    MissionRequest,
+    TaskReply,
+    TaskRequest,
+    TaskStatus,
+)
+from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, Topic
+from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.tasks import checks
 from gigabrain_zenoh.tasks.executive import Executive, Saved
 from gigabrain_zenoh.tasks.mission import Script
 from gigabrain_zenoh.tasks.orders import Explore, GoTo, Order, Outcome
-from tests.brain_rig import state
+from gigabrain_zenoh.tasks.service import TaskService
+from tests.brain_rig import BOOT, state
+from tests.bus_rig import Net, settle
 
 PLACES = "places: {dock: [0, 0, 1.5], a: [1, 0], b: [2, 0], c: [3, 0]}\n"
 
@@ -89,3 +104,49 @@ def one_robot() -> Iterator[Robot]:
     made = Robot()
     yield made
     assert all(program.stopped for program in made.programs)
+
+
+class Site:
+    """A service of tasks, somebody who drives, and somebody who asks."""
+
+    def __init__(self, folder: Path, *, scripts: str = "") -> None:
+        self.net = Net()
+        self.wall, self.lost = "", ""
+        self.service = TaskService(self.net.one, self, folder=str(folder), scripts=scripts)
+        self.told: list[TaskStatus] = []
+        self.net.two.subscribe(TASK, lambda _key, status: self.told.append(status))
+        self.tick, self.order, self.outcome = 0, None, None
+        self.order: Order | None
+        self.outcome: Outcome | None
+
+    async def can_reach(self, goal: Goal) -> str:
+        await self.can_drive()
+        if self.wall:
+            raise Refused(self.wall)
+        return "on the way, 4.2 m"
+
+    async def can_drive(self) -> None:
+        if self.lost:
+            raise Refused(self.lost)
+
+    async def go(self, x: float, **how: str) -> GoalReply:
+        request = msgspec.convert({"x": x, "y": 0.0, "source": "ann"} | how, GoalRequest)
+        return (await self.net.two.ask(GOAL, request))[0]
+
+    async def carry_out(self, text: str) -> MissionReply:
+        request = MissionRequest(mission=text, source="ann", label="tea")
+        return (await self.net.two.ask(MISSION, request))[0]
+
+    async def change(self, do: str, task: str = "") -> TaskReply:
+        request = msgspec.convert({"do": do, "task": task, "source": "bob"}, TaskRequest)
+        return (await self.net.two.ask(TASK_CHANGE, request))[0]
+
+    async def step(self, ticks: int = 5, boot: int = BOOT) -> None:
+        self.tick += ticks
+        self.net.one.time.see(state(self.tick, boot=boot))
+        self.order = self.service.step(state(self.tick, boot=boot), self.outcome)
+        self.outcome = None
+        await settle()
+
+    async def end(self) -> None:
+        await self.service.close()

@@ -19,7 +19,8 @@ from gigabrain_zenoh.navigation.models import model_of
 from gigabrain_zenoh.navigation.mppi import Sampler
 from gigabrain_zenoh.navigation.rating import NO_DISC, Weights
 from gigabrain_zenoh.navigation.rollout import AWAY, CLOSE, COSINE, LANES, STATE, X
-from gigabrain_zenoh.navigation.window import Place, Window
+from gigabrain_zenoh.navigation.window import Window
+from gigabrain_zenoh.navigation.window_cells import Place
 from tests.local_rig import OMNI, WAFFLE, wall
 
 NOTHING = np.empty((0, 2))

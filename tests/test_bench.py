@@ -1,45 +1,22 @@
+"""The benches: what they make of figures, what they show, and the commands on a robot."""
+
 import io
 import json
 from pathlib import Path
 
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rich.console import Console, RenderableType
 
-from gigabrain_drivers.round_trip import RoundTrip
-from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.topics import CMD_VEL, SCAN
-from gigabrain_zenoh.bench.chain import ChainResult, Compared
-from gigabrain_zenoh.bench.costs import Hop, Timed
+from gigabrain_zenoh.bench.chain import ChainResult
+from gigabrain_zenoh.bench.costs import Hop
 from gigabrain_zenoh.bench.estop import EstopResult, Presses
-from gigabrain_zenoh.bench.figures import Figures, figures, over_rounds
 from gigabrain_zenoh.bench.first_goal import FirstGoal
-from gigabrain_zenoh.bench.listening import Heard, median_ms
-from gigabrain_zenoh.bench.runs import relay_roles
 from gigabrain_zenoh.bench.stack import Process, StackResult, physics_share, targets
 from gigabrain_zenoh.bench.tables import chain_page, estop_page, stack_page, tools_page
 from gigabrain_zenoh.bench.with_tools import Beside, Tool, ToolsResult
-from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.percentile import Newest, percentile
-from gigabrain_zenoh.settings import Endpoint
+from tests.bench_rig import compared, one
 from tests.stack import Home
-
-MS = 1_000_000
-
-
-def one(n: int, p50_ms: float, p99_ms: float) -> Figures:
-    return Figures(n=n, p50_ms=p50_ms, p99_ms=p99_ms)
-
-
-def compared() -> Compared:
-    return Compared(
-        rate_hz=10.0,
-        chain=(one(100, 0.9, 3.0), one(99, 0.6, 1.0), one(101, 0.7, 1.5)),
-        relay=(one(100, 0.5, 0.9), one(100, 0.4, 0.8), one(100, 0.6, 1.1)),
-        peers=one(100, 0.25, 0.5),
-    )
 
 
 def stack(**changes: object) -> StackResult:
@@ -63,119 +40,6 @@ def shown(page: RenderableType) -> str:
     with console.capture() as capture:
         console.print(page)
     return capture.get()
-
-
-@pytest.mark.parametrize(
-    ("count", "share", "expected"),
-    [(1, 0.99, 1), (2, 0.50, 1), (3, 0.50, 2), (100, 0.50, 50), (100, 0.99, 99), (101, 0.99, 100)],
-)
-def test_a_percentile_is_a_value_that_was_measured(
-    count: int, share: float, expected: float
-) -> None:
-    assert percentile(range(1, count + 1), share) == expected
-
-
-def test_nothing_has_no_percentile() -> None:
-    assert percentile([], 0.5) is None
-    assert Newest(3).percentile(0.5) is None
-
-
-def test_the_oldest_value_gives_way() -> None:
-    newest = Newest(3)
-    for value in (5.0, 1.0, 9.0, 2.0):
-        newest.add(value)
-    assert len(newest) == 3
-    assert [newest.percentile(share) for share in (0.0, 0.5, 1.0)] == [1.0, 2.0, 9.0]
-
-
-@given(st.lists(st.floats(0, 9), min_size=1), st.integers(1, 9), st.floats(0, 1))
-def test_the_newest_values_are_those_that_came_last(
-    values: list[float], most: int, share: float
-) -> None:
-    newest = Newest(most)
-    for value in values:
-        newest.add(value)
-    assert newest.percentile(share) == percentile(sorted(values[-most:]), share)
-
-
-def test_a_run_that_measured_nothing_is_no_result() -> None:
-    assert figures([0.4, 0.2, 0.3]) == one(3, 0.3, 0.4)
-    with pytest.raises(GigabrainError, match="nothing came back"):
-        figures([])
-
-
-def test_one_disturbed_round_does_not_count() -> None:
-    assert over_rounds(compared().chain) == one(300, 0.7, 1.5)
-
-
-def test_a_ratio_is_ours_over_the_bare_relays() -> None:
-    assert compared().ratio_p50 == pytest.approx(1.4)
-    assert compared().ratio_p99 == pytest.approx(1.5 / 0.9)
-
-
-def test_what_a_hop_does_not_do_itself_is_the_rest() -> None:
-    hop = Hop(name="scan → world", took=1.0, put=0.1, bridge=0.05, decode=0.02, step=0.23)
-    assert hop.rest == pytest.approx(0.6)
-
-
-def test_work_is_timed_by_name_and_its_result_handed_on() -> None:
-    timed = Timed()
-    assert timed("step", lambda: 7) == 7
-    assert timed.median("step") >= 0.0
-    for duration_ns in (MS, 5 * MS, 2 * MS):
-        timed.add("put", duration_ns)
-    assert timed.median("put") == 2.0
-    assert timed.median("never done") == 0.0
-
-
-def test_a_hop_lasts_from_its_first_message_of_a_tick_to_the_next_ones() -> None:
-    heard = Heard()
-    for tick, left_ms in ((5, 100), (10, 200), (15, 300)):
-        heard.hear("robot/scan", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
-    for tick, left_ms in ((5, 101), (10, 203), (10, 220)):  # the last repeats what it rests on
-        heard.hear("robot/cmd_vel", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
-    assert heard.between(SCAN, CMD_VEL) == 2.0
-    assert not heard.complete
-    assert median_ms({1: 0, 2: 0, 3: 0}, {2: 4 * MS, 3: 8 * MS, 4: MS}) == 6.0
-
-
-def test_the_relay_is_a_ring_with_one_source() -> None:
-    here = Endpoint(connect=("tcp/127.0.0.1:7447",))
-    roles = relay_roles(50.0, 2.0, (1600, 240, 490, 125), [here] * 4)
-    assert [role.gets for role in roles[1:]] == [role.puts for role in roles[:-1]]
-    assert roles[0].gets == roles[-1].puts
-    assert [role.size for role in roles] == [1600, 240, 490, 125]
-    assert [role.rate_hz for role in roles] == [50.0, 0.0, 0.0, 0.0]
-
-
-def test_a_scan_is_timed_until_the_first_command_that_rests_on_it() -> None:
-    trip = RoundTrip()
-    trip.sent(5, 100 * MS)
-    trip.answered(0, 101 * MS, counts=True)
-    trip.answered(5, 103 * MS, counts=True)
-    trip.answered(5, 120 * MS, counts=True)
-    assert trip.scan_tick == 5
-    assert trip.report() == {
-        "scan_to_cmd_n": 1, "scan_to_cmd_p50_ms": 3.0, "scan_to_cmd_p99_ms": 3.0,
-    }  # fmt: skip
-
-
-def test_a_scan_that_was_skipped_counts_until_a_newer_one_is_answered() -> None:
-    trip = RoundTrip()
-    trip.sent(5, 100 * MS)
-    trip.sent(6, 120 * MS)
-    trip.answered(6, 124 * MS, counts=True)
-    assert trip.report() == {
-        "scan_to_cmd_n": 2, "scan_to_cmd_p50_ms": 4.0, "scan_to_cmd_p99_ms": 24.0,
-    }  # fmt: skip
-
-
-def test_a_brain_that_is_still_starting_is_not_timed() -> None:
-    trip = RoundTrip()
-    trip.sent(5, 100 * MS)
-    trip.answered(5, 900 * MS, counts=False)
-    assert trip.report()["scan_to_cmd_n"] == 0
-    assert trip.report()["scan_to_cmd_p50_ms"] is None
 
 
 def test_what_the_whole_robot_costs_leaves_its_physics_out() -> None:
@@ -255,7 +119,7 @@ async def test_a_whole_robot_is_measured(home: Home, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     pytest.importorskip("gtsam")
     report = tmp_path / "stack.json"
-    command = await home.run("bench", "stack", "--seconds", "2", "--goal", "--json", str(report))
+    command = home.start("bench", "stack", "--seconds", "2", "--goal", "--json", str(report))
     assert await command.ended(600.0) == 0, command.err  # where nothing is kept yet, it compiles
     result = json.loads(report.read_bytes())
     names = [process["name"] for process in result["processes"]]

@@ -1,10 +1,13 @@
 """What is wrong between the fields of a file is said with the line of the field that is wrong."""
 
+from pathlib import Path
+
 import pytest
 
 from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh import config
 from gigabrain_zenoh.cli.process import button
+from gigabrain_zenoh.cli.up import up
 from gigabrain_zenoh.deployment import Deployment, host_of
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.settings import ButtonConfig
@@ -59,6 +62,47 @@ def test_thresholds_that_contradict_each_other_are_refused_where_they_stand(
     with pytest.raises(ConfigError) as error:
         config.loads(text, Thresholds, "f")
     assert str(error.value) == said
+
+
+class Begun(Exception):
+    """Nothing was wrong up to the start of the processes."""
+
+
+@pytest.fixture
+def only_begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def begin(*_: object, **__: object) -> None:
+        raise Begun
+
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setattr("gigabrain_zenoh.launch.process_specs", begin)
+
+
+@pytest.mark.usefixtures("only_begun")
+@pytest.mark.parametrize("named", ["beeps", "a_file"])
+def test_a_folder_of_scripts_that_is_not_there_is_told_at_the_start(
+    tmp_path: Path, named: str
+) -> None:
+    (tmp_path / "a_file").touch()
+    place, file = tmp_path / named, tmp_path / "robot.yaml"
+    file.write_text(f"body: mock\ndecision:\n  behaviour: navigate\n  scripts: {place}\n")
+    with pytest.raises(ConfigError) as error:
+        up(str(file))
+    expected = "scripts: expected that of the programs that missions may run"
+    assert str(error.value) == f"{file}:4: no folder '{place}'; {expected}"
+    place.unlink(missing_ok=True)
+    place.mkdir()
+    with pytest.raises(Begun):
+        up(str(file))
+
+
+@pytest.mark.usefixtures("only_begun")
+def test_a_folder_of_scripts_is_looked_for_only_where_decision_runs(tmp_path: Path) -> None:
+    file = tmp_path / "robot.yaml"
+    file.write_text("hosts: {a: [router], b: [decision]}\ndecision: {scripts: /nowhere/beeps}\n")
+    with pytest.raises(Begun):
+        up(str(file), host="a")
+    with pytest.raises(ConfigError, match=r"robot\.yaml:2: no folder '/nowhere/beeps'; scripts: "):
+        up(str(file), host="b")
 
 
 def test_a_host_that_is_like_no_other_gets_no_suggestion() -> None:

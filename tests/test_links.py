@@ -1,8 +1,7 @@
 """Links: they keep themselves open, never block or raise, and send nothing late."""
 
 import asyncio
-import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -10,33 +9,9 @@ import serial
 
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.links import port_name, ports
-from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.links.serial_link import SerialLink, open_port
-from gigabrain_drivers.links.tcp_link import TcpLink
 from gigabrain_zenoh.clock import Clock
-
-GENEROUS_S = 60.0
-
-
-async def until(condition: Callable[[], object]) -> None:
-    """Wait for something that must come true."""
-    async with asyncio.timeout(GENEROUS_S):
-        while not condition():  # noqa: ASYNC110 - nothing here could set an event
-            await asyncio.sleep(0.002)
-
-
-class Heard:
-    """What a link told its owner."""
-
-    def __init__(self, link: Link) -> None:
-        self.data, self.opened, self.lost = b"", 0, list[str]()
-        link.on_bytes, link.on_open, link.on_lost = self._bytes, self._opened, self.lost.append
-
-    def _bytes(self, data: bytes) -> None:
-        self.data += data
-
-    def _opened(self) -> None:
-        self.opened += 1
+from tests.links_rig import Heard, until
 
 
 @pytest.fixture
@@ -243,77 +218,6 @@ def test_what_is_wrong_with_a_port_says_what_to_do() -> None:
     assert 'KERNEL=="ttyACM9", MODE="0666"' in ports.refused(
         "/dev/ttyACM9", PermissionError(13, "Permission denied")
     )
-
-
-def server() -> socket.socket:
-    listening = socket.create_server(("127.0.0.1", 0))
-    listening.settimeout(GENEROUS_S)
-    return listening
-
-
-async def test_tcp_there_and_back_and_again_after_the_peer_is_gone() -> None:
-    with server() as listening:
-        link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=None)
-        heard = Heard(link)
-        link.open()
-        peer, _ = await asyncio.to_thread(listening.accept)
-        await until(lambda: link.connected)
-        assert link.write(b"hello")
-        assert await asyncio.to_thread(peer.recv, 100) == b"hello"
-        peer.close()
-        await until(lambda: heard.lost)
-        peer, _ = await asyncio.to_thread(listening.accept)
-        await until(lambda: link.connected)
-        assert link.reconnects == 1
-        await link.close()
-        peer.close()
-
-
-async def test_a_tcp_peer_that_falls_silent_is_dropped_and_gets_nothing_old() -> None:
-    with server() as listening:
-        link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=100_000_000)
-        heard = Heard(link)
-        link.open()
-        frozen, _ = await asyncio.to_thread(listening.accept)
-        await until(lambda: link.connected)
-        while not heard.lost:
-            link.write(b"old")
-            await asyncio.sleep(0.01)
-        assert "nothing heard for" in heard.lost[0]
-        peer, _ = await asyncio.to_thread(listening.accept)
-        peer.sendall(b"alive")
-        await until(lambda: heard.data)
-        link.write(b"new")
-        assert await asyncio.to_thread(peer.recv, 100) == b"new"
-        await link.close()
-        frozen.close()
-        peer.close()
-
-
-async def test_a_tcp_peer_that_takes_nothing_is_dropped_in_the_middle_of_a_frame() -> None:
-    with server() as listening:
-        link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=None)
-        heard = Heard(link)
-        link.open()
-        peer, _ = await asyncio.to_thread(listening.accept)
-        await until(lambda: link.connected)
-        while link.write(b"x" * 65536):
-            pass
-        assert heard.lost == ["it does not take what is sent to it"]
-        await link.close()
-        peer.close()
-
-
-@pytest.mark.parametrize(
-    ("host", "complaint"), [("127.0.0.1", "nobody listens"), ("no.such.host.invalid", "no host")]
-)
-async def test_a_tcp_port_that_cannot_be_reached_says_so(host: str, complaint: str) -> None:
-    with server() as listening:
-        port = listening.getsockname()[1]
-    link = TcpLink(host, port, Clock())
-    link.open()
-    await until(lambda: complaint in link.problem)
-    await link.close()
 
 
 @pytest.mark.parametrize("path", ["/dev/null", "/tmp"])

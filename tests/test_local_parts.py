@@ -20,7 +20,8 @@ from gigabrain_zenoh.navigation.footprint import (
 )
 from gigabrain_zenoh.navigation.models import answer, feasible, lag_of, model_of, slowed
 from gigabrain_zenoh.navigation.mppi import past_of
-from gigabrain_zenoh.navigation.window import Place, Window
+from gigabrain_zenoh.navigation.window import Window
+from gigabrain_zenoh.navigation.window_cells import Place
 from tests.local_rig import CAR, WAFFLE, wall
 
 NOBODY = np.empty((0, 6))

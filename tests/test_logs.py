@@ -1,22 +1,20 @@
-import asyncio
+"""What a process logs: a JSON line each in the run folder, and on the console."""
+
 import contextlib
 import io
 import json
 import logging
 import re
 import sys
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 
-from gigabrain_schemas.safety import LogRecord
-from gigabrain_zenoh import log_text, logs
-from gigabrain_zenoh.errors import BusError, ConfigError, UnknownName
+from gigabrain_zenoh import logs
+from gigabrain_zenoh.errors import ConfigError, UnknownName
 
 log = logging.getLogger("a.module")
 
@@ -126,53 +124,6 @@ def test_no_value_breaks_a_line(value: object, written: object, stderr: Said) ->
     assert json.loads(stderr.getvalue())["value"] == written
 
 
-def test_a_library_whose_arguments_do_not_fit_loses_no_line() -> None:
-    record = logging.makeLogRecord({"msg": "%d beams", "args": ("many",), "levelno": 20})
-    assert log_text.fields(record, "control")["text"] == "%d beams ('many',)"
-
-
-def test_a_console_line_reads_time_process_level_text_and_data() -> None:
-    record = {
-        "t": 1_700_000_000_000_000_000,
-        "level": "warning",
-        "process": "driver",
-        "event": "silence",
-        "text": "no command",
-        "age_s": 0.1234567891,
-        "source": "control",
-        "why": "late again",
-        "causes": ["a", "b"],
-    }
-    line = log_text.readable(record)
-    assert re.fullmatch(r"\d\d:\d\d:20 .*", line)
-    assert line[9:] == (
-        "driver     warning  no command age_s=0.123457 source=control "
-        'why="late again" causes=["a","b"]'
-    )
-
-
-def test_a_record_without_text_shows_its_event() -> None:
-    record = {"t": 0, "level": "info", "process": "perception", "event": "ready"}
-    assert log_text.readable(record)[9:] == "perception info     ready"
-
-
-def test_colour_marks_the_level_alone() -> None:
-    record = {"t": 0, "level": "error", "process": "driver", "event": "log", "text": "lost"}
-    assert log_text.readable(record, colour=True)[9:] == "driver     \033[31merror   \033[0m lost"
-
-
-def test_text_from_outside_cannot_move_the_cursor() -> None:
-    record = {
-        "t": 0,
-        "level": "info",
-        "process": "p\r",
-        "event": "log",
-        "text": "\033[2J\n",
-        "k": "\a",
-    }
-    assert log_text.readable(record)[9:] == "p\\r        info     \\x1b[2J\\n k=\\x07"
-
-
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
@@ -207,14 +158,6 @@ def test_the_level_is_obeyed_and_a_mistyped_one_is_suggested(stderr: Said) -> No
     assert stderr.getvalue() == ""
     with pytest.raises(UnknownName, match="no log level 'warnign'; did you mean 'warning'"):
         logs.setup("control", None, json_console=True, level="warnign")
-
-
-@pytest.mark.parametrize(
-    ("number", "name"),
-    [(5, "debug"), (10, "debug"), (25, "info"), (50, "critical"), (99, "critical")],
-)
-def test_foreign_levels_take_the_nearest_name_below(number: int, name: str) -> None:
-    assert log_text.level_of(logging.makeLogRecord({"levelno": number})) == name
 
 
 def test_a_second_setup_replaces_the_first_and_the_file_goes_on(
@@ -304,94 +247,3 @@ def test_a_fault_is_logged_once_when_it_begins_and_once_when_it_ends(stderr: Sai
         ("warning", "fault", "scan is 300 ms old", None),
     ]
     assert said[0]["age_ms"] == 310
-
-
-@pytest.fixture
-def quiet() -> Iterator[logging.Logger]:
-    logger = logging.getLogger("bus.test")
-    logger.setLevel(logging.DEBUG)
-    logger.propagate = False
-    yield logger
-    logger.handlers.clear()
-
-
-async def test_the_bus_gets_records_from_info_up_as_valid_messages(quiet: logging.Logger) -> None:
-    sent: list[LogRecord] = []
-    quiet.addHandler(logs.BusHandler(sent.append, "driver"))
-    quiet.debug("not this")
-    quiet.info("ready to drive", extra={"data": {"event": "ready", "port": np.int64(7447)}})
-    assert sent == [
-        LogRecord(
-            process="driver",
-            level="info",
-            event="ready",
-            text="ready to drive",
-            data={"port": "7447"},
-        )
-    ]
-
-
-async def test_the_bus_gets_the_gist_of_a_record_of_any_size(quiet: logging.Logger) -> None:
-    sent: list[LogRecord] = []
-    quiet.addHandler(logs.BusHandler(sent.append, "driver"))
-    try:
-        raise ValueError("y" * 9000)
-    except ValueError:
-        data = {f"k{i}" * 99: "\udc80" * 999 for i in range(99)}
-        quiet.exception("x" * 9000, extra={"data": data | {"event": "e" * 99}})
-    payload = msgspec.msgpack.encode(sent[0])
-    assert len(payload) < 16_384
-    assert msgspec.msgpack.decode(payload, type=LogRecord) == sent[0]
-
-
-async def test_publishing_that_logs_does_not_log_itself(quiet: logging.Logger) -> None:
-    sent: list[str] = []
-
-    def publish(record: LogRecord) -> None:
-        sent.append(record.text)
-        quiet.warning("published %s", record.text)
-
-    quiet.addHandler(logs.BusHandler(publish, "driver"))
-    quiet.info("one")
-    quiet.info("two")
-    thread = threading.Thread(target=quiet.info, args=("three",))
-    thread.start()
-    thread.join()
-    await asyncio.sleep(0)
-    assert sent == ["one", "two", "three"]
-
-
-async def test_another_threads_record_is_published_on_the_loops_thread(
-    quiet: logging.Logger,
-) -> None:
-    threads: list[int] = []
-    handler = logs.BusHandler(lambda _: threads.append(threading.get_ident()), "driver")
-    quiet.addHandler(handler)
-    thread = threading.Thread(target=quiet.info, args=("from physics",))
-    thread.start()
-    thread.join()
-    await asyncio.sleep(0)
-    assert threads == [threading.get_ident()]
-
-
-async def test_a_bus_that_is_gone_costs_the_record_and_nothing_else(quiet: logging.Logger) -> None:
-    def publish(_: LogRecord) -> None:
-        raise BusError("closed")
-
-    handler = logs.BusHandler(publish, "driver")
-    quiet.addHandler(handler)
-    quiet.info("one")
-    quiet.info("two")
-    assert handler.lost == 2
-
-
-def test_a_record_after_the_loop_is_closed_is_dropped(quiet: logging.Logger) -> None:
-    async def make() -> logs.BusHandler:
-        return logs.BusHandler(print, "driver")
-
-    handler = asyncio.run(make())
-    quiet.addHandler(handler)
-    thread = threading.Thread(target=quiet.info, args=("late",))
-    thread.start()
-    thread.join()
-    assert handler.lost == 1

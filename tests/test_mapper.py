@@ -1,31 +1,23 @@
 """Perception with mapping on: the world first, then the pose of the same scan, and a map."""
 
 import asyncio
-import functools
-import time
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
-from gigabrain_schemas.requests import MapReply, MapRequest
-from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.topics import BODY, MAP, MAP_SAVE, POSE, SCAN, STATE, WORLD
-from gigabrain_zenoh import config, perception
-from gigabrain_zenoh.bus import Bus
+from gigabrain_schemas.topics import MAP, POSE, SCAN, STATE, WORLD
+from gigabrain_zenoh import config
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapper import chart_of
 from gigabrain_zenoh.mapping import map_file
-from gigabrain_zenoh.recording.placing import placed
-from gigabrain_zenoh.replay import record, replay
 from gigabrain_zenoh.settings import PerceptionConfig
-from tests.brain_rig import Bench, body, scan, state
+from tests.brain_rig import scan, state
 from tests.map_rig import HOUSE, Rooms, at, drawn
+from tests.mapper_rig import Robot
 
-SLAM = PerceptionConfig(mapping="slam")
 START = at(3.0, 2.0)
 
 
@@ -33,48 +25,6 @@ START = at(3.0, 2.0)
 def own_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     return tmp_path / "gigabrain" / "maps"
-
-
-class Robot(Bench):
-    """Perception alone, with a robot that drives north in the house at 0.2 m/s."""
-
-    def __init__(self, config: PerceptionConfig = SLAM) -> None:
-        super().__init__(functools.partial(perception.run, config))
-        self.rooms, self.tick, self.boot = Rooms(HOUSE), 0, 7
-
-    async def __aenter__(self) -> Self:
-        await super().__aenter__()
-        await self.ready()
-        return self
-
-    def say(self) -> None:
-        self.send(BODY, body(boot=self.boot))
-
-    def scan(self, *, y: float | None = None) -> LaserScan:
-        """As seen now."""
-        away = 0.004 * self.tick if y is None else y
-        values = self.rooms.ranges(at(3.0, 2.0 + away, 90))
-        return scan(values, self.tick, boot=self.boot)
-
-    def drive(self, scans: int, *, still: bool = False) -> None:
-        """So many scans, five ticks apart."""
-        for _ in range(scans):
-            for _ in range(5):
-                self.tick += 1
-                x = 0.0 if still else 0.004 * self.tick
-                self.send(STATE, state(self.tick, pose=(x, 0, 0), boot=self.boot))
-            self.send(SCAN, self.scan(y=0.0 if still else None))
-
-    async def save(self, name: str, *, replace: bool = False) -> MapReply:
-        """What perception answers."""
-        bus = Bus(self.network.transport(), self.clock, "test")
-        asking = asyncio.ensure_future(bus.ask(MAP_SAVE, MapRequest(name=name, replace=replace)))
-        async with asyncio.timeout(30):
-            while not asking.done():
-                await self.clock.advance(20_000_000)
-                await asyncio.sleep(0.005)
-        await bus.close()
-        return asking.result()[0]
 
 
 async def test_each_scan_gives_a_world_and_then_a_pose_that_rest_on_it() -> None:
@@ -193,88 +143,6 @@ async def test_after_a_new_start_of_the_driver_the_map_stays_and_the_robot_is_fo
     assert (maps[0].width, maps[0].origin_x) == (before.width, before.origin_x)
     assert pose.localized
     assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
-
-
-async def test_a_map_is_saved_and_found_in_again(own_maps: Path) -> None:
-    async with Robot() as robot:
-        robot.say()
-        assert (await robot.save("early")).text.startswith("not saved: where the robot is")
-        robot.drive(80)
-        reply = await robot.save("house")
-        assert reply.ok, reply.text
-        assert reply.text.startswith(f"saved {own_maps}/house.yaml: ")
-        assert "already" in (await robot.save("house")).text
-        assert (await robot.save("house", replace=True)).ok
-    found = PerceptionConfig(mapping="localize", map="house")
-    async with Robot(found) as robot:
-        robot.say()
-        for _ in range(40):
-            robot.drive(1, still=True)
-            await asyncio.sleep(0.005)
-        pose, grid = robot.sent(POSE)[-1], map_file.load(own_maps / "house.yaml")
-        reply = await robot.save("other")
-    assert pose.localized
-    assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
-    assert grid.resolution == 0.05
-    assert reply.text == "not saved: perception finds its way in a saved map, it makes none"
-
-
-async def test_two_who_save_at_once_do_not_write_into_each_others_files(
-    own_maps: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real, writing, most = map_file.save, [0], [0]
-
-    def slow(*args: Any, **how: Any) -> None:
-        writing[0] += 1
-        most[0] = max(most[0], writing[0])
-        time.sleep(0.05)
-        real(*args, **how)
-        writing[0] -= 1
-
-    monkeypatch.setattr(map_file, "save", slow)
-    async with Robot() as robot:
-        robot.say()
-        robot.drive(80)
-        replies = await asyncio.gather(robot.save("house"), robot.save("house"))
-    assert most == [1]
-    assert sorted(reply.ok for reply in replies) == [False, True]
-    assert map_file.load_graph(own_maps / "house.yaml")["poses"].ndim == 2
-
-
-async def test_a_replay_of_a_drive_with_a_save_says_the_same_and_saves_nothing(
-    own_maps: Path,
-) -> None:
-    async with Robot() as robot:
-        events = record(robot.network, robot.clock)
-        robot.say()
-        robot.drive(60)
-        assert (await robot.save("house")).ok
-        robot.drive(20)
-    (own_maps / "house.yaml").unlink()
-    own = (WORLD.key, POSE.key, MAP.key)
-    heard = placed([event for event in events if event[1] not in own])
-    assert sum(key == MAP_SAVE.key for _, key, _ in heard) == 1
-    now = await replay(functools.partial(perception.run, SLAM), heard, "perception")
-    then = [(key, data) for _, key, data in events if key in own]
-    assert [one for one in now if one[0] in own] == then
-    assert len(then) > 160
-    assert not (own_maps / "house.yaml").exists()
-
-
-async def test_a_saved_map_grows_on(own_maps: Path) -> None:
-    async with Robot() as robot:
-        robot.say()
-        robot.drive(60)
-        assert (await robot.save("house")).ok
-    size = map_file.load(own_maps / "house.yaml").cells.size
-    async with Robot(PerceptionConfig(mapping="slam", map="house")) as robot:
-        robot.say()
-        for _ in range(40):
-            robot.drive(1, still=True)
-            await asyncio.sleep(0.005)
-        assert robot.sent(POSE)[-1].localized
-        assert (await robot.save("house")).ok  # the same map: nobody else's is lost
-    assert map_file.load(own_maps / "house.yaml").cells.size >= size
 
 
 def test_a_map_for_nothing_is_refused_with_its_line() -> None:

@@ -1,173 +1,25 @@
-"""What the page draws of a robot that says all there is to say, over plain HTTP and over TLS."""
+"""What the page draws of a robot that says all there is to say."""
 
 import asyncio
-import contextlib
-import datetime
-import math
 from collections.abc import AsyncIterator, Callable
-from pathlib import Path
 
-import msgspec
-import numpy as np
 import pytest
 import pytest_asyncio
-from msgspec.structs import replace
 from playwright.async_api import Page
 
-from gigabrain_drivers.catalog import load_robot
-from gigabrain_schemas.arrays import ranges_bytes
-from gigabrain_schemas.base import Pose
-from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import (
-    Intent,
-    Obstacle,
-    OccupancyGrid,
-    PoseInMap,
-    TrajectoryPoint,
-    Twist,
-    WorldModel,
-)
-from gigabrain_schemas.examples import EXAMPLES
-from gigabrain_schemas.requests import EstopRequest, GateReply
-from gigabrain_schemas.sensors import Image, LaserScan
-from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskReply, TaskRequest, TaskStatus
-from gigabrain_schemas.topics import (
-    BODY,
-    ESTOP,
-    GOAL,
-    IMAGE,
-    INTENT,
-    MAP,
-    POSE,
-    SCAN,
-    STATE,
-    TASK,
-    TASK_CHANGE,
-    TELEOP,
-    WORLD,
-)
-from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.page.server import run
-from gigabrain_zenoh.settings import PageConfig
-from gigabrain_zenoh.transport import LocalNetwork
-from tests.page_rig import OPERATOR, VIEWER, Browser, browser, needs_browser
-from tests.stack import free_port, until
+from gigabrain_schemas.sensors import Image
+from gigabrain_schemas.topics import IMAGE
+from tests.fake_page_rig import Fake, serving
+from tests.page_rig import Browser, browser, needs_browser
+from tests.stack import until
 
 pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
-SIDE = 80  # cells of the map, of 0.05 m; its corner is at (-2, -2)
 PAD = """
 const button = (pressed) => ({ pressed, value: pressed ? 1 : 0 })
 window.pad = { axes: [0, 0, 0, 0], buttons: Array.from({ length: 16 }, () => button(false)) }
 navigator.getGamepads = () => [window.pad]
 """
-
-
-def wall_ahead() -> LaserScan:
-    """The lidar of a Waffle, 0.064 m behind its middle, sees a wall 1.2 m ahead of that."""
-    angles = np.radians(np.arange(-20, 21))
-    return LaserScan(
-        angle_min=float(angles[0]), angle_increment=math.radians(1.0), range_min=0.1, range_max=3.5,
-        ranges=ranges_bytes((1.2 + 0.064) / np.cos(angles)),
-    )  # fmt: skip
-
-
-class Fake:
-    """A robot with all topics, which stands at (0.5, 0) in its map and at (1, 1) by odometry."""
-
-    def __init__(self, folder: Path, **config: object) -> None:
-        network = LocalNetwork()
-        self.robot = Bus(network.transport(), Clock(), "driver")
-        self.bus = Bus(network.transport(), Clock(), "page")
-        tokens = folder / "tokens.json"
-        tokens.touch(0o600)
-        tokens.write_text(f'{{"operator": "{OPERATOR}", "viewer": "{VIEWER}"}}')
-        values = {"port": free_port(), "tokens": str(tokens), "login": True} | config
-        self.config = msgspec.convert(values, PageConfig)
-        self.goals: list[GoalRequest] = []
-        self.changes: list[TaskRequest] = []
-        self.steered: list[Twist] = []
-        self.robot.subscribe(TELEOP, lambda _key, twist: self.steered.append(twist))
-        self.robot.serve(GOAL, self._go)
-        self.robot.serve(TASK_CHANGE, self._change)
-        self.presses: list[str] = []
-        self.robot.serve(ESTOP, self._stop)
-
-    @property
-    def origin(self) -> str:
-        scheme = "https" if self.config.certificate else "http"
-        return f"{scheme}://127.0.0.1:{self.config.port}"
-
-    async def _go(self, goal: GoalRequest) -> GoalReply:
-        self.goals.append(goal)
-        return GoalReply(ok=True, text="on the way, 4.2 m", goal="goal-7")
-
-    async def _stop(self, request: EstopRequest) -> GateReply:
-        self.presses.append(request.source)
-        reply = EXAMPLES["GateReply"]
-        assert isinstance(reply, GateReply)
-        return replace(reply, gate=replace(reply.gate, mode="latched"))
-
-    async def _change(self, request: TaskRequest) -> TaskReply:
-        self.changes.append(request)
-        return TaskReply(ok=True, text="goal-7 is cancelled")
-
-    def say(self) -> None:
-        """All that is said again and again."""
-        state = EXAMPLES["RobotState"]
-        assert isinstance(state, RobotState)
-        gate = replace(state.gate, mode="enabled", commander="control", causes=())
-        state = replace(state, pose=Pose(x=1.0, y=1.0, yaw=0.0), gate=gate)
-        self.robot.publish(STATE, state)
-        self.robot.publish(POSE, PoseInMap(x=0.5, y=0.0, yaw=0.0, covariance=(0.0,) * 9))
-        thing = Obstacle(id=1, x=1.0, y=1.8, radius=0.3)  # so at (0.5, 0.8) in the map
-        wall = Obstacle(id=2, x=2.2, y=1.0, radius=0.45)
-        world = WorldModel(scan_ok=True, obstacle_ahead=False, obstacles=(thing, wall))
-        self.robot.publish(WORLD, world)
-        self.robot.publish(SCAN, wall_ahead())
-        way = tuple(TrajectoryPoint(t=i / 10, x=i / 10, y=0.0, yaw=0.0) for i in range(11))
-        intent = Intent(trajectory=way, behaviour="navigate", reason="on its way to the kitchen")
-        self.robot.publish(INTENT, intent)
-
-    def say_once(self) -> None:
-        """What is kept for those who come late."""
-        body = load_robot("turtlebot3_waffle").description()
-        self.robot.publish(BODY, Body(description=body, link="sim"))
-        cells = np.zeros((SIDE, SIDE), np.int8)
-        cells[:, 10] = 100  # a wall at x = -1.5
-        cells[60:, 40:] = -1
-        self.robot.publish(
-            MAP,
-            OccupancyGrid(
-                resolution=0.05, width=SIDE, height=SIDE, origin_x=-2.0, origin_y=-2.0,
-                cells=cells.tobytes(),
-            ),
-        )  # fmt: skip
-        task = EXAMPLES["TaskStatus"]
-        assert isinstance(task, TaskStatus)
-        self.robot.publish(TASK, replace(task, path=((0.5, 0.0), (0.5, -1.5), (1.5, -1.5))))
-
-
-@contextlib.asynccontextmanager
-async def serving(fake: Fake) -> AsyncIterator[None]:
-    ready = asyncio.Event()
-    server = asyncio.ensure_future(run(fake.config, fake.bus, ready.set))
-
-    async def talk() -> None:
-        while True:
-            fake.say()
-            await asyncio.sleep(0.05)
-
-    fake.say_once()
-    talking = asyncio.ensure_future(talk())
-    await ready.wait()
-    try:
-        yield
-    finally:
-        for task in (talking, server):
-            task.cancel()
-        await asyncio.gather(talking, server, return_exceptions=True)
 
 
 @pytest_asyncio.fixture(loop_scope="module", scope="module")
@@ -315,58 +167,3 @@ async def test_a_gamepad_drives_while_a_shoulder_button_is_held(
     await page.wait_for_selector('#confirmed:has-text("CONFIRMED by")')
     await page.wait_for_timeout(200)
     assert fake.presses == ["page"]  # once, for as long as the button is held
-
-
-def certificate(folder: Path) -> dict[str, str]:
-    """A page's own certificate, as people make one."""
-    from cryptography import x509
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    key = ec.generate_private_key(ec.SECP256R1())
-    name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "127.0.0.1")])
-    now = datetime.datetime.now(datetime.UTC)
-    made = (
-        x509.CertificateBuilder()
-        .subject_name(name)
-        .issuer_name(name)
-        .public_key(key.public_key())
-        .serial_number(1)
-        .not_valid_before(now - datetime.timedelta(days=1))
-        .not_valid_after(now + datetime.timedelta(days=1))
-        .sign(key, hashes.SHA256())
-    )
-    plain = serialization.NoEncryption()
-    form = serialization.PrivateFormat.PKCS8
-    pem = serialization.Encoding.PEM
-    (folder / "page.crt").write_bytes(made.public_bytes(pem))
-    (folder / "page.key").write_bytes(key.private_bytes(pem, form, plain))
-    return {"certificate": str(folder / "page.crt"), "certificate_key": str(folder / "page.key")}
-
-
-async def test_over_tls_a_token_opens_the_page_to_drive_and_another_to_look(
-    tmp_path: Path,
-) -> None:
-    pytest.importorskip("cryptography")
-    fake = Fake(tmp_path, **certificate(tmp_path))
-    async with serving(fake), browser(fake, tmp_path / "profile") as chromium:
-        page = await chromium.open()
-        assert page.url.startswith("https://")
-        await page.wait_for_selector("#gate[data-mode=enabled]")
-        await page.keyboard.down("w")
-        await until(lambda: fake.steered and fake.steered[-1].linear_x > 0.1, "steered")
-        await page.keyboard.up("w")
-        await until(lambda: fake.steered[-1].linear_x == 0.0, "let go")
-        viewer = await chromium.open(VIEWER)
-        assert await viewer.is_disabled("#estop")
-        count = len(fake.steered)
-        await viewer.keyboard.press("w")
-        stranger = await chromium.open(VIEWER)
-        await stranger.evaluate("sessionStorage.clear()")
-        await stranger.goto(f"{fake.origin}/#a-wrong-token-of-some-length")
-        await stranger.reload()
-        await stranger.wait_for_selector("#login[open]")
-        await stranger.fill("#token", OPERATOR)
-        await stranger.click("#login button")
-        await stranger.wait_for_selector("#link.live")
-        assert len(fake.steered) == count

@@ -1,5 +1,3 @@
-import random
-
 import pyrplidar_protocol
 import pytest
 import rplidar as roboticia
@@ -7,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_drivers.protocols import rplidar
-from gigabrain_drivers.protocols.rplidar import Answer, Decoder, Info, Request, RequestDecoder
+from gigabrain_drivers.protocols.rplidar import Answer, Decoder, Info
+from gigabrain_drivers.protocols.rplidar_requests import Request, RequestDecoder
 from gigabrain_drivers.protocols.rplidar_scans import (
     Dense,
     Express,
@@ -19,8 +18,6 @@ from gigabrain_drivers.protocols.rplidar_scans import (
 )
 
 STANDARD = bytes.fromhex("a55a0500004081")
-EXPRESS = bytes.fromhex("a55a5400004082")
-DENSE = rplidar.descriptor(0x85, 84, endless=True)
 INFO = Info(0x18, (1, 29), 7, "0123456789ABCDEF" * 2)
 
 distances = st.integers(0, 16_000)
@@ -159,141 +156,3 @@ def test_pyrplidar_reads_our_dense_capsules_as_we_do_but_for_its_swapped_bytes(
     assert swapped == mm
     for angle, other in zip(ours.angles, theirs, strict=True):
         assert abs((angle - other.get_angle() + 180) % 360 - 180) < 0.05
-
-
-def dense_turns(turns: int) -> bytes:
-    """A lidar of 360 samples a turn: nine capsules of 40 degrees, 1 m at 0 deg to 4.59 m at 359."""
-    capsules = [[1000 + 10 * (k * 40 + n) for n in range(40)] for k in range(9)]
-    return b"".join(
-        dense_capsule(40.0 * k, capsules[k], begins=turn + k == 0)
-        for turn in range(turns)
-        for k in range(9)
-    )
-
-
-def samples(found: list[Answer | Samples]) -> list[tuple[float, float]]:
-    points = []
-    for item in found:
-        assert isinstance(item, Samples)
-        points += zip(item.angles, item.distances, strict=True)
-    return points
-
-
-@given(st.data())
-def test_a_dense_stream_decodes_the_same_however_it_is_cut(data: st.DataObject) -> None:
-    stream, decoder, found = DENSE + dense_turns(2), Decoder(), list[Answer | Samples]()
-    while stream:
-        size = data.draw(st.integers(1, 400))
-        found += decoder.feed(stream[:size])
-        stream = stream[size:]
-
-    assert samples(found) == [
-        (float(n % 360), float(1000 + 10 * (n % 360))) for n in range(17 * 40)
-    ]
-    assert decoder.errors == 0
-
-
-def test_a_turn_begins_at_the_sample_that_passes_zero() -> None:
-    dense = Dense()
-    mm = [1000] * 40
-    dense.take(dense_capsule(350.0, mm, begins=False))
-    passing = dense.take(dense_capsule(30.0, mm, begins=False))
-    after = dense.take(dense_capsule(70.0, mm, begins=False))
-
-    assert passing is not None
-    assert (passing.turn_at, passing.angles[9], passing.angles[10]) == (10, 359.0, 360.0)
-    assert after is not None
-    assert after.turn_at is None
-
-
-@pytest.mark.parametrize("lost", [84, 83, 1])
-def test_bytes_lost_from_a_dense_stream_never_bend_an_angle(lost: int) -> None:
-    stream = DENSE + dense_turns(3)
-    cut = len(DENSE) + 84 * 12 + 10
-    points = samples(Decoder().feed(stream[:cut] + stream[cut + lost :]))
-
-    assert all(distance == 1000 + 10 * angle for angle, distance in points)
-    assert len(points) >= 40 * 26 - 40 * 5
-
-
-def test_a_lost_capsule_is_noticed_though_every_checksum_is_right() -> None:
-    stream = DENSE + dense_turns(2)
-    cut = len(DENSE) + 84 * 5
-    decoder = Decoder()
-    points = samples(decoder.feed(stream[:cut] + stream[cut + 84 :]))
-
-    assert all(distance == 1000 + 10 * angle for angle, distance in points)
-
-
-def standard_turns(turns: int) -> bytes:
-    return b"".join(
-        node(angle, 1000 + 10 * angle, quality=40, begins=angle == 0)
-        for _ in range(turns)
-        for angle in range(360)
-    )
-
-
-@given(st.integers(40, 1700), st.integers(1, 60))
-def test_a_standard_stream_finds_its_step_again_after_lost_bytes(at: int, lost: int) -> None:
-    stream = standard_turns(2)
-    decoder = Decoder()
-    points = samples(decoder.feed(STANDARD + stream[:at] + stream[at + lost :]))
-
-    assert all(distance == 1000 + 10 * angle for angle, distance in points[: at // 5])
-    wrong = sum(distance != 1000 + 10 * angle for angle, distance in points)
-    assert wrong <= 2  # the node that was cut has no checksum: it may pass
-    assert len(points) >= 700 - lost // 5
-
-
-def test_a_turn_is_seen_to_end_though_the_node_that_says_so_was_lost() -> None:
-    stream = standard_turns(3)
-    found = Decoder().feed(STANDARD + stream[: 360 * 5] + stream[361 * 5 :])
-    begins = [n for n, item in enumerate(found) if isinstance(item, Samples) and item.turn_at == 0]
-
-    assert begins == [0, 400, 719]  # 400 degrees on, where it was lost
-
-
-@given(st.binary(max_size=200))
-def test_a_descriptor_is_found_after_any_garbage(garbage: bytes) -> None:
-    decoder = Decoder()
-    decoder.feed(garbage)
-    decoder.clear()
-
-    assert decoder.feed(b"RP LIDAR System.\r\n" + rplidar.answer(rplidar.INFO, INFO.pack())) == [
-        Answer(rplidar.INFO, INFO.pack())
-    ]
-
-
-@given(st.lists(st.binary(max_size=100), max_size=40), st.sampled_from([b"", STANDARD, DENSE]))
-def test_what_the_decoders_keep_is_bounded_and_nothing_raises(
-    pieces: list[bytes], first: bytes
-) -> None:
-    decoder, requests = Decoder(), RequestDecoder()
-    decoder.feed(first)
-    for piece in pieces:
-        decoder.feed(piece)
-        requests.feed(piece)
-        assert len(decoder._buffer) < 200
-        assert len(requests._buffer) < 260
-
-
-def test_no_single_wrong_byte_in_a_capsule_is_accepted() -> None:
-    good = dense_capsule(40.0, range(1000, 1400, 10), begins=False)
-    for at in range(84):
-        for pattern in (1, 0x80, 0x55, 0xFF):
-            bad = bytearray(good)
-            bad[at] ^= pattern
-            assert not Dense().is_block(bytes(bad)), (at, pattern)
-
-
-def test_a_tenth_of_a_percent_of_wrong_bytes_bends_next_to_no_dense_sample() -> None:
-    chance = random.Random(5)
-    stream = bytearray(dense_turns(400))
-    for at in range(len(stream)):
-        if chance.random() < 0.001:
-            stream[at] ^= chance.randrange(1, 256)
-    points = samples(Decoder().feed(DENSE + bytes(stream)))
-    wrong = sum(abs(distance - 1000 - 10 * (angle % 360)) > 1 for angle, distance in points)
-
-    assert len(points) > 0.8 * 144_000
-    assert wrong <= 80  # two capsules; a capsule passes with two errors that cancel in its XOR

@@ -129,7 +129,7 @@ def test_a_way_to_where_it_begins_is_one_cell() -> None:
 def test_a_grid_that_needs_more_room_than_thought_gets_it() -> None:
     cost, search = random_costs(7, (60, 60)), Search()
     search.path(cost, (0, 0), (59, 59))
-    search._entries = np.empty((3, 16), np.int32)
+    search._memory = search._memory._replace(entries=np.empty((3, 16), np.int32))
     field = search.field(cost, (30, 30), "from")
-    assert search._entries.shape[1] > 16
+    assert search._memory.entries.shape[1] > 16
     np.testing.assert_array_equal(field, Search().field(cost, (30, 30), "from"))

@@ -10,7 +10,15 @@ import pytest
 
 from gigabrain_drivers.links import link as links
 from gigabrain_drivers.links.wording import Spelling, Wording, of_command, whole
-from gigabrain_drivers.protocols import alpha, dynamixel, ld, lds01, lds03, opencr, rplidar
+from gigabrain_drivers.protocols import (
+    alpha,
+    dynamixel,
+    ld,
+    lds01,
+    lds03,
+    opencr,
+    rplidar_requests,
+)
 from gigabrain_drivers.protocols.line import Decoder, Template, describe
 from gigabrain_drivers.protocols.line_fields import COMMAND
 from gigabrain_drivers.trace import run
@@ -63,8 +71,8 @@ FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [
         "a turn begins at 1.0 Hz, 2 samples from 10.00 deg, 1000 mm to 11.00 deg, 1010 mm",
     ),
     (
-        rplidar.RequestDecoder().feed,
-        rplidar.describe_request,
+        rplidar_requests.RequestDecoder().feed,
+        rplidar_requests.describe_request,
         "a5 82 05 00 00 00 00 00 22",
         "express scan 00 00 00 00 00",
     ),

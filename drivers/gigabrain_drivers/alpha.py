@@ -22,8 +22,8 @@ from gigabrain_drivers.protocols.alpha import Decoder, Frame, State
 from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import Battery, Joint, LinkHealth, RobotState
-from gigabrain_schemas.sensors import Imu, ImuData, LaserScan
-from gigabrain_schemas.topics import IMU, SCAN
+from gigabrain_schemas.sensors import Imu, ImuData
+from gigabrain_schemas.topics import IMU
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported
 from gigabrain_zenoh.limits import ZERO
@@ -69,15 +69,12 @@ class AlphaDriver(Driver):
         self._fall = Fault(log)
         self._imu: Imu | None = None
         self._lidar: ScanSource | None = None
-        self._scan: LaserScan | None = None
 
     async def open(self) -> None:
         """Begin to look for the body and its lidar; neither has to be there yet."""
         self._open = True
         self.link.open()
         self._lidar = carry(self, self._clock)
-        if self._lidar:
-            self._lidar.emit = self._scanned
 
     async def close(self) -> None:
         """Stop, and let go of the connection."""
@@ -140,7 +137,7 @@ class AlphaDriver(Driver):
         if sensor_name == "imu":
             return self._imu
         if sensor_name == "scan" and self.options.scan:
-            return self._scan
+            return self._lidar.newest if self._lidar else None
         has = "imu, scan" if self.options.scan else "imu"
         raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}; it has: {has}")
 
@@ -205,10 +202,6 @@ class AlphaDriver(Driver):
         alive = self._hearing.alive()
         told, self._untold = not self._untold, False
         return replace(self.link.health, connected=alive and told)
-
-    def _scanned(self, scan: LaserScan) -> None:
-        self._scan = scan
-        self.emit(SCAN, scan)
 
 
 def _with(state: RobotState, now: State) -> RobotState:

@@ -5,7 +5,6 @@ import asyncio
 import logging
 import math
 from collections.abc import AsyncIterator, Callable, Mapping
-from types import TracebackType
 from typing import Any, ClassVar, Self
 
 from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
@@ -52,12 +51,7 @@ class Driver(abc.ABC):
             raise
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.make_safe()
         await self.close()
 

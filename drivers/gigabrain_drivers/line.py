@@ -24,8 +24,6 @@ from gigabrain_drivers.protocols.line import Decoder, describe
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported
 from gigabrain_zenoh.limits import ZERO
@@ -72,7 +70,6 @@ class LineDriver(Driver):
         self._told_flags = 0
         self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
         self._lidar: ScanSource | None = None
-        self._scan: LaserScan | None = None
 
     @classmethod
     def check(cls, robot: RobotFile, options: LineOptions) -> None:
@@ -84,8 +81,6 @@ class LineDriver(Driver):
         self._open = True
         self.link.open()
         self._lidar = carry(self, self._clock)
-        if self._lidar:
-            self._lidar.emit = self._scanned
 
     async def close(self) -> None:
         """Stop, and let go of the ports."""
@@ -129,7 +124,7 @@ class LineDriver(Driver):
         """The newest `scan`."""
         if sensor_name != "scan" or self.robot.lidar is None:
             raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}")
-        return self._scan
+        return self._lidar.newest if self._lidar else None
 
     def _still(self) -> None:
         self._send(ZERO)
@@ -197,10 +192,6 @@ class LineDriver(Driver):
                 self._flags[bit].begin(f"the firmware reports: {name}")
             else:
                 self._flags[bit].end(f"the firmware no longer reports: {name}")
-
-    def _scanned(self, scan: LaserScan) -> None:
-        self._scan = scan
-        self.emit(SCAN, scan)
 
     def _is_ours(self, port: serial.Serial) -> bool:
         """Whether a good line comes from this port. Runs in a thread."""

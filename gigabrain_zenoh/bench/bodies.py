@@ -9,10 +9,7 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.safety import Health
-from gigabrain_schemas.topics import CMD_VEL, HEALTH, STATE
+from gigabrain_zenoh.bench.bodies_onlooker import Onlooker
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
@@ -30,7 +27,6 @@ START_S = 60.0  # until a body is enabled, on a busy machine
 STALL_S = 20.0
 STOP_S = 1.5
 TICK_S = 0.02
-LEVELS = (("linear_x", 0.05), ("angular_z", 0.2))  # [m/s], [rad/s]: what counts as motion
 
 
 class BodyFigures(Struct, frozen=True, kw_only=True):
@@ -64,68 +60,6 @@ class BodiesResult(Struct, frozen=True, kw_only=True):
     def ok(self) -> bool:
         """Whether nobody touched anything, and nothing of the brain was started anew."""
         return self.brain_restarts == 0 and all(body.contacts == 0 for body in self.bodies)
-
-
-class Onlooker:
-    """Compares commands and motion, tick by tick, while the gate is open."""
-
-    def __init__(self, bus: Bus) -> None:
-        self.enabled_ticks = self.stops = 0
-        self.state: RobotState | None = None
-        self.latencies: list[int] = []
-        self.driver_cpu: list[float] = []  # of a core, each second
-        self._commanded: list[float] = []
-        self._measured: list[float] = []
-        self._command: CmdVel | None = None
-        self._begun: dict[str, int | None] = {}  # tick of a command of motion not yet followed
-        self._was: dict[str, bool] = {}
-        self._open = False
-        bus.subscribe(STATE, self._see)
-        bus.subscribe(CMD_VEL, self._hear)
-        bus.subscribe(HEALTH, self._note_cpu)
-
-    @property
-    def commanded(self) -> float:
-        """Mean of the commanded speed forward [m/s]."""
-        return statistics.fmean(self._commanded) if self._commanded else 0.0
-
-    @property
-    def measured(self) -> float:
-        """Mean of the measured speed forward [m/s]."""
-        return statistics.fmean(self._measured) if self._measured else 0.0
-
-    def _note_cpu(self, _key: str, health: Health) -> None:
-        if self._open and health.process == "driver":
-            self.driver_cpu.append(health.cpu)
-
-    def _hear(self, _key: str, command: CmdVel) -> None:
-        self._command = command
-        for axis, level in LEVELS:
-            moves = abs(getattr(command, axis)) >= level
-            if moves and not self._was.get(axis, False):
-                self._begun[axis] = None if self._moves(axis, level) else command.tick
-            elif not moves:
-                self._begun[axis] = None
-            self._was[axis] = moves
-
-    def _see(self, _key: str, state: RobotState) -> None:
-        self.state = state
-        opened = state.gate.mode == "enabled"
-        self.stops += self._open and not opened
-        self._open = opened
-        if not opened or self._command is None or self._command.boot != state.boot:
-            return
-        self.enabled_ticks += 1
-        self._commanded.append(self._command.linear_x)
-        self._measured.append(state.velocity.linear_x)
-        for axis, level in LEVELS:
-            begun = self._begun.get(axis)
-            if begun is not None and self._moves(axis, level):
-                self.latencies.append(state.tick - begun)
-                self._begun[axis] = None
-
-    def _moves(self, axis: str, level: float) -> bool:
-        return self.state is not None and abs(getattr(self.state.velocity, axis)) >= level
 
 
 async def measure_bodies(

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Self, TypeVar
 
 from gigabrain_schemas.base import TICK_NS, Message
@@ -38,12 +37,7 @@ class InMemory:
             self._check()
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         for running, bus in reversed(self._running.values()):
             running.cancel()
             await asyncio.wait((running,))

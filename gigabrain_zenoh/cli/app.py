@@ -7,14 +7,15 @@ from collections.abc import Sequence
 
 from cyclopts import App, CycloptsError
 
+from gigabrain_zenoh.cli.whole import refuse_fractions
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 
 MODULES = "gigabrain_zenoh.cli"
 
 # command -> where it is, and what it does in a line
 COMMANDS = {
-    "demo": ("run:demo", "Drive a simulated robot round its world, until Ctrl-C."),
-    "up": ("run:up", "Start what a deployment file puts on this host, and keep it running."),
+    "demo": ("demo:demo", "Drive a simulated robot round its world, until Ctrl-C."),
+    "up": ("up:up", "Start what a deployment file puts on this host, and keep it running."),
     "router": ("process:router", "Start the router that joins the other processes."),
     "perception": ("process:perception", "Start perception."),
     "decision": ("process:decision", "Start decision."),
@@ -115,6 +116,7 @@ def make_app(chosen: Sequence[str] = ()) -> App:
         help="A robot brain of three systems that any body can wear.",
         help_format="plaintext",  # the default, Markdown, takes twice as long to start
         version=_version,
+        config=refuse_fractions,
     )
     groups = {name: App(name=name, help=about) for name, about in GROUPS.items()}
     for group in groups.values():

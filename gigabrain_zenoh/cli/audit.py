@@ -1,13 +1,16 @@
 """`gigabrain audit`: who did what to the robot, and what came of it."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.errors import ConfigError
+
+if TYPE_CHECKING:
+    from gigabrain_schemas.audit import AuditRecord
 
 
 def audit(
@@ -47,22 +50,23 @@ def audit(
         if follow or at.connect:
             raise ConfigError("leave out the name of a robot that runs")
         _print(map(show, audit_file.read(_folder(robot), newest)))
-        return 0
-
-    async def run() -> None:
-        from gigabrain_zenoh.client import connect as connect_robot
-
-        async with connect_robot(
-            at.connect, namespace=at.namespace, keys=at.folder, wait=False
-        ) as found:
-            following = found.topic("audit") if follow else None
-            _print(map(show, await found.audit(newest)))
-            if following:
-                async for record in following:
-                    _print([show(record)])
-
-    asyncio.run(run())
+    else:
+        asyncio.run(_ask(at, newest, follow, show))
     return 0
+
+
+async def _ask(at: Which, newest: int, follow: bool, show: "Callable[[AuditRecord], str]") -> None:
+    """Show what a robot that runs has in its log, and with `follow` what comes."""
+    from gigabrain_zenoh.client import connect as connect_robot
+
+    async with connect_robot(
+        at.connect, namespace=at.namespace, keys=at.folder, wait=False
+    ) as found:
+        following = found.topic("audit") if follow else None
+        _print(map(show, await found.audit(newest)))
+        if following:
+            async for record in following:
+                _print([show(record)])
 
 
 def _folder(robot: str) -> Path:

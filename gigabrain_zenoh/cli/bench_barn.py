@@ -1,10 +1,15 @@
 """`gigabrain bench barn`: the BARN and DynaBARN tasks against a plant that makes it hard."""
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from cyclopts import Parameter
+
+from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.checked import above_zero
+from gigabrain_zenoh.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -13,18 +18,44 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.bench.course import Trial
 
 
-def barn(
-    *,
-    worlds: Path,
-    trials: int = 1,
-    only: str = "",
-    dynamic: bool = False,
-    plant: Literal["hard", "ideal", "mujoco"] = "hard",
-    nodes: bool = True,
-    samples: int = 1000,
-    jobs: int = 2,
-    json: Path | None = None,
-) -> int:
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Trials:
+    """What is driven, and against what."""
+
+    worlds: Path
+    "The file of worlds: npz for BARN, JSON for DynaBARN."
+    trials: int = 1
+    "How often in each world."
+    only: str = ""
+    "Numbers of worlds, separated by commas; all without."
+    dynamic: bool = False
+    "DynaBARN: the obstacles move."
+    plant: Literal["hard", "ideal", "mujoco"] = "hard"
+    (
+        "hard: 100 ms delay, 150 ms lag, slip to 0.6, drift 2 %, 3 cm noise, 10 % dropouts.\n"
+        "ideal: none of it but 1 cm noise.\n"
+        "mujoco: a skid-steer Jackal among solid posts, otherwise as hard; not with --dynamic."
+    )
+    nodes: bool = True
+    (
+        "Without them the functions that they call drive, with no map, bus or safety process; so "
+        "they do with --dynamic, where nothing stands still that a map could be made of."
+    )
+    samples: int = 1000
+    "Plans per cycle."
+    jobs: int = 2
+    "How many trials at the same time."
+
+    def check(self) -> None:
+        """Raises ConfigError for what cannot be driven."""
+        for name in ("trials", "samples", "jobs"):
+            above_zero(name, getattr(self, name))
+        if self.dynamic and self.plant == "mujoco":
+            raise ConfigError("--plant mujoco has no moving obstacles; leave out --dynamic")
+
+
+def barn(*, of: Trials, json: Path | None = None) -> int:
     """Drive a Jackal through worlds that it does not know, and score it as the contest does.
 
     Example: gigabrain bench barn --worlds worlds.npz --trials 1 --only 1,7
@@ -35,45 +66,19 @@ def barn(
 
     Parameters
     ----------
-    worlds
-        The file of worlds: npz for BARN, JSON for DynaBARN.
-    trials
-        How often in each world.
-    only
-        Numbers of worlds, separated by commas; all without.
-    dynamic
-        DynaBARN: the obstacles move.
-    plant
-        hard: 100 ms delay, 150 ms lag, slip to 0.6, drift 2 %, 3 cm noise, 10 % dropouts.
-        ideal: none of it but 1 cm noise.
-        mujoco: a skid-steer Jackal among solid posts, otherwise as hard; not with --dynamic.
-    nodes
-        Without them the functions that they call drive, with no map, bus or safety process; so
-        they do with --dynamic, where nothing stands still that a map could be made of.
-    samples
-        Plans per cycle.
-    jobs
-        How many trials at the same time.
     json
         Write all trials into this file.
     """
     from rich.console import Console
 
-    from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.barn import measure_barn
     from gigabrain_zenoh.bench.barn_worlds import choose, read_worlds
-    from gigabrain_zenoh.errors import ConfigError
 
-    for name, value in (("trials", trials), ("samples", samples), ("jobs", jobs)):
-        above_zero(name, value)
+    of.check()
     results.check_place(json)
-    if dynamic and plant == "mujoco":
-        raise ConfigError("--plant mujoco has no moving obstacles; leave out --dynamic")
-    chosen = choose(read_worlds(worlds, dynamic), only)
-    result = measure_barn(
-        chosen, trials, plant, samples, jobs, _progress, nodes=nodes and not dynamic
-    )
-    Console().print(_table(result, worlds.name, plant))
+    chosen, nodes = choose(read_worlds(of.worlds, of.dynamic), of.only), of.nodes and not of.dynamic
+    result = measure_barn(chosen, of.trials, of.plant, of.samples, of.jobs, _progress, nodes=nodes)
+    Console().print(_table(result, of.worlds.name, of.plant))
     results.write(result, json)
     return 0
 

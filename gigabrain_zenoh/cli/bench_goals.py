@@ -3,9 +3,13 @@
 import asyncio
 import math
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from cyclopts import Parameter
+
+from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.checked import above_zero
 
 if TYPE_CHECKING:
@@ -18,17 +22,29 @@ WORLDS = ("house", "warehouse")
 WIDE = 120  # characters, of the table in a file
 
 
-def goals(
-    *,
-    bodies: tuple[str, ...] = BODIES,
-    worlds: tuple[str, ...] = WORLDS,
-    goals: int = 100,
-    meetings: int = 0,
-    speed: float = 5.0,
-    seed: int = 0,
-    json: Path | None = None,
-    logs: Path | None = None,
-) -> int:
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Runs:
+    """Who is sent where."""
+
+    bodies: tuple[str, ...] = BODIES
+    "Which robots; may be given again."
+    worlds: tuple[str, ...] = WORLDS
+    "Where; may be given again."
+    goals: int = 100
+    "How many places each robot is sent to in each world."
+    meetings: int = 0
+    "Send it on until the person of the world has had to stand for it so often."
+    speed: float = 5.0
+    "How many times faster than real time."
+    seed: int = 0
+    "For the start, the sensors' noise and the places."
+
+
+RUNS = Runs()
+
+
+def goals(*, of: Runs = RUNS, json: Path | None = None, logs: Path | None = None) -> int:
     """Have each body explore each world in MuJoCo, then send it to places drawn at random.
 
     Example: gigabrain bench goals --bodies alpha --worlds house --goals 10 --speed 1
@@ -42,31 +58,18 @@ def goals(
 
     Parameters
     ----------
-    bodies
-        Which robots; may be given again.
-    worlds
-        Where; may be given again.
-    goals
-        How many places each robot is sent to in each world.
-    meetings
-        Send it on until the person of the world has had to stand for it so often.
-    speed
-        How many times faster than real time.
-    seed
-        For the start, the sensors' noise and the places.
     json
         Write all figures into this file.
     logs
         Keep the logs of all processes in this folder.
     """
-    from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.goals import Course, measure_goals
 
-    above_zero("goals", goals)
-    above_zero("speed", speed)
+    above_zero("goals", of.goals)
+    above_zero("speed", of.speed)
     results.check_place(json)
-    course = Course(goals=goals, meetings=meetings, speed=speed, seed=seed, logs=logs)
-    result = asyncio.run(measure_goals(bodies, worlds, course, _progress))
+    course = Course(goals=of.goals, meetings=of.meetings, speed=of.speed, seed=of.seed, logs=logs)
+    result = asyncio.run(measure_goals(of.bodies, of.worlds, course, _progress))
     _show(result)
     results.write(result, json)
     return 0 if result.ok else 1

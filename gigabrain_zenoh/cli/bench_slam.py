@@ -59,6 +59,11 @@ def slam(
         from gigabrain_zenoh.cli.bench_slam_world import slam_world
 
         return slam_world(world, minutes, body, seed, png, json)
+    return _slam_logs(log, png, json)
+
+
+def _slam_logs(paths: tuple[Path, ...], png: Path | None, json: Path | None) -> int:
+    """Map what was recorded, and show how far the maps are from the reference."""
     from rich.console import Console
 
     from gigabrain_zenoh import results
@@ -67,7 +72,7 @@ def slam(
     from gigabrain_zenoh.bench.slam_picture import draw
 
     results.check_place(json)
-    logs = [load(path) for path in log]
+    logs = [load(path) for path in paths]
     for one in logs:
         relations(one)  # or it says at once what is wrong
     drives = _driven(logs)

@@ -129,13 +129,20 @@ def trace(
     angular_z
         What an emulated body is commanded all the time [rad/s].
     """
-    from gigabrain_schemas.base import Velocity
-
     above_zero("seconds", seconds)
     speeds = {"linear_x": linear_x, "linear_y": linear_y, "angular_z": angular_z}
     for option, speed in speeds.items():
         finite(option, speed)
-    received = False
+    received = _traced(name, link, part, seconds, speeds)
+    if not received:
+        print("nothing was received", file=sys.stderr)
+    return int(not received)
+
+
+def _traced(name: str, link: str, part: str, seconds: float, speeds: dict[str, float]) -> bool:
+    """Print the bytes; whether any came from the body, or whoever was reading has seen enough."""
+    from gigabrain_schemas.base import Velocity
+
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
         tracing = find("gigabrain_drivers.trace:run")(
             name,
@@ -147,13 +154,10 @@ def trace(
             say=lambda line: print(line, flush=True),
         )
         try:
-            received = asyncio.run(tracing)
-        except BrokenPipeError:  # whoever was reading has seen enough
+            return bool(asyncio.run(tracing))
+        except BrokenPipeError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            return 0
-    if not received:
-        print("nothing was received", file=sys.stderr)
-    return int(not received)
+            return True
 
 
 def new(name: str, *, folder: Path = Path()) -> int:

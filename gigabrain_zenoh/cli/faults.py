@@ -4,12 +4,14 @@ import asyncio
 import logging
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.where import show
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.process import find
@@ -18,8 +20,48 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from gigabrain_zenoh.faults.fault import Fault, Result
+    from gigabrain_zenoh.faults.rig import Options
 
 COLOURS = {"passed": "green", "FAILED": "bold red", "skipped": "yellow"}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Robot:
+    """What is broken."""
+
+    body: str = ""
+    "Which robot, instead of the one that each test has."
+    world: str = "arena"
+    "Where it drives."
+    behaviour: Literal["avoid", "navigate"] = "avoid"
+    (
+        "What drives it: navigate explores and visits places, with a map (tried with 1 to 9, 18, "
+        "19, 43 and 45)."
+    )
+    long: Annotated[bool, Parameter(negative=())] = False
+    "The long forms, for a release: soak, load, all orders of deaths."
+
+    def check(self) -> None:
+        """Raises ConfigError for what the suite cannot be run with."""
+        find("gigabrain_drivers.sim.worlds:load_world")(self.world, 0)
+        if not self.body:
+            return
+        sim = find("gigabrain_drivers.catalog:load_robot")(self.body).sim
+        if not sim or sim.get("driver") != "mujoco":
+            able = ", ".join(find("gigabrain_drivers.catalog:simulated")("sim"))
+            raise ConfigError(
+                f"--body {self.body}: no physics knows what becomes of it; choose of: {able}"
+            )
+
+    def options(self) -> "Options":
+        """As the suite takes it."""
+        from gigabrain_zenoh.faults.rig import Options
+
+        return Options(self.body, self.world, self.behaviour, self.long)
+
+
+ROBOT = Robot()
 
 
 def faults(
@@ -27,10 +69,7 @@ def faults(
     list_: Annotated[bool, Parameter(name="--list", negative=())] = False,
     only: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
     repeat: Annotated[int, Parameter(validator=Number(gte=1))] = 1,
-    body: str = "",
-    world: str = "arena",
-    behaviour: Literal["avoid", "navigate"] = "avoid",
-    long: Annotated[bool, Parameter(negative=())] = False,
+    robot: Robot = ROBOT,
     json: Path | None = None,
 ) -> int:
     """Break a running robot in all the ways of the table, and judge how it stops.
@@ -48,34 +87,33 @@ def faults(
         Which tests, by name or number.
     repeat
         How often each; the worst of all runs is judged.
-    body
-        Which robot, instead of the one that each test has.
-    world
-        Where it drives.
-    behaviour
-        What drives it: navigate explores and visits places, with a map (tried with 1 to 9, 18,
-        19, 43 and 45).
-    long
-        The long forms, for a release: soak, load, all orders of deaths.
     json
         Write all results into this file.
     """
-    from rich.console import Console
-
-    from gigabrain_zenoh import results
-    from gigabrain_zenoh.faults.rig import Options
-    from gigabrain_zenoh.faults.suite import failed, run_suite
+    from gigabrain_zenoh.faults.suite import failed
     from gigabrain_zenoh.faults.table import choose
 
-    # the suite hears what it forges itself; nobody has to read that
-    logging.getLogger("gigabrain_zenoh").addHandler(logging.NullHandler())
-    chosen, console = choose(only), Console()
+    chosen = choose(only)
     if list_:
         show(_plan(chosen))
         return 0
-    _check(body, world)
+    robot.check()
     results.check_place(json)
-    done: list[str] = []
+    judged = _run(chosen, robot.options(), repeat)
+    show(_table(judged, chosen))
+    results.write(judged, json)
+    return 1 if failed(judged) else 0
+
+
+def _run(chosen: "Sequence[Fault]", options: "Options", repeat: int) -> "list[Result]":
+    """Run them, with a line for each that has ended."""
+    from rich.console import Console
+
+    from gigabrain_zenoh.faults.suite import run_suite
+
+    # the suite hears what it forges itself; nobody has to read that
+    logging.getLogger("gigabrain_zenoh").addHandler(logging.NullHandler())
+    console, done = Console(), list[str]()
     with tempfile.TemporaryDirectory(prefix="gb-") as folder, console.status("") as status:
 
         def begun(fault: "Fault") -> None:
@@ -85,24 +123,7 @@ def faults(
             done.append(result.name)
             console.print(_line(result))
 
-        running = run_suite(
-            chosen, Options(body, world, behaviour, long), Path(folder), repeat, begun, ended
-        )  # fmt: skip
-        judged = asyncio.run(running)
-    show(_table(judged, chosen))
-    results.write(judged, json)
-    return 1 if failed(judged) else 0
-
-
-def _check(body: str, world: str) -> None:
-    """Raises ConfigError for what the suite cannot be run with."""
-    find("gigabrain_drivers.sim.worlds:load_world")(world, 0)
-    if not body:
-        return
-    sim = find("gigabrain_drivers.catalog:load_robot")(body).sim
-    if not sim or sim.get("driver") != "mujoco":
-        able = ", ".join(find("gigabrain_drivers.catalog:simulated")("sim"))
-        raise ConfigError(f"--body {body}: no physics knows what becomes of it; choose of: {able}")
+        return asyncio.run(run_suite(chosen, options, Path(folder), repeat, begun, ended))
 
 
 def _line(result: "Result") -> str:

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
+from gigabrain_zenoh.cli.where import HERE, Which
+
 
 def foxglove(
     *,
     port: int = 8765,
     layout: Path | None = None,
-    connect: str | None = None,
-    namespace: str = "",
-    keys: Path | None = None,
+    at: Which = HERE,
 ) -> int:
     """Show the robot in Foxglove or Lichtblick, live, at ws://127.0.0.1:8765.
 
@@ -24,12 +24,6 @@ def foxglove(
         Where it listens, on loopback.
     layout
         Write a layout for the viewer into this file, to be imported there, and do nothing else.
-    connect
-        The router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    namespace
-        The robot's own part of the key space.
-    keys
-        The folder of your identity, for a router that wants one.
     """
     import msgspec
 
@@ -45,6 +39,6 @@ def foxglove(
         write_layout(config, layout)
         print(f"{layout}: import it as a layout, and open a connection to ws://127.0.0.1:{port}")
         return 0
-    endpoint = find_endpoint(connect, namespace, str(keys) if keys else "")
+    endpoint = find_endpoint(at.connect, at.namespace, at.folder)
     settings = msgspec.to_builtins(config)
     return run(ProcessConfig(name="foxglove", endpoint=endpoint, settings=settings))

@@ -1,10 +1,12 @@
 """`gigabrain log`: what the processes have logged."""
 
 import asyncio
+import time
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from gigabrain_zenoh import log_text
 from gigabrain_zenoh.cli.live_names import processes
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import ConfigError
@@ -52,27 +54,35 @@ def log(
     json
         One JSON object per line.
     """
-    import time
-
-    from gigabrain_zenoh import log_text
-    from gigabrain_zenoh.tools.log_reading import Wanted, ago_ns, read, run_folder
+    from gigabrain_zenoh.tools.log_reading import read, run_folder
 
     if not 0 < newest <= 1_000_000:
         raise ConfigError(f"--newest: expected 1 to 1000000, got {newest}")
     if at.connect and not follow:
         raise ConfigError("what a robot elsewhere has logged lies there; add --follow to listen")
-    since_ns = ago_ns(since, time.time_ns()) if since else 0
-    wanted = Wanted(process=process, level=level, since_ns=since_ns)
-
-    def tell(line: "Line") -> None:
-        say(log_text.encode(line).decode() if json else log_text.readable(line))
-
+    wanted, tell = _wanted(process, level, since), _tell_json if json else _tell
     if not at.connect:
         for line in read(run_folder(run), wanted, newest):
             tell(line)
     if follow:
         asyncio.run(_follow(at, wanted, tell))
     return 0
+
+
+def _wanted(process: str, level: str, since: str) -> "Wanted":
+    """Raises ConfigError, and UnknownName."""
+    from gigabrain_zenoh.tools.log_reading import Wanted, ago_ns
+
+    since_ns = ago_ns(since, time.time_ns()) if since else 0
+    return Wanted(process=process, level=level, since_ns=since_ns)
+
+
+def _tell(line: "Line") -> None:
+    say(log_text.readable(line))
+
+
+def _tell_json(line: "Line") -> None:
+    say(log_text.encode(line).decode())
 
 
 async def _follow(at: Which, wanted: "Wanted", tell: "Callable[[Line], None]") -> None:

@@ -114,12 +114,16 @@ def decision(
     remember
         The folder for what must survive a restart: what it is to do.
     """
+    from gigabrain_zenoh.tasks.scripts import check_folder
+
     behaviours.load(behaviour)  # a wrong name is better told now than once there is a router
+    programs = str(scripts.absolute()) if scripts else ""
+    check_folder(programs)
     settings = DecisionConfig(
         behaviour=behaviour,
         turn=turn,
         begin=begin,
-        scripts=str(scripts.absolute()) if scripts else "",
+        scripts=programs,
         state_dir=str(remember or state_dir() / "robots" / (place.namespace or "decision")),
     )
     return _run("decision", place, msgspec.to_builtins(settings))

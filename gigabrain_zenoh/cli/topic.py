@@ -1,13 +1,17 @@
 """`gigabrain topic`: what goes over the bus."""
 
 import asyncio
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.cli.live_names import topics
 from gigabrain_zenoh.cli.where import HERE, Which, say, show
+
+if TYPE_CHECKING:
+    from gigabrain_schemas.base import Message
+    from gigabrain_schemas.topics import Topic
 
 Name = Annotated[str, Parameter(completer=topics)]
 Count = Annotated[int | None, Parameter(alias="-n")]
@@ -200,9 +204,8 @@ def pub(
         Even when somebody else drives, the robot's own brain included.
     """
     from gigabrain_schemas.topics import CMD_VEL
-    from gigabrain_zenoh.recording.joining import joined
     from gigabrain_zenoh.tools.names import COMMANDS, not_found, short, target
-    from gigabrain_zenoh.tools.publishing import drive, send, typed_in
+    from gigabrain_zenoh.tools.publishing import drive, typed_in
 
     above_zero("rate", rate)
     above_zero("count", count)
@@ -215,12 +218,22 @@ def pub(
         seconds = None if rate and not count else (count or 1) / (rate or 1.0)
         say(asyncio.run(drive(at.where(), name, words, seconds, take=take)))
         return 0
-    message = typed_in(topic, words)
-
-    async def run() -> None:
-        async with joined(at.where(), "pub") as (bus, _):
-            of = name.rpartition("/")[2] if topic.many else ""
-            say(f"sent {await send(bus, topic, message, rate, count, of)}")
-
-    asyncio.run(run())
+    of = name.rpartition("/")[2] if topic.many else ""
+    asyncio.run(_send(at, topic, typed_in(topic, words), of, rate, count))
     return 0
+
+
+async def _send(
+    at: Which,
+    topic: "Topic[Any]",
+    message: "Message",
+    of: str,
+    rate: float | None,
+    count: int | None,
+) -> None:
+    """Send a message, of the process `of` where each has its own topic, and say how often."""
+    from gigabrain_zenoh.recording.joining import joined
+    from gigabrain_zenoh.tools.publishing import send
+
+    async with joined(at.where(), "pub") as (bus, _):
+        say(f"sent {await send(bus, topic, message, rate, count, of)}")

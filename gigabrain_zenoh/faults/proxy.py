@@ -2,7 +2,6 @@
 
 import asyncio
 import random
-from types import TracebackType
 from typing import Self
 
 from gigabrain_zenoh.errors import ConfigError
@@ -54,12 +53,7 @@ class TcpProxy:
         await self.plug()
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.unplug()
 
     def set(self, chaos: Chaos = CALM, *ways: Way) -> None:

@@ -17,7 +17,8 @@ from gigabrain_zenoh.navigation.moment import Goal, LocalPlan, LocalSettings, Mo
 from gigabrain_zenoh.navigation.mppi import Planned, Sampler, past_of, step_of
 from gigabrain_zenoh.navigation.rating import Scene, Weights, distance_in
 from gigabrain_zenoh.navigation.rollout import Start
-from gigabrain_zenoh.navigation.window import Place, Window
+from gigabrain_zenoh.navigation.window import Window
+from gigabrain_zenoh.navigation.window_cells import Place
 
 __all__ = ["Goal", "LocalPlan", "LocalPlanner", "LocalSettings", "Moment", "Sent", "warm_up"]
 

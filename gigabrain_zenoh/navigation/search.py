@@ -9,7 +9,7 @@ time of a heap. A bucket is not in order, so a cell may be looked at again; the 
 """
 
 import math
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,24 +39,31 @@ Cell = tuple[int, int]  # row, column
 Way = Literal["from", "to"]
 
 
+class Memory(NamedTuple):
+    """What a search fills."""
+
+    g: Floats  # by cell, what the way to it costs
+    mark: Ints  # by cell, by what way it was reached, and in what turn
+    first: Ints  # by bucket, the entry on top
+    entries: Ints  # row, column, and the entry below
+
+
 class Search:
     """Searches with the same memory again and again. Not for two threads at once."""
 
     def __init__(self) -> None:
         self._shape = (0, 0)
         self._turn = 0
-        self._g: Floats = np.empty(0)
-        self._mark: Ints = np.empty(0, np.int32)  # by what way each was reached, and in what turn
-        self._first: Ints = np.empty(BUCKETS, np.int32)  # by bucket, the entry on top
-        self._entries: Ints = np.empty((3, 0), np.int32)  # row, column, and the entry below
+        none, first = np.empty(0, np.int32), np.empty(BUCKETS, np.int32)
+        self._memory = Memory(np.empty(0), none, first, np.empty((3, 0), np.int32))
 
     def path(self, cost: Costs, start: Cell, goal: Cell) -> Ints | None:
         """The cheapest way from cell to cell (row, column), (n, 2); None when there is none."""
         target = goal[0] * cost.shape[1] + goal[1]
         self._run(cost, start, goal, reverse=False)
-        if self._mark[target] < TURN * self._turn + DONE:
+        if self._memory.mark[target] < TURN * self._turn + DONE:
             return None
-        cells = _trace(self._mark, cost.shape[1], target)
+        cells = _trace(self._memory.mark, cost.shape[1], target)
         return np.column_stack(np.divmod(cells, np.int32(cost.shape[1])))
 
     def field(self, cost: Costs, cell: Cell, way: Way) -> Floats:
@@ -65,7 +72,7 @@ class Search:
         (height, width), in cells: times the resolution it is metres at cost 1.
         """
         self._run(cost, cell, ANYWHERE, reverse=way == "to")
-        field = np.where(self._mark >= TURN * self._turn + DONE, self._g, np.inf)
+        field = np.where(self._memory.mark >= TURN * self._turn + DONE, self._memory.g, np.inf)
         return field.reshape(cost.shape)
 
     def reach(self, cost: Costs, start: Cell) -> None:
@@ -74,7 +81,9 @@ class Search:
 
     def nearest(self, cost: Costs, row: float, column: float) -> Cell | None:
         """The cell nearest to a place of all that the last search reached, where the body fits."""
-        found = _nearest(cost, self._mark, TURN * self._turn + DONE, self._g, row, column)
+        found = _nearest(
+            cost, self._memory.mark, TURN * self._turn + DONE, self._memory.g, row, column
+        )
         return None if found == NOWHERE else divmod(found, cost.shape[1])
 
     def _run(self, cost: Costs, start: Cell, target: Cell, *, reverse: bool) -> None:
@@ -83,34 +92,23 @@ class Search:
         cost = np.ascontiguousarray(cost)
         while True:
             self._turn += 1
-            mine = (self._g, self._mark, self._first, self._entries)
-            if _search(cost, start, target, reverse, TURN * self._turn, *mine) != FULL:
+            if _search(cost, start, target, reverse, TURN * self._turn, self._memory) != FULL:
                 return
-            self._entries = np.empty((3, 2 * self._entries.shape[1]), np.int32)
+            more = np.empty((3, 2 * self._memory.entries.shape[1]), np.int32)
+            self._memory = self._memory._replace(entries=more)
 
     def _make_room(self, shape: tuple[int, ...]) -> None:
         """Memory for a grid. What no search comes to is never touched, and costs nothing."""
         size = shape[0] * shape[1]
         self._shape, self._turn = (shape[0], shape[1]), 0
-        self._g = np.empty(size)
-        self._mark = np.zeros(size, np.int32)
-        self._entries = np.empty((3, size + SPARE), np.int32)
+        entries = np.empty((3, size + SPARE), np.int32)
+        self._memory = Memory(np.empty(size), np.zeros(size, np.int32), self._memory.first, entries)
 
 
 @kernel
-def _search(
-    cost: Costs,
-    start: Cell,
-    target: Cell,
-    reverse: bool,
-    turn: int,
-    g: Floats,
-    mark: Ints,
-    first: Ints,
-    entries: Ints,
-) -> int:
-    """Fill `g` and `mark` until nothing makes the way to `target` cheaper. How many, or FULL."""
-    (height, width), flat = cost.shape, cost.ravel()
+def _search(cost: Costs, start: Cell, target: Cell, reverse: bool, turn: int, held: Memory) -> int:
+    """Fill the memory until nothing makes the way to `target` cheaper. How many, or FULL."""
+    (height, width), flat, (g, mark, first, entries) = cost.shape, cost.ravel(), held
     first[:] = NOWHERE
     at, best = start[0] * width + start[1], np.inf  # what the way to `target` costs, so far
     g[at], mark[at] = 0.0, turn + ROOT

@@ -6,46 +6,20 @@ odometry drifts.
 """
 
 import math
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.base import TICK_NS
-from gigabrain_zenoh.kernels import kernel
 from gigabrain_zenoh.navigation.chamfer import Chamfer
 from gigabrain_zenoh.navigation.footprint import FAR, Grid
+from gigabrain_zenoh.navigation.window_cells import CELL_M, Cells, Floats, Place, observe
+from gigabrain_zenoh.navigation.window_discs import ROUND_DISC, stays, take_back
 
-CELL_M = 0.025
-BINS = 720  # of the bearings round the lidar
-MARKED = 2  # of a cell that was just hit; each beam that passes takes one
-BEYOND_M = 0.1  # [m], how far past a cell a beam must go to have passed it
 STAYS_TICKS = 20  # a cell that was hit so long ago, and is now, belongs to what stands
 MOST_STAY = 0.5  # share of its cells that may, of a thing that moves
-LATE_TICKS = 10  # so much longer than it seems a disc may have been over a cell
-ROUND_DISC = 0.1  # [m], hits so near a moving thing are its own
 MOVES_AT = 0.05  # share of the window that the robot may be off its middle
-
-Floats = NDArray[np.float64]
-
-
-class Place(NamedTuple):
-    """A pose in the frame that is planned in."""
-
-    x: float  # [m]
-    y: float  # [m]
-    yaw: float  # [rad]
-
-
-class Cells(NamedTuple):
-    """The window as compiled functions take it, (rows, columns) each."""
-
-    level: NDArray[np.uint8]  # 0 where nothing is
-    seen: NDArray[np.int64]  # tick of the last hit
-    since: NDArray[np.int64]  # tick of the first hit since it was last free
-    x: float  # [m], of the corner of cell (0, 0)
-    y: float
 
 
 class Window:
@@ -72,7 +46,7 @@ class Window:
     def see(self, tick: int, place: Place, lidar: tuple[float, float], hits: Floats) -> None:
         """Take in a scan: `hits` (n, 2) [m] in the body's frame, the `lidar` at (x, y) in it."""
         self._follow(place)
-        _observe(self._held, _marked(self._held), place, lidar, hits, tick, tick - self._memory)
+        observe(self._held, _marked(self._held), place, lidar, hits, tick, tick - self._memory)
 
     def moving(self, tick: int, discs: Floats) -> Floats:
         """Those of the `discs` (n, 6), x, y [m] first and the radius fifth, that really move.
@@ -81,12 +55,12 @@ class Window:
         another, and then seem to move; but they keep hitting the same cells.
         """
         held, long_ago = self._held, tick - STAYS_TICKS
-        return discs[[_stays(held, disc, tick, long_ago) <= MOST_STAY for disc in discs]]
+        return discs[[stays(held, disc, tick, long_ago) <= MOST_STAY for disc in discs]]
 
     def take_back(self, tick: int, discs: Floats) -> None:
         """Free what each of `discs` (n, 6) covered on its way here: nothing stands there."""
         for disc in discs:
-            _take_back(self._held, disc, tick)
+            take_back(self._held, disc, tick)
 
     def grid(self, tick: int, known: Floats, moving: Floats) -> Grid:
         """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m].
@@ -139,119 +113,3 @@ def _carry(cells: Cells, to: Cells, down: int, right: int) -> None:
     to.level.fill(0)
     to.level[row, column] = cells.level[i, j]
     to.seen[row, column], to.since[row, column] = cells.seen[i, j], cells.since[i, j]
-
-
-@kernel
-def _observe(
-    cells: Cells,
-    marked: NDArray[np.int64],
-    place: Place,
-    lidar: tuple[float, float],
-    hits: Floats,
-    tick: int,
-    oldest: int,
-) -> None:
-    """Forget what is older than `oldest`, take back what beams have passed, mark what they hit."""
-    level, seen = cells.level, cells.seen
-    cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
-    eye_x = place.x + cosine * lidar[0] - sine * lidar[1]
-    eye_y = place.y + sine * lidar[0] + cosine * lidar[1]
-    reach = np.full(BINS, -1.0)
-    count = hits.shape[0]
-    points = np.empty((count, 2))
-    for i in range(count):
-        x = place.x + cosine * hits[i, 0] - sine * hits[i, 1]
-        y = place.y + sine * hits[i, 0] + cosine * hits[i, 1]
-        points[i, 0], points[i, 1] = x, y
-        k = _bin(x - eye_x, y - eye_y)
-        r = math.hypot(x - eye_x, y - eye_y)
-        if reach[k] < 0.0 or r < reach[k]:
-            reach[k] = r
-    (rows, columns), passed = level.shape, _passed(reach)
-    for n in marked:
-        i, j = n // columns, n % columns
-        x = cells.x + (j + 0.5) * CELL_M
-        y = cells.y + (i + 0.5) * CELL_M
-        if seen[i, j] < oldest:
-            level[i, j] = 0
-        elif math.hypot(x - eye_x, y - eye_y) + BEYOND_M < passed[_bin(x - eye_x, y - eye_y)]:
-            level[i, j] -= 1
-    for i in range(count):
-        x, y = points[i, 0], points[i, 1]
-        row = math.floor((y - cells.y) / CELL_M)
-        column = math.floor((x - cells.x) / CELL_M)
-        if 0 <= row < rows and 0 <= column < columns:
-            if level[row, column] == 0:
-                cells.since[row, column] = tick
-            level[row, column] = MARKED
-            seen[row, column] = tick
-
-
-@kernel
-def _bin(x: float, y: float) -> int:
-    """Into which of the BINS the direction of (x, y) falls: a series is quicker than atan2.
-
-    Abramowitz and Stegun, 4.4.47: to 1e-5 rad, a thousandth of a bin.
-    """
-    far, near = max(abs(x), abs(y), 1e-12), min(abs(x), abs(y))
-    r = near / far
-    s = r * r
-    series = -0.3302995 + s * (0.1801410 + s * (-0.0851330 + s * 0.0208351))
-    turn = r * (0.9998660 + s * series)
-    turn = 0.5 * math.pi - turn if abs(y) > abs(x) else turn
-    turn = math.pi - turn if x < 0.0 else turn
-    turn = -turn if y < 0.0 else turn
-    return math.floor((turn / math.tau + 0.5) * BINS) % BINS
-
-
-@kernel
-def _passed(reach: Floats) -> Floats:
-    """How far all beams round each bin went at least [m]; -1 where none is known to have."""
-    passed = np.full(BINS, -1.0)
-    for k in range(BINS):
-        for n in (k - 1, k, k + 1):
-            r, nearest = reach[n % BINS], passed[k]
-            if r >= 0.0 and (nearest < 0.0 or r < nearest):
-                passed[k] = r
-    return passed
-
-
-@kernel
-def _stays(cells: Cells, disc: Floats, tick: int, long_ago: int) -> float:
-    """The share of the cells of `disc` hit at `tick` that were hit `long_ago` already."""
-    x, y, radius = disc[0], disc[1], disc[4] + ROUND_DISC
-    rows, columns = cells.level.shape
-    hit = old = 0
-    for i in range(max(0, int((y - radius - cells.y) / CELL_M)), rows):
-        down = cells.y + (i + 0.5) * CELL_M - y
-        if down > radius:
-            break
-        for j in range(max(0, int((x - radius - cells.x) / CELL_M)), columns):
-            right = cells.x + (j + 0.5) * CELL_M - x
-            if right > radius:
-                break
-            near = math.hypot(right, down) <= radius
-            if near and cells.level[i, j] > 0 and cells.seen[i, j] == tick:
-                hit += 1
-                old += cells.since[i, j] <= long_ago
-    return old / hit if hit else 0.0
-
-
-@kernel
-def _take_back(cells: Cells, disc: Floats, tick: int) -> None:
-    """Free the cells that were first hit after `disc` had come to be over them."""
-    x, y, vx, vy, radius = disc[0], disc[1], disc[2], disc[3], disc[4] + ROUND_DISC
-    square, (rows, columns) = max(vx * vx + vy * vy, 1e-6), cells.level.shape
-    for i in range(max(0, int((y - radius - cells.y) / CELL_M)), rows):
-        down = cells.y + (i + 0.5) * CELL_M - y
-        if down > radius:
-            break
-        for j in range(max(0, int((x - radius - cells.x) / CELL_M)), columns):
-            right = cells.x + (j + 0.5) * CELL_M - x
-            if right > radius:
-                break
-            inside, along = radius**2 - right**2 - down**2, right * vx + down * vy
-            if inside >= 0.0 and cells.level[i, j] > 0:
-                ago = (math.sqrt(along**2 + square * inside) - along) / square * 1e9 / TICK_NS
-                if cells.since[i, j] >= tick - ago - LATE_TICKS:
-                    cells.level[i, j] = 0

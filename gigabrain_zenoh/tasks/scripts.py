@@ -7,7 +7,7 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
-from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
+from gigabrain_zenoh.errors import ConfigError, GigabrainError, Refused, unknown
 from gigabrain_zenoh.tasks.mission import Script
 
 LAST = 200  # bytes of what it wrote that are told
@@ -16,6 +16,14 @@ LINGER_S = 1.0  # for the rest of its words, once it has ended
 LEASHED = """exec 3<&0 </dev/null
 { read -r _ <&3; kill -s KILL 0; } >/dev/null 2>&1 &
 exec "$@" 3<&-"""
+
+
+def check_folder(folder: str) -> None:
+    """Whether the folder that `scripts` names is there, where it names one. Raises ConfigError."""
+    if folder and not Path(folder).expanduser().is_dir():
+        raise ConfigError(
+            f"no folder {folder!r}; scripts: expected that of the programs that missions may run"
+        )
 
 
 class Scripts:

@@ -14,7 +14,17 @@ from gigabrain_drivers.lidars import SCAN_SOURCES
 from gigabrain_drivers.lidars.base import source_class
 from gigabrain_drivers.line import LineDriver
 from gigabrain_drivers.opencr.driver import OpenCrDriver
-from gigabrain_drivers.protocols import alpha, dynamixel, ld, lds01, lds03, line, opencr, rplidar
+from gigabrain_drivers.protocols import (
+    alpha,
+    dynamixel,
+    ld,
+    lds01,
+    lds03,
+    line,
+    opencr,
+    rplidar,
+    rplidar_requests,
+)
 from gigabrain_drivers.robot import Run
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import Lidar
@@ -71,7 +81,9 @@ PROTOCOLS = {
         lambda: line.Decoder(CUSTOM.state_templates()), line.describe, 256, line_again, "_rest"
     ),
     "rplidar": Protocol(rplidar.Decoder, rplidar.describe, 420),
-    "rplidar request": Protocol(rplidar.RequestDecoder, rplidar.describe_request, 260),
+    "rplidar request": Protocol(
+        rplidar_requests.RequestDecoder, rplidar_requests.describe_request, 260
+    ),
 }
 
 

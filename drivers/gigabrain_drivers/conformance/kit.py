@@ -6,7 +6,6 @@ import functools
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple, Self
 
 from gigabrain_drivers.conformance import direct, line_faults, machine, stops, timing
@@ -129,12 +128,7 @@ class Shared:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self._stack.aclose()
 
     async def run(self, check: Callable[[Rig], Awaitable[Finding]]) -> Finding:

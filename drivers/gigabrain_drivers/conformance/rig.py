@@ -1,7 +1,6 @@
 """A driver in its real process, behind the real gate, on a network inside this program."""
 
 import asyncio
-from types import TracebackType
 from typing import Any, Self
 
 import msgspec
@@ -65,12 +64,7 @@ class Rig(Timeline):
         self._running = asyncio.create_task(self._process.run(lambda: None), name="driver process")
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         self.wanted = None
         if self._running:
             self._running.cancel()

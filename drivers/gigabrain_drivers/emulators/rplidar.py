@@ -9,7 +9,8 @@ from gigabrain_drivers.emulators.sweep import Sample, Sweep
 from gigabrain_drivers.lidars.rplidar import RplidarOptions
 from gigabrain_drivers.lidars.rplidar_start import MODELS
 from gigabrain_drivers.protocols import rplidar
-from gigabrain_drivers.protocols.rplidar import DENSE, EXPRESS, STANDARD, Health, Info, Request
+from gigabrain_drivers.protocols.rplidar import DENSE, EXPRESS, STANDARD, Health, Info
+from gigabrain_drivers.protocols.rplidar_requests import Request, RequestDecoder
 from gigabrain_drivers.protocols.rplidar_scans import (
     FORMATS,
     dense_capsule,
@@ -77,7 +78,7 @@ class RplidarDevice(Device):
         super().__init__(body, options, wire)
         self.unit = unit_of(options)
         self.health = Health(0, 0)
-        self._requests = rplidar.RequestDecoder()
+        self._requests = RequestDecoder()
         self._sweep = Sweep(body, *self.unit.reach)
         self._nominal_hz = body.robot.lidar.rate_hz if body.robot.lidar else 10.0
         self._mode: Mode | None = None  # while it scans

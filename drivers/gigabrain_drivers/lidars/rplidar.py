@@ -12,6 +12,7 @@ from gigabrain_drivers.lidars.serial_source import LOOK_NS, SerialSource
 from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_drivers.protocols import rplidar
 from gigabrain_drivers.protocols.rplidar import Answer, Info
+from gigabrain_drivers.protocols.rplidar_requests import RequestDecoder, describe_request
 from gigabrain_drivers.protocols.rplidar_scans import Samples
 from gigabrain_drivers.robot import ScanOptions
 from gigabrain_schemas.body import Lidar
@@ -52,7 +53,7 @@ class Rplidar(SerialSource):
         super().__init__(options, lidar, clock, self._bauds[0])
         self.link.on_lost = self._lost
         self.link.wording = Wording(
-            Spelling(rplidar.RequestDecoder().feed, rplidar.describe_request),
+            Spelling(RequestDecoder().feed, describe_request),
             Spelling(rplidar.Decoder().feed, rplidar.describe),
         )
         self._decoder = rplidar.Decoder()

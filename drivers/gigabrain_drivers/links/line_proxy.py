@@ -5,7 +5,6 @@ import os
 import random
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from gigabrain_drivers.emulators.pty import Pty
@@ -50,12 +49,7 @@ class LineProxy:
         await self.plug()
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.unplug()
         await self._link.close()
         for wire in self._wires:

@@ -23,8 +23,8 @@ from gigabrain_drivers.protocols.opencr import Readings
 from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
 from gigabrain_schemas.base import Message, Pose, Velocity
 from gigabrain_schemas.body import Battery, Joint, RobotState
-from gigabrain_schemas.sensors import Imu, ImuData, LaserScan
-from gigabrain_schemas.topics import IMU, SCAN
+from gigabrain_schemas.sensors import Imu, ImuData
+from gigabrain_schemas.topics import IMU
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
@@ -80,7 +80,6 @@ class OpenCrDriver(Driver):
             robot_type=robot.robot_type, pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity()
         )
         self._imu: Imu | None = None
-        self._scan: LaserScan | None = None
         self._lidar: ScanSource | None = None
         self._guard: asyncio.Task[None] | None = None
 
@@ -92,8 +91,6 @@ class OpenCrDriver(Driver):
     async def open(self) -> None:
         """Begin to look for the board and the lidar; neither has to be there yet."""
         self._lidar = carry(self, self._clock)
-        if self._lidar:
-            self._lidar.emit = self._scanned
         self.link.open()
         self._guard = asyncio.create_task(self._look_after(), name="opencr guard")
 
@@ -142,7 +139,7 @@ class OpenCrDriver(Driver):
         if sensor_name == "imu":
             return self._imu
         if sensor_name == "scan" and self.options.scan:
-            return self._scan
+            return self._lidar.newest if self._lidar else None
         has = "imu, scan" if self.options.scan else "imu"
         raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}; it has: {has}")
 
@@ -152,10 +149,6 @@ class OpenCrDriver(Driver):
             if now_ns - self._commanded_ns >= SILENT_NS and self._board.ready:
                 self._board.halt()
             self._board.look(now_ns)
-
-    def _scanned(self, scan: LaserScan) -> None:
-        self._scan = scan
-        self.emit(SCAN, scan)
 
     def _take(self, now: Readings) -> None:
         turned = self._encoders.turned(now.ticks)

@@ -22,19 +22,11 @@ STANDARD, EXPRESS, DENSE = 0x81, 0x82, 0x85
 MODE_COUNT, MODE_MICROSECONDS, MODE_DISTANCE = 0x70, 0x71, 0x74  # keys of GET_CONF
 MODE_ANSWER, MODE_TYPICAL, MODE_NAME = 0x75, 0x7C, 0x7F
 
-REQUESTS = {
-    STOP: "stop", RESET: "reset", SCAN: "scan", FORCE_SCAN: "force scan",
-    GET_INFO: "get info", GET_HEALTH: "get health", GET_SAMPLERATE: "get sample rate",
-    EXPRESS_SCAN: "express scan", GET_CONF: "get setting", SET_SPEED: "set speed",
-    SET_PWM: "set motor", GET_BOARD: "get board",
-}  # fmt: skip
-
 _SIZES = {INFO: 20, HEALTH: 3, SAMPLERATE: 4, BOARD: 4}
 _LONGEST_CONF = 64  # bytes
 _DESCRIPTOR = struct.Struct("<2sIB")
 _ENDLESS = 1 << 30
 _SYNC = b"\xa5\x5a"
-_BEFORE_CHECKSUM = 3  # bytes of a request with a payload before the payload
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
@@ -200,13 +192,6 @@ class Decoder:
         return True
 
 
-class Request(NamedTuple):
-    """What a host asks for."""
-
-    command: int
-    payload: bytes = b""
-
-
 def describe(item: "Answer | Samples") -> str:
     """What the lidar sent, in words; samples are those of the block before."""
     if isinstance(item, Samples):
@@ -219,43 +204,3 @@ def describe(item: "Answer | Samples") -> str:
     if item.kind == HEALTH:
         return f"health: status {Health.read(item.data).status}"
     return f"answer of type {item.kind:#04x}, {len(item.data)} bytes"
-
-
-def describe_request(request: "Request") -> str:
-    """What a host asks for, in words."""
-    name = REQUESTS.get(request.command, f"request {request.command:#04x}")
-    return f"{name} {request.payload.hex(' ')}".strip()
-
-
-class RequestDecoder:
-    """The lidar's side: requests out of a stream of bytes. Keeps less than 260 bytes."""
-
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self.errors = 0
-
-    def feed(self, data: bytes) -> list[Request]:
-        """The requests that `data` completes."""
-        buffer, found = self._buffer, list[Request]()
-        buffer += data
-        while True:
-            self._skip()
-            if len(buffer) < 2:
-                return found
-            if buffer[1] < 0x80:
-                found.append(Request(buffer[1]))
-                del buffer[:2]
-                continue
-            if len(buffer) < _BEFORE_CHECKSUM or len(buffer) < buffer[2] + 4:
-                return found
-            whole = bytes(buffer[: buffer[2] + 4])
-            if xor(whole) == 0:
-                found.append(Request(whole[1], whole[_BEFORE_CHECKSUM:-1]))
-                del buffer[: len(whole)]
-            else:
-                self.errors += 1
-                del buffer[:1]
-
-    def _skip(self) -> None:
-        at = self._buffer.find(0xA5)
-        del self._buffer[: at if at >= 0 else len(self._buffer)]

@@ -1,0 +1,107 @@
+"""`gigabrain demo`: a whole robot on this machine, watched."""
+
+import asyncio
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from cyclopts import Parameter
+
+from gigabrain_zenoh import behaviours
+from gigabrain_zenoh.cli.checked import above_zero, checked
+from gigabrain_zenoh.deployment import Deployment, recorded
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.process import find
+from gigabrain_zenoh.settings import LinkName, Resume
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Drive:
+    """What drives, where and how."""
+
+    body: str = "turtlebot3_waffle"
+    "Which robot; see `gigabrain robots`."
+    link: LinkName = "sim"
+    "How to reach it."
+    world: str = "arena"
+    "Where it drives; see `gigabrain worlds`."
+    seconds: float | None = None
+    "End after this much simulated time [s]."
+    seed: int = 0
+    "For the start pose and the noise of the sensors."
+    speed: float = 1.0
+    "Simulated over real time; other than 1, time waits for the brain."
+    behaviour: str = "navigate"
+    "What it does: `navigate`, or `avoid`, which makes no map."
+    turn: Literal["right", "left", "clearer"] = "right"
+    "Which way it turns from an obstacle, where it avoids."
+    resume: Resume | None = None
+    "Whether it goes on by itself after a stop that has passed; a real body never does."
+
+    def check(self) -> None:
+        """Raises ConfigError, and UnknownName, for what can be told before anything starts."""
+        behaviours.check(self.behaviour)
+        find("gigabrain_drivers.catalog:load_robot")(self.body)
+        find("gigabrain_drivers.sim.worlds:load_world")(self.world, 0)
+
+    def values(self) -> dict[str, object]:
+        """The deployment, raw."""
+        decision = {"behaviour": self.behaviour, "turn": self.turn}
+        values: dict[str, object] = {
+            "body": self.body,
+            "link": self.link,
+            "world": self.world,
+            "seed": self.seed,
+            "speed": self.speed,
+            "resume": self.resume or ("manual" if self.link == "real" else "auto"),
+            "router": "tcp/127.0.0.1:0",
+        }
+        if self.behaviour == "navigate":
+            decision = {"behaviour": "navigate", "begin": "roam"}
+            values["perception"] = {"mapping": "slam"}
+        return values | {"decision": decision}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class Shown:
+    """What is to be seen of it, and what stays."""
+
+    headless: bool = False
+    "Progress in a line instead of the live view."
+    report: Path | None = None
+    "Write what the run came to, as JSON, into this file."
+    record: Path | None = None
+    "Record the run from its very start into this file, for `gigabrain replay`."
+    page: bool | None = None
+    "Serve the operator page; as a rule where there is a live view too."
+    port: int = 8080
+    "Where the page is; another free one where that is taken."
+
+
+DRIVE, SHOWN = Drive(), Shown()
+
+
+def demo(*, drive: Drive = DRIVE, shown: Shown = SHOWN) -> int:
+    """Drive a simulated robot round its world, until Ctrl-C: it makes a map, then visits places.
+
+    Example: gigabrain demo --world house --seconds 60 --speed 5 --headless --report run.json
+
+    Ends with 1 after any contact, without motion, or when a process has died.
+    """
+    from gigabrain_zenoh.demo import Demo, DemoOptions
+    from gigabrain_zenoh.page.beside import with_page
+
+    drive.check()
+    if shown.record and shown.record.exists():
+        raise ConfigError(f"{shown.record} exists; choose another file")
+    above_zero("seconds", drive.seconds)
+    values = drive.values() | (recorded(shown.record) if shown.record else {})
+    deployment, where = checked(values, Deployment), ""
+    if shown.page or (shown.page is None and not shown.headless):
+        deployment, where = with_page(deployment, shown.port)
+    options = DemoOptions(
+        seconds=drive.seconds, headless=shown.headless, report=shown.report, page=where
+    )
+    return asyncio.run(Demo(deployment, options).run())

@@ -1,0 +1,96 @@
+"""What a bad line does to bytes, and the words that ask for it."""
+
+import random
+
+import pytest
+
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.faults.chaos import Chaos, Told, told
+from gigabrain_zenoh.faults.damage import Damage, Figures
+
+
+def damaged(chaos: Chaos, pieces: list[bytes], seed: int = 0) -> tuple[bytes, list[float], Figures]:
+    """All that arrives of `pieces`, one each 10 ms, and when."""
+    damage = Damage(random.Random(seed), Figures())
+    out = [out for n, piece in enumerate(pieces) for out in damage.damaged(piece, chaos, n / 100)]
+    return b"".join(data for _, data in out), [due_s for due_s, _ in out], damage.figures
+
+
+def test_a_bit_is_flipped_in_as_many_bytes_as_is_said() -> None:
+    pieces = [bytes(1000)] * 1000
+    data, _, figures = damaged(Chaos(corrupt=1e-3), pieces)
+    assert figures.flipped == sum(byte != 0 for byte in data) == 1024
+    assert all(byte.bit_count() <= 1 for byte in data)
+    assert damaged(Chaos(corrupt=1e-3), pieces)[0] == data  # the same seed, the same damage
+    assert damaged(Chaos(corrupt=1e-3), pieces, seed=1)[0] != data
+    assert damaged(Chaos(corrupt=1.0), [bytes(100)])[2].flipped == 100
+    assert damaged(Chaos(corrupt=5e-324), pieces)[2].flipped == 0
+
+
+def test_what_is_dropped_does_not_arrive_and_is_counted() -> None:
+    data, _, figures = damaged(Chaos(drop=0.25), [b"0123456789"] * 1000)
+    assert len(data) == 10_000 - figures.dropped == 7420
+    assert figures.taken == 10_000
+
+
+def test_garbage_comes_before_what_was_sent() -> None:
+    data, _, figures = damaged(Chaos(garbage=1.0), [b"frame"] * 10)
+    assert data.count(b"frame") == 10
+    assert len(data) == 50 + figures.garbage
+    assert 10 <= figures.garbage <= 640
+
+
+def test_what_is_split_comes_in_two_halves() -> None:
+    data, times, _ = damaged(Chaos(split=1.0), [b"01234567"])
+    assert (data, times) == (b"01234567", [0.0, 0.002])
+
+
+def test_what_is_merged_comes_at_one_time() -> None:
+    _, times, _ = damaged(Chaos(merge_ms=50), [b"a"] * 6)
+    assert times == pytest.approx([0.0, 0.05, 0.05, 0.05, 0.05, 0.05])
+
+
+def test_a_throttled_line_takes_as_long_as_it_says() -> None:
+    _, times, _ = damaged(Chaos(bytes_s=1000), [bytes(100), bytes(100)])
+    assert times == pytest.approx([n * 0.02 for n in range(1, 11)])
+
+
+def test_what_is_lost_is_late_and_so_is_what_comes_after_it() -> None:
+    chaos = Chaos(loss=0.2)
+    _, times, figures = damaged(chaos, [b"x"] * 200)
+    assert figures.late == 37
+    assert times == sorted(times)
+    assert max(due_s - n / 100 for n, due_s in enumerate(times)) == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize(
+    ("line", "wish"),
+    [
+        ("", Told(ways=("up", "down"))),
+        ("off", Told(ways=("up", "down"))),
+        ("hole", Told(ways=("up", "down"), chaos=Chaos(hole=True))),
+        ("down delay_ms=50 loss=0.1", Told(ways=("down",), chaos=Chaos(delay_ms=50, loss=0.1))),
+        ("up off", Told(ways=("up",))),
+        ("cut", Told(cut="fin")),
+        ("cut=rst", Told(cut="rst")),
+        ("unplug", Told(unplugged=True)),
+        ("plug", Told(unplugged=False)),
+        ("figures", Told(figures=True)),
+    ],
+)
+def test_what_is_typed_is_understood(line: str, wish: Told) -> None:
+    assert told(line) == wish
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("holes", r"no fault 'holes'; did you mean 'hole'\? known: .*bytes_s, corrupt"),
+        ("corrupt=2", r"'corrupt=2': Expected `float` <= 1.0 - at `\$.corrupt`"),
+        ("delay_ms=nan", "delay_ms=nan"),
+        ("hole cut", "no fault 'cut'"),
+    ],
+)
+def test_what_cannot_be_understood_is_refused_in_one_line(line: str, complaint: str) -> None:
+    with pytest.raises(ConfigError, match=complaint):
+        told(line)

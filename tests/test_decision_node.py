@@ -1,0 +1,166 @@
+"""Decision as a process: when it says what, and on which scan that rests."""
+
+import functools
+import logging
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Cause
+from gigabrain_schemas.brain import Intent, WorldModel
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, WORLD
+from gigabrain_zenoh import decision
+from gigabrain_zenoh.errors import UnknownName
+from gigabrain_zenoh.settings import DecisionConfig
+from tests.brain_rig import LIDAR, WAFFLE, Bench, body, state
+
+CONFIG = DecisionConfig()
+
+
+def world(tick: int, *, ahead: bool = False, boot: int = 7) -> WorldModel:
+    return WorldModel(
+        scan_ok=True,
+        obstacle_ahead=ahead,
+        distance_ahead=0.83 if ahead else None,
+        boot=boot,
+        tick=tick,
+        basis=tick,
+    )
+
+
+def bench(config: DecisionConfig = CONFIG) -> Bench:
+    return Bench(functools.partial(decision.run, config))
+
+
+def heads(intents: list[Intent]) -> list[tuple[int, int, str]]:
+    return [(i.tick, i.basis, i.reason.partition(" ")[0]) for i in intents]
+
+
+async def test_a_world_becomes_an_intent_at_once() -> None:
+    async with bench() as node:
+        node.send(STATE, state(10))
+        assert heads(node.sent(INTENT)) == [(10, 0, "waiting:")]
+        node.send(WORLD, world(10))
+        assert heads(node.sent(INTENT)) == [(10, 10, "forward")]
+
+
+async def test_an_intent_is_repeated_with_the_newest_tick_and_its_own_basis() -> None:
+    async with bench() as node:
+        node.send(STATE, state(10))
+        node.send(WORLD, world(10))
+        node.sent(INTENT)
+        for tick in (11, 12, 13):
+            node.send(STATE, state(tick))
+        assert heads(node.sent(INTENT)) == [
+            (11, 10, "forward"),
+            (12, 10, "forward"),
+            (13, 10, "forward"),
+        ]
+        node.send(STATE, state(15))
+        node.send(WORLD, world(15, ahead=True))
+        assert heads(node.sent(INTENT)) == [(15, 10, "forward"), (15, 15, "turning")]
+
+
+async def test_a_world_that_comes_before_the_state_of_its_tick_waits_for_it() -> None:
+    async with bench() as node:
+        node.send(STATE, state(9))
+        node.sent(INTENT)
+        node.send(WORLD, world(10))
+        assert node.sent(INTENT) == []
+        node.send(STATE, state(10))
+        assert heads(node.sent(INTENT)) == [(10, 10, "forward")]
+
+
+async def test_a_state_that_was_overtaken_by_a_later_world_does_not_use_it() -> None:
+    async with bench() as node:
+        node.send(STATE, state(8))
+        node.send(WORLD, world(10))
+        node.sent(INTENT)
+        node.send(STATE, state(9))
+        assert heads(node.sent(INTENT)) == [(9, 0, "waiting:")]
+
+
+async def test_it_thinks_once_per_world_however_often_it_repeats_itself() -> None:
+    async with bench() as node:
+        node.send(STATE, state(10))
+        node.send(WORLD, world(10))
+        node.send(STATE, state(11, pose=(1.0, 0.0, 0.0)))
+        node.send(WORLD, world(10))  # the same once more
+        intents = node.sent(INTENT)
+    assert [intent.progress for intent in intents] == [0.0, 0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(("rate_hz", "last"), [(10.0, 22), (5.0, 25)])
+async def test_it_waits_once_the_world_is_older_than_250_ms_or_one_and_a_half_scans(
+    rate_hz: float, last: int
+) -> None:
+    async with bench() as node:
+        node.send(BODY, body(replace(WAFFLE, lidar=replace(LIDAR, rate_hz=rate_hz))))
+        node.send(STATE, state(10))
+        node.send(WORLD, world(10))
+        for tick in range(11, 30):
+            node.send(STATE, state(tick))
+        intents = node.sent(INTENT)
+    forward = [intent.tick for intent in intents if intent.reason.startswith("forward")]
+    assert forward[-1] == last
+    assert intents[-1].reason == "waiting: perception is silent"
+    assert intents[-1].basis == 10
+
+
+async def test_a_driver_that_starts_anew_is_met_with_an_open_mind() -> None:
+    async with bench() as node:
+        node.send(STATE, state(5000))
+        node.send(WORLD, world(5000))
+        node.send(STATE, state(3, boot=8))
+        node.send(STATE, state(5, boot=8, pose=(9.0, 9.0, 0.0)))
+        node.send(WORLD, world(5, boot=8))
+        intents = node.sent(INTENT)
+    assert heads(intents)[2:] == [(3, 0, "waiting:"), (5, 0, "waiting:"), (5, 5, "forward")]
+    assert intents[-1].boot == 8
+    assert intents[-1].progress == 0.0
+
+
+async def test_a_change_of_mind_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gigabrain_zenoh.decision")
+    async with bench() as node:
+        for tick in range(10, 30, 5):
+            node.send(STATE, state(tick))
+            node.send(WORLD, world(tick, ahead=tick >= 20))
+    assert [record.getMessage() for record in caplog.records] == [
+        "waiting: perception is silent",
+        "forward 0.20 m/s",
+        "turning right: obstacle 0.83 m ahead",
+    ]
+
+
+async def test_without_a_state_it_says_nothing() -> None:
+    async with bench() as node:
+        node.send(WORLD, world(10))
+        assert node.sent(INTENT) == []
+        node.send(STATE, state(10))
+        node.sent(INTENT)
+        await node.clock.advance(260_000_000)  # the driver has stopped
+        node.send(WORLD, world(10))
+        assert node.sent(INTENT) == []
+
+
+async def test_an_unknown_behaviour_ends_the_process_before_it_begins() -> None:
+    with pytest.raises(UnknownName, match="no behaviour 'fly'"):
+        await decision.run(DecisionConfig(behaviour="fly"), None, lambda: None)  # type: ignore[arg-type]
+
+
+async def test_it_comes_to_rest_when_safety_warns_of_an_empty_battery() -> None:
+    low = Cause(code="battery_return", text="battery at 6 %")
+    async with Bench(functools.partial(decision.run, CONFIG)) as bench:
+        bench.send(BODY, body())
+        found = []
+        for tick in range(1, 5):
+            bench.send(STATE, state(tick))
+            bench.send(WORLD, world(tick))
+            warnings = (low,) if tick > 1 else ()
+            verdict = SafetyState(verdict="ok", warnings=warnings, boot=7, tick=tick)
+            bench.send(SAFETY, verdict)
+            found.append(bench.sent(INTENT)[-1].reason.partition(":")[0])
+    # what is said within a tick counts from the next
+    assert found == ["forward 0.20 m/s", "forward 0.20 m/s", "resting", "resting"]

@@ -1,0 +1,163 @@
+"""The ports of emulators: they appear, go, slow down, and are one emulator's at a time."""
+
+import asyncio
+import os
+import select
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers.emulators.claim import claimed
+from gigabrain_drivers.emulators.emulator import Emulator
+from gigabrain_drivers.emulators.pty import Pty
+from gigabrain_drivers.robot import Run
+from gigabrain_zenoh.errors import ConfigError
+from tests.line_rig import until
+
+
+def opened(path: Path) -> int:
+    return os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+
+
+async def test_a_port_appears_disappears_and_comes_back_empty(tmp_path: Path) -> None:
+    pty = Pty(tmp_path / "deeper" / "port")
+    assert not pty.write(b"nobody")
+    pty.plug()
+    pty.plug()
+    fd = opened(pty.path)
+    pty.write(b"old")
+    pty.unplug()
+    pty.unplug()
+    assert not pty.path.is_symlink()
+    with pytest.raises(OSError, match=r".*"):
+        os.write(fd, b"x")
+    os.close(fd)
+    pty.plug()
+    fd = opened(pty.path)
+    with pytest.raises(BlockingIOError):
+        os.read(fd, 10)
+    os.close(fd)
+    pty.unplug()
+
+
+async def test_a_host_that_goes_and_comes_back_finds_the_same_port(tmp_path: Path) -> None:
+    pty, heard = Pty(tmp_path / "port"), list[bytes]()
+    pty.on_bytes = heard.append
+    pty.plug()
+    for word in (b"one", b"two"):
+        fd = opened(pty.path)
+        os.write(fd, word)
+        await until(lambda word=word: word in heard)
+        os.close(fd)
+    pty.unplug()
+
+
+async def test_bytes_are_raw_both_ways(tmp_path: Path) -> None:
+    pty, heard, every = Pty(tmp_path / "port"), list[bytes](), bytes(range(256))
+    pty.on_bytes = heard.append
+    pty.plug()
+    fd = opened(pty.path)
+    os.write(fd, every)
+    await until(lambda: b"".join(heard) == every)
+    pty.write(every)
+    assert select.select([fd], [], [], 60.0)[0]
+    assert os.read(fd, 1000) == every
+    os.close(fd)
+    pty.unplug()
+
+
+async def test_a_slow_line_takes_ten_bits_a_byte(tmp_path: Path) -> None:
+    pty = Pty(tmp_path / "port", baud=9600)
+    pty.plug()
+    fd = opened(pty.path)
+    began = time.monotonic()
+    pty.write(b"x" * 96)  # 100 ms
+    termios.tcgetattr(fd)
+    with pytest.raises(BlockingIOError):
+        os.read(fd, 200)
+    await until(lambda: select.select([fd], [], [], 0)[0])
+    assert time.monotonic() - began >= 0.09
+    os.close(fd)
+    pty.unplug()
+
+
+async def test_what_is_on_the_wire_when_it_is_unplugged_is_gone(tmp_path: Path) -> None:
+    pty = Pty(tmp_path / "port", baud=9600)
+    pty.plug()
+    pty.write(b"x" * 48)
+    pty.unplug()
+    pty.plug()
+    fd = opened(pty.path)
+    await asyncio.sleep(0.1)
+    with pytest.raises(BlockingIOError):
+        os.read(fd, 100)
+    os.close(fd)
+    pty.unplug()
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs /proc")
+def test_the_port_of_an_emulator_that_was_killed_leads_nowhere(tmp_path: Path) -> None:
+    port = tmp_path / "base"
+    program = (
+        "import asyncio, os, pathlib, signal, sys\n"
+        "from gigabrain_drivers.emulators.pty import Pty\n"
+        "async def main():\n"
+        "    Pty(pathlib.Path(sys.argv[1])).plug()\n"
+        "    print(os.path.realpath(sys.argv[1]))\n"
+        "    sys.stdout.flush()\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "asyncio.run(main())\n"
+    )
+    ran = subprocess.run(
+        (sys.executable, "-c", program, str(port)), stdout=subprocess.PIPE, text=True, check=False
+    )
+    assert ran.stdout.startswith("/dev/")
+    name, opened = ran.stdout.strip(), list[int]()
+    try:
+        for _ in range(50):  # until the name is somebody else's
+            opened.extend(os.openpty())
+            if os.ttyname(opened[-1]) == name:
+                break
+        assert port.is_symlink()
+        assert not port.exists()
+    finally:
+        for descriptor in opened:
+            os.close(descriptor)
+
+
+async def test_a_port_that_is_another_emulators_by_now_is_left(tmp_path: Path) -> None:
+    first, second = Pty(tmp_path / "base"), Pty(tmp_path / "base")
+    first.plug()
+    second.plug()  # as after a folder was cleared and claimed anew
+    mine = os.readlink(tmp_path / "base")
+    first.unplug()
+    assert os.readlink(tmp_path / "base") == mine
+    second.unplug()
+    assert not (tmp_path / "base").is_symlink()
+
+
+async def test_a_file_that_is_no_port_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "base").write_text("somebody's")
+    run = Run(folder=Path(), link="emulated", emulator=str(tmp_path))
+    with pytest.raises(ConfigError, match=r"no ports can be made in .*base is there"):
+        async with Emulator("mycustombot", run):
+            pass
+    assert (tmp_path / "base").read_text() == "somebody's"
+
+
+def test_a_folder_of_ports_is_one_emulators_at_a_time(tmp_path: Path) -> None:
+    folder = tmp_path / "ports"
+    with claimed(folder), pytest.raises(ConfigError, match="another emulator"), claimed(folder):
+        pass
+    with claimed(folder):
+        pass
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(ConfigError, match="file: File exists; expected a folder"),
+        claimed(tmp_path / "file"),
+    ):
+        pass

@@ -1,0 +1,105 @@
+"""The mapping node saves its map, is found in one again, and goes on with it."""
+
+import asyncio
+import functools
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE, WORLD
+from gigabrain_zenoh import perception
+from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.recording.placing import placed
+from gigabrain_zenoh.replay import record, replay
+from gigabrain_zenoh.settings import PerceptionConfig
+from tests.mapper_rig import SLAM, Robot
+
+
+@pytest.fixture(autouse=True)
+def own_maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    return tmp_path / "gigabrain" / "maps"
+
+
+async def test_a_map_is_saved_and_found_in_again(own_maps: Path) -> None:
+    async with Robot() as robot:
+        robot.say()
+        assert (await robot.save("early")).text.startswith("not saved: where the robot is")
+        robot.drive(80)
+        reply = await robot.save("house")
+        assert reply.ok, reply.text
+        assert reply.text.startswith(f"saved {own_maps}/house.yaml: ")
+        assert "already" in (await robot.save("house")).text
+        assert (await robot.save("house", replace=True)).ok
+    found = PerceptionConfig(mapping="localize", map="house")
+    async with Robot(found) as robot:
+        robot.say()
+        for _ in range(40):
+            robot.drive(1, still=True)
+            await asyncio.sleep(0.005)
+        pose, grid = robot.sent(POSE)[-1], map_file.load(own_maps / "house.yaml")
+        reply = await robot.save("other")
+    assert pose.localized
+    assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
+    assert grid.resolution == 0.05
+    assert reply.text == "not saved: perception finds its way in a saved map, it makes none"
+
+
+async def test_two_who_save_at_once_do_not_write_into_each_others_files(
+    own_maps: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, writing, most = map_file.save, [0], [0]
+
+    def slow(*args: Any, **how: Any) -> None:
+        writing[0] += 1
+        most[0] = max(most[0], writing[0])
+        time.sleep(0.05)
+        real(*args, **how)
+        writing[0] -= 1
+
+    monkeypatch.setattr(map_file, "save", slow)
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(80)
+        replies = await asyncio.gather(robot.save("house"), robot.save("house"))
+    assert most == [1]
+    assert sorted(reply.ok for reply in replies) == [False, True]
+    assert map_file.load_graph(own_maps / "house.yaml")["poses"].ndim == 2
+
+
+async def test_a_replay_of_a_drive_with_a_save_says_the_same_and_saves_nothing(
+    own_maps: Path,
+) -> None:
+    async with Robot() as robot:
+        events = record(robot.network, robot.clock)
+        robot.say()
+        robot.drive(60)
+        assert (await robot.save("house")).ok
+        robot.drive(20)
+    (own_maps / "house.yaml").unlink()
+    own = (WORLD.key, POSE.key, MAP.key)
+    heard = placed([event for event in events if event[1] not in own])
+    assert sum(key == MAP_SAVE.key for _, key, _ in heard) == 1
+    now = await replay(functools.partial(perception.run, SLAM), heard, "perception")
+    then = [(key, data) for _, key, data in events if key in own]
+    assert [one for one in now if one[0] in own] == then
+    assert len(then) > 160
+    assert not (own_maps / "house.yaml").exists()
+
+
+async def test_a_saved_map_grows_on(own_maps: Path) -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(60)
+        assert (await robot.save("house")).ok
+    size = map_file.load(own_maps / "house.yaml").cells.size
+    async with Robot(PerceptionConfig(mapping="slam", map="house")) as robot:
+        robot.say()
+        for _ in range(40):
+            robot.drive(1, still=True)
+            await asyncio.sleep(0.005)
+        assert robot.sent(POSE)[-1].localized
+        assert (await robot.save("house")).ok  # the same map: nobody else's is lost
+    assert map_file.load(own_maps / "house.yaml").cells.size >= size

@@ -1,0 +1,110 @@
+"""What there is to do, and the node that does it: pauses, exploring, roaming, restarts."""
+
+import asyncio
+import math
+from pathlib import Path
+
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.tasks import GoalRequest, MissionRequest, TaskRequest
+from gigabrain_schemas.topics import GOAL, MISSION, TASK_CHANGE
+from gigabrain_zenoh.settings import DecisionConfig
+from tests.plane_rig import ROOM, Plane, drawn
+
+CELLS = drawn(ROOM)
+STANDS = Velocity()
+
+
+async def test_a_driver_that_starts_anew_does_not_end_what_there_is_to_do() -> None:
+    async with Plane(CELLS) as plane:
+        await plane.go(0.2)
+        await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
+        await plane.go(2.0)
+        plane.driver_starts_anew()
+        await plane.go(3.0)
+        assert plane.intent.reason.startswith("going to (4.00, 0.80): ")
+
+
+async def test_a_pause_stands_and_a_goal_before_it_goes_first() -> None:
+    async with Plane(CELLS) as plane:
+        await plane.go(0.2)
+        await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
+        await plane.go(1.0)
+        await plane.ask(TASK_CHANGE, TaskRequest(do="pause", source="bob"))
+        await plane.go(0.3)
+        assert plane.intent.twist == STANDS
+        await plane.ask(GOAL, GoalRequest(x=1.6, y=1.4, how="preempt"))
+        await plane.go(0.5)
+        assert plane.status.current
+        assert plane.status.current.id == "goal-2"
+        assert [task.id for task in plane.status.queue] == ["goal-1"]
+
+
+async def test_exploring_ends_once_all_is_seen_that_can_be_reached() -> None:
+    plane = Plane(CELLS, at=(2.0, 1.0, 0.3))
+    plane.known[:] = -1
+    async with plane:
+        await plane.go(0.2)
+        reply = await plane.ask(MISSION, MissionRequest(mission="do: [{explore: {}}]"))
+        assert reply.ok
+        await plane.until("succeeded", seconds=120)
+        assert plane.status.done[0].reason == "all is mapped that can be reached"
+        inside = CELLS[5:-5, 5:-5] == 0
+        assert (plane.known[5:-5, 5:-5][inside] == 0).mean() > 0.98
+        assert plane.travelled > 0.5
+
+
+async def test_what_it_was_to_do_goes_on_after_a_restart_of_decision(tmp_path: Path) -> None:
+    config = DecisionConfig(behaviour="navigate", state_dir=str(tmp_path))
+    async with Plane(CELLS, config=config) as plane:
+        await plane.go(0.2)
+        await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
+        await plane.go(2.0)
+        while not (tmp_path / "tasks.json").exists():  # noqa: ASYNC110 - a thread writes it
+            await asyncio.sleep(0.01)
+        await plane.restart()
+        await plane.until("succeeded", seconds=60)
+        assert plane.status.done[0].id == "goal-1"
+        assert math.hypot(plane.x - 4.0, plane.y - 0.8) < 0.15
+
+
+async def test_who_roams_explores_and_then_visits_places_until_it_is_sent_elsewhere() -> None:
+    plane = Plane(
+        CELLS, at=(2.0, 1.0, 0.3), config=DecisionConfig(behaviour="navigate", begin="roam")
+    )
+    plane.known[:] = -1
+    async with plane:
+        said = []
+        for _ in range(40):
+            await plane.go(0.5)
+            said.append(plane.intent.reason.partition(" ")[0])
+            if said[-1] == "going":
+                break
+        assert "exploring:" in said
+        assert said[-1] == "going"
+        current = plane.status.current
+        assert current
+        assert (current.label, current.source) == ("roaming", "itself")
+        await plane.ask_at_once(GOAL, GoalRequest(x=1.5, y=1.2))
+        await plane.go(0.5)
+        assert plane.status.done[0].reason == "replaced by goal-2"
+
+
+async def test_who_was_told_to_do_nothing_does_not_roam_after_a_restart_of_decision(
+    tmp_path: Path,
+) -> None:
+    config = DecisionConfig(behaviour="navigate", begin="roam", state_dir=str(tmp_path))
+    async with Plane(CELLS, config=config) as plane:
+        await plane.go(0.5)
+        await plane.ask(TASK_CHANGE, TaskRequest(do="cancel", task="all", source="ann"))
+        await plane.go(0.5)
+        assert plane.intent.reason == "waiting: for a goal"
+        while b'"jobs":[]' not in (tmp_path / "tasks.json").read_bytes():  # noqa: ASYNC110
+            await asyncio.sleep(0.01)
+        await plane.restart()
+        await plane.go(1.0)
+        assert plane.intent.reason == "waiting: for a goal"
+        plane.driver_starts_anew()
+        await plane.restart()
+        await plane.go(1.0)
+        assert plane.status.current
+        assert plane.status.current.label == "roaming"

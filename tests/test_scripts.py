@@ -1,0 +1,105 @@
+"""Programs of the host that missions run: started there, ended, and refused."""
+
+import asyncio
+import sys
+from pathlib import Path
+
+import pytest
+
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.tasks.executive import Saved
+from gigabrain_zenoh.tasks.mission import Script
+from gigabrain_zenoh.tasks.scripts import Run, Scripts
+from gigabrain_zenoh.tasks.store import TaskFile
+from tests.bus_rig import until
+
+
+def test_nothing_is_written_where_there_is_no_folder() -> None:
+    file = TaskFile("")
+    assert file.read() == (Saved(), "")
+    assert file.write((Saved(count=3),)) == ""
+
+
+def program(folder: Path, text: str) -> str:
+    path = folder / "beep"
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(0o755)
+    return str(folder)
+
+
+async def ended(run: Run) -> tuple[bool, str]:
+    await until(lambda: run.result)
+    assert run.result
+    return run.result
+
+
+async def test_a_program_of_the_folder_is_run_there_with_its_arguments(tmp_path: Path) -> None:
+    folder = program(tmp_path, 'echo "$1 in $(pwd)"')
+    run = Scripts(folder).start(Script(run="beep", arguments=("twice",)))
+    assert await ended(run) == (True, f"ended well: twice in {tmp_path}")
+
+
+async def test_a_program_that_fails_says_why(tmp_path: Path) -> None:
+    run = Scripts(program(tmp_path, "echo no sound >&2; exit 3")).start(Script(run="beep"))
+    assert await ended(run) == (False, "ended with exit code 3: no sound")
+
+
+def test_a_program_ends_on_uvloop_too(tmp_path: Path) -> None:
+    uvloop = pytest.importorskip("uvloop")
+    scripts = Scripts(program(tmp_path, "echo no sound; exit 3"))
+
+    async def run() -> tuple[bool, str]:
+        return await ended(scripts.start(Script(run="beep")))
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        assert runner.run(run()) == (False, "ended with exit code 3: no sound")
+
+
+async def test_a_program_that_takes_too_long_is_ended_with_all_it_has_started(
+    tmp_path: Path,
+) -> None:
+    text = f"sleep 600 & echo $! > {tmp_path}/child; wait"
+    scripts = Scripts(program(tmp_path, text))
+    run = scripts.start(Script(run="beep", seconds=0.5))
+    assert await ended(run) == (False, "did not end within 0.5 s and was ended")
+    child = int((tmp_path / "child").read_text())
+    await until(lambda: _gone(child))
+
+
+async def test_a_program_does_not_outlive_a_decision_that_is_killed(tmp_path: Path) -> None:
+    folder = program(tmp_path, f"sleep 600 & echo $! > {tmp_path}/child; wait")
+    text = (
+        "import asyncio\n"
+        "from gigabrain_zenoh.tasks.mission import Script\n"
+        "from gigabrain_zenoh.tasks.scripts import Scripts\n"
+        "async def main():\n"
+        f"    Scripts({folder!r}).start(Script(run='beep'))\n"
+        "    await asyncio.sleep(600)\n"
+        "asyncio.run(main())\n"
+    )
+    decision = await asyncio.create_subprocess_exec(sys.executable, "-c", text)
+    file = tmp_path / "child"
+    await until(lambda: file.exists() and file.read_text().strip())
+    child = int(file.read_text())
+    assert not _gone(child)
+    decision.kill()
+    await decision.wait()
+    await until(lambda: _gone(child))
+
+
+def _gone(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/status")
+    return not status.exists() or "State:\tZ" in status.read_text()
+
+
+@pytest.mark.parametrize("name", ["../beep", "/bin/sh", "boop"])
+def test_no_program_of_elsewhere_is_run(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match="no script"):
+        Scripts(program(tmp_path, "exit 0")).path(name)
+
+
+def test_a_program_that_may_not_be_run_is_refused(tmp_path: Path) -> None:
+    folder = program(tmp_path, "exit 0")
+    (tmp_path / "beep").chmod(0o644)
+    with pytest.raises(Refused, match="script 'beep' may not be run; chmod \\+x "):
+        Scripts(folder).path("beep")

@@ -1,0 +1,79 @@
+"""Tasks from a script's side: what it sends, waits for and is told."""
+
+import asyncio
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskStatus
+from gigabrain_schemas.topics import GOAL
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
+from gigabrain_zenoh.task_client import Tasks
+from gigabrain_zenoh.tasks.orders import GoTo, Outcome
+from tests.bus_rig import Net, until
+from tests.tasks_rig import Site
+
+
+@pytest.fixture
+async def site(tmp_path: Path) -> Site:
+    return Site(tmp_path)
+
+
+async def test_a_script_hears_how_its_goal_ended(site: Site) -> None:
+    await site.step()
+    tasks = Tasks(site.net.two)
+    name = await tasks.go_to(3.0, 0.0)
+    seen: list[TaskStatus] = []
+    waiting = asyncio.ensure_future(tasks.result(name, seen.append))
+    await site.step(10)
+    assert isinstance(site.order, GoTo)
+    site.outcome = Outcome(number=site.order.number, state="failed", reason="a wall")
+    await site.step(10)
+    end = await waiting
+    assert (end.id, end.state, end.reason) == ("goal-1", "failed", "a wall")
+    assert seen[-1].current
+    await site.end()
+
+
+async def test_a_script_is_told_who_is_missing() -> None:
+    net = Net()
+    with pytest.raises(BodyLost, match="nobody serves goals; does decision run with behaviour: n"):
+        await Tasks(net.two, starting_s=0.0).go_to(1.0, 0.0)
+
+
+async def test_a_goal_that_comes_while_the_robot_starts_waits_for_who_serves_goals() -> None:
+    net, said = Net(), list[str]()
+    tasks = Tasks(net.two, on_wait=said.append, starting_s=60.0)
+    sending = asyncio.ensure_future(tasks.go_to(1.0, 0.0))
+    await until(lambda: said)
+    assert said == ["waiting: nobody serves goals yet; is the robot just starting?"]
+
+    async def answer(request: GoalRequest) -> GoalReply:
+        return GoalReply(ok=True, text="accepted", goal=f"goal to {request.x:g}")
+
+    net.one.serve(GOAL, answer)
+    assert await sending == "goal to 1"
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize("x", [math.nan, math.inf, -1e300])
+async def test_a_script_is_told_of_a_goal_that_is_no_place(x: float) -> None:
+    with pytest.raises(ConfigError, match=re.escape(f"numbers up to 1e+09, got {x:g} 0 1")):
+        await Tasks(Net().two).go_to(x, 0.0, 1.0)
+
+
+async def test_a_refusal_reaches_the_script(site: Site) -> None:
+    await site.step()
+    site.wall = "the goal is outside the map"
+    tasks = Tasks(site.net.two)
+    with pytest.raises(Refused, match="the goal is outside the map"):
+        await tasks.go_to(1.0, 0.0)
+    with pytest.raises(Refused, match="there is nothing to do"):
+        await tasks.cancel()
+    assert (await tasks.explore()) == "mission-1"
+    assert await tasks.pause() == "mission-1 is paused"
+    await site.step()
+    assert (await tasks.status()).current
+    await site.end()

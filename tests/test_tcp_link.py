@@ -1,0 +1,81 @@
+"""TCP links: there and back, and peers that are gone, silent or take nothing."""
+
+import asyncio
+import socket
+
+import pytest
+
+from gigabrain_drivers.links.tcp_link import TcpLink
+from gigabrain_zenoh.clock import Clock
+from tests.links_rig import GENEROUS_S, Heard, until
+
+
+def server() -> socket.socket:
+    listening = socket.create_server(("127.0.0.1", 0))
+    listening.settimeout(GENEROUS_S)
+    return listening
+
+
+async def test_tcp_there_and_back_and_again_after_the_peer_is_gone() -> None:
+    with server() as listening:
+        link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=None)
+        heard = Heard(link)
+        link.open()
+        peer, _ = await asyncio.to_thread(listening.accept)
+        await until(lambda: link.connected)
+        assert link.write(b"hello")
+        assert await asyncio.to_thread(peer.recv, 100) == b"hello"
+        peer.close()
+        await until(lambda: heard.lost)
+        peer, _ = await asyncio.to_thread(listening.accept)
+        await until(lambda: link.connected)
+        assert link.reconnects == 1
+        await link.close()
+        peer.close()
+
+
+async def test_a_tcp_peer_that_falls_silent_is_dropped_and_gets_nothing_old() -> None:
+    with server() as listening:
+        link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=100_000_000)
+        heard = Heard(link)
+        link.open()
+        frozen, _ = await asyncio.to_thread(listening.accept)
+        await until(lambda: link.connected)
+        while not heard.lost:
+            link.write(b"old")
+            await asyncio.sleep(0.01)
+        assert "nothing heard for" in heard.lost[0]
+        peer, _ = await asyncio.to_thread(listening.accept)
+        peer.sendall(b"alive")
+        await until(lambda: heard.data)
+        link.write(b"new")
+        assert await asyncio.to_thread(peer.recv, 100) == b"new"
+        await link.close()
+        frozen.close()
+        peer.close()
+
+
+async def test_a_tcp_peer_that_takes_nothing_is_dropped_in_the_middle_of_a_frame() -> None:
+    with server() as listening:
+        link = TcpLink("127.0.0.1", listening.getsockname()[1], Clock(), quiet_ns=None)
+        heard = Heard(link)
+        link.open()
+        peer, _ = await asyncio.to_thread(listening.accept)
+        await until(lambda: link.connected)
+        while link.write(b"x" * 65536):
+            pass
+        assert heard.lost == ["it does not take what is sent to it"]
+        await link.close()
+        peer.close()
+
+
+@pytest.mark.parametrize(
+    ("host", "complaint"), [("127.0.0.1", "nobody listens"), ("no.such.host.invalid", "no host")]
+)
+async def test_a_tcp_port_that_cannot_be_reached_says_so(host: str, complaint: str) -> None:
+    with server() as listening:
+        port = listening.getsockname()[1]
+    link = TcpLink(host, port, Clock())
+    link.open()
+    await until(lambda: complaint in link.problem)
+    await link.close()
