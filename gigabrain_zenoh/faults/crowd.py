@@ -20,7 +20,6 @@ from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.forger import forging
 from gigabrain_zenoh.faults.rig import Rig
 from gigabrain_zenoh.faults.spoiled import HOLE, proxy_to
-from gigabrain_zenoh.faults.stopping import TICK_MS
 from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.percentile import percentile
@@ -107,9 +106,7 @@ async def _filmed(subject: Subject, picture: Image | None) -> tuple[float, list[
             onlooker.bus.publish(IMAGE, picture, name="front")
         puts_ms.append((time.perf_counter() - began_s) * 1e3)
         await asyncio.sleep(PICTURE_S)
-    ticks = [c.tick for c in onlooker.commands if c.boot == start.boot and c.tick > start.tick]
-    periods = sorted((b - a) * TICK_MS for a, b in itertools.pairwise(ticks))
-    return percentile(periods, 0.99) or float("nan"), puts_ms
+    return onlooker.period_ms(start), puts_ms
 
 
 VIEWER = """

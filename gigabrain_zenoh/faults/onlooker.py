@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
+from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import Body, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import DescribeRequest, Description, EnableRequest
@@ -30,6 +31,7 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.faults.fault import Failed
 from gigabrain_zenoh.faults.waiting import PATIENCE_S, until
 from gigabrain_zenoh.gate import BRAIN
+from gigabrain_zenoh.percentile import percentile
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.transport import Close
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
@@ -182,6 +184,16 @@ class Onlooker:
     def moved(self, start: RobotState) -> float:
         """How far the body is now from where it was [m]."""
         return math.dist((start.pose.x, start.pose.y), (self.state.pose.x, self.state.pose.y))
+
+    def period_ms(self, start: RobotState) -> float:
+        """Control's period (p99) since `start`, by the robot's ticks."""
+        ticks = [c.tick for c in self.commands if c.boot == start.boot and c.tick > start.tick]
+        periods = sorted((b - a) * TICK_NS / 1e6 for a, b in itertools.pairwise(ticks))
+        p99_ms = percentile(periods, 0.99)
+        if p99_ms is None:
+            passed = self.state.tick - start.tick
+            raise Failed(f"{len(ticks)} commands were heard within {passed} ticks")
+        return p99_ms
 
     def travel_until_rest(self, start: RobotState) -> float:
         """The path [m] by odometry from `start` until the body first came to rest."""

@@ -2,11 +2,10 @@
 
 import asyncio
 import contextlib
-import itertools
 import os
 import resource
 import socket
-from collections.abc import AsyncIterator, Awaitable
+from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from gigabrain_schemas.topics import (
@@ -22,14 +21,12 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.client import connect
 from gigabrain_zenoh.deployment import client_endpoint
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.faults.fault import Failed, Measured, Skipped
+from gigabrain_zenoh.faults.fault import Measured, Skipped
 from gigabrain_zenoh.faults.intruders import unauthorised_publisher
 from gigabrain_zenoh.faults.rig import Rig
 from gigabrain_zenoh.faults.spoiled import address_of
-from gigabrain_zenoh.faults.stopping import TICK_MS
 from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
-from gigabrain_zenoh.percentile import percentile
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
@@ -124,32 +121,23 @@ async def idle_and_random_connections(rig: Rig) -> Measured:
     where = client_endpoint(subject.deployment)
     host, port = address_of(where)
     pid, loop = subject.pid("router"), asyncio.get_running_loop()
-    calm_ms = await _period_ms(subject, asyncio.sleep(WATCH_S))
+    await subject.drive()
+    start = subject.onlooker.state
+    await asyncio.sleep(WATCH_S)
+    calm_ms = subject.onlooker.period_ms(start)
     async with _idle(host, port):
         began_s = loop.time()
         async with connect(where.connect[0], source="operator"):
             took_s = loop.time() - began_s
     calls = LONG_CALLS if rig.long else CALLS
-    period_ms = await _period_ms(subject, _noise(host, port, calls))
+    start = subject.onlooker.state
+    await _noise(host, port, calls)
+    period_ms = subject.onlooker.period_ms(start)
     return {
         "control period p99 above calm": period_ms - calm_ms,
         "operator connects after": took_s,
         "router deaths": int(subject.supervisor.statuses["router"].pid != pid),
     }
-
-
-async def _period_ms(subject: Subject, meanwhile: Awaitable[None]) -> float:
-    """Control's period (p99) by the robot's ticks."""
-    start = subject.onlooker.state
-    await meanwhile
-    commands = subject.onlooker.commands
-    ticks = [c.tick for c in commands if c.boot == start.boot and c.tick > start.tick]
-    periods = sorted((b - a) * TICK_MS for a, b in itertools.pairwise(ticks))
-    p99_ms = percentile(periods, 0.99)
-    if p99_ms is None:
-        passed = subject.onlooker.state.tick - start.tick
-        raise Failed(f"{len(ticks)} commands were heard within {passed} ticks")
-    return p99_ms
 
 
 async def _noise(host: str, port: int, calls: int) -> None:
