@@ -1,6 +1,9 @@
 """Programs of the host that missions run: started there, ended, and refused."""
 
 import asyncio
+import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -9,7 +12,7 @@ import pytest
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.tasks.executive import Saved
 from gigabrain_zenoh.tasks.mission import Script
-from gigabrain_zenoh.tasks.scripts import Run, Scripts
+from gigabrain_zenoh.tasks.scripts import LEASHED, Run, Scripts
 from gigabrain_zenoh.tasks.store import TaskFile
 from tests.bus_rig import until
 
@@ -64,6 +67,29 @@ async def test_a_program_that_takes_too_long_is_ended_with_all_it_has_started(
     assert await ended(run) == (False, "did not end within 0.5 s and was ended")
     child = int((tmp_path / "child").read_text())
     await until(lambda: _gone(child))
+
+
+async def test_what_a_program_leaves_behind_ends_with_it(tmp_path: Path) -> None:
+    run = Scripts(program(tmp_path, "sleep 600 & echo $!")).start(Script(run="beep"))
+    well, said = await ended(run)
+    assert well
+    await until(lambda: _gone(int(said.rpartition(" ")[2])))
+
+
+async def test_who_leaves_a_programs_group_does_not_hold_its_result_up(tmp_path: Path) -> None:
+    text = "import os, signal; os.setsid(); print(os.getpid()); signal.pause()"
+    wait = "while [ ! -s left ]; do sleep 0.01; done; cat left"
+    lines = f'{sys.executable} -uc "{text}" 2>&1 >left & {wait}'
+    run = Scripts(program(tmp_path, lines)).start(Script(run="beep"))
+    well, said = await ended(run)
+    os.kill(int(said.rpartition(" ")[2]), signal.SIGKILL)
+    assert well
+
+
+def test_a_program_whose_decision_died_before_it_began_ends_at_once() -> None:
+    command = ("/bin/sh", "-c", LEASHED, "sh", "sleep", "600")
+    ran = subprocess.run(command, stdin=subprocess.DEVNULL, start_new_session=True, check=False)
+    assert ran.returncode == -signal.SIGKILL
 
 
 async def test_a_program_does_not_outlive_a_decision_that_is_killed(tmp_path: Path) -> None:

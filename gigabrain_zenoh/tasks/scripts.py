@@ -67,12 +67,13 @@ class Run:
         try:
             path = scripts.path(script.run)
             with _leash() as end:
-                process = await asyncio.create_subprocess_exec(
-                    "/bin/sh", "-c", LEASHED, "sh", path, *script.arguments,
+                program, words = await asyncio.get_running_loop().subprocess_exec(
+                    _Words, "/bin/sh", "-c", LEASHED, "sh", path, *script.arguments,
                     cwd=path.parent, start_new_session=True, stdin=end,
                     stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
                 )  # fmt: skip
-                self.result = await _outcome(process, script.seconds)
+                with contextlib.closing(program):
+                    self.result = await _outcome(program, words, script.seconds)
         except (GigabrainError, OSError, ValueError) as error:
             self.result = False, f"cannot be run: {error}"
 
@@ -88,32 +89,49 @@ def _leash() -> Iterator[int]:
         os.close(ours)
 
 
-async def _outcome(process: asyncio.subprocess.Process, seconds: float) -> tuple[bool, str]:
+class _Words(asyncio.SubprocessProtocol):
+    """The end of what a program writes, and whether more may come."""
+
+    def __init__(self) -> None:
+        self.ended, self.silent = asyncio.Event(), asyncio.Event()
+        self._said = bytearray()
+
+    def __str__(self) -> str:
+        return " ".join(self._said.decode(errors="replace").split())
+
+    def pipe_data_received(self, fd: int, data: bytes) -> None:
+        """It writes."""
+        self._said += data
+        del self._said[:-LAST]
+
+    def pipe_connection_lost(self, fd: int, exc: Exception | None) -> None:
+        """Nobody holds its output any more."""
+        self.silent.set()
+
+    def process_exited(self) -> None:
+        """It has ended; others may write on."""
+        self.ended.set()
+
+
+async def _outcome(
+    program: asyncio.SubprocessTransport, words: _Words, seconds: float
+) -> tuple[bool, str]:
     """Whether a program ended well, and what it said; nothing of its group is left then."""
-    said = bytearray()
-    listening = asyncio.ensure_future(_listen(process, said))
     try:
         async with asyncio.timeout(seconds):
-            code = await process.wait()
+            await words.ended.wait()
     except TimeoutError:
         return False, f"did not end within {seconds:g} s and was ended"
     finally:
         with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        # whoever has left the group may hold its output open for ever
-        await asyncio.wait([listening, asyncio.ensure_future(process.wait())], timeout=LINGER_S)
-        listening.cancel()
-    return code == 0, _in_words(code, " ".join(said.decode(errors="replace").split()))
+            os.killpg(program.get_pid(), signal.SIGKILL)
+        await words.ended.wait()
+        with contextlib.suppress(TimeoutError):  # who has left the group may hold its output on
+            await asyncio.wait_for(words.silent.wait(), LINGER_S)
+    code = program.get_returncode()
+    return code == 0, _in_words(code, str(words))
 
 
-async def _listen(process: asyncio.subprocess.Process, said: bytearray) -> None:
-    """Keep the end of what a program writes."""
-    assert process.stdout
-    while chunk := await process.stdout.read(4096):
-        said += chunk
-        del said[:-LAST]
-
-
-def _in_words(code: int, said: str) -> str:
+def _in_words(code: int | None, said: str) -> str:
     ended = "ended well" if code == 0 else f"ended with exit code {code}"
     return f"{ended}: {said}" if said else ended
