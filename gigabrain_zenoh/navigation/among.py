@@ -21,6 +21,8 @@ QUICK = 1.0  # [m/s], a body that can go faster is quick
 MOVES_QUICKLY = 0.3  # [m/s]
 HORIZON_S = 2.0  # of its plans
 LOOKS_S = 0.6  # before it first drives off: so long it takes to tell what moves
+SIZES_UP_S = 4.0  # instead, where there is traffic: so long it takes to tell where
+AWAY_M = 1.25  # what comes nearer meanwhile it makes way for
 GROWS_S = 0.5  # how long what is known of a thing fades
 TOUCHED_DISC = 200.0  # what a contact with a moving thing costs
 DECAYS = 4.0  # times the way over which the cost of being near decays; farther off is nothing
@@ -36,6 +38,15 @@ def moving_quickly(discs: Floats) -> Floats:
     """Those of the `discs` (m, 6), their velocity x, y [m/s] third and fourth, that are quick."""
     found: Floats = discs[np.hypot(discs[:, 2], discs[:, 3]) > MOVES_QUICKLY]
     return found
+
+
+def keep_away(discs: Floats, x: float, y: float) -> bool:
+    """Whether none of the `discs` (m, 6) comes near (x, y) [m] while somebody there looks round."""
+    dx, dy, vx, vy = discs[:, 0] - x, discs[:, 1] - y, discs[:, 2], discs[:, 3]
+    nearest = -(dx * vx + dy * vy) / np.maximum(vx * vx + vy * vy, 1e-9)
+    when = np.clip(nearest, 0.0, HORIZON_S)
+    away = np.hypot(dx + vx * when, dy + vy * when) - discs[:, 4]
+    return bool((away > AWAY_M).all())
 
 
 @lean_kernel

@@ -1,12 +1,13 @@
 """How costly the way to the goal is from every place in the window."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.kernels import kernel
-from gigabrain_zenoh.navigation.footprint import Grid
+from gigabrain_zenoh.navigation.footprint import Grid, between
 
 COARSER = 2  # cells of the window per cell of the field, along each axis
 FARTHEST = 1e4  # [m], what cannot be reached
@@ -26,6 +27,13 @@ Singles = NDArray[np.float32]
 Units = NDArray[np.int32]
 
 
+class Ways(NamedTuple):
+    """What passes round the robot makes of the ways there, on a coarse grid that goes farther."""
+
+    price: Grid  # of a metre, 1 where nothing passes
+    field: Grid  # cost to go [m of free way]
+
+
 class CostToGo:
     """The cheapest ways over the window, 8-connected, with buffers that are used again."""
 
@@ -37,38 +45,49 @@ class CostToGo:
         self._spans = np.empty((3, side + 2), dtype=np.int32)
 
     def field(
-        self, grid: Grid, half_width: float, goal: tuple[float, float], path: Floats | None
-    ) -> Grid:
+        self, grid: Grid, half_width: float, goal: tuple[float, float], path: Floats | None,
+        ways: Ways | None = None,
+    ) -> Grid:  # fmt: skip
         """Cost from each place to the goal [m of free way], or to where the path leaves the window.
 
-        Without a path, and with the goal outside, every place at the rim counts on free way beyond.
+        Without a path, and with the goal outside, every place at the rim counts on free way beyond,
+        or on what the `ways` there cost.
         """
         cell = grid.cell * COARSER
         _price(grid.distance, np.float32(half_width), np.float32(cell / 2.0 / UNIT), self._halves)
         self._padded.fill(round(FARTHEST / UNIT))
-        _seed(self._padded[:, 1:-1], cell, (grid.x, grid.y), goal, path)
-        _sweep(self._halves, self._padded, self._spans)
+        inner = self._padded[:, 1:-1]
+        found = seed(inner, cell, (grid.x, grid.y), goal, path)
+        if ways is not None:
+            _make_dearer(self._halves, cell, grid.x - ways.price.x, grid.y - ways.price.y, ways)
+            if not found:
+                _seed_rim(inner, cell, grid.x - ways.price.x, grid.y - ways.price.y, ways)
+        sweep(self._halves, self._padded, self._spans)
         np.multiply(self._padded[:, 1:-1], np.float32(UNIT), out=self._field, casting="unsafe")
         return Grid(self._field, cell, grid.x, grid.y)
 
 
-def _seed(
-    seed: Units, cell: float, corner: tuple[float, float], goal: tuple[float, float],
+def seed(
+    known: Units, cell: float, corner: tuple[float, float], goal: tuple[float, float],
     path: Floats | None,
-) -> None:  # fmt: skip
-    """Put what is known from the start into `seed` (side, side), in units; elsewhere stays."""
-    side = len(seed)
+) -> bool:  # fmt: skip
+    """Put what is known from the start into `known` (side, side), in units; elsewhere stays.
+
+    Whether the goal, or a part of the path, is inside.
+    """
+    side = len(known)
     points = np.array([goal]) if path is None else path
     cells = np.floor((points - corner) / cell).astype(np.int64)
     inside = np.asarray(((cells >= 1) & (cells < side - 1)).all(axis=1))
     if inside.any():
         last = _way_out(points, inside, np.add(corner, side * cell / 2))
         column, row = cells[last]
-        seed[row, column] = 0
-        return
+        known[row, column] = 0
+        return True
     x, y = (np.add.outer(corner, (np.arange(side) + 0.5) * cell).T - points[-1]).T
     for end in (0, -1):
-        seed[end], seed[:, end] = np.hypot(x, y[end]) / UNIT, np.hypot(x[end], y) / UNIT
+        known[end], known[:, end] = np.hypot(x, y[end]) / UNIT, np.hypot(x[end], y) / UNIT
+    return False
 
 
 def _way_out(points: Floats, inside: NDArray[np.bool_], robot: Floats) -> int:
@@ -109,7 +128,30 @@ def _price(distance: Singles, half_width: np.float32, half: np.float32, halves: 
 
 
 @kernel
-def _sweep(halves: Units, field: Units, spans: Units) -> None:
+def _make_dearer(halves: Units, cell: float, x: float, y: float, ways: Ways) -> None:
+    """Multiply `halves` by what a metre costs there, (x, y) [m] from the corner of the `ways`."""
+    price, per_cell = ways.price.distance, 1.0 / ways.price.cell
+    for i in range(halves.shape[1]):
+        for j in range(halves.shape[1]):
+            u, v = (x + (j + 0.5) * cell) * per_cell - 0.5, (y + (i + 0.5) * cell) * per_cell - 0.5
+            times = between(price, u, v)
+            halves[0, i, j + 1] = np.int32(halves[0, i, j + 1] * times)
+            halves[1, i, j + 1] = np.int32(halves[1, i, j + 1] * times)
+
+
+@kernel
+def _seed_rim(known: Units, cell: float, x: float, y: float, ways: Ways) -> None:
+    """Put what is to go from the rim into `known`, (x, y) [m] from the corner of the `ways`."""
+    field, per_cell, side = ways.field.distance, 1.0 / ways.field.cell, len(known)
+    for i in range(side):
+        step = 1 if i in (0, side - 1) else side - 1
+        for j in range(0, side, step):
+            u, v = (x + (j + 0.5) * cell) * per_cell - 0.5, (y + (i + 0.5) * cell) * per_cell - 0.5
+            known[i, j] = np.int32(between(field, u, v) / UNIT)
+
+
+@kernel
+def sweep(halves: Units, field: Units, spans: Units) -> None:
     """Lower `field` until each cell is as cheap as by any of its eight neighbours.
 
     The edge between two costs its length times the mean of their costs. Row by row, down and up,

@@ -1,6 +1,7 @@
 """The local planner: from what is near now to the motion of the next seconds."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +9,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Obstacle, TrajectoryPoint
-from gigabrain_zenoh.navigation import among
+from gigabrain_zenoh.navigation import among, traffic
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import clearance, outline_of
 from gigabrain_zenoh.navigation.manner import kind_of, reason_of
@@ -31,6 +32,7 @@ SURE = 3.0  # standard deviations of its velocity that a thing must be faster th
 UNSURE = 0.05  # [m/s], standard deviation of a velocity that comes without
 MOST_GROWTH = 0.3  # [m/s], of a disc: how fast what is known of it fades at most
 IN_PLACE = 0.3  # [m], who gets no farther than this is in one place
+MAKES_WAY = "making way: it looks round for what moves"
 SLOW = 0.05  # share of the largest speeds at which a body has arrived
 
 
@@ -49,7 +51,11 @@ class LocalPlanner:
             self._model, settings.samples, settings.steps, step_of(self._model), settings.seed
         )
         self._weights = Weights()
-        self._looks = among.LOOKS_S if among.is_quick(self._model) else 0.0
+        sight = body.lidar.range_max if body.lidar else 0.0
+        quick = among.is_quick(self._model)
+        self._traffic = (
+            traffic.Traffic(2.0 * self._half_width, self._model.forward, sight) if quick else None
+        )
         self.reset()
 
     def reset(self) -> None:
@@ -57,6 +63,8 @@ class LocalPlanner:
         self._window = Window(self._settings.window, self._settings.memory)
         self._costs = CostToGo(self._window.cells)
         self._sampler.forget()
+        if self._traffic:
+            self._traffic.reset()
         self._tick: int | None = None
         self._began = 0
         self._anchor, self._anchor_tick = Pose(x=0.0, y=0.0, yaw=0.0), 0
@@ -72,11 +80,14 @@ class LocalPlanner:
         hits = np.ascontiguousarray(moment.hits, dtype=np.float64)
         self._window.see(moment.tick, place, self._lidar, hits)
         discs = self._window.moving(moment.tick, discs)
-        weights = self._look_out(moment.tick, discs)
+        weights = self._look_out(moment.tick, place, discs)
         if self._arrived(moment):
             return _standing("arrived: at the goal", arrived=True)
-        if (moment.tick - self._began) * TICK_S < self._looks:
-            return _standing("waiting: it looks round for what moves")
+        looks_round = self._looks_round(moment.tick)
+        if looks_round:
+            if weights is self._weights or among.keep_away(discs, place.x, place.y):
+                return _standing("waiting: it looks round for what moves")
+            moment = replace(moment, goal=Goal(x=place.x, y=place.y), path=None)
         scene = self._scene(moment, discs)
         model = slowed(self._model, moment.delayed)
         planned = self._sampler.plan(
@@ -86,11 +97,14 @@ class LocalPlanner:
             scene,
             self._start(moment, place),
         )
-        return self._answer(moment, scene, planned)
+        answer = self._answer(moment, scene, planned)
+        return replace(answer, reason=MAKES_WAY) if looks_round else answer
 
-    def _look_out(self, tick: int, discs: Floats) -> Weights:
+    def _look_out(self, tick: int, place: Place, discs: Floats) -> Weights:
         """Get ready for what moves: a quick body among quick things plans in another way."""
-        quick = among.moving_quickly(discs) if among.is_quick(self._model) else discs[:0]
+        quick = among.moving_quickly(discs) if self._traffic else discs[:0]
+        if self._traffic:
+            self._traffic.see(tick, place.x, place.y, quick)
         if not len(quick):
             self._sampler.step_by(step_of(self._model))
             return self._weights
@@ -98,10 +112,18 @@ class LocalPlanner:
         self._sampler.step_by(among.HORIZON_S / self._settings.steps)
         return among.WEIGHTS
 
+    def _looks_round(self, tick: int) -> bool:
+        """Whether a quick body has yet to see what moves, and where, before it drives off."""
+        if not self._traffic:
+            return False
+        looks = among.SIZES_UP_S if self._traffic.any else among.LOOKS_S
+        return (tick - self._began) * TICK_S < looks
+
     def _scene(self, moment: Moment, discs: Floats) -> Scene:
         goal = moment.goal
         grid = self._window.grid(moment.tick, moment.known, discs)
-        field = self._costs.field(grid, self._half_width, (goal.x, goal.y), moment.path)
+        ways = self._traffic.ways((goal.x, goal.y)) if self._traffic else None
+        field = self._costs.field(grid, self._half_width, (goal.x, goal.y), moment.path, ways)
         yaw = math.nan if goal.yaw is None else goal.yaw
         near, turned = self._settings.position_tolerance, self._settings.yaw_tolerance
         return Scene(grid, field, discs, goal.x, goal.y, yaw, near, turned)
@@ -210,6 +232,7 @@ def _growth(obstacle: Obstacle) -> float:
 
 def warm_up(body: BodyDescription) -> None:
     """Compile all that a driving robot will call, with `body`'s own shapes."""
+    traffic.warm_up()
     goal, here = Goal(x=0.5, y=0.0), Pose(x=0.0, y=0.0, yaw=0.0)
     planner = LocalPlanner(body, LocalSettings(samples=64, steps=10, window=2.0))
     for tick, x in ((1, 0.9), (51, 0.7)):  # once it has looked round

@@ -1,0 +1,164 @@
+"""Where quick things pass: ways beside are better, if they are not much longer."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.brain import Obstacle
+from gigabrain_zenoh.bench.barn_drive import drive
+from gigabrain_zenoh.bench.barn_worlds import Moving, World
+from gigabrain_zenoh.bench.plant import HARD, JACKAL
+from gigabrain_zenoh.navigation import among, cost_to_go, local, traffic
+from gigabrain_zenoh.navigation.cost_to_go import CostToGo
+from gigabrain_zenoh.navigation.footprint import distance_at
+from gigabrain_zenoh.navigation.local import Goal, LocalPlan, LocalPlanner, LocalSettings, Moment
+from gigabrain_zenoh.navigation.traffic import EVERY_TICKS, Traffic
+from gigabrain_zenoh.navigation.window import Place, Window
+from gigabrain_zenoh.steering import ANY_BODY
+
+NOTHING = np.empty((0, 2))
+NOBODY = np.empty((0, 6))
+GOAL = (12.0, 0.0)
+
+
+def crossing(seconds: float, speed: float) -> Traffic:
+    """What a body of 2 m/s sees of discs that go along x = 5 from y = -4 to 4 m, 2 m apart."""
+    traffic = Traffic(0.4, 2.0, 10.0)
+    for tick in range(1, round(seconds * 50), 2):
+        ys = [(speed * 0.02 * tick + k * 2.0) % 8.0 - 4.0 for k in range(4)]
+        discs = np.array([(5.0, y, 0.0, speed, 0.5, 0.0) for y in ys])
+        traffic.see(tick, 0.0, 0.0, discs)
+    return traffic
+
+
+def test_where_nothing_quick_was_seen_ways_cost_what_they_are_long() -> None:
+    traffic = Traffic(0.4, 2.0, 10.0)
+    traffic.see(1, 0.0, 0.0, NOBODY)
+    traffic.see(3, 0.0, 0.0, NOBODY)
+    assert traffic.ways(GOAL) is None
+
+
+def test_what_is_compiled_before_it_drives_is_all_that_it_will_call() -> None:
+    local.warm_up(ANY_BODY)
+    kernels: list[Any] = [traffic._watch, traffic._pass]
+    kernels += [cost_to_go._make_dearer, cost_to_go._seed_rim]
+    before = [len(kernel.signatures) for kernel in kernels]
+    drive(crowd(), 0, HARD, 64)
+    assert [len(kernel.signatures) for kernel in kernels] == before
+    assert 0 not in before
+
+
+def test_a_metre_where_quick_things_pass_costs_more_than_one_beside() -> None:
+    ways = crossing(2.0, 1.7).ways(GOAL)
+    assert ways is not None
+    there, beside = (distance_at(ways.price, *at) for at in ((5.0, 0.0), (5.0, -9.0)))
+    assert there > 4.0
+    assert beside == pytest.approx(1.0)
+    assert 12.5 < distance_at(ways.field, 0.0, 0.0) < 2 * math.hypot(6.0, 8.0)  # round it
+    assert distance_at(ways.field, 8.5, 0.0) == pytest.approx(3.5, abs=0.4)
+
+
+def test_what_is_faster_costs_more_and_what_can_be_dodged_nothing() -> None:
+    dear, cheap = crossing(2.0, 1.8).ways(GOAL), crossing(2.0, 1.55).ways(GOAL)
+    assert dear
+    assert cheap
+    there = [distance_at(ways.price, 5.0, 0.0) - 1.0 for ways in (dear, cheap)]
+    assert there[0] == pytest.approx(4.0 * there[1], rel=0.1)
+    assert crossing(2.0, 1.2).ways(GOAL) is None
+
+
+def test_it_fades_and_is_forgotten() -> None:
+    traffic = crossing(1.0, 1.7)
+    dearest = [price_of(traffic)]
+    for minute in range(5):
+        for tick in range(51 + 3000 * minute, 51 + 3000 * (minute + 1), EVERY_TICKS):
+            traffic.see(tick, 0.0, 0.0, NOBODY)
+            traffic.ways(GOAL)
+        dearest.append(price_of(traffic))
+    assert dearest[0] > 4.0
+    assert dearest[1] < 1.5
+    assert traffic.ways(GOAL) is None
+
+
+def price_of(traffic: Traffic) -> float:
+    ways = traffic.ways(GOAL)
+    return float(ways.price.distance.max()) if ways else 1.0
+
+
+@pytest.mark.parametrize("to", [(9.0, 0.0), (-8.0, 7.0), (500.0, 0.0)])
+def test_it_stays_where_it_was_when_the_robot_goes_on(to: tuple[float, float]) -> None:
+    traffic = crossing(2.0, 1.7)
+    before = traffic.ways(GOAL)
+    for tick in range(101, 105 + EVERY_TICKS, 2):
+        traffic.see(tick, *to, NOBODY)
+    after = traffic.ways(GOAL)
+    assert before
+    if to[0] > 100.0:
+        assert after is None
+        return
+    assert after
+    for at in ((5.0, 0.0), (5.0, 3.0), (0.0, -6.0)):
+        assert distance_at(after.price, *at) == pytest.approx(
+            distance_at(before.price, *at), rel=0.2
+        )
+
+
+def test_the_local_field_leads_round_what_it_cannot_see_the_end_of() -> None:
+    window = Window(8.0, 10.0)
+    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    grid, costs = window.grid(1, NOTHING, NOBODY), CostToGo(window.cells)
+    traffic = crossing(2.0, 1.7)
+    plain = costs.field(grid, 0.2, GOAL, None)
+    ahead, aside = ((3.0, 0.0), (2.0, -3.5))
+    assert distance_at(plain, *ahead) < distance_at(plain, *aside)
+    dear = costs.field(grid, 0.2, GOAL, None, traffic.ways(GOAL))
+    assert distance_at(dear, *ahead) > distance_at(dear, *aside) + 1.0
+
+
+def looks(discs: tuple[Obstacle, ...], seconds: float) -> LocalPlan:
+    """What a Jackal plans so long after it was sent somewhere."""
+    planner = LocalPlanner(JACKAL, LocalSettings(samples=128, window=6.0))
+    for tick in (1, 1 + round(seconds / 0.02)):
+        moment = Moment(
+            tick=tick,
+            pose=Pose(x=0.0, y=0.0, yaw=0.0),
+            velocity=Velocity(),
+            goal=Goal(x=12.0, y=0.0),
+            hits=NOTHING,
+            obstacles=discs,
+        )
+        plan = planner.plan(moment)
+    return plan
+
+
+def test_where_things_move_it_looks_longer_and_makes_way_for_what_comes() -> None:
+    far = Obstacle(id=1, x=6.0, y=0.0, velocity_y=1.5, radius=0.5)
+    coming = Obstacle(id=2, x=3.0, y=0.0, velocity_x=-1.5, radius=0.5)
+    wait = "waiting: it looks round for what moves"
+    assert looks((), 1.0).reason != wait
+    assert looks((far,), 1.0).reason == wait
+    assert looks((far,), among.SIZES_UP_S).reason != wait
+    makes_way = looks((far, coming), 1.0)
+    assert makes_way.reason == "making way: it looks round for what moves"
+    assert math.hypot(makes_way.trajectory[-1].x, makes_way.trajectory[-1].y) < 3.0
+
+
+def crowd() -> World:
+    """Ten discs that go to and fro between a Jackal and its goal."""
+    rows = [3.0 + 1.5 * i for i in range(5)]
+    times = np.array([0.0, 4.0, 8.0])
+    movers = tuple(
+        Moving(8.0, np.column_stack((times, np.full(3, x), s * np.array([3.4, -3.4, 3.4]))), 0.5)
+        for k, x in enumerate(rows)
+        for s in ((1.0, -1.0) if k % 2 else (-1.0, 1.0))
+    )
+    return World(3, np.empty((0, 3)), movers, (0.0, 0.0, 0.0), (13.0, 0.0), 13.0)
+
+
+def test_it_goes_round_a_crowd() -> None:
+    trial = drive(crowd(), 0, HARD, 200)
+    assert trial.result == "success"
+    assert trial.least_clearance > 0.3
