@@ -41,8 +41,9 @@ JACKAL = BodyDescription(
     max_angular_acceleration=ANGULAR_ACCELERATION,
     lidar=LIDAR,
     # from a scan to its brake: till the next, a tick on the bus, the hard plant's delay and most of
-    # its lag, of which a body that brakes from a low speed feels the less
-    thresholds=Thresholds(reaction_time=0.26),
+    # its lag, of which a body that brakes from a low speed feels the less; and told to stop at
+    # 2 m/s in a turn it goes on for 0.65 s until delay and lag are over
+    thresholds=Thresholds(reaction_time=0.26, follow_sustain=0.5),
 )
 
 
