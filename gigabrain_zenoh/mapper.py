@@ -86,6 +86,7 @@ class Mapper:
         self._shown: OccupancyGrid | None = None
         self._shown_tick = 0
         self._said, self._left_out = "", ""
+        self._early = False  # a first scan has come without its odometry
         self._took_ms = Newest(TIMED)
         self._saving = asyncio.Lock()  # two at once would write into each other's files
         bus.serve(MAP_SAVE, self._save)
@@ -97,7 +98,10 @@ class Mapper:
             self._leave_out(problem)
             return
         moment = self._fusion.at(scan.basis) if scan.boot == self._boot else None
-        if moment is None or (self._last and moment.tick <= self._last.tick):
+        if moment is None and self._last is None and not self._early:
+            self._early = True  # its odometry went by before this process could hear it
+            self._bus.counters["scans_left_out"] += 1
+        elif moment is None or (self._last and moment.tick <= self._last.tick):
             self._leave_out("there is no odometry for its tick")
         else:
             self._take(scan, moment)
@@ -124,6 +128,7 @@ class Mapper:
         if self._boot:
             self._chart.lose("the driver has started anew")
         self._boot, self._fusion, self._last, self._shown = boot, Fusion(), None, None
+        self._early = False
 
     def _take(self, scan: LaserScan, moment: Moment) -> None:
         body = self._bodies.current

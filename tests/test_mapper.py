@@ -102,6 +102,21 @@ async def test_bad_scans_are_left_out_and_told_once(caplog: pytest.LogCaptureFix
     ]
 
 
+@pytest.mark.parametrize(("early", "told"), [(1, 0), (2, 1)])
+async def test_one_scan_may_come_before_its_odometry(
+    early: int, told: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.tick += 5
+        robot.send(STATE, state(robot.tick + 1, pose=(0.0, 0.0, 0.0)))
+        for _ in range(early):
+            robot.send(SCAN, robot.scan())
+        robot.drive(2)
+        assert robot.bus.counters["scans_left_out"] == early
+    assert len([r for r in caplog.records if "no odometry for its tick" in r.message]) == told
+
+
 async def test_a_jump_of_the_odometry_is_told_and_the_robot_found_again(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
