@@ -34,8 +34,9 @@ lint: setup
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
+# a file stays in one process: its robots are shared; the longest goes first (tests/conftest.py)
 unit: setup
-	$(BIN)/pytest -n 2 --dist loadfile $(ARGS)  # a file stays in one process: its robots are shared
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 bench: setup
 	$(BIN)/gigabrain bench chain
