@@ -34,9 +34,8 @@ lint: setup
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-# a file stays in one process: its robots are shared; the longest goes first (tests/conftest.py)
 unit: setup
-	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(BIN)/pytest -n 2 --dist loadfile $(ARGS)  # a file stays in one process: its robots are shared
 
 bench: setup
 	$(BIN)/gigabrain bench chain

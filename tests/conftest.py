@@ -15,8 +15,6 @@ from tests.stack import PATIENCE_S, Home
 settings.register_profile("gigabrain", deadline=None)
 settings.load_profile("gigabrain")
 
-LONGEST = "test_fault_suite.py"
-
 
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
     """One test; again where it failed and the machine stood still meanwhile."""
@@ -25,11 +23,6 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
         item.ihook.pytest_runtest_logreport(report=report)
     item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
     return True
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest file first: begun last, one process would wait for the other for minutes."""
-    items.sort(key=lambda item: item.path.name != LONGEST)
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
