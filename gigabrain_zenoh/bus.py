@@ -115,24 +115,16 @@ class Bus:
 
         guarded = self._guard(receive)
         ends = self._transport.subscribe(pattern, guarded, topic.depth)
-        self.listens.append(pattern)
         if topic.keep and not topic.many:
             self._fetch(topic, guarded)
-
-        def close() -> None:
-            ends()
-            if pattern in self.listens:
-                self.listens.remove(pattern)
-
-        return close
+        return self._listening(pattern, ends)
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
         """Call `on_raw(key, encoding, payload)` for all on `pattern`, valid or not, in any thread.
 
         Returns the function that ends it.
         """
-        self.listens.append(pattern)
-        return self._transport.tap(pattern, on_raw)
+        return self._listening(pattern, self._transport.tap(pattern, on_raw))
 
     async def kept(self, topic: Topic[Any]) -> list[bytes]:
         """What those who keep the last value of `topic` hold now."""
@@ -191,6 +183,20 @@ class Bus:
         for task in self._fetching:
             task.cancel()
         await self._transport.close()
+
+    def _listening(self, pattern: str, ends: Close) -> Close:
+        """Note that somebody listens; the returned function ends that, any number of times."""
+        self.listens.append(pattern)
+        over = False
+
+        def close() -> None:
+            nonlocal over
+            if not over:
+                over = True
+                ends()
+                self.listens.remove(pattern)
+
+        return close
 
     def _guard(self, receive: OnSample) -> OnSample:
         """A fault in a node ends its process: `failed` carries it to whoever runs the node."""

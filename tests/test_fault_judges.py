@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.topics import STATE
+from gigabrain_schemas.topics import BODY, CMD_VEL, STATE
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.faults import clock
@@ -22,7 +22,8 @@ from gigabrain_zenoh.faults.onlooker import Onlooker
 from gigabrain_zenoh.faults.smooth import stops, stops_in_time
 from gigabrain_zenoh.faults.stopping import first_zero
 from gigabrain_zenoh.transport import LocalNetwork
-from tests.brain_rig import BOOT, DRIVING, state
+from tests.brain_rig import BOOT, DRIVING, body, state
+from tests.bus_rig import settle
 
 MB = 1_000_000
 
@@ -94,6 +95,22 @@ def drive(modes: Sequence[str], commanded: Sequence[int]) -> Onlooker:
         onlooker.commands.append(CmdVel(linear_x=0.2, source="control", boot=BOOT, tick=tick))
         onlooker.arrivals.append(tick)
     return onlooker
+
+
+async def test_who_looks_on_hears_commands_again_whoever_else_listens_to_them() -> None:
+    network = LocalNetwork()
+    onlooker = Onlooker(Bus(network.transport(), Clock(), "suite"))
+    robot = Bus(network.transport(), Clock(), "robot")
+    for deaf in (False, True, False):
+        end = onlooker.bus.tap(CMD_VEL.key, lambda *_: None)  # as the soak counts what comes
+        onlooker.deafen(deaf)
+        robot.publish(BODY, body())
+        await settle()
+        robot.publish(CMD_VEL, CmdVel(linear_x=0.2, source="control"))
+        await settle()
+        end()
+    assert len(onlooker.commands) == 2
+    assert onlooker.bus.listens.count(CMD_VEL.key) == 1
 
 
 @pytest.mark.parametrize(("seen", "zero"), [(20, 20), (21, 20), (22, 20), (23, 21), (40, 31)])

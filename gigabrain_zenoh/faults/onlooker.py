@@ -69,8 +69,8 @@ class Onlooker:
         self.health[health.process] = health
 
     def _join(self, body: Body) -> None:
-        topic = command_topic(body.description)
-        if topic.key not in self.bus.listens and not self._deaf:
+        if self._end_hearing is None and not self._deaf:
+            topic = command_topic(body.description)
             self._end_hearing = self.bus.subscribe(topic, self._obey)
 
     def deafen(self, deaf: bool) -> None:
@@ -81,6 +81,7 @@ class Onlooker:
         self._deaf = deaf
         if deaf and self._end_hearing:
             self._end_hearing()
+            self._end_hearing = None
 
     def _obey(self, _key: str, command: CmdVel) -> None:
         if command.source == BRAIN:
