@@ -29,9 +29,10 @@ from gigabrain_zenoh.journal import SaidJournal
 from gigabrain_zenoh.meeting import join
 from gigabrain_zenoh.param_service import serve_params
 from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.scheduling import go_first, step_aside
 from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.transport import Transport
-from gigabrain_zenoh.unobtrusive import NAP_S, step_aside
+from gigabrain_zenoh.unobtrusive import NAP_S
 
 log = logging.getLogger("gigabrain")
 
@@ -49,26 +50,37 @@ class Program:
 
     run: str
     settings: str = ""
+    stops: bool = False  # commands and stops go through it: it goes before others where it may
     repeats: bool = False  # it can be replayed, and says what it goes by
     looks_on: bool = False  # the robot does without it: it naps, and lets the others go first
 
 
 PROGRAMS = {
-    "router": Program("gigabrain_zenoh.router:run", "gigabrain_zenoh.settings:RouterConfig"),
-    "relay": Program("gigabrain_zenoh.relay:run", "gigabrain_zenoh.settings:RelayConfig"),
-    "driver": Program("gigabrain_drivers.process:run", "gigabrain_zenoh.settings:DriverConfig"),
-    "emulator": Program(
-        "gigabrain_drivers.emulators.process:run", "gigabrain_zenoh.settings:EmulatorConfig"
+    "router": Program(
+        "gigabrain_zenoh.router:run", "gigabrain_zenoh.settings:RouterConfig", stops=True
     ),
-    "button": Program("gigabrain_drivers.button:run", "gigabrain_zenoh.settings:ButtonConfig"),
+    "relay": Program(
+        "gigabrain_zenoh.relay:run", "gigabrain_zenoh.settings:RelayConfig", stops=True
+    ),
+    "driver": Program(
+        "gigabrain_drivers.process:run", "gigabrain_zenoh.settings:DriverConfig", stops=True
+    ),
+    "emulator": Program(
+        "gigabrain_drivers.emulators.process:run",
+        "gigabrain_zenoh.settings:EmulatorConfig",
+        stops=True,
+    ),
+    "button": Program(
+        "gigabrain_drivers.button:run", "gigabrain_zenoh.settings:ButtonConfig", stops=True
+    ),
     "perception": Program(
         "gigabrain_zenoh.perception:run", "gigabrain_zenoh.settings:PerceptionConfig", repeats=True
     ),
     "decision": Program(
         "gigabrain_zenoh.decision:run", "gigabrain_zenoh.settings:DecisionConfig", repeats=True
     ),
-    "control": Program("gigabrain_zenoh.control:run", repeats=True),
-    "safety": Program("gigabrain_zenoh.safety:run", repeats=True),
+    "control": Program("gigabrain_zenoh.control:run", stops=True, repeats=True),
+    "safety": Program("gigabrain_zenoh.safety:run", stops=True, repeats=True),
     "recorder": Program(
         "gigabrain_zenoh.recording.node:run",
         "gigabrain_zenoh.settings:RecorderConfig",
@@ -118,8 +130,10 @@ def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
         run_dir = Path(config.run_dir) if config.run_dir else None
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
         node = node_of(config)
+        if PROGRAMS[config.name].stops:
+            go_first()  # this and the next before there are threads, which inherit it
         if PROGRAMS[config.name].looks_on:
-            step_aside()  # before there are threads, which inherit it
+            step_aside()
         with asyncio.Runner(loop_factory=loop_factory()) as runner:
             runner.run(_run(config, node, make_bus))
     except GigabrainError as error:

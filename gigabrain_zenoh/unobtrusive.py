@@ -1,11 +1,9 @@
-"""How those who only look on disturb the robot least: few wake-ups, and no haste.
+"""How those who only look on disturb the robot least: few wake-ups.
 
 A thread that wakes for each message does so with cold caches, which costs more than the message
 itself, and takes the processor from the robot three hundred times a second.
 """
 
-import contextlib
-import os
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -44,14 +42,3 @@ class Nap:
             self._done_s = self._now_s()
 
         return take_and_nap
-
-
-def step_aside() -> None:
-    """Have this thread, and those that it starts, wait where they would push others aside.
-
-    Linux's SCHED_BATCH needs no rights and takes nothing of a process's share: what wakes up does
-    not interrupt what runs (sched(7)).
-    """
-    if hasattr(os, "SCHED_BATCH"):
-        with contextlib.suppress(OSError):  # a container may forbid it
-            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

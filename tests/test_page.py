@@ -63,6 +63,16 @@ async def turning(seen: Onlooker) -> None:
     await until(lambda: seen.state.velocity.angular_z > 0.3, "turning as told")
 
 
+async def hold_left(page: Page) -> None:
+    """Press the joystick and push it to the left."""
+    stick = page.locator("#stick")
+    await stick.hover()  # in its middle, once it stays where it is
+    await page.mouse.down()
+    box = await stick.bounding_box()
+    assert box
+    await page.mouse.move(box["x"], box["y"] + box["height"] / 2)
+
+
 async def test_a_held_key_drives_and_letting_go_stops(chromium: Browser, seen: Onlooker) -> None:
     page = await chromium.open()
     await ready_to_drive(page)
@@ -172,11 +182,53 @@ async def test_on_a_phone_nothing_is_cut_off_and_the_joystick_drives(
     await ready_to_drive(page)
     await page.locator("#stick").scroll_into_view_if_needed()
     await page.evaluate("scrollBy(0, 150)")
-    await page.locator("#stick").hover()  # in its middle, once it stays where it is
-    await page.mouse.down()
-    stick = await page.locator("#stick").bounding_box()
-    assert stick
-    await page.mouse.move(stick["x"], stick["y"] + stick["height"] / 2)
+    await hold_left(page)
+    await turning(seen)
+    await page.mouse.up()
+    await seen.still()
+
+
+async def test_a_joystick_pressed_while_the_robot_stops_for_a_moment_steers_when_it_goes_on(
+    chromium: Browser, seen: Onlooker
+) -> None:
+    page = await chromium.open()
+    await ready_to_drive(page)
+    pid = await seen.pid("control")
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        await page.wait_for_selector(f"#gate:not({ENABLED.removeprefix('#gate')})")
+        await hold_left(page)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    await turning(seen)
+    await page.mouse.up()
+    await seen.still()
+
+
+async def test_what_was_held_when_the_robot_was_latched_has_to_be_pressed_anew(
+    chromium: Browser, seen: Onlooker
+) -> None:
+    page, other = await chromium.open(), await chromium.open()
+    await ready_to_drive(other)
+    await page.bring_to_front()
+    await page.keyboard.press("Space")
+    await page.wait_for_selector("#gate[data-mode=latched]")
+    for hold, let_go in (
+        (lambda: hold_left(page), page.mouse.up),
+        (lambda: page.keyboard.down("a"), lambda: page.keyboard.up("a")),
+    ):
+        await hold()
+        await page.wait_for_timeout(200)  # some moments come in
+        await ready_to_drive(other)
+        await page.wait_for_selector(ENABLED)
+        await seen.ticks(25)
+        assert seen.state.velocity.angular_z < 0.3
+        assert "viewer" not in await text(page, "doing")
+        await let_go()
+        await page.keyboard.press("Space")
+        await page.wait_for_selector("#gate[data-mode=latched]")
+    await ready_to_drive(page)
+    await hold_left(page)
     await turning(seen)
     await page.mouse.up()
     await seen.still()

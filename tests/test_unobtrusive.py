@@ -1,12 +1,6 @@
-"""Those who only look on wake seldom, and push nobody aside."""
+"""Those who only look on wake seldom."""
 
-import os
-
-import pytest
-
-from gigabrain_zenoh.process import PROGRAMS
-from gigabrain_zenoh.unobtrusive import Nap, step_aside
-from tests.bus_rig import in_thread
+from gigabrain_zenoh.unobtrusive import Nap
 
 
 class Thread:
@@ -54,22 +48,3 @@ def test_320_messages_a_second_wake_the_thread_50_times() -> None:
         wakes += waits > 0
         thread.receive("one", after_s=waits)
     assert len(thread.slept_s) + wakes == 50  # of each 13 messages, one; and the end of its nap
-
-
-@pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="only Linux has it")
-def test_whoever_steps_aside_does_so_for_all_threads_that_it_starts() -> None:
-    found = []
-
-    def work() -> None:
-        step_aside()
-        in_thread(lambda: found.append(os.sched_getscheduler(0))).join()
-
-    before = os.sched_getscheduler(0)
-    in_thread(work).join()
-    assert found == [os.SCHED_BATCH]
-    assert os.sched_getscheduler(0) == before
-
-
-def test_only_those_without_whom_the_robot_drives_look_on() -> None:
-    looks_on = {name for name, program in PROGRAMS.items() if program.looks_on}
-    assert looks_on == {"recorder", "page", "foxglove"}

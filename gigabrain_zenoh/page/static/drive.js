@@ -89,7 +89,6 @@ export class Drive {
       this.#tick()
     }
     this.stick.addEventListener('pointerdown', (event) => {
-      if (!this.allowed()) return
       this.stick.setPointerCapture(event.pointerId)
       move(event)
     })

@@ -27,6 +27,7 @@ const link = new Link({
   },
   moment(now) {
     moment = now
+    if (now.state?.gate.mode === 'latched') drive.letGo() // what a person has to release is not started by a held key
     map.setMoment(now)
     showGate(now.state, looking())
     showFigures(now.state, now)
