@@ -24,7 +24,7 @@ AGAIN = "run again"
 
 
 class Watch:
-    """Sleeps again and again, and notes by how much it overslept, or how long a core stood still."""
+    """Sleeps again and again, and notes by how much it overslept, or how long a core was taken."""
 
     def __init__(self) -> None:
         self.longest_s = 0.0
