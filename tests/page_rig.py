@@ -13,7 +13,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from gigabrain_zenoh.deployment import ROBOT
 from gigabrain_zenoh.page import wire
 from gigabrain_zenoh.settings import Endpoint
-from tests.stack import Command, Home, endpoint_of, free_port
+from tests.stack import Command, Home, endpoint_of, free_port, listens, until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 # the first four as its sandbox, GPU and network are none of ours; the rest keep it from the network
@@ -47,6 +47,10 @@ class Robot:
     @property
     def origin(self) -> str:
         return f"http://127.0.0.1:{self.port}"
+
+    async def served(self) -> None:
+        """Wait until its page is there."""
+        await until(lambda: listens(self.port), "the page is served")
 
 
 class Served(Protocol):

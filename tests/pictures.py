@@ -30,7 +30,7 @@ async def take(folder: Path) -> None:
             robot = Robot(home, world="house", seed=1, **NAVIGATES)
             async with looking_on(robot.endpoint) as seen:
                 watch = Watch(seen.bus)
-                await until(lambda: "page" in seen.health, "the page is served", READY_S)
+                await robot.served()
                 await until(lambda: watch.task.current, "decision is ready", READY_S)
                 await until(lambda: watch.mapped_m2, "a map", READY_S)
                 async with async_playwright() as playwright:

@@ -25,7 +25,7 @@ from gigabrain_zenoh.health import answer_to_name
 from gigabrain_zenoh.settings import FoxgloveConfig
 from tests.foxglove_bridge_rig import Bridge, bridged, hold
 from tests.foxglove_rig import Viewer, fields
-from tests.stack import Home, free_port, until
+from tests.stack import Home, free_port, listens, until
 
 LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
 
@@ -181,7 +181,7 @@ async def test_a_robot_turns_as_a_viewer_tells_it_and_a_second_bridge_says_what_
     file = home.deployment(body="mock", resume="auto", hosts=hosts, foxglove={"port": port})
     home.start("up", str(file))
     async with looking_on(endpoint_of(file)) as seen:
-        await until(lambda: "foxglove" in seen.health, "the bridge is there")
+        await until(lambda: listens(port), "the bridge is there")
         await seen.hand_to_brain()
         async with connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"]) as made:  # type: ignore[list-item]
             viewer = Viewer(made)

@@ -32,8 +32,8 @@ async def seen(robot: Robot) -> AsyncIterator[Onlooker]:
 
 
 @pytest.fixture
-async def chromium(robot: Robot, tmp_path: Path, seen: Onlooker) -> AsyncIterator[Browser]:
-    await until(lambda: "page" in seen.health, "the page is served")
+async def chromium(robot: Robot, tmp_path: Path) -> AsyncIterator[Browser]:
+    await robot.served()
     async with browser(robot, tmp_path / "profile") as made:
         yield made
 

@@ -52,8 +52,7 @@ async def pour(socket: ClientConnection) -> None:
 
 @pytest.fixture
 async def served(robot: Robot) -> None:
-    async with looking_on(robot.endpoint) as seen:
-        await until(lambda: "page" in seen.health, "the page is served")
+    await robot.served()
 
 
 @pytest.mark.usefixtures("served")
