@@ -133,6 +133,11 @@ class Demo:
         why = ", compiling, once per installation" if self._compiling & set(late) else ""
         return f"{' and '.join(late)} {'is' if len(late) == 1 else 'are'} getting ready{why}"
 
+    def _served(self) -> str:
+        """Where the operator page is, once it is there, or how to get it."""
+        status = self._supervisor.statuses.get("page")
+        return self._options.page if status is None or status.state == "ready" else ""
+
     def _over(self, watch: Watch) -> bool:
         seconds = self._options.seconds
         return seconds is not None and watch.seconds >= seconds - 1e-6
@@ -140,7 +145,7 @@ class Demo:
     def _view(self, watch: Watch) -> View:
         seconds, page = self._options.seconds, self._options.page
         if self._options.headless or not sys.stdout.isatty():
-            return HeadlessView(watch, seconds, page, self._starting_up)
+            return HeadlessView(watch, seconds, self._served, self._starting_up)
         faults = self._faults
         return LiveView(
             watch, self._supervisor, self._deployment, faults, seconds, page, self._starting_up

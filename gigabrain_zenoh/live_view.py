@@ -23,6 +23,7 @@ GATE_COLOURS = {"enabled": "green", "idle": "yellow", "stopping": "yellow", "lat
 
 
 Starting = Callable[[], str]  # who is not ready yet, in words; an empty text where all are
+Where = Callable[[], str]  # where the operator page is, once it is there
 
 
 class View(Protocol):
@@ -43,11 +44,11 @@ class HeadlessView:
         self,
         watch: Watch,
         seconds: float | None,
-        page: str = "",
+        page: Where = str,
         starting: Starting = str,
     ) -> None:
         self._watch, self._seconds, self._page, self._starting = watch, seconds, page, starting
-        self._next = LINE_S
+        self._next, self._told = LINE_S, False
         self._in_place = sys.stderr.isatty()
 
     def __enter__(self) -> Self:
@@ -60,9 +61,9 @@ class HeadlessView:
     def show(self) -> None:
         """Bring it up to date."""
         watch = self._watch
-        if self._page and watch.state.newest:  # a robot that cannot be started has no page either
-            print(f"operator page: {self._page}", file=sys.stderr, flush=True)
-            self._page = ""
+        if not self._told and watch.state.newest and (page := self._page()):
+            print(f"operator page: {page}", file=sys.stderr, flush=True)
+            self._told = True
         if not self._in_place and watch.seconds < self._next:
             return
         self._next = watch.seconds + LINE_S
