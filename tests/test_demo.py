@@ -12,11 +12,12 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.tasks import Task, TaskStatus
-from gigabrain_schemas.topics import MAP
+from gigabrain_schemas.topics import MAP, STATE
 from gigabrain_zenoh import demo as demo_module
 from gigabrain_zenoh.demo import Demo, DemoOptions, newest_fault
-from gigabrain_zenoh.deployment import Deployment
+from gigabrain_zenoh.deployment import ROBOT, Deployment
 from gigabrain_zenoh.live_view import doing
 from gigabrain_zenoh.report import Observed, make_report, summary
 from gigabrain_zenoh.watch import Watch
@@ -254,5 +255,25 @@ async def test_a_clock_that_stands_still_ends_the_demo_but_not_while_a_process_i
     async with asyncio.timeout(60):
         assert await watching is None
     assert demo._failures == ["the robot's clock stood still for 1 s"]
+    await net.one.close()
+    await net.two.close()
+
+
+async def test_where_the_page_is_is_said_once_and_not_before_it_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    net = Net()
+    watch = Watch(net.one)
+    net.two.publish(STATE, EXAMPLES["RobotState"])
+    hosts = {"robot": (*ROBOT, "page")}
+    where = DemoOptions(headless=True, page="http://127.0.0.1:8080")
+    demo = Demo(Deployment(router="tcp/127.0.0.1:0", hosts=hosts), where)
+    view, page = demo._view(watch), demo._supervisor.statuses["page"]
+    said = []
+    for page.state in ("starting", "ready", "ready"):
+        view.show()
+        said.append(capsys.readouterr().err.count("operator page: http://127.0.0.1:8080\n"))
+    assert said == [0, 1, 0]
     await net.one.close()
     await net.two.close()
