@@ -7,10 +7,15 @@ from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.mapping.background import Background
 from gigabrain_zenoh.mapping.growing import GrowingMap
 from gigabrain_zenoh.mapping.se2 import between
-from tests.map_rig import HOUSE, PATIENCE_S, Rooms, Walker, at, error, grown
+from tests.map_rig import HALL, HOUSE, PATIENCE_S, Rooms, Walker, at, error, grown
 
 START = (1.0, 2.5)
 ROUND = ((3.0, 3.0), (5.5, 3.0), (6.5, 4.8), (6.5, 1.8), (5.0, 3.0), (3.0, 4.5), (1.2, 3.8), START)
+HALL_ROUND = (
+    (3.0, 3.0), (6.5, 3.0), (8.0, 1.5), (11.0, 3.2), (13.5, 3.0), (13.0, 1.2), (14.5, 1.0),
+    (14.5, 3.5), (12.5, 4.5), (8.0, 4.8), (5.0, 3.0), (3.0, 3.0), (1.5, 3.5), (3.0, 4.0),
+    (3.0, 3.0), (8.0, 3.0),
+)  # fmt: skip
 
 
 def in_map(walker: Walker) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
@@ -131,3 +136,20 @@ def test_work_that_failed_is_raised_at_its_scan() -> None:
     with pytest.raises(ValueError, match="broken"):
         background.at_scan()
     background.close()
+
+
+def test_who_crowds_the_robot_does_not_put_it_at_the_other_end_of_a_hall() -> None:
+    """In a hall that is the same from both ends, odometry alone says which of them it is."""
+    rooms = Rooms(HALL)
+    chart, walker = grown(rooms, (3.0, 3.0), *HALL_ROUND)
+    assert error(walker.look(), between(at(3.0, 3.0), walker.pose)) < 0.1
+    walker.go((11.0, 3.2))
+    left, low = walker.pose[:2] - (1.2, 0.4)
+    people = [(left, low, left + 2.4, low), (left, low, left, low - 0.5)]
+    crowded = [
+        chart.step(rooms.view(walker.pose, people), at(0, 0), np.eye(3) * 1e-6) for _ in range(12)
+    ]
+    assert not crowded[-1].localized
+    place = walker.look(25)
+    assert place.localized
+    assert error(place, between(at(3.0, 3.0), walker.pose)) < 0.1

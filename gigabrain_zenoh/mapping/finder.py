@@ -47,7 +47,7 @@ class Finder:
 
             def take() -> None:
                 if number == self._lost:
-                    localizer.found(found, self._moved)
+                    localizer.found(found, self._moved, self.last)
 
             return take
 

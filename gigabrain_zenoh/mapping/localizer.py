@@ -19,7 +19,8 @@ LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somew
 SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here
 TOLERANCE = 0.03  # of all beams ruled out, more than elsewhere, say nothing against a place,
 STILL_TOLERANCE, STILL_SCANS = 0.05, 5  # and while the robot stands, it takes more, and some scans
-AGAINST = 0.2  # that much in all speaks against it
+AGAINST = 0.2  # that much in all speaks against it,
+AGAINST_ODOMETRY = 0.6  # and so much, where odometry has the robot: somebody may stand in its view
 MOST_WRONG = 0.15  # of all beams ruled out, or it is not sure to be here
 DOUBTED_WRONG = 0.1  # ruled out, where the fit is bad as well, are enough against a place
 WALL_M = 0.08  # so near to a wall there is no body
@@ -60,6 +61,7 @@ class Hypothesis:
     shown: float = 1.0  # of the hits, see Fit
     wrong: float = 0.0  # beams that the map rules out, see Fit
     against: float = 0.0
+    continues: bool = False  # odometry has the robot here, from where it was before it was lost
     good: int = 0  # scans in a row that fit
     bad: int = 0  # scans in a row that do not
 
@@ -106,12 +108,18 @@ class Localizer:
         """Somebody has begun to search with the scan of the last step."""
         self._unsearched = 0
 
-    def found(self, candidates: list[Candidate], moved: Floats) -> None:
-        """Follow what a search has found, `moved` (3,) being the way since its scan."""
+    def found(self, candidates: list[Candidate], moved: Floats, last: Floats | None = None) -> None:
+        """Follow what a search has found, `moved` (3,) being the way since its scan.
+
+        `last` (3,) is where odometry has the robot now, if it was known before it was lost.
+        """
         if self._places:
             return
         there = [(compose(one.pose, moved), one.score) for one in candidates]
-        self._places = [Hypothesis(pose, SPREAD, score) for pose, score in there]
+        self._places = [
+            Hypothesis(pose, SPREAD, score, continues=last is not None and not apart(pose, [last]))
+            for pose, score in there
+        ]
         self.why = _in_words(len(there))
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
@@ -157,10 +165,20 @@ class Localizer:
                 self._places.append(one)
         if all(one.bad >= LOST_SCANS for one in self._places):
             self.lose("no place in the map looks like this")
-        elif len(self._places) == 1 and self._places[0].good >= SURE_SCANS:
-            self._localized, self.why = True, ""
+        elif (sure := self._sure()) is not None:
+            self._places, self._localized, self.why = [sure], True, ""
         else:
             self.why = _in_words(len(self._places))
+
+    def _sure(self) -> Hypothesis | None:
+        """The place where the robot is: the only one left, or the one where odometry has it.
+
+        What spoke against the latter is over if it fits again: somebody stood in the robot's view.
+        """
+        for one in self._places:
+            if one.good >= SURE_SCANS and (one.continues or len(self._places) == 1):
+                return one
+        return None
 
     def _gone(self, one: Hypothesis, best: Hypothesis) -> bool:
         """Whether `one` has led off what is shown, to where the map gives no reason to be."""
@@ -174,7 +192,8 @@ def _possible(one: Hypothesis) -> bool:
 
     A bad fit alone may come of walls that the map shows badly, as at its edge.
     """
-    return one.against < AGAINST and (one.bad < LOST_SCANS or one.wrong < DOUBTED_WRONG)
+    most = AGAINST_ODOMETRY if one.continues else AGAINST
+    return one.against < most and (one.bad < LOST_SCANS or one.wrong < DOUBTED_WRONG)
 
 
 def _in_words(count: int) -> str:
@@ -199,7 +218,7 @@ def _followed(into: Field, one: Hypothesis, view: View | None) -> Hypothesis:
     found = fit(into, view.scan.points, view.scan.free, view.sensor, one.pose, prior)
     seen = replace(one, score=found.score, shown=found.shown, wrong=found.wrong, good=0)
     if clearance(into, one.pose) < WALL_M:
-        seen = replace(seen, against=AGAINST)
+        seen = replace(seen, against=math.inf)
     if found.score < LOST_SCORE:
         seen = replace(seen, bad=one.bad + 1)
     if found.shown < SHOWN or found.likely < LOST_SCORE:
