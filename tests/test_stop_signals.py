@@ -1,0 +1,37 @@
+"""Ctrl-C ends a process in good order, however often it is pressed."""
+
+import subprocess
+import sys
+
+ENDS = """
+import asyncio, os, signal
+from gigabrain_zenoh.stop_signals import stop_signals
+
+async def work():
+    with stop_signals() as stop:
+        if {stopped}:
+            os.kill(os.getpid(), signal.SIGINT)
+            await stop.wait()
+    os.kill(os.getpid(), signal.SIGINT)
+    await asyncio.sleep(0.01)
+
+asyncio.run(work())
+print("in good order")
+"""
+
+
+def ended(*, stopped: bool) -> tuple[int, str]:
+    """The exit code and the output of a process that is interrupted after it has ended its work."""
+    words = (sys.executable, "-c", ENDS.format(stopped=stopped))
+    done = subprocess.run(words, capture_output=True, text=True)
+    return done.returncode, done.stdout
+
+
+def test_ctrl_c_after_a_stop_cuts_nothing_short() -> None:
+    assert ended(stopped=True) == (0, "in good order\n")
+
+
+def test_ctrl_c_after_work_that_nobody_stopped_ends_the_process() -> None:
+    code, out = ended(stopped=False)
+    assert code != 0
+    assert out == ""
