@@ -14,7 +14,6 @@ from contextlib import contextmanager
 import pytest
 from _pytest.runner import call_and_report
 
-from gigabrain_zenoh.faults.stolen import StolenTime
 from tests.turns import TURNS
 
 STALL_S = 0.05  # longer than anybody waits for two idle cores, and half of what stops a robot
@@ -24,7 +23,7 @@ AGAIN = "run again"
 
 
 class Watch:
-    """Sleeps again and again, and notes by how much it overslept, or how long a core was taken."""
+    """Sleeps a moment again and again, and notes by how much it overslept."""
 
     def __init__(self) -> None:
         self.longest_s = 0.0
@@ -32,11 +31,10 @@ class Watch:
 
     def look(self) -> None:
         """Until it is over."""
-        stolen = StolenTime()
         while not self.over.is_set():
             due_s = time.monotonic() + LOOK_S
             time.sleep(LOOK_S)
-            self.longest_s = max(self.longest_s, time.monotonic() - due_s, stolen.most_s())
+            self.longest_s = max(self.longest_s, time.monotonic() - due_s)
 
 
 @contextmanager

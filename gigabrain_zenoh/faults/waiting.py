@@ -4,7 +4,6 @@ import asyncio
 from collections.abc import Callable
 
 from gigabrain_zenoh.faults.fault import Failed
-from gigabrain_zenoh.faults.stolen import StolenTime
 
 PATIENCE_S = 60.0  # far more than anything here takes on a busy machine
 LOOK_S = 0.01
@@ -21,7 +20,7 @@ async def until(condition: Callable[[], object], what: str, within_s: float = PA
 
 
 class StallWatch:
-    """Notices when this machine, or one core of it, stands still; no robot is blamed for that."""
+    """Notices when this machine stands still, so that no robot is blamed for it."""
 
     def __init__(self) -> None:
         self._longest_s = 0.0
@@ -46,8 +45,8 @@ class StallWatch:
         return self._longest_s
 
     async def _watch(self) -> None:
-        loop, stolen = asyncio.get_running_loop(), StolenTime()
+        loop = asyncio.get_running_loop()
         while True:
             due_s = loop.time() + LOOK_S
             await asyncio.sleep(LOOK_S)
-            self._longest_s = max(self._longest_s, loop.time() - due_s, stolen.most_s())
+            self._longest_s = max(self._longest_s, loop.time() - due_s)
