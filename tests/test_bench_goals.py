@@ -4,7 +4,7 @@ from msgspec.structs import replace
 from rich.console import Console
 
 from gigabrain_zenoh.bench.goals import GoalFigures, GoalsResult
-from gigabrain_zenoh.bench.goals_sender import Off
+from gigabrain_zenoh.bench.goals_sender import Off, elsewhere
 from gigabrain_zenoh.cli.bench_goals import _table
 
 GOOD = GoalFigures(
@@ -32,6 +32,13 @@ def test_one_goal_in_a_hundred_may_be_missed_and_nothing_may_be_touched() -> Non
     assert not replace(GOOD, reached=98).ok
     assert not replace(GOOD, contacts=1).ok
     assert not GoalsResult(seed=0, runs=(GOOD, replace(GOOD, contacts=1))).ok
+
+
+def test_whoever_is_not_there_has_not_reached_it_whatever_it_says() -> None:
+    assert elsewhere(Off(9.8, None)) == "it said that it is there, 9.80 m from it"
+    assert elsewhere(Off(0.1, 3.0)) == "it said that it is there, turned by 172 degrees"
+    assert not elsewhere(Off(0.3, None))
+    assert not elsewhere(Off(0.3, 0.2))
 
 
 def test_the_table_says_what_was_measured() -> None:

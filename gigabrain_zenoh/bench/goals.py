@@ -47,7 +47,7 @@ class GoalFigures(Struct, frozen=True, kw_only=True):
     explored_s: float  # of the robot's time
     goals: int
     reached: int
-    off: tuple[Off, ...]  # of the goals that were reached
+    off: tuple[Off, ...]  # wherever it said that it was there
     contacts: int
     min_clearance_m: float
     met: int  # how often the person had to stand for the robot

@@ -22,6 +22,7 @@ from gigabrain_zenoh.task_client import Tasks
 
 EASY = 5.0  # a goal's cost at most: the body turns there as well
 FAR_M = 1.0  # from the robot to its next goal, at least
+THERE_M, THERE_RAD = 0.5, math.radians(15)  # by the physics; farther off it is not there
 
 T = TypeVar("T")
 
@@ -42,6 +43,15 @@ class Off(Struct, frozen=True):
     rad: float | None  # None where any heading would do
 
 
+def elsewhere(off: Off) -> str:
+    """Why a robot that says that it is there is not; nothing if it is."""
+    if off.m > THERE_M:
+        return f"it said that it is there, {off.m:.2f} m from it"
+    if off.rad is not None and off.rad > THERE_RAD:
+        return f"it said that it is there, turned by {math.degrees(off.rad):.0f} degrees"
+    return ""
+
+
 class Sender:
     """Sends a robot about. Every other goal has a heading."""
 
@@ -54,7 +64,7 @@ class Sender:
         self.sent = self.reached = 0
         self.accepted_s = 0.0  # when, by the host's clock, the first task was
         self.failures: list[Failure] = []
-        self.off: list[Off] = []  # of the goals that were reached
+        self.off: list[Off] = []  # wherever it said that it was there
 
     @property
     def seconds(self) -> float:
@@ -83,12 +93,15 @@ class Sender:
         goal = Goal(x=x, y=y, yaw=yaw)
         self.sent += 1
         reason = await self._go(goal)
+        if not reason:
+            off = await self._off(goal)
+            self.off.append(off)
+            reason = elsewhere(off)
         if reason:
             seconds, here = round(self.seconds, 2), self._here()
             self.failures.append(Failure(goal=goal, at=here, seconds=seconds, reason=reason))
         else:
             self.reached += 1
-            self.off.append(await self._off(goal))
 
     async def done(self, goals: int, meetings: int) -> bool:
         """Whether it was sent often enough, and has met the person often enough."""
