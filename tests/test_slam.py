@@ -117,11 +117,14 @@ def test_a_correction_carries_along_what_has_come_since(drive: Drive) -> None:
     assert correction is not None
     known, before = len(correction.poses), slam.poses
     assert len(before) > known
+    seen = between(before[-1], slam.pose)
     slam.apply(correction)
     assert slam.poses[:known].tolist() == correction.poses.tolist()
     assert between(slam.poses[known - 1], slam.poses[-1]) == pytest.approx(
         between(before[known - 1], before[-1]), abs=1e-9
     )
+    assert slam.poses[-1] != pytest.approx(before[-1], abs=1e-3)
+    assert between(slam.poses[-1], slam.pose) == pytest.approx(seen, abs=1e-9)
 
 
 @pytest.mark.parametrize(("reach", "uprights"), [(1.5, 0), (2.5, 8)])

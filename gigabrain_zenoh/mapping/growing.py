@@ -39,8 +39,8 @@ class GrowingMap:
         self._settling = False
         self._finder: Finder | None = None
         self._doubt = Doubt()
-        self._seen = self._moved = IDENTITY  # the last scan's pose, and the way since then
-        self._doubted = False  # since the last scan that was taken
+        self._moved = IDENTITY  # since the last scan that was taken
+        self._doubted = False  # likewise
         self._last = Place(IDENTITY, NOWHERE, False, "no scan yet")
         self._loops = self._renewals = 0
 
@@ -82,7 +82,6 @@ class GrowingMap:
         self._take(view, estimate)
         if self._slam.behind and self._background.idle and not self._settling:
             self._close_loops(self._slam.behind)
-        self._seen = estimate.pose
         self._last = Place(estimate.pose, estimate.covariance, True)
         return self._last
 
@@ -95,7 +94,7 @@ class GrowingMap:
         if self._finder:
             last = self._finder.last
         else:
-            last = compose(self._seen, self._moved) if self._last.localized else None
+            last = compose(self._slam.pose, self._moved) if self._last.localized else None
         self._finder = Finder(field, why, self._background, last)
         self._last = Place(self._last.pose, NOWHERE, False, why)
 
@@ -136,14 +135,14 @@ class GrowingMap:
         if place.localized:
             self._slam.relocate(place.pose)
             self._finder, self._doubt = None, Doubt()
-            self._seen, self._moved, self._doubted = place.pose, IDENTITY, False
+            self._moved, self._doubted = IDENTITY, False
         return place
 
     def _doubtful(self, view: View) -> bool:
         """Leave out a scan that does not belong here; after some of them, the robot is lost."""
         if not self._slam.keyframes:
             return False
-        pose = compose(self._seen, self._moved)
+        pose = compose(self._slam.pose, self._moved)
         if not self._doubt.look(self._grid, view, pose):
             return False
         if self._doubt.certain:

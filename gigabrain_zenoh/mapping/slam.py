@@ -83,6 +83,12 @@ class Slam:
         return self._poses[first:]
 
     @property
+    def pose(self) -> Floats:
+        """Where the robot was at the last scan, in the map as it is now. There is a keyframe."""
+        keyframe, placed = self._anchor
+        return compose(self._poses[keyframe], between(placed, self._front.pose))
+
+    @property
     def smooth(self) -> Floats:
         """Where the robot is in the front end's own frame, which never jumps."""
         return self._front.pose
