@@ -41,10 +41,14 @@ class Tasks:
         *,
         on_wait: OnWait | None = None,
         starting_s: float = STARTING_S,
+        silent_s: float = SILENT_S,
     ) -> None:
-        """Who serves goals is waited for `starting_s`; `on_wait` is told so."""
+        """Who serves goals is waited for `starting_s`; `on_wait` is told so.
+
+        Whoever says nothing of the tasks for `silent_s` is taken for gone.
+        """
         self._bus, self._keys = bus, keys
-        self._on_wait, self._starting_s = on_wait, starting_s
+        self._on_wait, self._starting_s, self._silent_s = on_wait, starting_s, silent_s
         self._news = asyncio.Event()
         self._newest: TaskStatus | None = None
         self._heard = False
@@ -158,7 +162,7 @@ class Tasks:
     async def _hear(self) -> None:
         self._news.clear()
         try:
-            await asyncio.wait_for(self._news.wait(), SILENT_S)
+            await asyncio.wait_for(self._news.wait(), self._silent_s)
         except TimeoutError:
             raise self._nobody() from None
 

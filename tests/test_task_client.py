@@ -43,6 +43,15 @@ async def test_a_script_is_told_who_is_missing() -> None:
         await Tasks(net.two, starting_s=0.0).go_to(1.0, 0.0)
 
 
+async def test_whoever_says_nothing_of_the_tasks_is_taken_for_gone_as_soon_as_was_agreed() -> None:
+    with pytest.raises(BodyLost, match="nobody serves goals"):
+        await Tasks(Net().two, silent_s=0.0).result("goal-1")
+    patient = asyncio.ensure_future(Tasks(Net().two, silent_s=60.0).result("goal-1"))
+    await asyncio.sleep(0.1)
+    assert not patient.done()
+    patient.cancel()
+
+
 async def test_a_goal_that_comes_while_the_robot_starts_waits_for_who_serves_goals() -> None:
     net, said = Net(), list[str]()
     tasks = Tasks(net.two, on_wait=said.append, starting_s=60.0)

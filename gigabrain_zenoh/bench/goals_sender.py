@@ -21,6 +21,7 @@ from gigabrain_zenoh.planar import compose, inverse, wrapped
 from gigabrain_zenoh.task_client import Tasks
 
 EASY = 5.0  # a goal's cost at most: the body turns there as well
+SILENT_S = 60.0  # without a word of the tasks: a busy host may stand still for seconds
 FAR_M = 1.0  # from the robot to its next goal, at least
 THERE_M, THERE_RAD = 0.5, math.radians(15)  # by the physics; farther off it is not there
 
@@ -56,7 +57,7 @@ class Sender:
     """Sends a robot about. Every other goal has a heading."""
 
     def __init__(self, bus: Bus, group: Group, seed: int) -> None:
-        self._bus, self._group, self._tasks = bus, group, Tasks(bus)
+        self._bus, self._group, self._tasks = bus, group, Tasks(bus, silent_s=SILENT_S)
         self._maps, self._poses, self._bodies = bus.latest(MAP), bus.latest(POSE), bus.latest(BODY)
         bus.latest(STATE)  # which start of the driver all else has to be of
         self._random, self._search = np.random.default_rng(seed), Search()
