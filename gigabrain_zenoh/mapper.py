@@ -23,11 +23,11 @@ from gigabrain_zenoh.granting import grant
 from gigabrain_zenoh.journal import done
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.background import InTime
-from gigabrain_zenoh.mapping.fusion import Fusion, Moment, uncertainty
+from gigabrain_zenoh.mapping.fusion import Fusion, Moment, way
 from gigabrain_zenoh.mapping.known import Chart, KnownMap
 from gigabrain_zenoh.mapping.localizer import Place, View
 from gigabrain_zenoh.mapping.points import Scan
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between
+from gigabrain_zenoh.mapping.se2 import Floats
 from gigabrain_zenoh.percentile import Newest
 from gigabrain_zenoh.perception import beams, hits
 from gigabrain_zenoh.settings import PerceptionConfig
@@ -136,28 +136,25 @@ class Mapper:
             return
         began = time.perf_counter()
         view = view_of(body.description.lidar, scan, self._config.ignore_below)
-        motion = self._motion(moment)
-        noise = uncertainty(motion, slipping=moment.slipping, gyro=moment.gyro)
-        place = self._chart.step(view, motion, noise)
+        place = self._chart.step(view, *self._way(moment))
         self._bus.publish(POSE, message_of(place), basis=scan.basis)
         self._tell(place)
         self._show(scan.basis)
         self._left_out = ""
         self._took_ms.add((time.perf_counter() - began) * 1e3)
 
-    def _motion(self, moment: Moment) -> Floats:
-        """From the last scan to this one.
+    def _way(self, moment: Moment) -> tuple[Floats, Floats]:
+        """From the last scan to this one (3,), and its covariance (3, 3).
 
         The first of a new map lies where odometry has it: should this process have died, places in
         the map stay the same ones, but for what odometry has drifted since.
         """
-        last, self._last = self._last, moment
+        last, self._last = self._last or moment, moment
         blank, self._blank = self._blank, False
-        if last is None:
-            return moment.fused if blank else IDENTITY
+        step, noise = way(last, moment)
         if last.jumps != moment.jumps:
             self._chart.lose("the odometry has jumped")
-        return between(last.fused, moment.fused)
+        return moment.fused if blank else step, noise
 
     def _show(self, tick: int) -> None:
         """Publish the map when it is time to and it has changed."""

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import ImuData
-from gigabrain_zenoh.mapping.fusion import Fusion, uncertainty
+from gigabrain_zenoh.mapping.fusion import Fusion, uncertainty, way
 from tests.brain_rig import WAFFLE, state
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -50,6 +50,21 @@ def test_wheels_say_how_far_and_the_gyro_how_much_it_turned() -> None:
     assert moment.fused[2] == pytest.approx(math.pi / 4)
     assert moment.fused[0] == pytest.approx(radius * math.sin(math.pi / 4), abs=1e-4)
     assert moment.fused[1] == pytest.approx(radius * (1 - math.cos(math.pi / 4)), abs=1e-4)
+
+
+def test_over_missing_states_the_wheels_say_how_much_it_turned() -> None:
+    """The gyro reads 1 rad/s before a gap of 0.8 s, and 0 after it; the body turned by 0.3 rad."""
+    before = [seen(1 + k, (0, 0, 0.02 * k), 1.0) for k in range(11)]
+    fusion = fused(*before, seen(51, (0.1, 0, 0.5), 0.0), seen(52, (0.1, 0, 0.5), 0.0))
+    last, moment, after = fusion.at(11), fusion.at(51), fusion.at(52)
+    assert last
+    assert moment
+    assert after
+    assert moment.fused == pytest.approx((0.1, 0, 0.5))
+    assert after.fused == pytest.approx((0.1, 0, 0.5))
+    by_wheels, by_gyro = way(last, moment)[1], way(moment, after)[1]
+    assert by_wheels == pytest.approx(uncertainty(way(last, moment)[0], slipping=False))
+    assert by_gyro[2, 2] == pytest.approx(uncertainty(np.zeros(3), slipping=False)[2, 2] * 0.3**2)
 
 
 def test_at_rest_the_bias_of_the_gyro_is_learnt_and_the_heading_stays() -> None:

@@ -16,9 +16,9 @@ from gigabrain_zenoh.bench.figures import Figures, figures
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.health import rss_bytes
 from gigabrain_zenoh.mapper import view_of
-from gigabrain_zenoh.mapping.fusion import Fusion, Moment, uncertainty
+from gigabrain_zenoh.mapping.fusion import Fusion, Moment, way
 from gigabrain_zenoh.mapping.growing import GrowingMap
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, inverse
+from gigabrain_zenoh.mapping.se2 import Floats, between, compose, inverse
 from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import PerceptionConfig
 
@@ -133,9 +133,7 @@ class _Run:
             return
         began = time.thread_time()
         view = view_of(lidar, scan, PerceptionConfig().ignore_below)
-        motion = between(self._last.fused, moment.fused) if self._last else IDENTITY
-        noise = uncertainty(motion, slipping=moment.slipping, gyro=moment.gyro)
-        place = self.chart.step(view, motion, noise)
+        place = self.chart.step(view, *way(self._last or moment, moment))
         self.took_ms.append((time.thread_time() - began) * 1e3)
         self._last = moment
         self.not_localized += not place.localized

@@ -1,7 +1,8 @@
 """Odometry and gyro in one: the wheels say how far, the gyro says how much it turned.
 
 Wheels slip and their track is known roughly, which shows in the heading first; a gyro drifts slowly
-and can be read off at rest. Where the two disagree, something slips, and neither length counts.
+and can be read off at rest. Where the two disagree, something slips, and neither length counts. A
+gyro tells rates: where states are missing, only the wheels know how much it turned meanwhile.
 """
 
 import math
@@ -16,7 +17,8 @@ from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_zenoh.mapping.se2 import Floats, between, compose
 
 KEPT = 250  # states, so 5 s
-GAP_TICKS = 25  # no pose is made up between states that lie farther apart
+GAP_TICKS = 25  # no pose is made up between states that lie farther apart,
+GYRO_TICKS = 5  # and no turn from the gyro
 
 REST_TICKS = 25  # without a turn of a wheel, then what the gyro says is its bias
 REST_RATE = 0.02  # [rad/s], faster is no bias: somebody turns the robot
@@ -39,7 +41,7 @@ class Moment(NamedTuple):
     fused: Floats  # (3,), with the gyro's heading
     slipping: bool
     jumps: int  # how often the odometry has jumped since the start
-    gyro: bool = False  # whether the heading is a gyro's
+    unaided: int = 0  # how many of the steps since then turned by what the wheels say alone
 
 
 class Fusion:
@@ -64,20 +66,21 @@ class Fusion:
         last = self.newest
         if last is None:
             self._rate = self._turn_rate(state)
-            self._moments.append(Moment(state.tick, pose, pose, False, 0, state.imu is not None))
+            self._moments.append(Moment(state.tick, pose, pose, slipping=False, jumps=0))
             return
         if state.tick <= last.tick:
             return
-        gyro = state.imu is not None
-        seconds = (state.tick - last.tick) * TICK_NS / 1e9
+        ticks = state.tick - last.tick
         step = between(last.odometry, pose)
-        if jumped(step, seconds, body):
+        fused, jumps, unaided = last.fused, last.jumps, last.unaided
+        if jumped(step, ticks * TICK_NS / 1e9, body):
             self._rate, self._rest = self._turn_rate(state), 0
-            moment = Moment(state.tick, pose, last.fused, self.slipping, last.jumps + 1, gyro)
+            jumps += 1
         else:
-            fused = advanced(last.fused, step, self._turn(state, step, seconds))
-            moment = Moment(state.tick, pose, fused, self.slipping, last.jumps, gyro)
-        self._moments.append(moment)
+            turn = self._turn(state, step, ticks)
+            unaided += turn is None
+            fused = advanced(fused, step, float(step[2]) if turn is None else turn)
+        self._moments.append(Moment(state.tick, pose, fused, self.slipping, jumps, unaided))
 
     @property
     def slipping(self) -> bool:
@@ -106,19 +109,20 @@ class Fusion:
             _along(before.fused, after.fused, share),
             after.slipping,
             after.jumps,
-            after.gyro,
+            after.unaided,
         )
 
     def _turn_rate(self, state: RobotState) -> float | None:
         return state.imu.angular_velocity[2] - self.bias if state.imu else None
 
-    def _turn(self, state: RobotState, step: Floats, seconds: float) -> float:
-        """How much the body has turned since the last state [rad]."""
+    def _turn(self, state: RobotState, step: Floats, ticks: int) -> float | None:
+        """How much the body has turned since the last state, by its gyro [rad]."""
         before, self._rate = self._rate, self._turn_rate(state)
-        if before is None or self._rate is None:
-            return float(step[2])
+        if before is None or self._rate is None or ticks > GYRO_TICKS:
+            return None
         if self._learn_bias(step, self._rate):
             return 0.0
+        seconds = ticks * TICK_NS / 1e9
         turn = (before + self._rate) / 2 * seconds
         self._slip += SLIP_SHARE * ((float(step[2]) - turn) / seconds - self._slip)
         return turn
@@ -132,6 +136,13 @@ class Fusion:
         self.bias += share * rate
         self._calibrated, self._slip = True, 0.0
         return True
+
+
+def way(last: Moment, moment: Moment) -> tuple[Floats, Floats]:
+    """The way (3,) from one moment to another, and its covariance (3, 3) in its own frame."""
+    step = between(last.fused, moment.fused)
+    aided = moment.unaided == last.unaided
+    return step, uncertainty(step, slipping=moment.slipping, gyro=aided)
 
 
 def jumped(step: Floats, seconds: float, body: BodyDescription) -> bool:
