@@ -6,7 +6,7 @@ import pytest
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.mapping.background import Background
 from gigabrain_zenoh.mapping.growing import GrowingMap
-from gigabrain_zenoh.mapping.se2 import between
+from gigabrain_zenoh.mapping.se2 import between, compose
 from tests.map_rig import HALL, HOUSE, PATIENCE_S, Rooms, Walker, at, error, grown
 
 START = (1.0, 2.5)
@@ -150,6 +150,16 @@ def test_who_crowds_the_robot_does_not_put_it_at_the_other_end_of_a_hall() -> No
         chart.step(rooms.view(walker.pose, people), at(0, 0), np.eye(3) * 1e-6) for _ in range(12)
     ]
     assert not crowded[-1].localized
+    place = walker.look(25)
+    assert place.localized
+    assert error(place, between(at(3.0, 3.0), walker.pose)) < 0.1
+
+
+def test_bumped_askew_it_is_found_where_it_was_though_the_hall_has_another_such_place() -> None:
+    _, walker = grown(Rooms(HALL), (3.0, 3.0), *HALL_ROUND)
+    walker.go((11.0, 3.2))
+    walker.pose = compose(walker.pose, at(0.3, 0.1, 35))
+    assert not walker.look(3).localized
     place = walker.look(25)
     assert place.localized
     assert error(place, between(at(3.0, 3.0), walker.pose)) < 0.1

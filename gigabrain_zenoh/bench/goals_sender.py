@@ -13,7 +13,7 @@ from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.topics import BODY, MAP, POSE, STATE
 from gigabrain_zenoh.bench.group import Group, driver_report
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.errors import GigabrainError, Refused
+from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.navigation.costmap import costmap, inflation
 from gigabrain_zenoh.navigation.planner import Point
 from gigabrain_zenoh.navigation.search import Search
@@ -21,7 +21,7 @@ from gigabrain_zenoh.planar import compose, inverse, wrapped
 from gigabrain_zenoh.task_client import Tasks
 
 EASY = 5.0  # a goal's cost at most: the body turns there as well
-SILENT_S = 60.0  # without a word of the tasks: a busy host may stand still for seconds
+SILENT_S = 60.0  # without an answer or a word of the tasks: a host may stand still for seconds
 FAR_M = 1.0  # from the robot to its next goal, at least
 THERE_M, THERE_RAD = 0.5, math.radians(15)  # by the physics; farther off it is not there
 
@@ -122,11 +122,23 @@ class Sender:
     async def _go(self, goal: Goal) -> str:
         """Why it did not get there; nothing if it did."""
         try:
-            task = await self._tasks.go_to(goal.x, goal.y, goal.yaw)
+            task = await self._order(goal)
             ended = await self._while_all_live(self._tasks.result(task))
         except Refused as refusal:
             return f"refused: {refusal}"
         return "" if ended.state == "succeeded" else f"{ended.state}: {ended.reason}"
+
+    async def _order(self, goal: Goal) -> str:
+        """The task's name. A question that a host has slept through is asked again."""
+        now = asyncio.get_running_loop().time
+        until = now() + SILENT_S
+        while True:
+            try:
+                return await self._tasks.go_to(goal.x, goal.y, goal.yaw)
+            except BodyLost:
+                if now() > until:
+                    raise
+            await self._group.look()
 
     async def _off(self, goal: Goal) -> Off:
         assert self._world_from_map

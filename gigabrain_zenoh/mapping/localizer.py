@@ -13,7 +13,7 @@ from gigabrain_zenoh.mapping.field import Field, clearance, fit
 from gigabrain_zenoh.mapping.likeness import alike
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.relocalize import FEWEST_POINTS, Candidate, apart
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, compose, inverse, turned
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, inverse, turned
 
 LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somewhere else
 SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here
@@ -21,6 +21,7 @@ TOLERANCE = 0.03  # of all beams ruled out, more than elsewhere, say nothing aga
 STILL_TOLERANCE, STILL_SCANS = 0.05, 5  # and while the robot stands, it takes more, and some scans
 AGAINST = 0.2  # that much in all speaks against it,
 AGAINST_ODOMETRY = 0.6  # and so much, where odometry has the robot: somebody may stand in its view
+BUMPED_M, BUMPED_RAD = 0.6, math.radians(45)  # so far off odometry, it may have slipped or been hit
 MOST_WRONG = 0.15  # of all beams ruled out, or it is not sure to be here
 DOUBTED_WRONG = 0.1  # ruled out, where the fit is bad as well, are enough against a place
 WALL_M = 0.08  # so near to a wall there is no body
@@ -115,12 +116,13 @@ class Localizer:
         """
         if self._places:
             return
-        there = [(compose(one.pose, moved), one.score) for one in candidates]
+        poses = [compose(one.pose, moved) for one in candidates]
+        here = None if last is None else _continuing(poses, last)
         self._places = [
-            Hypothesis(pose, SPREAD, score, continues=last is not None and not apart(pose, [last]))
-            for pose, score in there
+            Hypothesis(pose, SPREAD, one.score, continues=k == here)
+            for k, (pose, one) in enumerate(zip(poses, candidates, strict=True))
         ]
-        self.why = _in_words(len(there))
+        self.why = _in_words(len(poses))
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
         """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
@@ -194,6 +196,14 @@ def _possible(one: Hypothesis) -> bool:
     """
     most = AGAINST_ODOMETRY if one.continues else AGAINST
     return one.against < most and (one.bad < LOST_SCANS or one.wrong < DOUBTED_WRONG)
+
+
+def _continuing(poses: list[Floats], last: Floats) -> int | None:
+    """Which of the places is nearest to where odometry has the robot, if one is near."""
+    off = [between(last, pose).tolist() for pose in poses]
+    away = [math.hypot(x, y) if abs(yaw) < BUMPED_RAD else math.inf for x, y, yaw in off]
+    nearest = min(range(len(away)), key=away.__getitem__, default=None)
+    return None if nearest is None or away[nearest] > BUMPED_M else nearest
 
 
 def _in_words(count: int) -> str:
