@@ -1,11 +1,19 @@
 """What `gigabrain bench goals` makes of its figures."""
 
+from typing import cast
+
+import pytest
 from msgspec.structs import replace
 from rich.console import Console
 
+from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.bench.goals import GoalFigures, GoalsResult
-from gigabrain_zenoh.bench.goals_sender import Off, elsewhere
+from gigabrain_zenoh.bench.goals_sender import Off, Sender, elsewhere
+from gigabrain_zenoh.bench.group import Group
 from gigabrain_zenoh.cli.bench_goals import _table
+from gigabrain_zenoh.errors import BodyLost
+from gigabrain_zenoh.task_client import Tasks
+from tests.bus_rig import Net
 
 GOOD = GoalFigures(
     body="alpha",
@@ -39,6 +47,27 @@ def test_whoever_is_not_there_has_not_reached_it_whatever_it_says() -> None:
     assert elsewhere(Off(0.1, 3.0)) == "it said that it is there, turned by 172 degrees"
     assert not elsewhere(Off(0.3, None))
     assert not elsewhere(Off(0.3, 0.2))
+
+
+async def test_a_question_that_the_host_has_slept_through_is_asked_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[float] = []
+
+    async def go_to(_: Tasks, x: float, _y: float, _yaw: float | None) -> str:
+        asked.append(x)
+        if len(asked) < 3:
+            raise BodyLost("nobody serves goals")
+        return "goal-1"
+
+    class Alive:
+        async def look(self) -> None:
+            pass
+
+    monkeypatch.setattr(Tasks, "go_to", go_to)
+    sender = Sender(Net().two, cast("Group", Alive()), seed=0)
+    assert await sender._order(Goal(x=2.0, y=1.0)) == "goal-1"
+    assert asked == [2.0, 2.0, 2.0]
 
 
 def test_the_table_says_what_was_measured() -> None:
