@@ -70,6 +70,23 @@ def test_a_way_that_opens_again_is_planned_anew() -> None:
     assert kept.state == "running"
 
 
+def test_a_detour_has_its_own_time_and_going_to_and_fro_ends() -> None:
+    guide = Guide()
+    barred = ROOM.copy()
+    barred[10:, 40] = 100  # a wall at x = 4 m, round which the way is over 5 m longer
+    ask = functools.partial(think, guide, goal=Goal(x=7.0, y=4.5), y=4.5)
+    assert ask(ROOM, tick=1, x=3.0).state == "running"
+    ends = [ask(barred, tick=1001, x=3.5)]
+    ends += [ask(barred, tick=1001 + 100 * k, x=3.5, y=4.5 - 0.1 * k) for k in range(1, 30)]
+    assert {one.state for one in ends} == {"running"}
+    tick = 1001 + 2900
+    for k in range(40):
+        tick += 1000
+        if ask(barred if k % 2 else ROOM, tick=tick, x=3.5).state == "failed":
+            break
+    assert 6 <= k < 12
+
+
 def test_what_no_way_has_ever_led_to_is_refused_at_once() -> None:
     assert think(Guide(), SHUT, tick=1).state == "failed"
 

@@ -13,6 +13,7 @@ from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.behaviours.aside import Courtesy
 from gigabrain_zenoh.behaviours.bearings import Driven, Floats, Route
 from gigabrain_zenoh.behaviours.beyond import widened
+from gigabrain_zenoh.behaviours.progress import Progress
 from gigabrain_zenoh.navigation.costmap import Costmap, Unknown, costmap, inflation
 from gigabrain_zenoh.navigation.frontiers import frontiers
 from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable
@@ -20,7 +21,6 @@ from gigabrain_zenoh.tasks.orders import GoTo, Order, Visit
 
 GIVE_UP_TICKS = 1500  # 30 s of driving without coming any nearer
 LEAVE_TICKS = 500  # 10 s, for a place that is only to be looked at
-NEARER_M = 0.3  # what counts as nearer
 REMEMBERED_TICKS = 500  # 10 s, that what was in the way stays in the plans
 MUCH_BETTER_M = 1.5  # so much better has another frontier to be, or it goes to and fro
 OPEN, FAR_M = 2.0, 1.5  # cost of a place worth visiting, and the way there at least [m]
@@ -90,7 +90,7 @@ class Guide:
         self._found: Path | None = None  # the last way to this goal that there was
         self._goal: Goal | None = None
         self._been: list[tuple[float, float]] = []
-        self._nearest, self._nearest_tick, self._last_tick = math.inf, tick, tick
+        self._progress, self._last_tick = Progress(tick), tick
         self._open_tick = tick  # when there was something left to be seen
         self._version += 1
         self._courtesy = Courtesy()
@@ -99,7 +99,7 @@ class Guide:
         """Take note of what became of the last route."""
         driven = asked.driven
         if not asked.driving:  # whoever is held back by the gate is not stuck
-            self._nearest_tick += max(0, asked.tick - self._last_tick)
+            self._progress.hold(max(0, asked.tick - self._last_tick))
         self._last_tick = asked.tick
         if driven and driven.blocked and driven.version == self._version:
             self._in_the_way, self._in_the_way_tick = asked.seen, asked.tick
@@ -130,24 +130,24 @@ class Guide:
             goal = Goal(x=found.nearest[0], y=found.nearest[1], yaw=goal.yaw)
             found = self._planner.plan(chart, (asked.here.x, asked.here.y), found.nearest)
         if isinstance(found, Unreachable):
-            if first or self._stuck(asked, GIVE_UP_TICKS):
+            if first or self._progress.stuck(asked.tick, GIVE_UP_TICKS):
                 return self._ended("failed", found.reason)
             if self._found:  # noise closes narrow ways in the map; what is near shows up there
                 return self._going(goal, self._found)
             return self._waiting(found.reason)
         self._found = found
-        self._measure(found, asked.tick)
-        if self._stuck(asked, GIVE_UP_TICKS):
+        self._progress.measure(float(found.remaining[0]), asked.tick)
+        if self._progress.stuck(asked.tick, GIVE_UP_TICKS):
             left = f"{found.remaining[0]:.1f} m before the goal"
             return self._ended("failed", f"no nearer for 30 s, {left}: something is in the way")
         return self._going(goal, found, beside)
 
     def _making_room(self, goal: Goal, asked: Asked, chart: Costmap) -> Route | None:
         """Out of the way of whoever stands at the goal, and may wait for the robot to leave."""
-        here, stuck = (asked.here.x, asked.here.y), self._stuck(asked, TAKEN_TICKS)
+        here, stuck = (asked.here.x, asked.here.y), self._progress.stuck(asked.tick, TAKEN_TICKS)
         search = self._planner.search
         if self._courtesy.look(goal, here, asked.tick, stuck, chart, search):
-            self._nearest, self._nearest_tick, self._found = math.inf, asked.tick, None
+            self._progress, self._found = Progress(asked.tick), None
             self._version += 1
         place = self._courtesy.place
         way = self._planner.plan(chart, here, (place.x, place.y)) if place else None
@@ -171,7 +171,7 @@ class Guide:
         """To the next place from which something new can be seen."""
         here = asked.here.x, asked.here.y
         arrived = asked.driven is not None and asked.driven.arrived
-        if self._goal and (arrived or self._stuck(asked, LEAVE_TICKS)):
+        if self._goal and (arrived or self._progress.stuck(asked.tick, LEAVE_TICKS)):
             self._been.append((self._goal.x, self._goal.y))
             self._leave(asked.tick)
         for _ in range(len(self._been) + 10):
@@ -183,7 +183,7 @@ class Guide:
                 self._leave(asked.tick)
             found = self._plan(goal, asked.here, chart)
             if isinstance(found, Path):
-                self._measure(found, asked.tick)
+                self._progress.measure(float(found.remaining[0]), asked.tick)
                 return self._going(goal, found)
             self._been.append((goal.x, goal.y))
         return self._waiting("no way leads to what is still unknown")
@@ -221,18 +221,10 @@ class Guide:
         self._path = found if isinstance(found, Path) else None
         return found
 
-    def _measure(self, path: Path, tick: int) -> None:
-        left = float(path.remaining[0])
-        if left < self._nearest - NEARER_M:
-            self._nearest, self._nearest_tick = left, tick
-
-    def _stuck(self, asked: Asked, ticks: int) -> bool:
-        return asked.tick - self._nearest_tick > ticks
-
     def _leave(self, tick: int) -> None:
         """This goal is done with; the next is another."""
         self._goal = self._path = self._found = None
-        self._nearest, self._nearest_tick = math.inf, tick
+        self._progress = Progress(tick)
         self._version += 1
 
     def _going(self, goal: Goal, path: Path, reason: str = "") -> Route:

@@ -1,0 +1,36 @@
+"""How long a robot has come no nearer to where it is going."""
+
+import math
+
+NEARER_M = 0.3  # what counts as nearer
+DETOUR_M = 1.0  # so much longer from one plan to the next is another way,
+DETOURS = (
+    3  # and begins anew so often, until it is nearer than ever: or it goes to and fro for good
+)
+
+
+class Progress:
+    """Measures what is left of the way. A detour that has become necessary has its own time."""
+
+    def __init__(self, tick: int) -> None:
+        self._since = tick  # it has come no nearer
+        self._record = self._nearest = self._left = math.inf  # [m]: ever, on this way, and now
+        self._detours = 0
+
+    def measure(self, left: float, tick: int) -> None:
+        """So much of the way [m] is left now."""
+        if left < self._record - NEARER_M:
+            self._record, self._detours = left, 0
+        detour = left > self._left + DETOUR_M and self._detours < DETOURS
+        self._detours += detour
+        self._left = left
+        if detour or left < self._nearest - NEARER_M:
+            self._nearest, self._since = left, tick
+
+    def hold(self, ticks: int) -> None:
+        """So long it was not allowed to drive."""
+        self._since += ticks
+
+    def stuck(self, tick: int, ticks: int) -> bool:
+        """Whether it has come no nearer for more than so many ticks."""
+        return tick - self._since > ticks
