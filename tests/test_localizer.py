@@ -6,6 +6,7 @@ import pytest
 from gigabrain_zenoh.mapping.field import field_of, fit
 from gigabrain_zenoh.mapping.known import KnownMap
 from gigabrain_zenoh.mapping.likeness import alike
+from gigabrain_zenoh.mapping.localizer import Localizer
 from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.relocalize import Candidate, search
 from tests.map_rig import (
@@ -179,3 +180,17 @@ def test_a_wall_that_stands_in_the_way_of_beams_counts_against_a_place(house: Sa
     long = np.array([[5.0, -1.5]] * len(view.scan.points), np.float32)  # through the inner wall
     through = fit(field, view.scan.points, long, view.sensor, at(3.0, 2.5), free)
     assert here.score - through.score == pytest.approx(0.5, abs=0.06)
+
+
+def test_two_finds_that_come_to_the_same_do_not_forget_that_odometry_led_there() -> None:
+    rooms = Rooms(HALL)
+    saved = drawn(rooms, *(at(x, y) for x in range(1, 16) for y in (1.0, 3.0, 5.0)))
+    field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
+    localizer = Localizer(field)
+    finds = ((11.16, 3.2, 0.0, 0.9), (10.84, 3.2, 0.0, 0.8), (5.0, 2.8, 180.0, 0.85))
+    candidates = [Candidate(at(x, y, turn), score) for x, y, turn, score in finds]
+    localizer.found(candidates, at(0, 0), last=at(10.7, 3.2))
+    for _ in range(5):
+        place = localizer.step(rooms.view(at(11.0, 3.2)), at(0, 0), np.eye(3) * 1e-6)
+    assert place.localized
+    assert error(place, at(11.0, 3.2)) < 0.05

@@ -4,9 +4,7 @@ import math
 
 NEARER_M = 0.3  # what counts as nearer
 DETOUR_M = 1.0  # so much longer from one plan to the next is another way,
-DETOURS = (
-    3  # and begins anew so often, until it is nearer than ever: or it goes to and fro for good
-)
+DETOURS = 3  # and begins anew, so often at most until the robot is nearer than ever
 
 
 class Progress:

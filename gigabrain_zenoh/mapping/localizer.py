@@ -162,7 +162,7 @@ class Localizer:
         best = max(self._places, key=lambda one: one.score)
         left = [one for one in self._places if _possible(one) and not self._gone(one, best)]
         self._places = []
-        for one in sorted(left, key=lambda one: -one.score):
+        for one in sorted(left, key=lambda one: (not one.continues, -one.score)):
             if apart(one.pose, (other.pose for other in self._places)):
                 self._places.append(one)
         if all(one.bad >= LOST_SCANS for one in self._places):
