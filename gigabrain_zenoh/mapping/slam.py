@@ -108,7 +108,7 @@ class Slam:
         if kept:
             self._keep(scan, match, relative)
             keyframe, relative = len(self.keyframes) - 1, IDENTITY
-        pose = self.pose
+        pose = compose(self._poses[keyframe], relative)
         return Estimate(
             pose=pose,
             covariance=turned(match.covariance, float(pose[2] - match.pose[2])),
