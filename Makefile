@@ -4,6 +4,7 @@
 VENV := .venv
 BIN := $(VENV)/bin
 PYTHON ?= python3
+INSTALLED := $(VENV)/.installed
 DONE := $(VENV)/.done
 
 .PHONY: setup demo test lint unit bench mutation fuzz golden recordings pictures clean
@@ -11,7 +12,7 @@ DONE := $(VENV)/.done
 setup: $(DONE)
 
 # uv where it is installed, pip otherwise
-$(DONE): pyproject.toml
+$(INSTALLED): pyproject.toml
 	@if command -v uv >/dev/null; then \
 	  uv venv --quiet --allow-existing --python '>=3.11' $(VENV) && \
 	  uv pip install --quiet --python $(BIN)/python -e '.[all,dev]'; \
@@ -21,15 +22,20 @@ $(DONE): pyproject.toml
 	  $(PYTHON) -m venv $(VENV) && \
 	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[all,dev]'; \
 	fi
+	@touch $@
+
+$(DONE): $(INSTALLED)
 	@$(BIN)/gigabrain warm
 	@touch $@
 
 demo: setup
 	@$(BIN)/gigabrain demo $(ARGS)
 
-test: setup lint unit
+test:
+	@$(MAKE) --no-print-directory --jobs 2 setup lint  # one compiles while the other checks
+	@$(MAKE) --no-print-directory unit
 
-lint: setup
+lint: $(INSTALLED)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy

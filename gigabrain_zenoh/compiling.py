@@ -30,7 +30,7 @@ async def compiled(warm_up: str) -> None:
     """
     try:
         if await asyncio.to_thread(_missing, warm_up):
-            await _told(_in_child(warm_up))
+            await _told(in_child(warm_up))
         await _told(asyncio.to_thread(_call, warm_up))
     except ModuleNotFoundError as error:
         raise needs(error) from None
@@ -53,7 +53,7 @@ def _call(warm_up: str) -> None:
     find(warm_up)()  # imports too
 
 
-async def _told(work: Awaitable[None]) -> None:
+async def _told(work: Awaitable[object]) -> None:
     compiling = asyncio.ensure_future(work)
     try:
         done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
@@ -65,8 +65,8 @@ async def _told(work: Awaitable[None]) -> None:
         compiling.cancel()
 
 
-async def _in_child(warm_up: str) -> None:
-    """Whatever it cannot do is done here afterwards."""
+async def in_child(warm_up: str) -> int:
+    """Compile in a process of its own; its exit code. What it cannot do is to be done here."""
     paths = os.pathsep.join(path for path in sys.path if path)
     child = await asyncio.create_subprocess_exec(
         sys.executable,
@@ -80,7 +80,7 @@ async def _in_child(warm_up: str) -> None:
         stderr=asyncio.subprocess.DEVNULL,
     )
     try:
-        await child.wait()
+        return await child.wait()
     finally:
         if child.returncode is None:
             child.kill()

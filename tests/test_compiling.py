@@ -1,5 +1,6 @@
 """Compiling beforehand, in a process of its own."""
 
+import asyncio
 import os
 import subprocess
 import sys
@@ -78,13 +79,28 @@ def test_what_is_to_be_called_is_there(warm_up: str) -> None:
     assert isinstance(find(warm_up), types.FunctionType)
 
 
+@pytest.mark.parametrize("code", [0, 1])
 def test_what_is_compiled_beforehand_is_what_each_process_calls(
-    monkeypatch: pytest.MonkeyPatch,
+    code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    done: list[str] = []
+    tried, done = list[str](), list[str]()
+
+    async def in_child(warm_up: str) -> int:
+        tried.append(warm_up)
+        return code
+
+    monkeypatch.setattr(compiling, "in_child", in_child)
     monkeypatch.setattr(compiling, "compile_all", done.append)
     warm()
-    assert sorted(done) == sorted((compiling.MAPPING, compiling.FINDING, compiling.DRIVING))
+    assert sorted(tried) == sorted((compiling.MAPPING, compiling.FINDING, compiling.DRIVING))
+    assert done == (tried if code else [])  # what a child cannot do
+    assert capsys.readouterr().out.count(" s\n") == 2
+
+
+def test_a_child_that_fails_says_so(calls: Path) -> None:
+    assert asyncio.run(compiling.in_child(WARM_UP)) == 0
+    assert who(calls) == [False]
+    assert asyncio.run(compiling.in_child("counted:nothing")) == 1
 
 
 ALONE = """

@@ -1,8 +1,7 @@
 """`gigabrain warm`: compile beforehand what takes a minute at the first start."""
 
+import asyncio
 import time
-
-STEPS = ("mapping", "planning and driving")
 
 
 def warm() -> None:
@@ -13,21 +12,27 @@ def warm() -> None:
     What was compiled is kept in the user's cache folder, or in NUMBA_CACHE_DIR where that is set.
     After an update it is done again, at the latest at the first start, while nothing drives.
     """
-    from gigabrain_zenoh.compiling import needs
-
-    for name in STEPS:
-        print(f"{name} … ", end="", flush=True)
-        began_s = time.monotonic()
-        try:
-            _compile(name)
-        except ModuleNotFoundError as error:
-            print()
-            raise needs(error) from None
-        print(f"{time.monotonic() - began_s:.1f} s")
+    asyncio.run(_all())
 
 
-def _compile(name: str) -> None:
-    from gigabrain_zenoh.compiling import DRIVING, FINDING, MAPPING, compile_all
+async def _all() -> None:
+    """Both at a time: they share no kernel."""
+    from gigabrain_zenoh.compiling import DRIVING, FINDING, MAPPING
 
-    for warm_up in (MAPPING, FINDING) if name == "mapping" else (DRIVING,):
-        compile_all(warm_up)
+    print("compiling, which takes up to a minute")
+    await asyncio.gather(
+        _compile("mapping", MAPPING, FINDING), _compile("planning and driving", DRIVING)
+    )
+
+
+async def _compile(name: str, *warm_ups: str) -> None:
+    from gigabrain_zenoh.compiling import compile_all, in_child, needs
+
+    began_s = time.monotonic()
+    for warm_up in warm_ups:
+        if await in_child(warm_up):
+            try:
+                compile_all(warm_up)  # says why it cannot be done
+            except ModuleNotFoundError as error:
+                raise needs(error) from None
+    print(f"{name}: {time.monotonic() - began_s:.1f} s")
