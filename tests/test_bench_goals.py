@@ -71,13 +71,14 @@ async def test_a_question_that_the_host_has_slept_through_is_asked_again(
 
 
 def test_the_table_says_what_was_measured() -> None:
-    lines = _text(GoalsResult(seed=7, runs=(GOOD,)))
-    for figure in ("seed 7", "99 of 100", "0.090 m", "10.0 s", "0.11 m", "5.7°"):
+    lines = _text(GoalsResult(seed=7, runs=(replace(GOOD, body="turtlebot3_waffle"),)))
+    for figure in ("seed 7", "x5", "99/100", "0.090", "10.0", "0.11", "5.7"):
         assert figure in lines
+    assert "…" not in lines
 
 
 def _text(result: GoalsResult) -> str:
-    console = Console(width=120)
+    console = Console(width=80)
     with console.capture() as capture:
         console.print(_table(result))
     return capture.get()

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 BODIES = ("turtlebot3_waffle", "mycustombot", "alpha")
 WORLDS = ("house", "warehouse")
-WIDE = 120  # characters, of the table in a file
 
 
 @Parameter(name="*")
@@ -83,7 +82,6 @@ def _show(result: "GoalsResult") -> None:
     from gigabrain_zenoh.tasks.orders import where
 
     console = Console()
-    console = console if console.is_terminal else Console(width=WIDE)
     console.print(_table(result))
     for run in result.runs:
         for one in run.failures:
@@ -97,17 +95,21 @@ def _progress(text: str) -> None:
 
 def _table(result: "GoalsResult") -> "Table":
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table("body", "world", title=f"seed {result.seed}")
+    faster = ", ".join(sorted({f"x{run.speed:g}" for run in result.runs}))
+    title = f"seed {result.seed}, {faster} real time"
+    table = Table("body", "world", title=title, box=None, padding=(0, 1, 0, 0), pad_edge=False)
     for name in (
-        "speed", "mapped", "reached", "contacts", "room", "goal", "off", "turned", "met", "alone",
+        "mapped\n[s]", "reached", "con-\ntacts", "room\n[m]", "goal\n[s]", "off\n[m]", "turn\n[°]",
+        "met", "alone",
     ):  # fmt: skip
-        table.add_column(name, justify="right")
+        table.add_column(Text(name), justify="right")  # of 80 columns all that there is room for
     for run in result.runs:
         table.add_row(
-            run.body, run.world, f"x{run.speed:g}", f"{run.explored_s:.0f} s",
-            f"{run.reached} of {run.goals}", str(run.contacts), f"{run.min_clearance_m:.3f} m",
-            f"{run.seconds_per_goal:.1f} s", f"{run.worst_m:.2f} m",
-            f"{math.degrees(run.worst_rad):.1f}°", str(run.met), str(run.alone),
+            run.body, run.world, f"{run.explored_s:.0f}", f"{run.reached}/{run.goals}",
+            f"{run.contacts}", f"{run.min_clearance_m:.3f}", f"{run.seconds_per_goal:.1f}",
+            f"{run.worst_m:.2f}", f"{math.degrees(run.worst_rad):.1f}",
+            f"{run.met}", f"{run.alone}",
         )  # fmt: skip
     return table

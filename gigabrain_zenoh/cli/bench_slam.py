@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from gigabrain_zenoh.cli.side_by_side import side_by_side
 from gigabrain_zenoh.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -12,8 +13,6 @@ if TYPE_CHECKING:
 
     from gigabrain_zenoh.bench.slam import Drive, SlamResult
     from gigabrain_zenoh.bench.slam_logs import Log
-
-WIDE = 140  # columns of what is not printed on a terminal
 
 
 def slam(
@@ -80,9 +79,7 @@ def _slam_logs(paths: tuple[Path, ...], png: Path | None, json: Path | None) -> 
     if png:
         draw(drives, png)
     results.write(result, json)
-    console = Console()
-    console = console if console.is_terminal else Console(width=WIDE)
-    console.print(_table(result))
+    Console().print(_table(result))
     return 0
 
 
@@ -107,29 +104,22 @@ def _driven(logs: "list[Log]") -> "list[tuple[Log, Drive]]":
 
 
 def _table(result: "SlamResult") -> "Table":
-    from rich.table import Table
-
-    table = Table(
-        title="Errors of relations, mean ± standard deviation",
-        caption=f"graph, mean of the logs {result.mean_m:.3f} m; memory at most "
+    logs = result.logs
+    return side_by_side(
+        "Errors of relations: mean ± standard deviation",
+        f"graph, mean of the logs {result.mean_m:.3f} m; memory at most "
         f"{result.peak_mb:.0f} MB. Times are of the CPU.",
+        [one.log for one in logs],
+        {
+            "odometry [m]": [f"{one.odometry.mean_m:.2f}" for one in logs],
+            "front end [m]": [f"{one.front_end.mean_m:.2f}" for one in logs],
+            "graph [m]": [f"{one.graph.mean_m:.3f} ± {one.graph.std_m:.3f}" for one in logs],
+            "graph [°]": [f"{one.graph.mean_deg:.2f}" for one in logs],
+            "scans, beams": [f"{one.scans}, {one.beams}" for one in logs],
+            "loops closed": [str(one.loops) for one in logs],
+            "scans not matched": [str(one.unmatched) for one in logs],
+            "breaks": [str(one.breaks) for one in logs],
+            "scan p50, p99 [ms]": [f"{one.scan.p50_ms:.1f}, {one.scan.p99_ms:.1f}" for one in logs],
+            "loop p99, max [ms]": [f"{one.loop.p99_ms:.1f}, {one.loop_max_ms:.1f}" for one in logs],
+        },
     )
-    for title in ("log", "scans", "beams", "odometry", "front end", "graph"):
-        table.add_column(title, justify="left" if title == "log" else "right")
-    for title in ("loops", "not matched", "breaks", "scan p50, p99", "loop p99, max"):
-        table.add_column(title, justify="right")
-    for one in result.logs:
-        table.add_row(
-            one.log,
-            str(one.scans),
-            str(one.beams),
-            f"{one.odometry.mean_m:.2f} m",
-            f"{one.front_end.mean_m:.2f} m",
-            f"{one.graph.mean_m:.3f} ± {one.graph.std_m:.3f} m, {one.graph.mean_deg:.2f}°",
-            str(one.loops),
-            str(one.unmatched),
-            str(one.breaks),
-            f"{one.scan.p50_ms:.1f}, {one.scan.p99_ms:.1f} ms",
-            f"{one.loop.p99_ms:.1f}, {one.loop_max_ms:.1f} ms",
-        )
-    return table

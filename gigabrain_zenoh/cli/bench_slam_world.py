@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gigabrain_zenoh.cli.checked import above_zero
+from gigabrain_zenoh.cli.side_by_side import side_by_side
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -41,30 +42,23 @@ def slam_world(
 
 
 def _table(worlds: "Sequence[WorldResult]") -> "Table":
-    from rich.table import Table
-
-    table = Table(
-        title="Errors of poses against the physics: mean, most",
-        caption=f"{worlds[0].body}, seed {worlds[0].seed}. Times are of the CPU.",
+    return side_by_side(
+        "Errors of poses against the physics: mean, most",
+        f"{worlds[0].body}, seed {worlds[0].seed}. Times are of the CPU.",
+        [one.world for one in worlds],
+        {
+            "driven, in minutes": [f"{one.driven_m:g} m, {one.minutes:g}" for one in worlds],
+            "contacts": [str(one.contacts) for one in worlds],
+            "scans, not localized": [f"{one.scans}, {one.not_localized}" for one in worlds],
+            "keyframes": [str(one.keyframes) for one in worlds],
+            "loops closed, drawn anew": [f"{one.loops}, {one.drawn_anew}" for one in worlds],
+            "odometry with gyro": [_off(one.fused) for one in worlds],
+            "map": [_off(one.slam) for one in worlds],
+            "map, last minute": [_off(one.last_minute) for one in worlds],
+            "scan p50, p99 [ms]": [f"{o.scan.p50_ms:.1f}, {o.scan.p99_ms:.1f}" for o in worlds],
+            "memory, second minute to last": [f"+{one.grew_mb:.0f} MB" for one in worlds],
+        },
     )
-    table.add_column("")
-    for one in worlds:
-        table.add_column(one.world, justify="right")
-    rows = {
-        "driven, in minutes": [f"{one.driven_m:g} m, {one.minutes:g}" for one in worlds],
-        "contacts": [str(one.contacts) for one in worlds],
-        "scans, not localized": [f"{one.scans}, {one.not_localized}" for one in worlds],
-        "keyframes": [str(one.keyframes) for one in worlds],
-        "loops closed, drawn anew": [f"{one.loops}, {one.drawn_anew}" for one in worlds],
-        "odometry with gyro": [_off(one.fused) for one in worlds],
-        "map": [_off(one.slam) for one in worlds],
-        "map, last minute": [_off(one.last_minute) for one in worlds],
-        "scan p50, p99 [ms]": [f"{o.scan.p50_ms:.1f}, {o.scan.p99_ms:.1f}" for o in worlds],
-        "memory, second minute to last": [f"+{one.grew_mb:.0f} MB" for one in worlds],
-    }
-    for title, cells in rows.items():
-        table.add_row(title.replace("[", "\\["), *cells)
-    return table
 
 
 def _off(off: "Off") -> str:
