@@ -86,7 +86,8 @@ def _show(result: "GoalsResult") -> None:
     for run in result.runs:
         for one in run.failures:
             after = f"after {one.seconds:.0f} s"
-            console.print(f"{run.body} in {run.world}, {where(one.goal)} {after}: {one.reason}")
+            failure = f"{run.body} in {run.world}, {where(one.goal)} {after}: {one.reason}"
+            console.print(failure, markup=False, soft_wrap=True)
 
 
 def _progress(text: str) -> None:

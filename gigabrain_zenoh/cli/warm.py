@@ -19,7 +19,7 @@ async def _all() -> None:
     """Both at a time: they share no kernel."""
     from gigabrain_zenoh.compiling import DRIVING, FINDING, MAPPING
 
-    print("compiling, which takes up to a minute")
+    print("compiling, which takes up to a minute", flush=True)
     await asyncio.gather(
         _compile("mapping", MAPPING, FINDING), _compile("planning and driving", DRIVING)
     )
@@ -35,4 +35,4 @@ async def _compile(name: str, *warm_ups: str) -> None:
                 compile_all(warm_up)  # says why it cannot be done
             except ModuleNotFoundError as error:
                 raise needs(error) from None
-    print(f"{name}: {time.monotonic() - began_s:.1f} s")
+    print(f"{name}: {time.monotonic() - began_s:.1f} s", flush=True)
