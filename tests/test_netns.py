@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.topics import CMD_VEL, INTENT
+from gigabrain_schemas.topics import CMD_VEL
 from gigabrain_zenoh.client import Robot
 from gigabrain_zenoh.faults.chaos import CALM, Chaos
 from gigabrain_zenoh.faults.proxy import TcpProxy
@@ -57,21 +57,20 @@ class Site:
 
 
 class Ears:
-    """What is said on the way from decision to the gate."""
+    """What control says to the gate, and what of decision's it rests on."""
 
     def __init__(self, robot: Onlooker) -> None:
-        self.arrivals: deque[int] = deque(maxlen=10_000)  # of intents, in the robot's ticks
         self.commands: deque[CmdVel] = deque(maxlen=10_000)
-        time = robot.bus.time
-        robot.bus.subscribe(INTENT, lambda _key, _intent: self.arrivals.append(time.tick))
         robot.bus.subscribe(CMD_VEL, lambda _key, command: self.commands.append(command))
 
     def silence(self, after: int) -> tuple[int, int]:
-        """When decision was heard for the last time before it fell silent, and then again.
+        """When control heard decision for the last time before it fell silent, and then again.
 
-        As the robot's clock has it: what waited on the way may carry every tick there was.
+        It answers each intent at once, with what that rests on; who listens from elsewhere may have
+        heard the same intent a tick sooner, or one that came too late for control.
         """
-        ticks = [after, *(tick for tick in self.arrivals if tick >= after)]
+        heard = [b.tick for a, b in pairwise(self.commands) if b.basis > a.basis]
+        ticks = [after, *(tick for tick in heard if tick >= after)]
         gaps = ((a, b) for a, b in pairwise(ticks) if b - a > STOP_TICKS)
         return next(gaps, (ticks[-1], ticks[-1]))
 
