@@ -110,8 +110,8 @@ async def test_impatience_does_not_disturb_its_end(home: Home) -> None:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Home]:
-    """A home with 256 kB of disk, which goes with the last process that sees it."""
-    script = f'mount -t tmpfs -o size=256k none {tmp_path}/home/state && exec "$@"'
+    """A home with 128 kB of disk, which goes with the last process that sees it."""
+    script = f'mount -t tmpfs -o size=128k none {tmp_path}/home/state && exec "$@"'
     inside = ("unshare", "--mount", "--", "sh", "-c", script, "sh")
     (tmp_path / "home" / "state").mkdir(parents=True)
     if subprocess.run((*inside, "true"), capture_output=True).returncode:
