@@ -10,6 +10,7 @@ from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.limits import NO_CAPS, ZERO
+from gigabrain_zenoh.pose_history import PoseHistory
 from gigabrain_zenoh.safety import attitude, following, host, power, progress, round_trip, zones
 from gigabrain_zenoh.safety.attitude import Attitude
 from gigabrain_zenoh.safety.following import Following
@@ -49,6 +50,7 @@ class Memory(msgspec.Struct, frozen=True, kw_only=True):
     following: Following = Following()
     round_trip: RoundTrip = RoundTrip()
     progress: Progress = Progress()
+    history: PoseHistory = PoseHistory()
     field: Field = Field()
 
 
@@ -80,6 +82,7 @@ def _look(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
     state, limits = inputs.state, body.thresholds
     elapsed = min(max(0, state.tick - memory.tick), LONGEST_STEP_TICKS)
     followed = following.look(body, memory.following, state, inputs.command, memory.caps, elapsed)
+    history = memory.history.then(state)
     motion = Motion(
         measured=state.velocity, told=followed.told, wanted=_wanted(state, inputs.command)
     )
@@ -92,7 +95,8 @@ def _look(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
         following=followed,
         round_trip=round_trip.look(limits, memory.round_trip, inputs.echo_ages, elapsed),
         progress=progress.look(memory.progress, inputs.bases, elapsed),
-        field=zones.look(body, memory.field, inputs.scan, state, motion),
+        history=history,
+        field=zones.look(body, memory.field, inputs.scan, state, history, motion),
     )
 
 

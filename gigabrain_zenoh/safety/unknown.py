@@ -2,7 +2,7 @@
 
 The room is divided into sectors that keep their direction while the body turns. One without a
 single believable beam stands for an obstacle at its last range less the way that the body may have
-gone since.
+gone since; one where the lidar has no beam at all, for one where nothing tells that it is free.
 """
 
 import math
@@ -14,12 +14,13 @@ from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.perception import Floats
+from gigabrain_zenoh.safety.looks import EDGE, Looks, free
 from gigabrain_zenoh.sweep import edges
 
 SECTORS = 36
 WIDTH = math.tau / SECTORS  # [rad]
 TOUCHING = 0.001  # [m] outside the footprint
-EDGE = 1e-9  # [rad]
+STEP_M, FARTHEST_M = 0.05, 0.35  # how finely, and how far from the body, past looks are asked
 
 Ranges = tuple[float, ...]  # (SECTORS,) [m], of sectors counter-clockwise from yaw 0
 
@@ -63,24 +64,38 @@ def _sector_of_beam(count: int, angle_min: float, increment: float, yaw: float) 
 
 
 def obstacles(
-    body: BodyDescription, yaw: float, nearest: Ranges, unknown: tuple[int, ...]
+    body: BodyDescription,
+    yaw: float,
+    nearest: Ranges,
+    unknown: tuple[int, ...],
+    housing: float,
+    past: Looks,
 ) -> Floats:
     """Points (n, 2) [m] in the body's frame that stand for the `unknown` sectors.
 
-    Three for each: at its edges and in its middle.
+    Three for each: at its edges and in its middle. What is nearer than `housing` [m] in the `past`
+    looks is the lidar's own.
     """
     lidar = body.lidar
     if lidar is None or not unknown:
         return np.empty((0, 2))
-    where = np.array(unknown)
-    bearing = (where[:, None] + np.array([0.0, 0.5, 1.0])) * WIDTH - yaw
-    distance = np.repeat(np.array(nearest)[where], 3)
-    heading = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1).reshape(-1, 2)
+    where = np.repeat(np.array(unknown), 3)
+    bearing = (where + np.tile([0.0, 0.5, 1.0], len(unknown))) * WIDTH - yaw
+    heading = np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
     hull, mount = edges(body.footprint), np.array([lidar.x, lidar.y])
     towards = heading @ hull.normals.T
     room = hull.offsets - hull.normals @ mount
     with np.errstate(divide="ignore"):
         leaves = np.where(towards > 0, room / towards, np.inf).min(axis=1)
-    reach = np.maximum(distance, leaves + TOUCHING)
+    reach = np.maximum(np.array(nearest)[where], leaves + TOUCHING)
+    if past:
+        scan = past[-1].scan
+        angles = scan.angle_min, scan.angle_increment, lidar.yaw + yaw
+        blind = ~np.isin(where, _sector_of_beam(len(ranges(scan)), *angles))
+        ways = leaves[blind, None] + np.arange(TOUCHING, FARTHEST_M + STEP_M / 2, STEP_M)
+        points = (mount + ways[..., None] * heading[blind, None]).reshape(-1, 2)
+        known = free(body, lidar, housing, past, points).reshape(ways.shape)
+        first = np.where(known.all(axis=1), ways.shape[1] - 1, known.argmin(axis=1))
+        reach[blind] = np.maximum(reach[blind], ways[np.arange(len(ways)), first])
     found: Floats = (mount + reach[:, None] * heading)[np.isfinite(reach)]
     return found

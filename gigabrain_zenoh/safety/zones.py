@@ -11,7 +11,8 @@ from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.perception import Floats, blind_ahead, hits, scan_problem
-from gigabrain_zenoh.safety import unknown
+from gigabrain_zenoh.pose_history import PoseHistory
+from gigabrain_zenoh.safety import looks, unknown
 from gigabrain_zenoh.safety.words import say
 from gigabrain_zenoh.stop_zone import brakes
 from gigabrain_zenoh.sweep import arc, straight, turning
@@ -41,6 +42,7 @@ class Field(msgspec.Struct, frozen=True, kw_only=True):
     free: Free = {}
     stopped: frozenset[str] = frozenset()
     sectors: unknown.Ranges = ()
+    past: looks.Looks = ()
 
 
 class Motion(msgspec.Struct, frozen=True, kw_only=True):
@@ -56,7 +58,12 @@ class Motion(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def look(
-    body: BodyDescription, field: Field, scan: LaserScan | None, state: RobotState, motion: Motion
+    body: BodyDescription,
+    field: Field,
+    scan: LaserScan | None,
+    state: RobotState,
+    history: PoseHistory,
+    motion: Motion,
 ) -> Field:
     """Read a new scan, once the state of its tick is here as well.
 
@@ -73,17 +80,20 @@ def look(
         return msgspec.structs.replace(now, free={}, stopped=frozenset())
     elapsed_s = max(0, scan.basis - field.basis) * TICK_NS / 1e9 if field.basis else 0.0
     gone = elapsed_s * math.hypot(motion.measured.linear_x, motion.measured.linear_y)
-    yaw = state.pose.yaw
-    sectors, blank = unknown.remember(lidar, scan, NEAREST, yaw, field.sectors, gone)
+    pose = history.at(state.boot, scan.basis) or state.pose
+    sectors, blank = unknown.remember(lidar, scan, NEAREST, pose.yaw, field.sectors, gone)
+    # who does not drive may be carried, and the odometry would not know
+    past = looks.then(field.past, body, pose, scan) if state.gate.mode == "enabled" else ()
     seen = np.stack(hits(lidar, scan, NEAREST), axis=1)
-    points = np.concatenate([seen, unknown.obstacles(body, yaw, sectors, blank)])
+    dark = unknown.obstacles(body, pose.yaw, sectors, blank, NEAREST, past)
+    points = np.concatenate([seen, dark])
     free = _free(body, points, motion)
     stopped = frozenset(
         direction
         for direction, brake in brakes(body).items()
         if brake.in_zone(free[direction], motion.towards(direction), direction in field.stopped)
     )
-    return msgspec.structs.replace(now, free=free, stopped=stopped, sectors=sectors)
+    return msgspec.structs.replace(now, free=free, stopped=stopped, sectors=sectors, past=past)
 
 
 def caps(body: BodyDescription, field: Field) -> SpeedCaps:
