@@ -49,7 +49,9 @@ class Robot(Bench):
     async def save(self, name: str, *, replace: bool = False) -> MapReply:
         """What perception answers."""
         bus = Bus(self.network.transport(), self.clock, "test")
-        asking = asyncio.ensure_future(bus.ask(MAP_SAVE, MapRequest(name=name, replace=replace)))
+        request = MapRequest(name=name, replace=replace)
+        patient = bus.ask(MAP_SAVE, request, timeout_s=600.0)  # by the clock below, which runs fast
+        asking = asyncio.ensure_future(patient)
         async with asyncio.timeout(30):
             while not asking.done():
                 await self.clock.advance(20_000_000)
