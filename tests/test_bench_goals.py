@@ -7,11 +7,12 @@ from msgspec.structs import replace
 from rich.console import Console
 
 from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.bench import goals_sender
 from gigabrain_zenoh.bench.goals import GoalFigures, GoalsResult
 from gigabrain_zenoh.bench.goals_sender import Off, Sender, elsewhere
 from gigabrain_zenoh.bench.group import Group
 from gigabrain_zenoh.cli.bench_goals import _table
-from gigabrain_zenoh.errors import BodyLost
+from gigabrain_zenoh.errors import BodyLost, GigabrainError
 from gigabrain_zenoh.task_client import Tasks
 from tests.bus_rig import Net
 
@@ -68,6 +69,34 @@ async def test_a_question_that_the_host_has_slept_through_is_asked_again(
     sender = Sender(Net().two, cast("Group", Alive()), seed=0)
     assert await sender._order(Goal(x=2.0, y=1.0)) == "goal-1"
     assert asked == [2.0, 2.0, 2.0]
+
+
+async def test_a_robot_that_a_person_has_shut_in_is_sent_on_when_the_person_has_gone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks: list[GigabrainError | tuple[float, float]] = [
+        GigabrainError("no place can be reached"),
+        GigabrainError("none"),
+        (1.0, 2.0),
+    ]
+
+    def anywhere(_: Sender) -> tuple[float, float]:
+        found = looks.pop(0)
+        if isinstance(found, GigabrainError):
+            raise found
+        return found
+
+    class Alive:
+        async def look(self) -> None:
+            pass
+
+    monkeypatch.setattr(Sender, "_anywhere", anywhere)
+    sender = Sender(Net().two, cast("Group", Alive()), seed=0)
+    assert await sender._somewhere() == (1.0, 2.0)
+    monkeypatch.setattr(goals_sender, "SILENT_S", 0.0)
+    looks: list[GigabrainError | tuple[float, float]] = [GigabrainError("none")] * 100
+    with pytest.raises(GigabrainError, match="none"):
+        await sender._somewhere()
 
 
 def test_the_table_says_what_was_measured() -> None:

@@ -89,7 +89,7 @@ class Sender:
 
     async def send(self) -> None:
         """Send it to the next place, and wait until it is there or has given up."""
-        x, y = self._anywhere()
+        x, y = await self._somewhere()
         yaw = float(self._random.uniform(-math.pi, math.pi)) if self.sent % 2 else None
         goal = Goal(x=x, y=y, yaw=yaw)
         self.sent += 1
@@ -155,6 +155,18 @@ class Sender:
         pose = self._poses.current
         assert pose
         return Pose(x=pose.x, y=pose.y, yaw=pose.yaw)
+
+    async def _somewhere(self) -> Point:
+        """A place to go to; a person who has shut the robot in goes on after a while."""
+        now = asyncio.get_running_loop().time
+        until = now() + SILENT_S
+        while True:
+            try:
+                return self._anywhere()
+            except GigabrainError:
+                if now() > until:
+                    raise
+            await self._group.look()
 
     def _anywhere(self) -> Point:
         """A place in the known map that can be reached and where the body can turn."""
