@@ -94,7 +94,7 @@ async def test_a_robot_that_a_person_has_shut_in_is_sent_on_when_the_person_has_
     sender = Sender(Net().two, cast("Group", Alive()), seed=0)
     assert await sender._somewhere() == (1.0, 2.0)
     monkeypatch.setattr(goals_sender, "SILENT_S", 0.0)
-    looks: list[GigabrainError | tuple[float, float]] = [GigabrainError("none")] * 100
+    looks.extend([GigabrainError("none")] * 100)
     with pytest.raises(GigabrainError, match="none"):
         await sender._somewhere()
 

@@ -34,7 +34,7 @@ def remember(
     `gone` [m] how far the body may have moved since.
     """
     values = ranges(scan).astype(np.float64)
-    sector = _sector_of_beam(len(values), scan.angle_min, scan.angle_increment, lidar.yaw + yaw)
+    sector = _covered(lidar, scan, yaw)
     known = values >= nearest
     if lidar.no_return == "unknown":
         known &= values < np.inf
@@ -57,8 +57,10 @@ def _at_first(lidar: Lidar, values: Floats, sector: NDArray[np.intp]) -> Floats:
     return far
 
 
-def _sector_of_beam(count: int, angle_min: float, increment: float, yaw: float) -> NDArray[np.intp]:
-    angles = angle_min + yaw + increment * np.arange(count)
+def _covered(lidar: Lidar, scan: LaserScan, yaw: float) -> NDArray[np.intp]:
+    """The sector of each beam (beams,), for a body that is turned by `yaw`."""
+    beams = np.arange(len(ranges(scan)))
+    angles = scan.angle_min + (lidar.yaw + yaw) + scan.angle_increment * beams
     sectors: NDArray[np.intp] = np.floor((angles + EDGE) / WIDTH).astype(np.intp) % SECTORS
     return sectors
 
@@ -89,9 +91,7 @@ def obstacles(
         leaves = np.where(towards > 0, room / towards, np.inf).min(axis=1)
     reach = np.maximum(np.array(nearest)[where], leaves + TOUCHING)
     if past:
-        scan = past[-1].scan
-        angles = scan.angle_min, scan.angle_increment, lidar.yaw + yaw
-        blind = ~np.isin(where, _sector_of_beam(len(ranges(scan)), *angles))
+        blind = ~np.isin(where, _covered(lidar, past[-1].scan, yaw))
         ways = leaves[blind, None] + np.arange(TOUCHING, FARTHEST_M + STEP_M / 2, STEP_M)
         points = (mount + ways[..., None] * heading[blind, None]).reshape(-1, 2)
         known = free(body, lidar, housing, past, points).reshape(ways.shape)
