@@ -20,6 +20,7 @@ from gigabrain_zenoh.faults.stopping import TICK_MS, creep, stop_by
 from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.faults.with_keys import bit_flips
+from gigabrain_zenoh.safety.round_trip import SLOWED
 
 __all__ = [
     "bit_flips",
@@ -163,7 +164,7 @@ async def latency_jitter_loss(rig: Rig) -> Measured:
 async def _stops_in_time(subject: Subject) -> int:
     """How often it stopped though its commands came in time, as the robot's ticks have it."""
     onlooker = subject.onlooker
-    await subject.drive()
+    await subject.drive(share=SLOWED)  # a line of 100 ms and what this machine adds are too long
     start = onlooker.state
     await onlooker.ticks(DRIVE_TICKS)
     return stops_in_time(onlooker, start)

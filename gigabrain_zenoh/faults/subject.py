@@ -194,15 +194,18 @@ class Subject:
             truth = await self.truth()
         return truth
 
-    async def drive(self, room: float = 1.3) -> None:
-        """Have the brain drive straight on as fast as it may, as a person would: by hand."""
+    async def drive(self, room: float = 1.3, share: float = 1.0) -> None:
+        """Have the brain drive straight on as fast as it may, as a person would: by hand.
+
+        `share` of that is enough, where the gate must be expected to slow it down.
+        """
         onlooker = self.onlooker
         await self.release()
         await until(lambda: onlooker.bodies.current, "the driver says what its body is")
         body = onlooker.bodies.current
         most = body.description.max_linear_speed if body else 0.0
         decision = self.deployment.decision
-        speed = FULL_SHARE[decision.behaviour] * min(decision.linear_speed, most)
+        speed = share * FULL_SHARE[decision.behaviour] * min(decision.linear_speed, most)
         await onlooker.straight(speed, room, NEARLY_STRAIGHT[decision.behaviour], by_hand=True)
 
     async def release(self) -> None:
