@@ -56,6 +56,7 @@ BUTTON_LOST = Cause(
     latching=True,
     remedy="see that its process runs, then release the robot",
 )
+BRAIN_SILENT = frozenset(("perception_silent", "decision_silent", "control_silent"))  # safety's
 
 
 def button(text: str) -> Cause:

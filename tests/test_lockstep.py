@@ -3,6 +3,7 @@ import asyncio
 from gigabrain_drivers.lockstep import Lockstep
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
+from gigabrain_zenoh.safety.words import say
 
 
 def command(tick: int, basis: int, source: str = "control") -> CmdVel:
@@ -28,6 +29,17 @@ def test_a_tick_with_a_scan_waits_for_the_command_and_the_verdict_that_rest_on_i
     steps.command(command(10, 10))
     assert not steps.complete
     steps.verdict(SafetyState(verdict="ok", basis=10))
+    assert steps.complete
+
+
+def test_a_verdict_that_misses_a_part_of_the_brain_does_not_count() -> None:
+    steps = Lockstep()
+    steps.begin(1, 1)
+    steps.command(command(1, 1))
+    starting, missing = say("starting"), say("perception_silent")
+    steps.verdict(SafetyState(verdict="stop", basis=1, causes=(starting, missing)))
+    assert not steps.complete
+    steps.verdict(SafetyState(verdict="stop", basis=1, causes=(starting,)))
     assert steps.complete
 
 

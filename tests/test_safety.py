@@ -8,6 +8,7 @@ from gigabrain_schemas.body import BodyDescription, GateStatus, RobotState, Thre
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.ages import scan_limit_ns
+from gigabrain_zenoh.causes import BRAIN_SILENT
 from gigabrain_zenoh.safety import Inputs, Memory, step
 from gigabrain_zenoh.safety.zones import Field
 from tests.brain_rig import DRIVING, LIDAR, WAFFLE, open_space, scan, state
@@ -230,6 +231,19 @@ def test_nothing_moves_before_the_second_scan() -> None:
     assert found == [["starting"], ["starting"], [], []]
     bare = replace(BODY, lidar=None)
     assert step(bare, Memory(), Inputs(state=state(1)))[1] == SafetyState(verdict="ok")
+
+
+def test_with_the_first_scan_it_is_told_who_has_not_been_heard_yet() -> None:
+    """Later it is known whether there is a brain at all, which a script need not wait for."""
+    everybody, memory, found = ("perception", "decision", "control"), Memory(), []
+    for tick, basis in ((1, 0), (2, 2), (5, 2), (7, 7)):
+        seen = scan(open_space(), basis) if basis else None
+        now = state(tick, gate=GateStatus(mode="idle"))
+        inputs = Inputs(state=now, scan=seen, scan_age_ns=0, silent=everybody)
+        memory, verdict = step(BODY, memory, inputs)
+        found.append([code for code in codes(verdict) if code in BRAIN_SILENT])
+    all_silent = [f"{name}_silent" for name in everybody]
+    assert found == [[], all_silent, all_silent, []]
 
 
 def test_several_causes_stand_side_by_side() -> None:

@@ -4,6 +4,7 @@ import asyncio
 
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
+from gigabrain_zenoh.causes import BRAIN_SILENT
 from gigabrain_zenoh.gate import BRAIN
 
 PATIENCE_S = 0.15  # of wall time per tick
@@ -15,6 +16,9 @@ class Lockstep:
 
     A tick waits for a command that echoes it. A tick with a scan waits for the command, and for the
     verdict of safety, that rest on that scan. So decisions do not depend on how fast a machine is.
+
+    A verdict that misses a part of the brain does not count: safety has begun to listen when that
+    part had answered already, and when it hears the next answer would be left to chance.
     """
 
     def __init__(self, period_ticks: int = 1) -> None:
@@ -38,6 +42,8 @@ class Lockstep:
 
     def verdict(self, verdict: SafetyState) -> None:
         """Safety has spoken."""
+        if any(cause.code in BRAIN_SILENT for cause in verdict.causes):
+            return
         self._judged = max(self._judged, verdict.basis)
         self._wake.set()
 

@@ -49,16 +49,23 @@ def _chain(bases: Bases) -> tuple[int, int, int, int]:
 
 
 def causes(
-    limits: Thresholds, now: Progress, state: RobotState, silent: tuple[str, ...]
+    limits: Thresholds,
+    now: Progress,
+    state: RobotState,
+    silent: tuple[str, ...],
+    *,
+    first: bool,
 ) -> tuple[Cause, ...]:
     """Why the body must stop; `silent` are the systems of which nothing is heard.
 
     The brain's processes matter while the brain drives; a person or a script looks itself. While
     nobody drives they matter too, since the brain would be next; but where all three are silent
-    there is no brain, and a script need not wait for one.
+    there is no brain, and a script need not wait for one. Only with the `first` scan it cannot be
+    known yet whether there is one; who waits for it is told.
     """
     commander = state.gate.commander
-    if commander not in ("", BRAIN) or (not commander and len(silent) == len(SYSTEMS)):
+    brainless = not commander and len(silent) == len(SYSTEMS) and not first
+    if commander not in ("", BRAIN) or brainless:
         return ()
     found = [say(f"{name}_silent") for name in silent]
     for name, ticks in zip(SYSTEMS, now.behind_ticks, strict=True):

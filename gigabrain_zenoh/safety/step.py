@@ -111,10 +111,11 @@ def _wanted(state: RobotState, command: CmdVel | None) -> Velocity:
 def _stops(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause, ...]:
     """All that the body must stop for."""
     limits, state = body.thresholds, inputs.state
+    first = 0 < memory.field.scans < SCANS_TO_START
     return (
         *_blind(body, memory, inputs),
         *_starting(body, memory),
-        *progress.causes(limits, memory.progress, state, inputs.silent),
+        *progress.causes(limits, memory.progress, state, inputs.silent, first=first),
         *power.causes(limits, memory.power),
         *attitude.causes(memory.attitude),
         *following.causes(body, memory.following),
