@@ -83,6 +83,24 @@ def test_a_detour_has_its_own_time_and_going_to_and_fro_ends() -> None:
     assert tries == ["running"] * 8 + ["failed"] * 4
 
 
+def test_who_had_to_give_way_at_the_goal_has_time_to_settle_there_again() -> None:
+    guide = Guide()
+    ask = functools.partial(think, guide, OPEN, goal=AHEAD)
+    assert ask(tick=1).state == "running"
+    assert ask(tick=1000, x=5.0).state == "running"
+    assert ask(tick=1100, x=4.4).state == "running"  # for who comes along
+    tries = [ask(tick=2400 + 700 * k, x=5.0).state for k in range(3)]
+    assert tries == ["running", "running", "running"]
+    assert ask(tick=3901, x=5.0).state == "failed"  # it was there for 30 s and has not arrived
+
+
+def test_going_to_and_fro_at_the_goal_ends() -> None:
+    guide = Guide()
+    ends = [think(guide, OPEN, tick=1 + 1000 * k, x=5.0 if k % 2 else 4.8) for k in range(12)]
+    assert [one.state for one in ends] == ["running"] * 7 + ["failed"] * 5
+    assert ends[-1].reason.startswith("no nearer for 30 s, 0.0 m before the goal")
+
+
 def test_what_no_way_has_ever_led_to_is_refused_at_once() -> None:
     assert think(Guide(), SHUT, tick=1).state == "failed"
 
