@@ -13,11 +13,20 @@ def command(tick: int, basis: int, source: str = "control") -> CmdVel:
 def test_a_tick_without_a_scan_waits_for_the_command_that_echoes_it() -> None:
     steps = Lockstep()
     steps.begin(7, 5)
-    steps.verdict(SafetyState(verdict="ok", basis=5))
+    steps.verdict(SafetyState(verdict="ok", tick=6, basis=5))
     steps.command(command(6, 5))
     assert not steps.complete
     steps.command(command(7, 5))
     assert steps.complete
+
+
+def test_a_tick_without_a_scan_waits_for_safety_that_may_repeat_itself_in_every_second() -> None:
+    steps = Lockstep()
+    steps.begin(8, 5)
+    steps.command(command(8, 5))
+    for tick, enough in ((5, False), (6, False), (7, True)):
+        steps.verdict(SafetyState(verdict="ok", tick=tick, basis=5))
+        assert steps.complete is enough
 
 
 def test_a_tick_with_a_scan_waits_for_the_command_and_the_verdict_that_rest_on_it() -> None:
@@ -28,7 +37,7 @@ def test_a_tick_with_a_scan_waits_for_the_command_and_the_verdict_that_rest_on_i
     assert not steps.complete
     steps.command(command(10, 10))
     assert not steps.complete
-    steps.verdict(SafetyState(verdict="ok", basis=10))
+    steps.verdict(SafetyState(verdict="ok", tick=10, basis=10))
     assert steps.complete
 
 
@@ -46,7 +55,7 @@ def test_a_verdict_that_misses_a_part_of_the_brain_does_not_count() -> None:
 def test_a_commander_that_looks_itself_needs_no_basis() -> None:
     steps = Lockstep()
     steps.begin(10, 10)
-    steps.verdict(SafetyState(verdict="ok", basis=10))
+    steps.verdict(SafetyState(verdict="ok", tick=10, basis=10))
     steps.command(command(10, 0, "script"))
     assert steps.complete
 

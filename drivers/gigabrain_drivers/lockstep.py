@@ -4,6 +4,7 @@ import asyncio
 
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
+from gigabrain_zenoh.ages import REPEAT_TICKS
 from gigabrain_zenoh.causes import BRAIN_SILENT
 from gigabrain_zenoh.gate import BRAIN
 
@@ -15,7 +16,9 @@ class Lockstep:
     """Knows whether all that a tick waits for has come.
 
     A tick waits for a command that echoes it. A tick with a scan waits for the command, and for the
-    verdict of safety, that rest on that scan. So decisions do not depend on how fast a machine is.
+    verdict of safety, that rest on that scan. Between scans safety is waited for as well: a verdict
+    that is old by the robot's clock would stop it, where only the machine is slow. So decisions do
+    not depend on how fast a machine is.
 
     A verdict that misses a part of the brain does not count: safety has begun to listen when that
     part had answered already, and when it hears the next answer would be left to chance.
@@ -25,12 +28,14 @@ class Lockstep:
         self._period = period_ticks  # from one command of control to the next
         self._tick = self._basis = 0
         self._echo = self._echo_basis = self._judged = 0
+        self._seen = self._wanted = 0  # by safety, when it spoke
         self._wake = asyncio.Event()
         self.timeouts = 0  # ticks that went on without the brain
 
     def begin(self, tick: int, basis: int) -> None:
         """A tick has been sent out; `basis` is the tick of the newest scan, or 0."""
         self._tick, self._basis = tick - tick % self._period, basis
+        self._wanted = tick - REPEAT_TICKS + 1  # it need not say the same in every tick
         self._wake.clear()
 
     def command(self, command: CmdVel) -> None:
@@ -45,12 +50,14 @@ class Lockstep:
         if any(cause.code in BRAIN_SILENT for cause in verdict.causes):
             return
         self._judged = max(self._judged, verdict.basis)
+        self._seen = max(self._seen, verdict.tick)
         self._wake.set()
 
     @property
     def complete(self) -> bool:
         """Whether the tick has been answered."""
-        return self._echo >= self._tick and min(self._echo_basis, self._judged) >= self._basis
+        rested = min(self._echo_basis, self._judged) >= self._basis
+        return rested and self._echo >= self._tick and self._seen >= self._wanted
 
     async def wait(self, timeout_s: float) -> bool:
         """Wait for the answer; says whether it came in time."""

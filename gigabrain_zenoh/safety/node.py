@@ -7,6 +7,7 @@ from gigabrain_schemas.base import Cause, Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import SAFETY
+from gigabrain_zenoh.ages import REPEAT_TICKS
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.causes import in_words
 from gigabrain_zenoh.safety.host import HostWatch, Look
@@ -14,8 +15,6 @@ from gigabrain_zenoh.safety.senses import Senses
 from gigabrain_zenoh.safety.step import Memory, step
 
 log = logging.getLogger("gigabrain_zenoh.safety")
-
-REPEAT_TICKS = 2  # the verdict is repeated every 40 ms, and at once when it changes
 
 
 async def run(bus: Bus, ready: Callable[[], None], look: Look | None = None) -> None:
