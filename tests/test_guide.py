@@ -133,12 +133,31 @@ def test_what_stays_at_the_goal_for_ever_is_made_room_for_twice_and_then_told() 
     ask(ROOM, tick=1)
     ticks = (502, 1251, 1252, 1752, 1753, 2502, 2503, 4003)
     routes = [ask(TAKEN, tick=tick) for tick in ticks]
-    assert [one.aside for one in routes] == [True, True, False, False, True, True, False, False]
+    told = [one.reason.partition(":")[0] for one in routes]
+    away, look = "making room", "looking whether there is room"
+    assert told == [away, away, look, look, away, away, look, look]
     assert routes[4].goal
     assert math.hypot(routes[4].goal.x - 5.0, routes[4].goal.y - 3.0) > 4.0  # far, the second time
     told = ask(TAKEN, tick=4004)
     assert told.state == "failed"
     assert told.reason.startswith("the goal is inside something; nearest reachable point is ")
+
+
+def test_who_stood_aside_comes_back_to_look_whether_there_is_room_again() -> None:
+    """The map keeps whoever has gone meanwhile, where the robot cannot see it from aside."""
+    guide = Guide()
+    goal = Goal(x=5.0, y=3.0)
+    ask = functools.partial(think, guide, goal=goal)
+    ask(ROOM, tick=1, x=4.0, y=3.0)
+    ask(TAKEN, tick=502, x=4.0, y=3.0)
+    looks = ask(TAKEN, tick=1252, x=1.0, y=1.0)
+    assert looks.reason == "looking whether there is room: the goal is inside something"
+    assert looks.goal
+    assert looks.points is not None
+    assert looks.aside  # to be there is not to have arrived
+    assert 0.2 < math.hypot(looks.goal.x - 5.0, looks.goal.y - 3.0) < 0.8
+    back = ask(ROOM, tick=1400, x=looks.goal.x, y=looks.goal.y)
+    assert (back.goal, back.aside, back.reason) == (goal, False, "")
 
 
 def test_it_makes_room_for_who_keeps_it_from_the_place_beside_its_goal() -> None:

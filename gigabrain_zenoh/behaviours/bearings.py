@@ -26,7 +26,7 @@ class Route:
     points: Floats | None = None  # (n, 2) [m], in the map, from about here to there
     state: Literal["running", "done", "failed"] = "running"
     reason: str = ""  # in words
-    aside: bool = False  # it leads out of somebody's way: to be there is not to have arrived
+    aside: bool = False  # it leads elsewhere for a while: to be there is not to have arrived
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -134,7 +134,7 @@ class Guide:
                 return self._ended("failed", found.reason)
             if self._found:  # noise closes narrow ways in the map; what is near shows up there
                 return self._going(goal, self._found)
-            return self._waiting(found.reason)
+            return self._looking(found, asked, chart)
         self._found = found
         self._progress.measure(float(found.remaining[0]), asked.tick)
         if self._progress.stuck(asked.tick, GIVE_UP_TICKS):
@@ -154,6 +154,16 @@ class Guide:
         if place is None or not isinstance(way, Path):
             return None
         return replace(self._going(place, way, "making room: something is at the goal"), aside=True)
+
+    def _looking(self, found: Unreachable, asked: Asked, chart: Costmap) -> Route:
+        """As near as it can come to a goal: what stood there may have gone out of its sight."""
+        nearest = found.nearest
+        way = self._planner.plan(chart, (asked.here.x, asked.here.y), nearest) if nearest else None
+        if nearest is None or not isinstance(way, Path):
+            return self._waiting(found.reason)
+        x, y = nearest
+        reason = f"looking whether there is room: {found.reason.partition(';')[0]}"
+        return replace(self._going(Goal(x=x, y=y), way, reason), aside=True)
 
     def _anywhere(self, asked: Asked, chart: Costmap) -> Goal:
         """A place in the open that can be reached; where it is, if there is no other."""
