@@ -19,7 +19,7 @@ from gigabrain_zenoh.faults import clock
 from gigabrain_zenoh.faults.clock import OtherHost, age_error_ms
 from gigabrain_zenoh.faults.growth import Growth
 from gigabrain_zenoh.faults.onlooker import Onlooker
-from gigabrain_zenoh.faults.smooth import stops, stops_in_time
+from gigabrain_zenoh.faults.smooth import starts, stops, stops_in_time
 from gigabrain_zenoh.faults.stopping import first_zero
 from gigabrain_zenoh.transport import LocalNetwork
 from tests.brain_rig import BOOT, DRIVING, body, state
@@ -132,5 +132,7 @@ async def test_a_stop_is_unexplained_only_where_commands_came_in_time() -> None:
     with_a_gap = drive(modes, [*range(1, 25), *range(31, 76)])
     assert stops(with_a_gap, with_a_gap.states[0]) == [31]
     assert stops_in_time(with_a_gap, with_a_gap.states[0]) == 0
+    assert [starts(steady, steady.states[0], ticks) for ticks in (44, 45)] == [0, 1]
     never = drive(["enabled"] * 60, range(1, 61))
+    assert starts(never, never.states[0], 60) == 0
     assert stops_in_time(never, never.states[0]) == 0

@@ -14,7 +14,7 @@ from gigabrain_zenoh.faults.crowd import (
 from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.proxy import TcpProxy
 from gigabrain_zenoh.faults.rig import Rig
-from gigabrain_zenoh.faults.smooth import NO_GAP_TICKS, stops, stops_in_time
+from gigabrain_zenoh.faults.smooth import NO_GAP_TICKS, starts, stops, stops_in_time
 from gigabrain_zenoh.faults.spoiled import HOLE, behind_proxy
 from gigabrain_zenoh.faults.stopping import TICK_MS, creep, stop_by
 from gigabrain_zenoh.faults.subject import Subject
@@ -150,7 +150,7 @@ async def latency_jitter_loss(rig: Rig) -> Measured:
         rate_hz = 0.0
         for chaos in BAD:
             proxy.set(chaos)
-            rate_hz = max(rate_hz, await _stop_rate_hz(subject))
+            rate_hz = max(rate_hz, await _start_rate_hz(subject))
         proxy.set(Chaos(delay_ms=TOO_LONG_MS / 2))
         await subject.onlooker.still()
         moved_m = await creep(subject, RESTED_TICKS)
@@ -170,8 +170,8 @@ async def _stops_in_time(subject: Subject) -> int:
     return stops_in_time(onlooker, start)
 
 
-async def _stop_rate_hz(subject: Subject) -> float:
-    """How often it stopped in a second of its time."""
+async def _start_rate_hz(subject: Subject) -> float:
+    """How often it started anew in a second of its time; each time it has stopped before."""
     start = subject.onlooker.state
     await subject.onlooker.ticks(DRIVE_TICKS)
-    return len(stops(subject.onlooker, start)) / (DRIVE_TICKS * TICK_MS / 1e3)
+    return starts(subject.onlooker, start, DRIVE_TICKS) / (DRIVE_TICKS * TICK_MS / 1e3)

@@ -16,6 +16,14 @@ def stops(onlooker: Onlooker, start: RobotState) -> list[int]:
     return [b.tick for a, b in pairs if a.gate.mode == "enabled" != b.gate.mode]
 
 
+def starts(onlooker: Onlooker, start: RobotState, ticks: int) -> int:
+    """How often the gate has begun to let commands through, within so many ticks of `start`."""
+    end = start.tick + ticks
+    states = [s for s in onlooker.states if s.boot == start.boot and start.tick <= s.tick <= end]
+    pairs = itertools.pairwise(states)
+    return sum(a.gate.mode != "enabled" == b.gate.mode for a, b in pairs)
+
+
 def stops_in_time(onlooker: Onlooker, start: RobotState) -> int:
     """How often it stopped since `start` though its commands came in time."""
     heard = list(zip(onlooker.arrivals, (c.tick for c in onlooker.commands), strict=True))
