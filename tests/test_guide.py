@@ -94,10 +94,25 @@ def test_who_had_to_give_way_at_the_goal_has_time_to_settle_there_again() -> Non
     assert ask(tick=3901, x=5.0).state == "failed"  # it was there for 30 s and has not arrived
 
 
+def test_who_comes_no_nearer_than_a_hand_settles_there_and_says_so() -> None:
+    guide = Guide()
+    goal = Goal(x=5.0, y=1.0, yaw=1.5)
+    ask = functools.partial(think, guide, OPEN, goal=goal)
+    for tick in (1, 1501):  # safety sees something right ahead that is not in the map
+        assert ask(tick=tick, x=4.85).goal == goal
+    settled = ask(tick=1502, x=4.85)
+    assert settled.goal == Goal(x=4.85, y=1.0, yaw=1.5)
+    assert settled.reason == "0.2 m beside what was asked for: something is in the way"
+    assert not settled.aside
+    again = ask(tick=3002, x=4.86)  # while it turns
+    assert (again.goal, again.version) == (settled.goal, settled.version)
+    assert ask(tick=3003, x=4.86).state == "failed"
+
+
 def test_going_to_and_fro_at_the_goal_ends() -> None:
     guide = Guide()
-    ends = [think(guide, OPEN, tick=1 + 1000 * k, x=5.0 if k % 2 else 4.8) for k in range(12)]
-    assert [one.state for one in ends] == ["running"] * 7 + ["failed"] * 5
+    ends = [think(guide, OPEN, tick=1 + 1000 * k, x=5.0 if k % 2 else 4.8) for k in range(8)]
+    assert [one.state for one in ends] == ["running"] * 7 + ["failed"]
     assert ends[-1].reason.startswith("no nearer for 30 s, 0.0 m before the goal")
 
 
