@@ -105,7 +105,8 @@ def test_who_comes_no_nearer_than_a_hand_settles_there_and_says_so() -> None:
     assert settled.reason == "0.2 m beside what was asked for: something is in the way"
     assert not settled.aside
     again = ask(tick=3002, x=4.86)  # while it turns
-    assert (again.goal, again.version) == (settled.goal, settled.version)
+    assert (again.goal, again.reason) == (settled.goal, settled.reason)
+    assert again.version == settled.version
     assert ask(tick=3003, x=4.86).state == "failed"
 
 

@@ -28,7 +28,7 @@ class Lockstep:
         self._period = period_ticks  # from one command of control to the next
         self._tick = self._basis = 0
         self._echo = self._echo_basis = self._judged = 0
-        self._seen = self._wanted = 0  # by safety, when it spoke
+        self._seen = self._wanted = 0  # the tick that safety has seen, and the one it must have
         self._wake = asyncio.Event()
         self.timeouts = 0  # ticks that went on without the brain
 

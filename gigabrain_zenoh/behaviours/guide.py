@@ -89,7 +89,7 @@ class Guide:
         self._path: Path | None = None
         self._found: Path | None = None  # the last way to this goal that there was
         self._goal: Goal | None = None
-        self._settled: Goal | None = None  # where it is to stay, so near to its goal
+        self._settled: tuple[Goal, str] | None = None  # where it is to stay near its goal, and why
         self._been: list[tuple[float, float]] = []
         self._progress, self._last_tick = Progress(tick), tick
         self._open_tick = tick  # when there was something left to be seen
@@ -119,11 +119,8 @@ class Guide:
         return self._costmap
 
     def _to(self, goal: Goal, asked: Asked, chart: Costmap) -> Route:
-        first, beside = self._goal is None, ""
-        if self._settled:
-            off = math.hypot(goal.x - self._settled.x, goal.y - self._settled.y)
-            beside = f"{off:.1f} m beside what was asked for: something is in the way"
-            goal = self._settled
+        first, wanted = self._goal is None, goal
+        goal, beside = self._settled or (goal, "")
         found = self._plan(goal, asked.here, chart)
         room = None if first else self._making_room(goal, asked, chart)
         if room:
@@ -143,18 +140,20 @@ class Guide:
         self._found = found
         self._progress.measure(float(found.remaining[0]), asked.tick)
         if self._progress.stuck(asked.tick, GIVE_UP_TICKS):
-            if not self._settles(goal, asked):
+            if not self._settles(wanted, asked):
                 left = f"{found.remaining[0]:.1f} m before the goal"
                 return self._ended("failed", f"no nearer for 30 s, {left}: something is in the way")
-            return self._to(goal, asked, chart)
+            return self._to(wanted, asked, chart)
         return self._going(goal, found, beside)
 
     def _settles(self, goal: Goal, asked: Asked) -> bool:
         """Whether it is to stay where it is, as it cannot come nearer and is near enough."""
         x, y = asked.here.x, asked.here.y
-        if self._settled or not THERE_M < math.hypot(goal.x - x, goal.y - y) <= BESIDE_M:
+        off = math.hypot(goal.x - x, goal.y - y)
+        if self._settled or not THERE_M < off <= BESIDE_M:
             return False
-        self._settled, self._progress = Goal(x=x, y=y, yaw=goal.yaw), Progress(asked.tick)
+        why = f"{off:.1f} m beside what was asked for: something is in the way"
+        self._settled, self._progress = (Goal(x=x, y=y, yaw=goal.yaw), why), Progress(asked.tick)
         self._version += 1
         return True
 
