@@ -1,5 +1,6 @@
 # make demo   set up, and drive a robot round a room        make test   set up, and run all checks
 # make setup  the set-up alone                              make bench  measure this machine
+#                                                         make qa     and what takes hours
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -7,7 +8,7 @@ PYTHON ?= python3
 INSTALLED := $(VENV)/.installed
 DONE := $(VENV)/.done
 
-.PHONY: setup demo test lint unit bench mutation fuzz golden recordings pictures clean
+.PHONY: setup demo test lint unit bench faults soak mutation fuzz golden recordings pictures clean qa
 
 setup: $(DONE)
 
@@ -41,11 +42,27 @@ lint: $(INSTALLED)
 	$(BIN)/mypy
 
 unit: setup
-	$(BIN)/pytest -n 2 --dist loadfile $(ARGS)  # a file stays in one process: its robots are shared
+	$(BIN)/pytest -n 2 --dist loadfile -m 'not system' $(ARGS)
+	$(BIN)/pytest -m system $(ARGS)  # these start robots, which have the machine to themselves
+
+# before a release, on a machine with nothing else to do: hours, and continued where it was stopped
+qa: setup
+	$(BIN)/python -m tests.dockerfile_steps
+	$(BIN)/python -m gigabrain_zenoh.faults.extremes_run .qa/extremes.jsonl
 
 bench: setup
 	$(BIN)/gigabrain bench chain
 	$(BIN)/gigabrain bench stack
+
+# every row ten times, the e-stop's thirty; hours, and continued where it was stopped
+INTO ?= faults.jsonl
+faults: setup
+	$(BIN)/gigabrain faults --skip 39 43 44 --repeat 10 --into $(INTO)
+	$(BIN)/gigabrain faults --only 43 44 --repeat 30 --into $(INTO)
+
+# an hour's drive in which things happen
+soak: setup
+	$(BIN)/gigabrain faults --only 39 --long --behaviour navigate --json soak.json
 
 mutation: setup
 	rm -rf mutants
@@ -59,6 +76,12 @@ fuzz: setup
 	  $(BIN)/python $$target -max_total_time=$(FUZZ_S) -verbosity=0 -print_final_stats=1 || exit 1; \
 	done
 
+# signals to every command at random moments; goes on where it was stopped
+.PHONY: signals qa
+qa: signals
+signals: setup
+	$(BIN)/python -m tests.signal_sweep --results .signals.jsonl $(ARGS)
+
 golden: setup
 	$(BIN)/python -m gigabrain_schemas.golden
 
@@ -70,4 +93,4 @@ pictures: setup
 	$(BIN)/python -m tests.pictures docs/pictures
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .fuzz .fuzz-* mutants
+	rm -rf .signals.jsonl $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .fuzz .fuzz-* .qa mutants

@@ -49,6 +49,11 @@ def is_loopback(host: str) -> bool:
     return host == "localhost" or (is_ip(host) and ipaddress.ip_address(host).is_loopback)
 
 
+def reached_at(endpoint: str) -> str:
+    """Where this machine reaches whoever listens on an endpoint: loopback for all addresses."""
+    return endpoint.replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
 def exposed(endpoints: Iterable[str]) -> str:
     """The first of these Zenoh endpoints that other machines can reach, or nothing.
 

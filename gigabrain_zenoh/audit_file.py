@@ -1,4 +1,8 @@
-"""The audit log on disk: JSON lines, appended and synced; never overwritten, bounded in size."""
+"""The audit log on disk: JSON lines, appended and synced; never overwritten, bounded in size.
+
+What people have done has files of its own: nothing else that is logged, and nothing that was
+refused, can push it out.
+"""
 
 import heapq
 import os
@@ -8,15 +12,21 @@ from pathlib import Path
 
 import msgspec
 
-from gigabrain_schemas.audit import AuditRecord
+from gigabrain_schemas.audit import AuditRecord, What
 
 MAX_BYTES = 1_000_000  # of one file; then the next one is begun
-KEPT = 8  # files per process; the oldest is removed
+KEPT = 8  # files of a kind per process; the oldest is removed
 FOLDER = "audit"  # within the folder of what a robot remembers
+ACTS: tuple[What, ...] = ("boot", "end", "estop", "release", "enable", "take")
+EVENTS = "-events"  # at the end of the name of the files with everything else
 
 
 class AuditFile:
-    """One process's part of the log: `audit/<process>-<number>.jsonl`, newest last."""
+    """One process's part of the log, in `audit/`, newest last.
+
+    `<process>-<number>.jsonl` has what people have done, `<process>-events-<number>.jsonl` the
+    rest.
+    """
 
     def __init__(
         self, folder: Path, process: str, *, max_bytes: int = MAX_BYTES, kept: int = KEPT
@@ -26,15 +36,12 @@ class AuditFile:
 
     def append(self, records: Sequence[AuditRecord]) -> str:
         """Write and sync; returns the problem in one line, or an empty text. Blocks."""
-        lines = b"".join(msgspec.json.encode(record) + b"\n" for record in records)
+        acts = [record for record in records if record.ok and record.what in ACTS]
+        events = [record for record in records if not (record.ok and record.what in ACTS)]
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            path = self._place(len(lines))
-            torn = _torn(path)
-            with path.open("ab") as file:
-                file.write(b"\n" * torn + lines)
-                file.flush()
-                os.fsync(file.fileno())
+            self._append(self._process, acts)
+            self._append(self._process + EVENTS, events)
         except OSError as error:
             return f"cannot write the audit log in {self._folder}: {error.strerror}"
         return ""
@@ -43,15 +50,26 @@ class AuditFile:
         """The last `count` entries, oldest first. Blocks."""
         return read(self._folder.parent, count, self._process)
 
-    def _place(self, more: int) -> Path:
+    def _append(self, name: str, records: Sequence[AuditRecord]) -> None:
+        if not records:
+            return
+        lines = b"".join(msgspec.json.encode(record) + b"\n" for record in records)
+        path = self._place(name, len(lines))
+        torn = _torn(path)
+        with path.open("ab") as file:
+            file.write(b"\n" * torn + lines)
+            file.flush()
+            os.fsync(file.fileno())
+
+    def _place(self, name: str, more: int) -> Path:
         """The file to append to; begins a new one, and removes the oldest, where one is full."""
-        files = _files(self._folder, self._process)
+        files = _files(self._folder, name)
         if files and files[-1].stat().st_size + more <= self._max_bytes:
             return files[-1]
         number = _number(files[-1]) + 1 if files else 1
         for old in files[: max(0, len(files) + 1 - self._kept)]:
             old.unlink()
-        return self._folder / f"{self._process}-{number:06d}.jsonl"
+        return self._folder / f"{name}-{number:06d}.jsonl"
 
 
 def read(folder: Path, count: int, process: str = "") -> tuple[AuditRecord, ...]:
@@ -59,9 +77,11 @@ def read(folder: Path, count: int, process: str = "") -> tuple[AuditRecord, ...]
 
     A line that was torn by a power cut is left out.
     """
-    processes = {process} if process else {p.name.rpartition("-")[0] for p in _all(folder / FOLDER)}
+    names = {process, process + EVENTS}
+    if not process:
+        names = {path.name.rpartition("-")[0] for path in _all(folder / FOLDER)}
     found = []
-    for name in processes:
+    for name in sorted(names):  # of one moment acts come first
         mine: list[AuditRecord] = []
         for path in reversed(_files(folder / FOLDER, name)):
             mine = [*_records(path.read_bytes().splitlines()), *mine]

@@ -1,19 +1,18 @@
 """Typed publish, subscribe and ask. The bus speaks messages; a transport speaks bytes."""
 
 import asyncio
-import itertools
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeVar
 
 import msgspec
 
-from gigabrain_schemas.base import Message
-from gigabrain_schemas.topics import Service, Topic
+from gigabrain_schemas.base import Cause, Message
+from gigabrain_schemas.topics import STATE, Service, Topic
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.codec import Codec
-from gigabrain_zenoh.errors import GigabrainError, Refused
+from gigabrain_zenoh.errors import ClockLost, GigabrainError, Refused
 from gigabrain_zenoh.freshness import CLOCK_KEYS, Latest, RobotTime
 from gigabrain_zenoh.journal import Journal
 from gigabrain_zenoh.params import Params
@@ -26,6 +25,8 @@ M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
 
+LOST_NS = 3_000_000_000  # without a state that can be believed, while others come
+PAUSE_NS = 1_000_000_000  # between two of them, and the count begins again
 FETCH_S = 1.0  # how long the one who keeps a value may take to hand it over
 
 
@@ -42,12 +43,15 @@ class Bus:
         self.rejected = self._rejections.counts
         self.listens: list[str] = []
         self.counters: Counter[str] = Counter()  # what a node counts of its own, for its health
+        self.problems: tuple[Cause, ...] = ()  # what a node cannot do now, for its health
         self.latency_ms: dict[str, float] = {}  # what a node measures, for its health
         self.report: Callable[[], Mapping[str, float | int | str | None]] = dict
         self.journal = Journal()  # of what the node goes by
         self.params = Params()  # what may be changed while the process runs
-        # changes for as long as work gets done: the loop's turns, where a node knows nothing better
-        self.progress: Callable[[], int] = itertools.count().__next__
+        self.arrived: dict[str, tuple[int, int]] = {}  # boot and tick of the newest, by key
+        # whether work was done since the last call; a loop that turns, where a node says no more
+        self.progress: Callable[[], bool] = lambda: True
+        self._refusing_ns = self._refused_ns = 0  # since when, and when last
         self._kept: dict[str, bytes] = {}
         self._fetching: set[asyncio.Task[None]] = set()
 
@@ -107,16 +111,29 @@ class Bus:
                     on_bad(payload)
                 return False
             self._rejections.accept(pattern)
-            if moves_time:
-                self.time.see(message)
+            self.arrived[pattern] = message.boot, message.tick
             self.journal.note(key, message.seq)
+            if moves_time and not self._in_time(topic, message):
+                return False
             on_message(key, message)
             return True
 
         guarded = self._guard(receive)
-        ends = self._transport.subscribe(pattern, guarded, topic.depth)
-        if topic.keep and not topic.many:
-            self._fetch(topic, guarded)
+        if not topic.keep or topic.many:
+            return self._listening(
+                pattern, self._transport.subscribe(pattern, guarded, topic.depth)
+            )
+        live = False
+
+        def receive_live(key: str, payload: bytes) -> bool | None:
+            nonlocal live
+            taken = guarded(key, payload)
+            live = live or taken is True
+            return taken
+
+        ends = self._transport.subscribe(pattern, receive_live, topic.depth)
+        # what is said counts more than what anybody answers to have kept
+        self._fetch(topic, lambda key, payload: None if live else guarded(key, payload))
         return self._listening(pattern, ends)
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
@@ -154,7 +171,7 @@ class Bus:
                 self._fail(error)
                 raise Refused(f"{self.process or key} failed: {error!r}") from error
 
-        self._transport.serve(key, reply)
+        self._transport.serve(key, reply, urgent=service.priority == "real_time")
 
     async def ask(
         self, service: Service[Q, R], request: Q, *, timeout_s: float = 1.0, name: str = ""
@@ -198,6 +215,26 @@ class Bus:
 
         return close
 
+    def _in_time(self, topic: Topic[Any], message: Message) -> bool:
+        """Move the robot's time. Return whether the message is to be believed.
+
+        Where it hears nothing but states that it refuses, its own time is wrong: the process ends.
+        """
+        believed, now_ns = self.time.see(message), self.clock.now_ns()
+        if not believed:
+            self.counters["refused_ticks"] += 1
+        if topic.key != STATE.key:
+            return believed
+        if believed or now_ns - self._refused_ns > PAUSE_NS:
+            self._refusing_ns = now_ns
+        self._refused_ns = now_ns
+        if not believed and now_ns - self._refusing_ns > LOST_NS:
+            self._fail(ClockLost(
+                f"every {topic.key} has been refused for {LOST_NS / 1e9:g} s: this process is at "
+                f"tick {self.time.tick}, the newest claims to be of tick {message.tick}"
+            ))  # fmt: skip
+        return believed
+
     def _guard(self, receive: OnSample) -> OnSample:
         """A fault in a node ends its process: `failed` carries it to whoever runs the node."""
 
@@ -228,8 +265,11 @@ class Bus:
         """Ask for the kept value, for a subscriber that comes after it was sent."""
 
         async def fetch() -> None:
-            for payload in await self.kept(topic):
-                receive(topic.key, payload)
+            try:
+                for payload in await self.kept(topic):
+                    receive(topic.key, payload)
+            except Exception as error:  # noqa: BLE001 - as in `_guard`: nobody waits for this task
+                self._fail(error)
 
         task = asyncio.get_running_loop().create_task(fetch())
         self._fetching.add(task)

@@ -57,6 +57,7 @@ BUTTON_LOST = Cause(
     remedy="see that its process runs, then release the robot",
 )
 BRAIN_SILENT = frozenset(("perception_silent", "decision_silent", "control_silent"))  # safety's
+LATE = BRAIN_SILENT | {SILENCE.code, STALE.code, SAFETY_SILENT.code}  # somebody is too slow
 
 
 def button(text: str) -> Cause:

@@ -14,6 +14,7 @@ from collections.abc import Awaitable
 from gigabrain_zenoh import lifeline
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.process import find
+from gigabrain_zenoh.scheduling import join_in
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +59,7 @@ async def _told(work: Awaitable[object]) -> None:
     try:
         done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
         if not done:
+            join_in()  # a whole minute is too long to go before others
             said = {"event": "compiling"}
             log.info("compiling: the first start takes about a minute", extra={"data": said})
         await compiling
@@ -69,18 +71,21 @@ async def in_child(warm_up: str) -> int:
     """Compile in a process of its own; its exit code. What it cannot do is to be done here."""
     paths = os.pathsep.join(path for path in sys.path if path)
     child = await asyncio.create_subprocess_exec(
-        sys.executable,
-        "-m",
+        *(sys.executable, "-P", "-m"),  # -P: nothing is imported from the current folder
         __name__,
         warm_up,
         str(os.getpid()),
         env={**os.environ, "PYTHONPATH": paths},
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.DEVNULL,
-        stderr=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
     )
     try:
-        return await child.wait()
+        _, errors = await child.communicate()
+        if child.returncode and (said := errors.decode(errors="replace").strip()):
+            log.warning("compiling %s beforehand failed: %s", warm_up, said.splitlines()[-1])
+            log.debug("%s", said)
+        return child.returncode or 0
     finally:
         if child.returncode is None:
             child.kill()

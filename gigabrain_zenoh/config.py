@@ -7,9 +7,12 @@ from typing import TypeVar
 import msgspec
 
 from gigabrain_zenoh import config_faults, config_yaml
+from gigabrain_zenoh.bounded_file import read_bounded
 from gigabrain_zenoh.errors import ConfigError
 
 T = TypeVar("T")
+
+MOST_BYTES = 256 * 1024  # a hundred times what a large robot's file holds
 
 
 def load(path: Path, type: type[T]) -> T:
@@ -23,12 +26,10 @@ def load(path: Path, type: type[T]) -> T:
 def read(path: Path) -> str:
     """The text of a YAML file. Raises ConfigError."""
     try:
-        data = path.read_bytes()
+        data = read_bounded(path, MOST_BYTES)
         return data.decode()
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file{_nearest(path)}") from None
-    except IsADirectoryError:
-        raise ConfigError(f"{path}: is a folder; expected a YAML file") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except UnicodeDecodeError as error:

@@ -4,14 +4,14 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from gigabrain_zenoh import config_yaml
+from gigabrain_zenoh import config, config_yaml
 from gigabrain_zenoh.errors import ConfigError
 
 
 def located(path: Path, error: ConfigError) -> ConfigError:
     """What a process says of a name that it was given, with that name's line in the file."""
     if named := re.match(r"no \w+ ('.*?');", str(error)):
-        for node in _scalars(config_yaml.read(path.read_text(encoding="utf-8"))):
+        for node in _scalars(config_yaml.read(config.read(path))):
             if repr(node.value) == named[1]:
                 return type(error)(f"{path}:{node.line}: {error}")
     return error

@@ -14,6 +14,7 @@ from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, TELEOP, comman
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.gate import BRAIN
+from gigabrain_zenoh.heartbeat import Progress
 from gigabrain_zenoh.limits import NO_CAPS, ZERO, clamp, limits_of, ramp
 from gigabrain_zenoh.pose_history import PoseHistory
 from gigabrain_zenoh.teleop import Teleop
@@ -89,7 +90,7 @@ def step(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Memory,
     )
     allowed = clamp(needed, limits, inputs.caps)
     memory = replace(memory, setpoint=setpoint, wanted=needed, allowed=allowed)
-    return memory, _command(clamp(needed, limits))
+    return memory, _command(clamp(needed, limits), operator=memory.holding)
 
 
 def _next_tick(body: BodyDescription, memory: Memory, state: RobotState) -> Memory:
@@ -173,12 +174,13 @@ def _wish(
     return memory, intent.twist
 
 
-def _command(velocity: Velocity) -> CmdVel:
+def _command(velocity: Velocity, *, operator: bool = False) -> CmdVel:
     return CmdVel(
         linear_x=velocity.linear_x,
         linear_y=velocity.linear_y,
         angular_z=velocity.angular_z,
         source=BRAIN,
+        operator=operator,
     )
 
 
@@ -212,11 +214,11 @@ class EarlierCaps:
 
 async def run(bus: Bus, ready: Callable[[], None]) -> None:
     """A command at the body's rate, and at once when decision has thought again."""
-    memory, lost = Memory(), False
+    memory, lost, commands = Memory(), False, 0
     teleop, caps = Teleop(bus.clock.now_ns), EarlierCaps()
 
     def act(_: Message) -> None:
-        nonlocal memory, lost
+        nonlocal memory, lost, commands
         state, body = states.fresh(), bodies.current
         if state is None or body is None:
             return
@@ -234,6 +236,10 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
         due = state.tick % body.description.control.period_ticks == 0
         if due or memory.basis != before:
             bus.publish(command_topic(body.description), command, basis=memory.basis)
+            commands += 1
+
+    def came() -> tuple[object, ...]:
+        return (bus.arrived.get(STATE.key),) if bodies.current else ()
 
     def think_again(intent: Intent) -> None:
         # an intent of a tick whose state is still on its way waits for that state
@@ -245,5 +251,6 @@ async def run(bus: Bus, ready: Callable[[], None]) -> None:
     intents = bus.latest(INTENT, think_again)
     bus.latest(SAFETY, caps.receive)
     bus.latest(TELEOP, teleop.receive)
+    bus.progress = Progress(came, lambda: commands)
     ready()
     await bus.failed

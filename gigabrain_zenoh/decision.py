@@ -1,7 +1,7 @@
 """Decision: what is known becomes what to do, with what is expected to come of it, and why."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import RobotState
@@ -13,15 +13,10 @@ from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.behaviours import Plain, Senses
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.earlier import Earlier
+from gigabrain_zenoh.heartbeat import Progress
 from gigabrain_zenoh.settings import DecisionConfig
 
 log = logging.getLogger(__name__)
-
-CHANGEABLE = {  # while it runs, and what is expected
-    "linear_speed": "a number above 0, up to 10 [m/s]; the body's own limit holds as well",
-    "angular_speed": "a number above 0, up to 10 [rad/s]; the body's own limit holds as well",
-    "turn": "one of: right, left, clearer",
-}
 
 
 class Thinker:
@@ -44,8 +39,14 @@ class Thinker:
         return self._config
 
     def configure(self, config: DecisionConfig) -> None:
-        """Go by other settings from now on. The behaviour begins anew."""
-        self._config, self._behaviour = config, self._load(config)
+        """Go by other settings from now on; the behaviour keeps what it remembers."""
+        self._config = config
+        self._behaviour.configure(config)
+
+    @property
+    def params(self) -> Mapping[str, str]:
+        """The settings that may change while it runs, and what is expected of each."""
+        return self._load.PARAMS
 
     def think(
         self,
@@ -70,6 +71,8 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
     senses = behaviours.senses(config, bus)
     try:
         await senses.warm_up()
+        for name in behaviours.unread(config):
+            log.warning("%s has no effect: behaviour %s does not read it", name, config.behaviour)
         _think(config, bus, senses)
         ready()
         await bus.failed
@@ -78,10 +81,14 @@ async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> No
 
 
 def _think(config: DecisionConfig, bus: Bus, senses: Senses) -> None:
-    thinker, said = Thinker(config, senses), ""
-    for name, expected in CHANGEABLE.items():
+    thinker, said, too_old = Thinker(config, senses), "", 0
+    for name, expected in thinker.params.items():
         bus.params.add_field(name, expected, lambda: thinker.config, thinker.configure)
     verdicts: Earlier[SafetyState] = Earlier()
+
+    def newest_world() -> WorldModel | None:
+        body = bodies.current
+        return worlds.fresh(scan_limit_ns(body.description) if body else None)
 
     def decide(_: Message) -> None:
         nonlocal said
@@ -89,10 +96,8 @@ def _think(config: DecisionConfig, bus: Bus, senses: Senses) -> None:
         if state is None:
             return
         senses.see(state)
-        body = bodies.current
-        world = worlds.fresh(scan_limit_ns(body.description) if body else None)
         verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
-        thinker.think(state, world, verdict)
+        thinker.think(state, newest_world(), verdict)
         intent = thinker.intent
         bus.publish(INTENT, intent, basis=thinker.basis)
         phrase = intent.reason.partition(":")[0]
@@ -102,10 +107,16 @@ def _think(config: DecisionConfig, bus: Bus, senses: Senses) -> None:
             log.info("%s", intent.reason, extra={"data": data})
 
     def see(world: WorldModel) -> None:
+        nonlocal too_old
+        too_old += newest_world() is None  # over a slow link: looked at, and refused
         if world.basis <= bus.time.tick:
             decide(world)
+
+    def came() -> tuple[object, ...]:
+        return bus.arrived.get(STATE.key), bus.arrived.get(WORLD.key)
 
     bodies = bus.latest(BODY)
     states = bus.latest(STATE, decide)
     worlds = bus.latest(WORLD, see)
     bus.latest(SAFETY, verdicts.receive)
+    bus.progress = Progress(came, lambda: () if senses.hung else (thinker.basis, too_old))

@@ -13,13 +13,14 @@ from msgspec import Struct
 
 from gigabrain_zenoh import results
 from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.capacity import Capacity
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.errors import BodyLost, ConfigError
-from gigabrain_zenoh.launch import STOP_S
+from gigabrain_zenoh.launch import LIMIT_S, STOP_S
 from gigabrain_zenoh.live_view import HeadlessView, LiveView, View
 from gigabrain_zenoh.logs import new_run_dir
-from gigabrain_zenoh.report import Observed, Report, make_report, summary
+from gigabrain_zenoh.report import Observed, Report, last_told, make_report, summary
 from gigabrain_zenoh.running import announced
 from gigabrain_zenoh.specs import process_specs
 from gigabrain_zenoh.stop_signals import stop_signals
@@ -44,6 +45,7 @@ class DemoOptions(Struct, frozen=True, kw_only=True):
     headless: bool = False
     report: Path | None = None
     page: str = ""  # where the operator page is, or how to get it
+    keep_stuck: bool = False  # processes without progress are left alone, for a debugger
 
 
 class Demo:
@@ -60,12 +62,13 @@ class Demo:
             self._run_dir / "state",
             seconds=options.seconds,
         )
-        self._supervisor = Supervisor(specs, self._record)
+        self._supervisor = Supervisor(specs, self._record, keep_stuck=options.keep_stuck)
         self._decisions: list[tuple[float, str]] = []
         self._failures: list[str] = []
         self._compiling: set[str] = set()  # processes that have said so
         self._refusal = ""  # what a process said before it ended
         self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
+        self._capacity = Capacity()
         self._last_fault = ""  # before all were asked to end, the driver's first
 
     async def run(self) -> int:
@@ -75,7 +78,7 @@ class Demo:
         """
         label = f"{self._deployment.body} in {self._deployment.world}"
         endpoint = client_endpoint(self._deployment)
-        with stop_signals() as stop, announced(label, endpoint):
+        with stop_signals(LIMIT_S) as stop, announced(label, endpoint):
             async with self._supervisor:
                 running = asyncio.ensure_future(self._supervisor.run())
                 bus = await self._join(stop)
@@ -109,6 +112,10 @@ class Demo:
                 view.show()
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(stop.wait(), LOOK_S)
+                self._look_at_capacity(watch, view)
+                if watch.problem:
+                    self._failures.append(watch.problem)
+                    break
                 if watch.seconds != seconds or self._starting:
                     moved_s, seconds = loop.time(), watch.seconds
                 elif loop.time() - moved_s > STALLED_S:
@@ -117,6 +124,17 @@ class Demo:
             view.show()
         self._last_fault = newest_fault(text for _, text in self._faults)
         return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)
+
+    def _look_at_capacity(self, watch: Watch, view: View) -> None:
+        """Say once that this machine is too small; in lock-step time may wait for the brain."""
+        capacity, known = self._capacity, self._capacity.problem
+        if self._starting or self._deployment.speed != 1.0:
+            capacity.restart()
+            return
+        capacity.look(asyncio.get_running_loop().time(), watch.seconds, held=watch.held_by_load)
+        if capacity.problem != known:
+            self._faults.append((time.monotonic(), capacity.problem))
+            view.say(capacity.problem)
 
     @property
     def _starting(self) -> bool:
@@ -142,9 +160,14 @@ class Demo:
         seconds = self._options.seconds
         return seconds is not None and watch.seconds >= seconds - 1e-6
 
+    @property
+    def _live(self) -> bool:
+        """Whether there is a page in the terminal."""
+        return not self._options.headless and sys.stdout.isatty()
+
     def _view(self, watch: Watch) -> View:
         seconds, page = self._options.seconds, self._options.page
-        if self._options.headless or not sys.stdout.isatty():
+        if not self._live:
             return HeadlessView(watch, seconds, self._served, self._starting_up)
         faults = self._faults
         return LiveView(
@@ -156,10 +179,15 @@ class Demo:
         names = [name for name, status in statuses.items() if status.state == "ready"]
         told = await asyncio.gather(*(watch.describe(name, within_s) for name in names))
         answers = {answer.process: answer.report for answer in told if answer}
-        if "driver" not in answers:
+        state = watch.state.newest
+        if "driver" not in answers and state is None:
             return None
+        told_of_all = last_told(watch.health.get("driver"))
+        for answer in answers.values():
+            told_of_all |= answer
         seen = Observed(
-            body=watch.state.newest.robot_type if watch.state.newest else self._deployment.body,
+            body=state.robot_type if state else self._deployment.body,
+            answered="driver" in answers,
             world=self._deployment.world,
             seed=self._deployment.seed,
             speed=self._deployment.speed,
@@ -170,9 +198,9 @@ class Demo:
             restarts=sum(status.restarts for status in statuses.values()),
             mapped_m2=watch.mapped_m2,
             tasks=watch.task.current,
+            problem=watch.problem,
             rejected=sum(int(report.get("rejected_messages") or 0) for report in answers.values()),
         )
-        told_of_all = {key: value for report in answers.values() for key, value in report.items()}
         return make_report(told_of_all, seen)  # the truth is the simulator's, wherever it runs
 
     def _record(self, _name: str, record: Mapping[str, Any]) -> None:
@@ -194,6 +222,8 @@ class Demo:
             self._faults.append((time.monotonic(), text))
 
     def _finish(self, report: Report | None, *, stopped: bool) -> int:
+        if self._capacity.problem and self._live:
+            print(self._capacity.problem, file=sys.stderr)
         if report:
             results.write(report, self._options.report)
             print(summary(report))

@@ -1,6 +1,6 @@
 """A deployment file: which body on which link, and which process runs on which host."""
 
-import socket
+from collections import Counter
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +11,7 @@ from msgspec import Struct
 from gigabrain_zenoh import config
 from gigabrain_zenoh.addresses import exposed, host_and_port
 from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.free_port import reserve_port
 from gigabrain_zenoh.keys.checks import check_identity
 from gigabrain_zenoh.keys.files import identity_folder
 from gigabrain_zenoh.running import local_socket
@@ -20,6 +21,7 @@ from gigabrain_zenoh.settings import (
     Endpoint,
     FoxgloveConfig,
     LinkName,
+    LockstepTimeout,
     PageConfig,
     PerceptionConfig,
     RecorderConfig,
@@ -29,6 +31,7 @@ from gigabrain_zenoh.settings import (
 )
 from gigabrain_zenoh.zenoh_config import secured
 
+MOST_HOSTS = 64
 EMULATOR = "emulator"  # runs beside the driver where the link is `emulated`; not in `hosts`
 BUTTON = "button"  # runs beside the driver where there is one, unless `hosts` says where
 ProcessName = Literal[
@@ -57,6 +60,7 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     world: str = "arena"
     seed: Seed = 0
     speed: Speed = 1.0
+    lockstep_timeout_s: LockstepTimeout = 0.15  # longer: the same decisions on a slow machine, too
     resume: Resume = "manual"
     namespace: str = ""  # the robot's own part of the key space, where one router serves several
     router: str = "tcp/127.0.0.1:7447"  # where it listens; port 0 for any, where all is on one host
@@ -76,8 +80,10 @@ class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if not self.hosts:
             raise ValueError("hosts: expected at least one, with the processes that it runs")
-        placed = [name for names in self.hosts.values() for name in names]
-        twice = sorted({name for name in placed if placed.count(name) > 1})
+        if len(self.hosts) > MOST_HOSTS:
+            raise ValueError(f"hosts: {len(self.hosts)} of them; expected at most {MOST_HOSTS}")
+        placed = Counter(name for names in self.hosts.values() for name in names)
+        twice = sorted(name for name, times in placed.items() if times > 1)
         if twice:
             raise ValueError(f"hosts: {', '.join(twice)} must run once, on one host")
         if BUTTON in placed and self.button is None:
@@ -156,10 +162,8 @@ def with_free_port(deployment: Deployment) -> Deployment:
     host, _, port = address.rpartition(":")
     if port != "0":
         return deployment
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
-        with socket.create_server((host.strip("[]"), 0), family=family) as probe:
-            free = probe.getsockname()[1]
+        free = reserve_port(host.strip("[]"))
     except OSError as error:
         raise ConfigError(f"router {deployment.router}: {error.strerror}") from None
     return msgspec.structs.replace(deployment, router=f"{protocol}/{host}:{free}")

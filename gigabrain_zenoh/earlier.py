@@ -21,8 +21,9 @@ class Earlier(Generic[M]):
     def receive(self, message: M) -> None:
         """Take one message."""
         newest = self._newest
-        if newest and (message.boot, message.tick) != (newest.boot, newest.tick):
-            self._before = newest
+        same_start = newest and newest.boot == message.boot
+        if newest and not (same_start and newest.tick >= message.tick):
+            self._before = newest  # what claims to be of the future never comes before anything
         self._newest = message
 
     def at(self, boot: int, tick: int, within_ns: int) -> M | None:

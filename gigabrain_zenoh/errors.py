@@ -4,9 +4,11 @@ GigabrainError
 ├── ConfigError       a file or an option is wrong (exit code 2)
 │   └── UnknownName   no such robot, world, driver, process or behaviour
 ├── BusError          the router is missing, or its port is taken
+│   └── Ambiguous     several robots run here, and none was named
 ├── Refused           the robot said no, and why
 ├── Unsupported       the body has no such primitive
 ├── BodyLost          the body no longer answers
+├── ClockLost         a process's robot time agrees with no state any more
 └── NotConfirmed      no body has confirmed an e-stop (exit code 3)
 """
 
@@ -34,6 +36,10 @@ class BusError(GigabrainError):
     """The bus cannot be reached or cannot be opened."""
 
 
+class Ambiguous(BusError):
+    """Several robots run on this machine, and nobody has said which one is meant."""
+
+
 class Refused(GigabrainError):
     """The robot was asked for something and said no."""
 
@@ -44,6 +50,10 @@ class Unsupported(GigabrainError):
 
 class BodyLost(GigabrainError):
     """The body no longer answers. The process ends; its supervisor starts it again."""
+
+
+class ClockLost(GigabrainError):
+    """The robot's time in this process is wrong. It ends; its supervisor starts it again."""
 
 
 class NotConfirmed(GigabrainError):

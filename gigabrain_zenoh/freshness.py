@@ -10,21 +10,56 @@ M = TypeVar("M", bound=Message)
 
 LEAD_TICKS = 5  # how far behind the robot a process may be with reading its states
 CLOCK_KEYS = (STATE.key, SCAN.key)  # what the driver sends on these moves the robot's clock
+JUMP_TICKS = 50  # a message that is farther off, or of another boot, has to be confirmed
+CONFIRMED = 3  # messages in a row that agree
 
 
 class RobotTime:
-    """The newest tick that this process has seen, and of which start of the driver."""
+    """The newest tick that this process has seen, and of which start of the driver.
+
+    One message must not move it far: one flipped bit would silence the process for ever. A jump of
+    more than JUMP_TICKS, and a new boot, count once CONFIRMED messages in a row agree and none that
+    continues the present count has come between. Of the very first nothing better is known.
+    """
 
     def __init__(self) -> None:
         self.boot = 0
         self.tick = 0
+        self._claim: tuple[int, int] | None = None  # boot and tick of the last that was refused
+        self._claimed_by: tuple[type[Message], int, int] | None = None  # and which message it was
+        self._agree = 0  # how many have made that claim
 
-    def see(self, message: Message) -> None:
-        """Take note of the tick on a message from the driver; a new start begins anew."""
-        if message.boot == self.boot:
-            self.tick = max(self.tick, message.tick)
-        elif message.boot:
-            self.boot, self.tick = message.boot, message.tick
+    def see(self, message: Message) -> bool:
+        """Take note of the tick on a message from the driver. Return whether to believe it."""
+        if not message.boot:
+            return self.boot == 0  # a driver that has been heard says which start it is
+        if self.boot == 0:
+            self._believe(message)
+            return True
+        if message.boot == self.boot and abs(message.tick - self.tick) <= JUMP_TICKS:
+            if message.tick > self.tick:
+                self._believe(message)
+            return True
+        return self._confirmed(message)
+
+    def _confirmed(self, message: Message) -> bool:
+        by = (type(message), message.seq, message.tick)
+        if by == self._claimed_by:
+            return False  # the same message, which somebody else here listens to as well
+        boot, tick = self._claim or (0, 0)
+        agrees = message.boot == boot and abs(message.tick - tick) <= JUMP_TICKS
+        self._agree = self._agree + 1 if agrees else 1
+        self._claim, self._claimed_by = (message.boot, message.tick), by
+        if message.boot == self.boot and message.tick < self.tick:
+            return False  # time does not go back: who is ahead of all others has to begin anew
+        if self._agree < CONFIRMED:
+            return False
+        self._believe(message)
+        return True
+
+    def _believe(self, message: Message) -> None:
+        self.boot, self.tick = message.boot, message.tick
+        self._claim, self._claimed_by, self._agree = None, None, 0
 
 
 class Latest(Generic[M]):
@@ -44,7 +79,8 @@ class Latest(Generic[M]):
         """
         held, time = self.newest, self._time
         same_start = held and message.boot and message.boot == held.boot
-        if held and same_start and message.tick < min(held.tick, time.tick):
+        reached = held and held.tick <= time.tick + LEAD_TICKS
+        if held and same_start and reached and message.tick < min(held.tick, time.tick):
             return False
         self.newest = message
         self._arrived_ns = self._clock.now_ns()

@@ -53,17 +53,19 @@ TICK_S = TICK_NS / 1e9
 STOPPING_TICKS = 15  # 300 ms, then idle
 CALM_TICKS = 5  # 100 ms at zero after an enable, however hard somebody holds a joystick
 HEALTHY_TICKS = 25  # 0.5 s without a cause before an automatic resume
-RESUME_TICKS = 50  # from one start to an automatic one: on a bad link it stands, or drives on
+RESUME_TICKS = 110  # from one start to an automatic one: starts and stops stay under 1 Hz
 NAN_STORM_COUNT, NAN_STORM_TICKS = 5, 50  # five in a second
 
 
 def step(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:
     """One event. Whether the body may go on, and how fast, follows from the state it leads to."""
-    state, outcome = _take(config, state, event)
-    if state.mode == "enabled":
-        found = against(config, state, state.commander)
-        state = _stop(state, found) if found else state
-    return replace(state, output=_output(config, state)), outcome
+    taken, outcome = _take(config, state, event)
+    if taken is state:
+        return state, outcome
+    if taken.mode == "enabled":
+        found = against(config, taken, taken.commander)
+        taken = _stop(taken, found) if found else taken
+    return replace(taken, output=_output(config, taken)), outcome
 
 
 def _take(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:

@@ -1,4 +1,4 @@
-"""How a process is doing: once a second on `robot/health/<process>`, and whenever it is asked."""
+"""How a process is doing: once a second on `robot/health/<process>`."""
 
 import os
 import resource
@@ -8,14 +8,11 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import Health
-from gigabrain_schemas.topics import DESCRIBE, HEALTH
+from gigabrain_schemas.topics import HEALTH
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.errors import ConfigError
 
 PERIOD_NS = 1_000_000_000
-ASK_S = 0.3  # how long another process of the same name may take to answer
 
 
 def rss_bytes() -> int:
@@ -26,32 +23,6 @@ def rss_bytes() -> int:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak if sys.platform == "darwin" else peak * 1024
     return pages * resource.getpagesize()
-
-
-async def answer_to_name(bus: Bus) -> None:
-    """Answer `robot/describe/<process>`. Raises ConfigError where another one does already."""
-    others = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=ASK_S, name=bus.process)
-    if others:
-        other = others[0]
-        raise ConfigError(
-            f"a {bus.process} is already running here (pid {other.pid} on {other.host}); "
-            "stop it, or give this robot a namespace of its own"
-        )
-
-    async def describe(_: DescribeRequest) -> Description:
-        from gigabrain_zenoh.version import __version__  # 25 ms, which no start should wait for
-
-        return Description(
-            process=bus.process,
-            pid=os.getpid(),
-            host=socket.gethostname(),
-            version=__version__,
-            publishes=tuple(sorted(bus.sent)),
-            subscribes=tuple(sorted(bus.listens)),
-            report={"rejected_messages": bus.rejected.total(), **bus.report()},
-        )
-
-    bus.serve(DESCRIBE, describe, name=bus.process)
 
 
 async def publish_health(bus: Bus) -> None:
@@ -74,6 +45,7 @@ async def publish_health(bus: Bus) -> None:
             rejected=dict(bus.rejected),
             latency_ms=dict(bus.latency_ms),
             counters=dict(bus.counters),
+            problems=bus.problems,
         )
         then, cpu, received, sent = now, used, bus.received.copy(), bus.sent.copy()
         bus.publish(HEALTH, message, name=bus.process)

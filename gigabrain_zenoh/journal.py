@@ -10,10 +10,12 @@ from collections.abc import Callable
 from typing import Any
 
 from gigabrain_schemas.heard import MOST, WAITED, Heard, Taken
+from gigabrain_zenoh.bounded import put
 
 Job = concurrent.futures.Future[Any]
 EVERY_NS = 500_000_000  # from one word about it to the next
 ROOM = MOST // 2  # entries that may wait; one more may be added while they are said
+MOST_KEYS = 512  # of which the newest number is known
 HIGHEST = 2**63 - 1
 
 
@@ -53,7 +55,7 @@ class SaidJournal(Journal):
         """A message is looked at; by several parts of a node in turn, it is one."""
         if seq and self._last.get(key) == seq:
             return
-        self._last[key] = seq
+        put(self._last, key, seq, MOST_KEYS)
         self._add(key, seq)
 
     def in_time(self, job: Job, patience_s: float) -> bool:

@@ -27,6 +27,7 @@ class ProcessSpec:
     after: tuple[str, ...] = ()
     ready_timeout_s: float = 10.0
     stop_last: bool = False  # what the others need in order to end well, such as the router
+    beats: bool = False  # says once a second that it makes progress, and is killed when it does not
 
 
 @dataclass
@@ -39,7 +40,6 @@ class ProcessStatus:
     restarts: int = 0
     last_exit: int | None = None  # exit code, or minus the signal's number
     ready_after_s: float | None = None  # from its last start
-    progress_s: float = 0.0  # when it last got on with its work (loop time)
 
 
 @dataclass
@@ -48,6 +48,7 @@ class Shared:
 
     on_record: OnRecord
     backoff: Backoff
+    keep_stuck: bool = False  # processes without progress are left alone, for a debugger
     halt: asyncio.Event = field(default_factory=asyncio.Event)
     # held while a process is being started, so that a stop misses none
     starting: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -72,7 +73,8 @@ class Keeper:
         # ready, given up or stopping: whoever comes after this one need not wait any longer
         self.settled = asyncio.Event()
         self._shared, self._patience = shared, Patience(shared.backoff)
-        self._started_s = 0.0
+        self._started_s, self._silence = 0.0, heartbeat.Silence()
+        self.stuck = False  # it runs and makes no progress
 
     async def run(self, after: Sequence["Keeper"]) -> None:
         """Start once all of `after` are ready, then keep running until the supervisor stops."""
@@ -115,7 +117,7 @@ class Keeper:
         finally:
             late.cancel()
         self.child = status.pid = None
-        status.last_exit = code
+        self.stuck, status.last_exit = False, code
         ready_after_s = status.ready_after_s
         up_s = 0.0 if ready_after_s is None else loop.time() - self._started_s - ready_after_s
         bad = "what it was given is wrong" if code == ConfigError.exit_code else ""
@@ -132,22 +134,32 @@ class Keeper:
             self.status.pid = self.child.pid
             return self.child
 
-    @property
-    def stuck(self) -> bool:
-        """Whether it runs and gets nowhere."""
-        silent_s = asyncio.get_running_loop().time() - self.status.progress_s
-        return self.status.state == "ready" and silent_s > heartbeat.STUCK_S
+    def look(self, passed_s: float) -> None:
+        """Kill a process without progress; called every `heartbeat.LOOK_S`, or later."""
+        if not self.spec.beats or self.status.state != "ready" or self._shared.halt.is_set():
+            return
+        before, self.stuck = self.stuck, self._silence.look(passed_s)
+        if self.stuck and not before and self.child:
+            what = "is left alone" if self._shared.keep_stuck else "is killed"
+            limit_s = heartbeat.STALL_S
+            self._say("error", "stuck", f"has made no progress for {limit_s:g} s and {what}")
+            if not self._shared.keep_stuck:
+                self.child.send_signal(signal.SIGKILL)
 
     def _take(self, record: dict[str, Any]) -> None:
         if record["event"] == heartbeat.EVENT:
-            self.status.progress_s = asyncio.get_running_loop().time()
+            self._progressed()
             return
         if record["event"] == "ready" and self.status.state == "starting":
             self.status.state = "ready"
-            self.status.progress_s = asyncio.get_running_loop().time()
-            self.status.ready_after_s = self.status.progress_s - self._started_s
+            self.status.ready_after_s = asyncio.get_running_loop().time() - self._started_s
+            self._progressed()
             self.settled.set()
         self._shared.on_record(self.spec.name, record)
+
+    def _progressed(self) -> None:
+        self._silence.end()
+        self.stuck = False
 
     def _late(self) -> None:
         if self.status.state == "starting" and self.child and not self._shared.halt.is_set():

@@ -19,16 +19,23 @@ from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.supervisor import Supervisor
 from gigabrain_zenoh.tasks.scripts import check_folder
 
-STOP_S = 1.5
+STOP_S = 1.5  # until processes that do not end are killed
+LIMIT_S = STOP_S + 2.0  # until the supervisor itself is ended by force
 LOOK_S = 0.1
 ROUTERS = {"router", RELAY}  # without the one or the other nobody on the host hears anything
 
 
 async def up(
-    deployment: Deployment, host: str, say: Callable[[str], None], level: str = "info"
+    deployment: Deployment,
+    host: str,
+    say: Callable[[str], None],
+    level: str = "info",
+    *,
+    keep_stuck: bool = False,
 ) -> int:
     """Keep a host's processes running until Ctrl-C; the exit code.
 
+    What makes no progress is started again, or with `keep_stuck` left to a debugger.
     Raises ConfigError when what a process was given is wrong, or a folder cannot be written, and
     BusError when the router cannot run, without which nothing else can.
     """
@@ -53,8 +60,11 @@ async def up(
         say(log_text.readable(record, colour=False))
 
     say(f"{deployment.body} on {host}: {', '.join(spec.name for spec in specs)}; logs in {run_dir}")
-    with stop_signals() as stop, announced(label, local_endpoint(deployment, host)) as note:
-        async with Supervisor(specs, show) as supervisor:
+    with (
+        stop_signals(LIMIT_S) as stop,
+        announced(label, local_endpoint(deployment, host)) as note,
+    ):
+        async with Supervisor(specs, show, keep_stuck=keep_stuck) as supervisor:
             running = asyncio.ensure_future(supervisor.run())
             while not stop.is_set() and not running.done() and not _hopeless(supervisor):
                 _report(supervisor, notifier, note)

@@ -65,13 +65,36 @@ def clamp(velocity: Velocity, limits: Limits, caps: SpeedCaps = NO_CAPS) -> Velo
 
 
 def ramp(current: Velocity, target: Velocity, limits: Limits, dt: float) -> Velocity:
-    """What `current` can become within `dt` [s] on the way to `target`."""
+    """Return what `current` can become within `dt` [s] on the way to `target`.
+
+    Both have to be within the limits; then so is the result.
+    """
     up, down = limits.linear_acceleration * dt, limits.linear_deceleration * dt
     turn = limits.angular_acceleration * dt
-    return Velocity(
+    step = Velocity(
         linear_x=_approach(current.linear_x, target.linear_x, up, down),
         linear_y=_approach(current.linear_y, target.linear_y, up, down),
         angular_z=_approach(current.angular_z, target.angular_z, turn, turn),
+    )
+    return _within_rim_speed(current, step, limits)
+
+
+def _within_rim_speed(current: Velocity, step: Velocity, limits: Limits) -> Velocity:
+    """Let an axis gain only the speed that the other one has left to the wheels.
+
+    What slows down is left alone, so this never makes braking slower.
+    """
+    gain_x = max(0.0, abs(step.linear_x) - abs(current.linear_x))
+    gain_z = max(0.0, abs(step.angular_z) - abs(current.angular_z))
+    gained = gain_x + gain_z * limits.half_track
+    if not gained:
+        return step
+    rim = abs(step.linear_x) + abs(step.angular_z) * limits.half_track
+    share = min(1.0, max(0.0, rim - limits.rim_speed) / gained)
+    return Velocity(
+        linear_x=step.linear_x - math.copysign(gain_x * share, step.linear_x),
+        linear_y=step.linear_y,
+        angular_z=step.angular_z - math.copysign(gain_z * share, step.angular_z),
     )
 
 

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from gigabrain_zenoh.causes import in_words
 from gigabrain_zenoh.deployment import Deployment
+from gigabrain_zenoh.display import LINES, Display, writer
 from gigabrain_zenoh.supervisor import Supervisor
 from gigabrain_zenoh.watch import Watch
 
@@ -36,6 +37,9 @@ class View(Protocol):
     def show(self) -> None:
         """Bring it up to date."""
 
+    def say(self, fault: str) -> None:
+        """Show a fault, if it is not shown anyhow."""
+
 
 class HeadlessView:
     """A progress line on stderr: redrawn in place on a terminal, every ten seconds elsewhere."""
@@ -50,19 +54,27 @@ class HeadlessView:
         self._watch, self._seconds, self._page, self._starting = watch, seconds, page, starting
         self._next, self._told = LINE_S, False
         self._in_place = sys.stderr.isatty()
+        self._display = Display(writer(sys.stderr), LINES)
 
     def __enter__(self) -> Self:
+        self._display.__enter__()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *end: object) -> None:
         if self._in_place:
-            print(file=sys.stderr)
+            self._display.put("\n")
+        self._display.__exit__(*end)
+
+    def say(self, fault: str) -> None:
+        """Print a fault on a line of its own."""
+        below = "\n" if self._in_place else ""  # the line that is redrawn
+        self._display.put(f"{below}{fault}\n")
 
     def show(self) -> None:
         """Bring it up to date."""
         watch = self._watch
         if not self._told and watch.state.newest and (page := self._page()):
-            print(f"operator page: {page}", file=sys.stderr, flush=True)
+            self._display.put(f"operator page: {page}\n")
             self._told = True
         if not self._in_place and watch.seconds < self._next:
             return
@@ -71,9 +83,9 @@ class HeadlessView:
         does = doing(watch, self._starting())
         line = f"{watch.seconds:6.1f}{of} s  {watch.distance_m:6.2f} m  {does}"
         if self._in_place:
-            print(f"\r{line[:100]:<100}", end="", file=sys.stderr, flush=True)
+            self._display.put(f"\r{line[:100]:<100}")
         else:
-            print(line, file=sys.stderr, flush=True)
+            self._display.put(f"{line}\n")
 
 
 class LiveView:
@@ -93,15 +105,18 @@ class LiveView:
         self._subtitle = f"{page} · Ctrl-C ends it" if page else "Ctrl-C ends it"
         self._watch, self._supervisor, self._deployment = watch, supervisor, deployment
         self._faults, self._seconds = faults, seconds
-        # drawn on the loop's thread, from one moment's values; its own screen survives resizing
+        # made on the loop's thread, from one moment's values; its own screen survives resizing
         self._live = Live(self._page(), screen=True, auto_refresh=False)
+        self._display = Display[Panel](lambda page: self._live.update(page, refresh=True), room=1)
         self._next_s = 0.0
 
     def __enter__(self) -> Self:
         self._live.start()
+        self._display.__enter__()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *end: object) -> None:
+        self._display.__exit__(*end)
         self._live.stop()
         self._live.console.print(self._page())
 
@@ -110,7 +125,10 @@ class LiveView:
         now_s = time.monotonic()
         if now_s >= self._next_s:
             self._next_s = now_s + 1 / FRAMES_HZ
-            self._live.update(self._page(), refresh=True)
+            self._display.put(self._page())
+
+    def say(self, fault: str) -> None:
+        """Do nothing: the page has it."""
 
     def _page(self) -> Panel:
         deployment, watch = self._deployment, self._watch

@@ -2,19 +2,29 @@
 
 import asyncio
 import contextlib
+import itertools
 import logging
 import os
+import queue
 import re
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
+from logging.handlers import QueueHandler, QueueListener, RotatingFileHandler
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from gigabrain_schemas.safety import LogRecord
-from gigabrain_zenoh import errors, log_text
+from gigabrain_zenoh import errors, log_text, run_folders
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
+
+log = logging.getLogger(__name__)
+
+QUEUED_RECORDS = 1000  # for each of file and console; more are dropped and counted
+LAST_WORDS_S = 0.5  # how long the end of a process waits until they are written
+FILE_BYTES = 10_000_000  # of one log file; then the next is begun
+OLD_FILES = 2  # of a process, beside the one that is written
 
 
 class Fault:
@@ -117,16 +127,12 @@ class _ReadableFormatter(logging.Formatter):
         return log_text.readable(fields, colour=self._colour)
 
 
-class _Console(logging.StreamHandler[TextIO]):
-    pass
-
-
-class _File(logging.FileHandler):
+class _File(RotatingFileHandler):
     """A log file whose disk may fill up: that is said once, and again when there is room."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, encoding="utf-8")
-        self._fault, self._failed = Fault(logging.getLogger(__name__)), False
+        super().__init__(path, maxBytes=FILE_BYTES, backupCount=OLD_FILES, encoding="utf-8")
+        self._fault, self._failed = Fault(log), False
 
     def emit(self, record: logging.LogRecord) -> None:
         self._failed = False
@@ -139,6 +145,56 @@ class _File(logging.FileHandler):
         self._fault.begin(f"cannot write {self.baseFilename}: {sys.exc_info()[1]}")
 
 
+class Background(QueueHandler):
+    """Formats records where they are logged, and has `sink` write them in a thread of its own.
+
+    So a full disk, or a console that nobody reads, holds up neither the event loop nor the end of
+    the process. When `QUEUED_RECORDS` wait, more are dropped; how many is logged later.
+    """
+
+    def __init__(self, sink: logging.Handler, formatter: logging.Formatter, name: str) -> None:
+        self._records: queue.Queue[logging.LogRecord] = queue.Queue(QUEUED_RECORDS)
+        super().__init__(self._records)
+        self.setFormatter(formatter)
+        self.lost = 0
+        self._sink, self._name, self._closed = sink, name, False
+        self._listener = QueueListener(self._records, sink)
+        self._listener.start()
+
+    def enqueue(self, record: logging.LogRecord) -> None:
+        """Have the record written, or count it as lost."""
+        try:
+            self._records.put_nowait(record)
+            if self.lost:
+                self._records.put_nowait(self._loss())
+                self.lost = 0
+        except queue.Full:
+            self.lost += 1
+
+    def _loss(self) -> logging.LogRecord:
+        """Tell this sink alone: to log it would take the locks of the others."""
+        text, lost = f"{self.lost} records did not reach the {self._name}", self.lost
+        record = logging.LogRecord(log.name, logging.WARNING, "", 0, text, None, None)
+        record.data = {"event": "log records lost", "lost": lost}
+        return self.prepare(record)  # type: ignore[no-any-return]
+
+    def flush(self) -> None:
+        """Wait until all is written, `LAST_WORDS_S` at most."""
+        waiting = self._records
+        with waiting.all_tasks_done:
+            waiting.all_tasks_done.wait_for(lambda: not waiting.unfinished_tasks, LAST_WORDS_S)
+
+    def close(self) -> None:
+        """Write what waits, and close the sink; one that hangs is left behind."""
+        self.flush()
+        super().close()
+        if not self._closed and not self._records.unfinished_tasks:
+            self._closed = True
+            self._listener.stop()
+            with contextlib.suppress(OSError):  # what a full disk still owed
+                self._sink.close()
+
+
 def setup(process: str, run_dir: Path | None, *, json_console: bool, level: str = "info") -> None:
     """Log to `<run_dir>/<process>.jsonl` and to stderr; a second call replaces the first.
 
@@ -146,29 +202,35 @@ def setup(process: str, run_dir: Path | None, *, json_console: bool, level: str 
     """
     if level not in log_text.LEVELS:
         raise errors.unknown("log level", level, log_text.LEVELS)
-    handlers: list[logging.Handler] = [] if run_dir is None else [_file(process, run_dir)]
-    console = _Console(sys.stderr)
-    console.setFormatter(
-        _JsonFormatter(process) if json_console else _ReadableFormatter(process, _colour())
-    )
+    sinks = [] if run_dir is None else [_file(process, run_dir)]
+    console = _JsonFormatter(process) if json_console else _ReadableFormatter(process, _colour())
+    sinks.append(Background(logging.StreamHandler(sys.stderr), console, "console"))
     root = logging.getLogger()
-    for old in [h for h in root.handlers if isinstance(h, (_Console, _File))]:
+    for old in _sinks():
         root.removeHandler(old)
-        with contextlib.suppress(OSError):  # what a full disk still owed
-            old.close()
-    for handler in [*handlers, console]:
-        root.addHandler(handler)
+        old.close()
+    for sink in sinks:
+        root.addHandler(sink)
     root.setLevel(level.upper())
 
 
-def _file(process: str, run_dir: Path) -> logging.Handler:
+def flush() -> None:
+    """Wait until what was logged is written, but not for what hangs."""
+    for sink in _sinks():
+        sink.flush()
+
+
+def _sinks() -> list[Background]:
+    return [one for one in logging.getLogger().handlers if isinstance(one, Background)]
+
+
+def _file(process: str, run_dir: Path) -> Background:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
-        handler = _File(run_dir / f"{process}.jsonl")
+        file = _File(run_dir / f"{process}.jsonl")
     except OSError as error:
         raise _unwritable(run_dir, error) from None
-    handler.setFormatter(_JsonFormatter(process))
-    return handler
+    return Background(file, _JsonFormatter(process), "log file")
 
 
 def _colour() -> bool:
@@ -179,21 +241,23 @@ def _colour() -> bool:
 def new_run_dir(base: Path | None, label: str) -> Path:
     """Create `<base>/<UTC stamp>-<label>-<pid>`; `base` None is the user's state folder (XDG).
 
-    Raises ConfigError when it cannot be created.
+    Old run folders are removed first (see `run_folders`), and this one is marked as in use. Raises
+    ConfigError when it cannot be created.
     """
     base = base or state_dir() / "runs"
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     name = f"{stamp}-{re.sub(r'[^A-Za-z0-9._-]+', '-', label)}-{os.getpid()}"
-    path, n = base / name, 1
-    while True:
-        try:
-            path.mkdir(parents=True)
+    try:
+        with run_folders.tidied(base):
+            for n in itertools.count(1):
+                path = base / (name if n == 1 else f"{name}-{n}")
+                if not path.exists():  # by an earlier run of this process in this second
+                    break
+            path.mkdir()
+            run_folders.hold(path)
             return path
-        except FileExistsError:  # an earlier run of this process in this second
-            n += 1
-            path = base / f"{name}-{n}"
-        except OSError as error:
-            raise _unwritable(base, error) from None
+    except OSError as error:
+        raise _unwritable(base, error) from None
 
 
 def state_dir() -> Path:

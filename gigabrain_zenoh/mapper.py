@@ -22,6 +22,7 @@ from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.granting import grant
 from gigabrain_zenoh.journal import done
 from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping.autosave import Autosave, refuse
 from gigabrain_zenoh.mapping.background import InTime
 from gigabrain_zenoh.mapping.fusion import Fusion, Moment, way
 from gigabrain_zenoh.mapping.known import Chart, KnownMap
@@ -35,6 +36,7 @@ from gigabrain_zenoh.settings import PerceptionConfig
 log = logging.getLogger(__name__)
 
 MAP_TICKS = round(1e9 / TICK_NS)  # from one map to the next, at least
+MAP_AGAIN_TICKS = 2 * MAP_TICKS  # and at most, though nothing has changed
 FREE_M = 10.0  # a beam that hit nothing counts as free so far at most
 SHORT_M = 0.05  # and ends so much before the lidar's range
 SETTLE_NS, SETTLES = 20_000_000, 100  # a save waits for the work beside, and how often
@@ -83,8 +85,12 @@ class Mapper:
         self._fusion, self._boot = Fusion(), 0
         self._last: Moment | None = None  # of the last scan that was taken
         self._blank = not config.map  # nothing is in the map yet
+        self._mapped = False  # whether this process has taken a scan
         self._shown: OccupancyGrid | None = None
-        self._shown_tick = 0
+        self._shown_tick = self._said_tick = 0
+        saves = config.mapping == "slam" and config.state_dir and bus.journal.live
+        self._autosave = Autosave(Path(config.state_dir)) if saves else None
+        self._before: Moment | None = None  # of the last scan of a process that has died
         self._said, self._left_out = "", ""
         self._early = False  # a first scan has come without its odometry
         self._took_ms = Newest(TIMED)
@@ -113,6 +119,8 @@ class Mapper:
     def close(self) -> None:
         """End what runs beside."""
         self._chart.close()
+        if self._autosave:
+            self._autosave.close()
 
     def hear(self, state: RobotState) -> None:
         """Take a state, before any scan that rests on it."""
@@ -122,13 +130,37 @@ class Mapper:
             self._fusion.add(state, body.description)
 
     def _begin_anew(self, boot: int) -> None:
-        """After a new start of the driver the odometry begins elsewhere; the map stays."""
+        """After a new start of the driver the odometry begins elsewhere; the map stays.
+
+        After one of this process, the map of before goes on if the driver is still the same.
+        """
         if boot == self._boot:
             return
         if self._boot:
             self._chart.lose("the driver has started anew")
         self._boot, self._fusion, self._last, self._shown = boot, Fusion(), None, None
-        self._early = False
+        self._before, self._early = None, False
+        if self._autosave and not self._mapped:
+            self._go_on(self._autosave, boot)
+
+    def _go_on(self, autosave: Autosave, boot: int) -> None:
+        """Take the newest map of this start of the driver that is whole, if there is one."""
+        from gigabrain_zenoh.mapping.growing import GrowingMap  # and gtsam, as above
+
+        for head, arrays in autosave.found(boot):
+            last = None if head.place is None else np.array(head.place)
+            try:
+                chart = GrowingMap.thaw(arrays, in_time=self._bus.journal.in_time, last=last)
+            except ConfigError as error:
+                refuse(str(error))
+                continue
+            self._chart.close()
+            self._chart, self._blank, self._mapped = chart, False, True
+            odometry = np.array(head.odometry)
+            self._before = Moment(head.tick, odometry, odometry, slipping=False, jumps=0)
+            text = f"the map of tick {head.tick} goes on"
+            log.info(text, extra={"data": {"event": "map"}})
+            return
 
     def _take(self, scan: LaserScan, moment: Moment) -> None:
         body = self._bodies.current
@@ -136,7 +168,11 @@ class Mapper:
             return
         began = time.perf_counter()
         view = view_of(body.description.lidar, scan, self._config.ignore_below)
+        before = self._last
         place = self._chart.step(view, *self._way(moment))
+        self._mapped = True
+        if self._autosave and before:
+            self._keep(self._autosave, before)
         self._bus.publish(POSE, message_of(place), basis=scan.basis)
         self._tell(place)
         self._show(scan.basis)
@@ -149,22 +185,50 @@ class Mapper:
         The first of a new map lies where odometry has it: should this process have died, places in
         the map stay the same ones, but for what odometry has drifted since.
         """
-        last, self._last = self._last or moment, moment
+        last = self._last or self._before or moment
+        self._last, self._before = moment, None
         blank, self._blank = self._blank, False
         step, noise = way(last, moment)
         if last.jumps != moment.jumps:
             self._chart.lose("the odometry has jumped")
         return moment.fused if blank else step, noise
 
+    def _keep(self, autosave: Autosave, before: Moment) -> None:
+        """Save the map as it was at the scan `before`, when it is time to.
+
+        A copy costs little and changes nothing that follows, so runs that save are the same.
+        """
+        still = self._chart.kept()
+        if still:
+            autosave.save(self._boot, before.tick, before.odometry, still)
+        elif autosave.due(self._boot, before.tick):
+            self._chart.keep()
+
     def _show(self, tick: int) -> None:
-        """Publish the map when it is time to and it has changed."""
+        """Publish the map when it is time to and it has changed, or has not been said for long.
+
+        Somebody else's may have taken its place meanwhile.
+        """
         if self._shown and tick < self._shown_tick + MAP_TICKS:
             return
-        grid = self._chart.grid()
-        if grid != self._shown and grid.cells:
-            self._bus.publish(MAP, grid, basis=tick)
-            self._shown = grid
         self._shown_tick = tick
+        self._tell_problems()
+        grid = self._chart.grid()
+        due = grid != self._shown or tick >= self._said_tick + MAP_AGAIN_TICKS
+        if due and grid.cells:
+            self._bus.publish(MAP, grid, basis=tick)
+            self._shown, self._said_tick = grid, tick
+
+    def _tell_problems(self) -> None:
+        """Say what cannot be done: once in the log, and in the health for as long as it lasts."""
+        problems, known = self._chart.problems(), self._bus.problems
+        if self._autosave and self._autosave.problem:
+            problems = (*problems, self._autosave.problem)
+        for problem in problems:
+            if problem.code not in {one.code for one in known}:
+                log.warning("%s", problem.text, extra={"data": {"event": problem.code}})
+        self._bus.problems = problems
+        self._bus.counters["optimiser_rebuilt"] = self._chart.report().get("optimiser_rebuilt", 0)
 
     def _tell(self, place: Place) -> None:
         """Say once in the log whether it is known where the robot is, and why not."""
@@ -201,14 +265,15 @@ class Mapper:
             if self._chart.settle():
                 break
             await self._bus.clock.sleep_ns(SETTLE_NS)
-        saved, graph = self._chart.to_save()
+        saved, graph = await asyncio.to_thread(self._chart.still().to_save)
         if self._bus.journal.live:
             await asyncio.to_thread(map_file.save, path, saved, graph, replace=replace)
         return f"saved {path}: {map_file.in_words(saved)}"
 
     def _report(self) -> dict[str, float | int | str | None]:
         times = {f"map_ms_p{p}": self._took_ms.percentile(p / 100) for p in (50, 99)}
-        return {**times, **self._chart.report()}
+        saves = self._autosave.report() if self._autosave else {}
+        return {**times, **self._chart.report(), **saves}
 
 
 def message_of(place: Place) -> PoseInMap:

@@ -72,11 +72,17 @@ class Navigating:
         tick = world.basis if world else state.tick
         order = self._service.step(state, self._outcome, tick)
         self._outcome = None
-        return self._steering.situation(state, world, verdict, order)
+        waits = "" if order else self._service.waits
+        return self._steering.situation(state, world, verdict, order, waits)
 
     def heed(self, behaviour: Behaviour) -> None:
         """What became of the order goes to the tasks."""
         self._outcome = self._steering.heed(behaviour)
+
+    @property
+    def hung(self) -> bool:
+        """Whether a part of it never ends, while the rest goes on."""
+        return self._ready is not None and self._ready.hung
 
     async def close(self) -> None:
         """Once all is written down."""

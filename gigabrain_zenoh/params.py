@@ -60,4 +60,6 @@ class Params:
 
 
 def _shown(value: object) -> str:
+    if value is None:
+        return "null"
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -17,6 +17,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.compiling import FINDING, MAPPING, compiled
+from gigabrain_zenoh.heartbeat import Progress
 from gigabrain_zenoh.obstacles.surroundings import Surroundings
 from gigabrain_zenoh.placed_scans import PlacedScans
 from gigabrain_zenoh.settings import PerceptionConfig
@@ -87,7 +88,8 @@ def blind_ahead(lidar: Lidar, scan: LaserScan, nearest: float, cone_deg: float) 
 def hits(lidar: Lidar, scan: LaserScan, nearest: float) -> tuple[Floats, Floats]:
     """Where the beams of `scan` hit something: x and y in the body's frame [m], (n,) each."""
     values = ranges(scan)
-    hit = (values >= nearest) & (values <= scan.range_max)  # nan and inf are neither
+    farthest = min(scan.range_max, lidar.range_max)
+    hit = (values >= nearest) & (values <= farthest)  # nan and inf are neither
     cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
     reached = values[hit]
     return lidar.x + reached * cosines[hit], lidar.y + reached * sines[hit]
@@ -151,6 +153,12 @@ def _unknown(problem: str) -> WorldModel:
 async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """A world per scan, as soon as it comes; until the process ends."""
     body = bus.latest(BODY)
+    needs = (SCAN.key,) if config.mapping == "off" else (SCAN.key, STATE.key)
+
+    def came() -> tuple[object, ...]:
+        return tuple(map(bus.arrived.get, needs)) if body.current else ()
+
+    bus.progress = Progress(came, lambda: bus.sent[WORLD.key])
 
     def see(scan: LaserScan) -> None:
         if body.current:

@@ -19,17 +19,19 @@ from typing import Any
 import msgspec
 
 from gigabrain_schemas.topics import HEARD, LOG
-from gigabrain_zenoh import lifeline, logs
+from gigabrain_zenoh import heap, lifeline, logs
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, unknown
-from gigabrain_zenoh.health import answer_to_name, publish_health
-from gigabrain_zenoh.heartbeat import beat
+from gigabrain_zenoh.health import publish_health
+from gigabrain_zenoh.heartbeat import STDOUT, beat
+from gigabrain_zenoh.interrupts import interrupts
 from gigabrain_zenoh.journal import SaidJournal
 from gigabrain_zenoh.meeting import join
+from gigabrain_zenoh.name_claim import NameClaim
 from gigabrain_zenoh.param_service import serve_params
 from gigabrain_zenoh.process_config import ProcessConfig
-from gigabrain_zenoh.scheduling import go_first, step_aside
+from gigabrain_zenoh.scheduling import go_first, join_in, start_first, step_aside
 from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.transport import Transport
 from gigabrain_zenoh.unobtrusive import NAP_S
@@ -130,11 +132,17 @@ def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
         run_dir = Path(config.run_dir) if config.run_dir else None
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
         node = node_of(config)
-        if PROGRAMS[config.name].stops:
+        program = PROGRAMS[config.name]
+        if program.stops:
             go_first()  # this and the next before there are threads, which inherit it
-        if PROGRAMS[config.name].looks_on:
+        elif program.looks_on:
             step_aside()
-        with asyncio.Runner(loop_factory=loop_factory()) as runner:
+        else:
+            start_first()
+        with (
+            interrupts.reacting(None),  # before `stop_signals` there is nothing to stop
+            asyncio.Runner(loop_factory=loop_factory()) as runner,
+        ):
             runner.run(_run(config, node, make_bus))
     except GigabrainError as error:
         log.error("%s", error, extra={"data": {"event": "failed"}})
@@ -144,6 +152,7 @@ def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
         log.critical("died of %s: %s", type(first).__name__, first, exc_info=True)
         return 1
     finally:
+        logs.flush()
         gc.enable()
     return 0
 
@@ -176,13 +185,17 @@ async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
         say = functools.partial(bus.publish, HEARD, name=config.name)
         bus.journal = SaidJournal(say, bus.clock.unix_ns)
     try:
-        await answer_to_name(bus)
+        claim = NameClaim(bus)
+        await claim.take()
         serve_params(bus)
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(publish_health(bus))
+            tasks.create_task(claim.keep())
             if config.json_console:
-                tasks.create_task(beat(bus.clock, lambda: bus.progress()))
-            tasks.create_task(_node(bus, node))
+                out = os.dup(STDOUT)  # a router gives its standard output to Zenoh's log
+                tasks.create_task(beat(bus.clock, lambda: bus.progress(), out))
+            tasks.create_task(_failure(bus))
+            tasks.create_task(_node(bus, node, PROGRAMS[config.name]))
     except* GigabrainError as group:
         raise group.exceptions[0] from None
     finally:
@@ -191,11 +204,18 @@ async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
         await bus.close()
 
 
-async def _node(bus: Bus, node: Node) -> None:
-    await node(bus, _ready)
+async def _failure(bus: Bus) -> None:
+    """Raise what a handler of messages raised, whatever the node itself waits for."""
+    await bus.failed
 
 
-def _ready() -> None:
+async def _node(bus: Bus, node: Node, program: Program) -> None:
+    await node(bus, functools.partial(_ready, program))
+
+
+def _ready(program: Program) -> None:
+    if not program.stops:
+        join_in()
     gc.collect()
     gc.freeze()  # what set-up made stays: collections look at new objects only
     gc.enable()
@@ -205,8 +225,9 @@ def _ready() -> None:
 def main() -> None:
     """Entry of a supervised process."""
     lifeline.die_with_supervisor()
+    heap.map_large_blocks()
+    interrupts.install()
     code = run(msgspec.json.decode(sys.argv[1], type=ProcessConfig))
-    logging.shutdown()
     sys.stdout.flush()
     os._exit(code)  # Zenoh's threads must not keep a finished process alive
 

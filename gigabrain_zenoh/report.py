@@ -5,6 +5,7 @@ from typing import Any
 
 from msgspec import Struct
 
+from gigabrain_schemas.safety import Health
 from gigabrain_schemas.tasks import TaskStatus
 
 MOTION_M = 0.05  # less than this is no motion
@@ -30,15 +31,18 @@ class Observed(Struct, frozen=True, kw_only=True):
     deaths: int
     restarts: int
     rejected: int
+    problem: str = ""  # why the run could not be watched to its end
     mapped_m2: float | None = None  # where a map is made
     tasks: TaskStatus | None = None  # where anybody has any
+    answered: bool = True  # the driver told the truth in the end
 
 
 class Report(Struct, frozen=True, kw_only=True):
     """One run. Contacts, clearance and distance are MuJoCo's truth, not the robot's own view.
 
     A body that is not simulated knows no such truth: its contacts and clearance are null, and its
-    distance is that of its odometry.
+    distance is that of its odometry. Where the driver did not answer in the end, they are null as
+    well, and so is what its last health message did not hold.
     """
 
     body: str
@@ -51,10 +55,10 @@ class Report(Struct, frozen=True, kw_only=True):
     turns: int
     restarts: int
     rejected_messages: int
-    stale_commands_executed: int
+    stale_commands_executed: int | None
     scan_to_cmd_ms: Latency
     speed: float
-    lockstep_timeouts: int
+    lockstep_timeouts: int | None
     decisions: tuple[tuple[float, str], ...]  # simulated time [s] and the decision in words
     mapped_m2: float | None = None  # of the map, known to be free or taken
     tasks_done: int = 0  # of the last 16 that ended: goals reached, missions carried out
@@ -80,14 +84,16 @@ def make_report(told: Mapping[str, Any], seen: Observed) -> Report:
         turns=sum(words.startswith("turning") for _, words in seen.decisions),
         restarts=seen.restarts,
         rejected_messages=seen.rejected,
-        stale_commands_executed=told["stale_commands_executed"],
-        scan_to_cmd_ms=Latency(p50=told["scan_to_cmd_p50_ms"], p99=told["scan_to_cmd_p99_ms"]),
+        stale_commands_executed=told.get("stale_commands_executed"),
+        scan_to_cmd_ms=Latency(
+            p50=told.get("scan_to_cmd_p50_ms"), p99=told.get("scan_to_cmd_p99_ms")
+        ),
         speed=seen.speed,
-        lockstep_timeouts=told["lockstep_timeouts"],
+        lockstep_timeouts=told.get("lockstep_timeouts"),
         decisions=seen.decisions,
         mapped_m2=None if seen.mapped_m2 is None else round(seen.mapped_m2, 1),
         tasks_done=_succeeded(seen.tasks),
-        verdict=_verdict(distance, contacts or 0, seen.deaths),
+        verdict=_verdict(distance, contacts or 0, seen),
     )
 
 
@@ -95,14 +101,27 @@ def _succeeded(status: TaskStatus | None) -> int:
     return sum(task.state == "succeeded" for task in status.done) if status else 0
 
 
-def _verdict(distance_m: float, contacts: int, deaths: int) -> str:
-    faults = []
+def last_told(health: Health | None) -> dict[str, Any]:
+    """What the last health message of a driver that no longer answers holds of its report."""
+    if health is None:
+        return {}
+    counted = ("stale_commands_executed", "lockstep_timeouts")
+    times = {f"{name}_ms": value for name, value in health.latency_ms.items()}
+    return times | {name: health.counters.get(name, 0) for name in counted}
+
+
+def _verdict(distance_m: float, contacts: int, seen: Observed) -> str:
+    faults, deaths = [], seen.deaths
     if contacts:
         faults.append(_count(contacts, "contact"))
     if distance_m < MOTION_M:
         faults.append("no motion")
     if deaths:
         faults.append(f"{deaths} process{'es' if deaths > 1 else ''} died")
+    if not seen.answered:
+        faults.append("the driver did not answer in the end")
+    if seen.problem:
+        faults.append(seen.problem)
     return ", ".join(faults) or "ok"
 
 

@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import TICK_NS, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel, Response
+from gigabrain_zenoh.freshness import LEAD_TICKS
+from gigabrain_zenoh.gate_state import BRAIN
 
 Floats = NDArray[np.float64]
 
@@ -86,7 +88,7 @@ class ResponseEstimator:
     """Learns a body's response from the stream of its commands and states."""
 
     def __init__(self, prior: Response = PRIOR) -> None:
-        self._prior = prior
+        self._prior, self._newest = prior, 0  # tick of the newest state
         self._begin(0)
 
     @property
@@ -100,9 +102,17 @@ class ResponseEstimator:
         return self._response.turn_gain
 
     def command(self, command: CmdVel) -> None:
-        """Take what the body was told. Of several commands of a tick the last counts."""
-        if command.boot == self._boot and command.tick > self._done:
-            self._commands[command.tick] = command
+        """Take a command of the commander or the brain; of a tick, the one of the highest `seq`.
+
+        The gate too goes by `seq`: others may publish under the commander's name.
+        """
+        in_time = self._done < command.tick <= self._newest + LEAD_TICKS
+        known = command.source in (BRAIN, self._commander)
+        if command.boot != self._boot or not in_time or not known:
+            return
+        key = command.tick, command.source
+        if key not in self._commands or command.seq >= self._commands[key].seq:
+            self._commands[key] = command
 
     def state(self, state: RobotState) -> None:
         """Take what the body did. It is looked at once the commands of its time are known too."""
@@ -110,6 +120,8 @@ class ResponseEstimator:
             self._begin(state.boot)
         if state.tick <= self._done:
             return
+        self._newest = max(self._newest, state.tick)
+        self._commander = state.gate.commander or BRAIN
         self._states[state.tick] = state
         for tick in sorted(self._states):
             if tick <= state.tick - LATE_TICKS:
@@ -120,15 +132,19 @@ class ResponseEstimator:
 
         The command of a tick may still be on its way when the state of the next one is here.
         """
-        recent = {**self._past, **self._commands}
+        mine = self._commander
+        coming = {tick: told for (tick, source), told in self._commands.items() if source == mine}
+        recent = {**self._past, **coming}
         return tuple(
-            (tick, _velocity(recent[tick])) for tick in sorted(recent) if after < tick <= until
+            (tick, velocity_of(recent[tick])) for tick in sorted(recent) if after < tick <= until
         )
 
     def _begin(self, boot: int) -> None:
         self._boot, self._done = boot, 0
-        self._commands: dict[int, CmdVel] = {}
-        self._past: dict[int, CmdVel] = {}  # that have been looked at
+        self._newest = 0
+        self._commander = BRAIN
+        self._commands: dict[tuple[int, str], CmdVel] = {}  # by tick and source
+        self._past: dict[int, CmdVel] = {}  # the commander's, that have been looked at
         self._states: dict[int, RobotState] = {}
         self._told: CmdVel | None = None
         self._axes = tuple(Axis(*each) for each in zip(LEAST_CHANGE, NOISE, strict=True))
@@ -140,16 +156,18 @@ class ResponseEstimator:
             # a state that was missed is taken to be like the next one
             learnt |= self._one_tick(tick, state)
         self._done = state.tick
-        for tick in [tick for tick in self._commands if tick <= self._done]:
-            self._past[tick] = self._commands.pop(tick)
+        for tick, source in [key for key in self._commands if key[0] <= self._done]:
+            told = self._commands.pop((tick, source))
+            if source == (state.gate.commander or BRAIN):
+                self._past[tick] = told
         for tick in [tick for tick in self._past if tick <= self._done - DELAYS]:
             del self._past[tick]
         if learnt and self._done % LOOK_TICKS == 0:
             self._weigh()
 
     def _one_tick(self, tick: int, state: RobotState) -> bool:
-        self._told = self._commands.get(tick, self._told)
-        gate, told, measured = state.gate, self._told, state.velocity
+        gate, measured = state.gate, state.velocity
+        self._told = told = self._commands.get((tick, gate.commander), self._told)
         x, z = self._axes
         obeyed = told and gate.mode == "enabled" and told.source == gate.commander
         if not told or not obeyed or told.tick < tick - SILENT_TICKS:
@@ -177,7 +195,8 @@ class ResponseEstimator:
         )
 
 
-def _velocity(command: CmdVel) -> Velocity:
+def velocity_of(command: CmdVel) -> Velocity:
+    """The velocity that `command` asks for."""
     return Velocity(
         linear_x=command.linear_x, linear_y=command.linear_y, angular_z=command.angular_z
     )

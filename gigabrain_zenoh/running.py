@@ -1,21 +1,24 @@
 """Which robots run on this machine, so that tools and scripts find them by themselves."""
 
+import contextlib
+import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, BinaryIO
 
 import msgspec
 from msgspec import Meta, Struct
 
 from gigabrain_zenoh.codec import DECODE_ERRORS
-from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_config import secured
 
 SOCKET = "unixsock-stream"
+NOTE_BYTES = 65536  # at most
 
 Pid = Annotated[int, Meta(ge=1, le=2**31 - 1)]  # no group, and nobody's by default
 
@@ -23,7 +26,7 @@ Pid = Annotated[int, Meta(ge=1, le=2**31 - 1)]  # no group, and nobody's by defa
 class Running(Struct, frozen=True, kw_only=True):
     """One robot on this machine."""
 
-    pid: Pid  # of its supervisor
+    pid: Pid  # of its supervisor, or of its router where that was started by hand
     label: str  # for people
     endpoint: Endpoint
 
@@ -43,22 +46,51 @@ def local_socket() -> str:
 
 @contextmanager
 def announced(label: str, endpoint: Endpoint) -> Iterator[Path]:
-    """Leave a note while the block runs; its path."""
+    """Leave a note while the block runs; its path. Raises ConfigError.
+
+    The note is locked for as long as this process lives: its pid may be used again.
+    """
     note = folder() / f"{os.getpid()}.json"
     robot = Running(pid=os.getpid(), label=label, endpoint=endpoint)
     try:
-        note.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if note.parent.stat().st_uid != os.getuid():
-            raise ConfigError(f"{note.parent} is somebody else's; set XDG_RUNTIME_DIR")
-        fresh = note.with_suffix(".new")  # nobody finds half a note
-        fresh.write_bytes(msgspec.json.encode(robot))
-        fresh.replace(note)
+        for place in (note.parent.parent, note.parent):
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _check_private(note.parent)
+        file = _written(note, msgspec.json.encode(robot))
     except OSError as error:
         raise ConfigError(f"cannot write {note}: {error.strerror}; set XDG_RUNTIME_DIR") from None
+    with file:
+        try:
+            yield note
+        finally:
+            _forget(note)
+
+
+def _written(note: Path, text: bytes) -> BinaryIO:
+    """The note, written and locked; nobody finds half of it."""
+    fresh = note.with_suffix(".new")
+    file = fresh.open("wb")
     try:
-        yield note
-    finally:
-        _forget(note)
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.write(text)
+        file.flush()
+        fresh.replace(note)
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+def _check_private(place: Path) -> None:
+    """Raises ConfigError where somebody else may put notes into the folder, or swap it."""
+    for one in (place, place.parent):
+        with contextlib.suppress(FileNotFoundError):
+            about = one.stat()
+            if about.st_uid != os.getuid() or about.st_mode & 0o022:
+                raise ConfigError(
+                    f"{one} belongs to another user, or others may write it, so it cannot say "
+                    "which robots run; set XDG_RUNTIME_DIR to a folder of your own, of mode 0700"
+                )
 
 
 def _forget(note: Path) -> None:
@@ -68,17 +100,34 @@ def _forget(note: Path) -> None:
 
 
 def running() -> list[Running]:
-    """The robots whose supervisors are alive; notes of dead ones are taken away."""
-    found = []
-    for note in sorted(folder().glob("*.json")):
-        try:
-            robot = msgspec.json.decode(note.read_bytes(), type=Running)
-            os.kill(robot.pid, 0)
-        except (OSError, *DECODE_ERRORS):
-            _forget(note)
-        else:
-            found.append(robot)
-    return found
+    """The robots whose supervisors are alive; notes of dead ones are taken away.
+
+    Raises ConfigError where others may have written them.
+    """
+    _check_private(folder())
+    notes = sorted(folder().glob("*.json"))
+    return [robot for note in notes if (robot := _read(note)) is not None]
+
+
+def _read(note: Path) -> Running | None:
+    """The robot of a note; None where whoever left it is dead, or it cannot be read."""
+    try:
+        with note.open("rb") as file:
+            if _locked(file):
+                return msgspec.json.decode(file.read(NOTE_BYTES), type=Running)
+    except (OSError, *DECODE_ERRORS):
+        pass
+    _forget(note)
+    return None
+
+
+def _locked(file: BinaryIO) -> bool:
+    """Whether whoever wrote the file still has it open."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    return False
 
 
 def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> Endpoint:
@@ -95,7 +144,7 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
     nearest = {_place(robot): robot for robot in sorted(robots, key=_ways)}
     if len(nearest) > 1:
         where = ", ".join(f"{r.endpoint.connect[-1]} ({r.label})" for r in nearest.values())
-        raise BusError(f"several robots run here; choose one with --connect: {where}")
+        raise Ambiguous(f"several robots run here; choose one with --connect: {where}")
     return next(iter(nearest.values())).endpoint
 
 

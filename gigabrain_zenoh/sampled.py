@@ -1,12 +1,13 @@
 """The newest message of a busy topic, for those who only show it."""
 
+from collections import deque
 from typing import Generic, TypeVar
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.codec import Codec
-from gigabrain_zenoh.freshness import CLOCK_KEYS
+from gigabrain_zenoh.freshness import CLOCK_KEYS, CONFIRMED
 
 M = TypeVar("M", bound=Message)
 
@@ -20,26 +21,27 @@ class Sampled(Generic[M]):
         self._latest = Latest(topic, bus.clock, bus.time)
         self._time = bus.time if topic.key in CLOCK_KEYS else None
         self._codec = Codec(topic.type, topic.max_bytes)
-        self._raw: bytes | None = None
+        # of those that move the clock so many that they can confirm a jump between two looks
+        self._raw: deque[bytes] = deque(maxlen=CONFIRMED if self._time else 1)
         if not topic.many:
             bus.tap(topic.key, self.take)
 
     def take(self, _key: str, _encoding: str, payload: bytes) -> None:
         """Keep a payload, in whatever thread it comes."""
-        self._raw = payload
+        self._raw.append(payload)
 
     def look(self) -> M | None:
         """The message that has come since the last look, if there is a valid one."""
-        raw, self._raw = self._raw, None
-        if raw is None:
-            return None
-        try:
-            message = self._codec.decode(raw)
-        except ValueError:
-            return None
-        if self._time:
-            self._time.see(message)
-        return message if self._latest.take(message) else None
+        while self._raw:
+            try:
+                message = self._codec.decode(self._raw.pop())
+            except ValueError:
+                continue
+            if self._time and not self._time.see(message):
+                continue
+            self._raw.clear()
+            return message if self._latest.take(message) else None
+        return None
 
     def fresh(self) -> M | None:
         """The newest message, while it is worth showing."""

@@ -18,9 +18,26 @@ def go_first() -> None:
     """
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, FIRST)
+    _session(FIRST)
+
+
+def start_first() -> None:
+    """Have this process go before others until `join_in`, where it may.
+
+    A robot stands still until the part of its brain that has died is back.
+    """
+    _session(FIRST)
+
+
+def join_in() -> None:
+    """Take the same share as others from now on."""
+    _session(0)
+
+
+def _session(nice: int) -> None:
     if os.getsid(0) == os.getpid():
-        with contextlib.suppress(OSError):  # a kernel without, or another system
-            AUTOGROUP.write_text(str(FIRST))
+        with contextlib.suppress(OSError):  # no rights, a kernel without, or another system
+            AUTOGROUP.write_text(str(nice))
 
 
 def step_aside() -> None:

@@ -1,9 +1,12 @@
 """Writes files behind the event loop: a slow or full disk must not hold up a body."""
 
 import asyncio
+import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
+
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -41,7 +44,12 @@ class Scribe(Generic[T]):
         while self._waiting:
             items, self._items = tuple(self._items), deque(maxlen=self._items.maxlen)
             waiting, self._waiting = self._waiting, []
-            problem = await asyncio.to_thread(self._write, items)
+            try:
+                problem = await asyncio.to_thread(self._write, items)
+            except Exception as error:
+                # whatever it was: those who wait must hear of it, and the next must be written
+                log.exception("writing failed")
+                problem = f"{type(error).__name__}: {error}"
             for done in waiting:
                 if not done.done():
                     done.set_result(problem)

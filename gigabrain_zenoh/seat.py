@@ -19,6 +19,11 @@ class Steered(Protocol):
         """What it is; None while that is not known."""
         ...
 
+    @property
+    def enables(self) -> int | None:
+        """How often its gate was enabled; None while the robot is silent."""
+        ...
+
     def steer(self, wanted: Velocity) -> None:
         """Tell its control what an operator wants."""
         ...
@@ -31,6 +36,7 @@ class Seat:
         self._robot = robot
         self._viewer = 0
         self._until_s = self._said_s = self._from_s = 0.0
+        self._enables: int | None = None  # of the gate, when a viewer last steered
 
     def driving(self, now_s: float) -> int:
         """The number of the viewer who steers, or 0."""
@@ -47,19 +53,24 @@ class Seat:
             self._from_s = now_s + SETTLE_S
         self._viewer, self._said_s, self._until_s = viewer, now_s, now_s + SEAT_S
         if wanted == ZERO:
-            self._viewer = 0
-        elif now_s < self._from_s:
-            return True
-        self._robot.steer(clamp(wanted, limits_of(body.description)))
+            self._end()
+        elif now_s >= self._from_s:
+            self._enables = self._robot.enables
+            self._robot.steer(clamp(wanted, limits_of(body.description)))
         return True
 
     def leave(self, viewer: int) -> None:
         """A viewer is gone: whatever it wanted ends."""
         if viewer == self._viewer:
-            self._viewer = 0
-            self._robot.steer(ZERO)
+            self._end()
 
     def clear(self) -> None:
         """Nobody steers any more: an e-stop was pressed."""
         if self._viewer:
-            self.leave(self._viewer)
+            self._end()
+
+    def _end(self) -> None:
+        """Stop what was steered, unless the body was handed over since: a zero would take it."""
+        self._viewer = 0
+        if self._robot.enables in (None, self._enables):
+            self._robot.steer(ZERO)

@@ -11,6 +11,7 @@ LinkName = Literal["sim", "emulated", "real"]
 Resume = Literal["auto", "manual"]
 Seed = Annotated[int, Meta(ge=0, le=2**32)]
 Speed = Annotated[float, Meta(ge=0.1, le=100)]  # of real time; other than 1 means lock-step
+LockstepTimeout = Annotated[float, Meta(ge=0.15, le=60)]  # [s] of wall time
 
 
 class Endpoint(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -49,6 +50,7 @@ class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     sectors: Annotated[int, Meta(ge=4, le=360)] = 12  # all round, the first centred ahead
     mapping: Literal["off", "slam", "localize"] = "off"  # make a map, or find its way in one
     map: str = ""  # a saved map's YAML file: to be found in, or with `slam` to go on with
+    state_dir: str = ""  # where `slam` saves the map every few seconds; nowhere without
 
     def __post_init__(self) -> None:
         if self.map and self.mapping == "off":
@@ -80,6 +82,7 @@ class DriverConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
     world: str = "arena"
     seed: Seed = 0
     speed: Speed = 1.0
+    lockstep_timeout_s: LockstepTimeout = 0.15  # how long a tick waits for the brain, off speed 1
     seconds: Positive | None = None  # of simulated time, then the body holds still
     resume: Resume = "manual"
     state_dir: str  # where it remembers what latched it
@@ -114,7 +117,8 @@ class FoxgloveConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """The `foxglove` part of a deployment file."""
 
     port: Annotated[int, Meta(ge=0, le=65535)] = 8765  # on loopback
-    tokens: str = ""  # the page's file of tokens; the one in the user's state folder without
+    origins: tuple[str, ...] = ()  # of web viewers that may connect, beside those that are known
+    secret: str = ""  # the file of the secret to steer; one in the user's state folder without
 
 
 class EmulatorConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -7,14 +7,15 @@ import asyncio
 from collections import deque
 
 import numpy as np
+from msgspec.structs import asdict, replace
 
 from gigabrain_schemas.arrays import hits
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_schemas.brain import OccupancyGrid, PoseInMap, WorldModel
+from gigabrain_schemas.brain import CmdVel, OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import Goal
-from gigabrain_schemas.topics import BODY, MAP, POSE, command_topic
+from gigabrain_schemas.topics import BODY, MAP, POSE, STATE, command_topic
 from gigabrain_zenoh.behaviours import Behaviour, Situation, must_charge
 from gigabrain_zenoh.behaviours.bearings import Bearings, Driven, Route
 from gigabrain_zenoh.behaviours.guide import Asked, Guide
@@ -24,12 +25,13 @@ from gigabrain_zenoh.earlier import Earlier
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate_state import BRAIN
 from gigabrain_zenoh.lateness import Lateness
+from gigabrain_zenoh.limits import clamp, limits_of
 from gigabrain_zenoh.mapping.background import Background, Take
 from gigabrain_zenoh.navigation import local, planner
 from gigabrain_zenoh.navigation.moment import Sent
 from gigabrain_zenoh.planar import compose, inverse
 from gigabrain_zenoh.pose_history import PoseHistory
-from gigabrain_zenoh.response import ResponseEstimator
+from gigabrain_zenoh.response import ResponseEstimator, velocity_of
 from gigabrain_zenoh.settings import DecisionConfig
 from gigabrain_zenoh.tasks.orders import Order, Outcome
 
@@ -38,8 +40,10 @@ SENT_TICKS = 25  # commands of the last half second are planned with
 SMALL = 60_000  # cells; plans in larger maps are made in a thread,
 LARGE = 250_000  # and for each so many cells it may take a scan more than
 DUE_SCANS = 2
+HUNG_SCANS = 200  # a plan that is overdue for so many never ends
 PATIENCE_S = 0.05  # how long a scan waits for a plan that is due: control waits for no more
 AGAIN_TICKS = 25  # a route is looked at twice a second, whatever happens
+OPERATOR_HOLDS = "an operator holds the body; `gigabrain enable` hands it back"
 NO_MAP = "nobody says yet where in a map the robot is; perception: {mapping: slam} would"
 
 ANY_BODY = BodyDescription(
@@ -69,6 +73,10 @@ class Steering:
         self._beside = Background(PATIENCE_S, bus.journal.in_time)
         self._thought: tuple[int, OccupancyGrid] | None = None  # when, and about which map
         self._driven: Driven | None = None
+        self._commands: Earlier[CmdVel] = Earlier()
+        self._stands = False  # the behaviour did not follow its route in the last step
+        self._counted = (0, 0)  # boot and tick until which `_held_ticks` has counted
+        self._held_ticks = 0  # since the last route was asked for
         self._here: Pose | None = None
         self._seen = False  # a scan that can be believed, since the start
         self._oriented = False  # it has known its place and a map since the start
@@ -82,8 +90,15 @@ class Steering:
         body = self._bodies.current
         if body and not self._hears_commands:
             self._hears_commands = True
-            topic = command_topic(body.description)
-            self._bus.subscribe(topic, lambda _key, command: self._response.command(command))
+            self._bus.subscribe(command_topic(body.description), self._hear_command)
+
+    def _hear_command(self, _key: str, command: CmdVel) -> None:
+        """What the gate would make of it is what the body answers."""
+        if body := self._bodies.current:
+            told = clamp(velocity_of(command), limits_of(body.description))
+            self._response.command(replace(command, **asdict(told)))
+        if command.source == BRAIN:
+            self._commands.receive(command)
 
     def situation(
         self,
@@ -91,6 +106,7 @@ class Steering:
         world: WorldModel | None,
         verdict: SafetyState | None,
         order: Order | None,
+        waits: str,
     ) -> Situation:
         """Where the robot is, what it is to do, and which way."""
         tick = world.basis if world else state.tick
@@ -100,10 +116,12 @@ class Steering:
             self._beside.at_scan()
         pose, place = self._history.at(state.boot, tick), self._place(state.boot, tick)
         body = self._bodies.current
+        held = self._held(state)
+        self._count_held(state.boot, tick, held)
         map_from_odom, lost = place if pose else (None, "the odometry of the scan is missing")
         if world and pose and map_from_odom and body:
             self._here = compose(map_from_odom, pose)
-            self._steer(state, world, map_from_odom, order, body.description)
+            self._steer(world, map_from_odom, order, body.description, verdict)
         else:
             self._here = None
         bearings = Bearings(
@@ -119,6 +137,8 @@ class Steering:
             sent=tuple(Sent(*one) for one in self._response.sent(tick - SENT_TICKS, tick - 1)),
             order=order,
             route=self._route,
+            held=held,
+            waits=waits,
         )
         return Situation(world, pose or state.pose, must_charge(verdict), bearings)
 
@@ -127,11 +147,18 @@ class Steering:
         if not isinstance(behaviour, Navigate):
             return None
         self._driven = behaviour.driven or self._driven
+        route = self._route
+        self._stands = behaviour.driven is None and route is not None and route.points is not None
         return behaviour.outcome
 
     def close(self) -> None:
         """End what runs beside."""
         self._beside.close()
+
+    @property
+    def hung(self) -> bool:
+        """Whether the plan in the making never ends."""
+        return self._beside.overdue > HUNG_SCANS
 
     @property
     def placed(self) -> bool:
@@ -156,10 +183,7 @@ class Steering:
             raise Refused(self.lost)
         # beside whatever the guide is at: it has a memory of its own
         guide = Guide(self._config.unknown)
-        told = await asyncio.to_thread(guide.check, grid, body.description, self._here, goal)
-        if told.startswith("no: "):
-            raise Refused(told.removeprefix("no: "))
-        return told
+        return await asyncio.to_thread(guide.check, grid, body.description, self._here, goal)
 
     @property
     def lost(self) -> str:
@@ -189,16 +213,36 @@ class Steering:
         earlier = (one for one in reversed(self._maps) if one.boot != boot or one.tick < tick)
         return next(earlier, None)
 
+    def _held(self, state: RobotState) -> str:
+        """Why the body does not follow decision now, in words; empty while it does."""
+        gate = state.gate
+        if gate.mode != "enabled":
+            why = "; ".join(cause.text for cause in gate.causes)
+            return f"the gate is {gate.mode}{f': {why}' if why else ''}"[:300]
+        if gate.commander != BRAIN:
+            return f"{gate.commander} has the body"
+        command = self._commands.at(state.boot, state.tick, STATE.stale_after_ns)
+        return OPERATOR_HOLDS if command and command.operator else ""
+
+    def _count_held(self, boot: int, tick: int, held: str) -> None:
+        """Count the ticks in which the body did not follow the route."""
+        counted_boot, counted = self._counted
+        if boot != counted_boot:
+            counted, self._held_ticks = tick, 0
+        if held or self._stands:
+            self._held_ticks += max(0, tick - counted)
+        self._counted = boot, max(tick, counted)
+
     def _steer(
         self,
-        state: RobotState,
         world: WorldModel,
         map_from_odom: Pose,
         order: Order | None,
         body: BodyDescription,
+        verdict: SafetyState | None,
     ) -> None:
         """Have a route thought of where one is due."""
-        grid = self._grid(state.boot, world.basis)
+        grid = self._grid(world.boot, world.basis)
         self._oriented = self._oriented or grid is not None
         if order is None or grid is None or self._here is None or not self._beside.idle:
             return
@@ -207,14 +251,16 @@ class Steering:
         self._thought, driven, self._driven = (world.basis, grid), self._driven, None
         asked = Asked(
             tick=world.basis,
-            driving=state.gate.mode == "enabled" and state.gate.commander == BRAIN,
             order=order,
             here=self._here,
             grid=grid,
             body=body,
             driven=driven,
             seen=moved(self._here, hits(world).astype(np.float64)),
+            held_ticks=self._held_ticks,
+            slowed_by="; ".join(one.text for one in verdict.causes)[:300] if verdict else "",
         )
+        self._held_ticks = 0
         cells = grid.width * grid.height
         if cells <= SMALL:
             self._route = self._guide.think(asked)

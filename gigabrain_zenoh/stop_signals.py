@@ -1,28 +1,53 @@
-"""The signals that mean: come to an end in good order."""
+"""Signals inside an event loop: what they stop ends in good order."""
 
 import asyncio
-import signal
-from collections.abc import Iterator
+from collections.abc import Coroutine, Iterator
 from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from gigabrain_zenoh.interrupts import LIMIT_S, interrupts
+
+T = TypeVar("T")
 
 
 @contextmanager
-def stop_signals() -> Iterator[asyncio.Event]:
-    """An event that Ctrl-C, SIGTERM and the end of the terminal set; repeating them does no harm.
+def stop_signals(limit_s: float = LIMIT_S) -> Iterator[asyncio.Event]:
+    """Yield an event that the first SIGINT, SIGTERM or SIGHUP sets; more of them do no harm.
 
-    Where whoever started this process wants the end of the terminal ignored (nohup), it is. After
-    a stop Ctrl-C does nothing any more: what is left to do until the process ends is not cut short.
+    A command that has not ended `limit_s` after the signal is ended by force.
     """
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
-        numbers.append(signal.SIGHUP)
-    for number in numbers:
-        loop.add_signal_handler(number, stop.set)
-    try:
+
+    def react() -> None:
+        loop.call_soon_threadsafe(stop.set)
+
+    interrupts.limit_s = limit_s
+    with interrupts.installed(), interrupts.reacting(react):
         yield stop
-    finally:
-        if stop.is_set():
-            signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-        for number in numbers:
-            loop.remove_signal_handler(number)
+
+
+def run_async(work: Coroutine[Any, Any, T]) -> T:
+    """Run a command's coroutine to its end; the first signal cancels it.
+
+    Raises KeyboardInterrupt where that ended it. Unlike `asyncio.run`, it does so for SIGTERM and
+    SIGHUP too, never interrupts asyncio's own code, and hears SIGINT also where a shell has had it
+    ignored.
+    """
+
+    async def cancelled_by_signal() -> T:
+        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+        assert task
+
+        def react() -> None:
+            loop.call_soon_threadsafe(task.cancel)
+
+        with interrupts.reacting(react):
+            return await work
+
+    with interrupts.reacting(None):
+        try:
+            return asyncio.run(cancelled_by_signal())
+        except asyncio.CancelledError:
+            if not interrupts.received:
+                raise
+            raise KeyboardInterrupt from None

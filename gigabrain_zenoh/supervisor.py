@@ -1,12 +1,13 @@
 """Runs the processes of one host: starts them in readiness order, and ends them all."""
 
 import asyncio
+import contextlib
 import graphlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Self
 
-from gigabrain_zenoh import errors
+from gigabrain_zenoh import errors, heartbeat
 from gigabrain_zenoh.backoff import Backoff
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keeper import Keeper, OnRecord, ProcessSpec, ProcessStatus, Shared, State
@@ -22,10 +23,15 @@ class Supervisor:
     """Runs processes until told to stop; used once. Leaves none behind, however it ends."""
 
     def __init__(
-        self, specs: Sequence[ProcessSpec], on_record: OnRecord, backoff: Backoff | None = None
+        self,
+        specs: Sequence[ProcessSpec],
+        on_record: OnRecord,
+        backoff: Backoff | None = None,
+        *,
+        keep_stuck: bool = False,
     ) -> None:
         _check(specs)
-        self._shared = Shared(on_record, backoff or Backoff())
+        self._shared = Shared(on_record, backoff or Backoff(), keep_stuck)
         self._keepers = {spec.name: Keeper(spec, self._shared) for spec in specs}
         self.statuses: Mapping[str, ProcessStatus] = {
             name: keeper.status for name, keeper in self._keepers.items()
@@ -51,7 +57,7 @@ class Supervisor:
 
     @property
     def stuck(self) -> tuple[str, ...]:
-        """Names of the processes that run and get nowhere."""
+        """Names of the processes that run and make no progress."""
         return tuple(name for name, keeper in self._keepers.items() if keeper.stuck)
 
     async def __aenter__(self) -> Self:
@@ -67,15 +73,30 @@ class Supervisor:
             for name, keeper in self._keepers.items()
         }
         halted = asyncio.create_task(self._shared.halt.wait())
+        watching = asyncio.create_task(self._watch())
         try:
             # a keeper ends when all are told to; before that it can only fail
-            await asyncio.wait([halted, *self._tasks.values()], return_when="FIRST_EXCEPTION")
+            ends = [halted, watching, *self._tasks.values()]
+            await asyncio.wait(ends, return_when="FIRST_EXCEPTION")
         finally:
             try:
                 await self.stop()
                 await halted
+                await watching
             finally:  # a second Ctrl-C may come before the stop has begun
                 self._abandon()
+
+    async def _watch(self) -> None:
+        """Look for processes without progress until all are told to stop."""
+        loop, halt = asyncio.get_running_loop(), self._shared.halt
+        looked_s = loop.time()
+        while not halt.is_set():
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(heartbeat.LOOK_S):
+                    await halt.wait()
+            passed_s, looked_s = loop.time() - looked_s, loop.time()
+            for keeper in self._keepers.values():
+                keeper.look(passed_s)
 
     async def stop(self, within_s: float = 1.5) -> None:
         """End all processes within `within_s`, politely at first, also those that hang."""

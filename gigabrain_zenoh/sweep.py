@@ -14,6 +14,8 @@ Floats = NDArray[np.float64]
 Corners = tuple[tuple[float, float], ...]
 
 STEP = 0.02  # [m], how far any part of the body moves between two looks
+MOST_STEPS = 1000  # looks along one way; a longer way is looked at in longer steps
+AT_ONCE = 1_000_000  # distances from points to edges that are worked out at a time
 NEARER = 0.005  # [m]: what is nearer than the margin from the start must not come nearer by this
 
 
@@ -114,7 +116,7 @@ def turning(
     near = points[np.hypot(points[:, 0], points[:, 1]) <= outer + margin]
     if not len(near):
         return None, None
-    angles = _steps(reach, STEP / outer)
+    angles = _steps(min(reach, math.tau), STEP / outer)
     still = np.zeros_like(angles)
     return (
         _free(footprint, near, margin, angles, still, still, angles),
@@ -148,6 +150,7 @@ def arc(
 
 
 def _steps(reach: float, step: float) -> Floats:
+    step = max(step, reach / MOST_STEPS)
     return np.arange(0.0, reach + step, step)
 
 
@@ -172,8 +175,13 @@ def _free(
     if not len(points):
         return None
     allowed = np.minimum(margin, begin - NEARER)
-    dx, dy = points[:, 0] - x[:, None], points[:, 1] - y[:, None]
-    cosine, sine = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-    seen = np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx], axis=-1)
-    touched = np.flatnonzero((depth(hull, seen) < allowed).any(axis=1))
-    return float(ways[max(0, touched[0] - 1)]) if touched.size else None
+    many = max(1, AT_ONCE // (len(points) * len(hull.offsets)))
+    for first in range(0, len(ways), many):
+        part = slice(first, first + many)
+        dx, dy = points[:, 0] - x[part, None], points[:, 1] - y[part, None]
+        cosine, sine = np.cos(yaw[part])[:, None], np.sin(yaw[part])[:, None]
+        seen = np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx], axis=-1)
+        touched = np.flatnonzero((depth(hull, seen) < allowed).any(axis=1))
+        if touched.size:
+            return float(ways[max(0, first + touched[0] - 1)])
+    return None

@@ -46,8 +46,11 @@ class Transport(Protocol):
         """Call `on_raw` at once, in whatever thread, for all that arrives on `pattern`."""
         ...
 
-    def serve(self, key: str, answer: Answer) -> Close:
-        """Answer queries on `key`. A GigabrainError from `answer` travels back as its text."""
+    def serve(self, key: str, answer: Answer, *, urgent: bool = False) -> Close:
+        """Answer queries on `key`. A GigabrainError from `answer` travels back as its text.
+
+        What is `urgent` is answered before all others that wait.
+        """
         ...
 
     async def query(
@@ -128,8 +131,8 @@ class LocalTransport:
         """Register a listener; encodings are not known here."""
         return self.subscribe(pattern, lambda key, payload: on_raw(key, "", payload), 1)
 
-    def serve(self, key: str, answer: Answer) -> Close:
-        """Register one who answers on `key`."""
+    def serve(self, key: str, answer: Answer, *, urgent: bool = False) -> Close:
+        """Register one who answers on `key`; here nothing waits."""
         self._closers.append(self._network.serve(key, answer))
         return self._closers[-1]
 

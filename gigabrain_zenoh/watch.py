@@ -17,10 +17,13 @@ from gigabrain_schemas.topics import (
     TASK,
     WORLD,
 )
+from gigabrain_zenoh.bounded import put
 from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.causes import LATE
 from gigabrain_zenoh.errors import Refused
 
 UNKNOWN = b"\xff"  # a cell of which nothing is known
+PROCESSES = 64  # whose health is kept
 ASK_S, PAUSE_S = 1.0, 0.1  # of one question, and until the next
 
 
@@ -42,6 +45,12 @@ class Watch:
         bus.subscribe(HEALTH, self._healthy)
 
     @property
+    def problem(self) -> str:
+        """Why nothing can be made of what is heard any more; empty while all is well."""
+        failed = self._bus.failed
+        return str(failed.exception()) if failed.done() else ""
+
+    @property
     def seconds(self) -> float:
         """Time of the robot since its driver's start [s]."""
         return self._bus.time.tick * 0.02
@@ -53,6 +62,16 @@ class Watch:
         if grid is None:
             return None
         return (len(grid.cells) - grid.cells.count(UNKNOWN)) * grid.resolution**2
+
+    @property
+    def held_by_load(self) -> bool:
+        """Whether the brain is too late for the gate while the processors have no time to spare."""
+        state, verdict = self.state.newest, self.safety.current
+        if state is None or verdict is None or not state.gate.enables:
+            return False
+        busy = any(warning.code == "cpu_busy" for warning in verdict.warnings)
+        late = any(cause.code in LATE for cause in (*state.gate.causes, *verdict.causes))
+        return busy and late and state.gate.mode in ("idle", "stopping")
 
     async def describe(self, process: str, timeout_s: float = 0.3) -> Description | None:
         """What a process says of itself, or None when it does not answer.
@@ -72,7 +91,7 @@ class Watch:
         return None
 
     def _healthy(self, _key: str, health: Health) -> None:
-        self.health[health.process] = health
+        put(self.health, health.process, health, PROCESSES)
 
     def _moved(self, state: RobotState) -> None:
         last, self._last = self._last, state

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import zenoh
 
 from gigabrain_zenoh.bridge import Bridge
-from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.linger import close_in_background
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.transport import Close
@@ -72,9 +71,9 @@ class Lines:
     def declare(self, make: Make) -> Close:
         """Declare something here and on every line to come; the returned function ends it."""
         declared = Declared(make)
-        self._declared.append(declared)
         if self.now:
             declared.made = make(self.now)
+        self._declared.append(declared)
 
         def close() -> None:
             if declared in self._declared:
@@ -101,7 +100,8 @@ class Lines:
             await close_session(line.session)
 
     def _join(self, session: zenoh.Session) -> None:
-        self.now = line = Line(session)
+        """Declare everything on a new session; it becomes the line once all is declared."""
+        line = Line(session)
         renews = not self._endpoint.listen  # a router's links are those of others
 
         def linked(event: zenoh.LinkEvent) -> None:
@@ -111,9 +111,14 @@ class Lines:
                 self._bridge.post(self._lost, line)
 
         line.watch = session.info.declare_link_events_listener(linked, history=True)
-        for declared in self._declared:
-            declared.made = declared.make(line)
+        made = [declared.make(line) for declared in self._declared]
+        for declared, one in zip(self._declared, made, strict=True):
+            declared.made = one
+        self.now = line
         self._joined.set()
+        if renews and not session.info.links():  # lost before anybody listened: no event comes
+            line.cut = True
+            self._bridge.post(self._lost, line)
 
     def _lost(self, line: Line) -> None:
         if line is not self.now:
@@ -128,14 +133,16 @@ class Lines:
 
     async def _renew(self) -> None:
         while True:
+            session = None
             try:
                 session = await open_session(self._endpoint)
-            except GigabrainError as error:
-                log.warning("the router cannot be joined again: %s", error)
-                await asyncio.sleep(AGAIN_S)
-            else:
                 self._join(session)
                 return
+            except Exception as error:  # noqa: BLE001 - without a line the process is deaf for good
+                log.warning("the router cannot be joined again: %s", error)
+                if session:  # what could not all be declared on
+                    self._start(close_session(session))
+                await asyncio.sleep(AGAIN_S)
 
     def _start(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(work)

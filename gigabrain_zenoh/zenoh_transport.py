@@ -1,6 +1,8 @@
 """The bus over Zenoh: with `zenoh_session` and `zenoh_line` all that imports it."""
 
 import asyncio
+import contextlib
+import logging
 from typing import Any
 
 import zenoh
@@ -10,12 +12,15 @@ from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.bridge import Bridge
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.mailbox import Mailbox
+from gigabrain_zenoh.questions import Questions
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.staying import stay
 from gigabrain_zenoh.transport import Answer, Close, Link, OnLink, OnRaw, OnSample
 from gigabrain_zenoh.unobtrusive import Nap
 from gigabrain_zenoh.zenoh_line import Lines
 from gigabrain_zenoh.zenoh_session import open_session
+
+log = logging.getLogger(__name__)
 
 PRIORITIES: dict[Priority, zenoh.Priority] = {
     "real_time": zenoh.Priority.REAL_TIME,
@@ -35,7 +40,7 @@ class ZenohTransport:
         self._bridge = Bridge()
         self._loop = asyncio.get_running_loop()
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._questions: Questions[zenoh.Query] = Questions(self._bridge, _refuse)
         self._asking: set[asyncio.Future[None]] = set()
         self._closed = False
         self._lines = Lines(session, endpoint, self._bridge, self._lost)
@@ -90,29 +95,29 @@ class ZenohTransport:
             )
         )
 
-    def serve(self, key: str, answer: Answer) -> Close:
+    def serve(self, key: str, answer: Answer, *, urgent: bool = False) -> Close:
         """Answer queries, each in a task of its own."""
 
         async def run(query: zenoh.Query) -> None:
             with query:  # dropped at the end, else the asker waits for its timeout
                 asked = query.payload
-                try:
-                    payload, encoding = await answer(asked.to_bytes() if asked else b"")
-                    query.reply(key, payload, encoding=encoding)
-                except GigabrainError as error:
-                    query.reply_err(str(error))
+                with contextlib.suppress(zenoh.ZError):  # the asker's line is lost
+                    try:
+                        payload, encoding = await answer(asked.to_bytes() if asked else b"")
+                        query.reply(key, payload, encoding=encoding)
+                    except GigabrainError as error:
+                        query.reply_err(str(error))
 
-        def start(query: zenoh.Query) -> None:
-            task = self._loop.create_task(run(query))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
-
-        def post(query: zenoh.Query) -> None:
-            self._bridge.post(start, query)
-
-        return self._lines.declare(
-            lambda line: line.session.declare_queryable(key, line.take(post), complete=True)
+        put, ends = self._questions.serve(run, urgent=urgent)
+        undeclare = self._lines.declare(
+            lambda line: line.session.declare_queryable(key, line.take(put), complete=True)
         )
+
+        def close() -> None:
+            undeclare()
+            ends()
+
+        return close
 
     async def query(
         self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
@@ -131,18 +136,22 @@ class ZenohTransport:
         handler = Callback(
             replies.append, drop=lambda: self._bridge.post(finish, None), indirect=False
         )
-        line.session.get(
-            key,
-            handler,
-            payload=payload,
-            encoding=encoding or None,
-            timeout=timeout_s,
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,  # else one answer per key is all we get
-            priority=PRIORITIES[priority],
-            congestion_control=zenoh.CongestionControl.DROP,  # never block the loop
-            express=True,
-        )
+        try:
+            line.session.get(
+                key,
+                handler,
+                payload=payload,
+                encoding=encoding or None,
+                timeout=timeout_s,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,  # else one answer per key is all we get
+                priority=PRIORITIES[priority],
+                congestion_control=zenoh.CongestionControl.DROP,  # never block the loop
+                express=True,
+            )
+        except zenoh.ZError as error:  # the session has just been closed
+            log.debug("nobody was asked on %s: %s", key, error)
+            return []
         self._asking.add(done)
         try:
             await done
@@ -171,8 +180,7 @@ class ZenohTransport:
             return
         self._closed = True
         self._bridge.close()
-        for task in self._tasks:
-            task.cancel()
+        self._questions.close()
         self._give_up_asking()
         await self._lines.close()
 
@@ -185,6 +193,12 @@ class ZenohTransport:
         for done in self._asking:
             if not done.done():
                 done.set_result(None)
+
+
+def _refuse(query: zenoh.Query) -> None:
+    """Somebody asks more than can be answered; the asker is told at once."""
+    with query:
+        query.reply_err(f"too many others ask for {query.key_expr}; try again")
 
 
 def _unpack(reply: zenoh.Reply) -> bytes | str:

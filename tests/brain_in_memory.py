@@ -17,6 +17,7 @@ from gigabrain_schemas.topics import STATE
 from gigabrain_zenoh import control, decision, perception, safety
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.process import MakeBus
 from gigabrain_zenoh.replay import Node
 from gigabrain_zenoh.settings import DecisionConfig, DriverConfig, PerceptionConfig, Resume
 from gigabrain_zenoh.transport import Close, LocalNetwork, LocalTransport, OnSample
@@ -91,10 +92,10 @@ class Robot:
             await self.kill(name)
         await self.operator.close()
 
-    def start(self, name: str) -> None:
+    def start(self, name: str, make_bus: MakeBus = Bus) -> None:
         """Start one of the brain's processes."""
         self._ends[name] = Freezer(self.network)
-        bus = Bus(self._ends[name], self.clock, name)
+        bus = make_bus(self._ends[name], self.clock, name)
         self._running[name] = asyncio.ensure_future(BRAIN[name](bus, lambda: None)), bus
 
     def start_driver(self) -> None:

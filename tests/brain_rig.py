@@ -26,6 +26,7 @@ from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.transport import LocalNetwork
+from tests.bus_rig import PatientJournal
 
 M = TypeVar("M", bound=Message)
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
@@ -124,6 +125,7 @@ class Bench:
 
     async def __aenter__(self) -> Self:
         self.bus = Bus(self.network.transport(), self.clock, "node")
+        self.bus.journal = PatientJournal()
         self._running = asyncio.ensure_future(self._node(self.bus, self._ready.set))
         await self.clock.advance(0)
         return self

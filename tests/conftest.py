@@ -7,38 +7,21 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from gigabrain_zenoh.journal import Journal, done
-from tests import disturbance
-from tests.stack import PATIENCE_S, Home
+import gigabrain_zenoh.recording.arithmetic  # noqa: F401  before anything imports numpy
+from tests.stack import Home
+
+STARTS_PROCESSES = {"home", "shared_home"}  # fixtures
 
 # how long an example takes says something of the machine, and nothing of the code
 settings.register_profile("gigabrain", deadline=None)
 settings.load_profile("gigabrain")
 
 
-def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool:
-    """One test; again where it failed and the machine stood still meanwhile."""
-    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
-    for report in disturbance.run_test(item, nextitem):
-        item.ihook.pytest_runtest_logreport(report=report)
-    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
-    return True
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Say which tests were run again."""
-    reports = terminalreporter.getreports("passed") + terminalreporter.getreports("failed")
-    again = {r.nodeid for r in reports if disturbance.AGAIN in dict(r.user_properties)}
-    for name in sorted(again):
-        terminalreporter.write_line(f"run again, the machine had stood still: {name}")
-
-
-@pytest.fixture(scope="session", autouse=True)
-def patient_nodes() -> Iterator[None]:
-    """In the tests' own process work beside a node is in time, however slow this machine is."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Journal, "in_time", lambda _journal, job, _patience_s: done(job, PATIENCE_S))
-        yield
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what starts processes as `system`: those tests have the machine to themselves."""
+    for item in items:
+        if STARTS_PROCESSES & set(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.system)
 
 
 @pytest.fixture
@@ -59,7 +42,7 @@ def shared_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
 
 @pytest.fixture
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder of packages; what was imported from it goes with it, as a test may run again."""
+    """A folder of packages; what was imported from it goes with it."""
     folder = tmp_path / "site"
     folder.mkdir()
     monkeypatch.syspath_prepend(str(folder))

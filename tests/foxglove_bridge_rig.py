@@ -24,7 +24,7 @@ class Bridge:
     """A robot that says what a test wants, and the bridge beside it."""
 
     def __init__(self, folder: Path) -> None:
-        self.config = FoxgloveConfig(port=free_port(), tokens=str(folder / "tokens.json"))
+        self.config = FoxgloveConfig(port=free_port(), secret=str(folder / "secret"))
         network = LocalNetwork()
         self.robot = Bus(network.transport(), Clock(), "driver")
         self.bus = Bus(network.transport(), Clock(), "foxglove")

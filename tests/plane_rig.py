@@ -18,7 +18,7 @@ from gigabrain_zenoh import decision, perception
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.limits import limits_of, ramp
 from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
-from tests.brain_rig import BOOT, TICK_NS, WAFFLE, Bench, body, scan, state
+from tests.brain_rig import BOOT, DRIVING, TICK_NS, WAFFLE, Bench, body, scan, state
 
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
@@ -72,6 +72,7 @@ class Plane:
         self.velocity, self.tick, self.localized = Velocity(), 0, True
         self.intent = Intent(behaviour="none", reason="")
         self.status = TaskStatus()
+        self.gate = DRIVING
         self.travelled = 0.0
         self.closest = math.inf  # [m], from the body's middle to anything
         self.maps = True  # whether perception makes any
@@ -144,7 +145,7 @@ class Plane:
         x, y, yaw = self._odometry()
         bench.send(
             STATE, state(self.tick, v=self.velocity.linear_x, w=self.velocity.angular_z,
-                         pose=(x, y, yaw), boot=self.boot),
+                         pose=(x, y, yaw), gate=self.gate, boot=self.boot),
         )  # fmt: skip
         if self.tick % 5 == 0:
             self._on_the_way.append((self.tick + self.late_ticks, self._world(), self._place()))

@@ -10,6 +10,7 @@ from gigabrain_schemas.body import (
     BodyDescription,
     GateStatus,
     Joint,
+    LinkHealth,
     RobotState,
     Thresholds,
 )
@@ -61,6 +62,10 @@ class Patrol:
         shock: float = 0.0,
         host: Host | None = None,
         frozen: bool = False,
+        connected: bool = True,
+        late_ms: float | None = None,
+        age_ms: float = 0.0,
+        scan_late_ms: float = 0.0,
     ) -> list[str]:
         """So many ticks like this; the codes of the causes after the last."""
         asked = told or Velocity()
@@ -68,7 +73,10 @@ class Patrol:
             self.tick += 1
             if not frozen:
                 self.state = self._state(moves or asked, battery, joints, imu, bumpers)
-            self.state = replace(self.state, tick=self.tick, basis=self.tick, gate=gate)
+            link = LinkHealth(connected=connected, age_ms=age_ms, late_ms=late_ms)
+            self.state = replace(
+                self.state, tick=self.tick, basis=self.tick, gate=gate, link=link, sent=asked
+            )
             command = CmdVel(
                 linear_x=asked.linear_x,
                 linear_y=asked.linear_y,
@@ -78,9 +86,10 @@ class Patrol:
                 tick=self.tick - 1,
             )
             seen = self.tick - self.tick % 5
+            looked = scan(open_space() if values is None else values, seen)
             inputs = Inputs(
                 state=self.state,
-                scan=scan(open_space() if values is None else values, seen) if seen else None,
+                scan=replace(looked, late_ms=scan_late_ms) if seen else None,
                 scan_age_ns=0,
                 command=command,
                 echo_ages=echo_ages,

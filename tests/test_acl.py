@@ -15,6 +15,8 @@ from tests.bus_rig import until
 from tests.keys_rig import Site, make_fleet, raw, site
 from tests.zenoh_rig import Ear, repeat
 
+pytestmark = pytest.mark.system
+
 SAYS = {
     "brain": "world pose map intent task granted heard/perception health/perception log estop",
     "operator": "teleop cmd_vel joint_cmd button log estop",

@@ -104,3 +104,9 @@ def test_hits_travel_as_pairs() -> None:
     assert arrays.hits(world).tolist() == [[0.5, 2.0], [-1.25, 0.25]]
     with pytest.raises(ValueError, match="pairs of float32"):
         WorldModel(scan_ok=True, obstacle_ahead=False, hits=bytes(4))
+
+
+def test_hits_that_are_no_place_are_left_out() -> None:
+    x, y = np.array([0.5, np.nan, np.inf, 1e30, 2.0]), np.array([1.0, 0.0, 0.0, 0.0, np.nan])
+    world = WorldModel(scan_ok=True, obstacle_ahead=False, hits=arrays.hits_bytes(x, y))
+    assert arrays.hits(world).tolist() == [[0.5, 1.0]]

@@ -139,6 +139,31 @@ async def test_a_crowd_is_told_as_others(tmp_path: Path) -> None:
     assert (rig.heard[-1].source, rig.heard[-1].times) == ("others", 9899)
 
 
+async def test_a_crowd_of_sources_takes_the_place_of_nobody_who_was_obeyed(tmp_path: Path) -> None:
+    rig = Rig(tmp_path)
+    for second in range(120):
+        for number in range(1000):
+            rig.trail.note("refused", f"source-{second}-{number}", code=str(number), ok=False)
+        await rig.after(1.0)
+    assert len(rig.heard) == 100 + 99 + 3  # the others are told at once and after each minute
+    rig.trail.note("estop", "ann", "stopped")
+    assert rig.heard[-1].source == "ann"
+    assert sum(map(len, rig.trail._recent.values())) <= 102
+    await rig.trail.close()
+
+
+async def test_refusals_and_events_push_no_act_of_a_person_out_of_the_log(tmp_path: Path) -> None:
+    file = AuditFile(tmp_path, "driver", max_bytes=1000, kept=3)
+    file.append([entry(1)])
+    for number in range(2, 1000):
+        refused = msgspec.structs.replace(entry(number), what="refused", ok=False)
+        raised = msgspec.structs.replace(entry(number), what="raised")
+        file.append([refused, raised, msgspec.structs.replace(entry(number), ok=False)])
+    assert texts(read(tmp_path, 1000))[0] == "1"
+    assert texts(file.newest(1000))[0] == "1"
+    assert len(list((tmp_path / "audit").iterdir())) == 4
+
+
 async def test_a_disk_that_hangs_holds_nobody_up_and_the_oldest_give_way() -> None:
     goes_on, batches = threading.Event(), list[Sequence[int]]()
 

@@ -22,6 +22,8 @@ from tests.brain_in_memory import Robot
 from tests.bus_rig import Net, until
 from tests.zenoh_rig import repeat, robot
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -100,6 +100,7 @@ def test_the_relay_is_a_ring_with_one_source() -> None:
     assert roles[0].gets == roles[-1].puts
     assert [role.size for role in roles] == [1600, 240, 490, 125]
     assert [role.rate_hz for role in roles] == [50.0, 0.0, 0.0, 0.0]
+    assert [role.first for role in roles] == [True, False, False, True]  # as driver and control
 
 
 def test_a_scan_is_timed_until_the_first_command_that_rests_on_it() -> None:

@@ -11,6 +11,7 @@ from gigabrain_zenoh.bench import goals_sender
 from gigabrain_zenoh.bench.goals import GoalFigures, GoalsResult
 from gigabrain_zenoh.bench.goals_sender import Off, Sender, elsewhere
 from gigabrain_zenoh.bench.group import Group
+from gigabrain_zenoh.bench.growth import Growth
 from gigabrain_zenoh.cli.bench_goals import _table
 from gigabrain_zenoh.errors import BodyLost, GigabrainError
 from gigabrain_zenoh.task_client import Tasks
@@ -33,6 +34,7 @@ GOOD = GoalFigures(
     seconds=1030.0,
     alone=0,
     failures=(),
+    growth=Growth(memory_mb=(), mb_an_hour=0.0, walls=()),
 )
 
 

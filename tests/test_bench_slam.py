@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.bench.slam import drive, judged, total
+from gigabrain_zenoh.bench.slam_crispness import crispness
 from gigabrain_zenoh.bench.slam_logs import Log, errors, load, relations
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapping.se2 import Floats, compose
@@ -44,6 +45,29 @@ def test_a_map_in_another_frame_has_no_error_and_a_bent_one_has() -> None:
     bent = errors(one, one.reference + second_lap, pairs[pairs[:, 1] >= 60])
     assert bent.mean_m == pytest.approx(0.3, abs=0.01)
     assert bent.mean_deg == pytest.approx(0.0, abs=1e-9)
+
+
+def wall_from(poses: Floats) -> Log:
+    """A wall along y = 2.03 m, as seen from `poses` (n, 3) that look along x."""
+    angles = np.radians(-90.0 + np.arange(180))
+    ahead = (angles > 0.3) & (angles < 1.5)
+    ranges = np.where(ahead, (2.03 - poses[:, 1:2]) / np.sin(np.where(ahead, angles, 1.0)), 50.0)
+    return Log("wall", ranges, poses, poses)
+
+
+def test_a_wall_that_is_drawn_twice_fills_twice_the_cells() -> None:
+    along = np.column_stack((np.linspace(0, 20, 100), np.zeros(100), np.zeros(100)))
+    one = wall_from(np.concatenate((along, along)))
+    assert crispness(one, one.reference) == 1.0
+    apart = one.reference + (np.arange(200) >= 100)[:, None] * (0.0, 0.5, 0.0)
+    assert crispness(one, apart) == pytest.approx(2.0, abs=0.1)
+
+
+def test_crispness_does_not_depend_on_the_frame_of_the_poses() -> None:
+    along = np.column_stack((np.linspace(0, 20, 100), np.zeros(100), np.zeros(100)))
+    one = wall_from(along)
+    elsewhere = compose(np.array((5.0, -3.0, 1.0)), one.reference)
+    assert crispness(one, elsewhere) == pytest.approx(1.0, abs=0.01)
 
 
 def test_a_log_without_a_place_passed_twice_is_refused() -> None:
@@ -108,3 +132,20 @@ def test_freiburg_is_mapped_where_its_odometry_has_the_wrong_sign() -> None:
     result = judged(thin, drive(thin, lambda: None))
     assert result.graph.mean_m < 0.07
     assert result.breaks == 0
+
+
+@pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
+def test_long_corridors_do_not_cross() -> None:
+    """After 600 m without a loop the robot comes back 16 m from where it is thought to be."""
+    recorded = load(Path(str(DATA)) / "slam" / "infinite-corridor.npz")
+    result = judged(recorded, drive(recorded, lambda: None))
+    assert result.crispness < 1.0
+    assert result.breaks == 0
+
+
+@pytest.mark.skipif(not DATA, reason="GIGABRAIN_DATA does not name the folder of laser logs")
+def test_leaves_and_slopes_do_not_end_a_map_outdoors() -> None:
+    """Scans that fit nothing broke it eight times, and gtsam raised at scan 976."""
+    whole = load(Path(str(DATA)) / "slam" / "freiburg-campus.npz")
+    part = Log("part", *(a[:1000] for a in (whole.ranges, whole.reference, whole.odometry)))
+    assert judged(part, drive(part, lambda: None)).breaks == 0

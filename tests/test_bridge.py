@@ -14,6 +14,8 @@ import pytest
 from gigabrain_zenoh.bridge import WAKER, Bridge, EventFd, SocketPair, Waker
 from tests.bus_rig import in_thread, until
 
+pytestmark = pytest.mark.system
+
 KINDS: list[Callable[[], Waker]] = [SocketPair]
 if hasattr(os, "eventfd"):
     KINDS.append(EventFd)

@@ -245,3 +245,14 @@ async def test_what_is_sent_while_something_is_delivered_comes_after_it(net: Net
     net.two.latest(CMD_VEL, lambda command: order.append(("cmd_vel", command.linear_x)))
     net.two.publish(TELEOP, Twist(linear_x=0.2))
     assert order == [("teleop", 0.2), ("done", 0.2), ("cmd_vel", 0.2)]
+
+
+async def test_a_kept_value_does_not_replace_what_has_been_said_meanwhile(net: Net) -> None:
+    net.one.publish(MAP, msgspec.structs.replace(GRID, resolution=0.1))
+    net.bus("stranger").publish(MAP, GRID)
+    maps = net.two.latest(MAP)
+    net.one.publish(MAP, msgspec.structs.replace(GRID, resolution=0.2))
+    for _ in range(4):  # two answers to wait for
+        await settle()
+    assert maps.newest
+    assert maps.newest.resolution == 0.2

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_drivers import button
 from gigabrain_drivers.button import Button
 from gigabrain_drivers.button_watch import ButtonWatch
 from gigabrain_drivers.echo_loop import EchoLoop
@@ -112,8 +113,8 @@ class Rig:
         self.pty.on_bytes = self._contact
         self.pty.plug()
         bus = Bus(network.transport(), clock, "button")
-        button = Button(ButtonConfig(port=str(folder / "button")), bus)
-        self.task = asyncio.create_task(button.run(lambda: None))
+        self.button = Button(ButtonConfig(port=str(folder / "button")), bus)
+        self.task = asyncio.create_task(self.button.run(lambda: None))
 
     def _contact(self, data: bytes) -> None:
         if self.closed:
@@ -153,6 +154,20 @@ async def test_an_open_contact_stops_the_robot_and_a_closed_one_only_permits(rig
     assert (rig.asked[0].source, rig.asked[0].reason) == ("button", OPEN)
     rig.closed = True
     await rig.until(lambda: not rig.heard[-1].pressed)
+
+
+async def test_an_error_in_what_presses_ends_the_process_and_lets_go_of_the_port(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def broken(*_: object) -> None:
+        raise RuntimeError("a fault of ours")
+
+    monkeypatch.setattr(button, "press", broken)
+    rig.closed = False
+    with pytest.raises(ExceptionGroup) as raised:
+        await asyncio.wait_for(rig.task, 20)
+    assert [str(error) for error in raised.value.exceptions] == ["a fault of ours"]
+    assert not rig.button._link.connected
 
 
 async def test_it_asks_until_somebody_confirms(rig: Rig) -> None:

@@ -16,6 +16,8 @@ from tests.proxy_rig import Server, serving
 from tests.stack import until
 from tests.zenoh_rig import Ear, repeat, robot
 
+pytestmark = pytest.mark.system
+
 LONG = bytes(range(256)) * 400  # more than is read at once
 
 

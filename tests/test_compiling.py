@@ -16,6 +16,8 @@ from gigabrain_zenoh import compiling, kernels, numba_alone
 from gigabrain_zenoh.cli.warm import warm
 from gigabrain_zenoh.process import find
 
+pytestmark = pytest.mark.system
+
 CALLS = """
 import os
 def warm_up():
@@ -136,3 +138,22 @@ print("gtsam" in sys.modules)
 def test_who_finds_its_way_in_a_saved_map_does_not_pay_for_making_one() -> None:
     done = subprocess.run((sys.executable, "-c", FINDING), capture_output=True, text=True)
     assert done.stdout == "False\n", done.stderr
+
+
+def test_the_child_imports_nothing_from_the_current_folder(
+    calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    for name in ("msgspec", "signal", "gigabrain_schemas"):
+        (here / f"{name}.py").write_text(f"open({str(here / 'was_run')!r}, 'w')\n")
+    monkeypatch.chdir(here)
+    assert asyncio.run(compiling.in_child(WARM_UP)) == 0
+    assert not (here / "was_run").exists()
+    assert who(calls) == [False]
+
+
+def test_why_the_child_failed_is_in_the_log(calls: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert asyncio.run(compiling.in_child("counted:nothing")) == 1
+    (said,) = (record.getMessage() for record in caplog.records if "compil" in record.getMessage())
+    assert said.endswith("AttributeError: module 'counted' has no attribute 'nothing'")

@@ -253,7 +253,7 @@ def test_files_that_cannot_be_read_are_refused_in_one_line(tmp_path: Path) -> No
         load(tmp_path / "wafle.yaml", Robot)
     with pytest.raises(ConfigError, match=r"no such file; expected a YAML file$"):
         load(tmp_path / "nowhere" / "x.yaml", Robot)
-    with pytest.raises(ConfigError, match="is a folder; expected a YAML file"):
+    with pytest.raises(ConfigError, match="is a folder; expected a file"):
         load(tmp_path, Robot)
     with pytest.raises(ConfigError, match=r"latin\.yaml:2: byte 0xe9; expected UTF-8 text"):
         load(tmp_path / "latin.yaml", Robot)

@@ -8,6 +8,8 @@ import pytest
 from gigabrain_drivers.catalog import links_of, load_robot, robot_files
 from gigabrain_drivers.conformance import kit
 
+pytestmark = pytest.mark.system
+
 NEEDS_A_PEER = {
     "stops when it is killed",
     "stops unplugged",

@@ -6,14 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.conformance import kit, machine
+from gigabrain_drivers.conformance import kit
 from gigabrain_drivers.conformance.result import Failed, Finding, NotApplicable
+from gigabrain_zenoh import run_queue
 
 
 def waiting(monkeypatch: pytest.MonkeyPatch, each_ms: float) -> None:
     """A machine that has the kit wait so long between two looks."""
     steps = itertools.count()
-    monkeypatch.setattr(machine, "waited_ms", lambda: each_ms * next(steps))
+    monkeypatch.setattr(run_queue, "waited_ms", lambda: each_ms * next(steps))
 
 
 def finds(*findings: Finding) -> Callable[[], Awaitable[Finding]]:
@@ -75,15 +76,17 @@ def test_waiting_for_a_core_is_summed_over_all_threads(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for thread, text in (("7", "900 2000000 5\n"), ("8", "100 500000 2\n")):
-        (tmp_path / thread).mkdir()
-        (tmp_path / thread / "schedstat").write_text(text)
-    monkeypatch.setattr(machine, "TASKS", tmp_path)
-    assert machine.waited_ms() == 2.5
+        folder = tmp_path / "self" / "task" / thread
+        folder.mkdir(parents=True)
+        (folder / "schedstat").write_text(text)
+    monkeypatch.setattr(run_queue, "PROC", tmp_path)
+    assert run_queue.waited_ms() == 2.5
+    assert run_queue.by_thread("self") == {"7": 2_000_000, "8": 500_000}
 
 
 def test_where_the_system_does_not_say_nothing_was_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(machine, "TASKS", tmp_path / "none")
-    monkeypatch.setattr(machine, "OWN", tmp_path / "none")
-    assert (machine.waited_ms(), machine.own_waited_ms()) == (0.0, 0.0)
+    monkeypatch.setattr(run_queue, "PROC", tmp_path / "none")
+    monkeypatch.setattr(run_queue, "OWN", tmp_path / "none")
+    assert (run_queue.waited_ms(), run_queue.own_waited_ms()) == (0.0, 0.0)

@@ -8,6 +8,8 @@ from gigabrain_drivers.conformance import kit
 from gigabrain_drivers.conformance.result import Finding, summary
 from gigabrain_drivers.conformance.subject import Subject
 
+pytestmark = pytest.mark.system
+
 
 def test_the_worst_and_the_median_of_each_time_are_told() -> None:
     found = [

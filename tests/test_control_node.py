@@ -186,6 +186,7 @@ class Stick:
     def __init__(self) -> None:
         self.now_ms = 1000
         self.teleop = Teleop(lambda: self.now_ms * MS)
+        self.teleop.velocity(state(0), echo_wanted=False)  # the body was handed over long ago
 
     def push(self, every_ms: int, times: int, twist: Twist = FORWARD) -> None:
         for _ in range(times):

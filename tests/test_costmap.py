@@ -1,5 +1,7 @@
 """What cells cost a body: its footprint, unknown space, extra obstacles, maps that change."""
 
+import tracemalloc
+
 import msgspec
 import numpy as np
 import pytest
@@ -152,3 +154,14 @@ def test_places_and_cells() -> None:
 def test_an_empty_map_has_no_cells() -> None:
     made = costmap(grid_of(np.zeros((0, 0), np.int8)), RULES)
     assert made.cell(0.0, 0.0) is None
+
+
+def test_a_large_body_in_a_map_of_tiny_cells_asks_for_bounded_memory() -> None:
+    grid = grid_of(empty(0.06, 0.06, 0.001), 0.001)
+    tracemalloc.start()
+    try:
+        costmap(grid, inflation(body(10.0, 10.0, 10.0)), np.array([(0.03, 0.03)]))
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most < 64_000_000

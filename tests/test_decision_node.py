@@ -112,7 +112,8 @@ async def test_a_driver_that_starts_anew_is_met_with_an_open_mind() -> None:
     async with bench() as node:
         node.send(STATE, state(5000))
         node.send(WORLD, world(5000))
-        node.send(STATE, state(3, boot=8))
+        for tick in (1, 2, 3):
+            node.send(STATE, state(tick, boot=8))
         node.send(STATE, state(5, boot=8, pose=(9.0, 9.0, 0.0)))
         node.send(WORLD, world(5, boot=8))
         intents = node.sent(INTENT)

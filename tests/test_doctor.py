@@ -136,7 +136,13 @@ def test_a_router_that_does_not_answer_is_found(port_open: bool, words: str) -> 
 
 def test_that_no_robot_runs_is_no_fault_of_the_machine() -> None:
     (one,) = found(robot=Robot(problem="no robot runs here; start one"))
-    assert (one.grade, one.text) == ("hint", "no robot runs here")
+    assert (one.grade, one.text, one.cure) == ("hint", "no robot runs here", "start one")
+
+
+def test_of_several_robots_one_is_to_be_chosen() -> None:
+    (one,) = found(robot=Robot(problem="several robots run here; choose one with --connect: a, b"))
+    assert (one.grade, one.text) == ("hint", "several robots run here")
+    assert one.cure == "choose one with --connect: a, b"
 
 
 def test_a_slow_simulation_is_no_slow_robot() -> None:

@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers import catalog
+from gigabrain_drivers import catalog, links
 from gigabrain_drivers.conformance import direct, kit, new
 from gigabrain_drivers.conformance.subject import Subject
 from gigabrain_zenoh.errors import ConfigError
+
+pytestmark = pytest.mark.system
 
 
 def installed(folder: Path, site: Path) -> Path:
@@ -36,6 +38,17 @@ async def test_a_new_driver_passes_the_kit_by_its_name(tmp_path: Path, site: Pat
     results = await kit.check("kit_probe", "sim", tmp_path / "kit", lambda result: None)
     assert [result for result in results if result.verdict == "fail"] == []
     assert sum(result.verdict == "pass" for result in results) == 11
+
+
+def test_a_driver_that_cannot_be_imported_is_refused_in_one_line(
+    tmp_path: Path, site: Path
+) -> None:
+    with pytest.raises(ConfigError, match=r"driver 'kit_import' of .*No module named 'nowhere'"):
+        broken("kit_import", tmp_path, site, "from gigabrain_drivers.base", "from nowhere.base")
+
+
+def test_what_the_docs_name_can_be_imported() -> None:
+    assert {"Link", "SerialLink", "TcpLink"} <= set(vars(links))
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:

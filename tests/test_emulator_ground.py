@@ -18,6 +18,8 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import UnknownName
 from tests.line_rig import until
 
+pytestmark = pytest.mark.system
+
 
 class Collector:
     """A wire, or a port, that remembers what was written."""

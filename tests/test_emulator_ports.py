@@ -18,6 +18,8 @@ from gigabrain_drivers.robot import Run
 from gigabrain_zenoh.errors import ConfigError
 from tests.line_rig import until
 
+pytestmark = pytest.mark.system
+
 
 def opened(path: Path) -> int:
     return os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)

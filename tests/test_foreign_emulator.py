@@ -12,6 +12,8 @@ from gigabrain_drivers.robot import Run
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import UnknownName
 
+pytestmark = pytest.mark.system
+
 NAME = "foreign_base"
 DRIVER = '''"""Somebody's driver, and the board that it talks to."""
 

@@ -21,7 +21,8 @@ from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.topics import IMAGE, LOG, MAP, POSE, SCAN, STATE, TASK, WORLD
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.foxglove_bridge.layout import topic_to_steer, write_layout
-from gigabrain_zenoh.health import answer_to_name
+from gigabrain_zenoh.name_claim import NameClaim
+from gigabrain_zenoh.page.access import token_file, tokens
 from gigabrain_zenoh.settings import FoxgloveConfig
 from tests.foxglove_bridge_rig import Bridge, bridged, hold
 from tests.foxglove_rig import Viewer, fields
@@ -135,8 +136,8 @@ async def test_the_frames_join_map_and_robot(bridge: Bridge) -> None:
 
 async def test_a_viewer_sees_who_talks_to_whom(bridge: Bridge) -> None:
     bridge.robot.publish(SCAN, EXAMPLES["LaserScan"])  # type: ignore[type-var]
-    await answer_to_name(bridge.robot)
-    await answer_to_name(bridge.bus)
+    await NameClaim(bridge.robot).take()
+    await NameClaim(bridge.bus).take()
     async with bridge.viewer() as viewer:
         await viewer.say(op="subscribeConnectionGraph")
         graph = await viewer.connections("robot/scan")
@@ -145,7 +146,7 @@ async def test_a_viewer_sees_who_talks_to_whom(bridge: Bridge) -> None:
 
 
 def test_the_layout_holds_the_topic_and_only_its_owner_can_read_it(tmp_path: Path) -> None:
-    config = FoxgloveConfig(tokens=str(tmp_path / "tokens.json"))
+    config = FoxgloveConfig(secret=str(tmp_path / "secret"))
     path = tmp_path / "robot.json"
     path.write_text("of before")
     write_layout(config, path)
@@ -156,6 +157,20 @@ def test_the_layout_holds_the_topic_and_only_its_owner_can_read_it(tmp_path: Pat
     assert set(layout["configById"]) == set(_panels(layout["layout"]))
     with pytest.raises(ConfigError, match="cannot write"):
         write_layout(config, tmp_path / "none" / "robot.json")
+
+
+def test_the_secret_to_steer_opens_no_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    topic = topic_to_steer(FoxgloveConfig())
+    assert topic_to_steer(FoxgloveConfig()) == topic
+    made, _ = tokens(token_file(""))
+    assert made.operator not in topic
+    assert made.viewer not in topic
+    path = tmp_path / "gigabrain" / "foxglove" / "secret"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    path.write_text("a b")
+    with pytest.raises(ConfigError, match="remove it, and it is made"):
+        topic_to_steer(FoxgloveConfig())
 
 
 def _panels(place: object) -> list[str]:

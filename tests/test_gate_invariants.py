@@ -9,18 +9,20 @@ from typing import Literal
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule
+from msgspec.structs import replace
 
 from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_zenoh import gate
-from gigabrain_zenoh.limits import NO_CAPS, ZERO
+from gigabrain_zenoh.limits import NO_CAPS, ZERO, Limits, clamp
 from tests.gate_rig import BLIND, BOOT, CRASHED, HOT, LIMITS, LOST, ZONE
 
 MS = 1_000_000
 GAIN = (0.02, 0.02, 0.06)  # of speed in a tick, by axis, as LIMITS say
 LOSS = (0.04, 0.04, 0.06)
 MOST = (0.26, 0.2, 1.8)
+RIM, HALF_TRACK = 0.266, 0.1435  # [m/s], [m], of a base whose wheels are not as fast as that
 ROUNDING = 1e-9
 MOVES = {
     ("latched", "idle"),
@@ -58,9 +60,12 @@ def latching(causes: tuple[Cause, ...]) -> set[str]:
 class GateMachine(RuleBasedStateMachine):
     """Whatever may happen to a gate. Every event goes through `feed`, which checks all rules."""
 
-    @initialize(auto_resume=st.booleans())
-    def boot(self, auto_resume: bool) -> None:
-        self.config = gate.GateConfig(limits=LIMITS, auto_resume=auto_resume)
+    @initialize(auto_resume=st.booleans(), slow_wheels=st.booleans())
+    def boot(self, auto_resume: bool, slow_wheels: bool) -> None:
+        self.limits: Limits = LIMITS
+        if slow_wheels:
+            self.limits = replace(LIMITS, rim_speed=RIM, half_track=HALF_TRACK)
+        self.config = gate.GateConfig(limits=self.limits, auto_resume=auto_resume)
         self.state = gate.GateState(boot=BOOT)
         self.issued_ns = [0]  # by tick
         self.told = (0.0, 0.0, 0.0)  # what the body was told in the last tick
@@ -182,6 +187,14 @@ class GateMachine(RuleBasedStateMachine):
         self.enable(source, True, "bob")
         self.all_is_well(8, x, z)
 
+    @rule(first=st.sampled_from([(0.0, 9.0), (9.0, 0.0)]), then_x=speed, then_z=speed)
+    def it_goes_flat_out_and_then_another_way(
+        self, first: tuple[float, float], then_x: float, then_z: float
+    ) -> None:
+        self.a_person_sets_it_going("control", *first)
+        self.all_is_well(32, *first)
+        self.all_is_well(13, then_x, then_z)
+
     def send(self, command: CmdVel, wall_ns: int) -> None:
         before, good = self.state, self.good
         outcome = self.feed(gate.Command(command, wall_ns))
@@ -266,7 +279,14 @@ class GateMachine(RuleBasedStateMachine):
             assert abs(value) >= braking - ROUNDING
             assert abs(value) <= (abs(told) + GAIN[axis] if driven else braking) + ROUNDING
             assert bound is None or abs(value) <= max(bound, braking) + ROUNDING
+        self.check_last_clamp()
         assert self.state.output == ZERO or self.state.mode in ("enabled", "stopping")
+
+    def check_last_clamp(self) -> None:
+        """What a driver clamps once more is left as it is, so the steps above are the body's."""
+        clamped = clamp(self.state.output, self.limits)
+        for value, kept in zip(axes(self.state.output), axes(clamped), strict=True):
+            assert abs(value - kept) <= ROUNDING
 
     def check_that_it_may_move(self) -> None:
         now = self.state.tick

@@ -108,7 +108,7 @@ def test_what_another_commander_sent_before_is_not_held_against_the_next() -> No
 def test_auto_resume_waits_half_a_second_after_it() -> None:
     rig = driving()
     rig.config = gate.GateConfig(limits=rig.config.limits, auto_resume=True)
-    rig.live(50)
+    rig.live(110)
     rig.feed(gate.NotFinite("control", BOOT))
     rig.live(10)
     rig.feed(gate.NotFinite("control", BOOT))

@@ -138,12 +138,12 @@ async def test_a_disk_that_hangs_holds_up_the_confirmation_and_no_tick(
 async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: Path) -> None:
     async with Robot(tmp_path) as robot:
         await driving(robot)
-        (tmp_path / "latch.new").mkdir()  # where the file would be written first
+        (tmp_path / ".latch.json.new").mkdir()  # where the file would be written first
         [reply] = await robot.operator.ask(ESTOP, EstopRequest(source="ann"))
         assert reply.gate.mode == "latched"
         assert "; but a restart would forget it: cannot write" in reply.text
         assert await robot.go(100) == [0.0] * 100
-        (tmp_path / "latch.new").rmdir()
+        (tmp_path / ".latch.json.new").rmdir()
         await robot.go(100)  # tried again once a second
         request = ReleaseRequest(estop_generation=1, source="ann")
         [reply] = await robot.operator.ask(RELEASE, request)

@@ -100,6 +100,28 @@ def test_what_was_saved_goes_on(toured: tuple[GrowingMap, Walker]) -> None:
     assert error(place, in_map(again)) < 0.05
 
 
+def test_what_was_kept_goes_on_at_the_next_scan(toured: tuple[GrowingMap, Walker]) -> None:
+    chart, walker = toured
+    still = chart.still()
+    assert still.pose is not None
+    chart = GrowingMap.thaw(still.freeze(), PATIENCE_S, last=still.pose)
+    again = Walker(Rooms(HOUSE, seed=3), chart, walker.pose)
+    place = again.look()
+    assert place.localized
+    assert error(place, in_map(again)) < 0.05
+
+
+def test_carried_off_before_it_goes_on_it_is_looked_for(toured: tuple[GrowingMap, Walker]) -> None:
+    chart, _ = toured
+    still = chart.still()
+    chart = GrowingMap.thaw(still.freeze(), PATIENCE_S, last=still.pose)
+    again = Walker(Rooms(HOUSE, seed=3), chart, at(6.0, 4.5, 100))
+    assert not again.look().localized
+    place = again.look(30)
+    assert place.localized
+    assert error(place, in_map(again)) < 0.05
+
+
 @pytest.mark.parametrize("missing", ["poses", "sweep_hits", "link_ends"])
 def test_arrays_that_do_not_belong_together_are_refused(
     missing: str, toured: tuple[GrowingMap, Walker]
@@ -109,6 +131,18 @@ def test_arrays_that_do_not_belong_together_are_refused(
     for bad in (short, {name: values for name, values in arrays.items() if name != missing}):
         with pytest.raises(ConfigError, match="no pose graph: "):
             GrowingMap.thaw(bad)
+
+
+@pytest.mark.parametrize("name", ["points", "sweep_hits", "sweep_free", "sweep_sensor"])
+def test_points_that_no_lidar_has_seen_are_refused(
+    name: str, toured: tuple[GrowingMap, Walker]
+) -> None:
+    """A beam of 1e9 m would be drawn for minutes."""
+    arrays = dict(toured[0].to_save()[1])
+    far = arrays[name].copy()
+    far[0] = 1e9
+    with pytest.raises(ConfigError, match="no pose graph: "):
+        GrowingMap.thaw({**arrays, name: far})
 
 
 def test_the_same_drive_gives_the_same_map_bit_for_bit() -> None:

@@ -2,13 +2,17 @@
 
 import functools
 import math
+from typing import Any
 
 import numpy as np
+import pytest
+from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.behaviours.bearings import Route
+from gigabrain_zenoh.behaviours.bearings import Driven, Route
 from gigabrain_zenoh.behaviours.guide import Asked, Guide
+from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.tasks.orders import GoTo
 from tests.local_rig import WAFFLE
 from tests.navigation_rig import empty, grid_of
@@ -30,17 +34,21 @@ def think(
     x: float = 1.0,
     y: float = 1.0,
     goal: Goal = AHEAD,
+    held_ticks: int = 0,
+    slowed_by: str = "",
+    driven: Driven | None = None,
 ) -> Route:
     return guide.think(
         Asked(
             tick=tick,
-            driving=True,
             order=GoTo(1, goal),
             here=Pose(x=x, y=y, yaw=0.0),
             grid=grid_of(cells),
             body=WAFFLE,
-            driven=None,
+            driven=driven,
             seen=np.empty((0, 2)),
+            held_ticks=held_ticks,
+            slowed_by=slowed_by,
         )
     )
 
@@ -102,7 +110,7 @@ def test_who_comes_no_nearer_than_a_hand_settles_there_and_says_so() -> None:
         assert ask(tick=tick, x=4.85).goal == goal
     settled = ask(tick=1502, x=4.85)
     assert settled.goal == Goal(x=4.85, y=1.0, yaw=1.5)
-    assert settled.reason == "0.2 m beside what was asked for: something is in the way"
+    assert settled.reason == "0.15 m beside what was asked for: no progress for 30 s"
     assert not settled.aside
     again = ask(tick=3002, x=4.86)  # while it turns
     assert (again.goal, again.reason) == (settled.goal, settled.reason)
@@ -114,7 +122,57 @@ def test_going_to_and_fro_at_the_goal_ends() -> None:
     guide = Guide()
     ends = [think(guide, OPEN, tick=1 + 1000 * k, x=5.0 if k % 2 else 4.8) for k in range(8)]
     assert [one.state for one in ends] == ["running"] * 7 + ["failed"]
-    assert ends[-1].reason.startswith("no nearer for 30 s, 0.0 m before the goal")
+    assert ends[-1].reason.startswith("gave up: no progress for 30 s, 0.00 m from the goal")
+
+
+def test_the_time_in_which_the_robot_is_held_does_not_count() -> None:
+    guide = Guide()
+    ask = functools.partial(think, guide, OPEN, x=2.0)
+    ask(tick=1)
+    assert ask(tick=1001).state == "running"
+    assert ask(tick=9001, held_ticks=7700).state == "running"  # 300 ticks of it were driven
+    assert ask(tick=9201).state == "running"
+    assert ask(tick=9202).state == "failed"
+
+
+def test_a_robot_that_was_driven_away_meanwhile_has_to_come_nearer_than_there() -> None:
+    guide = Guide()
+    think(guide, OPEN, tick=1, x=4.0)
+    for step in range(20):  # an operator drives it back, 10 cm in a look
+        held = think(guide, OPEN, tick=26 + 25 * step, x=4.0 - 0.1 * step, held_ticks=25)
+        assert held.state == "running"
+    back = [think(guide, OPEN, tick=501 + 500 * k, x=2.1 + 0.5 * k) for k in range(1, 5)]
+    assert [one.state for one in back] == ["running"] * 4
+
+
+def test_it_gives_up_with_what_is_known_of_why() -> None:
+    def ended(**known: Any) -> str:
+        guide = Guide()
+        think(guide, OPEN, tick=1, x=2.0)
+        route = think(guide, OPEN, tick=1502, x=2.0, **known)
+        assert route.state == "failed"
+        return route.reason
+
+    doing = Driven(version=1, reason="waiting: no way on, 0.02 m of room")
+    gave_up = "gave up: no progress for 30 s, 3.00 m from the goal"
+    assert ended() == gave_up
+    assert ended(driven=doing) == f"{gave_up} (waiting: no way on, 0.02 m of room)"
+    near = "obstacle 0.14 m ahead of the body"
+    assert ended(driven=doing, slowed_by=near) == f"{gave_up} ({near})"
+
+
+def test_a_goal_within_the_arrival_tolerance_of_a_reachable_place_is_driven_to() -> None:
+    too_near = Goal(x=2.88, y=1.05)  # the nearest cell with room is at 2.75 m
+    with pytest.raises(Refused, match=r"^the goal is too close to something: .* 0\.13 m away at"):
+        Guide().check(grid_of(SHUT), WAFFLE, Pose(x=1.0, y=1.0, yaw=0.0), too_near)
+    assert think(Guide(), SHUT, tick=1, goal=too_near).state == "failed"
+    near = replace(too_near, x=2.83)
+    told = Guide().check(grid_of(SHUT), WAFFLE, Pose(x=1.0, y=1.0, yaw=0.0), near)
+    assert told.startswith("on the way, 1.8 m; 0.08 m beside what was asked for: the goal is too c")
+    route = think(Guide(), SHUT, tick=1, goal=near)
+    assert route.goal
+    assert math.dist((route.goal.x, route.goal.y), (near.x, near.y)) == pytest.approx(0.08)
+    assert route.reason.startswith("0.08 m beside what was asked for: the goal is too close to ")
 
 
 def test_what_no_way_has_ever_led_to_is_refused_at_once() -> None:
@@ -183,7 +241,7 @@ def test_it_makes_room_for_who_keeps_it_from_the_place_beside_its_goal() -> None
     ask = functools.partial(think, guide, goal=Goal(x=4.85, y=3.0), x=4.0, y=3.0)
     ask(ROOM, tick=1)
     beside = ask(taken, tick=50)
-    assert beside.reason.startswith("0.1 m beside what was asked for: the goal is too close to ")
+    assert beside.reason.startswith("0.11 m beside what was asked for: the goal is too close to ")
     assert not beside.aside
     assert ask(taken, tick=502).aside
 

@@ -13,9 +13,9 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.faults.hostile import leaves, replaced
 from tests.wire_rig import as_map, at, codec, dotted, maps, numbers, refuses
 
-# numbers that may be null: nothing measured, nothing in the way, no limit, any yaw
+# numbers that may be null: nothing measured, nothing in the way, no limit, any yaw, no clock
 NULLABLE = {
-    "Body.description.max_rim_speed",
+    "Body.description.max_rim_speed", "RobotState.link.late_ms",
     "RobotState.joints.0.effort", "RobotState.joints.0.temperature",
     "RobotState.joints.1.effort", "RobotState.joints.1.temperature",
     "WorldModel.distance_ahead",
@@ -24,6 +24,7 @@ NULLABLE = {
     "SafetyState.caps.right", "SafetyState.caps.rotation",
     "SafetyState.caps.turn_left", "SafetyState.caps.turn_right",
     "GoalRequest.yaw", "TaskStatus.distance_remaining", "TaskStatus.eta", "TaskStatus.goal.yaw",
+    "TaskStatus.done.0.position_error", "TaskStatus.done.0.heading_error",
     "Description.report.distance_m", "Description.report.contacts",
 }  # fmt: skip
 WILL_DO_EMPTY = {

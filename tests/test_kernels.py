@@ -12,6 +12,8 @@ numba = pytest.importorskip("numba")
 
 from gigabrain_zenoh import kernels  # noqa: E402
 
+pytestmark = pytest.mark.system
+
 
 def test_a_change_in_any_source_with_kernels_asks_for_a_folder_of_its_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -6,7 +6,10 @@ import pytest
 
 from tests.supervisor_rig import CHILD
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts")
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts"),
+]
 
 
 def lifeline_exit(code: str, variable: str | None) -> int:

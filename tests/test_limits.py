@@ -221,6 +221,45 @@ def test_a_step_in_which_turning_may_not_speed_up(
     ) == Velocity(angular_z=after)
 
 
+WHEELS = msgspec.structs.replace(LIMITS, rim_speed=0.5, half_track=0.25)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("side", [1, -1])
+def test_no_wheel_is_too_fast_while_one_axis_takes_over_from_the_other(
+    sign: int, side: int
+) -> None:
+    turning, straight = Velocity(angular_z=2.0 * side), Velocity(linear_x=0.5 * sign)
+    # turning gives up 0.25 rad/s, which is 0.0625 m/s of a wheel; 1/16 s would allow as much
+    assert ramp(turning, straight, WHEELS, 0.0625) == Velocity(
+        linear_x=0.0625 * sign, angular_z=1.75 * side
+    )
+    slow = msgspec.structs.replace(WHEELS, angular_acceleration=2.0)
+    assert ramp(turning, straight, slow, 0.0625) == Velocity(
+        linear_x=0.03125 * sign, angular_z=1.875 * side
+    )
+    assert ramp(straight, turning, msgspec.structs.replace(WHEELS, half_track=1.0), 0.0625) == (
+        Velocity(linear_x=0.375 * sign, angular_z=0.125 * side)
+    )
+
+
+def test_a_body_that_is_beyond_the_speed_of_its_wheels_slows_down_and_gains_nothing() -> None:
+    pushed = Velocity(linear_x=1.0, angular_z=1.0)
+    assert ramp(pushed, Velocity(angular_z=2.0), WHEELS, 0.0625) == Velocity(
+        linear_x=0.875, angular_z=1.0
+    )
+    no_track = msgspec.structs.replace(WHEELS, half_track=0.0)
+    assert ramp(pushed, Velocity(angular_z=2.0), no_track, 0.0625) == Velocity(
+        linear_x=0.875, angular_z=1.25
+    )
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_stop_brakes_both_axes_as_fast_as_they_can_whatever_the_wheels_can(sign: int) -> None:
+    curve = Velocity(linear_x=0.25 * sign, angular_z=1.0)
+    assert ramp(curve, ZERO, WHEELS, 0.0625) == Velocity(linear_x=0.125 * sign, angular_z=0.75)
+
+
 def test_a_ramp_reaches_its_target_exactly() -> None:
     velocity, target = ZERO, Velocity(linear_x=0.3, linear_y=-0.1, angular_z=1.7)
     for _ in range(40):

@@ -22,9 +22,9 @@ def test_a_car_may_be_told_its_speed_and_its_steering_angle() -> None:
     template = Template("C,{linear_x:.1f},{wheel_steering|deg:d}\n", COMMAND)
     command = LineCommand(template, Ackermann(0.05, 0.5))
     wanted = Velocity(linear_x=0.52, angular_z=0.5)  # atan(0.5 * 0.5 / 0.52) = 25.7 degrees
-    assert command.line(wanted, 0) == b"C,0.5,26\n"
+    assert command.line(wanted, 0) == b"C,0.5,25\n"
     sent = command.sent(wanted)
-    assert (sent.linear_x, sent.angular_z) == pytest.approx((0.5, 0.4877), abs=1e-4)
+    assert (sent.linear_x, sent.angular_z) == pytest.approx((0.5, 0.4663), abs=1e-4)
 
 
 def test_start_and_stop_are_told_apart_from_the_commands() -> None:

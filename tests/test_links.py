@@ -13,6 +13,8 @@ from gigabrain_drivers.links.serial_link import SerialLink, open_port
 from gigabrain_zenoh.clock import Clock
 from tests.links_rig import Heard, until
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture
 async def pty(tmp_path: Path) -> AsyncIterator[Pty]:

@@ -1,6 +1,7 @@
 """The parts of the local planner, each against what is known without it."""
 
 import math
+import threading
 
 import cv2
 import numpy as np
@@ -258,3 +259,26 @@ def test_a_path_is_followed_to_where_it_leaves_the_window() -> None:
     assert (grid.x + (column + 0.5) * 0.05, grid.y + (row + 0.5) * 0.05) == pytest.approx(
         (0.0, 1.9), abs=0.06
     )
+
+
+def test_the_way_straight_on_is_looked_at_no_farther_than_the_window_is_large() -> None:
+    window = Window(4.0, 10.0)
+    grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
+    found = list[float]()
+    ways = (grid, outline, 0.0, 0.0, 1.0, 0.0, 1.0, 0.03, 1e18)
+    asking = threading.Thread(target=lambda: found.append(free_ahead(*ways)), daemon=True)
+    asking.start()
+    asking.join(60.0)  # it includes the compilation
+    assert found == [1e18]
+
+
+def test_the_outline_of_a_large_or_jagged_body_has_a_bounded_number_of_points() -> None:
+    jagged = [((-10.0, 10.0)[n % 2], -10.0 + 0.3 * n) for n in range(63)]
+    outline = outline_of((*jagged, (-10.0, 10.0)))
+    assert 3 * len(outline.groups) < 600
+
+
+def test_a_goal_that_is_a_hundred_kilometres_off_is_as_far_as_anything() -> None:
+    grid = Window(4.0, 10.0).grid(1, NOTHING, NOBODY)
+    field = CostToGo(160).field(grid, 0.15, (1e5, -1e5), None).distance
+    assert 9_990.0 < field.min() <= field.max() <= 10_010.0

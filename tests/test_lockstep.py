@@ -52,6 +52,20 @@ def test_a_verdict_that_misses_a_part_of_the_brain_does_not_count() -> None:
     assert steps.complete
 
 
+def test_what_claims_a_tick_that_is_still_to_come_answers_none() -> None:
+    steps = Lockstep()
+    steps.begin(10, 10)
+    for wrong in ((2**40, 10), (10, 2**40)):
+        steps.command(command(*wrong))
+        steps.verdict(SafetyState(verdict="ok", tick=wrong[0], basis=wrong[1]))
+    steps.begin(11, 10)
+    assert not steps.complete
+    steps.command(command(11, 10))
+    assert not steps.complete
+    steps.verdict(SafetyState(verdict="ok", tick=11, basis=10))
+    assert steps.complete
+
+
 def test_a_commander_that_looks_itself_needs_no_basis() -> None:
     steps = Lockstep()
     steps.begin(10, 10)

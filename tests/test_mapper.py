@@ -8,11 +8,14 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
-from gigabrain_schemas.topics import MAP, POSE, SCAN, STATE, WORLD
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import HEALTH, MAP, POSE, SCAN, STATE, WORLD
 from gigabrain_zenoh import config
+from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.health import publish_health
 from gigabrain_zenoh.mapper import chart_of
-from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping import grid, map_file
 from gigabrain_zenoh.settings import PerceptionConfig
 from tests.brain_rig import scan, state
 from tests.map_rig import HOUSE, Rooms, at, drawn
@@ -160,6 +163,24 @@ async def test_after_a_new_start_of_the_driver_the_map_stays_and_the_robot_is_fo
     assert (pose.x, pose.y) == pytest.approx((0.0, 0.0), abs=0.05)
 
 
+async def test_a_map_that_may_grow_no_more_is_told_once_and_in_the_health(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(grid, "MOST_CELLS", 100)
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(30)
+        problems = robot.bus.problems
+        health = asyncio.ensure_future(publish_health(robot.bus))
+        await asyncio.sleep(0)
+        health.cancel()
+        told = [data for key, data in robot.network.sent if key == HEALTH.at("node")]
+    assert [problem.code for problem in problems] == ["map_full"]
+    assert problems[0].text == "the map is full: 140 m long; what lies beyond is left out"
+    assert Codec(Health, HEALTH.max_bytes).decode(told[-1]).problems == problems
+    assert caplog.messages.count(problems[0].text) == 1
+
+
 def test_a_map_for_nothing_is_refused_with_its_line() -> None:
     with pytest.raises(ConfigError, match="f:2: map: a map is for mapping: slam or localize;"):
         config.loads("sectors: 8\nmap: house\n", PerceptionConfig, "f")
@@ -184,3 +205,16 @@ def test_a_map_that_is_missing_or_not_named_is_told_at_the_start(own_maps: Path)
     map_file.save(own_maps / "bare.yaml", drawn(Rooms(HOUSE), START), {"poses": np.zeros((1, 3))})
     with pytest.raises(ConfigError, match="no pose graph: "):
         chart_of(PerceptionConfig(mapping="slam", map="bare"))
+
+
+async def test_a_map_that_does_not_change_is_said_again_every_two_seconds() -> None:
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(20)
+        assert (await robot.save("house")).ok
+    async with Robot(PerceptionConfig(mapping="localize", map="house")) as robot:
+        robot.say()
+        robot.drive(45, still=True)
+        maps = robot.sent(MAP)
+    assert [grid.basis for grid in maps] == [5, 105, 205]
+    assert len({grid.cells for grid in maps}) == 1

@@ -14,6 +14,8 @@ from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.bus_rig import until
 from tests.zenoh_rig import free_endpoint, under_way
 
+pytestmark = pytest.mark.system
+
 NOBODY = "nobody here knows a host {!r}; waiting for its name (is it spelt right?)"
 
 

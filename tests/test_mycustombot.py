@@ -24,6 +24,8 @@ from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.errors import ConfigError
 from tests.line_rig import until
 
+pytestmark = pytest.mark.system
+
 EMPTY = World(name="empty", description="", half_x=5.0, half_y=5.0, shapes=())
 
 

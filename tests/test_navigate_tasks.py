@@ -108,3 +108,20 @@ async def test_who_was_told_to_do_nothing_does_not_roam_after_a_restart_of_decis
         await plane.go(1.0)
         assert plane.status.current
         assert plane.status.current.label == "roaming"
+
+
+async def test_decision_says_what_the_task_list_says_while_a_mission_waits() -> None:
+    mission = "do: [{wait: 5}, {goto: [2, 1]}]"
+    async with Plane(CELLS) as plane:
+        await plane.go(0.2)
+        await plane.ask(MISSION, MissionRequest(mission=mission, source="ann"))
+        await plane.go(1.0)
+        assert (plane.intent.reason, plane.status.doing) == ("waiting 5 s", "waiting 5 s")
+        assert not plane.status.drives
+        await plane.ask(TASK_CHANGE, TaskRequest(do="pause", source="ann"))
+        await plane.go(0.5)
+        assert plane.intent.reason == "mission-1 is paused: paused by ann"
+        await plane.ask(TASK_CHANGE, TaskRequest(do="resume", source="ann"))
+        await plane.go(5.5)
+        assert plane.status.drives
+        assert plane.intent.reason.startswith("going to (2.00, 1.00): ")

@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+import pytest
+
 from gigabrain_zenoh.client import Robot
 from gigabrain_zenoh.keys.authority import issue, new_fleet
 from gigabrain_zenoh.settings import Endpoint
@@ -10,18 +12,20 @@ from tests.netns_rig import network
 from tests.onlooker import looking_on
 from tests.stack import ROOT, Home, until
 
+pytestmark = pytest.mark.system
+
 HOSTS = ("robot", "brain", "operator")
 
 
 def keyed(folder: Path, address: str) -> Path:
-    """The deployment with keys in place of `insecure: true`, and the keys beside it."""
+    """The deployment at an address of its own, and the keys beside it."""
     new_fleet("home", folder / "home")
     issue(folder / "home", "robot", hosts=(address,))
     for role in ("brain", "operator", "viewer"):
         issue(folder / "home", role)
     text = (ROOT / "deploy" / "three_hosts.yaml").read_text()
     text = re.sub(r"^router: \S+", f"router: tcp/{address}:7447", text, flags=re.MULTILINE)
-    text = re.sub(r"^insecure: true", "keys: home", text, flags=re.MULTILINE)
+    text = re.sub(r"^keys: keys", "keys: home", text, flags=re.MULTILINE)
     file = folder / "three_hosts.yaml"
     file.write_text(text)
     return file

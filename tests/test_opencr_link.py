@@ -21,6 +21,8 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
 from tests.opencr_rig import Rig, make_rig  # noqa: F401
 
+pytestmark = pytest.mark.system
+
 
 async def test_a_failed_read_is_never_taken_for_a_fresh_one(rig: Rig) -> None:
     await rig.drive(0.0, 0.0, 40)

@@ -10,7 +10,6 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers import lockstep
 from gigabrain_drivers.catalog import load_robot
 from gigabrain_drivers.mock import MockBody, MockOptions
 from gigabrain_drivers.process import DriverProcess
@@ -80,7 +79,9 @@ async def drive(folder: Path, seed: int, ticks: int) -> Story:
     draw, network, clock = random.Random(seed), LocalNetwork(), FakeClock()
     robot = load_robot("mock")
     body = Roamer(robot, MockOptions(driver="mock"), Run(folder=folder, speed=100.0))
-    config = DriverConfig(body="mock", speed=100.0, resume="auto", state_dir=str(folder))
+    config = DriverConfig(
+        body="mock", speed=100.0, lockstep_timeout_s=60.0, resume="auto", state_dir=str(folder)
+    )
     ends = [ShuffledEnd(network) for _ in range(5)]
     driver_bus, *brain_buses = [Bus(end, clock) for end in ends]
     driver = DriverProcess(config, robot, body, driver_bus)
@@ -113,12 +114,6 @@ def story(network: LocalNetwork) -> Story:
     decode = msgspec.msgpack.Decoder(RobotState).decode
     states = {(s := decode(data)).tick: s for key, data in network.sent if key == STATE.key}
     return [(s.tick, s.gate.mode, s.velocity, s.pose) for s in states.values()]
-
-
-@pytest.fixture(autouse=True)
-def no_timeouts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A slow machine is another matter."""
-    monkeypatch.setattr(lockstep, "PATIENCE_S", 60.0)
 
 
 async def test_a_drive_is_the_same_whichever_message_is_quicker(

@@ -3,6 +3,7 @@
 import socket
 import stat
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,11 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.topics import BODY, TELEOP
+from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.limits import ZERO
 from gigabrain_zenoh.page.access import Access, check, tokens
-from gigabrain_zenoh.page.beside import free_port
+from gigabrain_zenoh.page.beside import free_port, with_page
 from gigabrain_zenoh.page.operator import Operator
 from gigabrain_zenoh.page.scene import Scene
 from gigabrain_zenoh.page.server import run
@@ -39,6 +41,52 @@ def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
     path.write_text('{"operator": "short", "viewer": "short"}')
     with pytest.raises(ConfigError, match="two tokens of 16 characters"):
         tokens(path)
+
+
+def test_of_many_who_make_the_tokens_at_once_all_have_the_same(tmp_path: Path) -> None:
+    for number, start in enumerate(("none", "none", "empty", "empty")):
+        path = tmp_path / f"tokens-{number}.json"
+        if start == "empty":
+            path.touch(0o600)
+        with ThreadPoolExecutor(16) as pool:
+            found = list(pool.map(lambda _, path=path: tokens(path), range(32)))  # type: ignore[misc]
+        assert len({both for both, _ in found}) == 1
+        assert [made for _, made in found].count(True) == 1
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+def test_a_crash_before_the_tokens_are_written_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "tokens.json"
+    monkeypatch.setattr("os.fsync", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        tokens(path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_tokens_are_read_from_a_folder_that_cannot_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "tokens.json"
+    made, _ = tokens(path)
+    read_only = OSError(30, "Read-only file system")
+    monkeypatch.setattr("tempfile.NamedTemporaryFile", lambda **_: (_ for _ in ()).throw(read_only))
+    assert tokens(path) == (made, False)
+    with pytest.raises(ConfigError, match=r"other\.json: Read-only file system"):
+        tokens(tmp_path / "other.json")
+
+
+def test_an_empty_file_of_tokens_is_made_anew_and_said_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "tokens.json"
+    path.touch(0o600)
+    made, new = tokens(path)
+    assert new
+    assert tokens(path) == (made, False)
+    assert caplog.messages == [f"{path} was empty; it is made anew"]
 
 
 async def test_a_page_that_cannot_be_served_makes_no_tokens(tmp_path: Path) -> None:
@@ -98,6 +146,26 @@ def test_it_answers_to_its_own_names_and_to_its_own_pages(
     access = Access(PageConfig(names=("robot.lan",)), 8080)
     headers = {"host": host, "origin": origin}
     assert (access.named(headers), access.own_page(headers)) == (named, own)
+
+
+@pytest.mark.parametrize(
+    ("config", "port", "host"),
+    [
+        (PageConfig(names=("Robot.local",)), 8080, "robot.local:8080"),
+        (PageConfig(names=("fd00::5",)), 8080, "[fd00::5]:8080"),
+        (PageConfig(names=("[FD00:0::5]",)), 8080, "[fd00::5]:8080"),
+        (PageConfig(listen="127.0.0.2"), 8080, "127.0.0.2:8080"),
+        (PageConfig(listen="::1"), 8080, "[::1]:8080"),
+        (PageConfig(), 80, "127.0.0.1"),
+        (PageConfig(), 80, "localhost:80"),
+    ],
+)
+def test_it_answers_to_names_as_browsers_write_them(
+    config: PageConfig, port: int, host: str
+) -> None:
+    access = Access(config, port)
+    assert access.own_page({"host": host, "origin": f"http://{host}"})
+    assert not access.named({"host": f"x{host}"})
 
 
 async def test_a_slow_browser_gets_the_newest_and_never_more_than_64_frames() -> None:
@@ -176,6 +244,19 @@ async def test_a_goal_that_nobody_serves_is_said_to_be_so() -> None:
     reply = await Operator(page.net.one).answer(goal)
     assert (reply.id, reply.ok) == (7, False)
     assert reply.text == "nobody serves goals: this robot has no navigation running"
+
+
+def test_a_demo_on_a_shared_machine_prints_an_address_that_logs_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    deployment, address = with_page(Deployment(body="mock"), 0, login=True)
+    at, token = address.split("/#")
+    assert at == f"http://127.0.0.1:{deployment.page.port}"
+    assert Access(deployment.page, deployment.page.port).role(token) == "operator"
+    assert Access(deployment.page, deployment.page.port).role("") is None
+    deployment, address = with_page(Deployment(body="mock"), 0)
+    assert address == f"http://127.0.0.1:{deployment.page.port}"
 
 
 def test_a_port_that_is_taken_is_stepped_aside_from() -> None:

@@ -13,7 +13,7 @@ from tests.fake_page_rig import Fake, serving
 from tests.page_rig import Browser, browser, needs_browser
 from tests.stack import until
 
-pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
+pytestmark = [pytest.mark.system, needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
 PAD = """
 const button = (pressed) => ({ pressed, value: pressed ? 1 : 0 })

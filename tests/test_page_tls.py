@@ -9,7 +9,7 @@ from tests.fake_page_rig import Fake, serving
 from tests.page_rig import OPERATOR, VIEWER, browser, needs_browser
 from tests.stack import until
 
-pytestmark = needs_browser
+pytestmark = [pytest.mark.system, needs_browser]
 
 
 def certificate(folder: Path) -> dict[str, str]:

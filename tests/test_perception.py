@@ -245,7 +245,8 @@ async def test_without_its_body_it_says_nothing() -> None:
     async with Bench(functools.partial(perception.run, CONFIG)) as bench:
         bench.send(SCAN, scan(open_space(), tick=5))
         bench.send(BODY, body())
-        bench.send(SCAN, scan(open_space(), tick=10, boot=8))  # of another start: another body
+        for tick in (4, 7, 10):
+            bench.send(SCAN, scan(open_space(), tick=tick, boot=8))  # another start: another body
         assert bench.sent(WORLD) == []
         bench.send(BODY, body(boot=8))
         bench.send(SCAN, scan(open_space(), tick=15, boot=8))

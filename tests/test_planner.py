@@ -101,14 +101,14 @@ def test_a_goal_where_the_body_cannot_be_is_refused_with_the_nearest_place_where
 def test_the_refusal_says_it_in_words() -> None:
     found = refused(seen(rooms()), (5.55, 2.05), (3.05, 2.05))
     assert found.reason == (
-        "the goal is inside something; nearest reachable point is 0.2 m away at (2.85, 2.05)"
+        "the goal is inside something; nearest reachable point is 0.20 m away at (2.85, 2.05)"
     )
 
 
 def test_without_a_way_the_nearest_point_is_the_one_on_this_side() -> None:
     found = refused(seen(rooms(door=0)), (0.55, 1.05), (4.05, 1.05))
     assert found.reason == (
-        "no way leads to the goal; nearest reachable point is 1.2 m away at (2.85, 1.05)"
+        "no way leads to the goal; nearest reachable point is 1.20 m away at (2.85, 1.05)"
     )
     assert found.nearest == pytest.approx((2.85, 1.05))
 

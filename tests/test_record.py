@@ -15,7 +15,7 @@ from gigabrain_zenoh import codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.bagfile import BagFile
 from gigabrain_zenoh.recording.info import info
-from gigabrain_zenoh.recording.intake import Intake
+from gigabrain_zenoh.recording.intake import MOST_PLACES, OTHERS, Intake
 from gigabrain_zenoh.recording.node import chosen, listening, run
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.recorder import Recorder
@@ -146,6 +146,20 @@ def test_what_is_dropped_is_not_missing_nor_a_new_sender() -> None:
         intake.take("robot/scan", "", bag_rig.scan(seq))
     assert (intake.counts(), len(intake.hand_over())) == ((5, 2, 0), 3)
     assert not intake.gaps.restarts
+
+
+def test_who_makes_up_keys_and_encodings_costs_a_bounded_number_of_them() -> None:
+    intake = Intake(1 << 30, lambda: 1)
+    intake.take("robot/scan", "", bag_rig.scan(1))
+    for n in range(10_000):
+        intake.take(f"robot/{n}", "", b"x")
+        intake.take("robot/state", f"text/{n}", b"x")
+    intake.take("robot/scan", "", bag_rig.scan(2))
+    arrivals = intake.hand_over()
+    assert len({(one.key, one.encoding) for one in arrivals}) == MOST_PLACES
+    assert arrivals[-1].header.seq == 2
+    assert len(intake.seen) <= MOST_PLACES + 1
+    assert intake.dropped == {OTHERS: 20_002 - len(arrivals)}
 
 
 def test_viewers_get_every_second_state_and_each_thought_once(tmp_path: Path) -> None:

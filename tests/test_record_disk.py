@@ -22,6 +22,8 @@ from gigabrain_zenoh.settings import RecorderConfig
 from tests import bag_rig
 from tests.bag_rig import QUICK, kept, wait
 
+pytestmark = pytest.mark.system
+
 
 class SlowTape(tape.Tape):
     """A disk that takes 1 MB a second."""

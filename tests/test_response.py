@@ -162,3 +162,51 @@ def test_states_and_commands_that_are_missing_now_and_then_do_no_harm() -> None:
     plant.estimator.state = lossy  # type: ignore[method-assign]
     found = plant.wander(30)
     assert found.delay + found.lag == pytest.approx(0.25, abs=0.041)
+
+
+def told(tick: int, v: float = 0.0, source: str = "control", seq: int = 0) -> CmdVel:
+    return CmdVel(linear_x=v, source=source, boot=BOOT, tick=tick, seq=seq)
+
+
+def test_what_others_than_the_commander_say_was_not_told_to_the_body() -> None:
+    estimator = ResponseEstimator()
+    estimator.state(state(10))
+    estimator.command(told(10, 0.2))
+    estimator.command(told(10, -2.0, source="stranger"))
+    assert [speed.linear_x for _, speed in estimator.sent(0, 10)] == [0.2]
+
+
+def test_who_uses_the_commanders_name_is_believed_no_more_than_by_the_gate() -> None:
+    estimator = ResponseEstimator()
+    estimator.state(state(11))
+    for command in (told(10, -2.0), told(10, 0.2, seq=7), told(11, 0.3, seq=8), told(11, -2.0)):
+        estimator.command(command)
+    assert [speed.linear_x for _, speed in estimator.sent(0, 11)] == [0.2, 0.3]
+
+
+def test_after_a_change_of_commander_the_new_ones_commands_count() -> None:
+    estimator = ResponseEstimator()
+    estimator.state(state(10))
+    estimator.command(told(10, 0.2))
+    estimator.state(state(11, gate=GateStatus(mode="enabled", commander="script")))
+    estimator.command(told(11, 0.1, source="script"))
+    estimator.command(told(11, 0.2))
+    assert [speed.linear_x for tick, speed in estimator.sent(10, 11)] == [0.1]
+
+
+def test_commands_of_ticks_that_are_far_off_are_not_kept() -> None:
+    estimator = ResponseEstimator()
+    estimator.state(state(10))
+    for tick in range(10, 20_000):
+        estimator.command(told(tick))
+    assert [tick for tick, _ in estimator.sent(0, 2**40)] == [10, 11, 12, 13, 14, 15]
+
+
+def test_however_many_sources_and_ticks_are_named_little_is_kept() -> None:
+    estimator = ResponseEstimator()
+    for tick in range(1, 200):
+        estimator.state(state(tick))
+        for n in range(50):
+            estimator.command(told(tick + n, source=f"stranger {n}"))
+            estimator.command(told(tick + n))
+    assert len(estimator._commands) + len(estimator._past) < 40

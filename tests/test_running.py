@@ -1,14 +1,17 @@
 """Which robots run here: the notes that supervisors leave, and who reads them."""
 
+import contextlib
+import fcntl
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
 from gigabrain_zenoh.running import Running, announced, find_endpoint, folder, running
 from gigabrain_zenoh.settings import Endpoint
 
@@ -21,12 +24,21 @@ def notes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder()
 
 
-def leave_note(folder: Path, pid: int, namespace: str) -> Path:
+def leave_note(folder: Path, pid: int, namespace: str, mode: int = 0o700) -> Path:
     endpoint = Endpoint(connect=(f"tcp/127.0.0.1:{pid}",), namespace=namespace)
     folder.mkdir(parents=True, exist_ok=True)
+    folder.chmod(mode)
     note = folder / f"{pid}.json"
     note.write_bytes(msgspec.json.encode(Running(pid=pid, label=namespace, endpoint=endpoint)))
     return note
+
+
+@contextlib.contextmanager
+def living(note: Path) -> Iterator[None]:
+    """As for as long as the supervisor lives that left the note."""
+    with note.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def test_a_robot_is_found_for_as_long_as_its_supervisor_says(notes: Path) -> None:
@@ -39,11 +51,39 @@ def test_a_robot_is_found_for_as_long_as_its_supervisor_says(notes: Path) -> Non
 
 
 def test_the_note_of_a_dead_supervisor_is_taken_away(notes: Path) -> None:
-    dead = subprocess.Popen((sys.executable, "-c", ""))
-    dead.wait()
-    note = leave_note(notes, dead.pid, "ghost")
+    program = (
+        "import os\nfrom gigabrain_zenoh.running import announced, Endpoint\n"
+        "with announced('ghost', Endpoint(connect=('tcp/127.0.0.1:1',))): os.kill(os.getpid(), 9)"
+    )
+    subprocess.run((sys.executable, "-c", program), check=False)
+    (note,) = notes.iterdir()
     assert running() == []
     assert not note.exists()
+
+
+def test_a_note_whose_pid_is_used_again_is_that_of_a_dead_supervisor(notes: Path) -> None:
+    leave_note(notes, os.getppid(), "ghost")  # a process that lives, and has left no note
+    assert running() == []
+
+
+@pytest.mark.parametrize("whose", ["folder", "parent", "owner"])
+def test_notes_that_somebody_else_may_have_planted_are_not_believed(
+    whose: str, notes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    note = leave_note(notes, os.getpid(), "planted")
+    if whose == "owner":
+        monkeypatch.setattr(os, "getuid", lambda: note.stat().st_uid + 1)
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(notes.parent))
+    else:
+        (notes if whose == "folder" else notes.parent).chmod(0o777)
+    with living(note):
+        with pytest.raises(ConfigError, match="belongs to another user, or others may write it"):
+            find_endpoint(None)
+        with (
+            pytest.raises(ConfigError, match="belongs to another user, or others may write it"),
+            announced("mine", HERE),
+        ):
+            pass
 
 
 def test_a_note_that_cannot_be_read_is_taken_away(notes: Path) -> None:
@@ -54,13 +94,13 @@ def test_a_note_that_cannot_be_read_is_taken_away(notes: Path) -> None:
 
 
 def test_of_several_robots_the_namespace_chooses(notes: Path) -> None:
-    leave_note(notes, os.getpid(), "alpha")
-    leave_note(notes, os.getppid(), "beta")
-    assert find_endpoint(None, "beta").namespace == "beta"
-    with pytest.raises(BusError, match=r"several robots run here; choose one with --connect: "):
-        find_endpoint(None)
-    with pytest.raises(BusError, match="no robot runs here"):
-        find_endpoint(None, "gamma")
+    alpha, beta = leave_note(notes, 7001, "alpha"), leave_note(notes, 7002, "beta")
+    with living(alpha), living(beta):
+        assert find_endpoint(None, "beta").namespace == "beta"
+        with pytest.raises(Ambiguous, match=r"several robots run here; choose one with --connect"):
+            find_endpoint(None)
+        with pytest.raises(BusError, match="no robot runs here"):
+            find_endpoint(None, "gamma")
 
 
 def test_who_is_told_where_it_is_does_not_look() -> None:

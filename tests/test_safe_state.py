@@ -130,3 +130,29 @@ class Ready:
 
     def __call__(self) -> None:
         self.called = True
+
+
+async def test_a_driver_that_is_cancelled_on_its_way_to_the_safe_state_is_closed() -> None:
+    arm = Arm("park")
+    arm.moving = 1000
+
+    async def end() -> None:
+        async with arm:
+            pass
+
+    ending = asyncio.ensure_future(end())
+    while "look" not in arm.done:  # noqa: ASYNC110 - it waits for the body to rest
+        await asyncio.sleep(0)
+    ending.cancel()
+    await asyncio.wait((ending,))
+    assert ending.cancelled()
+    assert arm.done[-1] == "close"
+
+
+@pytest.mark.parametrize("world", ["../../etc/passwd", "hosue", "random:x"])
+async def test_a_simulated_driver_takes_no_world_that_there_is_not(
+    world: str, tmp_path: Path
+) -> None:
+    config = DriverConfig(body="mock", world=world, state_dir=str(tmp_path))
+    with pytest.raises(ConfigError, match=f"^no world '{world}'"):
+        await process.run(config, Net().one, Ready())

@@ -11,7 +11,7 @@ from tests.brain_rig import DRIVING, state
 from tests.safety_rig import Patrol
 
 REST, AHEAD, TURN = Velocity(), Velocity(linear_x=0.2), Velocity(angular_z=1.0)
-IDLE = GateStatus(mode="idle")
+IDLE, STOPPING = GateStatus(mode="idle"), GateStatus(mode="stopping", commander="control")
 
 
 def under_way(told: Velocity = AHEAD) -> Patrol:
@@ -50,6 +50,29 @@ def test_a_body_that_goes_on_when_told_to_stop_runs_away() -> None:
     patrol = under_way()
     ticks = patrol.ticks_until("runaway", 60, told=REST, moves=AHEAD)
     assert ticks <= 40  # the ramp of 0.2 s, the 0.3 s that explain it, and 0.3 s of patience
+
+
+def test_a_body_whose_power_went_while_it_drove_does_not_run_away() -> None:
+    """Its driver repeats what it heard last."""
+    patrol = under_way()
+    assert patrol.go(50, told=REST, frozen=True, connected=False, gate=STOPPING) == []
+    assert patrol.go(300, told=REST, frozen=True, connected=False, gate=IDLE) == []
+    assert patrol.go(100, told=REST, gate=IDLE) == []
+
+
+def test_what_is_not_heard_says_neither_that_a_body_is_stuck_nor_that_it_is_frozen() -> None:
+    patrol = under_way()
+    assert patrol.go(300, told=AHEAD, frozen=True, connected=False) == []
+
+
+def test_a_body_that_runs_away_on_a_line_that_comes_and_goes_is_still_found() -> None:
+    patrol, heard = under_way(REST), 0
+    while "runaway" not in patrol.codes:
+        connected = patrol.tick % 10 < 5
+        heard += connected
+        patrol.go(moves=AHEAD, connected=connected)
+        assert heard <= 15
+    assert heard == 15
 
 
 def test_one_wheel_that_is_stuck_turns_the_body_and_is_found() -> None:

@@ -167,12 +167,13 @@ async def test_silence_is_judged_by_the_robots_clock_alone() -> None:
 async def test_a_driver_that_starts_anew_is_judged_afresh() -> None:
     async with Chain() as chain:
         await started(chain)
-        chain.send(STATE, state(1, boot=8))
+        for tick in (1, 2, 3):
+            chain.send(STATE, state(tick, boot=8))
         assert chain.sent(SAFETY) == []  # whose body?
         chain.send(BODY, body(boot=8))
-        chain.send(STATE, state(2, boot=8))
+        chain.send(STATE, state(4, boot=8))
         (verdict,) = chain.sent(SAFETY)
-    assert (verdict.boot, verdict.tick, verdict.basis) == (8, 2, 0)
+    assert (verdict.boot, verdict.tick, verdict.basis) == (8, 4, 0)
     assert [cause.code for cause in verdict.causes][:2] == ["scan_lost", "starting"]
 
 

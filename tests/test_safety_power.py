@@ -140,3 +140,11 @@ def test_one_sample_after_a_long_gap_does_not_count_for_all_of_it() -> None:
     patrol.tick += 1000
     patrol.tick -= patrol.tick % 5 + 1
     assert "motor_hot" not in patrol.go(joints=motors(90.0))
+
+
+def test_one_state_that_measures_something_is_no_proof_that_the_body_does() -> None:
+    patrol = Patrol()
+    patrol.go(10, joints=motors(None))
+    for _ in range(3):
+        patrol.go(joints=motors(30.0), battery=charge(60.0))
+        assert patrol.go(200, joints=motors(None)) == []

@@ -1,6 +1,10 @@
 """Tilt, knocks, slow commands, and the computer itself."""
 
+import itertools
 import math
+import threading
+from collections import namedtuple
+from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
@@ -9,6 +13,9 @@ from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh.safety.attitude import tilt_deg
 from gigabrain_zenoh.safety.host import Host, HostWatch, warnings
 from tests.safety_rig import BODY, Patrol, imu
+from tests.stack import until
+
+Usage = namedtuple("Usage", "free")
 
 
 def rolled(degrees: float, axis: int = 0) -> tuple[float, float, float, float]:
@@ -84,8 +91,45 @@ def test_a_host_without_room_is_a_warning_and_no_more() -> None:
     assert warnings(Thresholds(), Host()) == ()
 
 
-def test_the_host_is_looked_at_once_a_second() -> None:
-    watch = HostWatch()
+SECONDS = itertools.count(1000)
+
+
+def disk_mb(watch: HostWatch) -> float:
+    """What it says a second later."""
+    return watch.now(next(SECONDS) * 1_100_000_000).disk_mb or 0.0
+
+
+async def test_a_disk_that_hangs_holds_up_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+    hangs, answers = threading.Event(), threading.Event()
+
+    def disk_usage(path: object) -> Usage:
+        asked.append(path)
+        hangs.wait(60)
+        answers.set()
+        return Usage(free=5_000_000)
+
+    monkeypatch.setattr("shutil.disk_usage", disk_usage)
+    watch = HostWatch(tmp_path)
+    for second in range(5):
+        assert watch.now(second * 1_100_000_000).disk_mb is None
+    assert asked == [tmp_path]
+    hangs.set()
+    assert answers.wait(60)
+    await until(lambda: disk_mb(watch) == 5.0, "the disk's answer")
+
+
+async def test_the_disk_of_a_folder_to_come_is_that_of_its_parent(
+    tmp_path: Path,
+) -> None:
+    watch = HostWatch(tmp_path / "gigabrain" / "runs")
+    await until(lambda: disk_mb(watch) > 0, "the disk's answer")
+
+
+def test_the_host_is_looked_at_once_a_second(tmp_path: Path) -> None:
+    watch = HostWatch(tmp_path)
     first = watch.now(1)
     assert watch.now(900_000_000) is first
     assert first.disk_mb is None or first.disk_mb > 0

@@ -48,6 +48,25 @@ def test_whoever_goes_first_does_so_with_all_of_its_session() -> None:
     assert told_of(session, FIRST)
 
 
+STARTING = """
+from gigabrain_zenoh.scheduling import AUTOGROUP, join_in, start_first
+for change in (start_first, join_in):
+    change()
+    print(AUTOGROUP.read_text().strip() if AUTOGROUP.exists() else "")
+"""
+
+
+@needs_rights
+def test_the_brain_goes_first_until_it_is_ready() -> None:
+    done = subprocess.run(
+        (sys.executable, "-c", STARTING),
+        start_new_session=True, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    first, then = done.stdout.splitlines()
+    assert told_of(first, FIRST)
+    assert told_of(then, 0)
+
+
 @needs_rights
 def test_a_session_that_it_shares_with_others_stays_as_it_is() -> None:
     nice, session = going_first(of_its_own=False)

@@ -16,6 +16,8 @@ from gigabrain_zenoh.tasks.scripts import LEASHED, Run, Scripts
 from gigabrain_zenoh.tasks.store import TaskFile
 from tests.bus_rig import until
 
+pytestmark = pytest.mark.system
+
 
 def test_nothing_is_written_where_there_is_no_folder() -> None:
     file = TaskFile("")

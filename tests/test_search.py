@@ -133,3 +133,14 @@ def test_a_grid_that_needs_more_room_than_thought_gets_it() -> None:
     field = search.field(cost, (30, 30), "from")
     assert search._memory.entries.shape[1] > 16
     np.testing.assert_array_equal(field, Search().field(cost, (30, 30), "from"))
+
+
+def test_marks_of_months_of_searches_are_reset_in_time() -> None:
+    search, cost = Search(), np.ones((20, 30))
+    expected = search.path(cost, (1, 1), (15, 22))
+    search._turn = np.iinfo(np.int32).max // 32 - 3  # 6.7e7 searches later
+    for _ in range(6):
+        path = search.path(cost, (1, 1), (15, 22))
+        assert path is not None
+        assert np.array_equal(path, expected)
+    assert search._turn < 10

@@ -1,6 +1,8 @@
 """The MuJoCo driver, joined to the real brain over an in-memory network, in lock-step."""
 
 import asyncio
+import itertools
+import threading
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -9,14 +11,18 @@ import pytest
 
 from gigabrain_drivers import catalog
 from gigabrain_drivers.process import DriverProcess
-from gigabrain_drivers.robot import Run
+from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.sim import driver as sim_driver
+from gigabrain_drivers.sim.account import account_of
 from gigabrain_drivers.sim.driver import MujocoDriver
+from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.topics import IMU, INTENT, SCAN, STATE
 from gigabrain_zenoh import control, decision, perception, safety
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
+from gigabrain_zenoh.recording.gaps import header_of
 from gigabrain_zenoh.settings import DecisionConfig, DriverConfig, PerceptionConfig
 from gigabrain_zenoh.transport import LocalNetwork
 
@@ -83,14 +89,38 @@ async def test_the_brain_drives_the_simulated_body_and_the_report_tells_the_trut
     assert report["sim_seconds"] == 5.0
     assert report["contacts"] == 0
     assert 0.7 <= float(report["distance_m"] or 0) <= 0.95  # half a second to wake, then 0.2 m/s
-    sent = {topic.key: 0 for topic in (STATE, SCAN, IMU)}
-    for key, _payload in network.sent:
-        if key in sent:
-            sent[key] += 1
-    woken = sent["robot/scan"] - 50  # one per 0.1 s, and some for the brain to wake up by
-    assert woken >= 1
-    assert sent["robot/state"] == 249 + woken
-    assert sent["robot/imu"] == 500
+    assert ticks_of(network, STATE.key) == list(range(1, 251))
+    scans = ticks_of(network, SCAN.key)
+    assert scans == [1, *range(5, 251, 5)]  # one per 0.1 s, and one for the brain to wake up by
+    assert sum(key == IMU.key for key, _ in network.sent) == 500
+
+
+def ticks_of(network: LocalNetwork, key: str) -> list[int]:
+    """The ticks of all messages on a key; the first is announced until the brain is there."""
+    ticks = [header_of(payload).tick for sent, payload in network.sent if sent == key]
+    announced = len(list(itertools.takewhile(lambda tick: tick == ticks[0], ticks)))
+    return ticks[announced - 1 :]
+
+
+async def test_a_report_reads_nothing_that_the_physics_is_at_work_on(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    readers = set[str]()
+
+    def account(simulation: Simulation, robot: RobotFile, run: Run) -> dict[str, object]:
+        readers.add(threading.current_thread().name)
+        return account_of(simulation, robot, run)
+
+    monkeypatch.setattr(sim_driver, "account_of", account)
+    driver = make(seconds=1.0)
+    readers.clear()  # before there is a thread
+    async with driver:
+        ticks = driver.ticks(Clock())
+        for seconds in (0.02, 0.04):
+            await anext(ticks)
+            assert driver.report()["sim_seconds"] == seconds
+        await ticks.aclose()  # type: ignore[attr-defined]
+    assert readers == {"physics"}
 
 
 async def test_two_runs_with_the_same_seed_decide_alike(tmp_path: Path) -> None:

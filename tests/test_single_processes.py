@@ -2,6 +2,10 @@
 
 import signal
 
+from gigabrain_schemas.requests import DescribeRequest
+from gigabrain_schemas.topics import DESCRIBE
+from gigabrain_zenoh.settings import Endpoint
+from tests.onlooker import looking_on
 from tests.stack import Home, free_port, until
 
 
@@ -15,6 +19,23 @@ async def test_a_missing_router_is_waited_for_and_said_in_one_line(home: Home) -
     assert perception.err.count("\n") == 2
     perception.send(signal.SIGINT)
     assert await perception.ended() == 0
+
+
+async def test_tools_find_a_robot_that_was_started_process_by_process(home: Home) -> None:
+    listen = f"tcp/0.0.0.0:{free_port()}"
+    where = listen.replace("0.0.0.0", "127.0.0.1")
+    router = home.start("router", "--listen", listen, "--insecure")
+    driver = home.start("driver", "run", "mock", "--connect", where)
+    await until(lambda: "ready" in driver.err, "the driver")
+    listed = await home.run("node", "list")
+    assert (await listed.ended(), "driver" in listed.out, listed.err) == (0, True, "")
+    other = home.start("router", "--listen", f"tcp/127.0.0.1:{free_port()}")
+    await until(lambda: "ready" in other.err, "a second router")
+    why = await home.run("why")
+    assert why.err.startswith("gigabrain: several robots run here; choose one with --connect: ")
+    assert (await why.ended(), why.out) == (1, "")
+    router.send(signal.SIGTERM)
+    assert await router.ended() == 0
 
 
 async def test_a_process_that_waits_for_its_router_can_be_ended(home: Home) -> None:
@@ -37,3 +58,18 @@ async def test_a_second_driver_for_the_same_body_is_refused_in_one_line(home: Ho
         "driver", "run", "mock", "--connect", where, "--namespace", "other"
     )  # fmt: skip
     await until(lambda: "ready" in namesake.err, "a driver in a namespace of its own")
+
+
+async def test_of_two_drivers_that_start_together_exactly_one_stays(home: Home) -> None:
+    where = f"tcp/127.0.0.1:{free_port()}"
+    home.start("router", "--listen", where)
+    both = [home.start("driver", "run", "mock", "--connect", where) for _ in range(2)]
+    await until(lambda: not all(driver.running for driver in both), "one of them leaves")
+    (left,) = [driver for driver in both if not driver.running]
+    (stays,) = [driver for driver in both if driver.running]
+    assert await left.ended() == 2
+    assert f"a driver is already running here (pid {stays.pid} on " in left.err
+    async with looking_on(Endpoint(connect=(where,))) as robot:
+        await robot.ticks(250)  # until the one that stays has settled
+        replies = await robot.bus.ask(DESCRIBE, DescribeRequest(), name="driver", timeout_s=20)
+        assert [(one.pid, one.claim) for one in replies] == [(stays.pid, "settled")]

@@ -227,6 +227,20 @@ def test_a_robot_that_is_carried_away_says_so_until_it_is_told_where_it_is() -> 
     assert found.pose == pytest.approx(home, abs=0.03)
 
 
+def test_scans_that_do_not_even_fit_one_another_do_not_break_the_map() -> None:
+    poses = lap()[:40]
+    random = np.random.default_rng(4)
+    scans = look(BLOCK, poses, Lidar(180, reach=6.0))
+    for at in range(20, 25):  # leaves in the wind
+        away, bearing = random.uniform(1, 6, 150), np.sort(random.uniform(-np.pi, np.pi, 150))
+        scans[at] = Scan.of(np.column_stack((away * np.cos(bearing), away * np.sin(bearing))))
+    slam = Slam()
+    estimates = feed(slam, scans, stepped(poses, 0.0, 1.0))
+    assert {estimate.kind for estimate in estimates[20:25]} == {"odometry"}
+    assert not any(estimate.lost for estimate in estimates)
+    assert estimates[-1].pose == pytest.approx(poses[-1], abs=0.05)
+
+
 def test_when_odometry_jumps_the_scan_tells_that_the_robot_did_not() -> None:
     poses = lap()[:30]
     lidar = Lidar(180, reach=6.0)

@@ -7,6 +7,9 @@ ENDS = """
 import asyncio, os, signal
 from gigabrain_zenoh.stop_signals import stop_signals
 
+# a shell's `&` starts the tests with SIGINT ignored
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 async def work():
     with stop_signals() as stop:
         if {stopped}:

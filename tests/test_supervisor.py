@@ -25,7 +25,10 @@ from tests.supervisor_rig import (
     until,
 )
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts")
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts"),
+]
 
 
 async def test_a_process_starts_when_those_before_it_are_ready_and_not_merely_started(
@@ -68,6 +71,22 @@ async def test_a_process_that_dies_is_started_again() -> None:
         assert records.texts("died") == [
             "control ended with signal 9 (Killed); next start in 0.01 s"
         ]
+
+
+async def test_a_process_that_freezes_for_ever_is_killed_and_started_again() -> None:
+    beating = """
+say('ready')
+while True:
+    say('progress'); time.sleep(0.2)
+"""
+    frozen, well = spec("control", beating, beats=True), spec("safety", beating, beats=True)
+    async with running(frozen, well) as (supervisor, records):
+        control, safety = supervisor.statuses["control"], supervisor.statuses["safety"]
+        await until(lambda: control.state == safety.state == "ready")
+        await freeze(control.pid)
+        await until(lambda: control.restarts == 1 and control.state == "ready")
+        assert records.texts("stuck") == ["control has made no progress for 5 s and is killed"]
+        assert (control.last_exit, safety.restarts, supervisor.deaths) == (-9, 0, 1)
 
 
 async def test_a_restart_leaves_those_that_come_after_alone() -> None:

@@ -20,7 +20,10 @@ from tests.supervisor_rig import (
     until,
 )
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts")
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts"),
+]
 
 
 async def test_all_end_also_those_that_hang_or_are_frozen_and_the_router_last() -> None:

@@ -1,6 +1,7 @@
 """How far a footprint can go: straight, turning and along arcs."""
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -128,3 +129,24 @@ def test_before_the_free_way_is_over_nothing_is_inside_the_body(
         c, s = math.cos(yaw), math.sin(yaw)
         seen = at((c * (x - px) + s * (y - py), c * (y - py) - s * (x - px)))
         assert depth(hull, seen)[0] > 0.0
+
+
+def test_a_huge_footprint_and_a_long_way_ask_for_bounded_memory() -> None:
+    huge = ((10.0, 10.0), (-10.0, 10.0), (-10.0, -10.0), (10.0, -10.0))
+    angles = np.linspace(0.0, math.tau, 2000)
+    around = np.stack([14.1 * np.cos(angles), 14.1 * np.sin(angles)], axis=1)
+    tracemalloc.start()
+    try:
+        assert turning(huge, around, 0.1, 1e6) != (None, None)
+        assert arc(huge, around, 0.1, 1e6, (0.02, 0.0, 100.0)) is not None
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most < 200_000_000
+
+
+def test_a_way_of_many_looks_is_worked_out_in_parts_with_the_same_result() -> None:
+    points = at((0.5, 0.3), (0.7, 0.1))
+    found = arc(WAFFLE, points, 0.03, 0.8, (0.2, 0.0, 0.3))
+    assert found == pytest.approx(0.51, abs=0.02)
+    assert arc(WAFFLE, np.tile(points, (20_000, 1)), 0.03, 0.8, (0.2, 0.0, 0.3)) == found

@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,10 @@ import jsonschema
 import pytest
 import yaml
 
+from gigabrain_zenoh.addresses import exposed
 from gigabrain_zenoh.config import loads
 from gigabrain_zenoh.deployment import Deployment, load_deployment
+from tests.dockerfile_steps import command, extras
 from tests.onlooker import looking_on
 from tests.stack import ROOT, Home, endpoint_of, until
 
@@ -99,11 +102,48 @@ def test_keys_can_be_mounted_as_the_compose_file_says() -> None:
     jsonschema.Draft201909Validator(schema).validate(document)
     for name, service in document["services"].items():
         assert f"${{KEYS}}/{name}:/etc/gigabrain/keys:ro" in service["volumes"]
-    site = (DOCKER / "deployment.yaml").read_text()
+    site = (DOCKER / "insecure.yaml").read_text()
     assert "insecure: true" in site
-    secure = loads(site.replace("insecure: true", "keys: keys"), Deployment, "deployment.yaml")
+    secure = loads(site.replace("insecure: true", "keys: keys"), Deployment, "insecure.yaml")
     assert (secure.router, secure.keys) == ("tcp/robot:7447", "keys")
-    assert ".[sim,keys,fast]" in (DOCKER / "Dockerfile").read_text()
+
+
+def test_the_image_has_the_extras_that_its_default_command_needs() -> None:
+    assert command() == ["gigabrain", "up", "demo"]
+    demo = load_deployment(ROOT / "deploy" / f"{command()[-1]}.yaml")
+    needs = {
+        "sim": demo.link == "sim",
+        "nav": demo.perception.mapping == "slam" or demo.decision.behaviour == "navigate",
+        "page": "page" in str(demo.hosts),
+        "record": "recorder" in str(demo.hosts) or "foxglove" in str(demo.hosts),
+        "keys": True,  # compose.yaml says how they are mounted
+    }
+    assert {name for name, wanted in needs.items() if wanted} <= extras()
+    known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert extras() <= set(known["optional-dependencies"])
+
+
+def test_no_shipped_deployment_listens_beyond_loopback_without_keys() -> None:
+    shipped = sorted((ROOT / "deploy").rglob("*.yaml"))
+    found = {
+        path.name: load_deployment(path)
+        for path in shipped
+        if re.search(r"^hosts:|^body:", path.read_text(), re.MULTILINE)
+    }
+    assert sorted(found) == ["demo.yaml", "insecure.yaml", "three_hosts.yaml"]
+    for name, deployment in found.items():
+        if name != "insecure.yaml":
+            assert not deployment.insecure, name
+            assert deployment.keys or not exposed((deployment.router,)), name
+
+
+def test_the_docs_install_a_deployment_with_keys_as_a_service() -> None:
+    docs = (ROOT / "docs" / "many_hosts.md").read_text()
+    (installed,) = re.findall(r"install .*(deploy/\S+) /etc/gigabrain/deployment\.yaml", docs)
+    deployment = load_deployment(ROOT / installed)
+    assert Path(deployment.keys).name == "keys"  # beside the file, where the docs put them
+    assert re.search(r"cp .*home/robot/.* /etc/gigabrain/keys", docs)
+    assert "/etc/gigabrain/deployment.yaml" in UNIT.read_text()
 
 
 def test_every_container_is_locked_up() -> None:
@@ -119,7 +159,7 @@ def test_every_container_is_locked_up() -> None:
 
 
 def load_hosts() -> list[str]:
-    return list(load_deployment(DOCKER / "deployment.yaml").hosts)
+    return list(load_deployment(DOCKER / "insecure.yaml").hosts)
 
 
 def test_the_image_has_no_root_and_no_build_tools_and_copies_what_there_is() -> None:

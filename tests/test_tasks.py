@@ -1,12 +1,16 @@
 """Tasks on the bus and on disk: what is asked, answered, told and remembered."""
 
+import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
 
 from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest, Granted
 from gigabrain_schemas.topics import GRANTED
+from gigabrain_zenoh.tasks import checks, service
+from gigabrain_zenoh.tasks.mission import Mission
 from gigabrain_zenoh.tasks.orders import GoTo, Outcome
 from gigabrain_zenoh.tasks.store import TaskFile
 from tests.brain_rig import BOOT, state
@@ -34,6 +38,22 @@ async def test_a_goal_is_accepted_with_its_way_and_told_from_then_on(site: Site)
     await site.step()
     assert [(task.id, task.state) for task in site.told[-1].done] == [("goal-1", "succeeded")]
     assert site.told[-1].current is None
+    await site.end()
+
+
+async def test_the_loop_goes_on_while_a_mission_is_read(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    readers: list[bool] = []
+
+    def loads(text: str, source: str) -> Mission:
+        readers.append(threading.current_thread() is threading.main_thread())
+        return checks.loads(text, source)
+
+    monkeypatch.setattr(service, "checks", SimpleNamespace(**{**vars(checks), "loads": loads}))
+    await site.step()
+    assert (await site.carry_out("do: [{wait: 5}]")).ok
+    assert readers == [False]
     await site.end()
 
 

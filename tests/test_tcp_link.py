@@ -79,3 +79,22 @@ async def test_a_tcp_port_that_cannot_be_reached_says_so(host: str, complaint: s
     link.open()
     await until(lambda: complaint in link.problem)
     await link.close()
+
+
+async def test_a_name_is_tried_at_all_its_addresses(monkeypatch: pytest.MonkeyPatch) -> None:
+    with server() as listening:
+        port = listening.getsockname()[1]
+        loop = asyncio.get_running_loop()
+
+        async def both(*_: object, **__: object) -> list[tuple[object, ...]]:
+            kind = (socket.SOCK_STREAM, socket.IPPROTO_TCP, "")
+            return [
+                (socket.AF_INET6, *kind, ("::1", port, 0, 0)),
+                (socket.AF_INET, *kind, ("127.0.0.1", port)),
+            ]
+
+        monkeypatch.setattr(loop, "getaddrinfo", both)
+        link = TcpLink("robot", port, Clock(), quiet_ns=None)
+        link.open()
+        await until(lambda: link.connected)
+        await link.close()

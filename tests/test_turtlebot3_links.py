@@ -17,6 +17,8 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
 from tests.lidar_rig import until
 
+pytestmark = pytest.mark.system
+
 ROBOTS = ["turtlebot3_burger", "turtlebot3_waffle"]
 
 

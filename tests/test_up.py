@@ -1,6 +1,7 @@
 """`gigabrain up`: starting, restarting, giving up, leaving nothing."""
 
 import asyncio
+import contextlib
 import os
 import re
 import signal
@@ -81,6 +82,31 @@ async def test_it_goes_on_when_nobody_reads_what_it_says(home: Home) -> None:
     assert up.err == ""
 
 
+async def test_a_terminal_that_stands_still_holds_up_neither_restarts_nor_the_end(
+    home: Home,
+) -> None:
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(writer, bytes(4096))  # until it is full
+    os.set_blocking(writer, True)
+    up = home.start("up", str(home.deployment()), stdout=writer)
+    os.close(writer)
+    async with looking_on(await robot_of(home, up)) as robot:
+        pid = (await robot.pids())["decision"]
+        os.kill(pid, signal.SIGKILL)
+        for _ in range(500):
+            if await robot.pid("decision") != pid:
+                break
+            await asyncio.sleep(0.02)
+        assert await robot.pid("decision") != pid
+        up.send(signal.SIGINT)
+        assert await up.ended() == 0
+    os.close(reader)
+    assert (up.err, home.processes()) == ("", [])
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 async def test_it_ends_cleanly_when_asked_or_when_its_terminal_has_gone(
     home: Home, number: signal.Signals
@@ -152,7 +178,8 @@ async def test_the_hosts_of_a_deployment_make_one_robot(home: Home) -> None:
     ours = (ROOT / "deploy" / "three_hosts.yaml").read_text()
     where = f"tcp/127.0.0.1:{free_port()}"
     file = home.folder / "three_hosts.yaml"
-    file.write_text(re.sub(r"router: tcp/\S+", f"router: {where}", ours))
+    here = re.sub(r"router: tcp/\S+", f"router: {where}", ours)
+    file.write_text(re.sub(r"keys: .*", "", here))  # it is on loopback
     brain = home.start("up", str(file), "--host", "brain")
     body = home.start("up", str(file), "--host", "robot")
     async with looking_on(Endpoint(connect=(where,))) as robot:

@@ -1,9 +1,14 @@
-"""Whoever watches a robot asks again when a question was lost."""
+"""Who watches a robot asks again when a question was lost, and sees when it lacks processors."""
 
 import asyncio
 
+import pytest
+
+from gigabrain_schemas.base import Cause, Pose, Velocity
+from gigabrain_schemas.body import GateMode, GateStatus, RobotState
 from gigabrain_schemas.requests import DescribeRequest, Description
-from gigabrain_schemas.topics import DESCRIBE
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.topics import DESCRIBE, SAFETY, STATE
 from gigabrain_zenoh.watch import Watch
 from tests.bus_rig import Net
 
@@ -24,3 +29,27 @@ async def test_a_process_that_comes_back_in_time_is_heard() -> None:
 
 async def test_who_never_answers_is_none() -> None:
     assert await Watch(Net().one).describe("driver", 0.15) is None
+
+
+@pytest.mark.parametrize(
+    ("mode", "cause", "warning", "held"),
+    [
+        ("idle", "stale", "cpu_busy", True),
+        ("stopping", "decision_silent", "cpu_busy", True),
+        ("enabled", "stale", "cpu_busy", False),
+        ("latched", "estop", "cpu_busy", False),
+        ("idle", "obstacle", "cpu_busy", False),
+        ("idle", "stale", "disk_low", False),
+    ],
+)
+async def test_a_brain_that_is_late_on_a_busy_machine_is_held_by_its_load(
+    mode: GateMode, cause: str, warning: str, held: bool
+) -> None:
+    net = Net()
+    watch, said = Watch(net.one), Cause(code=cause, text="why")
+    gate = GateStatus(mode=mode, causes=(said,), enables=1)
+    pose = Pose(x=0.0, y=0.0, yaw=0.0)
+    net.two.publish(STATE, RobotState(robot_type="any", pose=pose, velocity=Velocity(), gate=gate))
+    busy = Cause(code=warning, text="why")
+    net.two.publish(SAFETY, SafetyState(verdict="stop", warnings=(busy,)))
+    assert watch.held_by_load is held

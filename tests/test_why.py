@@ -9,13 +9,17 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import ranges_bytes
-from gigabrain_schemas.body import Battery, Joint, LinkHealth, RobotState
+from gigabrain_schemas.base import Cause, Velocity
+from gigabrain_schemas.body import Battery, GateStatus, Joint, LinkHealth, RobotState
 from gigabrain_schemas.brain import CmdVel, Twist
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, ReleaseRequest
 from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.tasks import Task, TaskStatus
 from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE, STATE, TELEOP
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.health import answer_to_name
+from gigabrain_zenoh.causes import estop
+from gigabrain_zenoh.health import publish_health
+from gigabrain_zenoh.name_claim import NameClaim
 from gigabrain_zenoh.tools.why import LINKS, Verdict, judge
 from gigabrain_zenoh.tools.why_facts import Facts, Watcher
 from tests.brain_in_memory import Robot
@@ -102,7 +106,7 @@ async def test_a_process_that_answers_and_says_nothing_is_told_from_one_that_is_
     async def do(robot: Robot) -> None:
         await robot.kill("perception")
         answering = asyncio.ensure_future(
-            answer_to_name(Bus(robot.network.transport(), robot.clock, "perception"))
+            NameClaim(Bus(robot.network.transport(), robot.clock, "perception")).take()
         )
         await robot.go(1)
         await answering
@@ -278,6 +282,114 @@ async def test_a_body_that_does_not_follow_is_named(tmp_path: Path) -> None:
     assert stuck.broken.text == "the body stands although it is told +0.26 m/s +0.00 rad/s"
 
 
+STANDS = Velocity()
+GOAL = Task(id="goal-3", kind="goal", label="(3.00, 1.50)", source="ann", state="active")
+WAITS = TaskStatus(current=GOAL, doing="waiting 5 s")
+DRIVES = TaskStatus(current=GOAL, doing="going to (3.00, 1.50)", drives=True)
+PAUSED = TaskStatus(current=replace(GOAL, state="paused", reason="paused by ann"))
+PRESSED = GateStatus(mode="latched", causes=(estop("ann"),))
+RELEASED = GateStatus(mode="idle")
+OPEN = GateStatus(mode="enabled", commander="control")
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Facts:
+    return asyncio.run(facts_of(tmp_path_factory.mktemp("robot")))
+
+
+def standing(
+    moving: Facts,
+    tasks: TaskStatus | None,
+    *,
+    gate: GateStatus = OPEN,
+    reason: str = "",
+    wants: Velocity = STANDS,
+    operator: bool = False,
+) -> Facts:
+    """The robot that drove, now that it stands."""
+    assert moving.state
+    assert moving.intent
+    assert moving.command
+    command = replace(moving.command, linear_x=0.0, angular_z=0.0, operator=operator)
+    return replace(
+        moving,
+        state=replace(moving.state, velocity=STANDS, gate=gate),
+        intent=replace(moving.intent, twist=wants, reason=reason),
+        command=command,
+        fastest=STANDS,
+        tasks=tasks,
+    )
+
+
+@pytest.mark.parametrize(
+    ("tasks", "operator", "waits", "act"),
+    [
+        (TaskStatus(), False, "waiting for a goal", "gigabrain goto"),
+        (WAITS, False, "goal-3: waiting 5 s", "by itself"),
+        (PAUSED, False, "goal-3 is paused: paused by ann", "gigabrain task resume goal-3"),
+        (TaskStatus(), True, "waiting for a goal", "gigabrain goto"),
+    ],
+)
+def test_a_robot_that_has_nowhere_to_go_is_not_broken(
+    moving: Facts, tasks: TaskStatus, operator: bool, waits: str, act: str
+) -> None:
+    verdict = judge(standing(moving, tasks, operator=operator))
+    assert (verdict.broken, verdict.exit_code, verdict.moves) == (None, 0, False)
+    assert all(found.ok for found in verdict.findings)
+    assert verdict.waits
+    assert (verdict.waits.link, verdict.waits.text) == ("intent", waits)
+    assert act in verdict.waits.remedy
+    control = next(found for found in verdict.findings if found.link == "control")
+    assert control.waits is operator  # it says so, and does not contradict the intent
+
+
+@pytest.mark.parametrize("tasks", [TaskStatus(), WAITS, PAUSED, DRIVES, None])
+@pytest.mark.parametrize(
+    ("gate", "text", "steps"),
+    [
+        (
+            PRESSED,
+            "it is latched: e-stop pressed by ann",
+            ("gigabrain release", "gigabrain enable"),
+        ),
+        (RELEASED, "it is idle: nobody has enabled it", ("gigabrain enable",)),
+    ],
+)
+def test_a_gate_that_is_shut_comes_before_a_brain_that_waits(
+    moving: Facts, gate: GateStatus, text: str, steps: tuple[str, ...], tasks: TaskStatus | None
+) -> None:
+    verdict = judge(standing(moving, tasks, gate=gate, reason="waiting: for whatever"))
+    assert verdict.broken
+    assert (verdict.broken.link, verdict.exit_code, verdict.broken.text) == ("gate", 18, text)
+    assert all(step in verdict.broken.remedy for step in steps)
+    assert "by itself" not in verdict.broken.remedy
+
+
+def test_a_brain_that_stands_although_it_has_a_goal_says_why(moving: Facts) -> None:
+    reason = "waiting: it is not sure where in the map it is"
+    verdict = judge(standing(moving, DRIVES, reason=reason))
+    assert verdict.broken
+    assert (verdict.broken.link, verdict.exit_code) == ("intent", 15)
+    assert verdict.broken.text == f"decision wants to stand: {reason}"
+
+
+def test_an_operator_who_keeps_the_body_from_a_goal_is_named(moving: Facts) -> None:
+    wants = Velocity(linear_x=0.2)
+    verdict = judge(standing(moving, DRIVES, wants=wants, operator=True))
+    assert verdict.broken
+    assert (verdict.broken.link, verdict.exit_code) == ("control", 16)
+    assert verdict.broken.text == "an operator holds the body; decision wants to move"
+    silent = judge(standing(moving, DRIVES, wants=wants))
+    assert silent.broken
+    assert silent.broken.text == "control sends zero although decision wants to move"
+
+
+def test_a_decision_that_is_starting_up_is_told_from_one_that_is_mute(moving: Facts) -> None:
+    starting = replace(standing(moving, TaskStatus()), intent=None)
+    assert judge(starting).waits
+    assert judge(replace(starting, tasks=None)).exit_code == 15
+
+
 async def facts_of(folder: Path) -> Facts:
     """One look at a robot that drives."""
     async with Robot(folder) as robot:
@@ -288,3 +400,14 @@ async def facts_of(folder: Path) -> Facts:
         facts = await look
         await bus.close()
     return facts
+
+
+async def test_what_a_process_cannot_do_is_told_beside_the_links(tmp_path: Path) -> None:
+    full = Cause(code="map_full", text="the map is full", remedy="map in parts")
+    async with Robot(tmp_path) as robot:
+        robot.operator.problems = (full,)
+        telling = asyncio.ensure_future(publish_health(robot.operator))
+        await robot.go(100)
+        verdict = await asked(robot)
+        telling.cancel()
+    assert "warning: the map is full (map in parts)" in verdict.notes

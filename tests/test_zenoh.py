@@ -28,6 +28,8 @@ from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.bus_rig import until
 from tests.zenoh_rig import Ear, Robot, repeat, robot
 
+pytestmark = pytest.mark.system
+
 REPLY = GateReply(ok=True, text="stopped", robot_type="mock", gate=GateStatus())
 
 

@@ -16,6 +16,8 @@ from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.bus_rig import until
 from tests.zenoh_rig import Ear, free_endpoint, repeat, robot, router_process, under_way
 
+pytestmark = pytest.mark.system
+
 
 def client_of(endpoint: str) -> Awaitable[ZenohTransport]:
     return ZenohTransport.open(Endpoint(connect=(endpoint,)))

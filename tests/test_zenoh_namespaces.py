@@ -11,6 +11,8 @@ from gigabrain_zenoh.clock import Clock
 from tests.bus_rig import until
 from tests.zenoh_rig import Ear, Robot, repeat, robot
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture
 async def net() -> AsyncIterator[Robot]:

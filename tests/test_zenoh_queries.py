@@ -12,6 +12,8 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.zenoh_rig import Robot, robot
 
+pytestmark = pytest.mark.system
+
 
 @pytest.fixture
 async def net() -> AsyncIterator[Robot]:

@@ -9,6 +9,7 @@ import logging
 from msgspec.structs import replace
 
 from gigabrain_drivers.base import Driver
+from gigabrain_drivers.device_clock import DeviceClock, EchoClock
 from gigabrain_drivers.kinematics import Twist
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.legs.geometry import JOINT_NAMES, LegGeometry
@@ -35,6 +36,7 @@ SENSELESS = "nothing that makes sense comes: is this the right port?"
 SILENT_NS = 100_000_000  # without a state, and the body counts as lost
 LAST_WORD_NS = 10_000_000  # for the last command to arrive before the connection is closed
 MILLISECONDS = 1 << 32  # after which the firmware's clock begins anew
+USUAL_MS = 30.0  # from a command to the state that echoes it
 
 
 class AlphaOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -64,6 +66,7 @@ class AlphaDriver(Driver):
         self._last: tuple[int, int] | None = None  # sequence and milliseconds of the newest state
         self._state: State | None = None
         self._hearing = Hearing(self.link, self._clock, SILENT_NS, SENSELESS, log)
+        self._stamps, self._echoes = DeviceClock(MILLISECONDS), EchoClock(USUAL_MS)
         self._untold = False  # whether a loss has not been reported yet
         self._open = self._parked = False
         self._fall = Fault(log)
@@ -147,6 +150,7 @@ class AlphaDriver(Driver):
 
     def _next(self) -> int:
         self._sequence = (self._sequence + 1) % alpha.SEQUENCES
+        self._echoes.sent(self._sequence, self._clock.now_ns())
         return self._sequence
 
     def _opened(self) -> None:
@@ -175,6 +179,9 @@ class AlphaDriver(Driver):
             self._last = last
             return
         first, self._state = self._hearing.hear(), state
+        now_ns = self._clock.now_ns()
+        self._stamps.arrived(state.milliseconds, now_ns)
+        self._echoes.echoed(state.echo, now_ns)
         if last:
             passed = (state.milliseconds - last[1]) % MILLISECONDS
             self._odometry.update(state.senses, passed / 1000)
@@ -201,7 +208,8 @@ class AlphaDriver(Driver):
         """
         alive = self._hearing.alive()
         told, self._untold = not self._untold, False
-        return replace(self.link.health, connected=alive and told)
+        late_ms = max(self._stamps.late_ms, self._echoes.late_ms)
+        return replace(self.link.health, connected=alive and told, late_ms=late_ms)
 
 
 def _with(state: RobotState, now: State) -> RobotState:

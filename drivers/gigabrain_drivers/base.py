@@ -52,8 +52,10 @@ class Driver(abc.ABC):
         return self
 
     async def __aexit__(self, *_: object) -> None:
-        await self.make_safe()
-        await self.close()
+        try:
+            await self.make_safe()
+        finally:  # it may be cancelled
+            await self.close()
 
     @abc.abstractmethod
     async def open(self) -> None:

@@ -1,7 +1,6 @@
 """An e-stop button on a USB-serial adapter: a normally closed contact between its TX and RX."""
 
 import asyncio
-import contextlib
 import logging
 from collections.abc import Callable
 
@@ -39,14 +38,12 @@ class Button:
     async def run(self, ready: Callable[[], None]) -> None:
         """Until cancelled."""
         self._link.open()
-        pressing = asyncio.create_task(self._press())
         ready()
         try:
-            await self._watch()
+            async with asyncio.TaskGroup() as tasks:  # an error in either ends both
+                tasks.create_task(self._press())
+                await self._watch()
         finally:
-            pressing.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await pressing
             await self._link.close()
 
     async def _watch(self) -> None:

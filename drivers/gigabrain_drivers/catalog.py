@@ -75,9 +75,9 @@ def ports_folder(name: str) -> Path:
 
 
 def links_of(robot: RobotFile) -> list[LinkName]:
-    """By which links a robot can be reached; what is real and simulated can be emulated."""
+    """By which links a robot can be reached; what is real and has physics can be emulated."""
     known = {name for name in LINKS if getattr(robot, name) is not None}
-    if {"sim", "real"} <= known:
+    if robot.real is not None and (robot.sim or {}).get("driver") == "mujoco":
         known.add("emulated")
     return [name for name in LINKS if name in known]
 
@@ -108,7 +108,10 @@ def driver_class(name: str) -> type[Driver]:
                 "install it with: pip install 'gigabrain-zenoh[sim]'"
             ) from None
     if name in offered:
-        return cast("type[Driver]", offered[name].load())
+        try:
+            return cast("type[Driver]", offered[name].load())
+        except (ImportError, AttributeError) as error:
+            raise ConfigError(f"driver {name!r} of {offered[name].value}: {error}") from None
     raise unknown("driver", name, {**DRIVERS, **offered})
 
 

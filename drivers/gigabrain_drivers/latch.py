@@ -1,6 +1,5 @@
 """What latched the gate, on disk: it survives a restart, and is there before anybody is told."""
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +7,7 @@ import msgspec
 from msgspec import Meta
 
 from gigabrain_schemas.base import Cause
+from gigabrain_zenoh.atomic_write import make_folder, replace_file
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
 
@@ -39,7 +39,7 @@ class LatchFile:
         Raises ConfigError when the folder cannot be written.
         """
         try:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self._folder)
             found = msgspec.json.decode(self._path.read_bytes(), type=Latched)
         except FileNotFoundError:
             found = Latched()
@@ -62,13 +62,8 @@ class LatchFile:
         """On disk when this returns. Raises ConfigError when the folder cannot be written."""
         if latched == self._written and self._path.exists():
             return
-        fresh = self._path.with_suffix(".new")
         try:
-            with fresh.open("wb") as file:
-                file.write(msgspec.json.encode(latched))
-                file.flush()
-                os.fsync(file.fileno())
-            fresh.replace(self._path)
+            replace_file(self._path, msgspec.json.encode(latched))
         except OSError as error:
             raise ConfigError(_unwritable(self._folder, error)) from None
         self._written = latched

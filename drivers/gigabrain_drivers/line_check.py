@@ -25,6 +25,11 @@ def check(options: LineOptions, robot: RobotFile) -> None:
     _check_steps(command, robot, base)
     _check_odometry(state, base)
     _check_motion(state, robot, base)
+    if robot.lidar and options.scan is None:
+        raise ValueError(
+            "scan: `lidar` says that the body has one; expected where its scans come from, such "
+            "as {driver: ld19, port: usb:10c4:ea60}, or no `lidar`"
+        )
 
 
 def speeds_of(base: Base) -> tuple[str, ...]:

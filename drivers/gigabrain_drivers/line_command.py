@@ -17,8 +17,9 @@ class LineCommand:
         self._by_wheels = any(name.startswith(WHEEL) for name in template.names)
 
     def line(self, wanted: Velocity, seq: int) -> bytes:
-        """The line that asks for a velocity."""
-        return self.template.encode({**self._values(wanted), "seq": float(seq)})
+        """The line that asks for a velocity, rounded so that no limit is exceeded."""
+        values = {**self._values(wanted), "seq": float(seq)}
+        return self.template.encode(values, toward_zero=True)
 
     def sent(self, wanted: Velocity) -> Velocity:
         """What is left of a velocity after it was written with the line's digits."""

@@ -8,7 +8,7 @@ from gigabrain_zenoh.ages import REPEAT_TICKS
 from gigabrain_zenoh.causes import BRAIN_SILENT
 from gigabrain_zenoh.gate import BRAIN
 
-PATIENCE_S = 0.15  # of wall time per tick
+TIMEOUT_S = 0.15  # of wall time per tick
 REPEAT_S = 0.1  # how often the first tick is announced until the brain is there
 
 
@@ -24,9 +24,10 @@ class Lockstep:
     part had answered already, and when it hears the next answer would be left to chance.
     """
 
-    def __init__(self, period_ticks: int = 1) -> None:
+    def __init__(self, period_ticks: int = 1, timeout_s: float = TIMEOUT_S) -> None:
+        self._timeout_s = timeout_s
         self._period = period_ticks  # from one command of control to the next
-        self._tick = self._basis = 0
+        self._tick = self._basis = self._newest = 0
         self._echo = self._echo_basis = self._judged = 0
         self._seen = self._wanted = 0  # the tick that safety has seen, and the one it must have
         self._wake = asyncio.Event()
@@ -34,12 +35,17 @@ class Lockstep:
 
     def begin(self, tick: int, basis: int) -> None:
         """A tick has been sent out; `basis` is the tick of the newest scan, or 0."""
-        self._tick, self._basis = tick - tick % self._period, basis
+        self._tick, self._basis, self._newest = tick - tick % self._period, basis, tick
         self._wanted = tick - REPEAT_TICKS + 1  # it need not say the same in every tick
         self._wake.clear()
 
     def command(self, command: CmdVel) -> None:
-        """A command has come. One without a basis comes from somebody who needs no scan."""
+        """A command has come. One without a basis comes from somebody who needs no scan.
+
+        One that echoes a tick that has not been sent out yet answers nothing.
+        """
+        if max(command.tick, command.basis) > self._newest:
+            return
         self._echo = max(self._echo, command.tick)
         basis = command.basis if command.source == BRAIN else command.tick
         self._echo_basis = max(self._echo_basis, basis)
@@ -47,7 +53,8 @@ class Lockstep:
 
     def verdict(self, verdict: SafetyState) -> None:
         """Safety has spoken."""
-        if any(cause.code in BRAIN_SILENT for cause in verdict.causes):
+        silent = any(cause.code in BRAIN_SILENT for cause in verdict.causes)
+        if silent or max(verdict.tick, verdict.basis) > self._newest:
             return
         self._judged = max(self._judged, verdict.basis)
         self._seen = max(self._seen, verdict.tick)
@@ -72,5 +79,5 @@ class Lockstep:
 
     async def answered(self) -> None:
         """Wait as long as a tick waits, and count where that was in vain."""
-        if not await self.wait(PATIENCE_S):
+        if not await self.wait(self._timeout_s):
             self.timeouts += 1

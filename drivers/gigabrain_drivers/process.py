@@ -11,12 +11,14 @@ from msgspec.structs import replace
 from gigabrain_drivers.base import Driver
 from gigabrain_drivers.button_watch import ButtonWatch
 from gigabrain_drivers.catalog import make_driver, ports_folder
+from gigabrain_drivers.clip import clipped
 from gigabrain_drivers.gatekeeper import Gatekeeper
 from gigabrain_drivers.links.wording import of_command
 from gigabrain_drivers.lockstep import REPEAT_S, Lockstep
 from gigabrain_drivers.raw_speeds import not_finite
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.round_trip import RoundTrip
+from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import Body, RobotState, SafeState
 from gigabrain_schemas.brain import CmdVel, JointCommand
@@ -35,6 +37,7 @@ from gigabrain_zenoh import gate
 from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.heartbeat import Progress
 from gigabrain_zenoh.limits import ZERO, limits_of
 from gigabrain_zenoh.settings import DriverConfig
 
@@ -61,13 +64,16 @@ class DriverProcess:
         )
         press = self._gatekeeper.press
         self._button = ButtonWatch(bus, press) if config.button else None
-        self._lockstep = Lockstep(robot.control.period_ticks) if driver.lockstep else None
+        wait_s = config.lockstep_timeout_s
+        self._lockstep = Lockstep(robot.control.period_ticks, wait_s) if driver.lockstep else None
         self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
         self._round_trip = RoundTrip()
         self._line = asyncio.Lock()  # one call at a time goes out to the body
+        self._sent = ZERO  # what it was told last
+        self._body_tick = 0  # when BODY was last published
         driver.emit = self._emit
         bus.report = self.report
-        bus.progress = lambda: self._gate.tick
+        bus.progress = Progress(self._time_goes_on, lambda: bus.sent[STATE.key])
 
     async def run(self, ready: Callable[[], None]) -> None:
         """Serve the body until cancelled; it is safe when this ends, however it ends."""
@@ -100,7 +106,6 @@ class DriverProcess:
         """Between two ticks as well: a command need not wait for anybody's period."""
         while True:
             await self._wake.wait()
-            self._wake.clear()
             await self._obey()
 
     def report(self) -> Mapping[str, float | int | str | None]:
@@ -112,9 +117,15 @@ class DriverProcess:
         }
         return {**self._driver.report(), **self._round_trip.report(), **figures}
 
+    def _time_goes_on(self) -> tuple[object, ...]:
+        """The body's time, which is to go on until a simulation is over."""
+        return () if self._driver.finished else (self._bus.clock.now_ns(),)
+
     async def _tick(self, passed: int) -> None:
         """20 ms of the body's time, or several where the process was held up."""
-        state = await self._driver.read_state()
+        state = clipped(await self._driver.read_state())
+        if self._wake.is_set():
+            await self._obey()  # the gate goes on from what the body has been told
         button = self._button.faults() if self._button else ()
         faults = button if state.link.connected else (why.LINK_LOST, *button)
         self._gatekeeper.ticks(passed, gate.Tick(state.velocity, self._wall_ns(), faults))
@@ -127,6 +138,7 @@ class DriverProcess:
 
     def _emit(self, topic: Topic[Any], message: Message) -> None:
         """A sensor has something: it waits for nobody's period, unless time waits for the brain."""
+        message = clipped(message)
         if self._lockstep or not self._gate.tick:
             self._sensors.append((topic, message))
         else:
@@ -140,11 +152,13 @@ class DriverProcess:
 
     def _announce(self, state: RobotState) -> None:
         bus, tick = self._bus, self._gate.tick
-        bus.publish(STATE, replace(state, gate=gate.status(self._gate)), basis=tick)
+        state = replace(state, gate=gate.status(self._gate), sent=self._sent)
+        bus.publish(STATE, state, basis=tick)
         for topic, message in self._sensors:
             self._send(topic, message)
         self._sensors.clear()
-        if tick % BODY_EVERY_TICKS == 0:
+        if tick - self._body_tick >= BODY_EVERY_TICKS:
+            self._body_tick = tick
             bus.publish(BODY, self._body)
             self._measure()
 
@@ -176,12 +190,15 @@ class DriverProcess:
     async def _obey(self) -> None:
         """Have the body do what the gate lets through."""
         async with self._line:
+            self._wake.clear()
             now = self._gate
             if now.mode == "latched":
+                self._sent = ZERO
                 await self._driver.stop()
                 return
             to = now.output
             sent = await self._driver.set_base_velocity(to.linear_x, to.linear_y, to.angular_z)
+            self._sent = sent
             if log.isEnabledFor(logging.DEBUG):
                 log.debug("%s", of_command(to, sent))
         if now.mode == "enabled" and now.command and to != ZERO:
@@ -231,6 +248,8 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
         raise ConfigError(f"link {config.link!r} runs in real time; --speed is for simulation")
     if config.link == "real" and config.resume == "auto":
         raise ConfigError("resume: auto is for simulation; a real body is enabled by a person")
+    if config.link != "real":
+        load_world(config.world, config.seed)  # a mock takes any, and would hide a wrong one
     where = Run(
         folder=Path(),
         link=config.link,

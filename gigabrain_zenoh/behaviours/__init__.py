@@ -1,8 +1,8 @@
 """What decision can do. Adding a behaviour means a module and a line in BEHAVIOURS."""
 
 import importlib
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol, cast
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, ClassVar, Protocol, cast
 
 import msgspec
 
@@ -35,7 +35,14 @@ def must_charge(verdict: SafetyState | None) -> bool:
 class Behaviour(Protocol):
     """Turns one situation after the other into intents. It keeps its own memory, and no clock."""
 
+    SETTINGS: ClassVar[frozenset[str]]  # the fields of DecisionConfig that it goes by
+    PARAMS: ClassVar[Mapping[str, str]]  # those that may change while it runs: what is expected
+
     def __init__(self, config: DecisionConfig) -> None: ...
+
+    def configure(self, config: DecisionConfig) -> None:
+        """Go by other settings from now on, and keep what it remembers."""
+        ...
 
     def step(self, situation: Situation) -> Intent:
         """What to do now."""
@@ -63,6 +70,11 @@ class Senses(Protocol):
         """Take note of what the behaviour has made of it."""
         ...
 
+    @property
+    def hung(self) -> bool:
+        """Whether a part of it never ends, while the rest goes on."""
+        ...
+
     async def close(self) -> None:
         """Once all is written down."""
         ...
@@ -86,6 +98,11 @@ class Plain:
     def heed(self, behaviour: Behaviour) -> None:
         """Nothing to note."""
 
+    @property
+    def hung(self) -> bool:
+        """It has no parts."""
+        return False
+
     async def close(self) -> None:
         """Nothing to write."""
 
@@ -98,6 +115,9 @@ BEHAVIOURS = {
 SENSES = {"navigate": "gigabrain_zenoh.navigating:Navigating"}  # of those that need more
 
 
+OF_ALL = frozenset({"behaviour", "state_dir"})  # settings that hold for every behaviour
+
+
 def check(name: str) -> None:
     """Raises UnknownName where there is no behaviour called `name`, listing the known ones."""
     if name not in BEHAVIOURS:
@@ -108,6 +128,17 @@ def load(name: str) -> type[Behaviour]:
     """The behaviour called `name`. Raises UnknownName listing the known ones, and ConfigError."""
     check(name)
     return cast("type[Behaviour]", _find(name, BEHAVIOURS[name]))
+
+
+def unread(config: DecisionConfig) -> tuple[str, ...]:
+    """The settings that differ from their defaults and that the behaviour does not read."""
+    read = load(config.behaviour).SETTINGS | OF_ALL
+    plain = DecisionConfig()
+    return tuple(
+        name
+        for name in DecisionConfig.__struct_fields__
+        if name not in read and getattr(config, name) != getattr(plain, name)
+    )
 
 
 def senses(config: DecisionConfig, bus: Bus) -> Senses:

@@ -2,6 +2,7 @@
 
 import math
 from functools import lru_cache
+from typing import ClassVar
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import Intent, TrajectoryPoint, WorldModel
@@ -16,12 +17,23 @@ TURN_RAD = math.pi / 2  # how far a turn is expected to go
 class Avoid:
     """The simplest behaviour that keeps a robot moving and whole."""
 
+    SETTINGS = frozenset({"turn", "linear_speed", "angular_speed"})
+    PARAMS: ClassVar = {
+        "linear_speed": "a number above 0, up to 10 [m/s]; the body's own limit holds as well",
+        "angular_speed": "a number above 0, up to 10 [rad/s]; the body's own limit holds as well",
+        "turn": "one of: right, left, clearer",
+    }
+
     def __init__(self, config: DecisionConfig) -> None:
         self._config = config
         self._doing = "waiting"
         self._began = Pose(x=0.0, y=0.0, yaw=0.0)
         self._expected = 1.0  # [m] straight on, [rad] turning
         self._progress = 0.0
+
+    def configure(self, config: DecisionConfig) -> None:
+        """Go by other settings; a turn once begun keeps its side."""
+        self._config = config
 
     def step(self, situation: Situation) -> Intent:
         """What to do now, with the reason in words."""

@@ -45,6 +45,8 @@ class Bearings:
     sent: tuple[Sent, ...]
     order: Order | None
     route: Route | None  # for that order, once there is one
+    waits: str = ""  # what it waits for, where there is no order, in words
+    held: str = ""  # why the body does not follow decision now, in words: the gate, an operator
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,3 +56,4 @@ class Driven:
     version: int
     arrived: bool = False
     blocked: bool = False  # another way is wanted
+    reason: str = ""  # what the local planner did, in words

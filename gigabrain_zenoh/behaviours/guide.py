@@ -14,17 +14,21 @@ from gigabrain_zenoh.behaviours.aside import Courtesy
 from gigabrain_zenoh.behaviours.bearings import Driven, Floats, Route
 from gigabrain_zenoh.behaviours.beyond import widened
 from gigabrain_zenoh.behaviours.progress import THERE_M, Progress
+from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.navigation.costmap import Costmap, Unknown, costmap, inflation
 from gigabrain_zenoh.navigation.frontiers import frontiers
+from gigabrain_zenoh.navigation.moment import LocalSettings
 from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable
 from gigabrain_zenoh.tasks.orders import GoTo, Order, Visit
 
 GIVE_UP_TICKS = 1500  # 30 s of driving without coming any nearer
+NO_PROGRESS = "no progress for 30 s"
 LEAVE_TICKS = 500  # 10 s, for a place that is only to be looked at
 REMEMBERED_TICKS = 500  # 10 s, that what was in the way stays in the plans
 MUCH_BETTER_M = 1.5  # so much better has another frontier to be, or it goes to and fro
 OPEN, FAR_M = 2.0, 1.5  # cost of a place worth visiting, and the way there at least [m]
 SURE_TICKS = 125  # 2.5 s: the map comes once a second
+ARRIVED_M = LocalSettings().position_tolerance  # so near a goal the robot has arrived
 BESIDE_M = 0.25  # so near will do, for a goal that was free when it was asked for: maps shift
 TAKEN_TICKS = 500  # 10 s without coming nearer to a goal where something is
 SAME_M = 0.6  # a frontier so near is the same one: it moves as the map grows
@@ -35,13 +39,14 @@ class Asked:
     """What a route is wanted for."""
 
     tick: int
-    driving: bool  # the gate lets it drive
     order: Order
     here: Pose  # in the map
     grid: OccupancyGrid
     body: BodyDescription
     driven: Driven | None  # what became of the last route
     seen: Floats  # (n, 2) [m], what is round the robot now, in the map
+    held_ticks: int = 0  # since the last route: the body did not follow decision, or had to wait
+    slowed_by: str = ""  # what safety says holds it back, in words
 
 
 class Guide:
@@ -72,13 +77,17 @@ class Guide:
         return self._onward(asked, chart)
 
     def check(self, grid: OccupancyGrid, body: BodyDescription, here: Pose, goal: Goal) -> str:
-        """The way to a goal in words; `no: …` where there is none."""
+        """The way to a goal in words. Raises Refused, and why, where there is none."""
         room = self._with_room(grid, goal)
         chart = costmap(room, inflation(body, self._unknown), before=None)
-        found = Planner().plan(chart, (here.x, here.y), (goal.x, goal.y))
+        start, planner = (here.x, here.y), Planner()
+        found, beside = planner.plan(chart, start, (goal.x, goal.y)), ""
+        if isinstance(found, Unreachable) and found.nearest and found.distance <= ARRIVED_M:
+            beside = f"; {_beside(found)}"
+            found = planner.plan(chart, start, found.nearest)
         if isinstance(found, Unreachable):
-            return f"no: {found.reason}"
-        return f"on the way, {found.remaining[0]:.1f} m"
+            raise Refused(found.reason)
+        return f"on the way, {found.remaining[0]:.1f} m{beside}"
 
     def _with_room(self, grid: OccupancyGrid, goal: Goal) -> OccupancyGrid:
         """The map to look for a goal in: one who may go anywhere may also leave the map."""
@@ -91,6 +100,7 @@ class Guide:
         self._goal: Goal | None = None
         self._settled: tuple[Goal, str] | None = None  # where it is to stay near its goal, and why
         self._been: list[tuple[float, float]] = []
+        self._doing = ""  # what the local planner did last, in words
         self._progress, self._last_tick = Progress(tick), tick
         self._open_tick = tick  # when there was something left to be seen
         self._version += 1
@@ -99,9 +109,9 @@ class Guide:
     def _note(self, asked: Asked) -> None:
         """Take note of what became of the last route."""
         driven = asked.driven
-        if not asked.driving:  # whoever is held back by the gate is not stuck
-            self._progress.hold(max(0, asked.tick - self._last_tick))
-        self._last_tick = asked.tick
+        passed, self._last_tick = max(0, asked.tick - self._last_tick), asked.tick
+        self._progress.hold(min(asked.held_ticks, passed))  # whoever is held back is not stuck
+        self._doing = driven.reason if driven else self._doing
         if driven and driven.blocked and driven.version == self._version:
             self._in_the_way, self._in_the_way_tick = asked.seen, asked.tick
         elif asked.tick - self._in_the_way_tick > REMEMBERED_TICKS:
@@ -125,10 +135,9 @@ class Guide:
         room = None if first else self._making_room(goal, asked, chart)
         if room:
             return room
-        if isinstance(found, Unreachable) and not first and found.distance <= BESIDE_M:
-            assert found.nearest
-            fault = found.reason.partition(";")[0]
-            beside = f"{found.distance:.1f} m beside what was asked for: {fault}"
+        near = ARRIVED_M if first else BESIDE_M
+        if isinstance(found, Unreachable) and found.nearest and found.distance <= near:
+            beside = _beside(found)
             goal = Goal(x=found.nearest[0], y=found.nearest[1], yaw=goal.yaw)
             found = self._planner.plan(chart, (asked.here.x, asked.here.y), found.nearest)
         if isinstance(found, Unreachable):
@@ -141,8 +150,8 @@ class Guide:
         self._progress.measure(float(found.remaining[0]), asked.tick)
         if self._progress.stuck(asked.tick, GIVE_UP_TICKS):
             if not self._settles(wanted, asked):
-                left = f"{found.remaining[0]:.1f} m before the goal"
-                return self._ended("failed", f"no nearer for 30 s, {left}: something is in the way")
+                left = f"{found.remaining[0]:.2f} m from the goal"
+                return self._ended("failed", f"gave up: {NO_PROGRESS}, {left}{self._why(asked)}")
             return self._to(wanted, asked, chart)
         return self._going(goal, found, beside)
 
@@ -152,10 +161,15 @@ class Guide:
         off = math.hypot(goal.x - x, goal.y - y)
         if self._settled or not THERE_M < off <= BESIDE_M:
             return False
-        why = f"{off:.1f} m beside what was asked for: something is in the way"
+        why = f"{off:.2f} m beside what was asked for: {NO_PROGRESS}{self._why(asked)}"
         self._settled, self._progress = (Goal(x=x, y=y, yaw=goal.yaw), why), Progress(asked.tick)
         self._version += 1
         return True
+
+    def _why(self, asked: Asked) -> str:
+        """What is known of why it makes no progress."""
+        why = asked.slowed_by or self._doing
+        return f" ({why})" if why else ""
 
     def _making_room(self, goal: Goal, asked: Asked, chart: Costmap) -> Route | None:
         """Out of the way of whoever stands at the goal, and may wait for the robot to leave."""
@@ -261,3 +275,9 @@ class Guide:
 
     def _ended(self, state: Literal["done", "failed"], reason: str) -> Route:
         return Route(number=self._number, version=self._version, state=state, reason=reason)
+
+
+def _beside(found: Unreachable) -> str:
+    """How far from its goal the robot goes instead, and why."""
+    fault = found.reason.partition(";")[0]
+    return f"{found.distance:.2f} m beside what was asked for: {fault}"

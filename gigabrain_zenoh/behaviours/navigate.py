@@ -1,6 +1,7 @@
 """Be where it is wanted: along a way through the map, round whatever is near."""
 
 import math
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,13 +14,18 @@ from gigabrain_zenoh.behaviours.bearings import Bearings, Driven, Floats, Route
 from gigabrain_zenoh.navigation import local
 from gigabrain_zenoh.planar import compose, inverse
 from gigabrain_zenoh.settings import DecisionConfig
-from gigabrain_zenoh.tasks.orders import Explore, Order, Outcome, where
+from gigabrain_zenoh.tasks.orders import Explore, GoTo, Order, Outcome, where
 
 TOO_LATE_TICKS = 10  # a scan so old is not to be driven by
 
 
 class Navigate:
     """Drives along a route. Without an order, or where anything is uncertain, it stands."""
+
+    SETTINGS = frozenset({"speed_limit", "unknown", "samples", "begin", "scripts"})
+    PARAMS: ClassVar = {
+        "speed_limit": "a number above 0, up to 10 [m/s], or null for the body's own limit alone",
+    }
 
     def __init__(self, config: DecisionConfig) -> None:
         self._config = config
@@ -29,6 +35,12 @@ class Navigate:
         self._number = 0
         self.outcome: Outcome | None = None  # of the order, as of the last step
         self.driven: Driven | None = None
+
+    def configure(self, config: DecisionConfig) -> None:
+        """Go by another speed limit; what the local planner has seen and planned is kept."""
+        self._config = config
+        if self._planner:
+            self._planner.limit_speed(config.speed_limit)
 
     def step(self, situation: Situation) -> Intent:
         """What to do now, with the reason in words."""
@@ -40,13 +52,18 @@ class Navigate:
             return self._wait(order, why)
         route = bearings.route
         if order is None:
-            return _stand("waiting: for a goal")
+            return _stand(bearings.waits)
         if route is None or route.number != order.number:
             return self._wait(order, "waiting: for a way through the map")
         if order.number != self._number:
             self._number, self._longest = order.number, 0.0
         if route.goal is None or route.points is None:
-            self.outcome = Outcome(number=order.number, state=route.state, reason=route.reason)
+            assert bearings.map_from_odom
+            off, turned = _errors(order, compose(bearings.map_from_odom, situation.pose))
+            self.outcome = Outcome(
+                number=order.number, state=route.state, reason=route.reason,
+                position_error=off, heading_error=turned,
+            )  # fmt: skip
             return _stand(f"waiting: {route.reason}")
         return self._drive(situation.pose, world, bearings, route)
 
@@ -95,21 +112,27 @@ class Navigate:
         assert route.goal
         assert route.points is not None
         order, goal = bearings.order, route.goal
+        off, turned = _errors(order, here)
         left = _ahead(route.points, here)
         distance = float(np.hypot(*np.diff(left, axis=0).T).sum())
         self._longest = max(self._longest, distance, 1e-6)
-        self.driven = Driven(version=route.version, arrived=plan.arrived, blocked=plan.blocked)
+        self.driven = Driven(
+            version=route.version, arrived=plan.arrived, blocked=plan.blocked, reason=plan.reason
+        )  # fmt: skip
         arrived = plan.arrived and not isinstance(order, Explore) and not route.aside
         speed = min(self._config.speed_limit or math.inf, bearings.body.max_linear_speed)
         self.outcome = Outcome(
             number=order.number,
             state="done" if arrived else "running",
-            reason=_at(route, goal) if arrived else plan.reason,
+            reason=_at(route, goal) if arrived else bearings.held or plan.reason,
+            held=bool(bearings.held),
             progress=1.0 if arrived else 1.0 - min(1.0, distance / self._longest),
             distance=distance,
             eta=distance / speed,
             goal=goal,
             path=_thinned(left),
+            position_error=off,
+            heading_error=turned,
         )
 
     def _planner_for(self, bearings: Bearings) -> local.LocalPlanner:
@@ -140,6 +163,15 @@ def _why_not(situation: Situation) -> str:
         late_s = bearings.late_ticks * 0.02
         return f"waiting: this host is too busy, its newest scan is {late_s:.2f} s old"
     return ""
+
+
+def _errors(order: Order, here: Pose) -> tuple[float | None, float | None]:
+    """How far from its goal [m], and from the heading wanted there [rad], the robot is."""
+    if not isinstance(order, GoTo):
+        return None, None
+    goal = order.goal
+    turned = None if goal.yaw is None else abs(math.remainder(goal.yaw - here.yaw, math.tau))
+    return math.hypot(goal.x - here.x, goal.y - here.y), turned
 
 
 def _headline(order: Order | None, route: Route) -> str:

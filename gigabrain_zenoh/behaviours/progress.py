@@ -19,9 +19,14 @@ class Progress:
         self._since = tick  # it has come no nearer
         self._record = self._nearest = self._left = math.inf  # [m]: ever, on this way, and now
         self._times = 0
+        self._was_held = False
 
     def measure(self, left: float, tick: int) -> None:
         """So much of the way [m] is left now."""
+        if self._was_held and left > self._left:  # an operator has driven it away meanwhile
+            self._nearest += left - self._left
+            self._record += left - self._left
+        self._was_held = False
         if left < self._record - NEARER_M:
             self._record, self._times = left, 0
         detour, there = left > self._left + DETOUR_M, left <= THERE_M < self._left
@@ -32,8 +37,9 @@ class Progress:
             self._nearest, self._since = left, tick
 
     def hold(self, ticks: int) -> None:
-        """So long it was not allowed to drive."""
+        """Leave out so many ticks, in which the robot could not follow the route."""
         self._since += ticks
+        self._was_held = self._was_held or ticks > 0
 
     def stuck(self, tick: int, ticks: int) -> bool:
         """Whether it has come no nearer for more than so many ticks."""

@@ -14,6 +14,7 @@ from msgspec import Struct
 
 from gigabrain_zenoh.bench.goals_sender import Failure, Off, Sender
 from gigabrain_zenoh.bench.group import client, running
+from gigabrain_zenoh.bench.growth import Growth
 from gigabrain_zenoh.bench.runs import LOOPBACK
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.navigation.planner import warm_up
@@ -31,6 +32,7 @@ class Course(Struct, frozen=True, kw_only=True):
 
     goals: int
     meetings: int = 0  # it is sent on until it has met the person so often
+    hours: float = 0.0  # and for so long, of the robot's time
     speed: float = 5.0
     seed: int = 0
     logs: Path | None = None  # where the processes' logs are kept
@@ -55,6 +57,7 @@ class GoalFigures(Struct, frozen=True, kw_only=True):
     seconds: float  # of the robot's time, in all
     alone: int  # ticks that went on without the brain, on a host too busy for the speed
     failures: tuple[Failure, ...]
+    growth: Growth  # of perception
 
     @property
     def worst_m(self) -> float:
@@ -130,10 +133,10 @@ async def _run(deployment: Deployment, course: Course, say: Say) -> GoalFigures:
             say(f"{name}: exploring")
             explored = await sender.explore()
             explored_s = sender.seconds
-            while not await sender.done(course.goals, course.meetings):
+            while not await sender.done(course.goals, course.meetings, course.hours):
                 await sender.send()
                 say(f"{name}: {sender.reached} of {sender.sent} reached")
-            report = await sender.report()
+            report, growth = await sender.report(), sender.growth()
     return GoalFigures(
         body=deployment.body,
         world=deployment.world,
@@ -151,6 +154,7 @@ async def _run(deployment: Deployment, course: Course, say: Say) -> GoalFigures:
         seconds=report["sim_seconds"],
         alone=int(report["lockstep_timeouts"]),
         failures=tuple(sender.failures),
+        growth=growth,
     )
 
 

@@ -11,7 +11,8 @@ from msgspec import Struct
 from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.topics import BODY, MAP, POSE, STATE
-from gigabrain_zenoh.bench.group import Group, driver_report
+from gigabrain_zenoh.bench.group import Group, driver_report, rss_bytes
+from gigabrain_zenoh.bench.growth import Growth, Watch
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.navigation.costmap import costmap, inflation
@@ -62,6 +63,7 @@ class Sender:
         bus.latest(STATE)  # which start of the driver all else has to be of
         self._random, self._search = np.random.default_rng(seed), Search()
         self._world_from_map: Pose | None = None
+        self._watch = Watch()
         self.sent = self.reached = 0
         self.accepted_s = 0.0  # when, by the host's clock, the first task was
         self.failures: list[Failure] = []
@@ -104,11 +106,22 @@ class Sender:
         else:
             self.reached += 1
 
-    async def done(self, goals: int, meetings: int) -> bool:
-        """Whether it was sent often enough, and has met the person often enough."""
-        if self.sent < goals:
+    async def done(self, goals: int, meetings: int, hours: float) -> bool:
+        """Whether it was sent often and long enough, and has met the person often enough."""
+        if self.sent < goals or self.seconds < hours * 3600:
             return False
         return not meetings or (await self.report())["person_stood"] >= meetings
+
+    def growth(self) -> Growth:
+        """What perception's memory and map have come to."""
+        assert self._maps.current
+        return self._watch.growth(self._maps.current)
+
+    def _sample(self) -> None:
+        """Take a sample of perception each minute of the robot's time."""
+        pid, grid = self._group.supervisor.statuses["perception"].pid, self._maps.current
+        if pid and grid and self.seconds >= (self._watch.minutes + 1) * 60:
+            self._watch.minute(rss_bytes(pid), grid)
 
     async def report(self) -> dict[str, float]:
         """The simulation's truth so far. Raises GigabrainError where it does not come."""
@@ -191,6 +204,7 @@ class Sender:
         try:
             while not waiting.done():
                 await self._group.look()
+                self._sample()
             return await waiting
         finally:
             waiting.cancel()

@@ -90,6 +90,15 @@ def cpu_s(pid: int) -> float:
     return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
+def rss_bytes(pid: int) -> int:
+    """Memory that a process holds, from proc(5); 0 where there is none."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except OSError:
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
 @asynccontextmanager
 async def starting(specs: Sequence[ProcessSpec]) -> AsyncIterator[Group]:
     """Run `specs` while the block lasts, which begins with their start; none is left after it."""

@@ -2,8 +2,9 @@
 
     source ──scan──► first ──world──► second ──intent──► third ──cmd──► source
 
-A callback puts straight away: no asyncio, no decoding, no work. Started as
-`python -m gigabrain_zenoh.bench.relay ROLE`, with a Role in JSON.
+A callback puts straight away: no asyncio, no decoding, no work. Each has the Zenoh threads and the
+niceness of the process that it stands for. Started as `python -m gigabrain_zenoh.bench.relay ROLE`,
+with a Role in JSON.
 """
 
 import json
@@ -21,6 +22,8 @@ from msgspec import Struct
 
 from gigabrain_zenoh import lifeline
 from gigabrain_zenoh.bench.figures import figures
+from gigabrain_zenoh.process import ZENOH_RUNTIME
+from gigabrain_zenoh.scheduling import go_first
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_config import session_config
 
@@ -36,6 +39,7 @@ class Role(Struct, frozen=True, kw_only=True):
     puts: str  # key
     size: int  # bytes of what it puts
     endpoint: Endpoint  # its router; or where it is met and whom it meets, as a peer
+    first: bool = False  # it goes before others where it may, as driver and control do
     rate_hz: float = 0.0  # of the source; 0 for the others
     settle_s: float = 0.0  # of the source: for how long it does not measure
     seconds: float = 0.0  # of the source: for how long it does
@@ -116,6 +120,9 @@ def main() -> None:
     lifeline.die_with_supervisor()
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDS)  # before Zenoh's threads inherit the mask
     role = msgspec.json.decode(sys.argv[1], type=Role)
+    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
+    if role.first:  # before there are threads, which inherit it
+        go_first()
     session = open_session(role.endpoint)
     if role.rate_hz:
         measure(session, role)

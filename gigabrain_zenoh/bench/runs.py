@@ -15,7 +15,7 @@ from gigabrain_zenoh.bench.relay import Role
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.keeper import ProcessSpec
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.process import PROGRAMS, find
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.specs import process_specs
 
@@ -25,6 +25,7 @@ LATE_S = 20.0  # how much longer than announced a relay may take
 RELAY = (sys.executable, "-P", "-m", "gigabrain_zenoh.bench.relay")
 KEYS = ("bench/scan", "bench/world", "bench/intent", "bench/cmd")
 NAMES = ("source", "first", "second", "third")
+STANDS_FOR = ("driver", "perception", "decision", "control")
 
 
 @asynccontextmanager
@@ -92,6 +93,7 @@ def relay_roles(
             puts=KEYS[i],
             size=sizes[i],
             endpoint=endpoints[i],
+            first=PROGRAMS[STANDS_FOR[i]].stops,
             rate_hz=0.0 if i else rate_hz,
             settle_s=SETTLE_S,
             seconds=seconds,

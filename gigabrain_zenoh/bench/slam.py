@@ -10,6 +10,7 @@ import numpy as np
 from msgspec import Struct
 
 from gigabrain_zenoh.bench.figures import Figures, figures
+from gigabrain_zenoh.bench.slam_crispness import crispness
 from gigabrain_zenoh.bench.slam_logs import Errors, Log, errors, relations
 from gigabrain_zenoh.mapping.se2 import Floats, between, compose
 from gigabrain_zenoh.mapping.slam import Estimate, Slam
@@ -31,6 +32,7 @@ class LogResult(Struct, frozen=True, kw_only=True):
     odometry: Errors
     front_end: Errors
     graph: Errors
+    crispness: float  # cells filled, per cell that the reference fills
     unmatched: int  # scans that were put where odometry or a search had them
     breaks: int  # in the sequence
     scan: Figures
@@ -97,7 +99,7 @@ def drive(log: Log, progress: Progress) -> Drive:
 
 def judged(log: Log, driven: Drive) -> LogResult:
     """What the drive is worth. Raises ConfigError for a log that passes no place twice."""
-    pairs = relations(log)
+    pairs, poses = relations(log), driven.poses()
     kinds = [estimate.kind for estimate in driven.estimates]
     return LogResult(
         log=log.name,
@@ -108,7 +110,8 @@ def judged(log: Log, driven: Drive) -> LogResult:
         relations=len(pairs),
         odometry=errors(log, log.odometry, pairs),
         front_end=errors(log, driven.smooth, pairs),
-        graph=errors(log, driven.poses(), pairs),
+        graph=errors(log, poses, pairs),
+        crispness=crispness(log, poses),
         unmatched=sum(kind in ("odometry", "searched") for kind in kinds),
         breaks=kinds.count("broken"),
         scan=figures(driven.scan_ms[COLD:]),

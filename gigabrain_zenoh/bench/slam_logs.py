@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapping.points import Scan, from_beams
-from gigabrain_zenoh.mapping.se2 import Floats, between
+from gigabrain_zenoh.mapping.se2 import Floats, between, compose, inverse
 
 RANGE_MIN, RANGE_MAX = 0.1, 25.0  # [m], beyond them a beam says nothing
 NEAR = 3.0  # [m], poses of a relation
@@ -107,3 +107,12 @@ def errors(log: Log, poses: Floats, pairs: NDArray[np.intp]) -> Errors:
         mean_deg=float(turn.mean()),
         std_deg=float(turn.std()),
     )
+
+
+def laid_onto(poses: Floats, reference: Floats) -> Floats:
+    """Return `poses` (n, 3) moved as one, so that their places fit `reference` best (Umeyama)."""
+    one, other = poses[:, :2], reference[:, :2]
+    spread = (one - one.mean(axis=0)).T @ (other - other.mean(axis=0))
+    turn = float(np.arctan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1]))
+    about = np.array((*one.mean(axis=0), 0.0))
+    return compose(np.array((*other.mean(axis=0), turn)), compose(inverse(about), poses))

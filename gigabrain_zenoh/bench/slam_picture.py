@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gigabrain_zenoh.bench.slam import Drive
-from gigabrain_zenoh.bench.slam_logs import Log
+from gigabrain_zenoh.bench.slam_logs import Log, laid_onto
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.mapping.se2 import Floats, compose, inverse, transform
+from gigabrain_zenoh.mapping.se2 import transform
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,7 +45,7 @@ def _map(axes: "Axes", log: Log, driven: Drive) -> None:
     keyframes = zip(driven.slam.poses, driven.slam.keyframes, strict=True)
     walls = np.concatenate([transform(pose, keyframe.points) for pose, keyframe in keyframes])
     poses = driven.poses()
-    reference = _onto(log.reference, poses)
+    reference = laid_onto(log.reference, poses)
     axes.set_axis_on()
     axes.plot(*walls.T, ",", color=WALLS, alpha=0.3)
     axes.plot(*reference[:, :2].T, color=REFERENCE, linewidth=1.2, label="reference")
@@ -55,12 +55,3 @@ def _map(axes: "Axes", log: Log, driven: Drive) -> None:
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
     axes.legend(loc="best")
-
-
-def _onto(reference: Floats, poses: Floats) -> Floats:
-    """The reference in the frame of `poses`, laid so that all places agree best (Umeyama)."""
-    one, other = reference[:, :2], poses[:, :2]
-    spread = (one - one.mean(axis=0)).T @ (other - other.mean(axis=0))
-    turn = float(np.arctan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1]))
-    about = np.array((*one.mean(axis=0), 0.0))
-    return compose(np.array((*other.mean(axis=0), turn)), compose(inverse(about), reference))

@@ -13,6 +13,7 @@ from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.bench.figures import Figures, figures
+from gigabrain_zenoh.bench.growth import Growth, Watch
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.health import rss_bytes
 from gigabrain_zenoh.mapper import view_of
@@ -56,7 +57,7 @@ class WorldResult(Struct, frozen=True, kw_only=True):
     slam: Off
     last_minute: Off
     scan: Figures
-    grew_mb: float  # this process, from the second minute to the last
+    growth: Growth  # of this process, simulation included
 
 
 class WorldsResult(Struct, frozen=True, kw_only=True):
@@ -79,13 +80,13 @@ def tour(body: str, world: str, seed: int, minutes: float, progress: Progress) -
     """Let the body roam the world for so long. Raises ConfigError."""
     roaming = find("gigabrain_drivers.sim.tour:Tour")(body, world, seed)
     run = _Run(GrowingMap(PATIENCE_S))
-    memory = [0, 0]
+    watch = Watch()
     for count, moment in enumerate(roaming.moments(round(minutes * TICKS_A_MINUTE)), 1):
         run.fusion.add(moment.state, roaming.body)
         if moment.scan:
             run.scan(roaming.body.lidar, moment.scan, np.array(moment.truth))
         if count % TICKS_A_MINUTE == 0:
-            memory = [memory[0] or rss_bytes(), rss_bytes()]
+            watch.minute(rss_bytes(), run.chart.grid())
             progress()
     if not len(run.poses):
         raise ConfigError(f"--minutes: {minutes:g} is too short for a scan")
@@ -111,7 +112,7 @@ def tour(body: str, world: str, seed: int, minutes: float, progress: Progress) -
         slam=_off(off),
         last_minute=_off(off[-600:]),
         scan=figures(run.took_ms[COLD:]),
-        grew_mb=(memory[1] - memory[0]) / 1e6,
+        growth=watch.growth(grid),
     )
     return Toured(result=result, grid=grid, poses=poses, truth=seen)
 

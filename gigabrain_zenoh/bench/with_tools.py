@@ -129,7 +129,7 @@ async def _time_with_tools(rate_hz: float, seconds: float, folder: Path) -> _Run
             hosts={"robot": (*ROBOT, "recorder", "page", "foxglove")},
             recorder=RecorderConfig(folder=str(folder / "bags"), keep_free_mb=0),
             page=PageConfig(port=ports.page),
-            foxglove=FoxgloveConfig(port=ports.foxglove, tokens=str(folder / "tokens.json")),
+            foxglove=FoxgloveConfig(port=ports.foxglove, secret=str(folder / "secret")),
         )
 
     told: defaultdict[str, list[Health]] = defaultdict(list)

@@ -1,14 +1,14 @@
 """The table of commands. Importing it is what `gigabrain --help` costs: keep it light."""
 
-import contextlib
+# Nothing here that Python has not imported already: signals are handled as early as can be
 import os
 import sys
-from collections.abc import Sequence
 
-from cyclopts import App, CycloptsError
+TYPE_CHECKING = False  # as in `typing`
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
-from gigabrain_zenoh.cli.whole import refuse_fractions
-from gigabrain_zenoh.errors import ConfigError, GigabrainError
+    from cyclopts import App
 
 MODULES = "gigabrain_zenoh.cli"
 
@@ -81,7 +81,7 @@ COMMANDS = {
     "view": ("view:view", "Draw a robot in its world into a PNG file."),
     "bench chain": ("bench:chain", "From scan to command, timed."),
     "bench stack": ("bench:stack", "CPU, memory and time to start."),
-    "faults": ("faults:faults", "Break the robot in 44 ways, and see whether it stops."),
+    "faults": ("faults:faults", "Break the robot on purpose, and see whether it stops."),
     "bench estop": ("bench:estop", "From the press to zero, timed."),
     "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
     "bench goals": ("bench_goals:goals", "Explore, then get to random places."),
@@ -105,12 +105,16 @@ GROUPS = {
 }
 
 
-def make_app(chosen: Sequence[str] = ()) -> App:
+def make_app(chosen: "Sequence[str]" = ()) -> "App":
     """All commands, by name, with the module that holds each.
 
     A command that is among the `chosen` words brings its own help; of the others a line will do,
     so that they need not be imported.
     """
+    from cyclopts import App
+
+    from gigabrain_zenoh.cli.whole import refuse_fractions
+
     app = App(
         name="gigabrain",
         help="A robot brain of three systems that any body can wear.",
@@ -136,20 +140,44 @@ def _version() -> str:
 
 def main() -> None:
     """Entry of the `gigabrain` command."""
-    call = make_app(sys.argv[1:])
     try:
-        code = call(exit_on_error=False, print_error=False, result_action="return_value")
-    except GigabrainError as error:
-        print(f"gigabrain: {error}", file=sys.stderr)
-        code = error.exit_code
-    except CycloptsError as error:
-        print(f"gigabrain: {' '.join(str(error).split())}", file=sys.stderr)
-        code = ConfigError.exit_code
+        from contextlib import suppress
+
+        from gigabrain_zenoh.interrupts import interrupts
+
+        interrupts.install()
     except KeyboardInterrupt:
-        code = 130
+        os._exit(130)
+    try:
+        code = _call(sys.argv[1:])
+    except KeyboardInterrupt:
+        code = interrupts.exit_code
     except BrokenPipeError:  # nobody reads on, as in `gigabrain robots | head -1`
         code = 1
-    for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError):  # nobody is there to read it, or the disk is full
-            stream.flush()
+    except Exception:  # what a signal has broken off may complain in any words
+        if not interrupts.received:
+            raise
+        code = interrupts.exit_code
+    with suppress(OSError):  # nobody is there to read it, or the disk is full
+        sys.stdout.flush()  # stderr owes nothing: it is written line by line
     os._exit(code if isinstance(code, int) else 0)  # Zenoh's threads must not hold it back
+
+
+def _call(words: "Sequence[str]") -> object:
+    """Parse and run a command. What it imports is done by then, so that a signal leaves nothing."""
+    from cyclopts import CycloptsError
+
+    from gigabrain_zenoh.errors import ConfigError, GigabrainError
+    from gigabrain_zenoh.interrupts import interrupts
+
+    try:
+        app = make_app(words)
+        command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
+        with interrupts.raising():
+            return command(*bound.args, **bound.kwargs)
+    except GigabrainError as error:
+        print(f"gigabrain: {error}", file=sys.stderr)
+        return interrupts.exit_code if interrupts.received else error.exit_code
+    except CycloptsError as error:
+        print(f"gigabrain: {' '.join(str(error).split())}", file=sys.stderr)
+        return ConfigError.exit_code

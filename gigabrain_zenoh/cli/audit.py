@@ -8,6 +8,7 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.audit import AuditRecord
@@ -39,7 +40,6 @@ def audit(
     json
         One JSON object per line.
     """
-    import asyncio
 
     from gigabrain_zenoh import audit_file, audit_text
 
@@ -51,7 +51,7 @@ def audit(
             raise ConfigError("leave out the name of a robot that runs")
         _print(map(show, audit_file.read(_folder(robot), newest)))
     else:
-        asyncio.run(_ask(at, newest, follow, show))
+        run_async(_ask(at, newest, follow, show))
     return 0
 
 

@@ -1,6 +1,5 @@
 """`gigabrain bag`: what can be done with a recording."""
 
-import asyncio
 import math
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +9,7 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.stop_signals import run_async
 
 
 def info(file: Path, *, json: bool = False) -> int:
@@ -128,7 +128,7 @@ def play(
     options = PlayOptions(
         rate=rate, start_s=start, loop=loop, topics=tuple(topics or ()), remap=_pairs(remap or [])
     )
-    return asyncio.run(run(file, options, at.where(), beside_robot=beside_robot))
+    return run_async(run(file, options, at.where(), beside_robot=beside_robot))
 
 
 def _pairs(texts: list[str]) -> dict[str, str]:

@@ -1,6 +1,5 @@
 """`gigabrain bench chain`, `stack` and `estop`: what this machine makes of it."""
 
-import asyncio
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,6 +12,7 @@ from rich.console import Console, RenderableType
 from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.stop_signals import run_async
 
 FASTEST_HZ = 50.0  # one scan per tick of the robot's clock
 
@@ -55,7 +55,7 @@ def chain(
         return _with_tools(seconds, rounds, rates, json)
     from gigabrain_zenoh.bench.tables import chain_page
 
-    result = asyncio.run(measure_chain(seconds, rounds, rates, _progress))
+    result = run_async(measure_chain(seconds, rounds, rates, _progress))
     _finish(chain_page(result), result, json)
     return 0
 
@@ -67,7 +67,7 @@ def _with_tools(seconds: float, rounds: int, rates: tuple[float, ...], json: Pat
     from gigabrain_zenoh.bench.tables import tools_page
     from gigabrain_zenoh.bench.with_tools import measure_with_tools
 
-    result = asyncio.run(measure_with_tools(seconds, rounds, rates, _progress))
+    result = run_async(measure_with_tools(seconds, rounds, rates, _progress))
     _finish(tools_page(result), result, json)
     return 0
 
@@ -102,7 +102,7 @@ def stack(
 
     results.check_place(json)
     above_zero("seconds", seconds)
-    result = asyncio.run(measure_stack(body, world, seconds, _progress, goal=goal))
+    result = run_async(measure_stack(body, world, seconds, _progress, goal=goal))
     _finish(stack_page(result), result, json)
     return 0
 
@@ -135,7 +135,7 @@ def estop(
     results.check_place(json)
     above_zero("driving", driving)
     above_zero("latched", latched)
-    result = asyncio.run(measure_estop(body, driving, latched, _progress))
+    result = run_async(measure_estop(body, driving, latched, _progress))
     _finish(estop_page(result), result, json)
     return 0
 

@@ -1,6 +1,5 @@
 """`gigabrain bench bodies`: one brain, all bodies in turn, side by side."""
 
-import asyncio
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -8,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.process import find
+from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -58,7 +58,7 @@ def bodies(
     console = Console()
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder, console.status("") as status:
         measuring = measure_bodies(chosen, deployment, seconds, Path(folder), status.update)
-        result = asyncio.run(measuring)
+        result = run_async(measuring)
     console.print(_table(result))
     results.write(result, json)
     return 0 if result.ok else 1

@@ -1,6 +1,5 @@
 """`gigabrain bench goals`: explore, then get to places drawn at random, all processes running."""
 
-import asyncio
 import math
 import sys
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.checked import above_zero
+from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -34,6 +34,8 @@ class Runs:
     "How many places each robot is sent to in each world."
     meetings: int = 0
     "Send it on until the person of the world has had to stand for it so often."
+    hours: float = 0.0
+    "Send it on for so long, of its own time, and tell what perception's memory came to."
     speed: float = 5.0
     "How many times faster than real time."
     seed: int = 0
@@ -47,6 +49,7 @@ def goals(*, of: Runs = RUNS, json: Path | None = None, logs: Path | None = None
     """Have each body explore each world in MuJoCo, then send it to places drawn at random.
 
     Example: gigabrain bench goals --bodies alpha --worlds house --goals 10 --speed 1
+    Example: gigabrain bench goals --bodies turtlebot3_waffle --worlds house --hours 8
 
     The table says how long mapping took, how much room the body kept round it at least, how long a
     goal took in the mean, how far from a goal and a wanted heading it came to rest at most (by the
@@ -68,8 +71,15 @@ def goals(*, of: Runs = RUNS, json: Path | None = None, logs: Path | None = None
     above_zero("goals", of.goals)
     above_zero("speed", of.speed)
     results.check_place(json)
-    course = Course(goals=of.goals, meetings=of.meetings, speed=of.speed, seed=of.seed, logs=logs)
-    result = asyncio.run(measure_goals(of.bodies, of.worlds, course, _progress))
+    course = Course(
+        goals=of.goals,
+        meetings=of.meetings,
+        hours=of.hours,
+        speed=of.speed,
+        seed=of.seed,
+        logs=logs,
+    )
+    result = run_async(measure_goals(of.bodies, of.worlds, course, _progress))
     _show(result)
     results.write(result, json)
     return 0 if result.ok else 1
@@ -83,6 +93,14 @@ def _show(result: "GoalsResult") -> None:
 
     console = Console()
     console.print(_table(result))
+    for run in result.runs:
+        grown = run.growth
+        console.print(
+            f"{run.body} in {run.world}: perception at most {grown.most_mb:.0f} MB, "
+            f"{grown.mb_an_hour:+.1f} MB/h after the first quarter; "
+            f"occupied cells by the hour: {', '.join(map(str, grown.walls))}",
+            soft_wrap=True,
+        )
     for run in result.runs:
         for one in run.failures:
             after = f"after {one.seconds:.0f} s"

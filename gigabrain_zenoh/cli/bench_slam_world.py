@@ -56,7 +56,11 @@ def _table(worlds: "Sequence[WorldResult]") -> "Table":
             "map": [_off(one.slam) for one in worlds],
             "map, last minute": [_off(one.last_minute) for one in worlds],
             "scan p50, p99 [ms]": [f"{o.scan.p50_ms:.1f}, {o.scan.p99_ms:.1f}" for o in worlds],
-            "memory, second minute to last": [f"+{one.grew_mb:.0f} MB" for one in worlds],
+            "memory, most": [f"{one.growth.most_mb:.0f} MB" for one in worlds],
+            "its slope after a quarter": [f"{o.growth.mb_an_hour:+.1f} MB/h" for o in worlds],
+            "occupied cells, by the hour": [
+                ", ".join(map(str, one.growth.walls)) for one in worlds
+            ],
         },
     )
 

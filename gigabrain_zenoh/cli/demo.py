@@ -1,9 +1,8 @@
 """`gigabrain demo`: a whole robot on this machine, watched."""
 
-import asyncio
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -13,6 +12,7 @@ from gigabrain_zenoh.deployment import Deployment, recorded
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import LinkName, Resume
+from gigabrain_zenoh.stop_signals import run_async
 
 
 @Parameter(name="*")
@@ -32,6 +32,8 @@ class Drive:
     "For the start pose and the noise of the sensors."
     speed: float = 1.0
     "Simulated over real time; other than 1, time waits for the brain."
+    lockstep_timeout: float = 0.15
+    "How long [s] time waits for the brain there; longer for a slow machine."
     behaviour: str = "navigate"
     "What it does: `navigate`, or `avoid`, which makes no map."
     turn: Literal["right", "left", "clearer"] = "right"
@@ -54,11 +56,12 @@ class Drive:
             "world": self.world,
             "seed": self.seed,
             "speed": self.speed,
+            "lockstep_timeout_s": self.lockstep_timeout,
             "resume": self.resume or ("manual" if self.link == "real" else "auto"),
             "router": "tcp/127.0.0.1:0",
         }
         if self.behaviour == "navigate":
-            decision = {"behaviour": "navigate", "begin": "roam"}
+            decision["begin"] = "roam"
             values["perception"] = {"mapping": "slam"}
         return values | {"decision": decision}
 
@@ -78,6 +81,10 @@ class Shown:
     "Serve the operator page; as a rule where there is a live view too."
     port: int = 8080
     "Where the page is; another free one where that is taken."
+    login: bool = False
+    "Have the page want a token, which is in the address that is printed; for a shared machine."
+    keep_stuck: Annotated[bool, Parameter(negative=())] = False
+    "Leave a process alone that makes no progress, for a debugger."
 
 
 DRIVE, SHOWN = Drive(), Shown()
@@ -100,8 +107,12 @@ def demo(*, drive: Drive = DRIVE, shown: Shown = SHOWN) -> int:
     values = drive.values() | (recorded(shown.record) if shown.record else {})
     deployment, where = checked(values, Deployment), ""
     if shown.page or (shown.page is None and not shown.headless):
-        deployment, where = with_page(deployment, shown.port)
+        deployment, where = with_page(deployment, shown.port, login=shown.login)
     options = DemoOptions(
-        seconds=drive.seconds, headless=shown.headless, report=shown.report, page=where
+        seconds=drive.seconds,
+        headless=shown.headless,
+        report=shown.report,
+        page=where,
+        keep_stuck=shown.keep_stuck,
     )
-    return asyncio.run(Demo(deployment, options).run())
+    return run_async(Demo(deployment, options).run())

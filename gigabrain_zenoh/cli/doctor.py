@@ -1,6 +1,7 @@
 """`gigabrain doctor`: what is wrong here, and the cure."""
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
+from gigabrain_zenoh.stop_signals import run_async
 
 MARKS = {"ok": "ok  ", "hint": "hint", "bad": "BAD "}
 
@@ -17,14 +18,13 @@ def doctor(*, at: Which = HERE, json: bool = False) -> int:
     json
         One JSON object per line.
     """
-    import asyncio
 
     import msgspec
 
     from gigabrain_zenoh.tools.doctor import examine, exit_code
     from gigabrain_zenoh.tools.doctor_facts import this_machine, this_robot
 
-    robot, keys = asyncio.run(this_robot(at.where()))
+    robot, keys = run_async(this_robot(at.where()))
     findings = examine(this_machine(keys), robot)
     for one in findings:
         if json:

@@ -1,6 +1,5 @@
 """`gigabrain driver test`, `new` and `trace`: for whoever writes drivers."""
 
-import asyncio
 import logging
 import os
 import sys
@@ -15,6 +14,7 @@ from cyclopts.validators import Number
 from gigabrain_zenoh.cli.checked import above_zero, finite
 from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import LinkName
+from gigabrain_zenoh.stop_signals import run_async
 
 COLOURS = {"pass": "green", "fail": "bold red", "n/a": "dim"}
 
@@ -80,7 +80,7 @@ def test(
     place = tempfile.TemporaryDirectory(prefix="gigabrain-")
     with said, place as folder, console.status("") as status:
         running = find("gigabrain_drivers.conformance.kit:check")
-        results = asyncio.run(running(name, chosen, Path(folder), status.update, repeat))
+        results = run_async(running(name, chosen, Path(folder), status.update, repeat))
     for result in results:
         colour = COLOURS[result.verdict]
         table.add_row(*result[:-1], f"[{colour}]{result.verdict}[/]")
@@ -154,7 +154,7 @@ def _traced(name: str, link: str, part: str, seconds: float, speeds: dict[str, f
             say=lambda line: print(line, flush=True),
         )
         try:
-            return bool(asyncio.run(tracing))
+            return bool(run_async(tracing))
         except BrokenPipeError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return True

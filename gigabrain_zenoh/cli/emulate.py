@@ -1,11 +1,11 @@
 """`gigabrain emulate`: a body that is not there, on real ports."""
 
-import asyncio
 from pathlib import Path
 
 from gigabrain_zenoh.cli.checked import checked
 from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import EmulatorConfig
+from gigabrain_zenoh.stop_signals import run_async
 
 
 def emulate(name: str, *, world: str = "arena", seed: int = 0, ports: Path | None = None) -> int:
@@ -31,7 +31,7 @@ def emulate(name: str, *, world: str = "arena", seed: int = 0, ports: Path | Non
     folder = ports or find("gigabrain_drivers.catalog:ports_folder")(name)
     values = {"body": name, "world": world, "seed": seed, "folder": str(folder.absolute())}
     config = checked(values, EmulatorConfig)
-    asyncio.run(find("gigabrain_drivers.emulators.process:emulate")(config, _say))
+    run_async(find("gigabrain_drivers.emulators.process:emulate")(config, _say))
     return 0
 
 

@@ -1,6 +1,5 @@
-"""`gigabrain faults`: break the robot in 44 ways, and see whether it stops."""
+"""`gigabrain faults`: break the robot on purpose, and see whether it stops."""
 
-import asyncio
 import logging
 import tempfile
 from collections.abc import Sequence
@@ -15,11 +14,12 @@ from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.where import show
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.process import find
+from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.faults.fault import Fault, Result
+    from gigabrain_zenoh.faults.fault import Fault, Result, Try
     from gigabrain_zenoh.faults.rig import Options
 
 COLOURS = {"passed": "green", "FAILED": "bold red", "skipped": "yellow"}
@@ -68,8 +68,10 @@ def faults(
     *,
     list_: Annotated[bool, Parameter(name="--list", negative=())] = False,
     only: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
+    skip: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
     repeat: Annotated[int, Parameter(validator=Number(gte=1))] = 1,
     robot: Robot = ROBOT,
+    into: Path | None = None,
     json: Path | None = None,
 ) -> int:
     """Break a running robot in all the ways of the table, and judge how it stops.
@@ -85,50 +87,63 @@ def faults(
         Show the table, and run nothing.
     only
         Which tests, by name or number.
+    skip
+        Which tests not.
     repeat
-        How often each; the worst of all runs is judged.
+        How many runs of each count; the worst of them is judged.
+    into
+        Append each run to this file, and go on from those that are in it.
     json
         Write all results into this file.
     """
     from gigabrain_zenoh.faults.suite import failed
     from gigabrain_zenoh.faults.table import choose
 
-    chosen = choose(only)
+    left_out = choose(skip) if skip else ()
+    chosen = tuple(fault for fault in choose(only) if fault not in left_out)
     if list_:
         show(_plan(chosen))
         return 0
     robot.check()
     results.check_place(json)
-    judged = _run(chosen, robot.options(), repeat)
+    results.check_place(into)
+    judged = _run(chosen, robot.options(), repeat, into)
     show(_table(judged, chosen))
     results.write(judged, json)
     return 1 if failed(judged) else 0
 
 
-def _run(chosen: "Sequence[Fault]", options: "Options", repeat: int) -> "list[Result]":
-    """Run them, with a line for each that has ended."""
+def _run(
+    chosen: "Sequence[Fault]", options: "Options", repeat: int, into: Path | None
+) -> "list[Result]":
+    """Run them, with a line for each run that has ended."""
     from rich.console import Console
 
     from gigabrain_zenoh.faults.suite import run_suite
+    from gigabrain_zenoh.faults.tries_file import TriesFile
 
     # the suite hears what it forges itself; nobody has to read that
     logging.getLogger("gigabrain_zenoh").addHandler(logging.NullHandler())
-    console, done = Console(), list[str]()
+    console, file = Console(), TriesFile(into, options) if into else None
+    earlier = file.read() if file else {}
     with tempfile.TemporaryDirectory(prefix="gb-") as folder, console.status("") as status:
 
         def begun(fault: "Fault") -> None:
-            status.update(f"{len(done) + 1} of {len(chosen)}: {fault.name}")
+            status.update(f"{chosen.index(fault) + 1} of {len(chosen)}: {fault.name}")
 
-        def ended(result: "Result") -> None:
-            done.append(result.name)
-            console.print(_line(result))
+        def ended(fault: "Fault", run: "Try") -> None:
+            console.print(_line(fault, run))
+            if file:
+                file.append(fault, run)
 
-        return asyncio.run(run_suite(chosen, options, Path(folder), repeat, begun, ended))
+        suite = run_suite(chosen, options, Path(folder), repeat, begun, ended, earlier)
+        return run_async(suite)
 
 
-def _line(result: "Result") -> str:
-    why = f": {result.reason}" if result.reason else ""
-    return f"{result.number:>2} {result.name}: {result.verdict}{why} ({result.seconds:g} s)"
+def _line(fault: "Fault", run: "Try") -> str:
+    why = f": {run.reason}" if run.reason else ""
+    disturbed = f", disturbed: waited {run.waited_ms:g} ms for a core" if run.disturbed else ""
+    return f"{fault.number:>2} {fault.name}: {run.verdict}{why} ({run.seconds:g} s{disturbed})"
 
 
 def _plan(chosen: "Sequence[Fault]") -> "Table":
@@ -152,15 +167,22 @@ def _table(results: "Sequence[Result]", chosen: "Sequence[Fault]") -> "Table":
     rows = {fault.number: fault for fault in chosen}
     passed = sum(result.verdict == "passed" for result in results)
     table = Table(title=f"{passed} of {len(results)} passed")
-    for name in ("no.", "fault", "criterion", "worst", "runs", "verdict"):
+    for name in ("no.", "fault", "criterion", "worst", "tries", "waited", "verdict"):
         table.add_column(name, overflow="fold", no_wrap=name == "fault")
     for result in results:
         told = f"[{COLOURS[result.verdict]}]{result.verdict}[/]"
         if result.reason:
             told += f": {escape(result.reason)}"
-        if result.stalls:
-            told += f" ({result.stalls} runs thrown away: this machine stood still)"
         worst = in_words(rows[result.number], result.worst)
-        runs, number = str(result.runs), str(result.number)
-        table.add_row(number, result.name, result.criterion, worst, runs, told)
+        waited = f"{max(one.waited_ms for one in result.tries):.0f} ms"
+        number, tries = str(result.number), _tries(result.tries)
+        table.add_row(number, result.name, result.criterion, worst, tries, waited, told)
     return table
+
+
+def _tries(tries: "Sequence[Try]") -> str:
+    """Say what came of all runs: `9 of 10, disturbed: 1 of 2`."""
+    counted = [one.verdict == "passed" for one in tries if not one.disturbed]
+    disturbed = [one.verdict == "passed" for one in tries if one.disturbed]
+    beside = f", disturbed: {sum(disturbed)} of {len(disturbed)}" if disturbed else ""
+    return f"{sum(counted)} of {len(counted)}{beside}"

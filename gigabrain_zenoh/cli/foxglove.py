@@ -8,6 +8,7 @@ from gigabrain_zenoh.cli.where import HERE, Which
 def foxglove(
     *,
     port: int = 8765,
+    origin: tuple[str, ...] = (),
     layout: Path | None = None,
     at: Which = HERE,
 ) -> int:
@@ -22,6 +23,8 @@ def foxglove(
     ----------
     port
         Where it listens, on loopback.
+    origin
+        A site whose pages may connect, such as https://viewer.example, beside the known viewers.
     layout
         Write a layout for the viewer into this file, to be imported there, and do nothing else.
     """
@@ -34,7 +37,7 @@ def foxglove(
     from gigabrain_zenoh.running import find_endpoint
     from gigabrain_zenoh.settings import FoxgloveConfig
 
-    config = checked({"port": port}, FoxgloveConfig)
+    config = checked({"port": port, "origins": origin}, FoxgloveConfig)
     if layout:
         write_layout(config, layout)
         print(f"{layout}: import it as a layout, and open a connection to ws://127.0.0.1:{port}")

@@ -6,6 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
+from gigabrain_zenoh.stop_signals import run_async
 
 
 def graph(
@@ -31,7 +32,6 @@ def graph(
     everything
         Also health, log and audit, which everybody sends.
     """
-    import asyncio
 
     from gigabrain_zenoh.errors import ConfigError
     from gigabrain_zenoh.recording.joining import joined
@@ -47,7 +47,7 @@ def graph(
         async with joined(at.where(), NAME) as (bus, _):
             return await census(bus)
 
-    nodes = asyncio.run(look())
+    nodes = run_async(look())
     found = draw.chain(flows(nodes.there.values(), nodes.health), everything=everything)
     if png:
         draw.write_png(found, png)

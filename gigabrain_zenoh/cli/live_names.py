@@ -1,9 +1,9 @@
 """TAB: what is alive now. Nothing rather than an error, and soon: a shell waits for it."""
 
-import asyncio
 from typing import TYPE_CHECKING
 
 from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.requests import Description
@@ -34,6 +34,6 @@ def _there() -> list["Description"]:
             return list((await roll_call(bus, SOON_S)).values())
 
     try:
-        return asyncio.run(ask())
+        return run_async(ask())
     except GigabrainError:
         return []

@@ -10,6 +10,7 @@ from gigabrain_zenoh import log_text
 from gigabrain_zenoh.cli.live_names import processes
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -65,7 +66,7 @@ def log(
         for line in read(run_folder(run), wanted, newest):
             tell(line)
     if follow:
-        asyncio.run(_follow(at, wanted, tell))
+        run_async(_follow(at, wanted, tell))
     return 0
 
 

@@ -2,6 +2,7 @@
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
+from gigabrain_zenoh.stop_signals import run_async
 
 PATIENCE_S = 20.0  # a large map takes a while to write
 
@@ -20,7 +21,6 @@ def save(name: str, /, *, at: Which = HERE, replace: bool = False) -> int:
     replace
         Another map of that name.
     """
-    import asyncio
     import getpass
 
     import msgspec
@@ -49,7 +49,7 @@ def save(name: str, /, *, at: Which = HERE, replace: bool = False) -> int:
             raise Refused(replies[0].text)
         say(replies[0].text)
 
-    asyncio.run(ask())
+    run_async(ask())
     return 0
 
 

@@ -1,12 +1,12 @@
 """`gigabrain node`: the processes of a robot."""
 
-import asyncio
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.live_names import processes
 from gigabrain_zenoh.cli.where import HERE, Which, say, show
+from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.tools.nodes import Nodes
@@ -62,4 +62,4 @@ def _census(at: Which) -> "Nodes":
         async with joined(at.where(), NAME) as (bus, _):
             return await census(bus)
 
-    return asyncio.run(look())
+    return run_async(look())

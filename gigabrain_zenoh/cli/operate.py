@@ -1,6 +1,5 @@
 """`gigabrain estop`, `release` and `enable`: what a person asks of the gate."""
 
-import asyncio
 import getpass
 import time
 from collections.abc import Awaitable, Callable
@@ -12,6 +11,7 @@ from gigabrain_zenoh.client import connect as connect_robot
 from gigabrain_zenoh.errors import GigabrainError, NotConfirmed
 from gigabrain_zenoh.estop import BY_HAND
 from gigabrain_zenoh.gate import BRAIN
+from gigabrain_zenoh.stop_signals import run_async
 
 
 def estop(*, at: Which = HERE, reason: str = "") -> int:
@@ -73,5 +73,5 @@ def _ask(
             took_ms = (time.perf_counter() - began) * 1e3
             print(f"{prefix}{reply.robot_type}: {reply.text} ({took_ms:.0f} ms)")
 
-    asyncio.run(run())
+    run_async(run())
     return 0

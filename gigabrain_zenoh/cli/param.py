@@ -8,6 +8,7 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.live_names import processes
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import BodyLost, Refused, unknown
+from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.requests import Param, ParamReply
@@ -25,7 +26,7 @@ def list_(process: Process = "", /, *, at: Which = HERE) -> int:
     process
         Of this one only.
     """
-    for name, reply in sorted(asyncio.run(_ask(at, process, "", "")).items()):
+    for name, reply in sorted(run_async(_ask(at, process, "", "")).items()):
         for one in reply.params:
             say(f"{name:<12} {one.name:<14} {one.value:<10} {one.expected}")
     return 0
@@ -34,7 +35,7 @@ def list_(process: Process = "", /, *, at: Which = HERE) -> int:
 def get(process: Process, name: str, /, *, at: Which = HERE) -> int:
     """Show one value.
 
-    Example: gigabrain param get decision linear_speed
+    Example: gigabrain param get decision speed_limit
 
     Parameters
     ----------
@@ -43,7 +44,7 @@ def get(process: Process, name: str, /, *, at: Which = HERE) -> int:
     name
         Of the parameter.
     """
-    reply = asyncio.run(_ask(at, process, "", ""))[process]
+    reply = run_async(_ask(at, process, "", ""))[process]
     say(_named(reply.params, name).value)
     return 0
 
@@ -51,7 +52,7 @@ def get(process: Process, name: str, /, *, at: Which = HERE) -> int:
 def set_(process: Process, name: str, value: str, /, *, at: Which = HERE) -> int:
     """Change one value, until the process ends.
 
-    Example: gigabrain param set decision linear_speed 0.15
+    Example: gigabrain param set decision speed_limit 0.15
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ def set_(process: Process, name: str, value: str, /, *, at: Which = HERE) -> int
     value
         What it should be.
     """
-    reply = asyncio.run(_ask(at, process, name, value))[process]
+    reply = run_async(_ask(at, process, name, value))[process]
     if not reply.ok:
         raise Refused(f"{process}: {reply.text}")
     say(f"{process}: {reply.text}")

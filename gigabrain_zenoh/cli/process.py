@@ -9,14 +9,14 @@ import msgspec
 from cyclopts import Parameter
 
 from gigabrain_zenoh import behaviours
-from gigabrain_zenoh.addresses import exposed
+from gigabrain_zenoh.addresses import exposed, reached_at
 from gigabrain_zenoh.cli.checked import checked
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.checks import identity_in
 from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.process import find, run
 from gigabrain_zenoh.process_config import ProcessConfig
-from gigabrain_zenoh.running import find_endpoint
+from gigabrain_zenoh.running import announced, find_endpoint
 from gigabrain_zenoh.settings import (
     ButtonConfig,
     DecisionConfig,
@@ -57,7 +57,7 @@ def router(
     insecure: bool = False,
     place: Annotated[Place, Parameter(show=False)] = HERE,
 ) -> int:
-    """Start the router that joins the other processes.
+    """Start the router that joins the other processes. Tools find it as they find `up` and `demo`.
 
     Example: gigabrain router --listen tcp/127.0.0.1:7447
 
@@ -77,7 +77,9 @@ def router(
     if not keys and not insecure:
         _refuse_exposed(listen)
     settings = router_config(endpoint, state_dir() / "robots" / (place.namespace or "router"))
-    return _run("router", place, msgspec.to_builtins(settings), endpoint)
+    here = Endpoint(connect=(reached_at(listen[0]),), namespace=place.namespace, keys=keys)
+    with announced(place.namespace or "router", secured(here)):
+        return _run("router", place, msgspec.to_builtins(settings), endpoint)
 
 
 def perception(*, place: Place = HERE) -> int:

@@ -15,6 +15,7 @@ from gigabrain_zenoh.faults.chaos import CALM, WAYS, Chaos, Told, Way, told
 from gigabrain_zenoh.faults.damage import Figures
 from gigabrain_zenoh.faults.proxy import TcpProxy
 from gigabrain_zenoh.process import find
+from gigabrain_zenoh.stop_signals import run_async
 from gigabrain_zenoh.typed import typed_lines
 
 ENDPOINT = re.compile(r"(?:(?:tcp|tls|ws)/)?(?P<host>\[[^\]]+\]|[^/:\[\]]+):(?P<port>\d+)")
@@ -59,7 +60,7 @@ def proxy(
         made: Spoiled = line_proxy(to, _path(listen), baud=baud, seed=seed)
     else:
         made = TcpProxy(_address(to), _own(listen, insecure), seed=seed)
-    asyncio.run(_stand(made, begin, to))
+    run_async(_stand(made, begin, to))
     return 0
 
 

@@ -1,6 +1,5 @@
 """`gigabrain record`: what a robot says, into a file."""
 
-import asyncio
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +8,7 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.checked import above_zero, checked
 from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.settings import RecorderConfig
+from gigabrain_zenoh.stop_signals import run_async
 
 
 def record(
@@ -59,4 +59,4 @@ def record(
         "split_s": split_time,
         "keep_free_mb": keep_free,
     }
-    return asyncio.run(run(checked(values, RecorderConfig), at.where(), seconds))
+    return run_async(run(checked(values, RecorderConfig), at.where(), seconds))

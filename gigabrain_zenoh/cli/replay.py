@@ -1,8 +1,9 @@
 """`gigabrain replay`: a recording through one process again."""
 
-import asyncio
 from pathlib import Path
 from typing import Literal
+
+from gigabrain_zenoh.stop_signals import run_async
 
 
 def replay(
@@ -29,4 +30,4 @@ def replay(
     """
     from gigabrain_zenoh.recording.process_replay import replay_file
 
-    return asyncio.run(replay_file(check, process, deployment))
+    return run_async(replay_file(check, process, deployment))

@@ -9,6 +9,7 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.tasks import Task
@@ -173,7 +174,7 @@ def _with(at: Which, do: "Callable[[Tasks], Awaitable[None]]") -> int:
         async with joined(at.where(), f"{getpass.getuser()}-cli") as (bus, _):
             await do(Tasks(bus, at.folder, on_wait=say))
 
-    asyncio.run(run())
+    run_async(run())
     return 0
 
 

@@ -1,6 +1,7 @@
 """`gigabrain teleop`: drive by keys or by a gamepad."""
 
 from gigabrain_zenoh.cli.where import HERE, Which
+from gigabrain_zenoh.stop_signals import run_async
 
 
 def teleop(
@@ -20,7 +21,6 @@ def teleop(
     take
         Even when somebody else drives, the robot's own brain included.
     """
-    import asyncio
     import getpass
     import sys
 
@@ -42,5 +42,5 @@ def teleop(
         finally:
             pad.close()
 
-    asyncio.run(run())
+    run_async(run())
     return 0

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from gigabrain_zenoh.cli.where import HERE, Which, show
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.stop_signals import run_async, stop_signals
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.tools.top_feed import Feed
@@ -40,7 +41,7 @@ def top(*, at: Which = HERE, once: bool = False) -> int:
                 else:
                     await _live(feed)
 
-    asyncio.run(run())
+    run_async(run())
     return 0
 
 
@@ -49,7 +50,16 @@ async def _live(feed: "Feed") -> None:
         from gigabrain_zenoh.tools.top import Top
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}; {NEEDS}") from None
-    await Top(feed, "").run_async()
+    app = Top(feed, "")
+    with stop_signals() as stop:
+        running = asyncio.ensure_future(app.run_async())
+        stopped = asyncio.ensure_future(stop.wait())
+        await asyncio.wait((running, stopped), return_when=asyncio.FIRST_COMPLETED)
+        stopped.cancel()
+        while not running.done():  # cancelled while it starts, Textual would show a traceback
+            app.exit()
+            await asyncio.wait((running,), timeout=0.1)
+        running.result()
 
 
 async def _once(feed: "Feed") -> None:

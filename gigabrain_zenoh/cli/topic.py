@@ -1,6 +1,5 @@
 """`gigabrain topic`: what goes over the bus."""
 
-import asyncio
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
@@ -8,6 +7,7 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.cli.live_names import topics
 from gigabrain_zenoh.cli.where import HERE, Which, say, show
+from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.base import Message
@@ -46,7 +46,7 @@ def list_(*, at: Which = HERE, all_topics: bool = False, json: bool = False) -> 
         else:
             show(topic_table.table(rows))
 
-    asyncio.run(run())
+    run_async(run())
     return 0
 
 
@@ -90,7 +90,7 @@ def echo(
         async with aimed(at.where(), topic, looks_on=True) as (bus, aim):
             return await run_echo(bus, aim, how, say)
 
-    return asyncio.run(run())
+    return run_async(run())
 
 
 def hz(topic: Name, /, *, at: Which = HERE, count: Count = None) -> int:
@@ -148,7 +148,7 @@ def _measure(what: Literal["hz", "bw", "delay"], topic: str, at: Which, count: i
         async with aimed(at.where(), topic) as (bus, aim):
             return await measure(bus, aim, what, count, say)
 
-    return asyncio.run(run())
+    return run_async(run())
 
 
 def info(topic: Name, /, *, at: Which = HERE) -> int:
@@ -171,7 +171,7 @@ def info(topic: Name, /, *, at: Which = HERE) -> int:
             for line in about(aim, found, bus.clock.now_ns()):
                 say(line)
 
-    asyncio.run(run())
+    run_async(run())
     return 0
 
 
@@ -216,10 +216,10 @@ def pub(
         raise not_found(name, ())
     if topic is None or topic is CMD_VEL:  # a key that is not ours may be what the body obeys
         seconds = None if rate and not count else (count or 1) / (rate or 1.0)
-        say(asyncio.run(drive(at.where(), name, words, seconds, take=take)))
+        say(run_async(drive(at.where(), name, words, seconds, take=take)))
         return 0
     of = name.rpartition("/")[2] if topic.many else ""
-    asyncio.run(_send(at, topic, typed_in(topic, words), of, rate, count))
+    run_async(_send(at, topic, typed_in(topic, words), of, rate, count))
     return 0
 
 

@@ -1,17 +1,25 @@
 """`gigabrain up`: what a deployment file puts on this host."""
 
-import asyncio
-import errno
-from collections.abc import Callable
+import sys
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from gigabrain_zenoh.config_places import located
 from gigabrain_zenoh.deployment import deployment_path, host_of, load_deployment
+from gigabrain_zenoh.display import LINES, Display, writer
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.stop_signals import run_async
 
 
 def up(
-    deployment: str, *, host: str | None = None, keys: Path | None = None, level: str = "info"
+    deployment: str,
+    *,
+    host: str | None = None,
+    keys: Path | None = None,
+    level: str = "info",
+    keep_stuck: Annotated[bool, Parameter(negative=())] = False,
 ) -> int:
     """Start what a deployment file puts on this host, and keep it running until Ctrl-C.
 
@@ -27,27 +35,20 @@ def up(
         The folder of this host's identity, in place of the one in the file.
     level
         The least level of what is logged: debug, info, warning or error.
+    keep_stuck
+        Leave a process alone that makes no progress, for a debugger; else it is started again.
     """
     from gigabrain_zenoh.launch import up as run
 
     path = deployment_path(deployment)
     loaded = load_deployment(path, str(keys.expanduser().absolute()) if keys else "")
     try:
-        return asyncio.run(run(loaded, host_of(loaded, host), _printer(), level))
+        where = host_of(loaded, host)
+        with Display(writer(sys.stdout), LINES) as display:
+
+            def say(line: str) -> None:
+                display.put(f"{line}\n")
+
+            return run_async(run(loaded, where, say, level, keep_stuck=keep_stuck))
     except ConfigError as error:
         raise located(path, error) from None
-
-
-def _printer() -> Callable[[str], None]:
-    """Prints lines for as long as somebody reads them: a robot goes on without its pager."""
-    read = True
-
-    def say(line: str) -> None:
-        nonlocal read
-        try:
-            if read:
-                print(line, flush=True)
-        except OSError as error:  # the pager has ended, or the terminal; a disk may have room again
-            read = error.errno == errno.ENOSPC
-
-    return say

@@ -3,6 +3,8 @@
 import asyncio
 import time
 
+from gigabrain_zenoh.stop_signals import run_async
+
 
 def warm() -> None:
     """Compile mapping and navigation, so that the first start is as quick as every other.
@@ -12,7 +14,7 @@ def warm() -> None:
     What was compiled is kept in the user's cache folder, or in NUMBA_CACHE_DIR where that is set.
     After an update it is done again, at the latest at the first start, while nothing drives.
     """
-    asyncio.run(_all())
+    run_async(_all())
 
 
 async def _all() -> None:

@@ -14,7 +14,7 @@ from gigabrain_zenoh import perception
 from gigabrain_zenoh.faults.bodies import description_of
 from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.rig import Rig
-from gigabrain_zenoh.faults.stopping import stop_by
+from gigabrain_zenoh.faults.stopping import Stop, stop_by
 from gigabrain_zenoh.faults.tampered import go_on, tampered
 from gigabrain_zenoh.perception import Floats
 from gigabrain_zenoh.safety import Inputs, Memory, step
@@ -29,13 +29,15 @@ async def blind_lidar(rig: Rig) -> Measured:
     body = description_of(rig)
     for name, values in blindness(body).items():
         _noticed(body, name, values)
-    kinds, zero_ms = LONG_KINDS if rig.long else KINDS, 0.0
+    kinds, stops = LONG_KINDS if rig.long else KINDS, list[Stop]()
     async with tampered(rig, *kinds) as subject:
         for _ in kinds:
-            stop = await stop_by(subject, lambda: go_on(subject))
-            zero_ms = max(zero_ms, stop.zero_ms)
+            stops.append(await stop_by(subject, lambda: go_on(subject)))
             go_on(subject)
-    return {"zero after": zero_ms}
+    return {
+        "brakes after": max(stop.brakes_ms for stop in stops),
+        "zero after": max(stop.zero_ms for stop in stops),
+    }
 
 
 def blindness(body: BodyDescription) -> dict[str, Floats]:

@@ -26,8 +26,9 @@ HEARD_MS = 25.0  # a body that reports 50 times a second or more is never older 
 RESTED_TICKS = 50
 REST_S = 1.0  # of simulated time, in which every body has come to rest
 TURNING, ROLLING = 0.2, 0.02  # [rad/s], [m/s]
+ROOM_M = 2.0  # so that it goes straight on for as long as it takes to notice
+PLACES, STRAIGHT_TICKS = 5, 30  # where to try, and for how long it has to be told to go straight
 RUNAWAY = 0.12  # [m/s]
-TRIES = 3
 
 
 async def serial_unplugged(rig: Rig) -> Measured:
@@ -185,20 +186,26 @@ async def motors_disobey(rig: Rig) -> Measured:
 
 
 async def _noticed(subject: Subject, *codes: str, **fault: Any) -> list[RobotState]:
-    """Break the body while it drives; all states until it is stopped for one of these causes.
+    """Break the body while it drives; return all states until it is stopped for these causes.
 
-    Tried again where a busy machine has stopped it for another.
+    Where the robot had to turn away from something meanwhile, it is driven to another place first.
     """
-    for _ in range(TRIES):
-        await subject.drive()
-        start = subject.onlooker.state
+    onlooker = subject.onlooker
+    for _ in range(PLACES):
+        await subject.drive(ROOM_M)
+        start = onlooker.state
         await subject.break_body(base=fault)
-        await _shut(subject)
-        shut = subject.onlooker.state
+        await onlooker.ticks(2 * STRAIGHT_TICKS)
+        shut = next((s for s in _from(subject, start) if s.gate.mode != "enabled"), None)
+        told = [abs(s.sent.angular_z) < TURNING for s in _from(subject, start)]
         await subject.break_body()
-        if _codes(shut) & set(codes):
-            return [s for s in _from(subject, start) if s.tick <= _shut_tick(subject, start)]
-    raise Failed(f"stopped for {', '.join(_codes(shut)) or 'nothing'}, not for {codes[0]}")
+        if shut or any(all(told[k : k + STRAIGHT_TICKS]) for k in range(STRAIGHT_TICKS)):
+            break
+    if shut is None:
+        raise Failed(f"not noticed within {2 * STRAIGHT_TICKS} ticks")
+    if not _codes(shut) & set(codes):
+        raise Failed(f"stopped for {', '.join(_codes(shut)) or 'nothing'}, not for {codes[0]}")
+    return [s for s in _from(subject, start) if s.tick <= shut.tick]
 
 
 def _codes(state: RobotState) -> set[str]:

@@ -1,6 +1,6 @@
-"""Somebody who may talk, and does not stop: commands by the thousand, and large messages.
+"""Somebody who may talk, and does not stop: commands and questions by the thousand, large messages.
 
-His commands call themselves the most urgent of all, and wait for nobody.
+Its commands call themselves the most urgent of all, and wait for nobody.
 
 For tests only. Started as `python -m gigabrain_zenoh.faults.flooder RATE_HZ LARGE_BYTES ENDPOINT`.
 """
@@ -13,7 +13,7 @@ from dataclasses import replace
 import msgspec
 
 from gigabrain_schemas.brain import CmdVel
-from gigabrain_schemas.topics import CMD_VEL, IMAGE, INTENT, SCAN, STATE, TELEOP
+from gigabrain_schemas.topics import CMD_VEL, DESCRIBE, IMAGE, INTENT, SCAN, STATE, TELEOP
 from gigabrain_zenoh import lifeline
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
@@ -25,6 +25,9 @@ URGENT = replace(CMD_VEL, priority="real_time", express=True)
 PERIOD_NS = 5_000_000
 LARGE_PERIODS = 100  # one large message in so many, on one of these keys after the other
 LARGE_KEYS = (IMAGE, SCAN, INTENT, TELEOP, CMD_VEL)
+ASKED = DESCRIBE.at("driver")
+ASKED_AT_ONCE, MAX_ASKED = 5, 2000  # questions in a period, and those that may be under way
+ANSWER_S = 5.0
 
 
 async def flood(rate_hz: int, large: bytes, endpoint: Endpoint) -> None:
@@ -34,10 +37,14 @@ async def flood(rate_hz: int, large: bytes, endpoint: Endpoint) -> None:
     bus = Bus(transport, Clock(), NAME)
     bus.latest(STATE)
     print("up", flush=True)
-    periods = 0
+    periods, asked = 0, set[asyncio.Task[list[bytes | str]]]()
     async for _ in bus.clock.every(PERIOD_NS):
         for _ in range(at_once):
             bus.publish(URGENT, CmdVel(linear_x=0.2, source=NAME))
+        for _ in range(min(ASKED_AT_ONCE, MAX_ASKED - len(asked))):
+            question = transport.query(ASKED, b"", "", ANSWER_S, DESCRIBE.priority)
+            asked.add(task := asyncio.create_task(question))
+            task.add_done_callback(asked.discard)
         periods += 1
         if periods % LARGE_PERIODS == 0:
             topic = LARGE_KEYS[periods // LARGE_PERIODS % len(LARGE_KEYS)]

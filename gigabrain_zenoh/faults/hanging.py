@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.topics import SCAN, WORLD, Topic
+from gigabrain_schemas.topics import SCAN, STATE, WORLD, Topic
 from gigabrain_zenoh import lifeline, process
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
@@ -22,7 +22,12 @@ from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.transport import Close, Transport
 
 M = TypeVar("M", bound=Message)
-PARTS: dict[str, Topic[Any]] = {"perception": SCAN, "decision": WORLD}  # what is not handled
+PARTS: dict[str, Topic[Any]] = {  # what is not handled
+    "perception": SCAN,
+    "decision": WORLD,
+    "control": STATE,
+    "safety": STATE,
+}
 
 
 class HangingBus(Bus):

@@ -1,4 +1,4 @@
-"""Faults of load: a machine that is busy with other things, a flood, a long time."""
+"""Faults of load: a machine that is busy with other things, and a flood."""
 
 import asyncio
 import os
@@ -9,21 +9,18 @@ import msgspec
 
 from gigabrain_schemas.audit import AuditRequest
 from gigabrain_schemas.base import TICK_NS
-from gigabrain_schemas.topics import AUDIT_LOG, CMD_VEL, SAFETY, SCAN, STATE, WORLD
+from gigabrain_schemas.topics import AUDIT_LOG, STATE
 from gigabrain_zenoh.deployment import client_endpoint
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.faults.estop import Presses
 from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.flooder import NAME
-from gigabrain_zenoh.faults.growth import Growth
 from gigabrain_zenoh.faults.helpers import helper, helpers, rss_mb
 from gigabrain_zenoh.faults.rig import Rig
-from gigabrain_zenoh.faults.smooth import stops_in_time
-from gigabrain_zenoh.faults.stopping import stop_by
+from gigabrain_zenoh.faults.stopping import Stop, stop_by
 from gigabrain_zenoh.faults.subject import Subject
-from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.percentile import percentile
-from gigabrain_zenoh.recording.gaps import Gaps, header_of
+from gigabrain_zenoh.recording.gaps import header_of
 
 HOGS = 4  # for each core
 OTHERS = ["fill", "litter", "parse"]
@@ -36,9 +33,6 @@ FLOODED_S, LONG_FLOODED_S = 8.0, 60.0
 RATE_HZ, LONG_RATE_HZ = 2000, 10_000  # of its commands
 LARGE_BYTES, LONG_LARGE_BYTES = 1_000_000, 10_000_000  # of a message twice a second
 LEAST_SHARE = 0.5  # of that rate, else it was no flood
-SOAK_S, LONG_SOAK_S = 20.0, 8 * 3600.0
-WARM_TICKS = 1000  # 20 s; a robot that has just started still takes memory
-COUNTED = (STATE, SCAN, WORLD, CMD_VEL, SAFETY)
 
 
 class Lateness:
@@ -68,22 +62,22 @@ class Lateness:
 async def cpu_hogs(rig: Rig) -> Measured:
     """Four busy processes for each core, and others that eat memory, litter, and parse."""
     subject = await rig.robot("sim")
-    zero_ms, missed = 0.0, 0
+    stops, missed = list[Stop](), 0
     hogs = ["spin"] * (HOGS * (os.cpu_count() or 1)) + OTHERS
     async with helpers("hogs", hogs):
         await asyncio.sleep(SETTLE_S)
         late = Lateness(subject)
         end_s = asyncio.get_running_loop().time() + (LONG_HOGGED_S if rig.long else HOGGED_S)
-        while not zero_ms or asyncio.get_running_loop().time() < end_s:
+        while not stops or asyncio.get_running_loop().time() < end_s:
             pid = subject.pid("decision")
-            stop = await stop_by(subject, lambda: subject.kill("decision"), "decision")
-            zero_ms = max(zero_ms, stop.zero_ms)
+            stops.append(await stop_by(subject, lambda: subject.kill("decision"), "decision"))
             await subject.restarted("decision", pid)
             missed += await _missed(subject, ESTOPS)
         late.close()
     return {
         "gate tick late p99.9": late.p999_ms,
-        "zero after": zero_ms,
+        "brakes after": max(stop.brakes_ms for stop in stops),
+        "zero after": max(stop.zero_ms for stop in stops),
         "missed e-stops": missed,
     }
 
@@ -105,7 +99,7 @@ async def _missed(subject: Subject, count: int) -> int:
 
 
 async def flood(rig: Rig) -> Measured:
-    """2 kHz of commands and 1 MB at a time; in the long form 10 kHz and 10 MB."""
+    """2 kHz of commands and of questions, 1 MB at a time; in the long form 10 kHz and 10 MB."""
     subject = await rig.robot("sim")
     endpoint = msgspec.json.encode(client_endpoint(subject.deployment)).decode()
     pid, seconds = subject.pid("driver"), LONG_FLOODED_S if rig.long else FLOODED_S
@@ -131,7 +125,8 @@ async def flood(rig: Rig) -> Measured:
     return {
         "cpu of the driver": 100.0 * statistics.median(cpu),
         "memory grown": most_mb - before_mb,
-        "e-stop p99": presses.p99_ms,
+        "latched after": presses.figures()["latched after"],
+        "e-stop p99": presses.figures()["zero p99"],
         "flooder unnamed": float(not named),
     }
 
@@ -150,35 +145,3 @@ async def _named(subject: Subject) -> bool:
     pages = await subject.onlooker.bus.ask(AUDIT_LOG, AuditRequest(newest=1000), timeout_s=5.0)
     records = [record for page in pages for record in page.records]
     return any(record.what == "refused" and record.source == NAME for record in records)
-
-
-async def soak(rig: Rig) -> Measured:
-    """It drives for a long time. In less than an hour nothing may grow by what it may in one."""
-    subject = await rig.robot("sim")
-    onlooker, gaps = subject.onlooker, Gaps()
-    await subject.drive()
-    await until(lambda: onlooker.state.tick >= WARM_TICKS, "it is warm")
-    pids = [subject.pid(name) for name in subject.supervisor.statuses]
-    growth = Growth(pids)
-
-    def see(key: str, _encoding: str, payload: bytes) -> None:
-        gaps.see(key, header_of(payload))
-
-    closes = [onlooker.bus.tap(topic.key, see) for topic in COUNTED]
-    seconds, stopped = LONG_SOAK_S if rig.long else SOAK_S, 0
-    end_s = asyncio.get_running_loop().time() + seconds
-    while asyncio.get_running_loop().time() < end_s:
-        await subject.drive(0.3)
-        start = onlooker.state
-        await asyncio.sleep(min(SOAK_S, seconds))
-        stopped += stops_in_time(onlooker, start)
-    for close in closes:
-        close()
-    if pids != [subject.pid(name) for name in subject.supervisor.statuses]:
-        raise Failed("a process has died")
-    return {
-        "unexplained stops": stopped,
-        "memory grown": growth.memory_mb() / max(1.0, seconds / 3600.0),
-        "open files grown": growth.open_files(),
-        "lost": gaps.missing.total(),
-    }

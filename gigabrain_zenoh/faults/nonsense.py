@@ -21,7 +21,7 @@ from gigabrain_zenoh.faults.hostile import codec_of, hostile_payloads
 from gigabrain_zenoh.faults.hostile import hostile_values as damaged
 from gigabrain_zenoh.faults.open_gate import COMMANDER, OpenGate
 from gigabrain_zenoh.faults.rig import Rig, deployment_of
-from gigabrain_zenoh.faults.smooth import stops_in_time
+from gigabrain_zenoh.faults.smooth import stops
 from gigabrain_zenoh.faults.stopping import TICK_MS
 from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
@@ -37,6 +37,7 @@ PER_TICK = 3  # of each key, on a running robot
 FLOOD_TICKS, LONG_FLOOD_TICKS = 100, 3000
 SPEEDS = (math.nan, math.inf, -math.inf)
 LOCKSTEP = 2.0  # of real time
+LOCKSTEP_TIMEOUT_S = 30.0
 ROUNDING = 1e-9
 AXES = ("linear_x", "linear_y", "angular_z")
 COMMAND = codec_of(CmdVel)
@@ -137,11 +138,12 @@ def sensed(body: BodyDescription, count: int) -> None:
 async def _flooded(rig: Rig, ticks: int) -> int:
     """Stops of a driving robot, and speeds beyond its limits, while nonsense comes on each key.
 
-    In lock-step, where time waits for the brain, though not for ever: where a machine has no time
-    for it, ticks pass without a command, and that stop is the machine's.
+    In lock-step, where time waits for the brain, however slow this machine is.
     """
     await rig.give_up()
-    deployment = msgspec.structs.replace(deployment_of(rig.options, "sim"), speed=LOCKSTEP)
+    deployment = msgspec.structs.replace(
+        deployment_of(rig.options, "sim"), speed=LOCKSTEP, lockstep_timeout_s=LOCKSTEP_TIMEOUT_S
+    )
     async with rig.new(deployment) as subject:
         await subject.settle()
         onlooker = subject.onlooker
@@ -153,7 +155,7 @@ async def _flooded(rig: Rig, ticks: int) -> int:
         states = [s for s in onlooker.states if s.boot == start.boot and s.tick > start.tick]
         await subject.check()
     fast = sum(not abs(s.velocity.linear_x) <= most for s in states)
-    return fast + stops_in_time(onlooker, start)
+    return fast + len(stops(onlooker, start))
 
 
 async def _pour(subject: Subject, ticks: int) -> None:

@@ -4,7 +4,7 @@ import asyncio
 import itertools
 import math
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
@@ -55,7 +55,8 @@ class Onlooker:
         self.logs: list[LogRecord] = []
         self.safety, self.world = bus.latest(SAFETY), bus.latest(WORLD)
         self.intent = bus.latest(INTENT)
-        bus.latest(STATE, self.states.append)
+        self.on_state: Callable[[RobotState], None] = lambda _state: None
+        bus.latest(STATE, self._see)
         self.bodies = bus.latest(BODY, self._join)
         bus.subscribe(HEALTH, self._hear)
         bus.subscribe(LOG, lambda _key, record: self.logs.append(record))
@@ -64,6 +65,10 @@ class Onlooker:
     def state(self) -> RobotState:
         """The newest state."""
         return self.states[-1]
+
+    def _see(self, state: RobotState) -> None:
+        self.states.append(state)
+        self.on_state(state)
 
     def _hear(self, _key: str, health: Health) -> None:
         self.health[health.process] = health

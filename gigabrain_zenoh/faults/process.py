@@ -84,7 +84,7 @@ async def one_part_of_decision_hangs(rig: Rig) -> Measured:
     async with rig.new(deployment_of(rig.options, "sim"), _hanging) as subject:
         stop = await stop_by(subject, lambda: subject.send("decision", signal.SIGUSR1))
         await subject.check()
-    return {"zero after": stop.zero_ms, "travel": stop.travel_m}
+    return stop.figures()
 
 
 def _hanging(specs: list[ProcessSpec]) -> list[ProcessSpec]:
@@ -126,4 +126,4 @@ def _worse(one: Mapping[str, float], two: Mapping[str, float]) -> dict[str, floa
 
 
 def _figures(stop: Stop, again_m: float) -> dict[str, float]:
-    return {"zero after": stop.zero_ms, "travel": stop.travel_m, "moved again": again_m}
+    return {**stop.figures(), "moved again": again_m}

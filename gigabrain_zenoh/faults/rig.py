@@ -31,6 +31,7 @@ class Options:
     world: str = "arena"
     behaviour: Literal["avoid", "navigate"] = "avoid"
     long: bool = False  # the forms for a release, instead of those for every change
+    wall: bool = True  # judge wall-clock limits as well, which need a machine with nothing beside
 
 
 class Rig:
@@ -40,11 +41,11 @@ class Rig:
         self.options, self.folder = options, folder
         self._numbers = itertools.count(1)
         self._kept: tuple[Deployment, Subject] | None = None
+        self._subjects: list[Subject] = []
 
-    @property
-    def late_s(self) -> float:
-        """How long this machine has kept a body's firmware waiting since the last test began."""
-        return self._kept[1].late_s if self._kept else 0.0
+    def pids(self) -> list[int]:
+        """Return the pids of all processes that are ready, of the robots that run now."""
+        return [pid for subject in self._subjects for pid in subject.ready_pids()]
 
     @property
     def long(self) -> bool:
@@ -72,13 +73,20 @@ class Rig:
         return subject
 
     def new(
-        self, deployment: Deployment, change: Change | None = None, backoff: Backoff = TIRELESS
+        self,
+        deployment: Deployment,
+        change: Change | None = None,
+        backoff: Backoff = TIRELESS,
+        *,
+        keep_stuck: bool = True,
     ) -> Subject:
         """A robot of a test's own, not started yet; to be used as `async with`.
 
         Call `give_up` first, so that two robots do not share the machine.
         """
-        return Subject(deployment, self.fresh_folder(), change, backoff)
+        subject = Subject(deployment, self.fresh_folder(), change, backoff, keep_stuck=keep_stuck)
+        self._subjects.append(subject)
+        return subject
 
     def fresh_folder(self) -> Path:
         """An empty folder of a test's own."""

@@ -6,21 +6,29 @@ from typing import NamedTuple
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.faults.fault import Failed
-from gigabrain_zenoh.faults.onlooker import Onlooker
+from gigabrain_zenoh.faults.onlooker import Onlooker, at_rest
 from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
 
 SLOWER = 0.01  # [m/s], half of what a body brakes in a tick
 TICK_MS = TICK_NS / 1e6
-LATE_TICKS = 2
 
 
 class Stop(NamedTuple):
     """What came of a fault while driving straight on."""
 
-    zero_ms: float  # from the last tick of the victim to the first that slows the body down
+    brakes_ms: float  # from the last tick of the victim to the first that slows the body down
+    zero_ms: float  # to the first tick from which the body is measured at rest
     travel_m: float  # by the physics, until at rest
     distance_m: float  # the whole path so far, by the physics
+
+    def figures(self) -> dict[str, float]:
+        """Return what a row of the table is judged by."""
+        return {
+            "brakes after": self.brakes_ms,
+            "zero after": self.zero_ms,
+            "travel": self.travel_m,
+        }
 
 
 async def stop_by(subject: Subject, fault: Callable[[], object], victim: str = "") -> Stop:
@@ -40,8 +48,9 @@ async def stop_by(subject: Subject, fault: Callable[[], object], victim: str = "
         raise Failed("the gate does not say why it is shut")
     await onlooker.still()
     distance_m = await subject.distance()
-    zero = first_zero(onlooker, start, begin)
-    return Stop((zero - begin) * TICK_MS, distance_m - before_m, distance_m)
+    brakes, zero = first_slower(onlooker, start, begin), first_zero(onlooker, start, begin)
+    brakes_ms, zero_ms = (brakes - begin) * TICK_MS, (zero - begin) * TICK_MS
+    return Stop(brakes_ms, zero_ms, distance_m - before_m, distance_m)
 
 
 def _last_word(onlooker: Onlooker, victim: str, start: RobotState) -> int:
@@ -58,26 +67,23 @@ def _last_word(onlooker: Onlooker, victim: str, start: RobotState) -> int:
     return said.tick if said and said.boot == start.boot else 0
 
 
-def first_zero(onlooker: Onlooker, start: RobotState, begin: int) -> int:
-    """The first tick since `begin` that has slowed the body down.
-
-    Of ticks that control never answered, because this machine woke it too late, two at most do not
-    count: what it would have done in the first of them it has done in the first that it saw.
-    """
-    shut = next(
-        s.tick
-        for s in onlooker.states
-        if s.boot == start.boot and s.tick > start.tick and s.gate.mode != "enabled"
-    )
+def first_slower(onlooker: Onlooker, start: RobotState, begin: int) -> int:
+    """Return the first tick since `begin` that slows the body: a slower command, or a shut gate."""
+    shut = next(s.tick for s in _since(onlooker, start) if s.gate.mode != "enabled")
     ours = [c for c in onlooker.commands if c.boot == start.boot]
     speed = next((c.linear_x for c in reversed(ours) if c.tick <= begin), 0.0)
-    answered = begin
-    for command in ours:
-        if command.tick > begin and command.linear_x < speed - SLOWER:
-            late = min(LATE_TICKS, max(0, command.tick - answered - 1))
-            return min(shut, command.tick - late)
-        answered = max(answered, command.tick)
-    return shut
+    slower = (c.tick for c in ours if c.tick > begin and c.linear_x < speed - SLOWER)
+    return min(shut, next(slower, shut))
+
+
+def first_zero(onlooker: Onlooker, start: RobotState, begin: int) -> int:
+    """Return the tick since `begin` from which the body is measured at rest."""
+    moving = [s.tick for s in _since(onlooker, start) if s.tick > begin and not at_rest(s)]
+    return (moving[-1] if moving else begin) + 1
+
+
+def _since(onlooker: Onlooker, start: RobotState) -> list[RobotState]:
+    return [s for s in onlooker.states if s.boot == start.boot and s.tick > start.tick]
 
 
 async def creep(subject: Subject, ticks: int) -> float:

@@ -43,13 +43,17 @@ class Subject:
         folder: Path,
         change: Change | None = None,
         backoff: Backoff = TIRELESS,
+        *,
+        keep_stuck: bool = True,
     ) -> None:
         self.deployment, self.folder = with_free_port(deployment), folder
         specs = process_specs(self.deployment, "robot", folder / "run", folder / "state")
-        self.supervisor = Supervisor(change(specs) if change else specs, self._record, backoff)
+        if change:
+            specs = change(specs)
+        # a test that freezes a process thaws it itself, unless it asks for the restart
+        self.supervisor = Supervisor(specs, self._record, backoff, keep_stuck=keep_stuck)
         self.records: list[Mapping[str, Any]] = []  # of all logs
         self.harmed = False  # a test may say that nobody should use this robot again
-        self.late_s = 0.0  # how long this machine has kept the body's firmware waiting
         self.onlooker: Onlooker
         self.person: Robot
         self._stack = AsyncExitStack()
@@ -98,6 +102,11 @@ class Subject:
     def truth_of(self) -> str:
         """The process whose report is the physics' truth."""
         return EMULATOR if self.deployment.link == "emulated" else "driver"
+
+    def ready_pids(self) -> list[int]:
+        """Return the pids of all processes that are ready."""
+        statuses = self.supervisor.statuses.values()
+        return [status.pid for status in statuses if status.pid and status.state == "ready"]
 
     def pid(self, name: str) -> int:
         """The pid of a process that runs. Raises Failed."""
@@ -177,9 +186,7 @@ class Subject:
 
     async def truth(self) -> dict[str, Any]:
         """What the physics knows: contacts, distance_m, true_speed and more."""
-        truth = dict((await self.onlooker.describe(self.truth_of)).report)
-        self.late_s = max(self.late_s, float(truth.get("firmware_late_s") or 0.0))
-        return truth
+        return dict((await self.onlooker.describe(self.truth_of)).report)
 
     async def distance(self) -> float:
         """How long the path of the body has been so far, by the physics [m]."""
@@ -230,7 +237,7 @@ class Subject:
         if self.onlooker.state.boot == boot:
             await self.release()
         self._contacts = int((await self.truth())["contacts"])
-        self._judged, self.late_s = len(self.records), 0.0
+        self._judged = len(self.records)
 
     async def check(self) -> None:
         """Raise Failed where something was touched, or a program has died of itself."""

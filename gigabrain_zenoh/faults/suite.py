@@ -1,12 +1,15 @@
 """Runs fault tests, one after the other, those that share a robot together."""
 
 import asyncio
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import get_args
 
+import msgspec
+
 from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.faults.disturbance import DISTURBED_MS, RunQueueWatch
 from gigabrain_zenoh.faults.fault import (
     Fault,
     Measured,
@@ -14,19 +17,20 @@ from gigabrain_zenoh.faults.fault import (
     Skipped,
     Stage,
     Test,
-    Verdict,
+    Try,
+    conclude,
     judge,
 )
 from gigabrain_zenoh.faults.rig import Options, Rig
-from gigabrain_zenoh.faults.waiting import StallWatch
 from gigabrain_zenoh.process import find
 
-STALL_S = 0.03  # held up for longer, this machine and not the robot is to blame for a failure
-TRIES = 3  # runs that end in such a stall are run again so often
+PATIENCE = 3  # disturbed runs at most, passed or failed, beside each that counts
 LIMIT_S = 300.0  # for one run of one test in its short form
 STAGES = get_args(Stage)
 
-Say = Callable[[Result], None]
+Begun = Callable[[Fault], None]
+Ended = Callable[[Fault, Try], None]
+Earlier = Mapping[int, Sequence[Try]]
 
 
 async def run_suite(
@@ -34,81 +38,65 @@ async def run_suite(
     options: Options,
     folder: Path,
     repeat: int = 1,
-    begun: Callable[[Fault], None] = lambda fault: None,
-    ended: Say = lambda result: None,
+    begun: Begun = lambda fault: None,
+    ended: Ended = lambda fault, one: None,
+    earlier: Earlier = MappingProxyType({}),
 ) -> list[Result]:
-    """Every fault `repeat` times; the results in the table's order."""
+    """Run every fault until `repeat` runs of it count; the results in the table's order.
+
+    `earlier` are runs of before, by the fault's number: they count like those of now.
+    """
     ordered = sorted(faults, key=lambda fault: (STAGES.index(fault.stage), fault.number))
-    stalls = StallWatch()
-    stalls.start()
     results = []
-    try:
-        async with Rig(options, folder) as rig:
-            for fault in ordered:
-                begun(fault)
-                results.append(await _repeated(fault, rig, stalls, repeat))
-                ended(results[-1])
-    finally:
-        stalls.close()
+    async with Rig(options, folder) as rig:
+        for fault in ordered:
+            begun(fault)
+            before = earlier.get(fault.number, ())
+            results.append(conclude(fault, await _tries(fault, rig, repeat, ended, before)))
     return sorted(results, key=lambda result: result.number)
 
 
-@dataclass
-class Run:
-    """What came of one run, after all that were thrown away."""
+async def _tries(
+    fault: Fault, rig: Rig, repeat: int, ended: Ended, before: Sequence[Try]
+) -> list[Try]:
+    """Run one fault; a run that was disturbed is followed by another, whatever came of it."""
+    tries, disturbed = list(before), sum(one.disturbed for one in before)
+    while len(tries) - disturbed < repeat and disturbed < PATIENCE * repeat:
+        tries.append(await _try(fault, rig))
+        ended(fault, tries[-1])
+        disturbed += tries[-1].disturbed
+        if tries[-1].verdict == "skipped":
+            break
+    return tries
 
-    measured: Measured | None = None
-    verdict: Verdict = "passed"
-    reason: str = ""
-    stall_s: float = 0.0
-    thrown: int = 0
 
-
-async def _repeated(fault: Fault, rig: Rig, stalls: StallWatch, repeat: int) -> Result:
-    """All runs of one fault; the first that does not pass is the last."""
-    loop, runs = asyncio.get_running_loop(), list[Run]()
+async def _try(fault: Fault, rig: Rig) -> Try:
+    loop, watch = asyncio.get_running_loop(), RunQueueWatch(lambda: ("self", *rig.pids()))
+    watch.start()
     began_s = loop.time()
-    while len(runs) < repeat and (not runs or runs[-1].verdict == "passed"):
-        runs.append(await _patiently(fault, rig, stalls))
-    measured = [run.measured for run in runs if run.measured is not None]
-    return Result(
-        number=fault.number,
-        name=fault.name,
-        criterion=fault.criterion,
-        verdict=runs[-1].verdict,
-        reason=runs[-1].reason,
-        worst=judge(fault, measured)[2] if measured else {},
-        runs=len(measured),
+    try:
+        judged = await _judged(fault, rig)
+    finally:
+        watch.close()
+    return msgspec.structs.replace(
+        judged,
+        waited_ms=round(watch.longest_ms, 1),
+        disturbed=watch.longest_ms >= DISTURBED_MS and not fault.loads,
         seconds=round(loop.time() - began_s, 1),
-        stalls=sum(run.thrown for run in runs),
-        stall_ms=round(max(run.stall_s for run in runs) * 1e3),
     )
 
 
-async def _patiently(fault: Fault, rig: Rig, stalls: StallWatch) -> Run:
-    """One run that passed, or was skipped, or failed although this machine did not stand still."""
-    for thrown in range(TRIES):
-        stalls.reset()
-        run = await _judged(fault, rig)
-        run.stall_s, run.thrown = max(run.stall_s, await stalls.longest_s()), thrown
-        if run.verdict != "FAILED" or run.stall_s < STALL_S:
-            break
-    return run
-
-
-async def _judged(fault: Fault, rig: Rig) -> Run:
+async def _judged(fault: Fault, rig: Rig) -> Try:
     """One run. The robot of one that failed is used no more."""
     try:
         measured = await _run(fault, rig)
     except Skipped as error:
-        return Run(verdict="skipped", reason=str(error))
+        return Try(verdict="skipped", reason=str(error))
     except (GigabrainError, TimeoutError) as error:
-        late_s = rig.late_s
         await rig.give_up()
-        text = str(error) or f"not over after {LIMIT_S:g} s"
-        return Run(verdict="FAILED", reason=text, stall_s=late_s)
-    verdict, reason, _ = judge(fault, [measured])
-    return Run(measured, verdict, reason, rig.late_s)
+        return Try(verdict="FAILED", reason=str(error) or f"not over after {LIMIT_S:g} s")
+    verdict, reason = judge(fault, measured, wall=rig.options.wall, long=rig.long)
+    return Try(verdict=verdict, reason=reason, measured=dict(measured))
 
 
 async def _run(fault: Fault, rig: Rig) -> Measured:

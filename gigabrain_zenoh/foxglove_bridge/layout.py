@@ -1,19 +1,32 @@
 """The layout for Lichtblick and Foxglove, with the topic by which its owner steers."""
 
 import os
+import re
+import secrets
 from importlib.resources import files
 from pathlib import Path
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.page.access import token_file, tokens
+from gigabrain_zenoh.keys.files import made_once
+from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.settings import FoxgloveConfig
 
+SECRET_BYTES = 24
 PLACE = "TOPIC_TO_STEER"  # in the package's file, where the topic belongs
 
 
 def topic_to_steer(config: FoxgloveConfig) -> str:
-    """The topic on which a viewer may publish velocities. Raises ConfigError."""
-    return f"/teleop/{tokens(token_file(config.tokens))[0].operator}"
+    """The topic on which a viewer may publish velocities. Raises ConfigError.
+
+    Its secret is for nothing else: layouts are shared, and the page's tokens do more than steer.
+    """
+    path = Path(config.secret) if config.secret else state_dir() / "foxglove" / "secret"
+    secret, _ = made_once(path, secrets.token_urlsafe(SECRET_BYTES).encode())
+    if not re.fullmatch(rb"[\w-]{16,200}", secret):
+        raise ConfigError(
+            f"{path}: expected a secret of 16 letters or more; remove it, and it is made"
+        )
+    return f"/teleop/{secret.decode()}"
 
 
 def write_layout(config: FoxgloveConfig, path: Path) -> None:

@@ -1,8 +1,8 @@
 """Joins the robot to viewers that speak Foxglove's WebSocket protocol. On loopback only.
 
-The protocol knows no login, and its library looks at no Origin: a page of any site that is open in
-a browser of this machine could connect. So it may look; to steer, a viewer has to publish on a
-topic that ends in a secret, which the layout file holds that `gigabrain foxglove --layout` writes.
+The protocol knows no login: whoever connects may look. Of browsers only pages of this machine and
+of known viewers may (`front`). To steer, a viewer has to publish on a topic that ends in a secret,
+which the layout file holds that `gigabrain foxglove --layout` writes.
 """
 
 import asyncio
@@ -14,6 +14,7 @@ from foxglove.websocket import Capability, ServerListener, WebSocketServer
 
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.foxglove_bridge.front import HOST, Front, hidden_host
 from gigabrain_zenoh.foxglove_bridge.graph import connections
 from gigabrain_zenoh.foxglove_bridge.layout import topic_to_steer
 from gigabrain_zenoh.foxglove_bridge.sources import Sources
@@ -22,20 +23,19 @@ from gigabrain_zenoh.settings import FoxgloveConfig
 
 log = logging.getLogger(__name__)
 
-HOST = "127.0.0.1"
 FRAME_NS = 100_000_000  # viewers see ten moments a second
 GRAPH_NS = 2_000_000_000  # how often it is asked who talks to whom
 BACKLOG = 64  # messages that wait for a slow viewer; the oldest give way
 NAME = "gigabrain"
 
 
-def start(port: int, context: foxglove.Context, listener: ServerListener) -> WebSocketServer:
-    """The server, which has threads of its own. Raises ConfigError where the port is taken."""
+def start(host: str, context: foxglove.Context, listener: ServerListener) -> WebSocketServer:
+    """The server, which has threads of its own. Raises ConfigError where it cannot listen."""
     try:
         return foxglove.start_server(
             name=NAME,
-            host=HOST,
-            port=port,
+            host=host,
+            port=0,
             capabilities=[Capability.ClientPublish, Capability.ConnectionGraph],
             server_listener=listener,
             supported_encodings=["json"],
@@ -43,10 +43,7 @@ def start(port: int, context: foxglove.Context, listener: ServerListener) -> Web
             message_backlog_size=BACKLOG,
         )
     except RuntimeError as error:
-        raise ConfigError(
-            f"foxglove: cannot listen on {HOST} port {port}: {error}; "
-            "choose another with --port, or `foxglove: {port: …}` in the deployment file"
-        ) from None
+        raise ConfigError(f"foxglove: cannot listen on loopback: {error}") from None
 
 
 async def run(config: FoxgloveConfig, bus: Bus, ready: Callable[[], None]) -> None:
@@ -55,12 +52,19 @@ async def run(config: FoxgloveConfig, bus: Bus, ready: Callable[[], None]) -> No
     context = foxglove.Context()
     sources = Sources(bus, context)
     steering = Steering(sources, topic_to_steer(config))
-    server = start(config.port, context, steering)
+    behind = hidden_host()
+    server = start(behind, context, steering)
+    front = Front(config.origins, (behind, server.port))
+    try:
+        port = await front.listen(config.port)
+    except ConfigError:
+        await asyncio.to_thread(server.stop)
+        raise
     works = [
         asyncio.ensure_future(_show(bus, sources)),
         asyncio.ensure_future(_show_graph(bus, steering, server)),
     ]
-    log.info("viewers connect to ws://%s:%d", HOST, server.port)
+    log.info("viewers connect to ws://%s:%d", HOST, port)
     ready()
     try:
         await asyncio.wait((*works, bus.failed), return_when=asyncio.FIRST_COMPLETED)
@@ -68,6 +72,7 @@ async def run(config: FoxgloveConfig, bus: Bus, ready: Callable[[], None]) -> No
         steering.close()
         for work in works:
             work.cancel()
+        await front.close()
         await asyncio.to_thread(server.stop)
     for end in (*works, bus.failed):
         if end.done() and not end.cancelled():

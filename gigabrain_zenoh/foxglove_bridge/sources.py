@@ -53,6 +53,12 @@ class Sources:
         bus.latest(BODY, self._hear_body)
         bus.tap(IMAGE.at("*"), self._hear_image)
 
+    @property
+    def enables(self) -> int | None:
+        """How often the gate was enabled; None while the robot is silent."""
+        state = self._state.fresh()
+        return state.gate.enables if state else None
+
     def steer(self, wanted: Velocity) -> None:
         """Tell the robot's own control what an operator wants, with the newest tick."""
         self._state.look()

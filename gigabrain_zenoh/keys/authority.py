@@ -5,7 +5,6 @@ Certificates are X.509 v3 with EC P-256 keys (RFC 5280); the common name is who 
 
 import datetime
 import ipaddress
-import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,6 +17,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from gigabrain_zenoh.addresses import host_and_port, is_host, is_ip
+from gigabrain_zenoh.atomic_write import sync_folder, write_synced
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.files import CA, CA_KEY, CERTIFICATE, KEY
 from gigabrain_zenoh.keys.identity import read_certificate, read_key
@@ -177,7 +177,9 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         made = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))  # mode 0700
         try:
             yield made
+            sync_folder(made)
             made.rename(folder)
+            sync_folder(folder.parent)
         except BaseException:
             shutil.rmtree(made, ignore_errors=True)
             raise
@@ -190,5 +192,4 @@ def _new_folder(folder: Path) -> Iterator[Path]:
 def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
     for name, data in contents.items():
         mode = 0o600 if name in (KEY, CA_KEY) else 0o644
-        with open(os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-            file.write(data)
+        write_synced(folder / name, data, mode)

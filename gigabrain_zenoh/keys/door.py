@@ -1,23 +1,28 @@
 """The router's door: who comes in, who is turned away, and who is denied what."""
 
-import asyncio
 import contextlib
 import fcntl
 import logging
 import os
-import select
+import re
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 
+from gigabrain_schemas.topics import SERVICES, TOPICS
 from gigabrain_zenoh.audit import AuditTrail
+from gigabrain_zenoh.bridge import Bridge
 from gigabrain_zenoh.keys.zenoh_log import DIRECTIVES, Denied, TurnedAway, ZenohLog
+from gigabrain_zenoh.mailbox import Mailbox
 from gigabrain_zenoh.transport import Link
 from gigabrain_zenoh.zenoh_session import log_to_stdout
 
 log = logging.getLogger(__name__)
 
-STDOUT, CHUNK, ROOM = 1, 1 << 16, 1 << 20  # bytes
+STDOUT, CHUNK_BYTES, PIPE_BYTES = 1, 1 << 16, 1 << 20
+WAITING = 1000  # denials that may wait for the loop
+PARTICULAR = re.compile(r"\S*\d\S*")  # words with a digit: addresses, ports, numbers
+TABLE = {*(topic.key for topic in TOPICS), *(service.key for service in SERVICES)}
 Seen = Denied | TurnedAway
 
 
@@ -43,52 +48,54 @@ class Door:
         else:
             log.info("%s has come from %s", name, link.address)
 
-    def seen(self, all_seen: Sequence[Seen]) -> None:
+    def seen(self, seen: Seen) -> None:
         """What Zenoh's log has told."""
-        for seen in all_seen:
-            if isinstance(seen, TurnedAway):
-                text = f"somebody was turned away at the door: {seen.why}"
-                self._trail.note("stranger", "unknown", text, code=seen.why, ok=False)
-                continue
-            link = self._links.get(seen.zid)
-            name = (link.name if link else "") or "local"
-            where = link.address if link else "an unknown address"
-            text = f"{name} at {where} may not {seen.what.lower()} {seen.key}"
-            code = f"{seen.what.lower()} {seen.key}"
-            self._trail.note("refused", name, text, code=code, ok=False)
+        if isinstance(seen, TurnedAway):
+            text = f"somebody was turned away at the door: {seen.why}"
+            code = PARTICULAR.sub("…", seen.why)
+            self._trail.note("stranger", "unknown", text, code=code, ok=False)
+            return
+        link = self._links.get(seen.zid)
+        name = (link.name or "local") if link else "unknown"
+        where = link.address if link else "an unknown address"
+        verb = seen.what.lower()
+        text = f"{name} at {where} may not {verb} {seen.key}"
+        code = f"{verb} {_of_table(seen.key)}"
+        self._trail.note("refused", name, text, code=code, ok=False)
+
+
+def _of_table(key: str) -> str:
+    """The topic or service that a key belongs to, of whatever robot; a sender chooses the key."""
+    parts = key.split("/")
+    known = ("/".join(parts[at : at + 2]) for at in (0, 1))
+    return next((each for each in known if each in TABLE), "other")
 
 
 @contextmanager
-def zenoh_log(on_seen: Callable[[Sequence[Seen]], None]) -> Iterator[None]:
+def zenoh_log(on_seen: Callable[[Seen], None]) -> Iterator[None]:
     """Read Zenoh's log while the block runs; `on_seen` is called on the loop's thread.
 
-    Zenoh writes it to standard output, whose place a pipe takes for good. A thread empties it, so
-    that Zenoh never waits for us; what others write there is passed on.
+    Zenoh writes it to standard output, whose place a pipe takes for good; nothing else may be
+    written there, since what the log quotes is chosen by strangers. A thread empties the pipe, so
+    that Zenoh never waits for us; of what it has seen the newest wait for a busy loop.
     """
-    loop = asyncio.get_running_loop()
-    outside = os.dup(STDOUT)
+    bridge = Bridge()
+    mailbox = Mailbox(bridge, on_seen, WAITING)
     reads, writes = os.pipe()
     with contextlib.suppress(OSError, AttributeError):  # other systems have smaller pipes
-        fcntl.fcntl(writes, fcntl.F_SETPIPE_SZ, ROOM)
+        fcntl.fcntl(writes, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
     os.dup2(writes, STDOUT)
     os.close(writes)
-    listening = True
 
     def work() -> None:
         parse = ZenohLog()
-        while data := os.read(reads, CHUNK):
-            said = list(parse.feed(data))
-            for line in said:
-                if isinstance(line, bytes) and select.select((), (outside,), (), 0)[1]:
-                    os.write(outside, line)
-            seen = [each for each in said if not isinstance(each, bytes)]
-            if seen and listening:
-                with contextlib.suppress(RuntimeError):  # the loop is gone
-                    loop.call_soon_threadsafe(on_seen, seen)
+        while data := os.read(reads, CHUNK_BYTES):
+            for seen in parse.feed(data):
+                mailbox.put(seen)
 
     threading.Thread(target=work, name="zenoh-log", daemon=True).start()
     log_to_stdout(DIRECTIVES)
     try:
         yield
     finally:
-        listening = False
+        bridge.close()

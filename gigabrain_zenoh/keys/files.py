@@ -1,13 +1,20 @@
 """The files of an identity. Looking at them costs nothing; reading them takes `identity`."""
 
+import fcntl
+import logging
 import os
 import stat
+import tempfile
 from pathlib import Path
 
+from gigabrain_zenoh.bounded_file import open_regular, read_bounded
 from gigabrain_zenoh.errors import ConfigError
+
+log = logging.getLogger(__name__)
 
 CA, CA_KEY = "ca.crt", "ca.key"
 CERTIFICATE, KEY = "identity.crt", "identity.key"
+MOST_BYTES = 65_536  # of a file that `made_once` makes
 REMEDY = "copy the whole folder that `gigabrain keys issue` made"
 
 
@@ -35,6 +42,38 @@ def check_private(path: Path) -> None:
     mode = stat.S_IMODE(path.stat().st_mode)
     if os.name == "posix" and mode & 0o077:
         raise ConfigError(f"{path} is open to others (mode {mode:04o}); chmod 600 {path}")
+
+
+def made_once(path: Path, content: bytes) -> tuple[bytes, bool]:
+    """What a private file holds, and whether it had to be made, with `content`. Raises ConfigError.
+
+    Of several who make it at once one wins, and nobody sees it unfinished. An empty one, as a
+    crash may leave it, is made anew.
+    """
+    try:
+        if path.exists() and (found := read_bounded(path, MOST_BYTES)):
+            check_private(path)
+            return found, False
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}-") as new:  # 0600
+            new.write(content)
+            new.flush()
+            os.fsync(new.fileno())
+            try:
+                os.link(new.name, path)
+                return content, True
+            except FileExistsError:
+                check_private(path)
+            with open_regular(path, MOST_BYTES) as old:
+                fcntl.flock(old, fcntl.LOCK_EX)  # of several who heal it one does
+                found = read_bounded(path, MOST_BYTES)
+                if not found:
+                    log.warning("%s was empty; it is made anew", path)
+                    os.link(new.name, f"{new.name}-whole")
+                    os.replace(f"{new.name}-whole", path)
+                return found or content, not found
+    except OSError as error:
+        raise ConfigError(f"cannot read or write {path}: {error.strerror}") from None
 
 
 def unreadable(path: Path) -> ConfigError:

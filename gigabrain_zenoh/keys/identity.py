@@ -10,6 +10,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from msgspec import Struct
 
+from gigabrain_zenoh.bounded_file import read_bounded
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.files import (
     CA,
@@ -21,6 +22,8 @@ from gigabrain_zenoh.keys.files import (
     unreadable,
 )
 from gigabrain_zenoh.keys.roles import Role, parse
+
+MOST_BYTES = 100_000  # of a key or a certificate
 
 
 class Identity(Struct, frozen=True, kw_only=True):
@@ -110,7 +113,7 @@ def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bounded(path, MOST_BYTES)
     except PermissionError:
         raise unreadable(path) from None
     except OSError as error:

@@ -5,10 +5,12 @@ from typing import Annotated
 
 import msgspec
 
+from gigabrain_zenoh.bounded_file import read_bounded
 from gigabrain_zenoh.errors import ConfigError
 
 LIST = "generations.json"
 MOST = 10_000
+MOST_BYTES = 1_000_000
 
 
 def generations_in(folder: Path) -> dict[str, int]:
@@ -16,7 +18,8 @@ def generations_in(folder: Path) -> dict[str, int]:
     path = folder / LIST
     try:
         return msgspec.json.decode(
-            path.read_bytes(), type=dict[str, Annotated[int, msgspec.Meta(ge=1, le=MOST)]]
+            read_bounded(path, MOST_BYTES),
+            type=dict[str, Annotated[int, msgspec.Meta(ge=1, le=MOST)]],
         )
     except FileNotFoundError:
         return {}

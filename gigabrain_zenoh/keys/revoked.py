@@ -3,12 +3,12 @@
 A router goes by the list in its own identity's folder: Zenoh knows no revocation of certificates.
 """
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
 
+from gigabrain_zenoh.atomic_write import replace_file
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.files import CERTIFICATE
 from gigabrain_zenoh.keys.identity import read
@@ -37,9 +37,8 @@ def revoke(fleet_folder: Path, role: Role, robot: str = "") -> tuple[Path, ...]:
 
 def write_list(folder: Path, generations: Mapping[str, int]) -> None:
     """Replace the list in a folder. Raises ConfigError."""
-    fresh = folder / f".{LIST}"
+    content = msgspec.json.format(msgspec.json.encode(generations)) + b"\n"
     try:
-        fresh.write_bytes(msgspec.json.format(msgspec.json.encode(generations)) + b"\n")
-        os.replace(fresh, folder / LIST)
+        replace_file(folder / LIST, content)
     except OSError as error:
         raise ConfigError(f"cannot write {folder / LIST}: {error.strerror}") from None

@@ -16,6 +16,7 @@ TURNED_AWAY = re.compile(r" WARN .*zenoh_link_tls::unicast: (.+?)(?:\. Hint: .*)
 THREAD = re.compile(rb"ThreadId\(\d+\)")
 COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
 LONGEST = 64 * 1024  # bytes of a line; what is longer is no line of Zenoh's
+THREADS = 100  # whose first line is remembered
 
 
 @dataclass(frozen=True)
@@ -41,15 +42,13 @@ class ZenohLog:
         self._rest = b""
         self._last: dict[bytes, bytes] = {}  # by thread
 
-    def feed(self, data: bytes) -> Iterator[Denied | TurnedAway | bytes]:
-        """What the log says, and lines that are not Zenoh's, with their ends."""
+    def feed(self, data: bytes) -> Iterator[Denied | TurnedAway]:
+        """What the log says of those whom the router does not let in, or not through."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > LONGEST:
             self._rest = b""
         for line in lines:
-            if line.startswith(b"{"):  # what this process says to its supervisor
-                yield line + b"\n"
-            elif seen := self._read(line):
+            if seen := self._read(line):
                 yield seen
 
     def _read(self, line: bytes) -> Denied | TurnedAway | None:
@@ -57,6 +56,8 @@ class ZenohLog:
         if thread is None:
             return None
         if b" is unauthorized to " in line:
+            if len(self._last) >= THREADS:
+                self._last.clear()
             self._last[thread[0]] = line
             return None
         if b"Msg intercepted!" in line:

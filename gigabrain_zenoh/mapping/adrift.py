@@ -1,6 +1,6 @@
 """What odometry did since a scan was matched, and what that makes uncertain."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ UNKNOWN = np.diag((10.0, 10.0, np.pi)) ** 2  # covariance of a link that nothing
 class Adrift:
     """What odometry did since a scan was matched."""
 
-    misses: int = 0  # scans
+    misses: int = 0  # scans in a row that fit one another, but not the map
     travel: float = 0.0  # [m]
     turn: float = 0.0  # [rad]
     blind: bool = False  # there was nothing to match for a while, so odometry may be right
@@ -25,7 +25,11 @@ class Adrift:
         """After odometry has moved by `delta` (3,) once more."""
         travel = self.travel + float(np.hypot(delta[0], delta[1]))
         turn = self.turn + abs(float(delta[2]))
-        return Adrift(self.misses + (not blind), travel, turn, self.blind or blind)
+        return Adrift(self.misses, travel, turn, self.blind or blind)
+
+    def missed(self, fits: bool) -> "Adrift":
+        """Return the state after a scan that was not matched; `fits` the one missed before it."""
+        return replace(self, misses=self.misses + 1 if fits else 1)
 
     @property
     def covariance(self) -> Floats:
@@ -35,7 +39,10 @@ class Adrift:
 
     @property
     def broken(self) -> bool:
-        """Whether nothing joins what comes to what was before."""
+        """Whether nothing joins what comes to what was before: the robot was carried off.
+
+        Scans that fit neither the map nor one another say nothing: trees in the wind, a slope.
+        """
         return (self.misses >= MISSES and self.far) or self.misses >= MISSES_STANDING
 
     @property

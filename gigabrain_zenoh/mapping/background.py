@@ -31,6 +31,11 @@ class Background:
         """Whether nothing is under way."""
         return self._job is None
 
+    @property
+    def overdue(self) -> int:
+        """For how many scans a result has been due and not there."""
+        return max(0, -self._left) if self._job else 0
+
     def start(self, work: Work, scans: int) -> None:
         """Begin; the result is due in so many scans."""
         self._job, self._left = self._pool.submit(work), scans

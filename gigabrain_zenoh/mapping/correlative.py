@@ -47,17 +47,23 @@ class Found:
 
 
 def search(
-    image: Image, points: Points, guess: Floats, window: Window, least: float = -np.inf
+    image: Image,
+    points: Points,
+    guess: Floats,
+    window: Window,
+    least: float = -np.inf,
+    most: int = SEARCHED,
 ) -> Found:
     """The pose within the window whose points fall on the likeliest cells.
 
-    The guess, with a score of 0, where none scores `least`, which saves most of the search.
+    The guess, with a score of 0, where none scores `least`, which saves most of the search. At
+    most `most` of the points are searched with.
     """
     if not len(points):
         return Found(guess, 0.0)
     steps = int(np.ceil(window.away / image.cell))
     turns = int(np.ceil(window.turn / window.step))
-    few = thinned(points, SEARCHED)
+    few = thinned(points, most)
     sides = BLOCK * (2 * steps // BLOCK + 1)
     hits = _placed(
         few, guess, image.origin, image.cell, steps, turns, window.step, image.cells.shape, sides

@@ -53,24 +53,41 @@ class Drift:
 
     def explains(self, loop: Edge, poses: Floats) -> bool:
         """Whether drift may have brought about what closing `loop` would correct."""
-        turn, away = self.between(loop.first, loop.second, poses)
-        x, y, yaw = between(between(poses[loop.first], poses[loop.second]), loop.relative)
-        return bool((x * x + y * y) / away + yaw * yaw / turn < GATE)
+        return explained(loop, poses, *self.between(loop.first, loop.second, poses))
 
     def between(self, first: int, second: int, poses: Floats) -> tuple[float, float]:
         """The variance of yaw and of place on the least uncertain way (Dijkstra)."""
-        far = poses[:, :2] - poses[second, :2]
-        levers = (far * far).sum(axis=1)  # a turn on the way moves what is far from it
-        queue = [(JOINT**2, JOINT**2, first)]
+        turn, away = self._spread(second, poses, first)
+        if not np.isfinite(turn[first]):
+            raise ValueError(f"no way from keyframe {first} to {second}")
+        return float(turn[first]), float(away[first])
+
+    def spread(self, to: int, poses: Floats) -> tuple[Floats, Floats]:
+        """Return the variances of yaw and of place from each keyframe to one of them, (n,) each."""
+        return self._spread(to, poses)
+
+    def _spread(self, to: int, poses: Floats, only: int | None = None) -> tuple[Floats, Floats]:
+        far = poses[:, :2] - poses[to, :2]
+        levers = (far * far).sum(axis=1).tolist()  # a turn on the way moves what is far from it
+        turns, aways = np.full(len(poses), np.inf), np.full(len(poses), np.inf)
+        queue = [(JOINT**2, JOINT**2, to)]
         done = set()
         while queue:
             turn, away, at = heapq.heappop(queue)
-            if at == second:
-                return turn, away
             if at in done:
                 continue
             done.add(at)
-            for to, more_turn, more_away in self._ways[at]:
-                moved = away + more_away + more_turn * float(levers[to])
-                heapq.heappush(queue, (turn + more_turn, moved, to))
-        raise ValueError(f"no way from keyframe {first} to {second}")
+            turns[at], aways[at] = turn, away
+            if at == only:
+                break
+            for by, more_turn, more_away in self._ways[at]:
+                if by not in done:
+                    moved = away + more_away + more_turn * levers[at]
+                    heapq.heappush(queue, (turn + more_turn, moved, by))
+        return turns, aways
+
+
+def explained(loop: Edge, poses: Floats, turn: float, away: float) -> bool:
+    """Return whether drift of these variances may have brought about what the loop corrects."""
+    x, y, yaw = between(between(poses[loop.first], poses[loop.second]), loop.relative)
+    return bool((x * x + y * y) / away + yaw * yaw / turn < GATE)

@@ -47,6 +47,8 @@ TURNS = (-1.5, -0.75, 0.75, 1.5)  # standard deviations of odometry's turn, to b
 LEAST_TURNED = 0.05  # share of the points, of the same after a turn
 FEW = 20  # points, with fewer there is nothing to match
 CONTRADICTED = 0.6  # squared deviations: a match that pulls odometry farther speaks against it
+SETTLED, SETTLED_INLIERS = (0.1, 0.03), 0.8  # [m] and [rad]; share of the points
+SETTLED_RMS = 0.06  # [m]
 UNMOVED = np.zeros((3, 3))
 
 
@@ -58,8 +60,9 @@ class FrontEnd:
         self._scans: list[Scan] = []
         self._poses: list[Floats] = []
         self._local: LocalMap | None = None
-        self._room = room_for(CELL)
+        self._room, self._spare = room_for(CELL), room_for(CELL)
         self._adrift = Adrift()
+        self._missed: tuple[Scan, Floats] | None = None  # the last scan not matched, and where
         self._noise: Floats | None = UNMOVED  # of odometry since a scan was matched
         self.pose = pose
 
@@ -79,7 +82,7 @@ class FrontEnd:
         far = match.kind == "broken" or self._far_enough()
         if match.kind == "odometry":
             return match, self._adrift.far and far
-        self._adrift, self._noise = Adrift(), UNMOVED
+        self._adrift, self._noise, self._missed = Adrift(), UNMOVED, None
         return match, far
 
     def place(self, pose: Floats) -> None:
@@ -97,6 +100,26 @@ class FrontEnd:
         self._scans, self._poses = list(scans[first:]), list(poses[first:])
         placed = np.array(self._poses)
         self._local = build(self._scans, placed, self.pose, CELL, SIGMA, self._room)
+
+    def settle(
+        self, scan: Scan, scans: Sequence[Scan], poses: Sequence[Floats], about: Match
+    ) -> Match | None:
+        """Match to these scans from now on, if the scan that was added last fits them.
+
+        `about` is where the scan lies among them, and how uncertain that is.
+        """
+        local = build(scans, np.array(poses), about.pose, CELL, SIGMA, self._spare)
+        fit = _fit(local, scan, about.pose, about.pose, about.covariance)
+        x, y, yaw = wrapped(fit.pose - about.pose).tolist()
+        if np.hypot(x, y) > SETTLED[0] or abs(yaw) > SETTLED[1]:
+            return None
+        if fit.inliers < SETTLED_INLIERS or fit.rms > SETTLED_RMS:
+            return None
+        self._scans, self._poses, self._local = list(scans), list(poses), local
+        self._room, self._spare = self._spare, self._room
+        self.pose = wrapped(fit.pose)
+        covariance = inverse_of(fit.information + inverse_of(about.covariance))
+        return replace(about, pose=self.pose, covariance=covariance, inliers=fit.inliers)
 
     @property
     def held(self) -> tuple[list[Scan], list[Floats]]:
@@ -145,7 +168,7 @@ class FrontEnd:
         if not wrong < WRONG:
             least = match.score + BETTER if match else 0.0
             match = self._recover(local, scan, guess, least, wrong) or match
-        return match or self._lost(guess, found)
+        return match or self._lost(scan, guess, found)
 
     def _turned(
         self, local: LocalMap, scan: Scan, guess: Floats, found: Found, wrong: float
@@ -198,11 +221,23 @@ class FrontEnd:
             return None
         return _matched(fit, found, UNKNOWN, "recovered")
 
-    def _lost(self, guess: Floats, found: Found) -> Match:
+    def _lost(self, scan: Scan, guess: Floats, found: Found) -> Match:
         """By odometry alone, as long as that goes."""
+        self._adrift = self._adrift.missed(self._fits_missed(scan, guess))
+        self._missed = scan, guess
         if self._adrift.broken:
             return Match(guess, self._adrift.after_break(), "broken", found.score, 0.0)
         return Match(guess, self._adrift.covariance, "odometry", found.score, 0.0)
+
+    def _fits_missed(self, scan: Scan, guess: Floats) -> bool:
+        """Return whether the scan fits the one that was not matched before it."""
+        if self._missed is None:
+            return False
+        before, pose = self._missed
+        local = build([before], pose[None], pose, CELL, SIGMA)
+        found = search(local.image, scan.points, guess, self._adrift.window)
+        fit = _fit(local, scan, found.pose, guess, self._adrift.covariance)
+        return fit.inliers >= SURE_INLIERS
 
     def _summed(self, noise: Floats | None, delta: Floats) -> Floats | None:
         """The odometry's covariance since a scan was matched, in the axes of the pose now."""

@@ -10,6 +10,8 @@ from gigabrain_zenoh.mapping.points import Points, pairs
 
 Arrays = Mapping[str, NDArray[np.generic]]
 
+REACH_M = 200.0  # of a beam: what it passes is drawn cell by cell
+
 
 def freeze_keyframes(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[np.generic]]:
     """All of the keyframes."""
@@ -27,8 +29,8 @@ def freeze_keyframes(keyframes: Sequence[Keyframe]) -> dict[str, NDArray[np.gene
 def thaw_keyframes(arrays: Arrays) -> list[Keyframe]:
     """The keyframes again; KeyError or ValueError if the arrays do not belong together."""
     links = thaw_edges("link", arrays)
-    points = _split(arrays["points"], arrays["points_each"])
-    free = _split(arrays["free"], arrays["free_each"])
+    points = split(arrays["points"], arrays["points_each"])
+    free = split(arrays["free"], arrays["free_each"])
     rows = zip(links, points, free, arrays["travel"], arrays["segment"], strict=True)
     return [
         Keyframe(pairs("points", hits), pairs("free", ends), link, float(travel), int(segment))
@@ -74,8 +76,11 @@ def _joined(parts: Iterable[Points]) -> Points:
     return np.concatenate([np.empty((0, 2), np.float32), *parts])
 
 
-def _split(rows: NDArray[np.generic], each: NDArray[np.generic]) -> list[Points]:
-    counts = each.astype(int)
-    if len(rows) != counts.sum() or (counts < 0).any():
-        raise ValueError(f"expected {counts.sum()} points, got {len(rows)}")
-    return np.split(rows.astype(np.float32), np.cumsum(counts)[:-1]) if len(counts) else []
+def split(rows: NDArray[np.generic], each: NDArray[np.generic]) -> list[Points]:
+    """Points (n, 2) of all scans, scan by scan; ValueError for what no lidar has seen."""
+    counts, points = each.astype(int), rows.astype(np.float32)
+    if points.shape != (counts.sum(), 2) or (counts < 0).any():
+        raise ValueError(f"expected {counts.sum()} points, got {points.shape}")
+    if points.size and not -REACH_M <= points.min() <= points.max() <= REACH_M:
+        raise ValueError(f"expected points within {REACH_M:g} m")
+    return np.split(points, np.cumsum(counts)[:-1]) if len(counts) else []

@@ -46,6 +46,14 @@ class Grid:
         grid._stamps, grid._scans = known.astype(np.int32), 1
         return grid
 
+    def still(self) -> "Grid":
+        """A copy that stays as it is."""
+        held = Grid()
+        held.origin_x, held.origin_y, held.full = self.origin_x, self.origin_y, self.full
+        held.log_odds, held._stamps = self.log_odds.copy(), self._stamps.copy()
+        held._scans = self._scans
+        return held
+
     def draw(self, sensor: Floats, hits: Points, free: Points) -> None:
         """One scan from `sensor`, a pose in the map; the ends of its beams in the sensor's frame.
 

@@ -1,21 +1,26 @@
 """A map that grows while the robot drives, and is drawn anew when a loop has corrected it."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.journal import done
+from gigabrain_zenoh.mapping.arrays_file import Arrays
 from gigabrain_zenoh.mapping.background import PATIENCE_S, Background, InTime, Take
 from gigabrain_zenoh.mapping.doubt import Doubt
 from gigabrain_zenoh.mapping.drift import Rates
 from gigabrain_zenoh.mapping.field import field_of
 from gigabrain_zenoh.mapping.finder import Finder
-from gigabrain_zenoh.mapping.grid import CELL, Grid
+from gigabrain_zenoh.mapping.frozen import shaped
+from gigabrain_zenoh.mapping.grid import CELL, MOST_CELLS, Grid
 from gigabrain_zenoh.mapping.localizer import NOWHERE, Place, View
-from gigabrain_zenoh.mapping.map_file import Arrays, SavedMap
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, compose, wrap
+from gigabrain_zenoh.mapping.map_file import SavedMap
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, wrap
 from gigabrain_zenoh.mapping.slam import Correction, Estimate, Slam
 from gigabrain_zenoh.mapping.sweeps import Sweep, Sweeps
 
@@ -25,6 +30,53 @@ LOOP_SCANS, KEYFRAME_SCANS, SWEEPS_A_SCAN = 5, 2, 200  # how long the work besid
 SHIFT_M, SHIFT_RAD = 0.02, 0.004  # keyframes that moved less need not be drawn anew
 RATES = Rates(away=0.008, turn=0.002)  # of scans every few centimetres, guided by odometry
 FITS = ("matched", "recovered")  # scans that were found otherwise are not drawn
+
+LOOKING = "looking for the robot in the map"
+SAVE_AND_GO_ON = "save the map, and start perception with it (map: NAME)"
+FULL = Cause(
+    code="map_full",
+    text=f"the map is full: {MOST_CELLS * CELL:g} m long; what lies beyond is left out",
+    remedy="map a large site in parts",
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Still:
+    """A map as it was at one scan; it can be put into arrays in another thread."""
+
+    pose: Floats | None  # (3,), of the robot at that scan, if it was known
+    slam: Slam
+    sweeps: Sweeps
+    grid: Grid
+    drawn: list[Floats]  # poses of the keyframes, as they are in the grid
+    waiting: list[Sweep]  # to be drawn
+
+    def freeze(self) -> dict[str, NDArray[np.generic]]:
+        """All that it takes to go on as if nothing had happened."""
+        grid, waiting = self.grid, {id(one) for one in self.waiting}
+        undrawn = [k for k, one in enumerate(self.sweeps.all()) if id(one) in waiting]
+        return {
+            **self.slam.freeze(),
+            **self.sweeps.freeze(),
+            "drawn": np.array(self.drawn).reshape(-1, 3),
+            "undrawn": np.array(undrawn, np.int32),
+            "grid_odds": grid.log_odds,
+            "grid_known": grid.known(),
+            "grid_origin": np.array((grid.origin_x, grid.origin_y)),
+        }
+
+    def to_save(self) -> tuple[SavedMap, Arrays]:
+        """The map for people and other programs, and what it takes to go on with it."""
+        grid = self.grid.still()
+        for sweep in self.waiting:
+            sweep.draw(grid, self.drawn[sweep.keyframe])
+        saved = SavedMap(grid.percent(), CELL, grid.origin_x, grid.origin_y)
+        return saved, {**self.slam.freeze(), **self.sweeps.freeze()}
+
+    @property
+    def changes(self) -> tuple[int, int, int]:
+        """Differs from that of a copy in which something else is mapped."""
+        return len(self.slam.keyframes), self.slam.revision, self.sweeps.seen
 
 
 class GrowingMap:
@@ -41,38 +93,72 @@ class GrowingMap:
         self._doubt = Doubt()
         self._moved = IDENTITY  # since the last scan that was taken
         self._doubted = False  # likewise
+        self._resumed = False  # no scan has come since it was thawed
         self._last = Place(IDENTITY, NOWHERE, False, "no scan yet")
         self._loops = self._renewals = 0
+        self._wanted = False  # a copy, as soon as nothing is under way beside
+        self._still: Still | None = None
 
     @classmethod
     def thaw(
-        cls, arrays: Arrays, patience_s: float = PATIENCE_S, in_time: InTime = done
+        cls,
+        arrays: Arrays,
+        patience_s: float = PATIENCE_S,
+        in_time: InTime = done,
+        last: Floats | None = None,
     ) -> "GrowingMap":
-        """A saved map, to go on with. Raises ConfigError for arrays that are none."""
+        """A map to go on with, saved or kept.
+
+        The robot is at `last` (3,) if its odometry has gone on since; if the next scan does not
+        belong there, it is looked for in the whole map. Raises ConfigError for arrays that are
+        none.
+        """
         grown = cls(patience_s, in_time)
         try:
             grown._slam = Slam.thaw(arrays, rates=RATES)
-            grown._sweeps = Sweeps.thaw(arrays, len(grown._slam.keyframes))
+            grown._sweeps = Sweeps.thaw(arrays, grown._slam.poses)
+            if "grid_odds" in arrays:
+                grown._thaw_grid(arrays)
+            else:
+                grown._drawn = list(grown._slam.poses)
+                grown._grid = _rendered(grown._sweeps.all(), grown._drawn)
         except KeyError as error:
             raise ConfigError(f"no pose graph: it has no {error}") from None
         except (ValueError, IndexError, TypeError, RuntimeError) as error:  # the last is gtsam's
             text = " ".join(str(error).split())[:200]
             raise ConfigError(f"no pose graph: {text}") from None
-        grown._drawn = list(grown._slam.poses)
-        grown._grid = _rendered(grown._sweeps.all(), grown._drawn)
-        grown.lose("looking for the robot in the map")
+        if last is None:
+            grown.lose(LOOKING)
+        else:
+            grown._moved, grown._resumed = between(grown._slam.pose, last), True
         return grown
+
+    def _thaw_grid(self, arrays: Arrays) -> None:
+        """As it was drawn; KeyError or ValueError if the arrays do not belong together."""
+        odds, known = arrays["grid_odds"], arrays["grid_known"]
+        if odds.ndim != 2 or odds.shape != known.shape or max(odds.shape) > MOST_CELLS:
+            raise ValueError(f"a grid of shape {odds.shape}")
+        x, y = shaped(arrays, "grid_origin", 2).tolist()
+        self._grid = Grid.of(odds, known.astype(np.bool_), (x, y))
+        self._drawn = list(shaped(arrays, "drawn", len(self._slam.keyframes), 3))
+        sweeps = self._sweeps.all()
+        self._waiting = [sweeps[k] for k in arrays["undrawn"].astype(int)]
 
     def step(self, view: View, motion: Floats, noise: Floats) -> Place:
         """See Chart."""
         self._background.at_scan()
+        if self._wanted and self._background.idle:
+            self._wanted, self._still = False, self._copied()
         self._draw_waiting()
         if self._finder:
             self._last = self._find(self._finder, view, motion, noise)
             return self._last
         self._moved = compose(self._moved, motion)
+        resumed, self._resumed = self._resumed, False
         if self._doubtful(view):
             self._doubted = True
+            if resumed:
+                self.lose(LOOKING)
             return self._last
         estimate = self._slam.add(view.scan, self._moved, None if self._doubted else noise)
         self._moved, self._doubted = IDENTITY, False
@@ -86,17 +172,28 @@ class GrowingMap:
         return self._last
 
     def lose(self, why: str) -> None:
-        """See Chart."""
+        """See Chart. The robot may still be where odometry has it."""
         if not self._slam.keyframes:
             return
         origin = (self._grid.origin_x, self._grid.origin_y)
         field = field_of(self._grid.percent(), CELL, origin)
-        if self._finder:
-            last = self._finder.last
-        else:
-            last = compose(self._slam.pose, self._moved) if self._last.localized else None
-        self._finder = Finder(field, why, self._background, last)
+        self._finder = Finder(field, why, self._background, self._here())
         self._last = Place(self._last.pose, NOWHERE, False, why)
+
+    def _here(self) -> Floats | None:
+        """Where the robot is as far as odometry knows."""
+        if self._finder:
+            return self._finder.last
+        return compose(self._slam.pose, self._moved) if self._last.localized else None
+
+    def keep(self) -> None:
+        """Copy the map at the next scan at which nothing is under way beside; see `kept`."""
+        self._wanted = True
+
+    def kept(self) -> Still | None:
+        """The copy of the map before the last scan, if one was made; only once."""
+        still, self._still = self._still, None
+        return still
 
     def grid(self) -> OccupancyGrid:
         """See Chart."""
@@ -108,23 +205,45 @@ class GrowingMap:
         return self._background.idle
 
     def to_save(self) -> tuple[SavedMap, Arrays]:
+        """The map now, as `Still` has it. Raises Refused."""
+        return self.still().to_save()
+
+    def still(self) -> Still:
         """See Chart. Waits for the work beside."""
         self._settling = False
         if self._finder or not self._slam.keyframes:
             raise Refused(f"not saved: where the robot is, is not known ({self._last.why})")
         self._background.finish()
-        self._draw_waiting(all_of_them=True)
-        saved = SavedMap(self._grid.percent(), CELL, self._grid.origin_x, self._grid.origin_y)
-        return saved, {**self._slam.freeze(), **self._sweeps.freeze()}
+        return self._copied()
+
+    def _copied(self) -> Still:
+        return Still(
+            pose=self._here(),
+            slam=self._slam.still(),
+            sweeps=self._sweeps.still(),
+            grid=self._grid.still(),
+            drawn=[*self._drawn, *self._slam.poses_from(len(self._drawn))],
+            waiting=list(self._waiting),
+        )
 
     def report(self) -> dict[str, int]:
         """See Chart."""
         return {
             "keyframes": len(self._slam.keyframes),
+            "sweeps": len(self._sweeps),
             "loops": self._loops,
             "drawn_anew": self._renewals,
             "late": self._background.late,
+            "optimiser_rebuilt": self._slam.rebuilt,
         }
+
+    def problems(self) -> tuple[Cause, ...]:
+        """See Chart."""
+        found = [FULL] if self._grid.full else []
+        if self._slam.failure:
+            text = f"loops are closed no more, the optimiser fails: {self._slam.failure}"
+            found.append(Cause(code="loops_open", text=text, remedy=SAVE_AND_GO_ON))
+        return tuple(found)
 
     def close(self) -> None:
         """See Chart."""
@@ -165,11 +284,10 @@ class GrowingMap:
         else:
             sweep.draw(self._grid, self._drawn[sweep.keyframe])
 
-    def _draw_waiting(self, *, all_of_them: bool = False) -> None:
-        count = len(self._waiting) if all_of_them else DRAWN_AT_ONCE
-        for sweep in self._waiting[:count]:
+    def _draw_waiting(self) -> None:
+        for sweep in self._waiting[:DRAWN_AT_ONCE]:
             sweep.draw(self._grid, self._drawn[sweep.keyframe])
-        del self._waiting[:count]
+        del self._waiting[:DRAWN_AT_ONCE]
 
     def _close_loops(self, count: int) -> None:
         """Beside the scans: look for loops from so many keyframes, and draw what they correct."""
@@ -194,14 +312,13 @@ class GrowingMap:
         for correction in corrections:
             self._slam.apply(correction)
             self._loops += len(correction.loops)
-        if grid is None:
-            return
-        self._renewals += 1
-        self._grid, self._drawn = grid, list(self._slam.poses)
-        done = {id(one) for one in drawn if one.keyframe < len(corrections[-1].poses)}
-        self._waiting = [one for one in self._sweeps.all() if id(one) not in done]
-        if self._finder:
-            self.lose(self._last.why)
+        if grid is not None:
+            self._renewals += 1
+            self._grid, self._drawn = grid, list(self._slam.poses)
+            done = {id(one) for one in drawn if one.keyframe < len(corrections[-1].poses)}
+            self._waiting = [one for one in self._sweeps.all() if id(one) not in done]
+            if self._finder:
+                self.lose(self._last.why)
 
 
 def _rendered(sweeps: Sequence[Sweep], poses: Sequence[Floats] | Floats) -> Grid:

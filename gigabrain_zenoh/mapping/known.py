@@ -1,7 +1,8 @@
 """What perception does with a map: the same for one that was saved and for one that grows."""
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
+from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.journal import done
@@ -9,8 +10,11 @@ from gigabrain_zenoh.mapping.background import PATIENCE_S, Background, InTime
 from gigabrain_zenoh.mapping.field import field_of
 from gigabrain_zenoh.mapping.finder import Finder
 from gigabrain_zenoh.mapping.localizer import Place, View
-from gigabrain_zenoh.mapping.map_file import Arrays, SavedMap
+from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.se2 import Floats
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.mapping.growing import Still  # and gtsam: only who makes maps pays
 
 
 class Chart(Protocol):
@@ -26,13 +30,22 @@ class Chart(Protocol):
         """The map as others see it."""
 
     def settle(self) -> bool:
-        """Begin nothing new beside, until `to_save`; whether nothing is under way there."""
+        """Begin nothing new beside, until `still`; whether nothing is under way there."""
 
-    def to_save(self) -> tuple[SavedMap, Arrays]:
-        """What there is to save. Raises Refused."""
+    def still(self) -> "Still":
+        """A copy to be saved, which stays as it is. Raises Refused."""
+
+    def keep(self) -> None:
+        """Copy the map at the next scan at which nothing is under way beside; see `kept`."""
+
+    def kept(self) -> "Still | None":
+        """The copy of the map before the last scan, if one was made; only once."""
 
     def report(self) -> dict[str, int]:
         """Figures for people."""
+
+    def problems(self) -> tuple[Cause, ...]:
+        """What it cannot do now."""
 
     def close(self) -> None:
         """End what runs beside."""
@@ -73,13 +86,24 @@ class KnownMap:
         """See Chart."""
         return True
 
-    def to_save(self) -> tuple[SavedMap, Arrays]:
+    def still(self) -> "Still":
         """Never: it is saved already."""
         raise Refused("not saved: perception finds its way in a saved map, it makes none")
+
+    def keep(self) -> None:
+        """Never, likewise."""
+
+    def kept(self) -> "Still | None":
+        """Never, likewise."""
+        return None
 
     def report(self) -> dict[str, int]:
         """See Chart."""
         return {"late": self._background.late}
+
+    def problems(self) -> tuple[Cause, ...]:
+        """See Chart."""
+        return ()
 
     def close(self) -> None:
         """See Chart."""

@@ -13,6 +13,7 @@ from gigabrain_zenoh.mapping.drift import Drift, Rates
 from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.local_map import build
 from gigabrain_zenoh.mapping.matching import icp
+from gigabrain_zenoh.mapping.places import PlaceSearch
 from gigabrain_zenoh.mapping.points import thinned
 from gigabrain_zenoh.mapping.se2 import (
     IDENTITY,
@@ -50,12 +51,19 @@ class LoopSearch:
 
     def __init__(self, rates: Rates) -> None:
         self.drift = Drift(rates)
+        self._places = PlaceSearch(self.drift)
         self.waiting: list[Edge] = []  # loops without a second witness
         self.searched = -SPACING  # [m] of travel
 
     def find(self, keyframes: Sequence[Keyframe], poses: Floats) -> list[Edge]:
         """Loops that end at the last keyframe and are beyond doubt, and those that they confirm."""
         travel = np.array([keyframe.travel for keyframe in keyframes])
+        far = self._places.find(keyframes, poses)
+        for loop in far:
+            self.drift.closed(loop)
+        return far or self._near(keyframes, poses, travel)
+
+    def _near(self, keyframes: Sequence[Keyframe], poses: Floats, travel: Floats) -> list[Edge]:
         if travel[-1] - self.searched < SPACING:
             return []
         self.searched = float(travel[-1])

@@ -4,12 +4,8 @@ All files of a save come into being at once. They are written into a folder of t
 renaming decides; whoever looks next finishes what a crash left between that and their own places.
 """
 
-import contextlib
 import hashlib
-import io
-import os
 import shutil
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,19 +17,19 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.base import Finite, Fraction
 from gigabrain_zenoh import config
+from gigabrain_zenoh.atomic_write import make_folder, sync_folder, write_synced
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.logs import state_dir
-from gigabrain_zenoh.mapping import pgm
+from gigabrain_zenoh.mapping import arrays_file, pgm
+from gigabrain_zenoh.mapping.arrays_file import Arrays
 
 Cells = NDArray[np.int8]
-Arrays = Mapping[str, NDArray[Any]]
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values, as ROS's map_server writes them
 OCCUPIED_PERCENT, FREE_PERCENT = 65, 40  # from here on, and up to here
 LEAST_FREE_M2, LEAST_WALL_M = 1.0, 1.0  # less than that is no map
 GRAPH = ".graph.npz"
 STAMP = "grid"  # in the graph's file: which grid it belongs to
-LARGEST = 1e9  # of any number in a graph, as on the bus
 
 
 class MapYaml(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -98,12 +94,7 @@ def load_graph(path: Path) -> dict[str, NDArray[Any]]:
     """The pose graph beside the YAML file `path`. Raises ConfigError, in one line."""
     _finish(path)
     file = path.with_suffix(GRAPH)
-    data = pgm.content(file, "the pose graph to go on with; expected it beside the YAML file")
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            graph = {name: _numbers(name, arrays[name]) for name in arrays.files}
-    except (ValueError, EOFError, KeyError, OSError, zipfile.BadZipFile, zipfile.error) as error:
-        raise ConfigError(f"{file}: cut or damaged: {_line(error)}") from None
+    graph = arrays_file.read(file, "the pose graph to go on with; expected it beside the YAML file")
     stamp = graph.pop(STAMP, None)
     if stamp is not None and not np.array_equal(stamp, _stamp(load(path))):
         raise ConfigError(
@@ -122,11 +113,13 @@ def save(path: Path, found: SavedMap, graph: Arrays, *, replace: bool = False) -
     if problem:
         raise Refused(f"not saved: {problem}")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(path.parent)
         _finish(path)
         if path.exists() and not replace:
             raise Refused(f"not saved: there is a map {path} already; --replace overwrites it")
         _commit(path, _files(path, found, graph))
+    except ValueError as error:
+        raise Refused(f"not saved: {error}") from None
     except OSError as error:
         raise Refused(f"not saved: {error.filename or path}: {error.strerror}") from None
     _finish(path)
@@ -156,13 +149,6 @@ def _stamp(found: SavedMap) -> NDArray[np.uint8]:
     return np.frombuffer(hashlib.sha256(whole).digest(), np.uint8)
 
 
-def _numbers(name: str, values: NDArray[Any]) -> NDArray[Any]:
-    """The array, if it holds plain numbers; else ValueError."""
-    if values.dtype.kind not in "biuf" or not (np.abs(values.astype(float)) <= LARGEST).all():
-        raise ValueError(f"{name} holds something else than numbers up to {LARGEST:g}")
-    return values
-
-
 def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
     """What to write, by name."""
     height, width = found.cells.shape
@@ -170,8 +156,6 @@ def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
     grey[found.cells >= OCCUPIED_PERCENT] = OCCUPIED
     grey[_free(found)] = FREE
     image = path.with_suffix(".pgm").name
-    arrays = io.BytesIO()
-    np.savez_compressed(arrays, allow_pickle=False, **{**graph, STAMP: _stamp(found)})
     about = (
         f"image: {image}\nresolution: {found.resolution:.12g}\n"
         f"origin: [{found.origin_x:.12g}, {found.origin_y:.12g}, 0.0]\n"
@@ -179,7 +163,7 @@ def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
     )
     return {
         image: b"P5\n%d %d\n255\n" % (width, height) + grey[::-1].tobytes(),
-        path.with_suffix(GRAPH).name: arrays.getvalue(),
+        path.with_suffix(GRAPH).name: arrays_file.written({**graph, STAMP: _stamp(found)}),
         path.name: about.encode(),
     }
 
@@ -196,16 +180,13 @@ def _commit(path: Path, files: Mapping[str, bytes]) -> None:
         shutil.rmtree(draft, ignore_errors=True)  # or a full disk would stay full
         raise
     draft.rename(_complete(path))
-    _sync(path.parent)
+    sync_folder(path.parent)
 
 
 def _write(folder: Path, files: Mapping[str, bytes]) -> None:
     for name, data in files.items():
-        with (folder / name).open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-    _sync(folder)
+        write_synced(folder / name, data)
+    sync_folder(folder)
 
 
 def _finish(path: Path) -> None:
@@ -216,7 +197,7 @@ def _finish(path: Path) -> None:
     try:
         for file in complete.iterdir():
             file.rename(path.with_name(file.name))
-        _sync(path.parent)
+        sync_folder(path.parent)
         complete.rmdir()
     except FileNotFoundError:  # somebody else was quicker, and has finished it
         return
@@ -226,16 +207,3 @@ def _finish(path: Path) -> None:
 
 def _complete(path: Path) -> Path:
     return path.with_name(f".{path.stem}.complete")
-
-
-def _sync(folder: Path) -> None:
-    with contextlib.suppress(OSError):  # not every file system syncs folders
-        fd = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(fd)
-        finally:
-            os.close(fd)
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split())[:120]

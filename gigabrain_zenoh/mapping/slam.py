@@ -1,17 +1,18 @@
 """Simultaneous localisation and mapping: front end, pose graph and loop search put together.
 
 `add` is what each scan costs. `close_loops` may run in a thread of its own meanwhile; what it finds
-moves nothing until `apply`, and as the front end never sees a correction, no match depends on when
-that was.
+moves nothing until `apply`. The front end sees a correction only where it comes to known ground.
 """
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.mapping.drift import Rates
+from gigabrain_zenoh.mapping.familiar import Ground
 from gigabrain_zenoh.mapping.front_end import FrontEnd
 from gigabrain_zenoh.mapping.frozen import (
     Arrays,
@@ -26,11 +27,14 @@ from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.loops import LoopSearch, around
 from gigabrain_zenoh.mapping.match import Kind, Match
 from gigabrain_zenoh.mapping.points import Scan
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, turned
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, inverse, turned
 from gigabrain_zenoh.mapping.spacing import Spacing
 
 LINK = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance of a link beside that of its match,
 GUIDED = np.diag((0.02, 0.02, 0.005)) ** 2  # and where odometry was known to be good
+TIED = 4.0  # [m] of travel since a loop, so long the way is known to lie right on earlier ones
+DRIFTED = np.diag((0.05, 0.05, 0.02)) ** 2  # covariance of that
+AGAIN = 12.0  # [m] of travel between the ends of a loop that ties the way to an earlier one
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +71,16 @@ class Slam:
         self._segment = 0
         self._joined = {0}  # segments that loops have joined to the first
         self._travel = 0.0
+        self._tied = -np.inf  # [m] of travel, where the way lay right on earlier ones last
+        self._known = False  # whether scans are laid onto earlier keyframes alone
+        self._smooth: Floats = IDENTITY  # the front end's frame, in the one that never jumps
+        self._ground = Ground()
+        self._shown: dict[int, Scan] = {}  # keyframes of known ground; their normals take long
         self._graph = Graph()
-        self._search = LoopSearch(rates or Rates())
+        self._rates = rates or Rates()
+        self._search = LoopSearch(self._rates)
         self._closing: tuple[Edge, ...] = ()  # loops that the graph has not settled with
-        self.keyframes: list[Keyframe] = []  # only ever appended to
+        self.keyframes: list[Keyframe] = []  # only appended to
         self.revision = 0  # changes whenever poses of keyframes are corrected
 
     @property
@@ -90,8 +100,8 @@ class Slam:
 
     @property
     def smooth(self) -> Floats:
-        """Where the robot is in the front end's own frame, which never jumps."""
-        return self._front.pose
+        """Where the robot is in a frame that drifts and never jumps."""
+        return compose(self._smooth, self._front.pose)
 
     def add(self, scan: Scan, delta: Floats, noise: Floats | None = None) -> Estimate:
         """Where the robot is, odometry having moved by `delta` (x, y, yaw) since the last scan.
@@ -102,7 +112,9 @@ class Slam:
         if not np.isfinite(delta).all():
             raise ValueError(f"odometry: expected finite numbers, got {delta}")
         self._travel += float(np.hypot(delta[0], delta[1]))
-        match, kept = self._front.add(scan, delta, noise)
+        match, far = self._front.add(scan, delta, noise)
+        known = self._familiar(scan, match) if far else None
+        match, kept = known or match, far and known is None
         keyframe, placed = self._anchor
         relative = between(placed, match.pose)
         if kept:
@@ -129,10 +141,40 @@ class Slam:
         nearest = int(np.argmin(away))
         place = around(travel, nearest, len(poses))
         ids = sorted(range(place.start, place.stop), key=lambda k: -abs(k - nearest))
+        smooth = self.smooth
         self._front.place(pose)
         self._front.restart([self.keyframes[k].scan for k in ids], [poses[k] for k in ids])
-        self._anchor = (nearest, poses[nearest])
-        self._segment = self.keyframes[nearest].segment
+        self._hang_on(nearest, poses, smooth)
+
+    def _hang_on(self, keyframe: int, poses: Floats, smooth: Floats) -> None:
+        """Go on in the map's frame from an earlier keyframe, the robot being at `smooth`."""
+        self._anchor = (keyframe, poses[keyframe])
+        self._segment = self.keyframes[keyframe].segment
+        self._tied = self._travel
+        self._smooth = compose(smooth, inverse(self._front.pose))
+
+    def _familiar(self, scan: Scan, match: Match) -> Match | None:
+        """Lay the scan onto the keyframes of known ground, and match to those from now on.
+
+        Return None where the ground is not known, or shows something else.
+        """
+        known, self._known = self._known, False
+        if match.kind != "matched" or self._travel - self._tied > TIED:
+            return None
+        keyframe, placed = self._anchor
+        poses, smooth = self.poses, self.smooth
+        pose = compose(poses[keyframe], between(placed, match.pose))
+        ids = self._ground.round(pose, self._travel, poses, self._joined)
+        if not ids:
+            return None
+        covariance = turned(match.covariance, float(pose[2] - match.pose[2]))
+        about = replace(match, pose=pose, covariance=covariance + (0.0 if known else DRIFTED))
+        self._shown = {k: self._shown.get(k) or self.keyframes[k].scan for k in ids}
+        found = self._front.settle(scan, list(self._shown.values()), list(poses[ids]), about)
+        if found:
+            self._known = True
+            self._hang_on(ids[-1], poses, smooth)
+        return found
 
     def close_loops(self) -> Correction | None:
         """Take in the next keyframe and look for a loop from it, or go on closing what was found.
@@ -148,6 +190,8 @@ class Slam:
         link = keyframes[here].link
         self._graph.extend([link])
         self._search.drift.linked(link)
+        if self._graph.failure:
+            return None
         loops = self._search.find(keyframes, self._graph.poses)
         if not loops:
             return None
@@ -157,8 +201,19 @@ class Slam:
     def _closed(self, settled: bool) -> Correction | None:
         if not settled:
             return None
-        loops, self._closing = self._closing, ()
+        kept = {id(loop) for loop in self._graph.loops}
+        loops, self._closing = tuple(one for one in self._closing if id(one) in kept), ()
         return Correction(self._graph.poses, loops)
+
+    @property
+    def rebuilt(self) -> int:
+        """How often the optimiser has failed and was rebuilt."""
+        return self._graph.rebuilt
+
+    @property
+    def failure(self) -> str:
+        """Why no loop closes any more, or an empty text."""
+        return self._graph.failure
 
     @property
     def behind(self) -> int:
@@ -168,12 +223,21 @@ class Slam:
     def apply(self, correction: Correction) -> None:
         """Move the keyframes to where `close_loops` has found them to be."""
         done = len(correction.poses)
-        self._poses[:done] = list(correction.poses)
+        self._poses = list(correction.poses)
         for keyframe in self.keyframes[done:]:
             link = keyframe.link
-            self._poses[link.second] = compose(self._poses[link.first], link.relative)
+            self._poses.append(compose(self._poses[link.first], link.relative))
         self._join(correction.loops)
         self.revision += 1
+
+    def still(self) -> "Slam":
+        """A copy, good for `freeze` only, that stays as it is. Not while `close_loops` runs."""
+        held = copy.copy(self)
+        held.keyframes, held._poses = list(self.keyframes), list(self._poses)
+        held._front, held._graph = copy.copy(self._front), copy.copy(self._graph)
+        held._search = copy.copy(self._search)
+        held._search.waiting = list(self._search.waiting)
+        return held
 
     def freeze(self) -> dict[str, NDArray[np.generic]]:
         """All that it takes to go on later, in arrays. Not while `close_loops` runs."""
@@ -201,6 +265,8 @@ class Slam:
         """Go on from what was frozen; KeyError or ValueError if it does not belong together."""
         slam = cls(shaped(arrays, "front", 3), spacing, rates)
         slam.keyframes = thaw_keyframes(arrays)
+        for keyframe in slam.keyframes:
+            slam._ground.add(keyframe)
         poses = arrays["poses"].astype(np.float64)
         behind, anchor = int(arrays["behind"]), int(arrays["anchor"])
         if poses.shape != (len(slam.keyframes), 3) or not 0 <= behind < len(poses) > anchor >= 0:
@@ -216,20 +282,20 @@ class Slam:
 
     def _thaw_graph(self, poses: Floats, arrays: Arrays) -> None:
         loops = thaw_edges("loop", arrays)
-        self._graph.extend([keyframe.link for keyframe in self.keyframes[: len(poses)]], poses)
+        self._graph = _graph_of(self.keyframes[: len(poses)], poses, loops)
         for keyframe in self.keyframes[: len(poses)]:
             self._search.drift.linked(keyframe.link)
         for loop in loops:
             self._search.drift.closed(loop)
-        settled = not loops or self._graph.close(loops)
-        while not settled:
-            settled = self._graph.settle()
         self._search.waiting = thaw_edges("waiting", arrays)
         self._search.searched = float(arrays["searched"])
         self._join(loops)
 
     def _join(self, loops: Sequence[Edge]) -> None:
         for loop in loops:
+            here, there = self.keyframes[loop.second].travel, self.keyframes[loop.first].travel
+            if here - there > AGAIN:
+                self._tied = max(self._tied, here)
             ends = {self.keyframes[loop.first].segment, self.keyframes[loop.second].segment}
             if ends & self._joined:
                 self._joined |= ends
@@ -243,6 +309,17 @@ class Slam:
         doubtful = match.kind in ("odometry", "broken")
         link = Edge(self._anchor[0], here, relative if here else match.pose, covariance, doubtful)
         self.keyframes.append(Keyframe(scan.points, scan.free, link, self._travel, self._segment))
+        self._ground.add(self.keyframes[-1])
         self._poses.append(compose(self._poses[link.first], relative) if here else match.pose)
         self._anchor = (here, match.pose)
         self._front.keep(scan, alone=broken)
+
+
+def _graph_of(keyframes: Sequence[Keyframe], poses: Floats, loops: Sequence[Edge]) -> Graph:
+    """Return the graph of keyframes that are about where they belong."""
+    graph = Graph()
+    graph.extend([keyframe.link for keyframe in keyframes], poses)
+    settled = not loops or graph.close(loops, known=True)
+    while not settled:
+        settled = graph.settle()
+    return graph

@@ -28,6 +28,15 @@ def seen_through(shown: Points, scan: Points, pose: Floats) -> float:
     return through / (through + hit) if through + hit >= FEW else np.nan
 
 
+def share_hit(shown: Points, scan: Points, pose: Floats) -> float:
+    """Return the share of the points `shown` (n, 2) that a scan at `pose` has hit as well."""
+    if not len(shown):
+        return 1.0
+    nearest, farthest = _ends(scan)
+    _, hit = _look(shown, nearest, farthest, np.array(pose))
+    return hit / len(shown)
+
+
 @kernel
 def _bin(x: float, y: float) -> int:
     return int((np.arctan2(y, x) / (2 * np.pi) + 1.0) * BINS) % BINS

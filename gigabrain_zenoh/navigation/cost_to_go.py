@@ -86,7 +86,8 @@ def seed(
         return True
     x, y = (np.add.outer(corner, (np.arange(side) + 0.5) * cell).T - points[-1]).T
     for end in (0, -1):
-        known[end], known[:, end] = np.hypot(x, y[end]) / UNIT, np.hypot(x[end], y) / UNIT
+        known[end] = np.minimum(np.hypot(x, y[end]), FARTHEST) / UNIT
+        known[:, end] = np.minimum(np.hypot(x[end], y), FARTHEST) / UNIT
     return False
 
 

@@ -23,6 +23,7 @@ NEAR = 12.0  # added where the body just fits
 UNSEEN = 4.0  # added in unknown space that is avoided: a detour of five times its length is better
 LEAST_DECAY = 0.1  # [m]
 FADED = 0.05  # what of NEAR may be left off at the end
+MOST_CELLS = 1000  # an obstacle costs nothing farther away; more would be too much to look at
 PART = 0.5  # of a map: if more of it has changed, all is computed anew
 WORDS = {"allow": 0.0, "avoid": UNSEEN, "forbid": LETHAL}
 
@@ -148,7 +149,7 @@ def _box_to_renew(
 
 
 def _reach_cells(rules: Inflation, resolution: float) -> int:
-    return math.ceil(rules.reach / resolution + 0.5)
+    return min(math.ceil(rules.reach / resolution + 0.5), MOST_CELLS)
 
 
 def _wider(box: Box, by: int, shape: tuple[int, ...]) -> Box:

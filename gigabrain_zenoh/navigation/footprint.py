@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.kernels import NONE, lean_kernel
 from gigabrain_zenoh.sweep import Corners, box
 
-SPACING = 0.05  # [m], between points on the outline at most
+SPACING = 0.05  # [m], between points on the outline at most,
+MOST_POINTS = 500  # unless there were more than so many: those of a long outline are farther apart
 GROUP = 3  # neighbouring points that are left out together: two and one in the middle
 STRETCH = 1.02  # a distance in the grid differs by no more than so many times the way,
 UNSURE = 0.87  # and so many cells, between one that is looked up in the nearest cell and any other
@@ -48,11 +49,12 @@ class Grid(NamedTuple):
 def outline_of(footprint: Corners) -> Outline:
     """The outline of any polygon."""
     corners = np.array(footprint, dtype=np.float64)
+    sides = np.roll(corners, -1, axis=0) - corners
+    spacing = max(SPACING, float(np.hypot(*sides.T).sum()) / MOST_POINTS)
     pieces = []
-    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        length = float(np.hypot(*(end - start)))
-        count = max(1, math.ceil(length / SPACING))
-        pieces.append(start + (end - start) * (np.arange(count) / count)[:, None])
+    for start, side in zip(corners, sides, strict=True):
+        count = max(1, math.ceil(float(np.hypot(*side)) / spacing))
+        pieces.append(start + side * (np.arange(count) / count)[:, None])
     front, rear, left, right = box(footprint)
     x, y = (front + rear) / 2, (left + right) / 2
     points = np.concatenate(pieces)
@@ -201,13 +203,15 @@ def free_ahead(
 ) -> float:
     """How far the body can go straight on, or back for a `sign` of -1, within `reach` [m].
 
-    As wide as the body and `side_margin` [m], followed by discs from the front edge on.
+    As wide as the body and `side_margin` [m], followed by discs from the front edge on. It looks no
+    farther than the grid is large, however far `reach` is: beyond it nothing is known.
     """
     half = (outline.left - outline.right) / 2
     edge = outline.front if sign > 0 else -outline.rear
     begin = edge - half
-    gone = 0.0
-    while gone < reach:
+    gone, rows, columns = 0.0, grid.distance.shape[0], grid.distance.shape[1]
+    end = min(reach, (rows + columns) * grid.cell + 2.0 * outline.far)
+    while gone < end:
         along = sign * (begin + gone)
         px = x + cosine * along - sine * outline.center_y
         py = y + sine * along + cosine * outline.center_y

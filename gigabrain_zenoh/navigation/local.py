@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
@@ -40,23 +41,36 @@ class LocalPlanner:
     """Drives one body. It keeps what it saw and planned, and no clock."""
 
     def __init__(self, body: BodyDescription, settings: LocalSettings = DEFAULTS) -> None:
-        self._settings = settings
+        self._body, self._settings = body, settings
         self._model = model_of(body, settings.linear_speed)
         self._outline = outline_of(body.footprint)
         self._lidar = (body.lidar.x, body.lidar.y) if body.lidar else (0.0, 0.0)
         half_y = (self._outline.left - self._outline.right) / 2
         half_x = (self._outline.front - self._outline.rear) / 2
         self._half_width = min(half_x, half_y) if self._model.lateral > 0 else half_y
-        self._sampler = Sampler(
-            self._model, settings.samples, settings.steps, step_of(self._model), settings.seed
-        )
+        self._sampler, self._traffic = self._sampler_of(), self._traffic_of()
         self._weights = Weights()
-        sight = body.lidar.range_max if body.lidar else 0.0
-        quick = among.is_quick(self._model)
-        self._traffic = (
-            traffic.Traffic(2.0 * self._half_width, self._model.forward, sight) if quick else None
-        )
         self.reset()
+
+    def limit_speed(self, linear_speed: float | None) -> None:
+        """Drive no faster than this [m/s] from now on; what was seen and planned is kept."""
+        self._settings = structs.replace(self._settings, linear_speed=linear_speed)
+        self._model = model_of(self._body, linear_speed)
+        before = self._sampler
+        self._sampler, self._traffic = self._sampler_of(), self._traffic_of()
+        self._sampler.last, self._sampler.dt = before.last, before.dt
+
+    def _sampler_of(self) -> Sampler:
+        model, settings = self._model, self._settings
+        return Sampler(model, settings.samples, settings.steps, step_of(model), settings.seed)
+
+    def _traffic_of(self) -> traffic.Traffic | None:
+        """What a quick body looks out for."""
+        lidar, model = self._body.lidar, self._model
+        if not among.is_quick(model):
+            return None
+        sight = lidar.range_max if lidar else 0.0
+        return traffic.Traffic(2.0 * self._half_width, model.forward, sight)
 
     def reset(self) -> None:
         """Forget all that was seen and planned: the odometry has begun anew."""

@@ -92,7 +92,7 @@ class Planner:
             return Unreachable(reason=f"{why}; the robot has no room to leave where it stands")
         x, y = costmap.points(np.array(cell[:1]), np.array(cell[1:]))[0]
         away = math.hypot(x - goal[0], y - goal[1])
-        where = f"nearest reachable point is {away:.1f} m away at ({x:.2f}, {y:.2f})"
+        where = f"nearest reachable point is {away:.2f} m away at ({x:.2f}, {y:.2f})"
         return Unreachable(reason=f"{why}; {where}", nearest=(float(x), float(y)), distance=away)
 
 

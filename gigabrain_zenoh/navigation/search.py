@@ -29,6 +29,7 @@ SPARE = 1024
 ROOT = 8  # the way came from nowhere: it began here
 DONE = 16  # and more: the cell was settled
 TURN = 32  # and more: of this search
+LAST_TURN = np.iinfo(np.int32).max // TURN - 1  # the marks hold no greater one
 NOWHERE = -1
 FULL = -1  # no room for more entries
 ANYWHERE = (NOWHERE, NOWHERE)
@@ -91,6 +92,8 @@ class Search:
             self._make_room(cost.shape)
         cost = np.ascontiguousarray(cost)
         while True:
+            if self._turn >= LAST_TURN:
+                self._memory.mark[:] = self._turn = 0
             self._turn += 1
             if _search(cost, start, target, reverse, TURN * self._turn, self._memory) != FULL:
                 return

@@ -1,6 +1,7 @@
 """Who may open the page, and what for: tokens, and the names under which it is asked for."""
 
 import hmac
+import ipaddress
 import os
 import secrets
 from collections.abc import Mapping
@@ -10,15 +11,16 @@ from typing import Literal
 import msgspec
 from msgspec import Struct
 
-from gigabrain_zenoh.addresses import is_loopback
+from gigabrain_zenoh.addresses import is_ip, is_loopback
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.keys.files import check_private
+from gigabrain_zenoh.keys.files import made_once
 from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.settings import PageConfig
 
 Role = Literal["operator", "viewer"]
-LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
+LOOPBACK_NAMES = ("127.0.0.1", "localhost", "::1")
+PORTS = {"http": 80, "https": 443}
 TOKEN_BYTES = 24
 
 
@@ -62,21 +64,13 @@ def tokens(path: Path) -> tuple[Tokens, bool]:
 
     Raises ConfigError where it cannot be used.
     """
+    fresh = Tokens(
+        operator=secrets.token_urlsafe(TOKEN_BYTES), viewer=secrets.token_urlsafe(TOKEN_BYTES)
+    )
+    held, made = made_once(path, msgspec.json.encode(fresh))
     try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        made = Tokens(
-            operator=secrets.token_urlsafe(TOKEN_BYTES), viewer=secrets.token_urlsafe(TOKEN_BYTES)
-        )
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-            file.write(msgspec.json.encode(made))
-        return made, True
-    except FileExistsError:
-        check_private(path)
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=Tokens), False
-    except (OSError, *DECODE_ERRORS) as error:
+        return msgspec.json.decode(held, type=Tokens), made
+    except DECODE_ERRORS as error:
         raise ConfigError(f"{path}: {error}; remove it, and new tokens are made") from None
 
 
@@ -87,12 +81,12 @@ class Access:
         self._tokens, self.made = None, False
         if wants_login(config):
             self._tokens, self.made = tokens(token_file(config.tokens))
-        names = LOOPBACK_NAMES if is_loopback(config.listen) else (config.listen,)
-        hosts = {f"{name}:{port}" for name in (*names, *config.names)}
-        if config.certificate and port == 443:
-            hosts |= {*names, *config.names}  # browsers leave out the port that goes without saying
-        self._hosts = hosts
         self._scheme = "https" if config.certificate else "http"
+        local = LOOPBACK_NAMES if is_loopback(config.listen) else ()
+        names = {_in_header(name) for name in (config.listen, *local, *config.names)}
+        self._hosts = {f"{name}:{port}" for name in names}
+        if port == PORTS[self._scheme]:
+            self._hosts |= names  # browsers leave out the port that goes without saying
 
     def told(self) -> str:
         """The tokens, for whoever has just had them made; else nothing."""
@@ -116,6 +110,12 @@ class Access:
         """Whether it is this page that opens a WebSocket, and no other site's."""
         origin = headers.get("origin", "").lower()
         return self.named(headers) and origin == f"{self._scheme}://{headers['host'].lower()}"
+
+
+def _in_header(name: str) -> str:
+    """A name or an address as browsers put it into `Host` and `Origin` (RFC 3986, 3.2.2)."""
+    name = name.strip("[]").lower()
+    return f"[{ipaddress.ip_address(name)}]" if ":" in name and is_ip(name) else name
 
 
 def _same(one: str, other: str) -> bool:

@@ -26,10 +26,12 @@ from gigabrain_schemas.topics import (
     TELEOP,
     WORLD,
 )
+from gigabrain_zenoh.bounded import put
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.page import wire
 from gigabrain_zenoh.sampled import Sampled
 
+PROCESSES = 64  # whose health is shown
 CAMERAS = 4  # whose pictures are shown
 KEPT_LINES = 30  # of the log, for a viewer who comes later
 
@@ -55,6 +57,12 @@ class Scene:
         bus.latest(BODY, self._hear_body)
         bus.tap(IMAGE.at("*"), self._hear_image)
         self.on_body: Callable[[], None] = lambda: None
+
+    @property
+    def enables(self) -> int | None:
+        """How often the gate was enabled; None while the robot is silent."""
+        state = self._state.fresh()
+        return state.gate.enables if state else None
 
     def steer(self, wanted: Velocity) -> None:
         """Tell the robot's own control what an operator wants, with the newest tick."""
@@ -107,7 +115,7 @@ class Scene:
 
     def _hear_health(self, _key: str, health: Health) -> None:
         frame = wire.as_json(wire.HEALTH, health)
-        self._health[health.process] = frame
+        put(self._health, health.process, frame, PROCESSES)
         self._tell(f"health/{health.process}", frame)
 
     def _hear_line(self, _key: str, line: LogRecord) -> None:

@@ -19,7 +19,9 @@ log = logging.getLogger(__name__)
 
 LOGIN_S = 5.0  # until a browser has to have said who it is
 WRONG_S = 0.5  # how long a wrong token waits for its answer
-MOST = 16  # viewers at a time
+MOST = 16  # browsers at a time; who only looks gives way to an operator
+MOST_OPERATORS = 64  # of whom each can stop the robot, so nobody else's number keeps one out
+ARRIVING = 64  # browsers that have not said who they are; the oldest gives way to the newest
 WAITING = 8  # requests of one viewer that are under way; e-stops do not count
 LONGEST = 120  # bytes of a reason for closing
 BAD, STRANGER, FULL = 1008, 4401, 4429  # why a WebSocket is closed (RFC 6455 7.4)
@@ -32,6 +34,7 @@ class Sessions:
         self._access = access
         self._numbers = itertools.count(1)
         self._asking: dict[asyncio.Task[None], Viewer] = {}
+        self._arriving: list[asyncio.Task[Role | None]] = []
         self._loop = asyncio.get_running_loop()
         self.viewers: list[Viewer] = []
 
@@ -63,11 +66,37 @@ class Sessions:
             return
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect):
-            role = await self._login(socket)
-            if role is None or len(self.viewers) >= MOST:
+            role = await self._arrive(socket)
+            if role is None or not self._has_room(role):
                 await socket.close(FULL if role else STRANGER)
                 return
-            await self._look_on(socket, Viewer(next(self._numbers), role))
+            viewer = Viewer(next(self._numbers), role)
+            await self._look_on(socket, viewer)
+            if viewer.gives_way.is_set():
+                await socket.close(FULL, "an operator has taken this place")
+
+    def _has_room(self, role: Role) -> bool:
+        """Whether one more gets in; makes room for an operator."""
+        looking = [each for each in self.viewers if each.role != "operator"]
+        if role != "operator":
+            return len(self.viewers) < MOST
+        if len(self.viewers) >= MOST and looking:
+            looking[0].gives_way.set()
+            self.viewers.remove(looking[0])
+        return len(self.viewers) < MOST_OPERATORS
+
+    async def _arrive(self, socket: WebSocket) -> Role | None:
+        login = self._loop.create_task(self._login(socket))
+        self._arriving.append(login)
+        if len(self._arriving) > ARRIVING:
+            self._arriving.pop(0).cancel()
+        try:
+            await asyncio.wait((login,))
+        finally:
+            login.cancel()
+            if login in self._arriving:
+                self._arriving.remove(login)
+        return None if login.cancelled() else login.result()
 
     async def _login(self, socket: WebSocket) -> Role | None:
         try:
@@ -88,14 +117,17 @@ class Sessions:
         self.viewers.append(viewer)
         sending = asyncio.ensure_future(_send(socket, viewer))
         hearing = asyncio.ensure_future(self._hear(socket, viewer))
+        leaving = asyncio.ensure_future(viewer.gives_way.wait())
+        tasks = (sending, hearing, leaving)
         try:
-            await asyncio.wait((sending, hearing), return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            self.viewers.remove(viewer)
+            if viewer in self.viewers:
+                self.viewers.remove(viewer)
             self._seat.leave(viewer.number)
-            sending.cancel()
-            hearing.cancel()
-            await asyncio.gather(sending, hearing, return_exceptions=True)
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
 
     def _greet(self, viewer: Viewer) -> None:
         body = self._scene.body

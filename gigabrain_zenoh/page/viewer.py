@@ -13,6 +13,7 @@ class Viewer:
 
     def __init__(self, number: int, role: Role) -> None:
         self.number, self.role = number, role
+        self.gives_way = asyncio.Event()
         self._slots: dict[str, bytes] = {}
         self._filled = asyncio.Event()
         self._second, self._said = 0.0, 0

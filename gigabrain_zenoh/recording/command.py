@@ -18,6 +18,7 @@ from gigabrain_zenoh.settings import RecorderConfig
 from gigabrain_zenoh.stop_signals import stop_signals
 
 LOOK_S = 0.5
+CLOSE_S = 10.0  # a slow disk may take as long to take the rest of a recording
 
 
 async def record(config: RecorderConfig, where: Where, seconds: float | None) -> int:
@@ -27,7 +28,7 @@ async def record(config: RecorderConfig, where: Where, seconds: float | None) ->
         recorder = Recorder(path, config)
         recorder.begin()
         recover_others(path.parent)
-        with stop_signals() as stop, recorder, listening(bus, recorder, config.topics):
+        with stop_signals(CLOSE_S) as stop, recorder, listening(bus, recorder, config.topics):
             print(f"recording into {path}; Ctrl-C ends it", flush=True)
             await _watch(recorder, stop, seconds)
     end = recorder.status()

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
+import gigabrain_zenoh.recording.arithmetic  # noqa: F401  before anything imports numpy
 from gigabrain_zenoh.demo import Demo, DemoOptions
 from gigabrain_zenoh.deployment import ALL, Deployment
 from gigabrain_zenoh.errors import GigabrainError

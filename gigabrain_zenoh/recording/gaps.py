@@ -6,6 +6,7 @@ from typing import Any
 import msgspec
 
 from gigabrain_schemas.topics import BODY, IMAGE, IMU, SCAN, STATE
+from gigabrain_zenoh.bounded import put
 
 OF_DRIVER = (STATE.key, SCAN.key, IMU.key, BODY.key, IMAGE.key)  # who makes the boot number
 
@@ -26,6 +27,7 @@ _msgpack = msgspec.msgpack.Decoder(Header)
 _json = msgspec.json.Decoder(Header)
 NO_HEADER = Header()
 HIGHEST = 2**63 - 1
+MOST_SENDERS = 4096  # keys and senders whose messages are counted at a time
 
 
 def is_json(payload: bytes) -> bool:
@@ -60,7 +62,8 @@ class Gaps:
             return 0
         who = header.process or header.source
         sender = key, str(who)[:64] if who else ""
-        last, self._last[sender] = self._last.get(sender), header
+        last = self._last.get(sender)
+        put(self._last, sender, header, MOST_SENDERS)
         if last is None:
             return 0
         if header.seq == last.seq + 1 and header.boot == last.boot:  # as nearly always

@@ -8,6 +8,8 @@ from typing import NamedTuple
 from gigabrain_zenoh.recording.gaps import Gaps, Header, header_of
 from gigabrain_zenoh.unobtrusive import LONGEST_S
 
+MOST_PLACES = 1000  # keys and encodings; anybody may make up another
+OTHERS = "others"  # counts messages on keys beyond those
 WAITED_NS = round(LONGEST_S * 1e9)  # a message's own stamp says when in this time it came
 
 
@@ -28,8 +30,9 @@ def _nobody() -> None:
 class Intake:
     """Takes messages from any thread, and hands them to one writer, who looks into them.
 
-    What does not fit is dropped and counted: a slow disk costs messages, never time. `hurry` is
-    called when a quarter of the room is full.
+    What does not fit is dropped and counted: a slow disk costs messages, never time; so is what
+    comes on more keys, or in more encodings, than any robot has. `hurry` is called when a quarter
+    of the room is full.
     """
 
     def __init__(
@@ -42,6 +45,7 @@ class Intake:
         self._held = 0  # [bytes], of what waits and of what is being written
         self._newest_ns = 0
         self.gaps = Gaps()
+        self._places: set[tuple[str, str]] = set()  # keys and encodings
         self.seen: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
 
@@ -49,6 +53,10 @@ class Intake:
         """One message. Waits for nobody but others who take or hand over."""
         now_ns, size = self._unix_ns(), len(payload)
         with self._lock:
+            if not self._knows(key, encoding):
+                self.seen[OTHERS] += 1
+                self.dropped[OTHERS] += 1
+                return
             self.seen[key] += 1
             if self._held + size > self._room:
                 self._look()  # what came before it is counted before it
@@ -59,6 +67,13 @@ class Intake:
             self._waiting.append((now_ns, key, encoding, payload))
         if before < self._room // 4 <= before + size:
             self._hurry()
+
+    def _knows(self, key: str, encoding: str) -> bool:
+        """Return whether a key is recorded in an encoding; the first MOST_PLACES are."""
+        place = key, encoding
+        if place not in self._places and len(self._places) < MOST_PLACES:
+            self._places.add(place)
+        return place in self._places
 
     def hand_over(self) -> list[Arrival]:
         """All that waits, oldest first; it keeps its room until `written` is called."""

@@ -47,7 +47,8 @@ SAYS: dict[str, tuple[Topic[Any], ...]] = {
 }
 ASIDE = ("stamp_ns", "seq")
 WITH_SETTINGS = ("perception", "decision")
-NOWHERE = {"scripts": "", "state_dir": ""}  # a replay runs no programs, and remembers nothing
+# a replay runs no programs, and remembers nothing
+NOWHERE = {"perception": {"state_dir": ""}, "decision": {"scripts": "", "state_dir": ""}}
 
 ELSEWHEN = 0.1  # share of words that may be said in one of the two alone
 # A process that is busy for a tick passes over a state; a replay has all the time in the world.
@@ -202,7 +203,7 @@ def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, 
                 "name the robot's deployment file: --deployment FILE"
             )
         settings = dict(msgspec.json.decode(held.get(process, "{}")))
-    return settings | NOWHERE if process == "decision" else settings
+    return settings | NOWHERE.get(process, {})
 
 
 async def replay_file(path: Path, process: str, deployment: str | None) -> int:

@@ -18,6 +18,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 
+from gigabrain_zenoh.bounded_file import open_regular
 from gigabrain_zenoh.errors import ConfigError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -33,7 +34,8 @@ MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 ZSTD_NAME = b"\x04\x00\x00\x00zstd"
 BEFORE_NAME = HEAD.size + CHUNK.size - 4  # from a chunk's opcode to the length of that name
 PIECE = 1 << 16
-MOST = 256 << 20  # [bytes] a chunk may grow to: a hostile file does not take all memory
+MOST = 48 << 20  # [bytes] of a record, and that a chunk may grow to: writers' chunks are of 1 MB
+WINDOW = 1 << 25  # [bytes] that a decompressor keeps at most
 
 
 class Message(NamedTuple):
@@ -65,7 +67,7 @@ Item = Schema | Channel | Message | Metadata | Damage | Finished
 def check_magic(path: Path) -> None:
     """Raises ConfigError for a file that is no bag, with what it is instead."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             head = file.read(len(MAGIC))
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
@@ -76,7 +78,7 @@ def check_magic(path: Path) -> None:
 def read(path: Path) -> Iterator[Item]:
     """All that is in a bag, in order. Raises ConfigError for a file that is none."""
     check_magic(path)
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
+    with open_regular(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as whole:
         yield from _walk(whole)
 
 
@@ -99,7 +101,10 @@ def _walk(whole: mmap.mmap) -> Iterator[Item]:
         if opcode == Opcode.DATA_END and after <= end:
             yield Finished(summary is not None)
             return
-        if opcode and after <= end:
+        if opcode and after <= end and after - at > MOST:
+            yield Damage(at, f"a record of {(after - at) / 1e6:.0f} MB is passed over")
+            at = after
+        elif opcode and after <= end:
             body = whole[at + HEAD.size : after]
             yield from _chunk(body, at) if opcode == Opcode.CHUNK else _record(opcode, body)
             at = after
@@ -108,7 +113,7 @@ def _walk(whole: mmap.mmap) -> Iterator[Item]:
             at = chunk
         else:
             if opcode == Opcode.CHUNK:
-                yield from _torn(whole[at + HEAD.size :])
+                yield from _torn(whole[at + HEAD.size : at + MOST])
             break
     yield Damage(at, "the file breaks off here")
 
@@ -142,6 +147,8 @@ def _summary(whole: mmap.mmap) -> bytes | None:
     begin, _, crc = FOOTER.unpack_from(whole, footer + HEAD.size)
     if opcode != Opcode.FOOTER or length != FOOTER.size or not 0 < begin <= footer:
         return None
+    if footer - begin > MOST:
+        return None
     good = crc == 0 or zlib.crc32(whole[begin : len(whole) - len(MAGIC) - 4]) == crc
     return whole[begin:footer] if good else None
 
@@ -172,7 +179,7 @@ def _packed(body: bytes) -> tuple[int, str, bytes]:
     return crc, name, body[CHUNK.size + length + 8 :]
 
 
-def _unpack(name: str, data: bytes) -> tuple[bytes, bool]:
+def _unpack(name: str, data: bytes) -> tuple[bytes | bytearray, bool]:
     """As much as can be decompressed, and whether that went well."""
     if name == "":
         return data, True
@@ -182,19 +189,19 @@ def _unpack(name: str, data: bytes) -> tuple[bytes, bool]:
         while len(records) < MOST and (piece := reader.read(PIECE)):
             records += piece
     except (zstandard.ZstdError, RuntimeError, EOFError, ConfigError):
-        return bytes(records), False
-    return bytes(records), len(records) < MOST
+        return records, False
+    return records, len(records) < MOST
 
 
 def _reader(name: str, data: bytes) -> IO[bytes]:
     if name == "zstd":
-        return zstandard.ZstdDecompressor().stream_reader(data)
+        return zstandard.ZstdDecompressor(max_window_size=WINDOW).stream_reader(data)
     if name == "lz4":
         return lz4.frame.open(BytesIO(data), "rb")  # type: ignore[no-any-return]
     raise ConfigError(f"compression {name!r} is not known")
 
 
-def _inner(records: bytes) -> Iterator[Item]:
+def _inner(records: bytes | bytearray) -> Iterator[Item]:
     """The records within a chunk, as far as they are whole."""
     at = 0
     while at + HEAD.size <= len(records):
@@ -202,7 +209,7 @@ def _inner(records: bytes) -> Iterator[Item]:
         at += HEAD.size
         if at + length > len(records):
             return
-        yield from _record(opcode, records[at : at + length])
+        yield from _record(opcode, bytes(records[at : at + length]))
         at += length
 
 

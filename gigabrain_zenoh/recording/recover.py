@@ -8,6 +8,7 @@ from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 
+from gigabrain_zenoh.bounded_file import open_regular
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.records import MAGIC, Damage, Message, check_magic
@@ -83,7 +84,7 @@ def recover(path: Path, to: Path) -> Recovered:
 
 def unfinished(path: Path) -> bool:
     """Whether `path` is a recording that was cut off, and that nobody is writing now."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
             return False
         file.seek(-len(MAGIC), os.SEEK_END)

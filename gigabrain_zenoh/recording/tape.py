@@ -5,6 +5,7 @@ import fcntl
 import os
 from pathlib import Path
 
+from gigabrain_zenoh.bounded_file import open_regular
 from gigabrain_zenoh.errors import ConfigError
 
 SYNC = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
@@ -62,7 +63,7 @@ class Tape:
 
 def being_written(path: Path) -> bool:
     """Whether somebody is recording into `path` now."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:

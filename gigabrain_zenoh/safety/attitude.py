@@ -6,7 +6,7 @@ import msgspec
 
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import RobotState, Thresholds
-from gigabrain_schemas.sensors import Quaternion, Vector
+from gigabrain_schemas.sensors import Accelerations, Quaternion
 from gigabrain_zenoh.safety.sustain import held
 from gigabrain_zenoh.safety.words import say
 
@@ -54,6 +54,6 @@ def tilt_deg(orientation: Quaternion) -> float | None:
     return math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y)))))
 
 
-def horizontal(acceleration: Vector) -> float:
+def horizontal(acceleration: Accelerations) -> float:
     """Acceleration across the body's z axis [m/s2]."""
     return math.hypot(acceleration[0], acceleration[1])

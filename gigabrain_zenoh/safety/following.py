@@ -6,6 +6,7 @@ late, give or take a tolerance.
 """
 
 import msgspec
+from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_NS, Cause, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
@@ -17,6 +18,7 @@ from gigabrain_zenoh.safety.sustain import held, ticks_of
 from gigabrain_zenoh.safety.words import say
 
 WINDOW_TICKS = 15  # 0.3 s for the way to the body and back, and for its motors
+MOST_LATE_TICKS = 30  # by which that may take longer where data are known to be late
 WATCHED_TICKS = 100  # after it was last enabled; later a person may well push it
 TICK_S = TICK_NS / 1e9
 
@@ -49,24 +51,26 @@ def look(
     command: CmdVel | None,
     caps: SpeedCaps,
     elapsed: int,
+    late_ticks: int = 0,
 ) -> Following:
-    """One state more, `elapsed` ticks after the last."""
+    """One state more, `elapsed` ticks after the last; its data are `late_ticks` late."""
     if not elapsed:
         return before
     told = ramp(before.told, _target(body, state, command, caps), limits_of(body), elapsed * TICK_S)
-    recent = (*before.recent, told)[-WINDOW_TICKS:]
-    bands = _bands(body, recent)
+    recent = (*before.recent, told)[-WINDOW_TICKS - MOST_LATE_TICKS :]
+    bands = _bands(body, recent[-WINDOW_TICKS - min(late_ticks, MOST_LATE_TICKS) :])
     active = state.gate.mode in ("enabled", "stopping")
     watched = WATCHED_TICKS if active else max(0, before.watched_ticks - elapsed)
+    now = replace(before, told=told, recent=recent, watched_ticks=watched)
+    if not state.link.connected:  # what the body said last is no evidence of what it does now
+        return now
     telemetry = (state.pose, state.velocity, state.joints, state.imu)
     moving = _moves(body, told)
     still = moving and _rests(body, state.velocity)
     same = telemetry == before.telemetry
-    return Following(
-        told=told,
-        recent=recent,
+    return replace(
+        now,
         telemetry=telemetry,
-        watched_ticks=watched,
         runaway_ticks=held(
             before.runaway_ticks, bool(watched) and _too_fast(bands, state.velocity), elapsed
         ),

@@ -1,7 +1,7 @@
 """The computer that safety runs on: disk, processors and memory."""
 
-import os
 import shutil
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -40,9 +40,16 @@ Look = Callable[[int], Host]  # what the computer has left at a time of the mono
 
 
 class HostWatch:
-    """Looks at the computer once a second at most; about 0.2 ms each time."""
+    """Looks at the computer once a second at most; about 0.2 ms each time.
 
-    def __init__(self) -> None:
+    `folder` is on the disk that counts: with logs, maps and the latch. A disk may hang,
+    so it is asked in a thread; what it said last holds until it answers.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._disk_mb: float | None = None
+        self._asking: threading.Thread | None = None
         self._next_ns = 0
         self._times: list[tuple[int, int]] = []  # idle and all [jiffies], newest last
         self._host = Host()
@@ -51,8 +58,14 @@ class HostWatch:
         """What it has left at this time of the monotonic clock."""
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + PERIOD_NS
-            self._host = Host(disk_mb=_disk_mb(), cpu=self._cpu(), memory=_memory())
+            if self._asking is None or not self._asking.is_alive():
+                self._asking = threading.Thread(target=self._ask, name="disk", daemon=True)
+                self._asking.start()
+            self._host = Host(disk_mb=self._disk_mb, cpu=self._cpu(), memory=_memory())
         return self._host
+
+    def _ask(self) -> None:
+        self._disk_mb = _disk_mb(self._folder)
 
     def _cpu(self) -> float | None:
         times = _processor_times()
@@ -65,11 +78,16 @@ class HostWatch:
         return 100.0 * (1.0 - idle / total) if total else None
 
 
-def _disk_mb() -> float | None:
-    try:
-        return shutil.disk_usage(os.getcwd()).free / 1e6
-    except OSError:
-        return None
+def _disk_mb(folder: Path) -> float | None:
+    """Free space where the folder is, or will be once something is written."""
+    for place in (folder, *folder.parents):
+        try:
+            return shutil.disk_usage(place).free / 1e6
+        except FileNotFoundError:
+            continue
+        except OSError:
+            return None
+    return None
 
 
 def _processor_times() -> tuple[int, int] | None:

@@ -6,10 +6,12 @@ from collections.abc import Callable
 from gigabrain_schemas.base import Cause, Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.topics import SAFETY
+from gigabrain_schemas.topics import SAFETY, STATE
 from gigabrain_zenoh.ages import REPEAT_TICKS
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.causes import in_words
+from gigabrain_zenoh.heartbeat import Progress
+from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.safety.host import HostWatch, Look
 from gigabrain_zenoh.safety.senses import Senses
 from gigabrain_zenoh.safety.step import Memory, step
@@ -36,7 +38,11 @@ async def run(bus: Bus, ready: Callable[[], None], look: Look | None = None) -> 
             basis = memory.field.basis
             said, said_tick = bus.publish(SAFETY, verdict, basis=basis), state.tick
 
-    senses = Senses(bus, judge, look or HostWatch().now)
+    def came() -> tuple[object, ...]:
+        return (bus.arrived.get(STATE.key),) if senses.bodies.current else ()
+
+    senses = Senses(bus, judge, look or HostWatch(state_dir()).now)
+    bus.progress = Progress(came, lambda: bus.sent[SAFETY.key])
     ready()
     await bus.failed
 

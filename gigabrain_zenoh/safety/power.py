@@ -9,9 +9,18 @@ from gigabrain_schemas.body import Battery, RobotState, Thresholds
 from gigabrain_zenoh.safety.sustain import held, ticks_of
 from gigabrain_zenoh.safety.words import say
 
+SHOWN = 3  # states in a row that measure something, before it counts as measured by this body
 SAG_SAMPLES = 25  # the median of so many (0.5 s) knows nothing of a sag of 0.2 s, down or up
 CLEAR_PERCENT, CLEAR_DEG_C = 2.0, 2.0  # better than the threshold by this before it is over
 COLDEST, HOTTEST = -40.0, 150.0  # [deg C]; what a motor's sensor says beyond that is a fault
+
+
+class Measured(msgspec.Struct, frozen=True):
+    """What one state has measured."""
+
+    charge: bool
+    volts: bool
+    motors: frozenset[str]  # whose temperature
 
 
 class Power(msgspec.Struct, frozen=True, kw_only=True):
@@ -21,6 +30,7 @@ class Power(msgspec.Struct, frozen=True, kw_only=True):
     low_ticks: tuple[int, int, int] = (0, 0, 0)  # below battery_warn, _return and _stop
     warm_ticks: int = 0
     hot_ticks: int = 0
+    measured: tuple[Measured, ...] = ()  # of the newest states
     charged: bool = False  # the body has shown that it measures its battery
     volts: bool = False  # and its voltage
     motors: frozenset[str] = frozenset()  # whose temperature the body has shown
@@ -38,15 +48,10 @@ def look(limits: Thresholds, power: Power, state: RobotState, elapsed: int) -> P
     battery = state.battery if _believable(state.battery, power.volts) else None
     charges = (*power.charges, battery.percentage) if battery and elapsed else power.charges
     temperatures = _temperatures(state)
-    power = msgspec.structs.replace(
-        power,
-        charges=charges[-SAG_SAMPLES:],
-        charged=power.charged or battery is not None,
-        volts=power.volts or (battery is not None and battery.voltage > 0),
-        motors=power.motors.union(temperatures)
-        if temperatures.keys() - power.motors
-        else power.motors,
-    )
+    power = msgspec.structs.replace(power, charges=charges[-SAG_SAMPLES:])
+    if elapsed or not power.measured:
+        volts = battery is not None and battery.voltage > 0
+        power = _shown(power, Measured(battery is not None, volts, frozenset(temperatures)))
     lost = bool(power.motors - temperatures.keys())
     hottest = max(temperatures.values(), default=COLDEST)
     return msgspec.structs.replace(
@@ -58,6 +63,21 @@ def look(limits: Thresholds, power: Power, state: RobotState, elapsed: int) -> P
             power.charge_missing_ticks, power.charged and battery is None, elapsed
         ),
         motor_missing_ticks=held(power.motor_missing_ticks, lost, elapsed),
+    )
+
+
+def _shown(power: Power, now: Measured) -> Power:
+    """What a body measures it has to show SHOWN times in a row: one message is no proof."""
+    newest = (*power.measured, now)[-SHOWN:]
+    power = msgspec.structs.replace(power, measured=newest)
+    if len(newest) < SHOWN:
+        return power
+    motors = frozenset.intersection(*(one.motors for one in newest))
+    return msgspec.structs.replace(
+        power,
+        charged=power.charged or all(one.charge for one in newest),
+        volts=power.volts or all(one.volts for one in newest),
+        motors=power.motors if motors <= power.motors else power.motors | motors,
     )
 
 

@@ -27,6 +27,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.earlier import Earlier
+from gigabrain_zenoh.freshness import LEAD_TICKS
 from gigabrain_zenoh.gate_state import BRAIN
 from gigabrain_zenoh.safety.attitude import horizontal
 from gigabrain_zenoh.safety.host import Look
@@ -49,6 +50,7 @@ class Senses:
         self._echoes: deque[tuple[int, str]] = deque(maxlen=MOST)
         self._shocks: deque[tuple[int, float]] = deque(maxlen=MOST)
         self._commands = Latest(CMD_VEL, bus.clock, bus.time)  # the brain's
+        self._obeyed, self._end_hearing = CMD_VEL.key, _nothing
         self.bodies = bus.latest(BODY, self._hear_body)
         self._states = bus.latest(STATE, on_new)
         self._scans = bus.latest(SCAN, on_new)
@@ -125,10 +127,20 @@ class Senses:
             self._echoes.append((max(0, self._bus.time.tick - command.tick), command.source))
 
     def _hear_imu(self, _key: str, imu: Imu) -> None:
-        if imu.boot == self._bus.time.boot:
+        time = self._bus.time
+        if imu.boot == time.boot and imu.tick <= time.tick + LEAD_TICKS:
             self._shocks.append((imu.tick, horizontal(imu.linear_acceleration)))
 
     def _hear_body(self, body: Body) -> None:
+        """Listen to what its driver obeys, besides the usual topic; to one such at a time."""
         topic = command_topic(body.description)
-        if topic.key not in self._bus.listens:
-            self._bus.subscribe(topic, self._hear_command)
+        if topic.key == self._obeyed:
+            return
+        self._end_hearing()
+        self._obeyed, self._end_hearing = topic.key, _nothing
+        if topic.key != CMD_VEL.key:
+            self._end_hearing = self._bus.subscribe(topic, self._hear_command)
+
+
+def _nothing() -> None:
+    """End what has never begun."""

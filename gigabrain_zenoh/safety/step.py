@@ -11,10 +11,20 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.limits import NO_CAPS, ZERO
 from gigabrain_zenoh.pose_history import PoseHistory
-from gigabrain_zenoh.safety import attitude, following, host, power, progress, round_trip, zones
+from gigabrain_zenoh.safety import (
+    attitude,
+    following,
+    host,
+    late,
+    power,
+    progress,
+    round_trip,
+    zones,
+)
 from gigabrain_zenoh.safety.attitude import Attitude
 from gigabrain_zenoh.safety.following import Following
 from gigabrain_zenoh.safety.host import Host
+from gigabrain_zenoh.safety.late import Late
 from gigabrain_zenoh.safety.power import Power
 from gigabrain_zenoh.safety.progress import Bases, Progress
 from gigabrain_zenoh.safety.round_trip import RoundTrip
@@ -49,6 +59,7 @@ class Memory(msgspec.Struct, frozen=True, kw_only=True):
     attitude: Attitude = Attitude()
     following: Following = Following()
     round_trip: RoundTrip = RoundTrip()
+    late: Late = Late()
     progress: Progress = Progress()
     history: PoseHistory = PoseHistory()
     field: Field = Field()
@@ -61,14 +72,17 @@ def step(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Memory,
         memory = Memory(boot=state.boot, tick=state.tick, following=following.begin(state))
     memory = _look(body, memory, inputs)
     stop = _stops(body, memory, inputs)
-    late = round_trip.causes(body.thresholds, memory.round_trip)
+    slow = (
+        *round_trip.causes(body.thresholds, memory.round_trip),
+        *late.slows(body, memory.late),
+    )
     caps = zones.caps(body, memory.field)
-    if late:
+    if slow:
         caps = round_trip.halved(body, caps)
     verdict = SafetyState(
         verdict="stop" if stop else "slow" if caps != NO_CAPS else "ok",
         caps=caps,
-        causes=(*stop, *late, *zones.causes(memory.field)),
+        causes=(*stop, *slow, *zones.causes(memory.field)),
         warnings=(
             *power.warnings(body.thresholds, memory.power, state),
             *host.warnings(body.thresholds, inputs.host),
@@ -81,8 +95,17 @@ def _look(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
     """Every monitor takes in what is new."""
     state, limits = inputs.state, body.thresholds
     elapsed = min(max(0, state.tick - memory.tick), LONGEST_STEP_TICKS)
-    followed = following.look(body, memory.following, state, inputs.command, memory.caps, elapsed)
     history = memory.history.then(state)
+    lateness = late.look(body, memory.late, state, inputs.scan, history, elapsed)
+    followed = following.look(
+        body,
+        memory.following,
+        state,
+        inputs.command,
+        memory.caps,
+        elapsed,
+        late.ticks_of_body(body, lateness),
+    )
     motion = Motion(
         measured=state.velocity, told=followed.told, wanted=_wanted(state, inputs.command)
     )
@@ -94,6 +117,7 @@ def _look(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
         attitude=attitude.look(limits, memory.attitude, state, inputs.shock, elapsed),
         following=followed,
         round_trip=round_trip.look(limits, memory.round_trip, inputs.echo_ages, elapsed),
+        late=lateness,
         progress=progress.look(memory.progress, inputs.bases, elapsed),
         history=history,
         field=zones.look(body, memory.field, inputs.scan, state, history, motion),
@@ -118,6 +142,7 @@ def _stops(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause
         *progress.causes(limits, memory.progress, state, inputs.silent, first=first),
         *power.causes(limits, memory.power),
         *attitude.causes(memory.attitude),
+        *late.stops(body, memory.late),
         *following.causes(body, memory.following),
     )
 

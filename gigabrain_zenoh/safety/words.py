@@ -98,6 +98,16 @@ CAUSES: dict[str, Cause] = {
             text="commands take too long; half speed",
             remedy="bring whoever drives nearer, or relieve the network or the computer",
         ),
+        Cause(
+            code="body_late",
+            text="what the body reports is late",
+            remedy="look at its cable, its network and how busy the computer is",
+        ),
+        Cause(
+            code="lidar_late",
+            text="what the lidar reports is late",
+            remedy="look at its cable, its adapter and how busy the computer is",
+        ),
         _zone("ahead", "ahead of the body"),
         _zone("behind", "behind the body"),
         _zone("left", "to the left of the body"),

@@ -97,7 +97,7 @@ class Executive:
                 return job.order
             succeeded = status is Status.SUCCESS
             reason = outcome.reason if outcome and succeeded else job.moment.problem
-            self._end(job, "succeeded" if succeeded else "failed", reason)
+            self._end(job, "succeeded" if succeeded else "failed", reason, outcome)
             outcome, seconds = None, 0.0
         return None
 
@@ -109,6 +109,16 @@ class Executive:
     def idle(self) -> bool:
         """Whether there is nothing to do."""
         return not self._jobs
+
+    @property
+    def waits(self) -> str:
+        """What the robot waits for where nothing is wanted of whoever drives, in words."""
+        if not self._jobs:
+            return "waiting: for a goal"
+        job = self._jobs[0]
+        if job.held:
+            return f"{job.id} is paused: {job.why_held}"
+        return job.moment.doing or "waiting: for a goal"
 
     @property
     def saved(self) -> Saved:
@@ -132,6 +142,7 @@ class Executive:
         return TaskStatus(
             current=job.told("active", outcome.reason or moment.doing),
             doing=moment.doing[:500],
+            drives=moment.order is not None,
             progress=min(1.0, max(0.0, outcome.progress)),
             distance_remaining=outcome.distance,
             eta=outcome.eta,
@@ -170,10 +181,10 @@ class Executive:
         there = ", ".join(job.id for job in self._jobs)
         raise Refused(f"there is no task {name!r} any more; there is: {there}")
 
-    def _end(self, job: Job, state: TaskState, reason: str) -> None:
+    def _end(self, job: Job, state: TaskState, reason: str, outcome: Outcome | None = None) -> None:
         self._jobs.remove(job)
         job.stop()
-        self._done = [job.told(state, reason), *self._done][:MOST_DONE]
+        self._done = [job.told(state, reason, outcome), *self._done][:MOST_DONE]
 
 
 def _waiting(job: Job, first: str) -> Task:

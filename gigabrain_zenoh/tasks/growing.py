@@ -101,7 +101,7 @@ def _repeated(child: Behaviour, times: int | None) -> Behaviour:
     return Repeat("for ever" if times is None else f"{times} times", child, times or FOR_EVER)
 
 
-def remembered(root: Behaviour, now_s: float) -> Memory:
+def remembered(root: Behaviour, free_s: float) -> Memory:
     """How far the nodes below `root` have come, apart from what the leaves are at."""
     memory: Memory = {}
     for number, node in enumerate(_nodes(root)):
@@ -114,7 +114,7 @@ def remembered(root: Behaviour, now_s: float) -> Memory:
         elif isinstance(node, Repeat):
             memory[str(number)] = node.success
         elif isinstance(node, nodes.Timeout):
-            memory[str(number)] = round(now_s - node.began_s, -1)  # seldom another: it is written
+            memory[str(number)] = round(free_s - node.began_s, -1)  # seldom another: it is written
         elif isinstance(node, nodes.Guard):
             memory[str(number)] = node.interrupted
     return memory

@@ -64,13 +64,16 @@ class Job:
         return SavedJob(
             id=self.id, kind=self._saved.kind, label=self._saved.label, source=self._saved.source,
             mission=self._saved.mission, held=self.held,
-            memory=remembered(self._root, self._moment.now_s),
+            memory=remembered(self._root, self._moment.free_s),
         )  # fmt: skip
 
-    def told(self, state: TaskState, reason: str = "") -> Task:
-        """As others see it."""
+    def told(self, state: TaskState, reason: str = "", outcome: Outcome | None = None) -> Task:
+        """As others see it; of a goal that has ended, with how far from it the robot is."""
         saved = self._saved
+        measured = outcome if saved.kind == "goal" else None
         return Task(
             id=self.id, kind=saved.kind, label=saved.label[:64], source=saved.source[:64],
             state=state, reason=reason[:500],
+            position_error=measured.position_error if measured else None,
+            heading_error=measured.heading_error if measured else None,
         )  # fmt: skip

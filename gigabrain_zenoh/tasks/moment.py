@@ -33,6 +33,7 @@ class Moment:
     start: Start
     numbers: Iterator[int]  # of orders, none of them twice
     now_s: float = 0.0
+    held_s: float = 0.0  # of that, while the body did not follow an order
     outcome: Outcome | None = None  # of the order of the tick before
     order: Order | None = None  # what the node that is at work wants
     doing: str = ""  # what it is at, in words
@@ -40,8 +41,15 @@ class Moment:
     progress: float | None = None  # of a step that is not driving
     left_s: float | None = None  # until such a step is done, where that is known
 
+    @property
+    def free_s(self) -> float:
+        """How long the mission has been carried out while nobody held the body."""
+        return self.now_s - self.held_s
+
     def begin(self, seconds: float, outcome: Outcome | None) -> None:
         """The next tick, `seconds` after the last."""
         self.now_s += seconds
+        if outcome and outcome.held:
+            self.held_s += seconds
         self.outcome, self.order, self.doing = outcome, None, ""
         self.progress = self.left_s = None

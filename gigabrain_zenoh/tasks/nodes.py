@@ -148,7 +148,10 @@ class RunScript(Leaf):
 
 
 class Timeout(Decorator):
-    """Fails when what is below takes longer than some seconds of the robot's time."""
+    """Fails when what is below takes longer than some seconds of the robot's time.
+
+    The clock stands while the gate or an operator holds the body.
+    """
 
     def __init__(self, child: Behaviour, seconds: float, moment: "Moment") -> None:
         super().__init__(f"at most {seconds:g} s", child)
@@ -156,13 +159,16 @@ class Timeout(Decorator):
 
     def initialise(self) -> None:
         """It begins now."""
-        self.began_s = self._moment.now_s
+        self.began_s = self._moment.free_s
 
     def update(self) -> Status:
         """As below, or a failure when it is late."""
-        late = self._moment.now_s - self.began_s > self._seconds
-        if self.decorated.status is Status.RUNNING and late:
-            self._moment.problem = f"{self._moment.doing}: not done within {self._seconds:g} s"
+        too_long = self._moment.free_s - self.began_s > self._seconds
+        if self.decorated.status is Status.RUNNING and too_long:
+            outcome = self._moment.outcome
+            why = f": {outcome.reason}" if outcome and outcome.reason else ""
+            problem = f"{self._moment.doing}: not done within {self._seconds:g} s"
+            self._moment.problem = problem + why
             self._moment.order = None
             return Status.FAILURE
         return self.decorated.status

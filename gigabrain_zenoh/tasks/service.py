@@ -1,5 +1,6 @@
 """Tasks on the bus: what is asked for is queued, what becomes of it is told and written down."""
 
+import asyncio
 import logging
 from typing import Any, Protocol
 
@@ -86,6 +87,11 @@ class TaskService:
             self._tell()
         return order
 
+    @property
+    def waits(self) -> str:
+        """What the robot waits for where `step` wants nothing, in words."""
+        return self._tasks.waits
+
     def begin(self, mission: Mission, label: str, boot: int) -> None:
         """Something to do where nobody has wanted anything yet since this start of the driver."""
         if self._tasks.idle and not self._tasks.knows(boot):
@@ -139,7 +145,8 @@ class TaskService:
     async def _mission(self, request: MissionRequest) -> MissionReply:
         label = request.label or "mission"
         try:
-            mission = checks.loads(request.mission, label)
+            # a long one takes a tenth of a second to read, which no scan should wait for
+            mission = await asyncio.to_thread(checks.loads, request.mission, label)
             for script in checks.scripts(mission):
                 self._scripts.path(script)
             if checks.drives(mission):

@@ -1,11 +1,11 @@
 """Tasks on disk: they survive a restart of decision."""
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 
+from gigabrain_zenoh.atomic_write import make_folder, replace_file
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.tasks.executive import Saved
 
@@ -33,14 +33,9 @@ class TaskFile:
         """Write the last of `newest`; the problem in one line, or an empty text."""
         if self._path is None:
             return ""
-        fresh = self._path.with_suffix(".new")
         try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            with fresh.open("wb") as file:
-                file.write(msgspec.json.encode(newest[-1]))
-                file.flush()
-                os.fsync(file.fileno())
-            fresh.replace(self._path)
+            make_folder(self._path.parent)
+            replace_file(self._path, msgspec.json.encode(newest[-1]))
         except OSError as error:
             return f"cannot write {self._path}: {error.strerror}; tasks will not survive a restart"
         return ""

@@ -150,8 +150,8 @@ def _router(robot: Robot) -> Iterator[Finding]:
         cure = "start the robot there, open its port in the firewall, or name it with --connect"
         yield _bad("router", f"{robot.problem} Nothing listens on that port.", cure)
     elif robot.problem:
-        cure = "start one with `gigabrain demo` or `gigabrain up`"
-        yield _hint("router", robot.problem.partition(";")[0], cure)
+        problem, _, cure = robot.problem.partition("; ")
+        yield _hint("router", problem, cure)
     else:
         yield _ok("router", f"answers at {robot.router}")
 

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from gigabrain_schemas.safety import LogRecord
+from gigabrain_zenoh.bounded_file import open_regular
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.log_text import LEVELS
@@ -65,16 +66,17 @@ def run_folder(name: str = "") -> Path:
 
 def read(folder: Path, wanted: Wanted, newest: int) -> list[Line]:
     """The newest lines of all processes of a run, oldest first. Raises UnknownName."""
-    files = {path.stem: path for path in sorted(folder.glob("*.jsonl"))}
-    if wanted.process and wanted.process not in files:
-        raise unknown("log of a process", wanted.process, files)
-    lines = [line for path in files.values() for line in _lines(path) if wanted.has(line)]
+    files = sorted(folder.glob("*.jsonl*"))  # driver.jsonl, and driver.jsonl.1 before it
+    names = {path.name.partition(".jsonl")[0] for path in files}
+    if wanted.process and wanted.process not in names:
+        raise unknown("log of a process", wanted.process, names)
+    lines = [line for path in files for line in _lines(path) if wanted.has(line)]
     return sorted(lines, key=lambda line: int(line["t"]))[-newest:]
 
 
 def _lines(path: Path) -> Iterator[Line]:
     """Every line that is whole: the last one of a process that died may not be."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         for text in file:
             try:
                 line = msgspec.json.decode(text)

@@ -82,6 +82,7 @@ def about(nodes: Nodes, name: str) -> Iterator[str]:
     yield from _rates("sends", one.publishes if one else (), health.sent_hz if health else {})
     yield from _rates("hears", one.subscribes if one else (), health.received_hz if health else {})
     if health:
+        yield from (f"  problem: {one.text} ({one.remedy})" for one in health.problems)
         yield from _figures("rejected", health.rejected)
         yield from _figures("latency [ms]", health.latency_ms)
         yield from _figures("counters", health.counters)

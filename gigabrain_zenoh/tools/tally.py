@@ -14,6 +14,7 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.recording.gaps import Gaps, header_of
 
 ROOM = 2000  # arrivals that are remembered per key
+MOST_KEYS = 1000  # that are listened to; anybody may make up another
 
 
 class Arrival(Struct, frozen=True):
@@ -101,7 +102,10 @@ class Tally:
         """Take one message."""
         header = header_of(payload)
         with self._lock:
-            stream = self._streams.get(key) or self._streams.setdefault(key, Stream())
+            stream = self._streams.get(key)
+            if stream is None and len(self._streams) >= MOST_KEYS:
+                return
+            stream = stream or self._streams.setdefault(key, Stream())
             stream.hear(encoding, payload, header.stamp_ns, self._now_ns(), self._unix_ns())
             self._gaps.see(key, header)
 

@@ -4,6 +4,7 @@ from typing import Protocol
 
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import HEALTH
+from gigabrain_zenoh.bounded import put
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.tools.tally import Tally
 from gigabrain_zenoh.tools.top_rows import (
@@ -16,6 +17,7 @@ from gigabrain_zenoh.tools.top_rows import (
 )
 
 Rows = dict[str, tuple[Cell, ...]]
+MOST_PROCESSES = 64
 
 
 class Feed(Protocol):
@@ -37,7 +39,7 @@ class BusFeed:
         bus.subscribe(HEALTH, self._hear)
 
     def _hear(self, _key: str, told: Health) -> None:
-        self._health[told.process] = told, self._bus.clock.now_ns()
+        put(self._health, told.process, (told, self._bus.clock.now_ns()), MOST_PROCESSES)
         self._past.add(told.process, max(told.latency_ms.values(), default=None))
 
     def refresh(self) -> tuple[Rows, Rows]:

@@ -6,10 +6,11 @@ from typing import Literal, get_args
 from msgspec import Struct
 
 from gigabrain_schemas.base import Cause
+from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, STATE, WORLD
 from gigabrain_zenoh.ages import scan_limit_ns
 from gigabrain_zenoh.gate import BRAIN
-from gigabrain_zenoh.limits import NO_CAPS
+from gigabrain_zenoh.limits import NO_CAPS, ZERO
 from gigabrain_zenoh.tools.standing import leaves_nothing, stands
 from gigabrain_zenoh.tools.why_facts import Facts
 
@@ -27,6 +28,7 @@ class Finding(Struct, frozen=True, kw_only=True):
     ok: bool
     text: str  # a phrase for people
     remedy: str = ""
+    waits: bool = False  # it works and stands: as it should where `ok`, else for the reason given
 
 
 class Verdict(Struct, frozen=True, kw_only=True):
@@ -37,12 +39,24 @@ class Verdict(Struct, frozen=True, kw_only=True):
 
     @property
     def broken(self) -> Finding | None:
-        """The first link that does not hold."""
-        return next((one for one in self.findings if not one.ok), None)
+        """The first link that is broken; one that works and only waits comes after all others."""
+        broken = [one for one in self.findings if not one.ok]
+        return min(broken, key=lambda one: one.waits, default=None)
+
+    @property
+    def waits(self) -> Finding | None:
+        """Where nothing is broken: the first link that stands as it should."""
+        return None if self.broken else next((one for one in self.findings if one.waits), None)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the body moves."""
+        body = self.findings[-1]
+        return body.link == "body" and body.ok and not body.waits
 
     @property
     def exit_code(self) -> int:
-        """0 where it moves, else 10 for the router to 19 for the body itself."""
+        """0 where nothing is broken, else 10 for the router to 19 for the body itself."""
         return FIRST_CODE + LINKS.index(self.broken.link) if self.broken else 0
 
 
@@ -66,6 +80,10 @@ ROUTER = (
 
 def _ok(link: Link, text: str) -> Finding:
     return Finding(link=link, ok=True, text=text)
+
+
+def _waits(link: Link, text: str, remedy: str = "") -> Finding:
+    return Finding(link=link, ok=True, text=text, remedy=remedy, waits=True)
 
 
 def _no(link: Link, text: str, remedy: str) -> Finding:
@@ -136,12 +154,37 @@ def _intent(facts: Facts) -> Finding:
     intent, other = facts.intent, _by_another(facts)
     if other:
         return _ok("intent", f"not asked: {other} drives")
+    if intent is None and facts.tasks:
+        return _waits("intent", "decision is starting up", "wait until it is ready")
     if intent is None:
         return _silent(facts, "intent", "decision", "intent")
-    if intent.twist is None or stands(intent.twist):
-        remedy = "see to what it says; it goes on by itself when that is over"
-        return _no("intent", f"decision wants to stand: {intent.reason}", remedy)
+    if not _wants_to_move(facts):
+        return _idle(facts.tasks) or Finding(
+            link="intent", ok=False, waits=True,
+            text=f"decision wants to stand: {intent.reason}",
+            remedy="remove the cause; decision goes on by itself then",
+        )  # fmt: skip
     return _ok("intent", f"{intent.reason}{_after(facts, INTENT.key, 'the world')}")
+
+
+def _wants_to_move(facts: Facts) -> bool:
+    twist = facts.intent.twist if facts.intent else None
+    return twist is not None and not stands(twist)
+
+
+def _idle(tasks: TaskStatus | None) -> Finding | None:
+    """That there is nowhere to drive to now, where that is so."""
+    if tasks is None:
+        return None  # a behaviour that is not sent anywhere drives by itself
+    task = tasks.current
+    if task is None:
+        return _waits("intent", "waiting for a goal", "send it one, as with `gigabrain goto 1 2`")
+    if task.state == "paused":
+        remedy = f"let it go on with `gigabrain task resume {task.id}`"
+        return _waits("intent", f"{task.id} is paused: {task.reason}", remedy)
+    if tasks.drives:
+        return None
+    return _waits("intent", f"{task.id}: {tasks.doing}", "it goes on by itself after that step")
 
 
 def _control(facts: Facts) -> Finding:
@@ -151,18 +194,23 @@ def _control(facts: Facts) -> Finding:
     if command is None:
         return _silent(facts, "control", "control", "command")
     gate = facts.state.gate if facts.state else None
-    open_to_it = gate is not None and gate.mode == "enabled"
-    free = facts.safety is not None and facts.safety.verdict != "stop"
-    wants = intent.twist if intent else None
-    caps = facts.safety.caps if facts.safety else NO_CAPS
-    held = wants is not None and leaves_nothing(wants, caps)
-    if open_to_it and free and wants and not held and stands(facts.fastest):
+    still = gate is not None and gate.mode == "enabled" and stands(facts.fastest)
+    if still and command.operator:
+        text = "an operator holds the body"
         remedy = "hand the body back to decision with `gigabrain enable`"
-        text = "control sends zero although decision wants to move: an operator's seat has it"
-        return _no("control", text, remedy)
+        if _wants_to_move(facts):
+            return _no("control", f"{text}; decision wants to move", remedy)
+        return _waits("control", text, remedy)
+    free = facts.safety is not None and facts.safety.verdict != "stop"
+    caps = facts.safety.caps if facts.safety else NO_CAPS
+    wants = intent.twist if intent and intent.twist else ZERO
+    if still and free and not stands(wants) and not leaves_nothing(wants, caps):
+        remedy = "read its log with `gigabrain log --process control`"
+        return _no("control", "control sends zero although decision wants to move", remedy)
+    who = "an operator drives: " if command.operator else ""
     return _ok(
         "control",
-        f"{command.linear_x:+.2f} m/s {command.angular_z:+.2f} rad/s"
+        f"{who}{command.linear_x:+.2f} m/s {command.angular_z:+.2f} rad/s"
         f"{_after(facts, CMD_VEL.key, 'the intent')}",
     )
 
@@ -211,7 +259,7 @@ def _body(facts: Facts) -> Finding:
         wanted = f"{told.linear_x:+.2f} m/s {told.angular_z:+.2f} rad/s"
         return _no("body", f"the body stands although it is told {wanted}", remedy)
     if stands(now):
-        return _no("body", "nobody wants it to move", "send it a command or a goal")
+        return _waits("body", "it stands, as it is told", "send it a command or a goal")
     return _ok("body", f"it moves: {speed}")
 
 
@@ -236,6 +284,6 @@ def _notes(facts: Facts) -> tuple[str, ...]:
     if facts.strangers:
         names = ", ".join(facts.strangers)
         notes.append(f"{names} sends commands as well, which the gate does not obey")
-    if facts.safety:
-        notes += [f"warning: {one.text} ({one.remedy})" for one in facts.safety.warnings]
+    warnings = facts.safety.warnings if facts.safety else ()
+    notes += [f"warning: {one.text} ({one.remedy})" for one in (*warnings, *facts.problems)]
     return tuple(notes)

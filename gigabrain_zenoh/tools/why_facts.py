@@ -6,18 +6,21 @@ from collections.abc import Mapping
 
 from msgspec import Struct
 
-from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.body import Body, RobotState
 from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
 from gigabrain_schemas.requests import Description
-from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.safety import Health, SafetyState
+from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import (
     BODY,
     CMD_VEL,
+    HEALTH,
     INTENT,
     SAFETY,
     SCAN,
     STATE,
+    TASK,
     WORLD,
     command_topic,
 )
@@ -44,6 +47,8 @@ class Facts(Struct, frozen=True, kw_only=True):
     fastest: Velocity = ZERO  # of the commander's commands in this look, each way
     strangers: tuple[str, ...] = ()  # who else sends commands
     safety: SafetyState | None = None
+    tasks: TaskStatus | None = None  # where decision is one that is sent to places
+    problems: tuple[Cause, ...] = ()  # of all processes: what they cannot do now
     hz: Mapping[str, float] = {}  # measured, by key
     after_ms: Mapping[str, float] = {}  # from the hop before to this one, median, by key
 
@@ -56,9 +61,16 @@ class Watcher:
         self._state, self._body = bus.latest(STATE), bus.latest(BODY, self._join)
         self._scan, self._world = bus.latest(SCAN), bus.latest(WORLD)
         self._intent, self._safety = bus.latest(INTENT), bus.latest(SAFETY)
+        self._tasks = bus.latest(TASK)
         self._heard = listen(bus)
         self._commands: dict[str, list[tuple[int, CmdVel]]] = {}
+        self._problems: dict[str, tuple[Cause, ...]] = {}  # by process
         bus.subscribe(CMD_VEL, self._command)
+        bus.subscribe(HEALTH, self._health)
+
+    def _health(self, _key: str, health: Health) -> None:
+        if health.problems:
+            self._problems[health.process] = health.problems
 
     def _join(self, body: Body) -> None:
         """A body may obey a key of its own."""
@@ -90,6 +102,8 @@ class Watcher:
             fastest=_fastest(self._commands.get(commander, [])),
             strangers=tuple(sorted(set(self._commands) - {BRAIN, commander})),
             safety=self._safety.fresh(),
+            tasks=self._tasks.fresh(),
+            problems=tuple(one for told in self._problems.values() for one in told),
             hz={
                 key: round((count - counts[key]) / lasted_s / (2 if key in TWICE else 1), 1)
                 for key, count in bus.received.items()

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.brain import OccupancyGrid, WorldModel
 from gigabrain_schemas.sensors import Image, LaserScan
 
+FARTHEST_HIT = 1000.0  # [m]
 DTYPES = {"mono8": "u1", "rgb8": "u1", "bgr8": "u1", "depth16": "<u2", "depth32f": "<f4"}
 
 
@@ -20,8 +21,13 @@ def ranges_bytes(values: NDArray[np.floating]) -> bytes:
 
 
 def hits(world: WorldModel) -> NDArray[np.float32]:
-    """Where beams hit something [m], (n, 2) in the body's frame, as a read-only view."""
-    return np.frombuffer(world.hits, "<f4").reshape(-1, 2)
+    """Where beams hit something [m], (n, 2) in the body's frame.
+
+    What is no place, such as NaN, is left out: whoever computes with places may rely on them.
+    """
+    points = np.frombuffer(world.hits, "<f4").reshape(-1, 2)
+    near = (np.abs(points) <= FARTHEST_HIT).all(axis=1)
+    return points if near.all() else points[near]
 
 
 def hits_bytes(x: NDArray[np.floating], y: NDArray[np.floating]) -> bytes:

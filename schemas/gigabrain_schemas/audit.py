@@ -6,6 +6,7 @@ from msgspec import Meta
 
 from gigabrain_schemas.base import Count, Message, Name, Text
 
+MOST_RECORDS = 1000
 What = Literal[
     "boot",  # the driver has started
     "end",  # the driver ends, and leaves the body in its safe state
@@ -36,10 +37,10 @@ class AuditRecord(Message, frozen=True, kw_only=True):
 class AuditRequest(Message, frozen=True, kw_only=True):
     """Asks for the newest entries. An empty request will do."""
 
-    newest: Annotated[int, Meta(ge=1, le=1000)] = 100
+    newest: Annotated[int, Meta(ge=1, le=MOST_RECORDS)] = 100
 
 
 class AuditPage(Message, frozen=True, kw_only=True):
     """The newest entries, oldest first."""
 
-    records: tuple[AuditRecord, ...] = ()
+    records: Annotated[tuple[AuditRecord, ...], Meta(max_length=MOST_RECORDS)] = ()

@@ -1,6 +1,8 @@
 """The base of all messages, and the bounded types that they share.
 
 A bound on a float refuses NaN and infinity as well, so a message that decodes holds finite numbers.
+Every number has the bound of its kind, and every text and list a greatest length: whoever computes
+with a message need not fear for its memory or its time.
 """
 
 from typing import Annotated
@@ -8,14 +10,27 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Finite = Annotated[float, Meta(ge=-1e9, le=1e9)]  # of figures that no body moves by
 NonNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
-Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
+Positive = Annotated[float, Meta(gt=0.0, le=1e9)]  # of settings
+Coordinate = Annotated[float, Meta(ge=-1e5, le=1e5)]  # [m], in a map or an odometry
+Distance = Annotated[float, Meta(ge=0.0, le=1e5)]  # [m]
+Range = Annotated[float, Meta(ge=0.0, le=1000.0)]  # [m], of a sensor
+Offset = Annotated[float, Meta(ge=-10.0, le=10.0)]  # [m], on a body
+Angle = Annotated[float, Meta(ge=-1e6, le=1e6)]  # [rad]; one that is summed up goes round often
+LinearSpeed = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [m/s]
+AngularSpeed = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [rad/s]
+SpeedLimit = Annotated[float, Meta(ge=0.001, le=100.0)]  # [m/s] or [rad/s]
+SpeedCap = Annotated[float, Meta(ge=0.0, le=100.0)]  # [m/s] or [rad/s]
+AccelerationLimit = Annotated[float, Meta(ge=0.001, le=1000.0)]  # [m/s2] or [rad/s2]
 Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
 Percentage = Annotated[float, Meta(ge=0.0, le=100.0)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Tick = Annotated[int, Meta(ge=0, le=2**38)]  # 170 years; in nanoseconds it still is 64 bits
+Milliseconds = Annotated[float, Meta(ge=0.0, le=1e12)]  # of a line that has been silent for years
 Name = Annotated[str, Meta(max_length=64)]
 Text = Annotated[str, Meta(max_length=500)]
+Key = Annotated[str, Meta(max_length=256)]  # on the bus, or the name of a figure
 
 TICK_NS = 20_000_000  # one tick of the robot's clock is 20 ms of the body's own time
 
@@ -30,24 +45,24 @@ class Message(Record, frozen=True, kw_only=True):
     stamp_ns: Count = 0  # Unix time of validity, for people and recordings; never for safety
     seq: Count = 0  # counts what this sender sent on this key
     boot: Count = 0  # which start of the driver the tick belongs to
-    tick: Count = 0  # newest tick of the robot's clock that the sender had seen
-    basis: Count = 0  # tick of the sensor data that the content rests on; 0 for none
+    tick: Tick = 0  # newest tick of the robot's clock that the sender had seen
+    basis: Tick = 0  # tick of the sensor data that the content rests on; 0 for none
 
 
 class Pose(Record, frozen=True, kw_only=True):
     """A planar pose (REP-103: x forward, y left, yaw counter-clockwise)."""
 
-    x: Finite  # [m]
-    y: Finite  # [m]
-    yaw: Finite  # [rad]
+    x: Coordinate  # [m]
+    y: Coordinate  # [m]
+    yaw: Angle  # [rad]
 
 
 class Velocity(Record, frozen=True, kw_only=True):
     """A planar velocity in the body's own frame."""
 
-    linear_x: Finite = 0.0  # [m/s], forward
-    linear_y: Finite = 0.0  # [m/s], left
-    angular_z: Finite = 0.0  # [rad/s], counter-clockwise
+    linear_x: LinearSpeed = 0.0  # [m/s], forward
+    linear_y: LinearSpeed = 0.0  # [m/s], left
+    angular_z: AngularSpeed = 0.0  # [rad/s], counter-clockwise
 
 
 class Cause(Record, frozen=True, kw_only=True):
@@ -57,3 +72,6 @@ class Cause(Record, frozen=True, kw_only=True):
     text: Text  # a sentence for people
     latching: bool = False  # stays until a person releases it
     remedy: Text = ""  # what to do about it, in the imperative
+
+
+Causes = Annotated[tuple[Cause, ...], Meta(max_length=64)]

@@ -5,19 +5,23 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from gigabrain_schemas.base import (
-    Cause,
+    AccelerationLimit,
+    Angle,
+    Causes,
     Count,
-    Finite,
     Message,
+    Milliseconds,
     Name,
-    NonNegative,
+    Offset,
     Percentage,
     Pose,
-    Positive,
+    Range,
     Record,
+    SpeedCap,
+    SpeedLimit,
     Velocity,
 )
-from gigabrain_schemas.sensors import ImuData
+from gigabrain_schemas.sensors import ImuData, RangeMax
 
 GateMode = Literal["latched", "idle", "enabled", "stopping"]
 DriveType = Literal["differential", "omni", "mecanum", "ackermann", "quadruped", "arm"]
@@ -29,9 +33,20 @@ Sustain = Annotated[float, Meta(ge=0.02, le=10.0)]  # [s]
 Age = Annotated[float, Meta(ge=0.02, le=2.0)]  # [s]
 Shock = Annotated[float, Meta(ge=1.0, le=200.0)]  # [m/s2]
 Margin = Annotated[float, Meta(ge=0.01, le=10.0)]  # [m]
+Gain = Annotated[float, Meta(ge=0.0, le=1000.0)]  # [1/s]
+Rate = Annotated[float, Meta(ge=0.1, le=1000.0)]  # [Hz]
+OffBy = Annotated[float, Meta(gt=0.0, le=100.0)]  # [m/s] or [rad/s]
+Megabytes = Annotated[float, Meta(gt=0.0, le=1e9)]
+Volts = Annotated[float, Meta(ge=0.0, le=1000.0)]
+Amperes = Annotated[float, Meta(ge=-10_000.0, le=10_000.0)]
+JointPosition = Annotated[float, Meta(ge=-1e9, le=1e9)]  # [rad] or [m]; a wheel's adds up
+JointSpeed = Annotated[float, Meta(ge=-10_000.0, le=10_000.0)]  # [rad/s] or [m/s]
+Effort = Annotated[float, Meta(ge=-1e5, le=1e5)]  # [N m] or [N]
+Temperature = Annotated[float, Meta(ge=-273.15, le=1000.0)]  # [deg C]
 Key = Annotated[str, Meta(pattern=r"^\w+(/\w+)*$", max_length=128)]
 
 
+MOST_JOINTS = 128
 LEAST_AREA = 1e-4  # [m2]
 
 
@@ -39,25 +54,26 @@ class Joint(Record, frozen=True, kw_only=True):
     """One joint as measured."""
 
     name: Name
-    position: Finite  # [rad], or [m] for a sliding joint
-    velocity: Finite = 0.0  # [rad/s] or [m/s]
-    effort: Finite | None = None  # [N m] or [N]; None where it is not measured
-    temperature: Finite | None = None  # [deg C] of its motor
+    position: JointPosition  # [rad], or [m] for a sliding joint
+    velocity: JointSpeed = 0.0  # [rad/s] or [m/s]
+    effort: Effort | None = None  # [N m] or [N]; None where it is not measured
+    temperature: Temperature | None = None  # [deg C] of its motor
 
 
 class Battery(Record, frozen=True, kw_only=True):
     """The main battery."""
 
-    voltage: NonNegative  # [V]
+    voltage: Volts  # [V]
     percentage: Percentage  # [%]
-    current: Finite = 0.0  # [A], positive while it drains
+    current: Amperes = 0.0  # [A], positive while it drains
 
 
 class LinkHealth(Record, frozen=True, kw_only=True):
     """How the driver's line to the body is doing."""
 
     connected: bool = True
-    age_ms: NonNegative = 0.0  # since the body was last heard
+    age_ms: Milliseconds = 0.0  # since the body was last heard
+    late_ms: Milliseconds | None = None  # by which it came later than it can; None: no clock tells
     errors: Count = 0  # frames that were thrown away
     reconnects: Count = 0
 
@@ -66,7 +82,7 @@ class GateStatus(Record, frozen=True, kw_only=True):
     """What the gate lets through, and why not more."""
 
     mode: GateMode = "latched"
-    causes: tuple[Cause, ...] = ()
+    causes: Causes = ()
     estop_generation: Count = 0  # how often an e-stop was pressed; a release must name it
     commander: Name = ""  # whose commands pass; empty for nobody's
     enables: Count = 0  # how often it was enabled since this boot
@@ -78,10 +94,11 @@ class RobotState(Message, frozen=True, kw_only=True):
     robot_type: Name
     pose: Pose  # odometry, since the driver's start
     velocity: Velocity  # as measured
-    joints: tuple[Joint, ...] = ()
+    sent: Velocity = Velocity()  # what the body was told last, as its protocol has it
+    joints: Annotated[tuple[Joint, ...], Meta(max_length=MOST_JOINTS)] = ()
     battery: Battery | None = None
     imu: ImuData | None = None
-    bumpers: tuple[bool, ...] = ()
+    bumpers: Annotated[tuple[bool, ...], Meta(max_length=64)] = ()
     link: LinkHealth = LinkHealth()
     gate: GateStatus = GateStatus()
 
@@ -90,20 +107,20 @@ class Lidar(Record, frozen=True, kw_only=True):
     """A planar lidar and where it sits."""
 
     beams: Annotated[int, Meta(ge=1, le=100_000)]
-    rate_hz: Positive
-    range_min: NonNegative  # [m]
-    range_max: Positive  # [m]
-    x: Finite = 0.0  # [m], mounting in the body's frame
-    y: Finite = 0.0  # [m]
-    yaw: Finite = 0.0  # [rad]
+    rate_hz: Rate
+    range_min: Range  # [m]
+    range_max: RangeMax  # [m]
+    x: Offset = 0.0  # [m], mounting in the body's frame
+    y: Offset = 0.0  # [m]
+    yaw: Angle = 0.0  # [rad]
     no_return: Literal["free", "unknown"] = "free"  # what an infinite range of this sensor means
 
 
 class ControlGains(Record, frozen=True, kw_only=True):
     """How often control commands, and how it corrects the measured velocity."""
 
-    linear_integral: NonNegative = 1.5  # [1/s]
-    angular_integral: NonNegative = 1.5  # [1/s]
+    linear_integral: Gain = 1.5  # [1/s]
+    angular_integral: Gain = 1.5  # [1/s]
     max_correction: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.25  # of the commanded speed
     rate_hz: Annotated[float, Meta(ge=12.5, le=50.0)] = 50.0  # of commands; whole ticks apart
 
@@ -128,16 +145,19 @@ class Thresholds(Record, frozen=True, kw_only=True):
     heartbeat: Age = 0.15  # [s] without an answer from one of the three systems
     round_trip: Age = 0.1  # [s], 99 of 100 commands echo a tick younger than this
     round_trip_sustain: Sustain = 1.0  # [s]
-    follow_linear: Positive = 0.05  # [m/s], measured speed off what was commanded
-    follow_angular: Positive = 0.3  # [rad/s]
+    follow_linear: OffBy = 0.05  # [m/s], measured speed off what was commanded
+    follow_angular: OffBy = 0.3  # [rad/s]
     follow_sustain: Sustain = 0.3  # [s]
     stuck_sustain: Sustain = 2.0  # [s] without moving at all
+    response: Age = 0.1  # [s], how late the measured speed follows when all is well
+    late: Age = 0.07  # [s], by which data may be later than they can be, or than `response`
+    late_sustain: Sustain = 0.2  # [s]
     frozen_sustain: Sustain = 0.4  # [s] of values that do not change while it should move
     tilt_stop: Annotated[float, Meta(ge=5.0, le=90.0)] = 30.0  # [deg], it stops and latches
     shock_stop: Annotated[float, Meta(ge=1.0, le=200.0)] = (
         40.0  # [m/s2], horizontally; it stops and latches
     )
-    disk_warn: Positive = 500.0  # [MB] left where safety runs
+    disk_warn: Megabytes = 500.0  # [MB] left where safety runs
     cpu_warn: PerCent = 95.0  # [%] of all cores, over ten seconds
     memory_warn: PerCent = 95.0  # [%] in use
     reaction_time: Age = 0.22  # [s], scan period + bus + gate + drive
@@ -160,16 +180,17 @@ class BodyDescription(Record, frozen=True, kw_only=True):
 
     robot_type: Name
     drive_type: DriveType
-    footprint: Annotated[tuple[tuple[Finite, Finite], ...], Meta(min_length=3, max_length=64)]
+    footprint: Annotated[tuple[tuple[Offset, Offset], ...], Meta(min_length=3, max_length=64)]
     # [m], corners in the body's frame, in order
-    max_linear_speed: Positive  # [m/s]
-    max_lateral_speed: NonNegative = 0.0  # [m/s]
-    max_angular_speed: Positive  # [rad/s]
-    max_linear_acceleration: Positive = 1.0  # [m/s2]
-    max_linear_deceleration: Positive = 1.0  # [m/s2]
-    max_angular_acceleration: Positive = 3.0  # [rad/s2]
-    wheel_separation: NonNegative = 0.0  # [m], left to right; of omni wheels, to the next one
-    max_rim_speed: Positive | None = None
+    max_linear_speed: SpeedLimit  # [m/s]
+    max_lateral_speed: SpeedCap = 0.0  # [m/s]
+    max_angular_speed: SpeedLimit  # [rad/s]
+    max_linear_acceleration: AccelerationLimit = 1.0  # [m/s2]
+    max_linear_deceleration: AccelerationLimit = 1.0  # [m/s2]
+    max_angular_acceleration: AccelerationLimit = 3.0  # [rad/s2]
+    wheel_separation: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
+    # [m], left to right; of omni wheels, to the next one
+    max_rim_speed: SpeedLimit | None = None
     # [m/s], of a wheel of a differential base; None: it has its largest speeds both at once
     lidar: Lidar | None = None
     thresholds: Thresholds = DEFAULT

@@ -6,29 +6,38 @@ import msgspec
 from msgspec import Meta
 
 from gigabrain_schemas.base import (
+    Angle,
+    AngularSpeed,
+    Coordinate,
     Count,
+    Distance,
     Finite,
     Fraction,
+    LinearSpeed,
     Message,
     Name,
-    NonNegative,
-    Positive,
     Record,
     Text,
     Velocity,
 )
+from gigabrain_schemas.body import MOST_JOINTS, JointPosition, JointSpeed
+
+Resolution = Annotated[float, Meta(ge=0.001, le=1.0)]  # [m] per cell
+Cells = Annotated[int, Meta(ge=0, le=100_000)]  # along one side
+Delay = Annotated[float, Meta(ge=0.0, le=10.0)]  # [s]
 
 
 class Obstacle(Record, frozen=True, kw_only=True):
     """Something that perception follows from scan to scan."""
 
     id: Count
-    x: Finite  # [m], in the frame of the odometry
-    y: Finite  # [m]
-    velocity_x: Finite = 0.0  # [m/s]
-    velocity_y: Finite = 0.0  # [m/s]
-    radius: NonNegative  # [m]
-    covariance: tuple[Finite, ...] = ()  # of (x, y, velocity_x, velocity_y), 16 values by row
+    x: Coordinate  # [m], in the frame of the odometry
+    y: Coordinate  # [m]
+    velocity_x: LinearSpeed = 0.0  # [m/s]
+    velocity_y: LinearSpeed = 0.0  # [m/s]
+    radius: Annotated[float, Meta(ge=0.0, le=10.0)]  # [m]
+    covariance: Annotated[tuple[Finite, ...], Meta(max_length=16)] = ()
+    # of (x, y, velocity_x, velocity_y), 16 values by row
 
     def __post_init__(self) -> None:
         if len(self.covariance) not in (0, 16):
@@ -41,11 +50,12 @@ class WorldModel(Message, frozen=True, kw_only=True):
     scan_ok: bool
     scan_problem: Text = ""  # why the scan cannot be believed
     obstacle_ahead: bool  # true as well while that is unknown
-    distance_ahead: NonNegative | None = None  # [m] to the nearest hit ahead; None: none or unknown
-    sectors: tuple[NonNegative | None, ...] = ()
+    distance_ahead: Distance | None = None  # [m] to the nearest hit ahead; None: none or unknown
+    sectors: Annotated[tuple[Distance | None, ...], Meta(max_length=3600)] = ()
     # [m], nearest hit per equal sector, counter-clockwise, the first centred ahead; None for none
-    obstacles: tuple[Obstacle, ...] = ()
-    hits: bytes = b""  # float32 little-endian [m], (n, 2): where beams hit; only for navigation
+    obstacles: Annotated[tuple[Obstacle, ...], Meta(max_length=256)] = ()
+    hits: Annotated[bytes, Meta(max_length=64 * 1024)] = b""
+    # float32 little-endian [m], (n, 2): where beams hit; only for navigation
 
     def __post_init__(self) -> None:
         if len(self.hits) % 8:
@@ -55,9 +65,9 @@ class WorldModel(Message, frozen=True, kw_only=True):
 class PoseInMap(Message, frozen=True, kw_only=True):
     """Where the robot is in the map."""
 
-    x: Finite  # [m]
-    y: Finite  # [m]
-    yaw: Finite  # [rad]
+    x: Coordinate  # [m]
+    y: Coordinate  # [m]
+    yaw: Angle  # [rad]
     covariance: Annotated[tuple[Finite, ...], Meta(min_length=9, max_length=9)]  # of x, y, yaw
     localized: bool = True
 
@@ -68,12 +78,13 @@ CELL_VALUES = bytes((*range(101), 255))  # as int8: 0 to 100, and -1
 class OccupancyGrid(Message, frozen=True, kw_only=True):
     """A map. The last value is kept for those who join late."""
 
-    resolution: Positive  # [m] per cell
-    width: Count  # cells
-    height: Count  # cells
-    origin_x: Finite  # [m], of the corner of cell (0, 0)
-    origin_y: Finite  # [m]
-    cells: bytes  # int8, (height, width) by row: 0 free to 100 occupied, -1 unknown
+    resolution: Resolution  # [m] per cell
+    width: Cells  # cells
+    height: Cells  # cells
+    origin_x: Coordinate  # [m], of the corner of cell (0, 0)
+    origin_y: Coordinate  # [m]
+    cells: Annotated[bytes, Meta(max_length=8 * 1024 * 1024)]
+    # int8, (height, width) by row: 0 free to 100 occupied, -1 unknown
 
     def __post_init__(self) -> None:
         if len(self.cells) != self.width * self.height:
@@ -85,35 +96,37 @@ class OccupancyGrid(Message, frozen=True, kw_only=True):
 class TrajectoryPoint(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """What decision expects of the body, in the body's frame at the tick of the intent's basis."""
 
-    t: NonNegative  # [s] from that tick
-    x: Finite  # [m]
-    y: Finite  # [m]
-    yaw: Finite  # [rad]
-    linear_x: Finite = 0.0  # [m/s], in the body's frame of then
-    linear_y: Finite = 0.0  # [m/s]
-    angular_z: Finite = 0.0  # [rad/s]
+    t: Annotated[float, Meta(ge=0.0, le=60.0)]  # [s] from that tick
+    x: Coordinate  # [m]
+    y: Coordinate  # [m]
+    yaw: Angle  # [rad]
+    linear_x: LinearSpeed = 0.0  # [m/s], in the body's frame of then
+    linear_y: LinearSpeed = 0.0  # [m/s]
+    angular_z: AngularSpeed = 0.0  # [rad/s]
 
 
 class Response(Record, frozen=True, kw_only=True):
     """How a body answers a commanded velocity: nothing at first, then as a first-order lag."""
 
-    delay: NonNegative = 0.0  # [s]
-    lag: NonNegative = 0.0  # [s], time constant
-    turn_gain: Positive = 1.0  # of the turn rate: measured over commanded
+    delay: Delay = 0.0  # [s]
+    lag: Delay = 0.0  # [s], time constant
+    turn_gain: Annotated[float, Meta(ge=0.01, le=100.0)] = (
+        1.0  # of the turn rate: measured over commanded
+    )
 
 
 class JointTarget(Record, frozen=True, kw_only=True):
     """Where one joint should go."""
 
     name: Name
-    position: Finite  # [rad] or [m]
+    position: JointPosition  # [rad] or [m]
 
 
 class Intent(Message, frozen=True, kw_only=True):
     """What decision wants, what it expects to come of it, and why."""
 
     twist: Velocity | None = None
-    joints: tuple[JointTarget, ...] = ()
+    joints: Annotated[tuple[JointTarget, ...], Meta(max_length=MOST_JOINTS)] = ()
     trajectory: Annotated[tuple[TrajectoryPoint, ...], Meta(max_length=256)] = ()
     follow: bool = False  # control keeps to the trajectory; without, it gives the body the twist
     response: Response = Response()  # what the trajectory counts on
@@ -125,26 +138,30 @@ class Intent(Message, frozen=True, kw_only=True):
 class Twist(Message, frozen=True, kw_only=True):
     """A velocity that an operator asks for."""
 
-    linear_x: Finite  # [m/s]
-    linear_y: Finite = 0.0  # [m/s]
-    angular_z: Finite = 0.0  # [rad/s]
+    linear_x: LinearSpeed  # [m/s]
+    linear_y: LinearSpeed = 0.0  # [m/s]
+    angular_z: AngularSpeed = 0.0  # [rad/s]
 
 
 class CmdVel(Message, frozen=True, kw_only=True):
     """A velocity that the gate is asked to let through to the body."""
 
-    linear_x: Finite  # [m/s]
-    linear_y: Finite = 0.0  # [m/s]
-    angular_z: Finite = 0.0  # [rad/s]
+    linear_x: LinearSpeed  # [m/s]
+    linear_y: LinearSpeed = 0.0  # [m/s]
+    angular_z: AngularSpeed = 0.0  # [rad/s]
     source: Name = ""  # who commands
+    operator: bool = False  # control follows an operator's teleop stream, not decision's intent
 
 
 class JointCommand(Message, frozen=True, kw_only=True):
     """Where, or how fast, the joints should move; one of position and velocity per name."""
 
-    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=128)]
-    position: tuple[Finite, ...] = ()  # [rad] or [m]
-    velocity: tuple[Finite, ...] = ()  # [rad/s] or [m/s]
+    name: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MOST_JOINTS)]
+    position: Annotated[tuple[JointPosition, ...], Meta(max_length=MOST_JOINTS)] = ()
+    # [rad] or [m]
+    velocity: Annotated[
+        tuple[JointSpeed, ...], Meta(max_length=MOST_JOINTS)
+    ] = ()  # [rad/s] or [m/s]
     source: Name = ""
 
     def __post_init__(self) -> None:

@@ -71,6 +71,7 @@ ZONE = Cause(
     remedy="turn or back away, or clear the way",
 )
 LOW = Cause(code="battery_low", text="battery at 14 %", remedy="charge it soon")
+FULL = Cause(code="map_full", text="the map is full", remedy="map in parts")
 GATE = GateStatus(
     mode="enabled", causes=(ZONE,), estop_generation=2, commander="control", enables=3
 )
@@ -113,6 +114,7 @@ BODY: tuple[Message, ...] = (
         robot_type="turtlebot3_waffle",
         pose=Pose(x=0.41, y=-0.02, yaw=0.175),
         velocity=Velocity(linear_x=0.198, linear_y=0.001, angular_z=-0.5),
+        sent=Velocity(linear_x=0.2, linear_y=0.0, angular_z=-0.52),
         joints=(
             Joint(
                 name="wheel_left_joint", position=12.4, velocity=3.83, effort=0.11,
@@ -126,7 +128,7 @@ BODY: tuple[Message, ...] = (
         battery=Battery(voltage=11.8, percentage=82.5, current=0.65),
         imu=IMU_DATA,
         bumpers=(False, True),
-        link=LinkHealth(connected=True, age_ms=4.2, errors=1, reconnects=1),
+        link=LinkHealth(connected=True, age_ms=4.2, late_ms=0.3, errors=1, reconnects=1),
         gate=GATE,
     ),
     Body(
@@ -243,6 +245,7 @@ SAFETY: tuple[Message, ...] = (
         rejected={"robot/scan": 1},
         latency_ms={"scan_to_world_p50": 0.21},
         counters={"blind_scans": 0},
+        problems=(FULL,),
     ),
     LogRecord(
         stamp_ns=STAMP_NS, seq=9, boot=BOOT, tick=206, basis=0,
@@ -323,6 +326,7 @@ TASKS: tuple[Message, ...] = (
             reason="going round something",
         ),
         doing="going to (3.00, 1.50)",
+        drives=True,
         progress=0.25,
         distance_remaining=3.15,
         eta=15.8,
@@ -332,7 +336,8 @@ TASKS: tuple[Message, ...] = (
         done=(
             Task(
                 id="goal-6", kind="goal", label="(0.00, 0.00)", source="page", state="failed",
-                reason="the goal is inside something; nearest reachable point is 0.40 m away",
+                reason="gave up: no progress for 30 s, 0.40 m from the goal",
+                position_error=0.4, heading_error=0.05,
             ),
         ),
     ),

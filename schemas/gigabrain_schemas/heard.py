@@ -4,11 +4,9 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from gigabrain_schemas.base import Count, Message
+from gigabrain_schemas.base import Count, Key, Message
 
 MOST = 4096  # entries in one message
-
-Key = Annotated[str, Meta(max_length=256)]
 
 
 class Taken(Struct, frozen=True, array_like=True, forbid_unknown_fields=True):

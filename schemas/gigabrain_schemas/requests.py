@@ -1,11 +1,14 @@
 """What may be asked of a robot, and what it answers."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from msgspec import Meta, field
 
-from gigabrain_schemas.base import Count, Finite, Message, Name, Record, Text
+from gigabrain_schemas.base import Count, Finite, Key, Message, Name, Record, Text
 from gigabrain_schemas.body import GateStatus
+
+Keys = Annotated[tuple[Key, ...], Meta(max_length=256)]
+Figure = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 
 
 class EstopRequest(Message, frozen=True, kw_only=True):
@@ -60,6 +63,10 @@ class DescribeRequest(Message, frozen=True, kw_only=True):
     """Who are you? An empty request will do."""
 
 
+# Asks who else has its name; works; has asked again for some seconds.
+Claim = Literal["starting", "working", "settled"]
+
+
 class Description(Message, frozen=True, kw_only=True):
     """What a process is, and figures that only it knows."""
 
@@ -67,9 +74,13 @@ class Description(Message, frozen=True, kw_only=True):
     pid: Count
     host: Name
     version: Name
-    publishes: tuple[str, ...] = ()
-    subscribes: tuple[str, ...] = ()
-    report: dict[str, Finite | int | str | None] = field(default_factory=dict)
+    publishes: Keys = ()
+    subscribes: Keys = ()
+    instance: Count = 0  # drawn at random at each start
+    claim: Claim = "settled"  # to its name
+    report: Annotated[dict[Key, Finite | Figure | Text | None], Meta(max_length=256)] = field(
+        default_factory=dict
+    )
     # of a simulation: its truth, for reports only
 
 
@@ -94,4 +105,4 @@ class ParamReply(Message, frozen=True, kw_only=True):
 
     ok: bool
     text: Text  # a sentence for people
-    params: tuple[Param, ...] = ()
+    params: Annotated[tuple[Param, ...], Meta(max_length=256)] = ()

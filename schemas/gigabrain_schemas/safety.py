@@ -1,22 +1,37 @@
 """What safety says, how processes are doing, and what they log."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from msgspec import field
+from msgspec import Meta, field
 
-from gigabrain_schemas.base import Cause, Count, Message, Name, NonNegative, Record, Text
+from gigabrain_schemas.base import (
+    Cause,
+    Causes,
+    Count,
+    Key,
+    Message,
+    Name,
+    NonNegative,
+    Record,
+    SpeedCap,
+    Text,
+)
+
+Figures = Annotated[dict[Key, NonNegative], Meta(max_length=256)]
+Data = Annotated[str, Meta(max_length=4096)]
+Counts = Annotated[dict[Key, Count], Meta(max_length=256)]
 
 
 class SpeedCaps(Record, frozen=True, kw_only=True):
     """How fast the body may go in each direction now; None where nothing limits it."""
 
-    forward: NonNegative | None = None  # [m/s]
-    backward: NonNegative | None = None  # [m/s]
-    left: NonNegative | None = None  # [m/s]
-    right: NonNegative | None = None  # [m/s]
-    rotation: NonNegative | None = None  # [rad/s], either way
-    turn_left: NonNegative | None = None  # [rad/s], where turning one way is the danger
-    turn_right: NonNegative | None = None  # [rad/s]
+    forward: SpeedCap | None = None  # [m/s]
+    backward: SpeedCap | None = None  # [m/s]
+    left: SpeedCap | None = None  # [m/s]
+    right: SpeedCap | None = None  # [m/s]
+    rotation: SpeedCap | None = None  # [rad/s], either way
+    turn_left: SpeedCap | None = None  # [rad/s], where turning one way is the danger
+    turn_right: SpeedCap | None = None  # [rad/s]
 
 
 class SafetyState(Message, frozen=True, kw_only=True):
@@ -24,8 +39,8 @@ class SafetyState(Message, frozen=True, kw_only=True):
 
     verdict: Literal["ok", "slow", "stop"]
     caps: SpeedCaps = SpeedCaps()
-    causes: tuple[Cause, ...] = ()  # why the verdict is what it is
-    warnings: tuple[Cause, ...] = ()  # what will become a cause if nobody acts
+    causes: Causes = ()  # why the verdict is what it is
+    warnings: Causes = ()  # what will become a cause if nobody acts
 
 
 class Health(Message, frozen=True, kw_only=True):
@@ -37,11 +52,12 @@ class Health(Message, frozen=True, kw_only=True):
     uptime_s: NonNegative
     cpu: NonNegative  # of one core, since the last report
     rss_bytes: Count
-    received_hz: dict[str, NonNegative]  # per key, since the last report
-    sent_hz: dict[str, NonNegative]
-    rejected: dict[str, Count]  # per key, since the start
-    latency_ms: dict[str, NonNegative]  # named figures, since the last report
-    counters: dict[str, Count]  # named counts, since the start
+    received_hz: Figures  # per key, since the last report
+    sent_hz: Figures
+    rejected: Counts  # per key, since the start
+    latency_ms: Figures  # named figures, since the last report
+    counters: Counts  # named counts, since the start
+    problems: Annotated[tuple[Cause, ...], Meta(max_length=16)] = ()  # what it cannot do now
 
 
 class LogRecord(Message, frozen=True, kw_only=True):
@@ -51,4 +67,4 @@ class LogRecord(Message, frozen=True, kw_only=True):
     level: Literal["debug", "info", "warning", "error", "critical"]
     event: Name
     text: Text
-    data: dict[str, str] = field(default_factory=dict)
+    data: Annotated[dict[Key, Data], Meta(max_length=64)] = field(default_factory=dict)

@@ -1,27 +1,40 @@
 """What sensors measure."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from gigabrain_schemas.base import Count, Finite, Message, Name, NonNegative, Positive, Record
+from msgspec import Meta
 
-Vector = tuple[Finite, Finite, Finite]
-Quaternion = tuple[Finite, Finite, Finite, Finite]
+from gigabrain_schemas.base import Message, Milliseconds, Name, Range, Record
+
+RangeMax = Annotated[float, Meta(ge=0.01, le=1000.0)]  # [m]
+BeamAngle = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [rad]
+BeamStep = Annotated[float, Meta(ge=-6.3, le=6.3)]  # [rad]
+Turning = Annotated[float, Meta(ge=-1000.0, le=1000.0)]  # [rad/s]
+Acceleration = Annotated[float, Meta(ge=-10_000.0, le=10_000.0)]  # [m/s2]
+Turnings = tuple[Turning, Turning, Turning]
+Accelerations = tuple[Acceleration, Acceleration, Acceleration]
+Part = Annotated[float, Meta(ge=-2.0, le=2.0)]  # of a quaternion of about unit length
+Quaternion = tuple[Part, Part, Part, Part]
+Pixels = Annotated[int, Meta(ge=0, le=16_384)]
+LEAST_STEP = 1e-6  # [rad], from beam to beam
 
 
 class LaserScan(Message, frozen=True, kw_only=True):
     """One turn of a planar lidar, counter-clockwise, in the sensor's frame."""
 
     frame_id: Name = "base_scan"
-    angle_min: Finite  # [rad], angle of the first beam
-    angle_increment: Finite  # [rad]
-    range_min: NonNegative  # [m]
-    range_max: Positive  # [m]
-    ranges: bytes  # float32 little-endian [m], (n,); inf where nothing was hit, nan where unknown
+    angle_min: BeamAngle  # [rad], angle of the first beam
+    angle_increment: BeamStep  # [rad]
+    range_min: Range  # [m]
+    range_max: RangeMax  # [m]
+    ranges: Annotated[bytes, Meta(max_length=64 * 1024)]
+    # float32 little-endian [m], (n,); inf where nothing was hit, nan where unknown
+    late_ms: Milliseconds = 0.0  # how much later than it can it came; 0 without stamps
 
     def __post_init__(self) -> None:
         if not self.ranges or len(self.ranges) % 4:
             raise ValueError(f"ranges must be float32 values, got {len(self.ranges)} bytes")
-        if self.angle_increment == 0:
+        if abs(self.angle_increment) < LEAST_STEP:
             raise ValueError("angle_increment must not be 0")
         if self.range_max <= self.range_min:
             raise ValueError("range_max must be larger than range_min")
@@ -31,8 +44,8 @@ class ImuData(Record, frozen=True, kw_only=True):
     """Attitude, turn rate and acceleration of the body."""
 
     orientation: Quaternion  # x, y, z, w
-    angular_velocity: Vector  # [rad/s]
-    linear_acceleration: Vector  # [m/s2], +9.81 on z at rest
+    angular_velocity: Turnings  # [rad/s]
+    linear_acceleration: Accelerations  # [m/s2], +9.81 on z at rest
 
 
 class Imu(Message, frozen=True, kw_only=True):
@@ -40,8 +53,8 @@ class Imu(Message, frozen=True, kw_only=True):
 
     frame_id: Name = "imu_link"
     orientation: Quaternion  # x, y, z, w
-    angular_velocity: Vector  # [rad/s]
-    linear_acceleration: Vector  # [m/s2]
+    angular_velocity: Turnings  # [rad/s]
+    linear_acceleration: Accelerations  # [m/s2]
 
 
 PIXEL_BYTES = {"rgb8": 3, "bgr8": 3, "mono8": 1, "depth16": 2, "depth32f": 4}
@@ -52,9 +65,9 @@ class Image(Message, frozen=True, kw_only=True):
 
     frame_id: Name
     encoding: Literal["jpeg", "rgb8", "bgr8", "mono8", "depth16", "depth32f"]
-    height: Count  # [px]
-    width: Count  # [px]
-    data: bytes  # row by row, little-endian
+    height: Pixels  # [px]
+    width: Pixels  # [px]
+    data: Annotated[bytes, Meta(max_length=1024 * 1024)]  # row by row, little-endian
 
     def __post_init__(self) -> None:
         if not self.data:

@@ -4,7 +4,17 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from gigabrain_schemas.base import Finite, Fraction, Message, Name, NonNegative, Record, Text
+from gigabrain_schemas.base import (
+    Angle,
+    Coordinate,
+    Distance,
+    Fraction,
+    Message,
+    Name,
+    NonNegative,
+    Record,
+    Text,
+)
 
 How = Literal["replace", "queue", "preempt"]
 # in place of all that there is to do; after it; or before it, which goes on afterwards
@@ -16,17 +26,17 @@ MOST_POINTS = 256  # of a path that is only drawn
 class Goal(Record, frozen=True, kw_only=True):
     """A place to be, in the map."""
 
-    x: Finite  # [m]
-    y: Finite  # [m]
-    yaw: Finite | None = None  # [rad]; None for any
+    x: Coordinate  # [m]
+    y: Coordinate  # [m]
+    yaw: Angle | None = None  # [rad]; None for any
 
 
 class GoalRequest(Message, frozen=True, kw_only=True):
     """Go there."""
 
-    x: Finite  # [m], in the map
-    y: Finite  # [m]
-    yaw: Finite | None = None  # [rad]; None for any
+    x: Coordinate  # [m], in the map
+    y: Coordinate  # [m]
+    yaw: Angle | None = None  # [rad]; None for any
     how: How = "replace"
     source: Name = "anonymous"
 
@@ -42,7 +52,7 @@ class GoalReply(Message, frozen=True, kw_only=True):
 class MissionRequest(Message, frozen=True, kw_only=True):
     """Carry out a mission."""
 
-    mission: str  # the YAML text
+    mission: Annotated[str, Meta(max_length=LONGEST)]  # the YAML text
     how: How = "replace"
     source: Name = "anonymous"
     label: Name = "mission"  # what people call it; stands for the file's name in errors
@@ -92,6 +102,8 @@ class Task(Record, frozen=True, kw_only=True):
     source: Name  # who wanted it
     state: TaskState
     reason: Text = ""  # in words: why it waits, what became of it
+    position_error: NonNegative | None = None  # [m] from the goal where it ended; None if unknown
+    heading_error: NonNegative | None = None  # [rad]; None where the goal has no heading
 
 
 class TaskStatus(Message, frozen=True, kw_only=True):
@@ -99,11 +111,12 @@ class TaskStatus(Message, frozen=True, kw_only=True):
 
     current: Task | None = None  # active or paused
     doing: Text = ""  # the step that it is at, in words
+    drives: bool = False  # whether that step wants the robot to drive
     progress: Fraction = 0.0  # of that step
-    distance_remaining: NonNegative | None = None  # [m] along the path; None while none is known
+    distance_remaining: Distance | None = None  # [m] along the path; None while none is known
     eta: NonNegative | None = None  # [s] until the step is done
     goal: Goal | None = None  # where it drives to now
-    path: Annotated[tuple[tuple[Finite, Finite], ...], Meta(max_length=MOST_POINTS)] = ()
+    path: Annotated[tuple[tuple[Coordinate, Coordinate], ...], Meta(max_length=MOST_POINTS)] = ()
     # [m] in the map, from here to the goal, for drawing
     queue: Annotated[tuple[Task, ...], Meta(max_length=32)] = ()
     done: Annotated[tuple[Task, ...], Meta(max_length=16)] = ()  # the last ones, newest first

@@ -10,6 +10,7 @@ from typing import Any
 
 from gigabrain_drivers.alpha import AlphaDriver
 from gigabrain_drivers.catalog import load_link
+from gigabrain_drivers.clip import clipped
 from gigabrain_drivers.lidars import SCAN_SOURCES
 from gigabrain_drivers.lidars.base import source_class
 from gigabrain_drivers.line import LineDriver
@@ -160,7 +161,7 @@ def said(driver: Any) -> Message:
 
 def valid(message: Message) -> None:
     """What the bus would carry, the others would take."""
-    finite(codec_of(type(message)).decode(encode(message)))
+    finite(codec_of(type(message)).decode(encode(clipped(message))))
 
 
 def in_pieces(data: bytes, size: int) -> list[bytes]:

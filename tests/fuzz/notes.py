@@ -1,6 +1,7 @@
 """What must hold for small files that are read back, and for words that people type."""
 
 import contextlib
+import fcntl
 import os
 import tempfile
 from collections.abc import Callable, Iterator
@@ -41,9 +42,12 @@ def note(data: bytes) -> None:
     """A note of a running robot that cannot be read is taken away."""
     os.environ["XDG_RUNTIME_DIR"] = PLACE.name
     folder().mkdir(exist_ok=True)
-    (folder() / "1.json").write_bytes(data)
-    for robot in running():
-        assert robot.pid > 0
+    with (folder() / "1.json").open("wb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)  # as a living supervisor does
+        file.write(data)
+        file.flush()
+        for robot in running():
+            assert robot.pid > 0
 
 
 def record(data: bytes) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import NamedTuple, Self
 
-from gigabrain_drivers.conformance import direct, line_faults, machine, stops, timing
+from gigabrain_drivers.conformance import direct, line_faults, stops, timing
 from gigabrain_drivers.conformance.result import (
     Failed,
     Finding,
@@ -18,6 +18,7 @@ from gigabrain_drivers.conformance.result import (
 )
 from gigabrain_drivers.conformance.rig import Rig
 from gigabrain_drivers.conformance.subject import Subject
+from gigabrain_zenoh import run_queue
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.settings import LinkName
 
@@ -170,9 +171,9 @@ async def _found(call: Callable[[], Awaitable[Finding]]) -> Finding:
     Raises NotApplicable where that is so each time.
     """
     for _ in range(ATTEMPTS):
-        waited_ms = machine.waited_ms()
+        waited_ms = run_queue.waited_ms()
         finding = await _tried(call)
-        waited_ms = machine.waited_ms() - waited_ms
+        waited_ms = run_queue.waited_ms() - waited_ms
         if finding.ok or not 0 < finding.late_ms <= waited_ms:
             return finding
     raise NotApplicable(

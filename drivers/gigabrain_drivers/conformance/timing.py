@@ -2,11 +2,11 @@
 
 import asyncio
 
-from gigabrain_drivers.conformance import machine
 from gigabrain_drivers.conformance.result import Failed, Finding
 from gigabrain_drivers.conformance.rig import Rig
 from gigabrain_drivers.conformance.subject import link_of
 from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_zenoh import run_queue
 from gigabrain_zenoh.clock import Clock
 
 RATE_TICKS = 70  # 1.4 s
@@ -23,6 +23,9 @@ async def reports(rig: Rig) -> Finding:
     """A state per tick, fresh; scans as often as the body's file says."""
     lidar = rig.robot.lidar
     if await rig.until(lambda: rig.state and (rig.scan or not lidar), SCAN_TICKS) is None:
+        if rig.state and rig.states >= OF_TICKS * SCAN_TICKS:  # so the machine had time
+            text = f"no scan within {SCAN_TICKS} ticks, though `lidar:` is in the robot's file"
+            return Finding(False, f"{text}; does its link have `scan:`?")
         raise Failed(f"no state and scan within {SCAN_TICKS} ticks")
     assert rig.state
     begin, states, scans, oldest = rig.tick, rig.states, rig.scans, 0.0
@@ -61,7 +64,7 @@ async def latency(rig: Rig) -> Finding:
         nonlocal asked_ns
         if way == "tx" and rig.tap.speaking and asked_ns:
             took_ms = (clock.now_ns() - asked_ns) / 1e6
-            times.append(took_ms - (machine.own_waited_ms() - waited_ms))
+            times.append(took_ms - (run_queue.own_waited_ms() - waited_ms))
             asked_ns = 0
 
     wanted = await rig.drive()
@@ -71,7 +74,7 @@ async def latency(rig: Rig) -> Finding:
         for i in range(SAMPLES):
             await rig.go_on(1)
             await asyncio.sleep(MID_TICK_S)
-            waited_ms = machine.own_waited_ms()
+            waited_ms = run_queue.own_waited_ms()
             asked_ns = clock.now_ns()
             rig.command(Velocity(linear_x=wanted.linear_x - (i % 2) * step))
     finally:

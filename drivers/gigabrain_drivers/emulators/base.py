@@ -2,6 +2,7 @@
 
 import abc
 import asyncio
+import logging
 import threading
 import time
 from collections import deque
@@ -21,13 +22,15 @@ from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry, Si
 from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_zenoh.errors import BodyLost
 
+log = logging.getLogger(__name__)
+
 KEPT_STEPS = 25  # of 10 ms
 
 
 class Snapshot(NamedTuple):
     """What the body's parts measured at the end of a step of 10 ms."""
 
-    time_ns: int  # simulated
+    time_ns: int  # by the electronics' own clock
     odometry: Odometry
     wheels: tuple[Motor, ...]  # left, right; or all joints of legs
     imu: ImuSample
@@ -58,6 +61,7 @@ class EmulatedBody:
         self._simulation = simulation
         self._halt = threading.Event()
         self._thread: threading.Thread | None = None
+        self._pace: Pace | None = None  # once time has begun
         self._commanded = (0.0, 0.0, 0.0)
         self._gait: Gait | None = None  # instead of a velocity
         self._cpu_s = 0.0
@@ -65,6 +69,7 @@ class EmulatedBody:
         self._faulted_ns = 0  # when what is wrong with it last changed
         self._broken = Broken()
         self.snapshot = self._look()
+        self._account = account_of(self._simulation, robot, run)  # as of the newest step
         self._untaken: deque[Snapshot] = deque(maxlen=KEPT_STEPS)
 
     def start(self) -> None:
@@ -108,26 +113,37 @@ class EmulatedBody:
         self._broken, self._faulted_ns = broken, self._simulation.time_ns
 
     @property
+    def clock_ns(self) -> int:
+        """Time by the electronics' own clock: where the host drops simulated time, it goes on."""
+        dropped_s = self._pace.dropped_s if self._pace else 0.0
+        return self._simulation.time_ns + round(dropped_s * 1e9)
+
+    @property
     def simulation(self) -> Simulation:
         """The physics; to be touched in `on_step` only."""
         return self._simulation
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far."""
-        return account_of(self._simulation, self.robot, self.run) | {
+        return self._account | {
             "motors_moved_s": round(self._moved_ns / 1e9, 2),
             "faulted_s": round(self._faulted_ns / 1e9, 2),
             "physics_cpu_s": round(self._cpu_s, 3),
         }
 
     def _work(self) -> None:
-        pace, began = Pace(TICK_S), time.thread_time()
+        began = time.thread_time()
+        self._pace = pace = Pace(TICK_S)
         while not self._halt.is_set():
             pace.wait()
             try:
                 self._step()
             except BodyLost as error:
                 self.lost = str(error)
+                return
+            except Exception as error:  # whatever it is, the process ends with its physics
+                log.exception("the physics has ended")
+                self.lost = f"{type(error).__name__}: {error}"
                 return
             self._cpu_s = time.thread_time() - began
 
@@ -143,6 +159,7 @@ class EmulatedBody:
             self._simulation.drive(*commanded)
         self._simulation.advance()
         snapshot = self._look()
+        self._account = account_of(self._simulation, self.robot, self.run)
         if not broken.frozen_values:
             self.snapshot = snapshot
             self._untaken.append(snapshot)
@@ -160,7 +177,7 @@ class EmulatedBody:
     def _look(self) -> Snapshot:
         simulation = self._simulation
         return Snapshot(
-            time_ns=simulation.time_ns,
+            time_ns=self.clock_ns,
             odometry=simulation.odometry(),
             wheels=simulation.wheels(),
             imu=simulation.imu(),

@@ -76,8 +76,7 @@ class Emulator:
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far, and whether this machine has kept the body waiting."""
-        late_s = max(station.late_s for station in self.stations.values())
-        return {**self.body.report(), "firmware_late_s": round(late_s, 4)}
+        return self.body.report()
 
     def told(self) -> str:
         """The faults that it has now, in the words of `faults_of`."""

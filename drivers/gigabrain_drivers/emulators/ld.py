@@ -9,7 +9,6 @@ from gigabrain_drivers.emulators.sweep import Sample, Sweep
 from gigabrain_drivers.protocols import ld
 from gigabrain_drivers.robot import ScanOptions
 
-CLOCK_MS = 30_000  # when its milliseconds begin anew
 LEAST_VOLTS = 0.5  # below its 5 V by more than this, the motor does not keep its speed
 
 
@@ -56,5 +55,5 @@ class LdDevice(Device):
             end=round(samples[-1].angle * 100) % ld.TURN,
             distances=distances,
             confidences=tuple(200 if distance else 0 for distance in distances),
-            time_ms=self.body.snapshot.time_ns // 1_000_000 % CLOCK_MS,
+            time_ms=self.body.clock_ns // 1_000_000 % ld.CLOCK_MS,
         )

@@ -12,6 +12,7 @@ from gigabrain_drivers.emulators.faults import Faults
 from gigabrain_drivers.robot import Run
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, ConfigError
+from gigabrain_zenoh.heartbeat import Progress
 from gigabrain_zenoh.settings import EmulatorConfig
 from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.typed import typed_lines
@@ -26,6 +27,8 @@ async def run(config: EmulatorConfig, bus: Bus, ready: Callable[[], None]) -> No
     """Be the body until the process ends; its truth is in `describe`."""
     async with emulator_of(config) as emulator:
         bus.report = emulator.report
+        physics = emulator.body.simulation
+        bus.progress = Progress(lambda: (bus.clock.now_ns(),), lambda: physics.time_ns)
         ready()
         await watch(emulator, Path(config.folder) / FAULTS_FILE)
 

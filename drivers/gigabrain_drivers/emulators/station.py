@@ -1,14 +1,11 @@
 """One device on its port: stepped in real time, with its faults."""
 
 import asyncio
-from collections import deque
 from collections.abc import Callable
 
 from gigabrain_drivers.emulators.base import Device, Port, Wire
 from gigabrain_drivers.emulators.faults import NONE, Faults, FaultyWire
 from gigabrain_zenoh.clock import Clock
-
-REMEMBERED = 200  # steps
 
 
 class Station:
@@ -20,7 +17,6 @@ class Station:
         self.device = make(self._wire)
         self.faults = NONE
         self._task: asyncio.Task[None] | None = None
-        self._late_s: deque[float] = deque(maxlen=REMEMBERED)
         port.on_bytes = self._take
 
     def start(self) -> None:
@@ -54,15 +50,7 @@ class Station:
         if data := self._wire.incoming(data):
             self.device.feed(data)
 
-    @property
-    def late_s(self) -> float:
-        """How much later than due one of its newest steps was, at most."""
-        return max(self._late_s, default=0.0)
-
     async def _run(self) -> None:
-        period_ns, before_ns = round(self.device.period_s * 1e9), self._clock.now_ns()
-        async for now_ns in self._clock.every(period_ns):
-            self._late_s.append(max(0, now_ns - before_ns - period_ns) / 1e9)
-            before_ns = now_ns
+        async for now_ns in self._clock.every(round(self.device.period_s * 1e9)):
             if not self.faults.reboot:
                 self.device.step(now_ns)

@@ -6,7 +6,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 import serial
+from msgspec.structs import replace
 
+from gigabrain_drivers.device_clock import DeviceClock
 from gigabrain_drivers.lidars.serial_source import SerialSource
 from gigabrain_drivers.lidars.turn import Gathered, Samples
 from gigabrain_drivers.links.wording import Spelling, Wording
@@ -62,6 +64,7 @@ class Ld(SerialSource):
         self.link.wording = Wording(received=Spelling(ld.Decoder().feed, ld.describe))
         self._decoder = ld.Decoder()
         self._frames = Frames(lidar, self.place)
+        self._stamps = DeviceClock(ld.CLOCK_MS)
         self._last: int | None = None  # [0.01 deg], of the newest sample
         self._understood = False
 
@@ -73,6 +76,7 @@ class Ld(SerialSource):
         """A new stream."""
         self._decoder.clear()
         self._frames.clear()
+        self._stamps.clear()
         self._last, self._understood = None, False
 
     def received(self, data: bytes) -> None:
@@ -80,8 +84,10 @@ class Ld(SerialSource):
         now_ns = self.clock.now_ns()
         for raw in self._decoder.cut(data):
             self._understood = True
+            self._stamps.arrived(raw.time_ms, now_ns)
             turn_at, self._last = turn_start(raw, self._last), raw.end
-            self.finished(self._frames.take(raw.data, turn_at, now_ns))
+            scan = self._frames.take(raw.data, turn_at, now_ns)
+            self.finished(replace(scan, late_ms=self._stamps.late_ms) if scan else None)
         self.link.errors = self._decoder.errors
 
     def understands(self) -> bool:

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 from collections.abc import Callable
+from typing import TypeVar
 
 from gigabrain_drivers.links.wording import Wording
 from gigabrain_schemas.body import LinkHealth
@@ -13,6 +14,7 @@ from gigabrain_zenoh.clock import Clock
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
 Trace = Callable[[str, bytes], None]
 
 FIRST_RETRY_NS = 100_000_000
@@ -48,6 +50,7 @@ class Link(abc.ABC):
         self._fd: int | None = None
         self._gathering: asyncio.TimerHandle | None = None
         self._opened_once = False
+        self._reported: set[str] = set()
         self._ended = asyncio.Event()
         self._keeper: asyncio.Task[None] | None = None
 
@@ -104,7 +107,7 @@ class Link(abc.ABC):
             self._gathering.cancel()
         self._shut()
         self._ended.set()
-        self.on_lost(reason)
+        self._call(self.on_lost, reason)
 
     async def close(self) -> None:
         """Let go of the port. Any number of times."""
@@ -140,15 +143,35 @@ class Link(abc.ABC):
         while True:
             try:
                 fd = await self._connect()
-            except (LinkProblem, OSError) as error:
+            except Exception as error:  # noqa: BLE001 - the port may be good in a moment
+                self._report(error)
                 self.problem = why(error)
                 await self._clock.sleep_ns(retry_ns)
                 retry_ns = min(2 * retry_ns, LONGEST_RETRY_NS)
                 continue
             retry_ns = FIRST_RETRY_NS
-            self._attach(fd)
-            await self._until_ended()
+            try:
+                self._attach(fd)
+                await self._until_ended()
+            except Exception as error:  # noqa: BLE001 - of this connection; the next may be good
+                self._report(error)
+                self.drop(why(error))
             await self._clock.sleep_ns(retry_ns)
+
+    def _call(self, callback: Callable[[T], None], value: T) -> None:
+        """Call the owner; a connection on which it fails is given up, and a new one made."""
+        try:
+            callback(value)
+        except Exception as error:  # noqa: BLE001 - its fault must not end the link
+            self._report(error)
+            self.drop(f"what it brings cannot be handled: {why(error)}")
+
+    def _report(self, error: Exception) -> None:
+        """Log an exception that is a fault of a program and not of a port, once each."""
+        text = f"{type(error).__name__}: {error}"
+        if not isinstance(error, (LinkProblem, OSError)) and text not in self._reported:
+            self._reported.add(text)
+            log.error("%s: %s", self, text, exc_info=error)
 
     def _attach(self, fd: int) -> None:
         self._fd, self.problem, self._heard_ns = fd, "", self._clock.now_ns()
@@ -156,7 +179,7 @@ class Link(abc.ABC):
         self.reconnects += self._opened_once
         self._opened_once = True
         asyncio.get_running_loop().add_reader(fd, self._readable)
-        self.on_open()
+        self._call(lambda _: self.on_open(), None)
 
     async def _until_ended(self) -> None:
         if self.quiet_ns is None:
@@ -204,7 +227,7 @@ class Link(abc.ABC):
             return False
         self._heard_ns = self._clock.now_ns()
         self._tell("rx", data)
-        self.on_bytes(data)
+        self._call(self.on_bytes, data)
         return True
 
 
@@ -212,7 +235,7 @@ def why(error: Exception) -> str:
     """In words; asyncio puts its own before the system's."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
-    return str(error)
+    return str(error) or type(error).__name__
 
 
 def _ignore(_: object) -> None:

@@ -82,13 +82,15 @@ class SerialLink(Link):
             port = open_port(path, self.baud)
         except LinkProblem:
             return None
+        found = False
         try:
-            if self._probe and self._probe(port):
-                return port
-        except OSError:
+            found = self._probe is not None and self._probe(port)
+        except (OSError, termios.error):  # it is gone, or no terminal
             pass
-        port.close()
-        return None
+        finally:
+            if not found:
+                port.close()
+        return port if found else None
 
     def _shut(self) -> None:
         if self._serial:
@@ -112,18 +114,25 @@ def open_port(path: str, baud: int) -> serial.Serial:
         return serial.Serial(path, baud, timeout=0.2, write_timeout=0.2, exclusive=True)
     except OSError as error:  # serial.SerialException is one
         raise LinkProblem(ports.refused(path, error)) from None
-    except ValueError as error:
+    except (ValueError, termios.error) as error:
         raise LinkProblem(f"{path}: {error}") from None
 
 
 def ready(port: serial.Serial) -> serial.Serial:
-    """An open port for the event loop: nothing old in it, and a read says when it is unplugged."""
-    fd = port.fileno()
-    os.set_blocking(fd, False)
-    settings = termios.tcgetattr(fd)
-    settings[6][termios.VMIN] = 1  # at 0, no data and no device would both read as b""
-    termios.tcsetattr(fd, termios.TCSANOW, settings)
-    termios.tcflush(fd, termios.TCIOFLUSH)
+    """Ready an open port for the event loop: nothing old in it, and a read tells an unplugging.
+
+    Raises LinkProblem, with the port closed.
+    """
+    try:
+        fd = port.fileno()
+        os.set_blocking(fd, False)
+        settings = termios.tcgetattr(fd)
+        settings[6][termios.VMIN] = 1  # at 0, no data and no device would both read as b""
+        termios.tcsetattr(fd, termios.TCSANOW, settings)
+        termios.tcflush(fd, termios.TCIOFLUSH)
+    except (OSError, termios.error) as error:
+        port.close()
+        raise LinkProblem(f"{port.name}: {error.args[-1]}: unplugged?") from None
     return port
 
 

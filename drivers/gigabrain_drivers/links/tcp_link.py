@@ -2,13 +2,17 @@
 
 import asyncio
 import contextlib
+import errno
 import socket
 import struct
+
+from aiohappyeyeballs import start_connection
 
 from gigabrain_drivers.links.link import Link, LinkProblem, why
 from gigabrain_zenoh.clock import Clock
 
 CONNECT_S = 1.0
+NEXT_S = 0.1  # after which the next address of a name is tried beside the one before
 QUIET_NS = 200_000_000  # a frozen peer acknowledges for ever; only what it sends shows it alive
 DISCARD = struct.pack("ii", 1, 0)  # linger on, for 0 s: what is still to be sent is thrown away
 
@@ -31,27 +35,17 @@ class TcpLink(Link):
         try:
             async with asyncio.timeout(CONNECT_S):
                 found = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
-                family, kind, protocol, _, address = found[0]
-                self._socket = socket.socket(family, kind, protocol)
-                self._socket.setblocking(False)
-                self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, DISCARD)
-                await loop.sock_connect(self._socket, address)
+                self._socket = await start_connection(found, happy_eyeballs_delay=NEXT_S)
         except TimeoutError:
-            self._shut()
             raise LinkProblem(f"no answer from {self}: is it switched on?") from None
-        except socket.gaierror as error:
-            self._shut()
-            raise LinkProblem(f"no host {self._host!r}: {error.strerror}") from None
-        except ConnectionRefusedError:
-            self._shut()
-            raise LinkProblem(f"nobody listens at {self}: is its program running?") from None
+        except (socket.gaierror, UnicodeError) as error:
+            raise LinkProblem(f"no host {self._host!r}: {error.args[-1]}") from None
         except OSError as error:
-            self._shut()
+            if error.errno == errno.ECONNREFUSED:
+                raise LinkProblem(f"nobody listens at {self}: is its program running?") from None
             raise LinkProblem(f"{self}: {why(error)}") from None
-        except asyncio.CancelledError:
-            self._shut()
-            raise
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, DISCARD)
         return self._socket.fileno()
 
     def _shut(self) -> None:

@@ -67,6 +67,7 @@ class Board:
             self.link.health,
             connected=self.ready and age_ns <= LOST_NS and not self._fault(),
             age_ms=age_ns / 1e6,
+            late_ms=0.0,  # an answer that is late is thrown away
         )
 
     @property

@@ -15,11 +15,12 @@ POINTS = 12  # per frame
 SIZE = 47  # bytes
 HEADER, VERSIONS = 0x54, (0x2C, 0xEC)  # low five bits of the second byte: 12 points
 TURN = 36_000  # [0.01 deg]
+CLOCK_MS = 30_000  # when its milliseconds begin anew
 LEAST_SAMPLES_HZ = 2300  # of the slowest of these lidars; none spreads its points wider
 _POINT = np.dtype([("distance", "<u2"), ("confidence", "u1")])
 SLACK = 1.5  # on the width of a frame, as the vendor's driver allows
 _LAYOUT = struct.Struct("<BBHH" + "HB" * POINTS + "HHB")
-_HEAD, _END, _END_AT = struct.Struct("<BBHH"), struct.Struct("<H"), SIZE - 5
+_HEAD, _END, _END_AT = struct.Struct("<BBHH"), struct.Struct("<HH"), SIZE - 5
 _FRAMES = np.dtype(
     {"names": ["start", "points", "end"], "formats": ["<u2", (_POINT, POINTS), "<u2"],
      "offsets": [4, _HEAD.size, _END_AT], "itemsize": SIZE}
@@ -77,6 +78,7 @@ class Raw(NamedTuple):
 
     start: int  # [0.01 deg], clockwise
     end: int  # [0.01 deg], of the last point
+    time_ms: int  # wraps at 30000
     data: bytes  # (47,)
 
 
@@ -91,11 +93,11 @@ def whole(data: bytes) -> Raw | None:
     if crc8(data):  # of all bytes with their own at the end it is 0
         return None
     _, version, speed, start = _HEAD.unpack_from(data)
-    (end,) = _END.unpack_from(data, _END_AT)
+    end, time_ms = _END.unpack_from(data, _END_AT)
     widest = SLACK * speed * 100 * POINTS / LEAST_SAMPLES_HZ
     if version not in VERSIONS or max(start, end) >= TURN or (end - start) % TURN > widest:
         return None
-    return Raw(start, end, data)
+    return Raw(start, end, time_ms, data)
 
 
 def decode(data: bytes) -> Frame | None:

@@ -50,11 +50,11 @@ class Template:
         self.names = frozenset(names)
         self._expression = re.compile(self._regular())
 
-    def encode(self, values: Mapping[str, float]) -> bytes:
+    def encode(self, values: Mapping[str, float], *, toward_zero: bool = False) -> bytes:
         """The line for values in SI units; a field without a value is 0."""
         text = self._texts[0]
         for field, after in zip(self.fields, self._texts[1:], strict=False):
-            text += field.write(values.get(field.name, 0.0)) + after
+            text += field.write(values.get(field.name, 0.0), toward_zero=toward_zero) + after
         if self.check:
             text += self._sum(text)
         return (text + self._tail).encode("ascii")
@@ -78,10 +78,10 @@ class Template:
         return {f.name: value for f, value in read}
 
     def sent(self, name: str, value: float) -> float:
-        """What is left of a value [SI] after it was rounded to the line's digits."""
+        """What is left of a commanded value [SI]: it is rounded towards zero."""
         for field in self.fields:
             if field.name == name:
-                return field.read(field.write(value))
+                return field.read(field.write(value, toward_zero=True))
         return value
 
     def reads_all_of(self, other: "Template") -> bool:

@@ -1,5 +1,6 @@
 """One number of a line of text: how it is written, and what it looks like."""
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ from gigabrain_drivers.protocols.checks import CHECKS
 from gigabrain_drivers.protocols.line_fields import DEFAULT_FORMATS, factor
 from gigabrain_zenoh.errors import unknown
 
+EXACT = 1e-6  # of a digit: what binary fractions miss
 _FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.[0-9])?f|d|[xX])")
 _ANY_NUMBER = r" *[-+]?[0-9]{1,12}(?:\.[0-9]{0,9})?"
 
@@ -34,9 +36,12 @@ class Field:
             return abs(self.factor)
         return abs(self.factor) * 10.0 ** -_places(self.format)
 
-    def write(self, value: float) -> str:
-        """The text for a value in SI units; zero has no sign."""
+    def write(self, value: float, *, toward_zero: bool = False) -> str:
+        """The text for a value in SI units, rounded to its digits; zero has no sign."""
         wire = value / self.factor
+        if toward_zero:
+            places = 10.0 ** _places(self.format) if self.format[-1] == "f" else 1.0
+            wire = math.copysign(math.floor(abs(wire) * places + EXACT), wire) / places
         if self.format[-1] != "f":
             return format(round(wire), self.format)
         text = format(wire, self.format)

@@ -51,6 +51,7 @@ class SimModel:
     """
 
     model: str  # MJCF
+    path: str = "the model"  # where it came from, for people
     lidar: SimLidar | None = field(default_factory=SimLidar)
     battery: SimBattery = field(default_factory=SimBattery)
     motor: SimMotor = field(default_factory=SimMotor)

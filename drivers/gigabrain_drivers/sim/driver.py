@@ -65,6 +65,7 @@ class MujocoDriver(Driver):
         self._thread: threading.Thread | None = None
         self._bridge: Bridge | None = None
         self._readings: asyncio.Queue[Reading | Exception | None] = asyncio.Queue()
+        self._account = account_of(self._simulation, robot, run)  # as of the newest tick
         self._state: RobotState | None = None
         self._newest: dict[str, Message] = {}  # by sensor
 
@@ -142,8 +143,7 @@ class MujocoDriver(Driver):
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far."""
-        account = account_of(self._simulation, self.robot, self.run)
-        return account | {"physics_cpu_s": round(self._physics_s, 3)}
+        return self._account | {"physics_cpu_s": round(self._physics_s, 3)}
 
     def _take(self, reading: Reading) -> None:
         self._state = reading.state or self._state
@@ -154,7 +154,14 @@ class MujocoDriver(Driver):
             self.emit(SCAN, reading.scan)
 
     def _work(self) -> None:
-        """The physics thread."""
+        """The physics thread. Whatever ends it is raised from `ticks`."""
+        try:
+            self._simulate()
+        except Exception as error:  # noqa: BLE001 - handed on whole, to end the driver's process
+            self._post(error)
+
+    def _simulate(self) -> None:
+        """Step until the run's seconds are over, or until told to stop."""
         pace = Pace(STEP_S / self.run.speed)
         while not self._halt.is_set():
             if self.lockstep:
@@ -169,11 +176,7 @@ class MujocoDriver(Driver):
                 pace.wait(1 if scans else STEPS * (step == 0))
                 if self._halt.is_set():
                     return
-                try:
-                    self._post(self._step(last=step == STEPS - 1))
-                except BodyLost as error:
-                    self._post(error)
-                    return
+                self._post(self._step(last=step == STEPS - 1))
 
     def _step(self, *, last: bool) -> Reading:
         if self._simulation.time_ns - self._commanded_ns >= DEAD_MAN_NS:
@@ -182,6 +185,7 @@ class MujocoDriver(Driver):
         if self._simulation.fallen:
             raise BodyLost(f"fell over after {self._simulation.time_ns / 1e9:.2f} s")
         if last:
+            self._account = account_of(self._simulation, self.robot, self.run)
             return Reading(self._imu(), state=self._look())
         # a lidar keeps no step with the states: between two of them nobody else needs a core
         due = self._ticks >= self._next_scan

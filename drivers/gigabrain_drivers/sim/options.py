@@ -15,7 +15,11 @@ from gigabrain_drivers.sim.body import (
     SimQuadruped,
 )
 from gigabrain_schemas.base import NonNegative, Percentage, Positive
+from gigabrain_zenoh.bounded_file import read_bounded
 from gigabrain_zenoh.errors import ConfigError
+
+SIMULATED = ("differential", "quadruped")  # drive types
+MOST_MODEL_BYTES = 10_000_000
 
 
 class MujocoOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -33,22 +37,30 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
     """The body as the simulation wants it. Raises ConfigError when there is no model."""
     path = run.folder / options.model
     try:
-        model = path.read_text(encoding="utf-8")
+        model = read_bounded(path, MOST_MODEL_BYTES).decode()
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: expected UTF-8 text") from None
     except OSError as error:
         raise ConfigError(
             f"{path}: {error.strerror}; the robot's MJCF model belongs there, "
             "its own or that of a body like it; `model` names it"
         ) from None
     lidar = _sim_lidar(robot, options)
+    if robot.drive_type not in SIMULATED:
+        raise ConfigError(
+            f"{robot.robot_type}: drive_type {robot.drive_type!r} cannot be simulated in MuJoCo; "
+            f"{' and '.join(SIMULATED)} can; a skid-steered base is differential"
+        )
     if robot.drive_type == "quadruped":
         battery = replace(
             LEG_BATTERY,
             capacity_ah=options.battery_capacity,
             percentage=options.battery_percentage,
         )
-        return SimQuadruped(model=model, lidar=lidar, battery=battery)
+        return SimQuadruped(model=model, path=str(path), lidar=lidar, battery=battery)
     return SimBody(
         model=model,
+        path=str(path),
         wheel_radius=robot.wheel_radius,
         wheel_separation=robot.wheel_separation,
         odometry_wheel_radius=options.odometry_wheel_radius,

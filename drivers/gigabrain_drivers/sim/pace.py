@@ -10,6 +10,7 @@ class Pace:
 
     def __init__(self, step_s: float) -> None:
         self._step_s, self._start_s, self._done = step_s, time.perf_counter(), 0
+        self.dropped_s = 0.0  # all together
 
     def wait(self, steps: int = 1) -> None:
         """Sleep until the deadline that lies so many steps behind the last one."""
@@ -19,3 +20,4 @@ class Pace:
             time.sleep(wait)
         elif wait < -LATE_S:
             self._start_s -= wait
+            self.dropped_s -= wait

@@ -13,14 +13,17 @@ from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_drivers.sim.world import World
 from gigabrain_zenoh.errors import ConfigError
 
+log = logging.getLogger(__name__)
+
 ROBOT = "robot/"  # prefix of all names of the robot's model
 PERSON = "person"
+UNLIKE = 0.05  # share by which two measures differ that should be the same
 PERSON_HEIGHT_M = 1.45  # to the shoulders
 
 
 def compile_scene(body: SimModel, world: World) -> mujoco.MjModel:
     """The model of `body` at the start of `world`. Raises ConfigError for a bad robot model."""
-    mujoco.set_mju_user_warning(logging.getLogger(__name__).warning)  # instead of a file
+    mujoco.set_mju_user_warning(log.warning)  # instead of a file
     spec = world_spec(world)
     spec.option.timestep = TICK_S / body.substeps
     start = world.start
@@ -30,7 +33,7 @@ def compile_scene(body: SimModel, world: World) -> mujoco.MjModel:
         spec.attach(robot, prefix=ROBOT, frame=frame)
         return spec.compile()
     except ValueError as error:
-        raise ConfigError(f"the body's MJCF model cannot be used: {error}") from error
+        raise ConfigError(f"{body.path}: this MJCF model cannot be used: {error}") from error
 
 
 def yaw_quaternion(pose: Pose) -> tuple[float, float, float, float]:
@@ -44,6 +47,7 @@ def _robot_spec(body: SimModel) -> mujoco.MjSpec:
     _check_names(spec, body)
     if not isinstance(body, SimBody):
         return spec
+    _compare_wheels(spec, body)
     for name in body.wheels:
         wheel = spec.body(name)
         radius = spec.geom(name).size[0]
@@ -51,6 +55,21 @@ def _robot_spec(body: SimModel) -> mujoco.MjSpec:
         for geom in wheel.geoms:
             geom.size = geom.size * body.wheel_scale
     return spec
+
+
+def _compare_wheels(spec: mujoco.MjSpec, body: SimBody) -> None:
+    """Warn where the wheels of the model are not those of the robot's file."""
+    left, right = (spec.body(name) for name in body.wheels)
+    apart = math.dist(left.pos[:2], right.pos[:2])
+    pairs = [("wheel_separation", body.wheel_separation, apart)]
+    if body.wheel_scale == 1.0 and body.odometry_wheel_radius is None:  # else it is on purpose
+        pairs.append(("wheel_radius", body.wheel_radius, spec.geom(body.wheels[0]).size[0]))
+    for name, told, is_in_model in pairs:
+        if abs(told / is_in_model - 1.0) > UNLIKE:
+            log.warning(
+                "%s: the wheels have a %s of %.3f m here, and of %.3f m in the robot's file",
+                body.path, name, is_in_model, told,
+            )  # fmt: skip
 
 
 def _check_names(spec: mujoco.MjSpec, body: SimModel) -> None:

@@ -71,7 +71,7 @@ function doing(state, moment) {
 
 export function showSafety(safety, body) {
   put($('verdict'), safety?.verdict ?? 'silent')
-  listCauses($('warnings'), [...(safety?.causes ?? []), ...(safety?.warnings ?? [])])
+  listCauses($('warnings'), [...(safety?.causes ?? []), ...(safety?.warnings ?? []), ...problems()])
   if (!body) return
   const caps = safety?.caps ?? {}
   const rows = AXES.filter(([, most]) => body[most] > 0).map(([name, key, unit]) => {
@@ -113,6 +113,10 @@ const compiling = new Set() // processes that have said so, and not yet that the
 export function hearHealth(health) {
   healths.set(health.process, [health, performance.now()])
   showTables()
+}
+
+function problems() {
+  return [...healths.values()].flatMap(([health]) => health.problems ?? [])
 }
 
 export function showTables() {

@@ -1,0 +1,68 @@
+"""What decision makes of messages that nobody would send."""
+
+import msgspec
+
+from gigabrain_schemas import topics
+from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.tasks import GoalRequest
+from gigabrain_schemas.topics import BODY, CMD_VEL, GOAL
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.faults.extremes import fixed
+from gigabrain_zenoh.settings import DecisionConfig
+from gigabrain_zenoh.steering import Steering
+from tests.brain_rig import body, state
+from tests.bus_rig import Net, settle
+from tests.plane_rig import ROOM, Plane, as_map, drawn
+
+
+async def test_the_brains_own_commands_count_as_the_gate_lets_them_through() -> None:
+    net = Net()
+    steering = Steering(DecisionConfig(behaviour="navigate"), net.two)
+    for bus in (net.one, net.two):
+        bus.time.see(state(10))
+    net.one.publish(BODY, body())
+    await settle()
+    steering.see(state(10))
+    net.one.publish(CMD_VEL, CmdVel(linear_x=90.0, angular_z=-90.0, source="control"))
+    net.one.publish(CMD_VEL, CmdVel(linear_x=-90.0, source="stranger"))
+    await settle()
+    steering.see(state(11))
+    bearings = steering.situation(state(11), None, None, None, "").bearings
+    steering.close()
+    assert bearings
+    assert [(one.tick, one.velocity) for one in bearings.sent] == [
+        (10, Velocity(linear_x=0.26, angular_z=-1.82))
+    ]
+
+
+def said(plane: Plane, topic: object) -> Message | None:
+    """What the robot itself says on `topic` now."""
+    match topic:
+        case topics.MAP:
+            return as_map(plane.known, plane.tick, plane.boot)
+        case topics.STATE:
+            return state(plane.tick, boot=plane.boot)
+        case topics.BODY:
+            return body(boot=plane.boot)
+        case _:
+            return None
+
+
+async def test_no_extreme_stops_decision_and_it_reaches_its_goal_afterwards() -> None:
+    heard = (BODY, topics.MAP, topics.STATE, topics.WORLD, topics.POSE, CMD_VEL, topics.SAFETY)
+    async with Plane(drawn(ROOM)) as plane:
+        await plane.go(0.2)
+        await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
+        for case in (one for one in fixed() if one.to in heard):
+            own = said(plane, case.to)
+            base = msgspec.msgpack.decode(codec.encode(own)) if own else None
+            header = {"boot": plane.boot, "tick": plane.tick, "basis": plane.tick}
+            plane.bench.network.deliver(case.key, case.payload(base, header))
+            before, plane.maps_sent = plane.intent, False
+            await plane.go(0.1)
+            assert not plane.bench.bus.failed.done(), (case, plane.bench.bus.failed.exception())
+            assert plane.intent is not before, case
+        await plane.go(1.2)
+        await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
+        await plane.until("succeeded", seconds=60.0)

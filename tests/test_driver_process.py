@@ -1,0 +1,77 @@
+"""The driver's process: what it publishes of the body, and when."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from itertools import pairwise
+from pathlib import Path
+
+from gigabrain_drivers.catalog import load_robot
+from gigabrain_drivers.mock import MockBody, MockOptions
+from gigabrain_drivers.process import DriverProcess
+from gigabrain_drivers.robot import Run
+from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.topics import BODY, CMD_VEL
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import Clock, FakeClock
+from gigabrain_zenoh.settings import DriverConfig
+from gigabrain_zenoh.transport import LocalNetwork
+from tests.brain_in_memory import Robot
+
+
+class HeldUp(MockBody):
+    """A body whose process is always held up: it makes up for seven ticks at a time."""
+
+    async def ticks(self, clock: Clock) -> AsyncIterator[int]:
+        while True:
+            await clock.sleep_ns(7 * TICK_NS)
+            yield 7
+
+
+async def test_the_body_is_described_once_a_second_whatever_ticks_are_missed(
+    tmp_path: Path,
+) -> None:
+    network, clock, told = LocalNetwork(), FakeClock(), list[int]()
+    watcher = Bus(network.transport(), clock)
+    watcher.subscribe(BODY, lambda _key, body: told.append(body.tick))
+    driver = HeldUp(load_robot("mock"), MockOptions(driver="mock"), Run(folder=Path()))
+    config = DriverConfig(body="mock", state_dir=str(tmp_path))
+    bus = Bus(network.transport(), clock, "driver")
+    running = asyncio.ensure_future(
+        DriverProcess(config, driver.robot, driver, bus).run(lambda: None)
+    )
+    await clock.advance(168 * TICK_NS)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    assert told == [0, 56, 112, 168]
+
+
+async def test_a_state_says_what_the_body_was_told_last(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        for _ in range(200):
+            await robot.go(1)
+            assert robot.state
+            assert robot.state.sent == Velocity(linear_x=robot.body.speeds[-1])
+        assert robot.state.sent == Velocity(linear_x=0.26)
+
+
+async def test_what_comes_just_before_a_tick_counts_as_told_before_it(tmp_path: Path) -> None:
+    async with Robot(tmp_path) as robot:
+        await robot.go(200)
+        brain, read = robot.operator, robot.body.read_state
+        brain.sent[CMD_VEL.key] = 10**6  # so it is these that the gate obeys
+        speeds, wanted = [0.26], [0.0, 0.0, 0.26, 0.0, 0.26, 0.26] * 20
+
+        async def read_after_a_command() -> RobotState:
+            assert robot.state
+            speeds.append(robot.state.sent.linear_x)
+            command = CmdVel(linear_x=wanted.pop(), source="control")
+            brain.publish(CMD_VEL, command, basis=brain.time.tick)
+            return await read()
+
+        robot.body.read_state = read_after_a_command  # type: ignore[method-assign]
+        await robot.go(100)
+        assert robot.mode == "enabled"
+        changes = [after - before for before, after in pairwise(speeds)]
+        assert -0.04 - 1e-9 <= min(changes) < 0 < max(changes) <= 0.02 + 1e-9

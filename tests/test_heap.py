@@ -1,0 +1,50 @@
+"""A process that has planned in large maps is small again afterwards."""
+
+import subprocess
+import sys
+
+import pytest
+
+MAPS = """
+import sys, threading
+import numpy as np
+from gigabrain_zenoh import heap
+
+if "mapped" in sys.argv:
+    heap.map_large_blocks()
+
+
+def held_mb():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096 / 1e6
+
+
+def plan():
+    costs = [np.ones((2800, 2800), np.float32) for _ in range(2)]
+    small = np.ones(1000)
+    del costs
+    return small
+
+
+kept, before = [], held_mb()
+for _ in range(3):
+    threads = [threading.Thread(target=lambda: kept.append(plan())) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+print(held_mb() - before)
+"""
+LEFT_MB = 5.0
+
+
+def grown_mb(*words: str) -> float:
+    """By how much a process grows that has held large arrays in threads [MB]."""
+    done = subprocess.run(
+        (sys.executable, "-c", MAPS, *words), capture_output=True, text=True, check=True
+    )
+    return float(done.stdout)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_large_blocks_go_back_to_the_system() -> None:
+    assert grown_mb("mapped") < LEFT_MB

@@ -1,0 +1,146 @@
+"""A signal is never lost, and ends a command with its documented exit code."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+BEGIN = """
+import asyncio, os, signal, sys, threading, time
+from gigabrain_zenoh.interrupts import interrupts
+from gigabrain_zenoh.stop_signals import run_async, stop_signals
+interrupts.install()
+interrupts.limit_s = 0.3
+
+def elsewhere(number):  # the kernel may hand a signal to any thread; the main thread sleeps on
+    time.sleep(0.1)
+    signal.pthread_kill(threading.get_ident(), number)
+
+def main():
+"""
+END = """
+try:
+    with interrupts.raising():
+        code = main()
+except KeyboardInterrupt:
+    code = interrupts.exit_code
+print("in good order", flush=True)
+os._exit(code or 0)
+"""
+
+
+def ended(body: str, sigint: object = signal.default_int_handler) -> tuple[int, str, str]:
+    """The exit code, the output and the complaints of a program whose `main` has this body."""
+    lines = "".join(f"    {line}\n" for line in body.strip().splitlines())
+    before = signal.signal(signal.SIGINT, sigint)  # type: ignore[arg-type]
+    try:
+        words = (sys.executable, "-c", BEGIN + lines + END)
+        done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_that_another_thread_gets_ends_a_sleeping_event_loop(number: int) -> None:
+    body = f"""
+threading.Thread(target=elsewhere, args=({number},), daemon=True).start()
+run_async(asyncio.sleep(3600))
+"""
+    assert ended(body) == (128 + number, "in good order\n", "")
+
+
+def test_a_signal_that_another_thread_gets_ends_a_sleeping_program() -> None:
+    body = """
+threading.Thread(target=elsewhere, args=(2,), daemon=True).start()
+time.sleep(3600)
+"""
+    assert ended(body) == (130, "in good order\n", "")
+
+
+def test_sigint_counts_where_a_shell_has_had_it_ignored() -> None:
+    body = """
+os.kill(os.getpid(), 2)
+time.sleep(3600)
+"""
+    assert ended(body, signal.SIG_IGN) == (130, "in good order\n", "")
+
+
+def test_a_signal_that_a_destructor_swallows_comes_again() -> None:
+    body = """
+class Swallows:
+    def __del__(self):
+        os.kill(os.getpid(), 15)
+        time.sleep(0.01)
+Swallows()
+time.sleep(3600)
+"""
+    assert ended(body) == (143, "in good order\n", "")
+
+
+def test_a_signal_before_the_loop_runs_cancels_what_it_runs() -> None:
+    body = """
+with interrupts.reacting(None):
+    os.kill(os.getpid(), 15)
+    run_async(asyncio.sleep(3600))
+"""
+    assert ended(body) == (143, "in good order\n", "")
+
+
+def test_a_cancelled_command_cleans_up_and_is_not_cut_short_by_a_second_signal() -> None:
+    body = """
+async def work():
+    try:
+        os.kill(os.getpid(), 2)
+        await asyncio.sleep(3600)
+    finally:
+        os.kill(os.getpid(), 2)
+        await asyncio.sleep(0.01)
+        print("cleaned up")
+run_async(work())
+"""
+    assert ended(body) == (130, "cleaned up\nin good order\n", "")
+
+
+def test_what_a_signal_stops_in_good_order_has_an_exit_code_of_its_own() -> None:
+    body = """
+async def work():
+    with stop_signals(0.3) as stop:
+        os.kill(os.getpid(), 15)
+        await stop.wait()
+    os.kill(os.getpid(), 15)
+    return 7
+return run_async(work())
+"""
+    assert ended(body) == (7, "in good order\n", "")
+
+
+@pytest.mark.parametrize(
+    "stuck",
+    [
+        "await asyncio.to_thread(time.sleep, 3600)",  # the loop waits for its threads
+        "time.sleep(3600)",  # in a callback
+    ],
+)
+def test_what_does_not_end_is_ended_by_force(stuck: str) -> None:
+    body = f"""
+async def work():
+    threading.Timer(0.1, os.kill, (os.getpid(), 15)).start()
+    {stuck}
+run_async(work())
+"""
+    assert ended(body) == (143, "", "")
+
+
+def test_a_signal_before_the_work_begins_ends_the_program_at_once() -> None:
+    done = subprocess.run(
+        (
+            sys.executable,
+            "-c",
+            BEGIN.partition("\ndef")[0] + "\nos.kill(os.getpid(), 15)\nprint(1)",
+        ),
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (143, "", "")

@@ -1,0 +1,87 @@
+"""Emulated devices behind a proxy that brings their bytes late, in real time."""
+
+import asyncio
+import itertools
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from gigabrain_drivers.emulators.ld import LdDevice
+from gigabrain_drivers.lidars.ld import Ld19
+from gigabrain_drivers.line import LineDriver
+from gigabrain_drivers.links.line_proxy import LineProxy
+from gigabrain_drivers.robot import ScanOptions
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.faults.chaos import CALM, Chaos
+from gigabrain_zenoh.limits import limits_of, ramp
+from gigabrain_zenoh.safety import lag
+from tests.lidar_rig import LIDAR, Listener, emulated, until
+from tests.line_rig import Bench
+
+TICK_S = 0.02
+
+
+async def test_an_emulated_ld19_behind_a_late_line_says_so(tmp_path: Path) -> None:
+    device = ScanOptions(driver="ld19", port=str(tmp_path / "scan"))
+    behind = ScanOptions(driver="ld19", port=str(tmp_path / "behind"))
+    async with (
+        emulated(LdDevice, device),
+        LineProxy(device.port, Path(behind.port)) as proxy,
+        Listener(Ld19(behind, LIDAR, Clock())) as listener,
+    ):
+        await listener.more(5)
+        await until(lambda: listener.scans[-1].late_ms < 40.0)
+        proxy.set(Chaos(delay_ms=100.0))
+        await until(lambda: listener.scans[-1].late_ms >= 70.0)
+        proxy.set(CALM)
+        await until(lambda: listener.scans[-1].late_ms < 40.0)
+
+
+class Swaying:
+    """A base on a text line that is told one way and the other, and how late it follows."""
+
+    def __init__(self, driver: LineDriver) -> None:
+        self.driver, self.lag = driver, lag.Lag()
+
+    async def run(self) -> None:
+        told, limits, begin = Velocity(), limits_of(self.driver.robot), asyncio.get_running_loop()
+        start_s, last = begin.time(), 0
+        for step in itertools.count():
+            to = Velocity(linear_x=0.3 if step % 60 < 30 else -0.3)
+            told = ramp(told, to, limits, TICK_S)
+            sent = await self.driver.set_base_velocity(told.linear_x, 0.0, 0.0)
+            await asyncio.sleep(TICK_S)
+            tick = round((begin.time() - start_s) / TICK_S)
+            state = replace(await self.driver.read_state(), tick=tick, sent=sent)
+            self.lag, last = lag.look(self.lag, state, tick - last), tick
+
+    def is_late(self, least: int, most: int) -> Callable[[], bool]:
+        return lambda: self.lag.ticks is not None and least <= self.lag.ticks <= most
+
+
+@asynccontextmanager
+async def swaying(bench: Bench, port: Path) -> AsyncIterator[Swaying]:
+    options = replace(bench.driver.options, port=str(port))
+    driver = LineDriver(bench.robot, options, bench.driver.run)
+    bench.station.start()
+    async with driver:
+        body = Swaying(driver)
+        task = asyncio.create_task(body.run())
+        yield body
+        task.cancel()
+        await asyncio.wait((task,))
+    await bench.station.close()
+
+
+async def test_a_base_without_a_clock_is_seen_to_follow_late(tmp_path: Path) -> None:
+    bench, port = Bench(tmp_path), tmp_path / "behind"
+    async with (
+        LineProxy(str(tmp_path / "base"), port) as proxy,
+        swaying(bench, port) as body,
+    ):
+        await until(body.is_late(0, 4))
+        proxy.set(Chaos(delay_ms=50.0))
+        await until(body.is_late(5, 10))

@@ -1,0 +1,106 @@
+"""A body of one's own, by its file alone: what fits it, and what is said where it does not."""
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers import catalog
+from gigabrain_drivers.catalog import links_of, load_robot, robot_path
+from gigabrain_drivers.conformance.subject import Subject
+from gigabrain_drivers.emulators.physics import emulated_body
+from gigabrain_drivers.line_command import LineCommand
+from gigabrain_drivers.protocols.line import Template
+from gigabrain_drivers.protocols.line_fields import COMMAND
+from gigabrain_drivers.robot import Run
+from gigabrain_drivers.sim.options import MujocoOptions, sim_body
+from gigabrain_drivers.sim.scene import compile_scene
+from gigabrain_drivers.sim.worlds import load_world
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.errors import ConfigError
+
+MINE = robot_path("mycustombot")
+MODEL = MINE.with_name("model.xml")
+
+
+def mine(folder: Path, *changes: tuple[str, str]) -> str:
+    """mycustombot's file with these changes, beside its model."""
+    text = MINE.read_text()
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    (folder / "model.xml").write_text(MODEL.read_text())
+    (folder / "robot.yaml").write_text(text)
+    return str(folder / "robot.yaml")
+
+
+def test_an_emulated_battery_has_the_voltages_of_the_bodys_own_file(tmp_path: Path) -> None:
+    six_cells = mine(tmp_path, ("empty: 9.9", "empty: 20"), ("full: 12.6", "full: 25.2"))
+    charge = emulated_body(six_cells, Run(folder=tmp_path)).simulation.battery()
+    assert charge.voltage == pytest.approx(25.2, abs=0.1)
+    assert emulated_body("mycustombot", Run(folder=tmp_path)).simulation.battery().voltage < 12.61
+
+
+def test_a_body_without_physics_is_not_said_to_be_emulated(tmp_path: Path) -> None:
+    own = mine(tmp_path, ("sim: {driver: mujoco, battery_capacity: 10.0}", "sim: {driver: mock}"))
+    assert links_of(load_robot(own)) == ["sim", "real"]
+    with pytest.raises(ConfigError, match="has no link 'emulated'; it has: sim, real"):
+        Subject(own, "emulated", tmp_path)
+
+
+def test_a_lidar_without_a_source_is_refused_with_file_and_line(tmp_path: Path) -> None:
+    own = mine(tmp_path, ("  scan: {driver: ld19, port: usb:10c4:ea60}\n", ""))
+    with pytest.raises(ConfigError, match=r"robot.yaml:\d+: real: scan: `lidar` says that"):
+        catalog.load_link(own, Run(folder=tmp_path, link="real"))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_whole_numbers_do_not_exceed_the_bodys_limits(sign: int) -> None:
+    template = Template("M,{linear_x|mm/s:d},{angular_z|deg/s:d}\n", COMMAND)
+    command = LineCommand(template, None)
+    wanted = Velocity(linear_x=sign * 0.4996, angular_z=sign * 1.82)  # 104.28 degrees
+    assert command.line(wanted, 0) == f"M,{sign * 499},{sign * 104}\n".encode()
+    assert abs(command.sent(wanted).linear_x) == pytest.approx(0.499)
+    exact = Velocity(linear_x=sign * 0.3, angular_z=0.0)  # 0.3 is no binary fraction
+    assert command.line(exact, 0) == f"M,{sign * 300},0\n".encode()
+
+
+def compiled(own: str, folder: Path) -> None:
+    """Its model as the simulator takes it."""
+    run = Run(folder=folder)
+    robot, _, options, place = catalog.load_link(own, run)
+    assert isinstance(options, MujocoOptions)
+    body = sim_body(robot, options, Run(folder=place))
+    compile_scene(body, load_world("arena", 0))
+
+
+def test_a_model_whose_wheels_are_others_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    compiled(mine(tmp_path), tmp_path)
+    assert not caplog.records
+    radius = f"wheel_radius: {load_robot('mycustombot').wheel_radius:g}"
+    own = mine(tmp_path, (radius, "wheel_radius: 0.16"))
+    with caplog.at_level(logging.WARNING):
+        compiled(own, tmp_path)
+    (warning,) = caplog.messages
+    assert warning == (
+        f"{tmp_path}/model.xml: the wheels have a wheel_radius of 0.080 m here, "
+        "and of 0.160 m in the robot's file"
+    )
+
+
+def test_a_drive_that_has_no_physics_is_called_so(tmp_path: Path) -> None:
+    own = mine(tmp_path, ("drive_type: differential", "drive_type: mecanum\nwheel_base: 0.3"))
+    text = Path(own).read_text()
+    Path(own).write_text(text[: text.index("real:")])
+    with pytest.raises(ConfigError, match=r"drive_type 'mecanum' cannot be simulated in MuJoCo"):
+        compiled(own, tmp_path)
+
+
+def test_a_model_that_lacks_parts_is_named(tmp_path: Path) -> None:
+    own = mine(tmp_path)
+    model = tmp_path / "model.xml"
+    model.write_text(model.read_text().replace('name="wheel_left"', 'name="left"'))
+    with pytest.raises(ConfigError, match=r"model\.xml: this MJCF model cannot be used: it has no"):
+        compiled(own, tmp_path)

@@ -1,0 +1,107 @@
+"""Who gets a place at the operator page, and who gives one up."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from gigabrain_zenoh.page import wire
+from gigabrain_zenoh.page.access import Access, tokens
+from gigabrain_zenoh.page.operator import Operator
+from gigabrain_zenoh.page.scene import Scene
+from gigabrain_zenoh.page.sessions import Sessions
+from gigabrain_zenoh.seat import Seat
+from gigabrain_zenoh.settings import PageConfig
+from tests.bus_rig import Net, settle
+
+HOST = "127.0.0.1:8080"
+
+
+class Socket(WebSocket):
+    """A browser's end, in memory."""
+
+    def __init__(self) -> None:
+        scope = {"type": "websocket", "path": "/ws", "query_string": b""}
+        scope |= {"headers": [(b"host", HOST.encode()), (b"origin", f"http://{HOST}".encode())]}
+        super().__init__(scope, self.receive, self.send)
+        self.said: asyncio.Queue[bytes] = asyncio.Queue()
+        self.got: list[bytes] = []
+        self.code = 0
+        self.ended = asyncio.Event()
+
+    async def accept(self, *_: object) -> None:  # type: ignore[override]
+        pass
+
+    async def receive(self) -> dict[str, bytes]:  # type: ignore[override]
+        return {"type": "websocket.receive", "bytes": await self.said.get()}  # type: ignore[dict-item]
+
+    async def send_bytes(self, data: bytes) -> None:
+        self.got.append(data)
+
+    async def close(self, code: int = 1000, reason: str | None = None) -> None:
+        if self.code:
+            raise WebSocketDisconnect
+        self.code = code
+
+
+class Page:
+    """The sessions of a page that wants a token."""
+
+    def __init__(self, folder: Path) -> None:
+        config = PageConfig(login=True, tokens=str(folder / "tokens.json"))
+        self.tokens, _ = tokens(folder / "tokens.json")
+        self.sessions = Sessions(Access(config, 8080))
+        self.net = Net()
+        scene = Scene(self.net.one, self.sessions.tell)
+        self.sessions.serve(scene, Seat(scene), Operator(self.net.one))
+        self._talks: list[asyncio.Task[None]] = []
+
+    async def comes(self, token: str = "") -> Socket:
+        """A browser that says who it is, or nothing."""
+        socket = Socket()
+        if token:
+            socket.said.put_nowait(wire.as_json(wire.LOGIN, wire.Login(token=token)))
+        self._talks.append(asyncio.ensure_future(self.sessions.talk(socket)))
+        for _ in range(3):
+            await settle()
+        return socket
+
+    async def close(self) -> None:
+        for talk in self._talks:
+            talk.cancel()
+        for talk in self._talks:
+            with contextlib.suppress(asyncio.CancelledError):
+                await talk
+
+
+@pytest.fixture
+async def page(tmp_path: Path) -> AsyncIterator[Page]:
+    made = Page(tmp_path)
+    yield made
+    await made.close()
+
+
+async def test_20_viewers_keep_no_operator_out_and_the_oldest_viewer_gives_way(page: Page) -> None:
+    viewers = [await page.comes(page.tokens.viewer) for _ in range(20)]
+    assert [viewer.code for viewer in viewers] == [0] * 16 + [4429] * 4
+    operator = await page.comes(page.tokens.operator)
+    assert operator.code == 0
+    assert operator.got
+    assert [viewer.code for viewer in viewers[:3]] == [4429, 0, 0]
+    assert len(page.sessions.viewers) == 16
+    assert (await page.comes(page.tokens.viewer)).code == 4429  # the place is not his again
+
+
+async def test_operators_get_in_though_all_places_are_taken_by_operators(page: Page) -> None:
+    operators = [await page.comes(page.tokens.operator) for _ in range(65)]
+    assert [operator.code for operator in operators] == [0] * 64 + [4429]
+
+
+async def test_200_browsers_that_do_not_say_who_they_are_keep_no_operator_out(page: Page) -> None:
+    silent = [await page.comes() for _ in range(200)]
+    assert [each.code for each in silent] == [4401] * 136 + [0] * 64
+    operator = await page.comes(page.tokens.operator)
+    assert (operator.code, len(page.sessions.viewers)) == (0, 1)

@@ -1,0 +1,130 @@
+"""A map of ground that is driven over again and again stops growing, stays right and follows."""
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.mapping.familiar import Ground
+from gigabrain_zenoh.mapping.growing import GrowingMap
+from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
+from gigabrain_zenoh.mapping.localizer import View
+from gigabrain_zenoh.mapping.map_file import SavedMap
+from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between
+from gigabrain_zenoh.mapping.sweeps import Sweeps
+from tests.map_rig import HOUSE, PATIENCE_S, Rooms, Walker, at, box, error
+
+START = (1.0, 2.5)
+ROUND = ((3.0, 3.0), (5.5, 3.0), (6.5, 4.8), (6.5, 1.8), (5.0, 3.0), (3.0, 4.5), (1.2, 3.8), START)
+FIRST, LATER = 3, 3  # rounds
+PILLAR, SHELF = box(2.0, 1.2, 2.4, 1.6), box(4.6, 4.2, 5.2, 4.8)  # moved from there to here
+
+
+class Patrol:
+    """A robot that goes its rounds in the house."""
+
+    def __init__(self) -> None:
+        self.chart = GrowingMap(PATIENCE_S)
+        self.walker = Walker(Rooms(HOUSE), self.chart, at(*START))
+        self.walker.look()
+        self.errors: list[float] = []
+        self.keyframes: list[int] = []  # after each round
+        self.sweeps: list[int] = []
+
+    def rounds(self, count: int) -> None:
+        for _ in range(count):
+            for place in ROUND:
+                found = self.walker.go(place)
+                self.errors.append(error(found, between(at(*START), self.walker.pose)))
+            self.keyframes.append(self.chart.report()["keyframes"])
+            self.sweeps.append(self.chart.report()["sweeps"])
+
+
+@pytest.fixture(scope="module")
+def patrol() -> Patrol:
+    patrol = Patrol()
+    patrol.rounds(FIRST + LATER)
+    return patrol
+
+
+def test_the_same_rounds_again_add_no_keyframes(patrol: Patrol) -> None:
+    first = patrol.keyframes[0]
+    assert patrol.keyframes[1] > 1.8 * first  # the second round is still mapped
+    assert patrol.keyframes[-1] <= patrol.keyframes[FIRST - 1] + 0.02 * first
+
+
+def test_of_sweeps_the_newest_of_each_place_stay(patrol: Patrol) -> None:
+    assert patrol.sweeps[-1] - patrol.sweeps[-2] < 0.2 * patrol.sweeps[0]
+
+
+def test_on_known_ground_the_robot_is_where_it_is(patrol: Patrol) -> None:
+    assert max(patrol.errors[-LATER * len(ROUND) :]) < 0.04
+
+
+def test_a_map_of_known_ground_is_saved_and_gone_on_with(patrol: Patrol) -> None:
+    _, arrays = patrol.chart.to_save()
+    again = GrowingMap.thaw(arrays, PATIENCE_S)
+    assert again.report()["keyframes"] == patrol.keyframes[-1]
+    assert again.report()["sweeps"] == patrol.sweeps[-1]
+    frozen = patrol.chart.still().freeze()
+    assert GrowingMap.thaw(frozen, PATIENCE_S).grid() == patrol.chart.grid()
+    walker = Walker(Rooms(HOUSE, seed=3), again, patrol.walker.pose)
+    place = walker.look(30)
+    assert place.localized
+    for goal in ROUND:
+        place = walker.go(goal)
+        assert error(place, between(at(*START), walker.pose)) < 0.05
+    assert again.report()["keyframes"] <= patrol.keyframes[-1] + 0.1 * patrol.keyframes[0]
+
+
+def test_furniture_that_is_moved_is_followed_and_adds_little() -> None:
+    patrol = Patrol()
+    patrol.rounds(FIRST)
+    before = patrol.chart.report()["keyframes"]
+    moved = [wall for wall in HOUSE if wall not in PILLAR]
+    patrol.walker.rooms = Rooms([*moved, *SHELF], seed=4)
+    patrol.rounds(LATER + 1)
+    assert max(patrol.errors) < 0.04
+    assert before < patrol.keyframes[-1] < before + patrol.keyframes[0]
+    assert patrol.keyframes[-1] - patrol.keyframes[-2] < 0.1 * patrol.keyframes[0]
+    saved = patrol.chart.to_save()[0]
+    assert occupied(saved, 4.9, 4.2)
+    assert not occupied(saved, 2.2, 1.6)
+
+
+def occupied(saved: SavedMap, x: float, y: float) -> bool:
+    """Return whether something stands within 0.1 m of a place of the house [m]."""
+    place = between(at(*START), at(x, y))
+    column, row = (round((v - o) / 0.05) for v, o in
+                   zip(place[:2], (saved.origin_x, saved.origin_y), strict=True))  # fmt: skip
+    return bool((saved.cells[row - 2 : row + 3, column - 2 : column + 3] > 60).any())
+
+
+def keyframe(travel: float) -> Keyframe:
+    none = np.empty((0, 2), np.float32)
+    return Keyframe(none, none, Edge(0, 0, IDENTITY, np.eye(3), False), travel, 0)
+
+
+def around(travels: list[float], poses: Floats, now: float) -> list[int]:
+    ground = Ground()
+    for travel in travels:
+        ground.add(keyframe(travel))
+    return ground.round(IDENTITY, now, poses, {0})
+
+
+def test_ground_is_known_after_two_passes_that_are_over() -> None:
+    poses = np.array(((0.5, 0.0, 0.0), (0.0, 0.1, 0.0), (0.2, 0.0, 0.0), IDENTITY))
+    assert around([0.0, 0.2, 30.0, 60.0], poses, 50.0) == [0, 2]  # of two in one square the newest
+    assert around([0.0, 0.2, 11.0, 11.2], poses, 50.0) == []
+    assert around([0.0, 0.2, 30.0, 60.0], poses, 41.0) == []
+    poses[2:, 0] += 1.0
+    assert around([0.0, 0.2, 30.0, 60.0], poses, 50.0) == []
+
+
+def test_of_sweeps_from_one_place_the_newest_three_stay() -> None:
+    sweeps = Sweeps()
+    for k in range(6):
+        view = View(Scan.of(np.full((30, 2), float(k))), np.zeros(2))
+        sweeps.add(view, 0, IDENTITY, np.array((0.05 + 0.15 * (k % 3), 0.1, 0.1)))
+    sweeps.add(View(Scan.of(np.full((30, 2), 9.0)), np.zeros(2)), 0, IDENTITY, at(0.0, 0.0, -90))
+    assert [one.hits[0, 0] for one in sweeps.all()] == [3.0, 4.0, 5.0, 9.0]
+    assert sweeps.seen == 7

@@ -1,0 +1,63 @@
+"""Places are recognised where drift has led far from them, and not where places look alike."""
+
+import numpy as np
+import pytest
+
+from gigabrain_zenoh.mapping.drift import Drift, Rates
+from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
+from gigabrain_zenoh.mapping.places import PlaceSearch
+from gigabrain_zenoh.mapping.se2 import Floats, between, compose
+from tests.rooms import Lidar, Walls, box, line
+from tests.test_slam import BLOCK, lap
+
+BAD = Rates(away=0.2, turn=0.02)
+
+
+def searched(
+    walls: Walls, poses: Floats, thought: Floats, lidar: Lidar, first: int, rates: Rates = BAD
+) -> list[Edge]:
+    """Search from each keyframe from `first` on; the robot is at `poses`, thought at `thought`."""
+    drift = Drift(rates)
+    search, keyframes, loops = PlaceSearch(drift), list[Keyframe](), list[Edge]()
+    travel = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
+    for k, pose in enumerate(poses):
+        scan, before = lidar.scan(walls, pose), max(k - 1, 0)
+        link = Edge(before, k, between(thought[before], thought[k]), np.eye(3) * 1e-3, False)
+        drift.linked(link)
+        keyframes.append(Keyframe(scan.points, scan.free, link, float(travel[k]), 0))
+        if k >= first:
+            loops += search.find(keyframes, thought[: k + 1])
+    return loops
+
+
+def test_a_place_is_recognised_four_metres_from_where_the_robot_is_thought_to_be() -> None:
+    once = lap()
+    poses = np.concatenate((once, lap()[17:125]))
+    drifted = np.arange(len(poses)) >= len(once)
+    thought = np.where(drifted[:, None], compose(np.array((3.5, -2.0, 0.1)), poses), poses)
+    loops = searched(BLOCK, poses, thought, Lidar(180, reach=6.0), len(once))
+    assert len({loop.second for loop in loops}) >= 3
+    for loop in loops:
+        true = between(poses[loop.first], poses[loop.second])
+        assert loop.relative == pytest.approx(true, abs=0.1)
+
+
+def test_a_corridor_in_which_all_doors_are_alike_is_recognised_nowhere() -> None:
+    doors: list[tuple[float, ...]] = []
+    for k in range(40):
+        doors += [*box(2.0 * k, 1.0, 0.9, 0.35), *box(2.0 * k + 0.6, -1.35, 0.9, 0.35)]
+    walls = np.array([*doors, (-5, 1.35, 90, 1.35), (-5, -1.35, 90, -1.35)])
+    out = line(np.array((15.0, 0.0, 0.0)), np.array((60.0, 0.0, 0.0)), 0.5)
+    again = line(np.array((20.0, 0.0, 0.0)), np.array((50.0, 0.0, 0.0)), 0.5)
+    poses = np.concatenate((out, again))
+    shift = (np.arange(len(poses)) >= len(out))[:, None] * (2.0, 0.0, 0.0)
+    assert searched(walls, poses, poses + shift, Lidar(180, reach=6.0), len(out)) == []
+
+
+def test_a_place_that_drift_cannot_have_led_away_from_is_another_one_like_it() -> None:
+    once = lap()
+    poses = np.concatenate((once, lap()[17:125]))
+    second = (np.arange(len(poses)) >= len(once))[:, None]
+    thought = np.where(second, compose(np.array((3.5, -2.0, 0.1)), poses), poses)
+    good = Rates(away=0.06, turn=0.01)  # 0.4 m over the lap
+    assert searched(BLOCK, poses, thought, Lidar(180, reach=6.0), len(once), good) == []

@@ -1,0 +1,163 @@
+"""The robot's time: what one message may do to it, and what several may."""
+
+import asyncio
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import PoseInMap
+from gigabrain_schemas.topics import STATE
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.earlier import Earlier
+from gigabrain_zenoh.errors import ClockLost
+from gigabrain_zenoh.freshness import RobotTime
+from gigabrain_zenoh.sampled import Sampled
+from tests.brain_rig import BOOT, open_space, scan, state
+from tests.bus_rig import Net
+
+SECOND_NS = 1_000_000_000
+FAR = 2**37
+
+
+@pytest.fixture
+def time() -> RobotTime:
+    time = RobotTime()
+    assert time.see(state(100))
+    return time
+
+
+def test_one_state_of_the_far_future_is_not_believed(time: RobotTime) -> None:
+    assert not time.see(state(FAR))
+    assert time.tick == 100
+    assert time.see(state(101))
+    assert time.tick == 101
+
+
+def test_one_scan_of_the_far_future_is_not_believed(time: RobotTime) -> None:
+    assert not time.see(scan(open_space(), FAR))
+    assert time.tick == 100
+
+
+def test_a_gap_of_up_to_a_second_needs_no_confirmation(time: RobotTime) -> None:
+    assert time.see(state(150))
+    assert time.tick == 150
+
+
+def test_a_jump_ahead_is_believed_once_the_third_state_agrees(time: RobotTime) -> None:
+    assert [time.see(state(tick)) for tick in (500, 501, 502)] == [False, False, True]
+    assert time.tick == 502
+
+
+def test_a_jump_is_not_believed_while_the_present_time_goes_on(time: RobotTime) -> None:
+    for n in range(1, 50):
+        assert not time.see(state(FAR + n))
+        assert time.see(state(100 + n))
+    assert time.tick == 149
+
+
+def test_states_that_jump_about_confirm_nothing(time: RobotTime) -> None:
+    assert not any(time.see(state(1000 * n)) for n in range(1, 50))
+    assert time.tick == 100
+
+
+def test_another_boot_is_believed_once_the_third_message_agrees(time: RobotTime) -> None:
+    assert not time.see(state(1, boot=8))
+    assert not time.see(scan(open_space(), 1, boot=8))
+    assert time.see(state(2, boot=8))
+    assert (time.boot, time.tick) == (8, 2)
+
+
+def test_one_state_of_another_boot_changes_nothing(time: RobotTime) -> None:
+    assert not time.see(state(3, boot=8))
+    assert time.see(state(101))
+    assert not time.see(state(4, boot=8))
+    assert (time.boot, time.tick) == (BOOT, 101)
+
+
+def test_a_message_that_several_here_listen_to_counts_once(time: RobotTime) -> None:
+    assert not any(time.see(state(FAR)) for _ in range(10))
+
+
+def test_a_first_tick_that_is_repeated_until_the_brain_is_there_is_believed(
+    time: RobotTime,
+) -> None:
+    said = [replace(state(1, boot=8), seq=seq) for seq in (1, 2, 3)]
+    assert [time.see(one) for one in said] == [False, False, True]
+
+
+def test_a_state_of_no_boot_is_refused_once_a_driver_has_been_heard(time: RobotTime) -> None:
+    assert not time.see(state(101, boot=0))
+    assert RobotTime().see(state(101, boot=0))
+
+
+def test_time_does_not_go_back(time: RobotTime) -> None:
+    assert not any(time.see(state(tick)) for tick in range(1, 40))
+    assert time.tick == 100
+
+
+def test_what_came_before_is_still_known_after_a_message_of_the_future() -> None:
+    places: Earlier[PoseInMap] = Earlier()
+
+    def place(tick: int) -> PoseInMap:
+        return PoseInMap(x=0.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9, boot=BOOT, tick=tick)
+
+    for tick in (10, FAR, 15):
+        places.receive(place(tick))
+    assert places.at(BOOT, 15, SECOND_NS) == place(10)
+    assert places.at(BOOT, 16, SECOND_NS) == place(15)
+
+
+def say(net: Net, message: RobotState) -> None:
+    net.network.deliver(STATE.key, codec.encode(message))
+
+
+async def test_who_refuses_every_state_for_three_seconds_says_so_and_ends() -> None:
+    net = Net()
+    states = net.one.latest(STATE)
+    say(net, state(FAR))  # of the very first nothing better is known
+    for tick in range(1, 149):
+        say(net, state(tick))
+        await net.clock.advance(20_000_000)
+    assert not net.one.failed.done()
+    for tick in range(149, 155):
+        say(net, state(tick))
+        await net.clock.advance(20_000_000)
+    assert states.newest == state(FAR)
+    with pytest.raises(ClockLost, match=r"every robot/state has been refused for 3 s.* tick 152"):
+        net.one.failed.result()
+
+
+async def test_a_lie_now_and_then_ends_nobody() -> None:
+    net = Net()
+    net.one.latest(STATE)
+    say(net, state(1))
+    for n in range(20):
+        say(net, state(FAR, boot=n + 20))
+        await net.clock.advance(2 * SECOND_NS)
+    assert not net.one.failed.done()
+
+
+async def test_a_lie_reaches_no_reader_and_is_counted() -> None:
+    net = Net()
+    heard = list[int]()
+    net.one.latest(STATE, lambda state: heard.append(state.tick))
+    for tick in (100, FAR, 101):
+        say(net, state(tick))
+    await asyncio.sleep(0)
+    assert heard == [100, 101]
+    assert net.one.counters["refused_ticks"] == 1
+
+
+async def test_who_looks_seldom_confirms_a_jump_by_what_has_come_meanwhile() -> None:
+    net = Net()
+    sampled = Sampled(net.one, STATE)
+    say(net, state(100))
+    assert sampled.look() == state(100)
+    for tick in (500, 501, 502):
+        say(net, state(tick))
+    assert sampled.look() == state(500)
+    say(net, state(FAR))
+    assert sampled.look() is None
+    say(net, state(503))
+    assert sampled.look() == state(503)

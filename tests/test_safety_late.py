@@ -1,0 +1,196 @@
+"""Data that come late: named, and the body slowed or stopped within a second, on a fake clock."""
+
+import random
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import GateStatus, Thresholds
+from gigabrain_zenoh.limits import clamp, limits_of
+from tests.brain_rig import DRIVING
+from tests.safety_rig import BODY, Patrol
+
+REST = Velocity()
+STOPPING = GateStatus(mode="stopping", commander="control")
+QUICK = replace(BODY, thresholds=Thresholds(reaction_time=0.22, response=0.06))
+STEP, TURN_STEP = 0.02, 0.06  # of speed in a tick
+
+
+class Follower(Patrol):
+    """A body that does what it was told `delay` ticks ago, and is somewhat noisy."""
+
+    def __init__(self, delay: int = 3) -> None:
+        super().__init__(QUICK)
+        self.delay, self.noise = delay, 0.004
+        self.told = [REST] * 100
+        self.go(40)
+        self.chance = random.Random(1)
+
+    def drive(
+        self, ticks: int, to: Velocity, gate: GateStatus = DRIVING, age_ms: float = 10.0
+    ) -> list[str]:
+        """Ramp to a speed and keep it; every cause that came up."""
+        found: list[str] = []
+        for _ in range(ticks):
+            now, to = self.told[-1], clamp(to, limits_of(QUICK), self.verdict.caps)
+            told = Velocity(
+                linear_x=_towards(now.linear_x, to.linear_x, STEP),
+                angular_z=_towards(now.angular_z, to.angular_z, TURN_STEP),
+            )
+            self.told.append(told)
+            then = self.told[-1 - self.delay]
+            moves = Velocity(
+                linear_x=then.linear_x + self.chance.gauss(0.0, self.noise),
+                angular_z=then.angular_z + self.chance.gauss(0.0, 4 * self.noise),
+            )
+            found += self.go(told=told, moves=moves, gate=gate, age_ms=age_ms)
+        return list(dict.fromkeys(found))
+
+    @property
+    def texts(self) -> list[str]:
+        return [cause.text for cause in self.verdict.causes]
+
+
+def _towards(now: float, to: float, step: float) -> float:
+    return max(now - step, min(now + step, to))
+
+
+FAST, TURN = Velocity(linear_x=0.26), Velocity(linear_x=0.1, angular_z=1.0)
+
+
+def test_a_lidar_whose_stamps_show_that_it_is_100_ms_late_is_named_and_halves_the_speed() -> None:
+    patrol = Patrol(QUICK)
+    patrol.go(50)
+    assert patrol.ticks_until("lidar_late", 50, scan_late_ms=100.0) == 10
+    assert patrol.verdict.verdict == "slow"
+    assert patrol.verdict.caps.forward == 0.13
+    text = "what the lidar reports is late, by 100 ms; half speed"
+    assert [cause.text for cause in patrol.verdict.causes] == [text]
+    assert patrol.go() == []
+
+
+def test_a_body_whose_stamps_show_that_it_is_100_ms_late_is_named_and_halves_the_speed() -> None:
+    patrol = Patrol(QUICK)
+    patrol.go(50)
+    assert patrol.ticks_until("body_late", 50, late_ms=100.0) == 10
+    assert patrol.verdict.caps.rotation == 0.91
+    assert patrol.go() == []
+
+
+@pytest.mark.parametrize("which", ["late_ms", "scan_late_ms"])
+def test_what_is_later_than_the_reaction_time_stops_it(which: str) -> None:
+    patrol = Patrol(QUICK)
+    patrol.go(50)
+    patrol.go(9, **{which: 240.0})  # type: ignore[arg-type]
+    assert patrol.verdict.verdict == "ok"
+    patrol.go(1, **{which: 240.0})  # type: ignore[arg-type]
+    assert patrol.verdict.verdict == "stop"
+    assert not patrol.verdict.causes[0].latching
+
+
+def test_what_a_busy_machine_makes_late_is_left_alone() -> None:
+    patrol = Patrol(QUICK)
+    assert patrol.go(100, late_ms=40.0, scan_late_ms=40.0) == []
+
+
+def test_a_line_without_stamps_that_is_100_ms_late_is_named_within_a_second_of_moving() -> None:
+    for to in (FAST, TURN):
+        body = Follower(delay=8)
+        assert body.drive(50, to) == ["body_late"]
+        assert body.texts == ["what the body reports is late, by 100 ms; half speed"]
+
+
+def test_one_that_becomes_late_on_the_way_is_named_within_a_second_of_a_change_of_speed() -> None:
+    body = Follower()
+    assert body.drive(100, FAST) == []
+    body.delay = 8
+    assert body.drive(100, FAST) == []  # who goes on alike shows nothing
+    assert body.drive(50, TURN) == ["body_late"]
+    body.delay = 3
+    body.drive(50, FAST)
+    assert body.drive(50, TURN) == []
+
+
+def test_one_that_becomes_late_while_it_goes_on_alike_is_doubted_for_its_silence() -> None:
+    body = Follower()
+    assert body.drive(100, FAST) == []
+    for age_ms in (30.0, 50.0, 70.0, 90.0):
+        body.drive(1, FAST, age_ms=age_ms)
+    assert body.texts == ["the body was silent for 90 ms, and may be late; half speed"]
+    body.delay = 8
+    assert body.drive(50, FAST) == ["body_late"]
+    assert body.texts == ["what the body reports is late, by 100 ms; half speed"]
+
+
+def test_what_was_measured_before_a_silence_says_nothing_of_the_time_after_it() -> None:
+    body = Follower()
+    body.drive(60, REST)
+    assert body.drive(25, FAST) == []
+    for age_ms in (30.0, 50.0, 70.0, 90.0):
+        body.drive(1, FAST, age_ms=age_ms)
+    body.delay = 8
+    for _ in range(100):
+        assert body.drive(1, FAST) == ["body_late"]
+    assert body.texts == ["what the body reports is late, by 100 ms; half speed"]
+
+
+def test_one_that_is_slower_than_that_is_doubted_for_five_seconds() -> None:
+    body, slow = Follower(), Velocity(linear_x=0.1)
+    assert body.drive(100, slow) == []
+    body.drive(1, slow, age_ms=90.0)
+    assert body.drive(249, slow) == ["body_late"]
+    assert body.drive(100, slow) == []
+
+
+def test_the_silence_of_a_body_with_a_clock_casts_no_doubt() -> None:
+    patrol = Patrol(QUICK)
+    patrol.go(50)
+    assert patrol.go(1, age_ms=90.0, late_ms=0.0) == []
+    assert patrol.go(1, age_ms=90.0) == ["body_late"]
+
+
+def test_a_body_that_was_only_silent_is_believed_again_as_soon_as_it_is_seen_to_follow() -> None:
+    body = Follower()
+    assert body.drive(100, FAST) == []
+    for age_ms in (30.0, 50.0, 70.0, 90.0):
+        body.drive(1, FAST, age_ms=age_ms)
+    assert body.drive(50, FAST) == ["body_late"]
+    assert body.drive(100, FAST) == []
+
+
+def test_jitter_of_a_line_casts_no_doubt() -> None:
+    body, chance = Follower(), random.Random(4)
+    assert body.drive(100, FAST) == []
+    for _ in range(200):
+        assert body.drive(1, FAST, age_ms=chance.uniform(0.0, 60.0)) == []
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3, 5])
+def test_a_body_that_follows_as_it_always_does_is_not_late(delay: int) -> None:
+    body, chance = Follower(delay), random.Random(2)
+    for _ in range(100):
+        to = Velocity(linear_x=chance.uniform(-0.26, 0.26), angular_z=chance.uniform(-1.0, 1.0))
+        body.delay = max(0, delay - chance.randint(0, 1))
+        assert body.drive(chance.randint(5, 80), to) == []
+
+
+def test_it_is_forgotten_at_rest_so_that_a_line_that_was_mended_is_tried_again() -> None:
+    body = Follower(delay=8)
+    assert body.drive(50, FAST) == ["body_late"]
+    body.drive(50, REST)
+    assert "body_late" in body.codes
+    body.delay = 3
+    body.drive(60, REST)
+    assert body.codes == []
+
+
+@pytest.mark.parametrize("delay", [10, 15, 20, 25])
+def test_a_line_that_is_late_however_much_makes_no_runaway(delay: int) -> None:
+    """A stop from full speed, whose reports still tell of motion when it is over."""
+    body = Follower(delay)
+    for _ in range(5):
+        found = body.drive(60, Velocity(linear_x=0.26))
+        found += body.drive(80, REST, gate=STOPPING)
+        assert "body_late" in found
+        assert not {"runaway", "not_following"} & set(found)

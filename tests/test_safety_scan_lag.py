@@ -1,0 +1,118 @@
+"""A lidar without stamps that comes late: seen by how its scans turn, on a fake clock."""
+
+import math
+import random
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import BodyDescription, RobotState, Thresholds
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.pose_history import PoseHistory
+from gigabrain_zenoh.safety.late import Late, look, slows, stops
+from tests.brain_rig import LIDAR, WAFFLE, scan, state
+
+BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.25))
+SLOW_LIDAR = replace(WAFFLE, lidar=replace(LIDAR, rate_hz=5.0), thresholds=BODY.thresholds)
+TICK_S = 0.02
+ANGLES = np.radians(np.arange(360.0))
+
+
+def room(pose: Pose) -> NDArray[np.float64]:
+    """What 360 beams measure in a room of 6 m by 4 m, its middle in (0.5, 0.3)."""
+    angles = ANGLES + pose.yaw
+    across, along = np.cos(angles), np.sin(angles)
+    x = np.where(across > 0, 3.5 - pose.x, -2.5 - pose.x) / np.where(across == 0, 1e-9, across)
+    y = np.where(along > 0, 2.3 - pose.y, -1.7 - pose.y) / np.where(along == 0, 1e-9, along)
+    return np.minimum(np.abs(x), np.abs(y))
+
+
+def silo(_: Pose) -> NDArray[np.float64]:
+    """Round, and the same from everywhere."""
+    return np.full(360, 2.0)
+
+
+class Robot:
+    """Drives as it is told; its lidar's scans come `delay` ticks after they were measured."""
+
+    def __init__(self, delay: int, body: BodyDescription = BODY) -> None:
+        self.body, self.delay = body, delay
+        assert body.lidar
+        self.period = round(1 / (body.lidar.rate_hz * TICK_S))
+        self.tick, self.rate = 0, 0.0
+        self.poses = [Pose(x=0.0, y=0.0, yaw=0.0)] * 100
+        self.history, self.late = PoseHistory(), Late()
+        self.scan: LaserScan | None = None
+        self.chance, self.noise = random.Random(1), np.random.default_rng(1)
+        self.world = room
+        self.drive(60, 0.0)
+
+    def drive(self, ticks: int, turning: float, speed: float = 0.0) -> list[str]:
+        """So many ticks, turning like that soon; what was found to be late."""
+        found: list[str] = []
+        for _ in range(ticks):
+            self.tick += 1
+            self.rate += max(-0.06, min(0.06, turning - self.rate))
+            now = self.state(Velocity(linear_x=speed, angular_z=self.rate))
+            if self.tick % self.period == 0:
+                seen = self.world(self.poses[-1 - self.delay - self.period // 2])
+                self.scan = scan(seen + self.noise.normal(0.0, 0.01, 360), self.tick)
+                self.scan = replace(self.scan, basis=self.tick)
+            self.history = self.history.then(now)
+            self.late = look(self.body, self.late, now, self.scan, self.history, 1)
+            found += [c.code for c in (*slows(self.body, self.late), *stops(self.body, self.late))]
+        return list(dict.fromkeys(found))
+
+    def state(self, velocity: Velocity) -> RobotState:
+        pose = self.poses[-1]
+        yaw = pose.yaw + velocity.angular_z * TICK_S
+        step = velocity.linear_x * TICK_S
+        pose = Pose(x=pose.x + step * math.cos(yaw), y=pose.y + step * math.sin(yaw), yaw=yaw)
+        self.poses.append(pose)
+        measured = replace(pose, yaw=math.remainder(yaw + self.chance.gauss(0, 0.002), math.tau))
+        return replace(
+            state(self.tick), basis=self.tick, pose=measured, velocity=velocity, sent=velocity
+        )
+
+
+def test_a_lidar_without_stamps_that_is_100_ms_late_is_named_within_a_second_of_a_turn() -> None:
+    for delay in (5, 6):
+        robot = Robot(delay)
+        assert robot.drive(50, 1.0) == ["lidar_late"]
+    assert robot.drive(80, 0.0) == ["lidar_late"]
+    assert robot.drive(60, 0.0) == []  # at rest nothing is known any more
+
+
+def test_one_that_becomes_late_is_named_when_the_turn_ends() -> None:
+    robot = Robot(0)
+    assert robot.drive(100, 1.0, 0.1) == []
+    robot.delay = 5
+    robot.drive(50, 1.0, 0.1)
+    assert "lidar_late" in robot.drive(50, -0.5, 0.1)
+
+
+@pytest.mark.parametrize("body", [BODY, SLOW_LIDAR])
+def test_a_lidar_that_is_in_time_is_left_alone_however_the_body_drives(
+    body: BodyDescription,
+) -> None:
+    robot, chance = Robot(0, body), random.Random(3)
+    for _ in range(60):
+        robot.delay = chance.choice((0, 0, 1))
+        assert robot.drive(chance.randint(10, 80), chance.uniform(-1.8, 1.8), 0.05) == []
+
+
+@pytest.mark.parametrize("delay", [0, 5])
+def test_a_room_that_shows_no_turn_says_nothing(delay: int) -> None:
+    robot = Robot(delay)
+    robot.world = silo
+    assert robot.drive(50, 1.0) == []
+    assert robot.late.scan_lag.ticks is None
+
+
+def test_who_drives_straight_on_learns_nothing() -> None:
+    robot = Robot(5)
+    assert robot.drive(200, 0.0, 0.2) == []
+    assert robot.late.scan_lag.ticks is None

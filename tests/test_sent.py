@@ -1,0 +1,109 @@
+"""What the gate lets out is what the body is told, but for the units of its protocol."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from gigabrain_drivers import catalog
+from gigabrain_drivers.base import Driver
+from gigabrain_drivers.kinematics import Twist, base_of
+from gigabrain_drivers.legs.gait import WALKER
+from gigabrain_drivers.line_command import LineCommand
+from gigabrain_drivers.protocols import opencr
+from gigabrain_drivers.protocols.line import Template
+from gigabrain_drivers.protocols.line_fields import COMMAND
+from gigabrain_drivers.robot import Run
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import RobotState
+from gigabrain_zenoh.faults.fault import Failed
+from gigabrain_zenoh.faults.reversals import let_through, over, told_over
+from tests.brain_rig import DRIVING, state
+
+BODIES = ["alpha", "mock", "mycustombot", "turtlebot3_burger", "turtlebot3_waffle"]
+COMMANDS = 5_000
+ROUNDING = 1e-9
+BURGER = catalog.load_robot("turtlebot3_burger")
+
+
+def outputs(body: str) -> Iterator[Velocity]:
+    return (now for _, now in let_through(catalog.load_robot(body), COMMANDS))
+
+
+def axes(of: Velocity) -> tuple[float, float, float]:
+    return of.linear_x, of.linear_y, of.angular_z
+
+
+def driver_of(body: str) -> Driver:
+    return catalog.make_driver(body, Run(folder=Path()))[1]
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_the_drivers_own_clamp_changes_nothing_of_what_the_gate_lets_out(body: str) -> None:
+    driver = driver_of(body)
+    for now in outputs(body):
+        assert axes(driver.bounded(*axes(now))) == pytest.approx(axes(now), abs=ROUNDING)
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_what_the_gate_lets_out_keeps_the_accelerations_straight_on_and_turning(body: str) -> None:
+    robot = catalog.load_robot(body)
+    worst = max(over(robot, before, now, 1) for before, now in let_through(robot, COMMANDS))
+    assert worst < 1e-6
+
+
+async def test_a_simulated_base_is_told_just_that() -> None:
+    for body in ("turtlebot3_burger", "mycustombot", "alpha"):
+        async with driver_of(body) as driver:
+            for now in outputs(body):
+                sent = await driver.set_base_velocity(*axes(now))
+                assert axes(sent) == pytest.approx(axes(now), abs=ROUNDING)
+
+
+@pytest.mark.parametrize("body", ["turtlebot3_burger", "turtlebot3_waffle"])
+def test_an_opencr_is_told_that_to_within_half_of_its_unit(body: str) -> None:
+    base = base_of(catalog.load_robot(body))
+    assert base
+    for now in outputs(body):
+        wheels = base.to_wheels(Twist(*axes(now)))
+        assert max(map(abs, wheels)) <= opencr.FASTEST_WHEEL  # or its driver would slow it down
+        sent = opencr.velocity(now.linear_x, now.angular_z)
+        told = (sent.linear_x, sent.angular_z)
+        assert told == pytest.approx((now.linear_x, now.angular_z), abs=0.005 + ROUNDING)
+
+
+def test_a_line_base_is_told_that_to_within_half_of_its_last_digit() -> None:
+    command = LineCommand(Template("V,{linear_x:.3f},{angular_z:.3f}\n", COMMAND), None)
+    for now in outputs("mycustombot"):
+        assert axes(command.sent(now)) == pytest.approx(axes(now), abs=0.0005 + ROUNDING)
+
+
+def test_a_quadruped_can_step_as_fast_as_the_gate_lets_it() -> None:
+    for now in outputs("alpha"):
+        assert WALKER.to_body(WALKER.to_gait(Twist(*axes(now)))) == pytest.approx(axes(now))
+
+
+def told(*sent: Velocity) -> list[RobotState]:
+    """A robot's states while this was sent to its body, one a tick."""
+    return [
+        replace(state(tick), gate=DRIVING, sent=velocity)
+        for tick, velocity in enumerate(sent, start=1)
+    ]
+
+
+def test_the_fault_suite_goes_by_what_was_sent_turning_included() -> None:
+    turning = Velocity(angular_z=2.6)
+    within = Velocity(linear_x=0.02, angular_z=2.54)
+    beyond = Velocity(linear_x=0.018, angular_z=2.366)  # what a clamp in the driver made of it
+    fast = Velocity(linear_x=0.2)
+    gap = replace(told(fast)[0], tick=90)
+    assert told_over(BURGER, [*told(turning, within), gap]) == pytest.approx(0.0, abs=1e-6)
+    assert told_over(BURGER, [*told(turning, beyond), gap]) == pytest.approx(290.0)
+    shut = replace(told(beyond)[0], tick=2, gate=replace(DRIVING, mode="stopping"))
+    assert told_over(BURGER, [*told(turning), shut, gap, replace(gap, tick=91)]) == 0.0
+
+
+def test_the_fault_suite_judges_no_body_that_stood_still() -> None:
+    with pytest.raises(Failed, match=r"told 0.20 m/s, 0.00 rad/s at most"):
+        told_over(BURGER, told(Velocity(linear_x=0.2), Velocity(linear_x=0.2)))

@@ -1,0 +1,33 @@
+"""A few commands get signals at random moments; `python -m tests.signal_sweep` tries them all."""
+
+import random
+from collections.abc import Iterator
+
+import pytest
+
+from gigabrain_zenoh.cli.app import COMMANDS
+from tests.signal_commands import CALLS
+from tests.signal_sweep import PATIENCE_S, Stage, attempt
+
+FIRST_S = 1.5  # of a life: imports, start-up, and what it is for
+
+
+@pytest.fixture(scope="module")
+def stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
+    made = Stage(tmp_path_factory.mktemp("stage"), robot=False)
+    yield made
+    made.close()
+
+
+def test_the_sweep_knows_every_command() -> None:
+    assert sorted(CALLS) == sorted(COMMANDS)
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("command", ["proxy", "control", "topic echo", "record", "worlds"])
+def test_a_signal_at_any_moment_ends_a_command(stage: Stage, command: str, name: str) -> None:
+    for number in range(2):
+        at_s = random.Random(f"{command} {number} {name}").random() * FIRST_S
+        trial = attempt(stage, command, number, name, at_s, {0})
+        assert trial.took_s < PATIENCE_S
+        assert trial.problem in ("", "did not end in time"), trial  # how long is for `make qa`

@@ -1,0 +1,105 @@
+"""What raises in a thread, or in a handler of messages, ends its process."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gigabrain_drivers import catalog
+from gigabrain_drivers.emulators.physics import emulated_body
+from gigabrain_drivers.process import DriverProcess
+from gigabrain_drivers.robot import Run
+from gigabrain_drivers.sim.driver import MujocoDriver
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.topics import CMD_VEL
+from gigabrain_zenoh import process
+from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.settings import DriverConfig, Endpoint
+from gigabrain_zenoh.transport import LocalNetwork, LocalTransport
+from tests.bus_rig import until
+
+WAFFLE = "turtlebot3_waffle"
+PATIENCE_S = 20.0
+
+
+def broken_at(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """Have the physics raise in this step."""
+    advance, steps = Simulation.advance, iter(range(1, 1_000_000))
+
+    def advance_or_raise(simulation: Simulation) -> None:
+        if next(steps) == step:
+            raise FloatingPointError("mj_step: divided by zero")
+        advance(simulation)
+
+    monkeypatch.setattr(Simulation, "advance", advance_or_raise)
+
+
+@pytest.mark.parametrize("step", [1, 2, 25])
+async def test_a_physics_step_that_raises_ends_the_driver(
+    step: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    broken_at(monkeypatch, step)
+    robot, driver = catalog.make_driver(WAFFLE, Run(folder=Path()))
+    assert isinstance(driver, MujocoDriver)
+    config = DriverConfig(body=WAFFLE, state_dir=str(tmp_path))
+    bus = Bus(LocalNetwork().transport(), Clock(), "driver")
+    node = DriverProcess(config, robot, driver, bus).run(lambda: None)
+    with pytest.raises(ExceptionGroup) as ended:
+        await asyncio.wait_for(node, PATIENCE_S)
+    assert "mj_step: divided by zero" in str(ended.value.exceptions[0])
+
+
+async def test_a_scan_that_raises_ends_the_driver_too(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    robot, driver = catalog.make_driver(WAFFLE, Run(folder=Path()))
+    config = DriverConfig(body=WAFFLE, state_dir=str(tmp_path))
+    bus = Bus(LocalNetwork().transport(), Clock(), "driver")
+
+    def ready() -> None:
+        monkeypatch.setattr(Simulation, "scan", lambda _simulation: 1 / 0)
+
+    node = DriverProcess(config, robot, driver, bus).run(ready)
+    with pytest.raises(ExceptionGroup, match="unhandled"):
+        await asyncio.wait_for(node, PATIENCE_S)
+
+
+async def test_physics_that_raises_ends_the_emulator(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its process watches `lost`, and ends with what it says."""
+    broken_at(monkeypatch, 5)
+    body = emulated_body(WAFFLE, Run(folder=Path()))
+    body.start()
+    try:
+        await until(lambda: body.lost)
+        assert body.lost == "FloatingPointError: mj_step: divided by zero"
+    finally:
+        await body.close()
+
+
+async def test_a_handler_that_raises_ends_a_process_that_waits_for_other_things(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    network = LocalNetwork()
+
+    async def join(_: Endpoint) -> LocalTransport:
+        return network.transport()
+
+    async def node(bus: Bus, ready: Callable[[], None]) -> None:
+        bus.subscribe(CMD_VEL, lambda _key, _command: 1 / 0)
+        ready()
+        await asyncio.Event().wait()
+
+    monkeypatch.setattr(process, "join", join)
+    config = ProcessConfig(name="control", endpoint=Endpoint())
+    working = asyncio.ensure_future(asyncio.wait_for(process._work(config, node, Bus), PATIENCE_S))
+    sender = Bus(network.transport(), Clock())
+    while not working.done():
+        sender.publish(CMD_VEL, CmdVel(linear_x=0.1, source="anybody"))
+        await asyncio.sleep(0.01)
+    with pytest.raises(ExceptionGroup) as ended:
+        working.result()
+    assert isinstance(ended.value.exceptions[0], ZeroDivisionError)
