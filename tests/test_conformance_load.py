@@ -1,6 +1,7 @@
 """What the kit says on a machine that has no time for it."""
 
 import itertools
+import os
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -90,3 +91,14 @@ def test_where_the_system_does_not_say_nothing_was_waited_for(
     monkeypatch.setattr(run_queue, "PROC", tmp_path / "none")
     monkeypatch.setattr(run_queue, "OWN", tmp_path / "none")
     assert (run_queue.waited_ms(), run_queue.own_waited_ms()) == (0.0, 0.0)
+    assert run_queue.stolen() == {}
+
+
+def test_what_a_host_keeps_from_a_virtual_machine_is_told_by_core(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = ("cpu  9 9 9 9 9 9 9 7 0 0", "cpu0 1 2 3 4 5 6 7 5 9 9", "cpu1 1 2 3 4 5 6 7 2 9 9")
+    (tmp_path / "stat").write_text("\n".join((*lines, "intr 1 2 3", "")))
+    monkeypatch.setattr(run_queue, "PROC", tmp_path)
+    tick_ns = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+    assert run_queue.stolen() == {"cpu0": 5 * tick_ns, "cpu1": 2 * tick_ns}

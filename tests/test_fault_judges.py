@@ -16,6 +16,7 @@ from gigabrain_schemas.topics import BODY, CMD_VEL, STATE
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.faults import clock
+from gigabrain_zenoh.faults.body_link import straight_ticks
 from gigabrain_zenoh.faults.clock import OtherHost, age_error_ms
 from gigabrain_zenoh.faults.estop import Presses
 from gigabrain_zenoh.faults.onlooker import Onlooker
@@ -163,3 +164,11 @@ async def test_a_press_takes_as_long_as_its_answer_however_few_ticks_that_are() 
     figures = presses.figures()
     assert figures["latched after"] == 20.0
     assert min(figures["answer"], figures["answer p99"], figures["zero"]) >= 200.0
+
+
+def test_a_body_that_was_told_to_turn_was_not_told_to_go_straight() -> None:
+    told = (0.0, 0.0, 0.9, -0.9, 0.1, 0.0, 0.0)
+    states = [replace(state(tick), sent=Velocity(angular_z=w)) for tick, w in enumerate(told)]
+    assert straight_ticks(states) == 3
+    assert straight_ticks(states[:2]) == 2
+    assert straight_ticks([]) == 0

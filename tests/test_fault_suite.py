@@ -245,10 +245,22 @@ async def test_the_longest_wait_of_one_thread_between_two_looks_is_told(
 ) -> None:
     looks = iter([{"1": 5_000_000, "2": 0}, {"1": 6_000_000, "2": 31_000_000, "3": 90_000_000}])
     monkeypatch.setattr(run_queue, "by_thread", lambda process: next(looks))
+    monkeypatch.setattr(run_queue, "stolen", dict)
     watch = RunQueueWatch(lambda: [7])
     watch.look()
     watch.look()
     assert watch.longest_ms == 31.0  # of the second; the third was not there before
+
+
+async def test_a_core_that_the_host_gave_to_others_was_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks = iter([{"cpu0": 900_000_000, "cpu1": 0}, {"cpu0": 940_000_000, "cpu1": 10_000_000}])
+    monkeypatch.setattr(run_queue, "stolen", lambda: next(looks))
+    watch = RunQueueWatch(list)
+    watch.look()
+    watch.look()
+    assert watch.longest_ms == 40.0
 
 
 async def test_a_part_that_hangs_leaves_the_rest_of_its_process_running() -> None:

@@ -2,7 +2,7 @@
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from gigabrain_schemas.body import RobotState
@@ -188,24 +188,38 @@ async def motors_disobey(rig: Rig) -> Measured:
 async def _noticed(subject: Subject, *codes: str, **fault: Any) -> list[RobotState]:
     """Break the body while it drives; return all states until it is stopped for these causes.
 
-    Where the robot had to turn away from something meanwhile, it is driven to another place first.
+    Where the robot had to turn away from something meanwhile, it is driven to another place: what
+    turns as it was told disobeys only later.
     """
     onlooker = subject.onlooker
     for _ in range(PLACES):
         await subject.drive(ROOM_M)
         start = onlooker.state
         await subject.break_body(base=fault)
+        broken = onlooker.state
         await onlooker.ticks(2 * STRAIGHT_TICKS)
-        shut = next((s for s in _from(subject, start) if s.gate.mode != "enabled"), None)
-        told = [abs(s.sent.angular_z) < TURNING for s in _from(subject, start)]
+        states = _from(subject, start)
         await subject.break_body()
-        if shut or any(all(told[k : k + STRAIGHT_TICKS]) for k in range(STRAIGHT_TICKS)):
-            break
-    if shut is None:
-        raise Failed(f"not noticed within {2 * STRAIGHT_TICKS} ticks")
-    if not _codes(shut) & set(codes):
-        raise Failed(f"stopped for {', '.join(_codes(shut)) or 'nothing'}, not for {codes[0]}")
-    return [s for s in _from(subject, start) if s.tick <= shut.tick]
+        shut = next((k for k, s in enumerate(states) if s.gate.mode != "enabled"), len(states))
+        if shut == len(states) and straight_ticks(_from(subject, broken)) >= STRAIGHT_TICKS:
+            raise Failed(f"not noticed within {STRAIGHT_TICKS} ticks of going straight")
+        if shut < len(states) and straight_ticks(states[:shut]) == shut:
+            if not _codes(states[shut]) & set(codes):
+                why = ", ".join(_codes(states[shut])) or "nothing"
+                raise Failed(f"stopped for {why}, not for {codes[0]}")
+            return states[: shut + 1]
+        await onlooker.still()
+        await subject.release()
+    raise Failed(f"it had to turn away at all of {PLACES} places")
+
+
+def straight_ticks(states: Iterable[RobotState]) -> int:
+    """Return for how many states in a row, at most, the body was told to go straight."""
+    most = row = 0
+    for state in states:
+        row = row + 1 if abs(state.sent.angular_z) < TURNING else 0
+        most = max(most, row)
+    return most
 
 
 def _codes(state: RobotState) -> set[str]:

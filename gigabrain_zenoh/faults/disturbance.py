@@ -10,7 +10,10 @@ DISTURBED_MS = 30.0  # of 100: a tick and a half in which a part of the robot co
 
 
 class RunQueueWatch:
-    """Notes the longest that one thread of some processes has waited for a core within 0.1 s."""
+    """Notes the longest that one thread of some processes has waited for a core within 0.1 s.
+
+    A core that a virtual machine's host gave to others counts as a thread that waited for it.
+    """
 
     def __init__(self, processes: Callable[[], Iterable[int | str]]) -> None:
         self._processes = processes
@@ -34,6 +37,7 @@ class RunQueueWatch:
             for process in self._processes()
             for thread, waited_ns in run_queue.by_thread(process).items()
         }
+        now |= {("host", core): stolen_ns for core, stolen_ns in run_queue.stolen().items()}
         waits = (waited - self._before.get(thread, waited) for thread, waited in now.items())
         self.longest_ms = max(self.longest_ms, max(waits, default=0) / 1e6)
         self._before = now
