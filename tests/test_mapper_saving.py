@@ -2,6 +2,7 @@
 
 import asyncio
 import functools
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE, WORLD
 from gigabrain_zenoh import perception
 from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping.growing import Still
 from gigabrain_zenoh.recording.placing import placed
 from gigabrain_zenoh.replay import record, replay
 from gigabrain_zenoh.settings import PerceptionConfig
@@ -67,6 +69,22 @@ async def test_two_who_save_at_once_do_not_write_into_each_others_files(
     assert most == [1]
     assert sorted(reply.ok for reply in replies) == [False, True]
     assert map_file.load_graph(own_maps / "house.yaml")["poses"].ndim == 2
+
+
+async def test_a_map_is_drawn_beside_the_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    real, threads = Still.to_save, []
+
+    def noted(still: Still) -> Any:
+        threads.append(threading.current_thread())
+        return real(still)
+
+    monkeypatch.setattr(Still, "to_save", noted)
+    async with Robot() as robot:
+        robot.say()
+        robot.drive(60)
+        assert (await robot.save("house")).ok
+    assert threads
+    assert threading.current_thread() not in threads
 
 
 async def test_a_replay_of_a_drive_with_a_save_says_the_same_and_saves_nothing(

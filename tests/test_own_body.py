@@ -2,11 +2,15 @@
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from gigabrain_drivers import catalog
 from gigabrain_drivers.catalog import links_of, load_robot, robot_path
+from gigabrain_drivers.conformance import timing
+from gigabrain_drivers.conformance.result import Failed
 from gigabrain_drivers.conformance.subject import Subject
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.line_command import LineCommand
@@ -18,6 +22,7 @@ from gigabrain_drivers.sim.scene import compile_scene
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import ConfigError
+from tests.brain_rig import state
 
 MINE = robot_path("mycustombot")
 MODEL = MINE.with_name("model.xml")
@@ -52,6 +57,22 @@ def test_a_lidar_without_a_source_is_refused_with_file_and_line(tmp_path: Path) 
     own = mine(tmp_path, ("  scan: {driver: ld19, port: usb:10c4:ea60}\n", ""))
     with pytest.raises(ConfigError, match=r"robot.yaml:\d+: real: scan: `lidar` says that"):
         catalog.load_link(own, Run(folder=tmp_path, link="real"))
+
+
+async def test_a_lidar_that_never_scans_is_told_apart_from_a_busy_machine() -> None:
+    async def in_vain(*_: object) -> None:
+        return None
+
+    lidar = load_robot(str(MINE)).lidar
+    rig: Any = SimpleNamespace(
+        robot=SimpleNamespace(lidar=lidar), until=in_vain, state=state(1), scan=None, states=350
+    )
+    found = await timing.reports(rig)
+    assert not found.ok
+    assert "no scan within 350 ticks, though `lidar:` is in the robot's file" in found.measured
+    rig.states = 100  # of 350: the machine had no time
+    with pytest.raises(Failed, match="no state and scan within 350 ticks"):
+        await timing.reports(rig)
 
 
 @pytest.mark.parametrize("sign", [1, -1])

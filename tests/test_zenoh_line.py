@@ -11,6 +11,7 @@ from gigabrain_zenoh import zenoh_line
 from gigabrain_zenoh.bridge import Bridge
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_line import Lines
+from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.bus_rig import until
 
 
@@ -41,6 +42,13 @@ class Session:
             raise self.refuses
         self.declared.append(name)
         return name
+
+    def get(self, *_: object, **__: object) -> None:
+        if self.refuses:
+            raise self.refuses
+
+    def close(self) -> None:
+        self.closed = True
 
     def lose(self) -> None:
         class Gone:
@@ -108,3 +116,10 @@ async def test_a_link_that_was_lost_before_anybody_listened_is_noticed(
     assert first.closed
     await world.lines.close()
     await asyncio.sleep(0)
+
+
+async def test_who_asks_on_a_session_that_was_just_closed_is_answered_by_nobody() -> None:
+    closed: Any = Session(refuses=zenoh.ZError("session closed"))
+    transport = ZenohTransport(closed, Endpoint(connect=("tcp/127.0.0.1:1",)))
+    assert await transport.query("robot/map", b"", "", 1.0, "data") == []
+    await transport.close()
