@@ -208,8 +208,6 @@ async def _noticed(subject: Subject, *codes: str, **fault: Any) -> list[RobotSta
                 why = ", ".join(_codes(states[shut])) or "nothing"
                 raise Failed(f"stopped for {why}, not for {codes[0]}")
             return states[: shut + 1]
-        await onlooker.still()
-        await subject.release()
     raise Failed(f"it had to turn away at all of {PLACES} places")
 
 
