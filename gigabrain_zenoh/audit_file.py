@@ -13,6 +13,8 @@ from pathlib import Path
 import msgspec
 
 from gigabrain_schemas.audit import AuditRecord, What
+from gigabrain_zenoh.bounded_file import read_bounded
+from gigabrain_zenoh.errors import ConfigError
 
 MAX_BYTES = 1_000_000  # of one file; then the next one is begun
 KEPT = 8  # files of a kind per process; the oldest is removed
@@ -75,7 +77,7 @@ class AuditFile:
 def read(folder: Path, count: int, process: str = "") -> tuple[AuditRecord, ...]:
     """The last `count` entries that a robot's folder holds, in order of time.
 
-    A line that was torn by a power cut is left out.
+    A line that was torn by a power cut is left out. Raises ConfigError.
     """
     names = {process, process + EVENTS}
     if not process:
@@ -84,7 +86,11 @@ def read(folder: Path, count: int, process: str = "") -> tuple[AuditRecord, ...]
     for name in sorted(names):  # of one moment acts come first
         mine: list[AuditRecord] = []
         for path in reversed(_files(folder / FOLDER, name)):
-            mine = [*_records(path.read_bytes().splitlines()), *mine]
+            try:
+                text = read_bounded(path, 2 * MAX_BYTES)
+            except OSError as error:
+                raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+            mine = [*_records(text.splitlines()), *mine]
             if len(mine) >= count:
                 break
         found.append(mine[-count:])

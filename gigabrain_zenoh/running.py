@@ -12,6 +12,7 @@ from typing import Annotated, BinaryIO
 import msgspec
 from msgspec import Meta, Struct
 
+from gigabrain_zenoh.bounded_file import open_regular
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
 from gigabrain_zenoh.settings import Endpoint
@@ -112,10 +113,10 @@ def running() -> list[Running]:
 def _read(note: Path) -> Running | None:
     """The robot of a note; None where whoever left it is dead, or it cannot be read."""
     try:
-        with note.open("rb") as file:
+        with open_regular(note) as file:
             if _locked(file):
                 return msgspec.json.decode(file.read(NOTE_BYTES), type=Running)
-    except (OSError, *DECODE_ERRORS):
+    except (OSError, ConfigError, *DECODE_ERRORS):
         pass
     _forget(note)
     return None

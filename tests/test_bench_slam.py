@@ -79,9 +79,9 @@ def test_a_log_without_a_place_passed_twice_is_refused() -> None:
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"ref": None}, "expected the arrays ranges, ref, odom"),
+        ({"ref": None}, "no ref; expected ranges, ref, odom"),
         ({"ref": np.zeros((4, 3))}, r"ref: expected poses of shape \(5, 3\)"),
-        ({"odom": np.full((5, 3), np.nan)}, "odom: expected finite numbers"),
+        ({"odom": np.full((5, 3), np.nan)}, "odom holds something else than numbers"),
         ({"ranges": np.zeros(5, np.uint16)}, "ranges: expected whole centimetres"),
         ({"ranges": np.zeros((5, 180))}, "ranges: expected whole centimetres"),
     ],
@@ -106,7 +106,7 @@ def test_a_cut_log_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "log.npz"
     np.savez(path, ranges=np.zeros((50, 180), np.uint16), ref=np.zeros((50, 3)))
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ConfigError, match=r"is no whole \.npz file"):
+    with pytest.raises(ConfigError, match="cut or damaged: "):
         load(path)
     with pytest.raises(ConfigError, match="No such file"):
         load(tmp_path / "nope.npz")

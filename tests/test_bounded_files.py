@@ -12,18 +12,27 @@ import pytest
 import zstandard
 
 from gigabrain_drivers.catalog import load_robot
+from gigabrain_drivers.latch import UNREADABLE, LatchFile
+from gigabrain_drivers.links.address import written
+from gigabrain_drivers.links.link import LinkProblem
 from gigabrain_drivers.robot import Run
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
-from gigabrain_zenoh import config
+from gigabrain_zenoh import audit_file, config
+from gigabrain_zenoh.bench import slam_logs
 from gigabrain_zenoh.config_places import located
 from gigabrain_zenoh.deployment import Deployment, load_deployment
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.faults.rig import Options
+from gigabrain_zenoh.faults.tries_file import TriesFile
 from gigabrain_zenoh.keys import files, identity
 from gigabrain_zenoh.keys.list_file import LIST, generations_in
 from gigabrain_zenoh.mapping import arrays_file, map_file
 from gigabrain_zenoh.recording import records
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.tasks import checks
+from gigabrain_zenoh.tasks.executive import Saved
+from gigabrain_zenoh.tasks.store import TaskFile
+from gigabrain_zenoh.tools import log_reading
 
 YAML = "image: x\nresolution: 0.05\norigin: [0, 0, 0]\n"
 
@@ -73,13 +82,32 @@ def read_bag(path: Path) -> object:
     return list(Bag(path))
 
 
+def read_laser_log(path: Path) -> object:
+    return slam_logs.load(path)
+
+
+def read_run(path: Path) -> object:
+    path.rename(path.with_name("driver.jsonl"))
+    return log_reading.read(path.parent, log_reading.Wanted(), 10)
+
+
+def read_audit(path: Path) -> object:
+    (path.parent / "audit").mkdir()
+    path.rename(path.parent / "audit" / "gate-000001.jsonl")
+    return audit_file.read(path.parent, 10)
+
+
+def read_tries(path: Path) -> object:
+    return TriesFile(path, Options()).read()
+
+
 def read_secret(path: Path) -> object:
     return files.made_once(path, b"secret")
 
 
 READERS: tuple[Callable[[Path], object], ...] = (
     read_deployment, read_mission, read_name, read_map, read_image, read_graph, read_list,
-    read_key, read_model, read_bag, read_secret,
+    read_key, read_model, read_bag, read_secret, read_laser_log, read_run, read_audit, read_tries,
 )  # fmt: skip
 
 
@@ -253,3 +281,36 @@ def test_a_record_of_a_gigabyte_is_passed_over(tmp_path: Path) -> None:
         tracemalloc.stop()
     assert found[0] == records.Damage(8, "a record of 1074 MB is passed over")
     assert [one.data for one in found if isinstance(one, records.Message)] == [b"after"]
+
+
+@pytest.mark.parametrize("make", [device, fifo, endless])
+def test_a_latch_that_is_no_plain_file_counts_as_latched(
+    make: Callable[[Path], None], tmp_path: Path
+) -> None:
+    make(tmp_path / "latch.json")
+    assert LatchFile(tmp_path).read().causes == (UNREADABLE,)
+    assert (tmp_path / "latch.json").stat().st_size < 1000
+
+
+@pytest.mark.parametrize("make", [device, fifo, endless])
+def test_tasks_that_are_no_plain_file_are_set_aside(
+    make: Callable[[Path], None], tmp_path: Path
+) -> None:
+    make(tmp_path / "tasks.json")
+    saved, problem = TaskFile(str(tmp_path)).read()
+    assert saved == Saved()
+    assert "nothing is to be done" in problem
+
+
+@pytest.mark.parametrize("make", [device, fifo, endless])
+def test_an_address_in_no_plain_file_is_a_problem_of_the_link(
+    make: Callable[[Path], None], tmp_path: Path
+) -> None:
+    make(tmp_path / "port")
+    with pytest.raises(LinkProblem, match="does not hold HOST:PORT"):
+        written(tmp_path / "port")
+
+
+def test_a_folder_without_logs_is_said_to_hold_none(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="holds no logs; expected files such as decision"):
+        log_reading.run_folder(str(tmp_path))

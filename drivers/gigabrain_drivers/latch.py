@@ -8,9 +8,11 @@ from msgspec import Meta
 
 from gigabrain_schemas.base import Cause
 from gigabrain_zenoh.atomic_write import make_folder, replace_file
+from gigabrain_zenoh.bounded_file import read_bounded
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
 
+MOST_BYTES = 65_536
 UNREADABLE = Cause(
     code="latch_unreadable",
     text="the file that remembers what latched the gate cannot be read",
@@ -40,10 +42,10 @@ class LatchFile:
         """
         try:
             make_folder(self._folder)
-            found = msgspec.json.decode(self._path.read_bytes(), type=Latched)
+            found = msgspec.json.decode(read_bounded(self._path, MOST_BYTES), type=Latched)
         except FileNotFoundError:
             found = Latched()
-        except DECODE_ERRORS:
+        except (ConfigError, *DECODE_ERRORS):
             found = Latched(causes=(UNREADABLE,))
         except OSError as error:
             raise ConfigError(_unwritable(self._folder, error)) from None

@@ -4,7 +4,6 @@ R. Kümmerle et al., On measuring the accuracy of SLAM algorithms, Autonomous Ro
 judged by how poses that are near one another lie to each other, not by where they are.
 """
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.mapping import arrays_file
 from gigabrain_zenoh.mapping.points import Scan, from_beams
 from gigabrain_zenoh.mapping.se2 import Floats, between, compose, inverse
 
@@ -52,23 +52,16 @@ class Errors(Struct, frozen=True, kw_only=True):
 
 def load(path: Path) -> Log:
     """The log in an .npz file: `ranges` [cm], `ref` and `odom`. Raises ConfigError."""
-    try:
-        with path.open("rb") as stream, np.load(stream) as file:
-            ranges, reference, odometry = (file[name] for name in FIELDS)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or 'is no whole .npz file'}") from None
-    except KeyError:
-        raise ConfigError(f"{path}: expected the arrays {', '.join(FIELDS)}") from None
-    except (ValueError, EOFError, TypeError, zipfile.BadZipFile, NotImplementedError):
-        raise ConfigError(f"{path}: is no whole .npz file") from None
+    arrays = arrays_file.read(path, "no laser log")
+    if missing := set(FIELDS) - arrays.keys():
+        raise ConfigError(f"{path}: no {', '.join(sorted(missing))}; expected {', '.join(FIELDS)}")
+    ranges, reference, odometry = (arrays[name] for name in FIELDS)
     count = len(ranges) if ranges.ndim == 2 else 0
     if count < 2 or ranges.shape[1] < 2 or not np.issubdtype(ranges.dtype, np.integer):
         raise ConfigError(f"{path}: ranges: expected whole centimetres, (scans, beams)")
     for name, poses in (("ref", reference), ("odom", odometry)):
         if poses.shape != (count, 3) or not np.issubdtype(poses.dtype, np.floating):
             raise ConfigError(f"{path}: {name}: expected poses of shape ({count}, 3)")
-        if not np.isfinite(poses).all():
-            raise ConfigError(f"{path}: {name}: expected finite numbers")
     return Log(path.stem, ranges / 100.0, reference.astype(float), odometry.astype(float))
 
 

@@ -13,11 +13,13 @@ from pathlib import Path
 
 import msgspec
 
+from gigabrain_zenoh.bounded_file import read_bounded
 from gigabrain_zenoh.faults.errand import waiting_robot
 from gigabrain_zenoh.faults.extremes import Case, cases
 from gigabrain_zenoh.faults.one_message import Outcome, sending
 from gigabrain_zenoh.faults.rig import Options, Rig
 
+MOST_BYTES = 100_000_000
 BATCH = 100  # to one robot; then a new one begins
 
 
@@ -39,7 +41,7 @@ def main(words: list[str]) -> int:
 
 def read(path: Path) -> Iterator[Outcome]:
     """What is in the file; a line that was cut off is no result."""
-    for line in path.read_bytes().splitlines() if path.exists() else ():
+    for line in read_bounded(path, MOST_BYTES).splitlines() if path.exists() else ():
         try:
             yield msgspec.json.decode(line, type=Outcome)
         except msgspec.DecodeError:

@@ -6,9 +6,12 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
+from gigabrain_zenoh.bounded_file import read_bounded
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.faults.fault import Fault, Try
 from gigabrain_zenoh.faults.rig import Options
+
+MOST_BYTES = 100_000_000
 
 
 class Line(Struct, frozen=True, kw_only=True):
@@ -33,7 +36,7 @@ class TriesFile:
         """Return the runs in the file, by the fault's number. Raises ConfigError."""
         runs: dict[int, list[Try]] = {}
         try:
-            text = self._path.read_bytes() if self._path.exists() else b""
+            text = read_bounded(self._path, MOST_BYTES) if self._path.exists() else b""
             for line in map(_line.decode, text.splitlines()):
                 if line.options == self._options:
                     runs.setdefault(line.number, []).append(line.run)

@@ -6,8 +6,12 @@ from pathlib import Path
 import msgspec
 
 from gigabrain_zenoh.atomic_write import make_folder, replace_file
+from gigabrain_zenoh.bounded_file import read_bounded
 from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.tasks.executive import Saved
+
+MOST_BYTES = 1_000_000
 
 
 class TaskFile:
@@ -21,12 +25,12 @@ class TaskFile:
         if self._path is None:
             return Saved(), ""
         try:
-            return msgspec.json.decode(self._path.read_bytes(), type=Saved), ""
+            return msgspec.json.decode(read_bounded(self._path, MOST_BYTES), type=Saved), ""
         except FileNotFoundError:
             return Saved(), ""
         except OSError as error:
             return Saved(), f"{self._path} cannot be read: {error.strerror}; nothing is to be done"
-        except DECODE_ERRORS as error:
+        except (ConfigError, *DECODE_ERRORS) as error:
             return Saved(), self._set_aside(self._path, error)
 
     def write(self, newest: Sequence[Saved]) -> str:

@@ -13,8 +13,9 @@ from gigabrain_zenoh.bounded_file import open_regular
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.log_text import LEVELS
-from gigabrain_zenoh.logs import state_dir
+from gigabrain_zenoh.logs import FILE_BYTES, state_dir
 
+LOGS = "*.jsonl*"  # driver.jsonl, and driver.jsonl.1 before it
 UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 Line = Mapping[str, Any]
 
@@ -53,6 +54,8 @@ def run_folder(name: str = "") -> Path:
     Raises ConfigError, and UnknownName.
     """
     if name and Path(name).is_dir():
+        if not any(Path(name).glob(LOGS)):
+            raise ConfigError(f"{name}: holds no logs; expected files such as decision.jsonl")
         return Path(name)
     base = state_dir() / "runs"
     runs = sorted((p for p in base.glob("*") if p.is_dir()), key=lambda p: p.name)
@@ -65,18 +68,21 @@ def run_folder(name: str = "") -> Path:
 
 
 def read(folder: Path, wanted: Wanted, newest: int) -> list[Line]:
-    """The newest lines of all processes of a run, oldest first. Raises UnknownName."""
-    files = sorted(folder.glob("*.jsonl*"))  # driver.jsonl, and driver.jsonl.1 before it
+    """The newest lines of all processes of a run, oldest first. Raises ConfigError."""
+    files = sorted(folder.glob(LOGS))
     names = {path.name.partition(".jsonl")[0] for path in files}
     if wanted.process and wanted.process not in names:
         raise unknown("log of a process", wanted.process, names)
-    lines = [line for path in files for line in _lines(path) if wanted.has(line)]
+    try:
+        lines = [line for path in files for line in _lines(path) if wanted.has(line)]
+    except OSError as error:
+        raise ConfigError(f"cannot read {error.filename}: {error.strerror}") from None
     return sorted(lines, key=lambda line: int(line["t"]))[-newest:]
 
 
 def _lines(path: Path) -> Iterator[Line]:
     """Every line that is whole: the last one of a process that died may not be."""
-    with open_regular(path) as file:
+    with open_regular(path, 2 * FILE_BYTES) as file:
         for text in file:
             try:
                 line = msgspec.json.decode(text)

@@ -4,8 +4,11 @@ from pathlib import Path
 
 from gigabrain_drivers.links.link import LinkProblem
 from gigabrain_drivers.links.tcp_link import TcpLink
+from gigabrain_zenoh.bounded_file import read_bounded
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
+
+MOST_BYTES = 256  # of a file that says where to call
 
 
 class AddressLink(TcpLink):
@@ -25,7 +28,7 @@ class AddressLink(TcpLink):
 
     async def _connect(self) -> int:
         if "/" in self._where:
-            self._host, self._port = _written(Path(self._where))
+            self._host, self._port = written(Path(self._where))
         return await super()._connect()
 
 
@@ -37,9 +40,10 @@ def address(text: str) -> tuple[str, int]:
     return host.strip("[]"), int(port)
 
 
-def _written(path: Path) -> tuple[str, int]:
+def written(path: Path) -> tuple[str, int]:
+    """(host, port) in a file. Raises LinkProblem."""
     try:
-        return address(path.read_text(encoding="ascii"))
+        return address(read_bounded(path, MOST_BYTES).decode("ascii"))
     except OSError:
         raise LinkProblem(f"no {path}: is the emulator running?") from None
     except (ConfigError, UnicodeDecodeError):
