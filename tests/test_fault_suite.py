@@ -1,7 +1,9 @@
 """The fault suite: its frame, and every fault once, in its short form, on real processes."""
 
 import asyncio
+import gc
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +17,7 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.faults import suite
-from gigabrain_zenoh.faults.disturbance import RunQueueWatch
+from gigabrain_zenoh.faults.disturbance import LOOK_S, RunQueueWatch
 from gigabrain_zenoh.faults.fault import Failed, Fault, Limit, Result, Skipped, Try, judge, worst_of
 from gigabrain_zenoh.faults.hanging import HangingBus
 from gigabrain_zenoh.faults.rig import Options, Rig, deployment_of
@@ -218,6 +220,21 @@ async def test_a_fault_that_loads_the_machine_is_not_disturbed_by_itself(
     assert result.tries[0].waited_ms == 500.0
 
 
+async def test_no_garbage_is_collected_while_a_fault_is_tried(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    collects = list[bool]()
+
+    async def noted() -> dict[str, float]:
+        collects.append(gc.isenabled())
+        return well()
+
+    monkeypatch.setattr(suite, "find", lambda path: lambda rig: noted())
+    await run_suite([FAULT], Options(), Path())
+    assert collects == [False]
+    assert gc.isenabled()
+
+
 async def test_a_suite_goes_on_where_its_file_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -250,6 +267,16 @@ async def test_the_longest_wait_of_one_thread_between_two_looks_is_told(
     watch.look()
     watch.look()
     assert watch.longest_ms == 31.0  # of the second; the third was not there before
+
+
+async def test_what_holds_up_the_suite_itself_was_waited_for() -> None:
+    watch = RunQueueWatch(list)
+    watch.start()
+    await asyncio.sleep(0)
+    time.sleep(LOOK_S + 0.05)  # noqa: ASYNC251  it is to hold up the loop
+    await asyncio.sleep(0.01)
+    watch.close()
+    assert watch.longest_ms >= 50.0
 
 
 async def test_a_core_that_the_host_gave_to_others_was_waited_for(

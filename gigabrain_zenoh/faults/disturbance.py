@@ -12,7 +12,8 @@ DISTURBED_MS = 30.0  # of 100: a tick and a half in which a part of the robot co
 class RunQueueWatch:
     """Notes the longest that one thread of some processes has waited for a core within 0.1 s.
 
-    A core that a virtual machine's host gave to others counts as a thread that waited for it.
+    A core that a virtual machine's host gave to others counts as a thread that waited for it, and
+    so does this program's own event loop where it is held up: it is the network and the people.
     """
 
     def __init__(self, processes: Callable[[], Iterable[int | str]]) -> None:
@@ -43,6 +44,9 @@ class RunQueueWatch:
         self._before = now
 
     async def _watch(self) -> None:
+        loop = asyncio.get_running_loop()
         while True:
             self.look()
+            due_s = loop.time() + LOOK_S
             await asyncio.sleep(LOOK_S)
+            self.longest_ms = max(self.longest_ms, (loop.time() - due_s) * 1e3)
