@@ -11,15 +11,16 @@ from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, MAP, POSE, STATE
-from gigabrain_zenoh import control, decision, perception, safety
+from gigabrain_zenoh import control, decision, perception
 from gigabrain_zenoh.bench.barn_worlds import World
 from gigabrain_zenoh.bench.course import Course, Trial
 from gigabrain_zenoh.bench.in_memory import InMemory
 from gigabrain_zenoh.bench.plant import JACKAL, Conditions
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.replay import Node
+from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.host import Host
 from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
 

@@ -15,7 +15,7 @@ from gigabrain_zenoh.bench.barn_worlds import World
 from gigabrain_zenoh.bench.plant import FIELD_OF_VIEW, JACKAL, LIDAR, Body, Conditions, Plant
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.navigation.moment import Goal
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 
 TICK_S = TICK_NS / 1e9
 SCAN_TICKS = 2  # from scan to scan

@@ -15,7 +15,8 @@ from gigabrain_zenoh.bench.relay import Role
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.keeper import ProcessSpec
-from gigabrain_zenoh.process import PROGRAMS, find
+from gigabrain_zenoh.plugins import find
+from gigabrain_zenoh.process import PROGRAMS
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.specs import process_specs
 

@@ -20,7 +20,7 @@ from gigabrain_zenoh.mapper import view_of
 from gigabrain_zenoh.mapping.fusion import Fusion, Moment, way
 from gigabrain_zenoh.mapping.growing import GrowingMap
 from gigabrain_zenoh.mapping.se2 import Floats, between, compose, inverse
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.settings import PerceptionConfig
 
 PATIENCE_S = 60.0  # so that a slow machine makes the same map

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.deployment import Deployment
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from gigabrain_zenoh import behaviours
 from gigabrain_zenoh.cli.checked import above_zero, checked
 from gigabrain_zenoh.deployment import Deployment, recorded
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.settings import LinkName, Resume
 from gigabrain_zenoh.stop_signals import run_async
 

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from gigabrain_zenoh.cli.checked import above_zero, finite
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.settings import LinkName
 from gigabrain_zenoh.stop_signals import run_async
 

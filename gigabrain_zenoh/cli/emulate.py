@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from gigabrain_zenoh.cli.checked import checked
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.settings import EmulatorConfig
 from gigabrain_zenoh.stop_signals import run_async
 

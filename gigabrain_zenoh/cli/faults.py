@@ -13,7 +13,7 @@ from cyclopts.validators import Number
 from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.where import show
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from gigabrain_zenoh.keys.checks import INSTALL
 from gigabrain_zenoh.keys.files import CA_KEY, CERTIFICATE
 from gigabrain_zenoh.keys.list_file import generations_in
 from gigabrain_zenoh.keys.roles import Role, common_name
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 
 SOON_DAYS = 30
 

@@ -1,6 +1,6 @@
 """`gigabrain robots` and `gigabrain worlds`: what there is to choose from."""
 
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 
 
 def robots() -> None:

@@ -14,7 +14,8 @@ from gigabrain_zenoh.cli.checked import checked
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.checks import identity_in
 from gigabrain_zenoh.logs import state_dir
-from gigabrain_zenoh.process import find, run
+from gigabrain_zenoh.plugins import find
+from gigabrain_zenoh.process import run
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.running import announced, find_endpoint
 from gigabrain_zenoh.settings import (

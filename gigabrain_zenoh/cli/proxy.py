@@ -14,7 +14,7 @@ from gigabrain_zenoh.faults.call import Address
 from gigabrain_zenoh.faults.chaos import CALM, WAYS, Chaos, Told, Way, told
 from gigabrain_zenoh.faults.damage import Figures
 from gigabrain_zenoh.faults.proxy import TcpProxy
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.stop_signals import run_async
 from gigabrain_zenoh.typed import typed_lines
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 
 
 def view(

@@ -2,7 +2,7 @@
 
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.faults.rig import BODIES, Rig
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 
 LOAD_ROBOT = "gigabrain_drivers.catalog:load_robot"
 

@@ -14,7 +14,7 @@ from gigabrain_zenoh.faults.stopping import TICK_MS
 from gigabrain_zenoh.faults.subject import Subject, configured
 from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.keeper import ProcessSpec
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 
 NOISE = "gigabrain_drivers.conformance.noise"
 IN_FRONT = "gigabrain_drivers.links.line_proxy:in_front_of"

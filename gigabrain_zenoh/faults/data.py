@@ -7,7 +7,7 @@ from gigabrain_zenoh.faults.nonsense import hostile_values
 from gigabrain_zenoh.faults.obstacles import obstacle_at_stopping_distance, thin_obstacles
 from gigabrain_zenoh.faults.reversals import full_reversals
 from gigabrain_zenoh.faults.rig import Rig
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 
 __all__ = [
     "battery_and_temperature",

@@ -17,7 +17,7 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.faults.bodies import body_of
 from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.rig import Rig
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.stop_zone import brakes
 
 TRACK = "gigabrain_drivers.sim.track:Track"

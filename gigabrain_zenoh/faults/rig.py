@@ -9,7 +9,7 @@ from gigabrain_zenoh.backoff import Backoff
 from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.faults.fault import Skipped, Stage
 from gigabrain_zenoh.faults.subject import TIRELESS, Change, Subject
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.settings import DecisionConfig, LinkName, PerceptionConfig, Resume
 
 SPEED = 0.26  # [m/s], of all tests that do not say otherwise
