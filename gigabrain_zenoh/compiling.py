@@ -13,14 +13,11 @@ from collections.abc import Awaitable
 
 from gigabrain_zenoh import lifeline
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.scheduling import join_in
 
 log = logging.getLogger(__name__)
 
-MAPPING = "gigabrain_zenoh.mapping.warm:warm_up"  # call all that is compiled for a process once
-FINDING = "gigabrain_zenoh.mapping.warm:warm_up_finding"
-DRIVING = "gigabrain_zenoh.steering:warm_up"
 QUIET_S = 5.0  # of compiling, before people are told
 
 

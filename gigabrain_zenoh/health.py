@@ -1,12 +1,11 @@
 """How a process is doing: once a second on `robot/health/<process>`."""
 
 import os
-import resource
 import socket
-import sys
 import time
 from collections import Counter
-from pathlib import Path
+
+import psutil
 
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import HEALTH
@@ -16,13 +15,8 @@ PERIOD_NS = 1_000_000_000
 
 
 def rss_bytes() -> int:
-    """Memory that this process holds now; where /proc is missing, the most it ever held."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak if sys.platform == "darwin" else peak * 1024
-    return pages * resource.getpagesize()
+    """Return the memory that this process holds."""
+    return psutil.Process().memory_info().rss
 
 
 async def publish_health(bus: Bus) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TypeVar, cast
 
 import numpy as np
+from platformdirs import user_cache_path
 
 from gigabrain_zenoh import numba_alone
 
@@ -52,10 +53,9 @@ def cache_folder() -> Path | None:
     Numba notices a change in a kernel's own file and none in those that it calls.
     """
     try:
-        root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        return user_cache_path("gigabrain") / f"kernels-{_digest()}"
     except RuntimeError:
         return None
-    return Path(root) / "gigabrain" / f"kernels-{_digest()}"
 
 
 def mark_of(warm_up: str) -> Path | None:

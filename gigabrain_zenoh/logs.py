@@ -261,12 +261,11 @@ def new_run_dir(base: Path | None, label: str) -> Path:
 
 
 def state_dir() -> Path:
-    """Where runs and robots leave what they have to remember (XDG). Raises ConfigError."""
-    given = os.environ.get("XDG_STATE_HOME", "")
-    if os.path.isabs(given):  # the XDG base directory specification ignores relative paths
-        return Path(given) / "gigabrain"
+    """Return the folder in which runs and robots keep their state. Raises ConfigError."""
+    from platformdirs import user_state_path  # 10 ms, of which not every command has need
+
     try:
-        return Path.home() / ".local" / "state" / "gigabrain"
+        return user_state_path("gigabrain")
     except RuntimeError:
         raise ConfigError("there is no home folder; set XDG_STATE_HOME to a folder") from None
 

@@ -30,7 +30,7 @@ from gigabrain_zenoh.mapping.localizer import Place, View
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.se2 import Floats
 from gigabrain_zenoh.percentile import Newest
-from gigabrain_zenoh.perception import beams, hits
+from gigabrain_zenoh.scan import beams, hits
 from gigabrain_zenoh.settings import PerceptionConfig
 
 log = logging.getLogger(__name__)

@@ -12,9 +12,8 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.behaviours import Behaviour, Situation
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.compiling import DRIVING, compiled
+from gigabrain_zenoh.compiling import compiled
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import DecisionConfig
 from gigabrain_zenoh.tasks.mission import roaming
 from gigabrain_zenoh.tasks.orders import Outcome
@@ -23,7 +22,7 @@ from gigabrain_zenoh.tasks.service import TaskService
 if TYPE_CHECKING:
     from gigabrain_zenoh.steering import Steering
 
-STEERING = "gigabrain_zenoh.steering:Steering"
+DRIVE_KERNELS = "gigabrain_zenoh.steering:warm_up"  # calls all that is compiled for it once
 GETTING_READY = "it is getting ready"
 TOLD_NS = 200_000_000  # from one word about that to the next
 PATIENCE_NS, LOOK_NS = 700_000_000, 50_000_000  # for the first word of the place, when asked
@@ -43,10 +42,12 @@ class Navigating:
         """Import and compile all that a driving robot calls. Raises ConfigError."""
         telling = asyncio.ensure_future(self._tell())
         try:
-            await compiled(DRIVING)
+            await compiled(DRIVE_KERNELS)
         finally:
             telling.cancel()
-        self._ready = find(STEERING)(self._config, self._bus)
+        from gigabrain_zenoh.steering import Steering  # and numba: only who drives by it pays
+
+        self._ready = Steering(self._config, self._bus)
 
     async def _tell(self) -> None:
         while True:

@@ -11,24 +11,23 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import hits_bytes, ranges
 from gigabrain_schemas.base import Pose
-from gigabrain_schemas.body import Body, BodyDescription, Lidar, RobotState
+from gigabrain_schemas.body import Body, BodyDescription, RobotState
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
 from gigabrain_zenoh.bus import Bus, Latest
-from gigabrain_zenoh.compiling import FINDING, MAPPING, compiled
+from gigabrain_zenoh.compiling import compiled
 from gigabrain_zenoh.heartbeat import Progress
 from gigabrain_zenoh.obstacles.surroundings import Surroundings
 from gigabrain_zenoh.placed_scans import PlacedScans
+from gigabrain_zenoh.scan import EDGE, Floats, blind_ahead, hits, scan_problem
 from gigabrain_zenoh.settings import PerceptionConfig
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.mapper import Mapper
 
-Floats = NDArray[np.float64]
-
-EDGE = 1e-9  # [rad], [m], so that rounding does not decide what lies on an edge
-STUCK_BEAMS = 8  # so many beams that all agree to the last bit come from a stuck lidar
+MAP_KERNELS = "gigabrain_zenoh.mapping.warm:warm_up"  # calls all that is compiled for it once
+LOCALIZE_KERNELS = "gigabrain_zenoh.mapping.warm:warm_up_finding"
 
 
 def step(config: PerceptionConfig, body: BodyDescription, scan: LaserScan) -> WorldModel:
@@ -53,70 +52,10 @@ def step(config: PerceptionConfig, body: BodyDescription, scan: LaserScan) -> Wo
     )
 
 
-def scan_problem(lidar: Lidar, values: NDArray[np.float32], nearest: float) -> str:
-    """Why a scan must not be believed, or an empty text. A blind lidar is not free space.
-
-    `values` are the ranges (n,) [m]; those below `nearest` [m] are the lidar's own housing.
-    """
-    count = len(values)
-    if count != lidar.beams:
-        return f"the scan has {count} beams, the body's lidar {lidar.beams}"
-    seen = values >= nearest  # nan is not, nor is -inf (REP-117: too close to measure)
-    if lidar.no_return == "unknown":
-        seen &= values < np.inf
-    found = int(np.count_nonzero(seen))
-    if found == 0:
-        return "the lidar sees nothing at all"
-    if 2 * found <= count:
-        return f"{count - found} of {count} beams are missing"
-    alike = count >= STUCK_BEAMS and values[0] == values[1] < np.inf
-    if alike and (values == values[0]).all():
-        return "all beams report the same distance"
-    return ""
-
-
-def blind_ahead(lidar: Lidar, scan: LaserScan, nearest: float, cone_deg: float) -> str:
-    """Why nothing is known of the cone ahead (whole angle [deg]), or an empty text."""
-    values = ranges(scan)
-    cone = _beams_ahead(len(values), scan.angle_min, scan.angle_increment, lidar.yaw, cone_deg)
-    seen = int(np.count_nonzero(values[cone] >= nearest))
-    if 2 * seen <= len(cone):
-        return f"{len(cone) - seen} of {len(cone)} beams ahead are missing"
-    return ""
-
-
-def hits(lidar: Lidar, scan: LaserScan, nearest: float) -> tuple[Floats, Floats]:
-    """Where the beams of `scan` hit something: x and y in the body's frame [m], (n,) each."""
-    values = ranges(scan)
-    farthest = min(scan.range_max, lidar.range_max)
-    hit = (values >= nearest) & (values <= farthest)  # nan and inf are neither
-    cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
-    reached = values[hit]
-    return lidar.x + reached * cosines[hit], lidar.y + reached * sines[hit]
-
-
-@lru_cache(maxsize=8)
-def beams(
-    count: int, angle_min: float, angle_increment: float, yaw: float
-) -> tuple[Floats, Floats]:
-    """Cosines and sines of the beams' angles in the body's frame, (count,) each."""
-    angles = yaw + angle_min + angle_increment * np.arange(count)
-    return np.cos(angles), np.sin(angles)
-
-
 @lru_cache(maxsize=8)
 def _reach(footprint: tuple[tuple[float, float], ...]) -> tuple[float, float]:
     """How far the footprint reaches ahead, and when it turns on the spot [m]."""
     return max(x for x, _ in footprint), max(math.hypot(x, y) for x, y in footprint)
-
-
-@lru_cache(maxsize=8)
-def _beams_ahead(
-    count: int, angle_min: float, angle_increment: float, yaw: float, cone_deg: float
-) -> NDArray[np.intp]:
-    """Indices of the beams that look into the cone ahead, as the lidar sees it."""
-    cosines, _ = beams(count, angle_min, angle_increment, yaw)
-    return np.flatnonzero(cosines >= math.cos(math.radians(cone_deg) / 2) - EDGE)
 
 
 def _ahead(
@@ -169,7 +108,7 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         ready()
         await bus.failed
         return
-    await compiled(MAPPING if config.mapping == "slam" else FINDING)
+    await compiled(MAP_KERNELS if config.mapping == "slam" else LOCALIZE_KERNELS)
     from gigabrain_zenoh.mapper import Mapper  # and numba: only who has a map pays
 
     with closing(Mapper(config, bus, body)) as mapper:

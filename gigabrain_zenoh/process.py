@@ -7,14 +7,12 @@ import asyncio
 import contextlib
 import functools
 import gc
-import importlib
 import logging
 import os
 import sys
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -30,20 +28,18 @@ from gigabrain_zenoh.journal import SaidJournal
 from gigabrain_zenoh.meeting import join
 from gigabrain_zenoh.name_claim import NameClaim
 from gigabrain_zenoh.param_service import serve_params
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.scheduling import go_first, join_in, start_first, step_aside
 from gigabrain_zenoh.stop_signals import stop_signals
 from gigabrain_zenoh.transport import Transport
 from gigabrain_zenoh.unobtrusive import NAP_S
+from gigabrain_zenoh.zenoh_config import ZENOH_RUNTIME
 
 log = logging.getLogger("gigabrain")
 
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 MakeBus = Callable[[Transport, Clock, str], Bus]
-
-# Zenoh's work in one thread, sending apart: a message wakes half as many threads on its way. A
-# documented variable of Zenoh's (zenoh_runtime::ZRuntime); whoever sets it has the last word.
-ZENOH_RUNTIME = "(rx: (handover: app), acc: (handover: app), net: (handover: app))"
 
 
 @dataclass(frozen=True)
@@ -82,7 +78,7 @@ PROGRAMS = {
         "gigabrain_zenoh.decision:run", "gigabrain_zenoh.settings:DecisionConfig", repeats=True
     ),
     "control": Program("gigabrain_zenoh.control:run", stops=True, repeats=True),
-    "safety": Program("gigabrain_zenoh.safety:run", stops=True, repeats=True),
+    "safety": Program("gigabrain_zenoh.safety.node:run", stops=True, repeats=True),
     "recorder": Program(
         "gigabrain_zenoh.recording.node:run",
         "gigabrain_zenoh.settings:RecorderConfig",
@@ -97,12 +93,6 @@ PROGRAMS = {
         looks_on=True,
     ),
 }
-
-
-def find(path: str) -> Any:
-    """The object at "module:name"."""
-    module, _, name = path.partition(":")
-    return getattr(importlib.import_module(module), name)
 
 
 def node_of(config: ProcessConfig) -> Node:

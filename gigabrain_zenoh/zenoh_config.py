@@ -15,6 +15,10 @@ from gigabrain_zenoh.keys.list_file import generations_in
 from gigabrain_zenoh.settings import Endpoint, RouterConfig
 from gigabrain_zenoh.zenoh_bounds import bounds
 
+# Zenoh's work in one thread, sending apart: a message wakes half as many threads on its way. A
+# documented variable of Zenoh's (zenoh_runtime::ZRuntime); a value set by the user wins.
+ZENOH_RUNTIME = "(rx: (handover: app), acc: (handover: app), net: (handover: app))"
+
 SECURE, PLAIN = "tls/", "tcp/"
 ROOMY = ("real_time", "interactive_high", "data_high", "data")
 PENDING = 4000  # links that may be on their way in; silent ones are dropped after a second

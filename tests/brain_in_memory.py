@@ -14,11 +14,12 @@ from gigabrain_drivers.process import DriverProcess
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.topics import STATE
-from gigabrain_zenoh import control, decision, perception, safety
+from gigabrain_zenoh import control, decision, perception
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.process import MakeBus
 from gigabrain_zenoh.replay import Node
+from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.settings import DecisionConfig, DriverConfig, PerceptionConfig, Resume
 from gigabrain_zenoh.transport import Close, LocalNetwork, LocalTransport, OnSample
 from tests.brain_rig import TICK_NS

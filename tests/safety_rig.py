@@ -17,8 +17,8 @@ from gigabrain_schemas.body import (
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import ImuData
-from gigabrain_zenoh.safety import Inputs, Memory, step
 from gigabrain_zenoh.safety.host import Host
+from gigabrain_zenoh.safety.step import Inputs, Memory, step
 from tests.brain_rig import DRIVING, WAFFLE, open_space, scan, state
 
 BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.32))

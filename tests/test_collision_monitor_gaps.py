@@ -26,7 +26,9 @@ from gigabrain_schemas.topics import (
     STATE,
     WORLD,
 )
-from gigabrain_zenoh import gate, safety
+from gigabrain_zenoh import gate
+from gigabrain_zenoh.safety import node as safety
+from gigabrain_zenoh.safety.step import Inputs, step
 from gigabrain_zenoh.stop_zone import brakes
 from tests.brain_rig import Bench, body, open_space, scan, state
 from tests.gate_rig import driving
@@ -77,8 +79,8 @@ def test_c_scans_of_ticks_to_come_do_not_hide_that_none_is_true() -> None:
     memory, found = Patrol().memory, []  # it has seen those of the ticks 5 and 10
     for tick in range(11, 41):
         future = scan(open_space(), tick + 1000)
-        inputs = safety.Inputs(state=state(tick), scan=future, scan_age_ns=0)
-        memory, verdict = safety.step(BODY, memory, inputs)
+        inputs = Inputs(state=state(tick), scan=future, scan_age_ns=0)
+        memory, verdict = step(BODY, memory, inputs)
         found.append((tick, [cause.code for cause in verdict.causes]))
     assert [tick for tick, causes in found if "scan_lost" in causes] == list(range(23, 41))
     assert verdict.causes[0].text == (

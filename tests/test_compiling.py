@@ -14,7 +14,9 @@ pytest.importorskip("numba")
 
 from gigabrain_zenoh import compiling, kernels, numba_alone
 from gigabrain_zenoh.cli.warm import warm
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.navigating import DRIVE_KERNELS
+from gigabrain_zenoh.perception import LOCALIZE_KERNELS, MAP_KERNELS
+from gigabrain_zenoh.plugins import find
 
 pytestmark = pytest.mark.system
 
@@ -76,7 +78,7 @@ def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) 
     assert mark.exists()
 
 
-@pytest.mark.parametrize("warm_up", [compiling.MAPPING, compiling.FINDING, compiling.DRIVING])
+@pytest.mark.parametrize("warm_up", [MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS])
 def test_what_is_to_be_called_is_there(warm_up: str) -> None:
     assert isinstance(find(warm_up), types.FunctionType)
 
@@ -94,7 +96,7 @@ def test_what_is_compiled_beforehand_is_what_each_process_calls(
     monkeypatch.setattr(compiling, "in_child", in_child)
     monkeypatch.setattr(compiling, "compile_all", done.append)
     warm()
-    assert sorted(tried) == sorted((compiling.MAPPING, compiling.FINDING, compiling.DRIVING))
+    assert sorted(tried) == sorted((MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS))
     assert done == (tried if code else [])  # what a child cannot do
     assert capsys.readouterr().out.count(" s\n") == 2
 

@@ -24,7 +24,7 @@ from gigabrain_zenoh.faults.rig import Options, Rig, deployment_of
 from gigabrain_zenoh.faults.suite import failed, run_suite
 from gigabrain_zenoh.faults.table import FAULTS, choose
 from gigabrain_zenoh.faults.tries_file import TriesFile
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.transport import LocalNetwork
 from tests.bus_rig import settle
 

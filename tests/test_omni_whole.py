@@ -15,11 +15,12 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.tasks import GoalRequest, TaskStatus
 from gigabrain_schemas.topics import GOAL, STATE, TASK
-from gigabrain_zenoh import control, decision, perception, safety
+from gigabrain_zenoh import control, decision, perception
 from gigabrain_zenoh.bench.in_memory import InMemory
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.limits import ZERO
 from gigabrain_zenoh.replay import Node
+from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.host import Host
 from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.sweep import depth, edges

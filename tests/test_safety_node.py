@@ -9,7 +9,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, SCAN, STATE, WORLD
-from gigabrain_zenoh import safety
+from gigabrain_zenoh.safety import node as safety
 from tests.brain_rig import BOOT, DRIVING, TICK_NS, Bench, body, open_space, scan, state
 
 ALL = ("perception", "decision", "control")

@@ -5,25 +5,25 @@ import functools
 import tempfile
 from collections.abc import Callable
 
+from gigabrain_drivers.planted import node_of
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, MAP, POSE, STATE
-from gigabrain_zenoh import control, decision, perception, safety
+from gigabrain_zenoh import control, decision, perception
 from gigabrain_zenoh.bench.barn_worlds import World
 from gigabrain_zenoh.bench.course import Course, Trial
 from gigabrain_zenoh.bench.in_memory import InMemory
 from gigabrain_zenoh.bench.plant import JACKAL, Conditions
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.replay import Node
+from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.host import Host
 from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
 
-DRIVER = "gigabrain_drivers.planted:node_of"  # imports point the other way
 WAKING_TICKS = 500  # until the gate is open and the robot knows where it is
 
 
@@ -74,7 +74,7 @@ def _nodes(plant: Watched, samples: int, folder: str) -> dict[str, Node]:
         "decision": functools.partial(decision.run, anywhere),
         "control": control.run,
         "safety": _safety,
-        "driver": find(DRIVER)(JACKAL, plant, folder),
+        "driver": node_of(JACKAL, plant, folder),
     }
 
 

@@ -15,7 +15,6 @@ from gigabrain_zenoh.bench.barn_worlds import World
 from gigabrain_zenoh.bench.plant import FIELD_OF_VIEW, JACKAL, LIDAR, Body, Conditions, Plant
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.navigation.moment import Goal
-from gigabrain_zenoh.process import find
 
 TICK_S = TICK_NS / 1e9
 SCAN_TICKS = 2  # from scan to scan
@@ -23,7 +22,6 @@ LIMIT_S = 100.0
 REACHED_M, BEGUN_M = 1.0, 0.1  # [m], from the goal and from the start
 APART_S = 7.3  # between the times at which trials of a moving world begin
 SEED = 1000
-PHYSICS = "gigabrain_drivers.sim.jackal:Jackal"  # imports point the other way
 
 
 class Trial(Struct, frozen=True, kw_only=True):
@@ -117,10 +115,9 @@ def body_in(world: World, conditions: Conditions, seed: int) -> Body:
     if not conditions.physics:
         return Plant(conditions, world.start, seed)
     try:
-        make = find(PHYSICS)
+        from gigabrain_drivers.sim.jackal import Jackal
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"the plant mujoco needs {error.name}: pip install 'gigabrain-zenoh[sim]'"
         ) from None
-    body: Body = make(conditions, world.start, world.posts, seed)
-    return body
+    return Jackal(conditions, world.start, world.posts, seed)

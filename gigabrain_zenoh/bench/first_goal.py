@@ -13,8 +13,10 @@ from gigabrain_schemas.topics import GOAL, INTENT
 from gigabrain_zenoh.bench.group import Group, client, starting
 from gigabrain_zenoh.bench.runs import LOOPBACK
 from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.compiling import DRIVING, MAPPING, compiled
+from gigabrain_zenoh.compiling import compiled
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
+from gigabrain_zenoh.navigating import DRIVE_KERNELS
+from gigabrain_zenoh.perception import MAP_KERNELS
 from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.specs import process_specs
 
@@ -40,7 +42,7 @@ async def measure_first_goal(body: str, world: str, say: Callable[[str], None]) 
     What is to be compiled is compiled before. Raises ConfigError where that is not installed, and
     GigabrainError when a process dies on the way.
     """
-    for warm_up in (MAPPING, DRIVING):
+    for warm_up in (MAP_KERNELS, DRIVE_KERNELS):
         await compiled(warm_up)
     deployment = with_free_port(
         Deployment(

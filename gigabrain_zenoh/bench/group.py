@@ -1,11 +1,11 @@
 """A group of processes that runs for one measurement, under the supervisor that `up` uses."""
 
 import asyncio
-import os
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from pathlib import Path
 from typing import Any
+
+import psutil
 
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE
@@ -81,22 +81,20 @@ class Group:
 
 
 def cpu_s(pid: int) -> float:
-    """CPU time that a process has used so far, from proc(5); 0 where there is none."""
+    """Return the CPU time that a process has used so far; 0 where there is none."""
     try:
-        stat = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
+        times = psutil.Process(pid).cpu_times()
+    except psutil.Error:
         return 0.0
-    user, system = stat.rpartition(")")[2].split()[11:13]
-    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
+    return times.user + times.system
 
 
 def rss_bytes(pid: int) -> int:
-    """Memory that a process holds, from proc(5); 0 where there is none."""
+    """Return the memory that a process holds; 0 where there is none."""
     try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    except OSError:
+        return psutil.Process(pid).memory_info().rss
+    except psutil.Error:
         return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 @asynccontextmanager

@@ -22,10 +22,9 @@ from msgspec import Struct
 
 from gigabrain_zenoh import lifeline
 from gigabrain_zenoh.bench.figures import figures
-from gigabrain_zenoh.process import ZENOH_RUNTIME
 from gigabrain_zenoh.scheduling import go_first
 from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_config import session_config
+from gigabrain_zenoh.zenoh_config import ZENOH_RUNTIME, session_config
 
 STAMP_BYTES = 8
 LOST_S = 0.3  # what has not come back by then never will

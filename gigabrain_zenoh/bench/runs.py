@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import yaml
 
+from gigabrain_drivers.catalog import robot_path
 from gigabrain_zenoh.bench.figures import Figures
 from gigabrain_zenoh.bench.group import Group, client, driver_report, running
 from gigabrain_zenoh.bench.listening import Heard, listen
@@ -15,7 +16,7 @@ from gigabrain_zenoh.bench.relay import Role
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.keeper import ProcessSpec
-from gigabrain_zenoh.process import PROGRAMS, find
+from gigabrain_zenoh.process import PROGRAMS
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.specs import process_specs
 
@@ -115,7 +116,7 @@ async def _run_relay(router: Sequence[ProcessSpec], roles: Sequence[Role]) -> Fi
 
 def _mock_body(rate_hz: float, folder: Path) -> Path:
     """The file of a body without physics whose lidar turns at this rate."""
-    known = Path(find("gigabrain_drivers.catalog:robot_path")("mock"))
+    known = robot_path("mock")
     robot = yaml.safe_load(known.read_text(encoding="utf-8"))
     robot["lidar"]["rate_hz"] = rate_hz
     path = folder / "mock.yaml"

@@ -20,7 +20,6 @@ from gigabrain_zenoh.mapper import view_of
 from gigabrain_zenoh.mapping.fusion import Fusion, Moment, way
 from gigabrain_zenoh.mapping.growing import GrowingMap
 from gigabrain_zenoh.mapping.se2 import Floats, between, compose, inverse
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import PerceptionConfig
 
 PATIENCE_S = 60.0  # so that a slow machine makes the same map
@@ -78,13 +77,17 @@ class Toured:
 
 def tour(body: str, world: str, seed: int, minutes: float, progress: Progress) -> Toured:
     """Let the body roam the world for so long. Raises ConfigError."""
-    roaming = find("gigabrain_drivers.sim.tour:Tour")(body, world, seed)
+    from gigabrain_drivers.sim.tour import Tour  # MuJoCo, which a bench of logs has no need of
+
+    roaming = Tour(body, world, seed)
+    if (lidar := roaming.body.lidar) is None:
+        raise ConfigError(f"{body} has no lidar, and so makes no map")
     run = _Run(GrowingMap(PATIENCE_S))
     watch = Watch()
     for count, moment in enumerate(roaming.moments(round(minutes * TICKS_A_MINUTE)), 1):
         run.fusion.add(moment.state, roaming.body)
         if moment.scan:
-            run.scan(roaming.body.lidar, moment.scan, np.array(moment.truth))
+            run.scan(lidar, moment.scan, np.array(moment.truth))
         if count % TICKS_A_MINUTE == 0:
             watch.minute(rss_bytes(), run.chart.grid())
             progress()

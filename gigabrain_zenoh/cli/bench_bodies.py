@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Literal
 
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.deployment import Deployment
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
@@ -46,12 +45,13 @@ def bodies(
     """
     from rich.console import Console
 
+    from gigabrain_drivers.catalog import simulated
     from gigabrain_zenoh import results
     from gigabrain_zenoh.bench.bodies import measure_bodies
 
     above_zero("seconds", seconds)
     results.check_place(json)
-    chosen = names or find("gigabrain_drivers.catalog:simulated")(link)
+    chosen = names or simulated(link)
     deployment = Deployment(
         link=link, world=world, seed=seed, resume="auto", router="tcp/127.0.0.1:0"
     )

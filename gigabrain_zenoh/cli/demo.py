@@ -10,7 +10,6 @@ from gigabrain_zenoh import behaviours
 from gigabrain_zenoh.cli.checked import above_zero, checked
 from gigabrain_zenoh.deployment import Deployment, recorded
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import LinkName, Resume
 from gigabrain_zenoh.stop_signals import run_async
 
@@ -43,9 +42,12 @@ class Drive:
 
     def check(self) -> None:
         """Raises ConfigError, and UnknownName, for what can be told before anything starts."""
+        from gigabrain_drivers.catalog import load_robot
+        from gigabrain_drivers.sim.worlds import load_world
+
         behaviours.check(self.behaviour)
-        find("gigabrain_drivers.catalog:load_robot")(self.body)
-        find("gigabrain_drivers.sim.worlds:load_world")(self.world, 0)
+        load_robot(self.body)
+        load_world(self.world, 0)
 
     def values(self) -> dict[str, object]:
         """The deployment, raw."""

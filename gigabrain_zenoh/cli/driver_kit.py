@@ -12,7 +12,6 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from gigabrain_zenoh.cli.checked import above_zero, finite
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import LinkName
 from gigabrain_zenoh.stop_signals import run_async
 
@@ -68,9 +67,10 @@ def test(
     from rich.console import Console
     from rich.table import Table
 
-    links = find("gigabrain_drivers.catalog:links_of")(
-        find("gigabrain_drivers.catalog:load_robot")(name)
-    )
+    from gigabrain_drivers.catalog import links_of, load_robot
+    from gigabrain_drivers.conformance import kit
+
+    links = links_of(load_robot(name))
     chosen: LinkName = link or ("emulated" if "emulated" in links else "sim")
     table = Table(title=f"{name}, link {chosen}")
     for title in ("check", "criterion", "measured", "verdict"):
@@ -79,8 +79,7 @@ def test(
     said = _Said()
     place = tempfile.TemporaryDirectory(prefix="gigabrain-")
     with said, place as folder, console.status("") as status:
-        running = find("gigabrain_drivers.conformance.kit:check")
-        results = run_async(running(name, chosen, Path(folder), status.update, repeat))
+        results = run_async(kit.check(name, chosen, Path(folder), status.update, repeat))
     for result in results:
         colour = COLOURS[result.verdict]
         table.add_row(*result[:-1], f"[{colour}]{result.verdict}[/]")
@@ -139,12 +138,13 @@ def trace(
     return int(not received)
 
 
-def _traced(name: str, link: str, part: str, seconds: float, speeds: dict[str, float]) -> bool:
+def _traced(name: str, link: LinkName, part: str, seconds: float, speeds: dict[str, float]) -> bool:
     """Print the bytes; whether any came from the body, or whoever was reading has seen enough."""
+    from gigabrain_drivers import trace
     from gigabrain_schemas.base import Velocity
 
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
-        tracing = find("gigabrain_drivers.trace:run")(
+        tracing = trace.run(
             name,
             link,
             Path(folder),
@@ -174,6 +174,8 @@ def new(name: str, *, folder: Path = Path()) -> int:
     folder
         Where the package's folder is made.
     """
-    path = find("gigabrain_drivers.conformance.new:write")(name, folder)
+    from gigabrain_drivers.conformance.new import write
+
+    path = write(name, folder)
     print(f"{path}: edit robot.yaml and driver.py; README.md says how to go on")
     return 0

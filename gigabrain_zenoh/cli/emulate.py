@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from gigabrain_zenoh.cli.checked import checked
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import EmulatorConfig
 from gigabrain_zenoh.stop_signals import run_async
 
@@ -28,10 +27,13 @@ def emulate(name: str, *, world: str = "arena", seed: int = 0, ports: Path | Non
     ports
         The folder in which its ports appear.
     """
-    folder = ports or find("gigabrain_drivers.catalog:ports_folder")(name)
+    from gigabrain_drivers.catalog import ports_folder
+    from gigabrain_drivers.emulators.process import emulate as emulated
+
+    folder = ports or ports_folder(name)
     values = {"body": name, "world": world, "seed": seed, "folder": str(folder.absolute())}
     config = checked(values, EmulatorConfig)
-    run_async(find("gigabrain_drivers.emulators.process:emulate")(config, _say))
+    run_async(emulated(config, _say))
     return 0
 
 

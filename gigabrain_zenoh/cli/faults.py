@@ -13,7 +13,6 @@ from cyclopts.validators import Number
 from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.where import show
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.stop_signals import run_async
 
 if TYPE_CHECKING:
@@ -44,12 +43,15 @@ class Robot:
 
     def check(self) -> None:
         """Raises ConfigError for what the suite cannot be run with."""
-        find("gigabrain_drivers.sim.worlds:load_world")(self.world, 0)
+        from gigabrain_drivers.catalog import load_robot, simulated
+        from gigabrain_drivers.sim.worlds import load_world
+
+        load_world(self.world, 0)
         if not self.body:
             return
-        sim = find("gigabrain_drivers.catalog:load_robot")(self.body).sim
+        sim = load_robot(self.body).sim
         if not sim or sim.get("driver") != "mujoco":
-            able = ", ".join(find("gigabrain_drivers.catalog:simulated")("sim"))
+            able = ", ".join(simulated("sim"))
             raise ConfigError(
                 f"--body {self.body}: no physics knows what becomes of it; choose of: {able}"
             )

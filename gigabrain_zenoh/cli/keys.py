@@ -1,17 +1,16 @@
 """`gigabrain keys`: a fleet's own authority, and identities for its hosts and people."""
 
+import contextlib
 import datetime
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 from gigabrain_zenoh.keys.checks import INSTALL
 from gigabrain_zenoh.keys.files import CA_KEY, CERTIFICATE
 from gigabrain_zenoh.keys.list_file import generations_in
 from gigabrain_zenoh.keys.roles import Role, common_name
-from gigabrain_zenoh.process import find
 
 SOON_DAYS = 30
 
@@ -28,8 +27,11 @@ def new(fleet: str, *, dir: Path | None = None) -> None:
     dir
         The folder to make; without it, one named after the fleet.
     """
+    with _importing():
+        from gigabrain_zenoh.keys.authority import new_fleet
+
     folder = dir or Path(fleet)
-    _find("authority:new_fleet")(fleet, folder)
+    new_fleet(fleet, folder)
     print(f"{folder / CA_KEY}: keep it on this machine; whoever has it can be anybody")
     print(f"next: gigabrain keys issue robot --host ADDRESS --dir {_quoted(folder)}")
 
@@ -63,9 +65,10 @@ def issue(
     dir
         The fleet's folder; without it, the only one here.
     """
-    folder = _find("authority:issue")(
-        _fleet(dir), role, robot=robot, name=name, hosts=host, days=days
-    )
+    with _importing():
+        from gigabrain_zenoh.keys import authority
+
+    folder = authority.issue(_fleet(dir), role, robot=robot, name=name, hosts=host, days=days)
     print(f"{folder}: copy it to its host, and let nobody else read it")
     print(f"next: {_use(role, robot, folder)}")
 
@@ -86,8 +89,11 @@ def revoke(role: Role, *, robot: str = "", dir: Path | None = None) -> None:
     dir
         The fleet's folder; without it, the only one here.
     """
+    with _importing():
+        from gigabrain_zenoh.keys import revoked
+
     folder = _fleet(dir)
-    lists = _find("revoked:revoke")(folder, role, robot)
+    lists = revoked.revoke(folder, role, robot)
     for path in lists:
         print(
             f"{path}: copy it into that identity's folder on its host, and start its router again"
@@ -138,8 +144,11 @@ def zenohd(
     dir
         The fleet's folder, where some of its identities were revoked.
     """
+    with _importing():
+        from gigabrain_zenoh.keys.zenohd import configuration
+
     generations = generations_in(_fleet(dir)) if dir else {}
-    print(_find("zenohd:configuration")(robot or ("",), str(keys), listen, generations), end="")
+    print(configuration(robot or ("",), str(keys), listen, generations), end="")
 
 
 def _use(role: Role, robot: str, folder: Path) -> str:
@@ -159,13 +168,16 @@ def _quoted(path: Path) -> str:
 
 def _listed(folder: Path) -> Iterator[tuple[str, bool]]:
     """A line for each identity in a fleet's folder, or for the only one, and whether it is good."""
+    with _importing():
+        from gigabrain_zenoh.keys import identity as identities
+
     places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
     now, generations = datetime.datetime.now(datetime.UTC), generations_in(folder)
     for place in places:
         if not (place / CERTIFICATE).exists():
             continue
         try:
-            identity = _find("identity:load")(place, now)
+            identity = identities.load(place, now)
         except GigabrainError as error:
             yield f"{place.name:<20} {error}", False
             continue
@@ -197,9 +209,10 @@ def _fleet(dir: Path | None) -> Path:
     return fleets[0]
 
 
-def _find(path: str) -> Any:
-    """What works with certificates. Raises ConfigError where the library for that is missing."""
+@contextlib.contextmanager
+def _importing() -> Iterator[None]:
+    """Import what works with certificates. Raises ConfigError where its library is missing."""
     try:
-        return find(f"gigabrain_zenoh.keys.{path}")
+        yield
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}; {INSTALL}") from None

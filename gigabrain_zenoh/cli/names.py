@@ -1,16 +1,16 @@
 """`gigabrain robots` and `gigabrain worlds`: what there is to choose from."""
 
-from gigabrain_zenoh.process import find
-
 
 def robots() -> None:
     """List the robots that there are.
 
     Example: gigabrain robots
     """
-    for name, path in find("gigabrain_drivers.catalog:robot_files")().items():
-        robot = find("gigabrain_drivers.catalog:load_robot")(name)
-        links = ", ".join(find("gigabrain_drivers.catalog:links_of")(robot))
+    from gigabrain_drivers.catalog import links_of, load_robot, robot_files
+
+    for name, path in robot_files().items():
+        robot = load_robot(name)
+        links = ", ".join(links_of(robot))
         print(f"{name:<20} {robot.summary} ({links})  {path}")
 
 
@@ -19,5 +19,7 @@ def worlds() -> None:
 
     Example: gigabrain worlds
     """
-    for name, about in find("gigabrain_drivers.sim.worlds:world_names")().items():
+    from gigabrain_drivers.sim.worlds import world_names
+
+    for name, about in world_names().items():
         print(f"{name:<14} {about}")

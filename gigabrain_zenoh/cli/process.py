@@ -14,7 +14,7 @@ from gigabrain_zenoh.cli.checked import checked
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.checks import identity_in
 from gigabrain_zenoh.logs import state_dir
-from gigabrain_zenoh.process import find, run
+from gigabrain_zenoh.process import run
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.running import announced, find_endpoint
 from gigabrain_zenoh.settings import (
@@ -182,6 +182,8 @@ def driver(
     remember
         The folder for what must survive a restart: what latched it.
     """
+    from gigabrain_drivers.catalog import load_robot
+
     label = place.namespace or Path(name).stem
     values = {
         "body": name,
@@ -194,7 +196,7 @@ def driver(
         "state_dir": str(remember or state_dir() / "robots" / label),
     }
     settings = checked(values, DriverConfig)
-    find("gigabrain_drivers.catalog:load_robot")(name)  # as above
+    load_robot(name)  # as above
     return _run("driver", place, msgspec.to_builtins(settings))
 
 
@@ -208,8 +210,10 @@ def button(*, port: str, place: Place = HERE) -> int:
     port
         The adapter: a path, or usb:VID:PID[:SERIAL].
     """
+    from gigabrain_drivers.links.ports import absent
+
     settings = checked({"port": port}, ButtonConfig)
-    if problem := find("gigabrain_drivers.links.ports:absent")(port):
+    if problem := absent(port):
         # the process itself says so only where it has a robot to stop
         print(f"gigabrain: {problem} Waiting for it.", file=sys.stderr)
     return _run("button", place, msgspec.to_builtins(settings))

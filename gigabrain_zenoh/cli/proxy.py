@@ -14,7 +14,6 @@ from gigabrain_zenoh.faults.call import Address
 from gigabrain_zenoh.faults.chaos import CALM, WAYS, Chaos, Told, Way, told
 from gigabrain_zenoh.faults.damage import Figures
 from gigabrain_zenoh.faults.proxy import TcpProxy
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.stop_signals import run_async
 from gigabrain_zenoh.typed import typed_lines
 
@@ -56,8 +55,9 @@ def proxy(
     """
     begin = told(chaos)
     if to.startswith("/"):
-        line_proxy = find("gigabrain_drivers.links.line_proxy:LineProxy")
-        made: Spoiled = line_proxy(to, _path(listen), baud=baud, seed=seed)
+        from gigabrain_drivers.links.line_proxy import LineProxy
+
+        made: Spoiled = LineProxy(to, _path(listen), baud=baud, seed=seed)
     else:
         made = TcpProxy(_address(to), _own(listen, insecure), seed=seed)
     run_async(_stand(made, begin, to))

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-from gigabrain_zenoh.process import find
-
 
 def view(
     *, png: Path, body: str = "turtlebot3_waffle", world: str = "house", seed: int = 0
@@ -23,5 +21,7 @@ def view(
     seed
         For the pose in which it stands there.
     """
-    find("gigabrain_drivers.sim.portrait:portray")(body, world, seed, png)
+    from gigabrain_drivers.sim.portrait import portray
+
+    portray(body, world, seed, png)
     print(png)

@@ -19,11 +19,13 @@ def warm() -> None:
 
 async def _all() -> None:
     """Both at a time: they share no kernel."""
-    from gigabrain_zenoh.compiling import DRIVING, FINDING, MAPPING
+    from gigabrain_zenoh.navigating import DRIVE_KERNELS
+    from gigabrain_zenoh.perception import LOCALIZE_KERNELS, MAP_KERNELS
 
     print("compiling, which takes up to a minute", flush=True)
     await asyncio.gather(
-        _compile("mapping", MAPPING, FINDING), _compile("planning and driving", DRIVING)
+        _compile("mapping", MAP_KERNELS, LOCALIZE_KERNELS),
+        _compile("planning and driving", DRIVE_KERNELS),
     )
 
 

@@ -16,8 +16,8 @@ from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.rig import Rig
 from gigabrain_zenoh.faults.stopping import Stop, stop_by
 from gigabrain_zenoh.faults.tampered import go_on, tampered
-from gigabrain_zenoh.perception import Floats
-from gigabrain_zenoh.safety import Inputs, Memory, step
+from gigabrain_zenoh.safety.step import Inputs, Memory, step
+from gigabrain_zenoh.scan import Floats
 from gigabrain_zenoh.settings import PerceptionConfig
 
 KINDS = ("nan", "half", "crooked")

@@ -1,10 +1,8 @@
 """The body that is tried where no robot runs."""
 
+from gigabrain_drivers.catalog import load_robot
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.faults.rig import BODIES, Rig
-from gigabrain_zenoh.process import find
-
-LOAD_ROBOT = "gigabrain_drivers.catalog:load_robot"
 
 
 def body_of(rig: Rig) -> str:
@@ -14,5 +12,4 @@ def body_of(rig: Rig) -> str:
 
 def description_of(rig: Rig) -> BodyDescription:
     """What its file says."""
-    description: BodyDescription = find(LOAD_ROBOT)(body_of(rig)).description()
-    return description
+    return load_robot(body_of(rig)).description()

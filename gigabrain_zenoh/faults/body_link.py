@@ -5,6 +5,8 @@ import itertools
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
+from gigabrain_drivers.conformance.noise import let_through, lost_after_garbage
+from gigabrain_drivers.links.line_proxy import in_front_of
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.faults.chaos import Chaos
 from gigabrain_zenoh.faults.fault import Failed, Measured
@@ -14,10 +16,7 @@ from gigabrain_zenoh.faults.stopping import TICK_MS
 from gigabrain_zenoh.faults.subject import Subject, configured
 from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.keeper import ProcessSpec
-from gigabrain_zenoh.process import find
 
-NOISE = "gigabrain_drivers.conformance.noise"
-IN_FRONT = "gigabrain_drivers.links.line_proxy:in_front_of"
 CHECK = "*{crc16}"  # at the end of a command; what it costs to have none: docs/firmware_line.md
 LINES, LONG_LINES = 20_000, 1_000_000
 BYTE_ERRORS = (0.001, 0.05)
@@ -60,11 +59,10 @@ async def serial_noise(rig: Rig) -> Measured:
         await subject.onlooker.ticks(NOISY_TICKS)
     await subject.break_body()
     lines = LONG_LINES if rig.long else LINES
-    let_through, lost = find(f"{NOISE}:let_through"), find(f"{NOISE}:lost_after_garbage")
     wrong = sum(let_through(CHECK, byte_errors, lines)[1] for byte_errors in BYTE_ERRORS)
     return {
         "wrong commands per million": wrong * 1e6 / lines,
-        "lines lost after garbage": lost(CHECK, 1000),
+        "lines lost after garbage": lost_after_garbage(CHECK, 1000),
         "deaths": subject.supervisor.deaths - deaths,
     }
 
@@ -90,7 +88,7 @@ async def tcp_cut(rig: Rig) -> Measured:
     deployment = deployment_of(rig.options, "tcp")
     async with (
         rig.new(deployment, functools.partial(_through, str(folder))) as subject,
-        find(IN_FRONT)(subject.ports, folder) as proxies,
+        in_front_of(subject.ports, folder) as proxies,
     ):
         proxy = next(p for p in proxies.values() if isinstance(p, TcpProxy))
         await subject.settle()

@@ -17,7 +17,7 @@ from gigabrain_zenoh.faults.hostile import as_map, codec_of
 from gigabrain_zenoh.faults.rig import Rig
 from gigabrain_zenoh.faults.tampered import go_on, tampered
 from gigabrain_zenoh.faults.waiting import until
-from gigabrain_zenoh.safety import Inputs, Memory, step
+from gigabrain_zenoh.safety.step import Inputs, Memory, step
 
 NEAR = 0.01  # of a threshold, on either side
 FULL, COOL, VOLTS = 80.0, 40.0, 12.0  # [%], [deg C], [V]

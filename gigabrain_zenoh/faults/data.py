@@ -7,7 +7,6 @@ from gigabrain_zenoh.faults.nonsense import hostile_values
 from gigabrain_zenoh.faults.obstacles import obstacle_at_stopping_distance, thin_obstacles
 from gigabrain_zenoh.faults.reversals import full_reversals
 from gigabrain_zenoh.faults.rig import Rig
-from gigabrain_zenoh.process import find
 
 __all__ = [
     "battery_and_temperature",
@@ -19,14 +18,11 @@ __all__ = [
     "thin_obstacles",
 ]
 
-TAPING = "gigabrain_zenoh.faults.taping:recorder_killed"
-
 
 async def recorder_killed(rig: Rig) -> Measured:
     """Where a recorder is installed."""
     try:
-        test = find(TAPING)
+        from gigabrain_zenoh.faults import taping
     except ModuleNotFoundError as error:
         raise Skipped(f"needs gigabrain-zenoh[record]: {error.name} is missing") from None
-    measured: Measured = await test(rig)
-    return measured
+    return await taping.recorder_killed(rig)

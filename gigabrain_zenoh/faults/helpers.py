@@ -3,14 +3,14 @@
 import asyncio
 import contextlib
 import os
-import resource
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager
-from pathlib import Path
+
+import psutil
 
 from gigabrain_zenoh import lifeline
-from gigabrain_zenoh.faults.fault import Skipped
+from gigabrain_zenoh.faults.fault import Failed
 from gigabrain_zenoh.faults.tampered import MODULES
 
 
@@ -40,21 +40,20 @@ async def helpers(module: str, words: list[str]) -> AsyncIterator[None]:
 
 
 def rss_mb(pid: int) -> float:
-    """The memory that a process holds [MB]. Raises Skipped where /proc does not say."""
-    pages = int(_read(pid, "statm").split()[1])
-    return pages * resource.getpagesize() / 1e6
+    """Return the memory that a process holds [MB]. Raises Failed where it has ended."""
+    with _looking_at(pid) as process:
+        return process.memory_info().rss / 1e6
 
 
 def open_files(pid: int) -> int:
-    """How many files, sockets and pipes it has open. Raises Skipped where /proc does not say."""
-    try:
-        return len(os.listdir(f"/proc/{pid}/fd"))
-    except OSError as error:
-        raise Skipped(f"needs /proc: {error}") from None
+    """Return how many files and sockets a process has open. Raises Failed where it has ended."""
+    with _looking_at(pid) as process:
+        return process.num_fds()
 
 
-def _read(pid: int, name: str) -> str:
+@contextlib.contextmanager
+def _looking_at(pid: int) -> Iterator[psutil.Process]:
     try:
-        return Path(f"/proc/{pid}/{name}").read_text()
-    except OSError as error:
-        raise Skipped(f"needs /proc: {error}") from None
+        yield psutil.Process(pid)
+    except psutil.Error:
+        raise Failed(f"process {pid} has ended") from None

@@ -27,7 +27,7 @@ from gigabrain_zenoh.faults.subject import Subject
 from gigabrain_zenoh.faults.waiting import until
 from gigabrain_zenoh.gate_state import BRAIN
 from gigabrain_zenoh.limits import limits_of
-from gigabrain_zenoh.safety import Inputs, Memory, step
+from gigabrain_zenoh.safety.step import Inputs, Memory, step
 from gigabrain_zenoh.settings import PerceptionConfig
 
 COMMANDS, LONG_COMMANDS = 20_000, 1_000_000

@@ -8,19 +8,18 @@ import itertools
 import math
 import random
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_drivers.sim.track import Track
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.faults.bodies import body_of
 from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.rig import Rig
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.stop_zone import brakes
 
-TRACK = "gigabrain_drivers.sim.track:Track"
 HALF_M = 5.0  # the walls are out of sight of most lidars
 RADII = (0.035, 0.010)  # [m], a leg of a person and one of a chair
 FULL, HALF = 1.0, 0.5  # of the body's greatest speed
@@ -63,9 +62,9 @@ async def thin_obstacles(rig: Rig) -> Measured:
 
 def _contacts(body: str, draw: Draw, share: float, number: int, chance: random.Random) -> int:
     """Of one run; every other post gives back one beam in two."""
-    empty = find(TRACK)(body, HALF_M, HALF_M)
+    empty = Track(body, HALF_M, HALF_M)
     way = draw(empty.body, share, RADII[number // 2 % len(RADII)], chance)
-    track = find(TRACK)(body, HALF_M, HALF_M, (way.post,), number)
+    track = Track(body, HALF_M, HALF_M, (way.post,), number)
     if number % 2:
         track.sees = dark(np.random.default_rng(number))
     track.go(way.ticks, way.linear_x, way.angular_z)
@@ -126,10 +125,10 @@ async def obstacle_at_stopping_distance(rig: Rig) -> Measured:
     }
 
 
-def _surprised(body: str, later_m: float, phase: float) -> Any:
+def _surprised(body: str, later_m: float, phase: float) -> Track:
     """A track whose body has stopped for a pillar that appeared at L(v) + `later_m`, and held."""
-    begin = 1.5 + phase * 0.1 * find(TRACK)(body, HALF_M, HALF_M).body.max_linear_speed
-    track = find(TRACK)(body, HALF_M, HALF_M, ((begin + PILLAR_M, 0.0, PILLAR_M),))
+    begin = 1.5 + phase * 0.1 * Track(body, HALF_M, HALF_M).body.max_linear_speed
+    track = Track(body, HALF_M, HALF_M, ((begin + PILLAR_M, 0.0, PILLAR_M),))
     front = max(x for x, _ in track.body.footprint)
     speed = track.body.max_linear_speed
     seen_m = brakes(track.body)["forward"].distance(speed) + later_m
@@ -150,7 +149,7 @@ def nothing(ranges: Ranges) -> Ranges:
     return np.full_like(ranges, np.inf)
 
 
-def _resumes_after_s(track: Any) -> float:
+def _resumes_after_s(track: Track) -> float:
     """From the obstacle's going until the body may go on [s]."""
     track.sees = nothing
     for tick in range(HOLD_TICKS):
@@ -162,8 +161,8 @@ def _resumes_after_s(track: Any) -> float:
 
 def _false_stops(rig: Rig) -> float:
     """The share of ticks in an empty corridor in which it was held back [%]."""
-    lab = find(TRACK)(body_of(rig), HALF_M, HALF_M)
-    track = find(TRACK)(body_of(rig), CORRIDOR_M, 2 * lab.radius)
+    lab = Track(body_of(rig), HALF_M, HALF_M)
+    track = Track(body_of(rig), CORRIDOR_M, 2 * lab.radius)
     ticks, held, way = LONG_CORRIDOR_TICKS if rig.long else CORRIDOR_TICKS, 0, 1.0
     for _ in range(ticks):
         x = track.simulation.truth.pose().x

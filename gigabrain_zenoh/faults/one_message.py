@@ -32,7 +32,7 @@ from gigabrain_zenoh.deployment import client_endpoint
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.faults.errand import PLACES, in_map, needs_navigation, waiting_robot
 from gigabrain_zenoh.faults.extremes import Case, fixed
-from gigabrain_zenoh.faults.fault import Failed, Measured, Skipped
+from gigabrain_zenoh.faults.fault import Failed, Measured
 from gigabrain_zenoh.faults.helpers import rss_mb
 from gigabrain_zenoh.faults.rig import Rig
 from gigabrain_zenoh.faults.subject import Subject
@@ -260,5 +260,5 @@ def _held_mb(pid: int) -> float:
     """The memory of a process [MB]; nan of one that has just ended."""
     try:
         return rss_mb(pid)
-    except Skipped:
+    except Failed:
         return math.nan

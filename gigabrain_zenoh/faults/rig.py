@@ -5,11 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self
 
+from gigabrain_drivers.emulators.emulator import wire_of
 from gigabrain_zenoh.backoff import Backoff
 from gigabrain_zenoh.deployment import Deployment
 from gigabrain_zenoh.faults.fault import Skipped, Stage
 from gigabrain_zenoh.faults.subject import TIRELESS, Change, Subject
-from gigabrain_zenoh.process import find
 from gigabrain_zenoh.settings import DecisionConfig, LinkName, PerceptionConfig, Resume
 
 SPEED = 0.26  # [m/s], of all tests that do not say otherwise
@@ -20,7 +20,6 @@ BODIES: dict[Stage, str] = {
     "serial": "mycustombot",
     "tcp": "alpha",
 }
-WIRES = "gigabrain_drivers.emulators.emulator:wire_of"
 
 
 @dataclass(frozen=True)
@@ -110,7 +109,7 @@ def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> 
     """What runs on a stage. Raises Skipped where the chosen body has no such link."""
     body = options.body or BODIES[stage]
     link: LinkName = "sim" if stage in ("sim", "auto") else "emulated"
-    wire: Literal["serial", "tcp", ""] = find(WIRES)(body) if link == "emulated" else ""
+    wire: Literal["serial", "tcp", ""] = wire_of(body) if link == "emulated" else ""
     if link == "emulated" and not (wire == stage or (wire and stage == "line")):
         raise Skipped(f"{body} has no {stage} line" if stage != "line" else f"{body} has no line")
     return Deployment(

@@ -24,7 +24,7 @@ from gigabrain_zenoh.faults.fault import (
     judge,
 )
 from gigabrain_zenoh.faults.rig import Options, Rig
-from gigabrain_zenoh.process import find
+from gigabrain_zenoh.plugins import find
 
 PATIENCE = 3  # disturbed runs at most, passed or failed, beside each that counts
 LIMIT_S = 300.0  # for one run of one test in its short form

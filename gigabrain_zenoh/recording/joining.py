@@ -10,10 +10,10 @@ from msgspec import Struct, structs
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.keys.checks import no_router
-from gigabrain_zenoh.process import ZENOH_RUNTIME
 from gigabrain_zenoh.running import find_endpoint
 from gigabrain_zenoh.scheduling import step_aside
 from gigabrain_zenoh.unobtrusive import NAP_S
+from gigabrain_zenoh.zenoh_config import ZENOH_RUNTIME
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 ROUTER_S = 3.0  # how long a router may take to answer

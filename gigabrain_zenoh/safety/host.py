@@ -2,10 +2,12 @@
 
 import shutil
 import threading
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
+import psutil
 
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import Thresholds
@@ -51,7 +53,8 @@ class HostWatch:
         self._disk_mb: float | None = None
         self._asking: threading.Thread | None = None
         self._next_ns = 0
-        self._times: list[tuple[int, int]] = []  # idle and all [jiffies], newest last
+        self._busy: deque[float] = deque(maxlen=LOOKS)  # [%] of all cores, since the look before
+        psutil.cpu_percent()  # from now on
         self._host = Host()
 
     def now(self, now_ns: int) -> Host:
@@ -61,21 +64,14 @@ class HostWatch:
             if self._asking is None or not self._asking.is_alive():
                 self._asking = threading.Thread(target=self._ask, name="disk", daemon=True)
                 self._asking.start()
-            self._host = Host(disk_mb=self._disk_mb, cpu=self._cpu(), memory=_memory())
+            self._busy.append(psutil.cpu_percent())
+            cpu = sum(self._busy) / LOOKS if len(self._busy) == LOOKS else None
+            memory = psutil.virtual_memory().percent
+            self._host = Host(disk_mb=self._disk_mb, cpu=cpu, memory=memory)
         return self._host
 
     def _ask(self) -> None:
         self._disk_mb = _disk_mb(self._folder)
-
-    def _cpu(self) -> float | None:
-        times = _processor_times()
-        if times is None:
-            return None
-        self._times = [*self._times, times][-LOOKS - 1 :]
-        if len(self._times) <= LOOKS:
-            return None
-        idle, total = (times[i] - self._times[0][i] for i in (0, 1))
-        return 100.0 * (1.0 - idle / total) if total else None
 
 
 def _disk_mb(folder: Path) -> float | None:
@@ -88,23 +84,3 @@ def _disk_mb(folder: Path) -> float | None:
         except OSError:
             return None
     return None
-
-
-def _processor_times() -> tuple[int, int] | None:
-    """Idle and all, from /proc/stat (proc(5)); None where there is none."""
-    try:
-        with Path("/proc/stat").open() as file:
-            times = [int(value) for value in file.readline().split()[1:9]]
-    except (OSError, ValueError):
-        return None
-    return (times[3] + times[4], sum(times)) if len(times) == 8 else None  # idle and iowait
-
-
-def _memory() -> float | None:
-    """From /proc/meminfo; None where there is none."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()[:8]
-        kb = {name: int(rest.split()[0]) for name, rest in (line.split(":") for line in lines)}
-        return 100.0 * (1.0 - kb["MemAvailable"] / kb["MemTotal"])
-    except (OSError, KeyError, ValueError, ZeroDivisionError):
-        return None

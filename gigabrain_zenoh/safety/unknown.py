@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.perception import Floats
 from gigabrain_zenoh.safety.looks import EDGE, Looks, free
+from gigabrain_zenoh.scan import Floats
 from gigabrain_zenoh.sweep import edges
 
 SECTORS = 36

@@ -28,7 +28,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh import gate
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.limits import limits_of
-from gigabrain_zenoh.safety import Inputs, Memory, step
+from gigabrain_zenoh.safety.step import Inputs, Memory, step
 
 BOOT, COMMANDER = 1, "blind"
 LATE_TICKS = 2  # from a verdict's making to the gate

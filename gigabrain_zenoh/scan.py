@@ -1,0 +1,76 @@
+"""What one scan of a planar lidar shows: where its beams end, and whether it can be believed."""
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.body import Lidar
+from gigabrain_schemas.sensors import LaserScan
+
+Floats = NDArray[np.float64]
+
+EDGE = 1e-9  # [rad], [m], so that rounding does not decide what lies on an edge
+STUCK_BEAMS = 8  # so many beams that all agree to the last bit come from a stuck lidar
+
+
+def scan_problem(lidar: Lidar, values: NDArray[np.float32], nearest: float) -> str:
+    """Why a scan must not be believed, or an empty text. A blind lidar is not free space.
+
+    `values` are the ranges (n,) [m]; those below `nearest` [m] are the lidar's own housing.
+    """
+    count = len(values)
+    if count != lidar.beams:
+        return f"the scan has {count} beams, the body's lidar {lidar.beams}"
+    seen = values >= nearest  # nan is not, nor is -inf (REP-117: too close to measure)
+    if lidar.no_return == "unknown":
+        seen &= values < np.inf
+    found = int(np.count_nonzero(seen))
+    if found == 0:
+        return "the lidar sees nothing at all"
+    if 2 * found <= count:
+        return f"{count - found} of {count} beams are missing"
+    alike = count >= STUCK_BEAMS and values[0] == values[1] < np.inf
+    if alike and (values == values[0]).all():
+        return "all beams report the same distance"
+    return ""
+
+
+def blind_ahead(lidar: Lidar, scan: LaserScan, nearest: float, cone_deg: float) -> str:
+    """Why nothing is known of the cone ahead (whole angle [deg]), or an empty text."""
+    values = ranges(scan)
+    cone = _beams_ahead(len(values), scan.angle_min, scan.angle_increment, lidar.yaw, cone_deg)
+    seen = int(np.count_nonzero(values[cone] >= nearest))
+    if 2 * seen <= len(cone):
+        return f"{len(cone) - seen} of {len(cone)} beams ahead are missing"
+    return ""
+
+
+def hits(lidar: Lidar, scan: LaserScan, nearest: float) -> tuple[Floats, Floats]:
+    """Where the beams of `scan` hit something: x and y in the body's frame [m], (n,) each."""
+    values = ranges(scan)
+    farthest = min(scan.range_max, lidar.range_max)
+    hit = (values >= nearest) & (values <= farthest)  # nan and inf are neither
+    cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
+    reached = values[hit]
+    return lidar.x + reached * cosines[hit], lidar.y + reached * sines[hit]
+
+
+@lru_cache(maxsize=8)
+def beams(
+    count: int, angle_min: float, angle_increment: float, yaw: float
+) -> tuple[Floats, Floats]:
+    """Cosines and sines of the beams' angles in the body's frame, (count,) each."""
+    angles = yaw + angle_min + angle_increment * np.arange(count)
+    return np.cos(angles), np.sin(angles)
+
+
+@lru_cache(maxsize=8)
+def _beams_ahead(
+    count: int, angle_min: float, angle_increment: float, yaw: float, cone_deg: float
+) -> NDArray[np.intp]:
+    """Indices of the beams that look into the cone ahead, as the lidar sees it."""
+    cosines, _ = beams(count, angle_min, angle_increment, yaw)
+    return np.flatnonzero(cosines >= math.cos(math.radians(cone_deg) / 2) - EDGE)
