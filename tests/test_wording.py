@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from gigabrain_drivers.conformance import kit
 from gigabrain_drivers.links import link as links
 from gigabrain_drivers.links.wording import Spelling, Wording, of_command, whole
 from gigabrain_drivers.protocols import (
@@ -188,10 +189,7 @@ def test_the_kit_tells_in_one_line_what_it_has_broken_on_purpose(
             logging.getLogger("somebody.elses.driver").warning("the firmware reports: %s", text)
         return []
 
-    found = driver_kit.find
-    monkeypatch.setattr(
-        driver_kit, "find", lambda path: check if path.endswith("kit:check") else found(path)
-    )
+    monkeypatch.setattr(kit, "check", check)
     assert driver_kit.test("mycustombot") == 0
     assert capsys.readouterr().out.splitlines()[0] == (
         "what was broken on purpose, in its own words: the firmware reports: watchdog (2 times); "
