@@ -10,13 +10,13 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Velocity
-from gigabrain_schemas.body import GateStatus
+from gigabrain_schemas.body import GateStatus, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import BODY, CMD_VEL, STATE
 from gigabrain_zenoh.bus import Bus, Latest
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.faults import clock
-from gigabrain_zenoh.faults.body_link import straight_ticks
+from gigabrain_zenoh.faults.body_link import first_disobeyed
 from gigabrain_zenoh.faults.clock import OtherHost, age_error_ms
 from gigabrain_zenoh.faults.estop import Presses
 from gigabrain_zenoh.faults.onlooker import Onlooker
@@ -166,9 +166,18 @@ async def test_a_press_takes_as_long_as_its_answer_however_few_ticks_that_are() 
     assert min(figures["answer"], figures["answer p99"], figures["zero"]) >= 200.0
 
 
-def test_a_body_that_was_told_to_turn_was_not_told_to_go_straight() -> None:
-    told = (0.0, 0.0, 0.9, -0.9, 0.1, 0.0, 0.0)
-    states = [replace(state(tick), sent=Velocity(angular_z=w)) for tick, w in enumerate(told)]
-    assert straight_ticks(states) == 3
-    assert straight_ticks(states[:2]) == 2
-    assert straight_ticks([]) == 0
+def turned(*pairs: tuple[float, float]) -> list[RobotState]:
+    """States in which the body was told to turn, and turned, so fast [rad/s]."""
+    return [
+        replace(state(tick), sent=Velocity(angular_z=told), velocity=Velocity(angular_z=measured))
+        for tick, (told, measured) in enumerate(pairs)
+    ]
+
+
+def test_a_body_disobeys_from_when_it_turns_unlike_all_it_was_told_of_late() -> None:
+    straight, swings = (0.0, 0.0), (0.0, 0.9)
+    assert first_disobeyed(turned(*[straight] * 3, *[swings] * 5)) == 3
+    # it was told so a while ago, and may still turn for its own lag of 15 ticks
+    assert first_disobeyed(turned((0.9, 0.0), (0.9, 0.9), *[swings] * 30)) == 17
+    # the other way round is no obedience
+    assert first_disobeyed(turned((-0.9, 0.0), straight, *[swings] * 5)) == 2
