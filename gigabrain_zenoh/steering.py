@@ -244,7 +244,12 @@ class Steering:
         """Have a route thought of where one is due."""
         grid = self._grid(world.boot, world.basis)
         self._oriented = self._oriented or grid is not None
-        if order is None or grid is None or self._here is None or not self._beside.idle:
+        if order is None or grid is None or self._here is None:
+            return
+        cells = grid.width * grid.height
+        scans = DUE_SCANS + cells // LARGE
+        if not self._beside.idle:  # maybe with a larger map, which this one has replaced
+            self._beside.hasten(scans)
             return
         if not self._due(order, world.basis, grid):
             return
@@ -261,11 +266,10 @@ class Steering:
             slowed_by="; ".join(one.text for one in verdict.causes)[:300] if verdict else "",
         )
         self._held_ticks = 0
-        cells = grid.width * grid.height
         if cells <= SMALL:
             self._route = self._guide.think(asked)
         else:
-            self._beside.start(lambda: self._thought_of(asked), DUE_SCANS + cells // LARGE)
+            self._beside.start(lambda: self._thought_of(asked), scans)
 
     def _thought_of(self, asked: Asked) -> Take:
         """In a thread of its own: the route, and what makes it count."""

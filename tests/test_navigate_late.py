@@ -9,7 +9,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import GoalRequest
-from gigabrain_schemas.topics import GOAL
+from gigabrain_schemas.topics import GOAL, MAP
 from gigabrain_zenoh import steering
 from gigabrain_zenoh.behaviours.bearings import Route
 from gigabrain_zenoh.behaviours.guide import Asked, Guide
@@ -17,7 +17,7 @@ from gigabrain_zenoh.navigating import Navigating
 from gigabrain_zenoh.settings import DecisionConfig
 from tests.brain_rig import BOOT, state
 from tests.bus_rig import Net
-from tests.plane_rig import ROOM, Plane, drawn
+from tests.plane_rig import ROOM, Plane, as_map, drawn
 
 CELLS = drawn(ROOM)
 STANDS = Velocity()
@@ -104,6 +104,22 @@ async def test_in_a_large_map_a_way_counts_from_the_same_scan_however_long_it_ta
     quick = await ticks_to_a_way(monkeypatch, 0.0)
     assert await ticks_to_a_way(monkeypatch, 0.1) == quick
     assert quick[0] - 10 == 15
+
+
+async def test_a_plan_for_a_huge_map_does_not_delay_the_first_one_for_the_real_map() -> None:
+    huge = np.zeros((2800, 2800), np.int8)
+    async with Plane(CELLS) as plane:
+        await plane.go(0.2)
+        plane.bench.send(MAP, as_map(huge, plane.tick, plane.boot))
+        await plane.go(0.1)
+        await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
+        await plane.go(0.2)
+        assert plane.intent.reason == "waiting: for a way through the map"
+        began = plane.tick
+        plane.bench.send(MAP, as_map(CELLS, plane.tick, plane.boot))
+        while plane.intent.reason == "waiting: for a way through the map":
+            await plane.go(0.02)
+        assert plane.tick - began <= 25
 
 
 async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_that_is() -> None:

@@ -169,14 +169,16 @@ class Sender:
         await self._until(self._drives)
         again_s, now = loop.time() - began_s, self._pids()
         ended = tuple(name for name, pid in before.items() if now.get(name) != pid)
+        growth: dict[str, float] = {}
 
-        def grown() -> dict[str, float]:
-            return {name: _held_mb(now[name]) - mb for name, mb in held_mb.items() if name in now}
+        def small() -> bool:
+            for name, mb in held_mb.items():
+                growth[name] = _held_mb(now[name]) - mb if name in now else 0.0
+            return not any(mb > GROWN_MB for name, mb in growth.items() if name not in ended)
 
         # what it holds until the robot's own message has taken the place of this one is no growth
-        await self._until(lambda: not any(mb > GROWN_MB for mb in grown().values()))
-        growth = {name: mb for name, mb in grown().items() if name not in ended}
-        most = max(growth, key=growth.__getitem__, default="")
+        await self._until(small)
+        most = max(set(growth) - set(ended), key=growth.__getitem__, default="")
         return Outcome(
             number=case.number,
             what=str(case),

@@ -40,6 +40,10 @@ class Background:
         """Begin; the result is due in so many scans."""
         self._job, self._left = self._pool.submit(work), scans
 
+    def hasten(self, scans: int) -> None:
+        """Make the result due in `scans` at most, if there is work under way."""
+        self._left = min(self._left, scans)
+
     def at_scan(self) -> None:
         """Take the result, when it is due at this scan and there. Raises what the work raised."""
         if self._job is None:
