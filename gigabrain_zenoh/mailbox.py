@@ -1,4 +1,4 @@
-"""The newest samples of one subscription, on their way to the loop."""
+"""Bounded mailbox that carries the newest samples of one subscription to the event loop."""
 
 from collections import deque
 from collections.abc import Callable
@@ -9,14 +9,15 @@ from gigabrain_zenoh.bridge import Bridge
 T = TypeVar("T")
 
 
-SPARE = 8  # samples from which the newest that can be read is taken
+SPARE = 8  # samples kept at depth 1, of which the newest readable one is delivered
 
 
 class Mailbox(Generic[T]):
-    """Holds `depth` samples while the loop is busy; the oldest give way to newer ones.
+    """Queue of at most `depth` samples for a busy event loop; new samples replace the oldest.
 
-    Where only the newest counts it is the newest that can be read (`on_sample` does not say False):
-    whoever sends nonsense must not push out what is good.
+    With `depth` 1, only the newest readable sample is delivered. A sample is unreadable if
+    `on_sample` returns False. The mailbox keeps a few spares, so that invalid samples do not
+    displace a valid one.
     """
 
     def __init__(self, bridge: Bridge, on_sample: Callable[[T], bool | None], depth: int) -> None:
@@ -26,14 +27,14 @@ class Mailbox(Generic[T]):
         self._posted = False
 
     def put(self, sample: T) -> None:
-        """Take a sample. From any thread; never blocks."""
+        """Store a sample and wake the event loop. Never blocks; may be called from any thread."""
         self._samples.append(sample)
         if not self._posted:
             self._posted = True
             self._bridge.post(Mailbox._deliver, self)
 
     def _deliver(self) -> None:
-        self._posted = False  # before emptying: what comes now is posted again
+        self._posted = False  # before emptying, so that samples arriving from now on post again
         if self._newest_only:
             self._deliver_newest()
             return

@@ -1,6 +1,6 @@
-"""What perception does beside the world: where the robot is in the map, and the map itself.
+"""Localization and mapping in the perception process: the robot's pose in the map, and the map.
 
-It comes after the world of the same scan, and takes the odometry of the scan's own tick.
+Each scan is processed after its world model is published, with the odometry of the scan's tick.
 """
 
 import asyncio
@@ -35,16 +35,16 @@ from gigabrain_zenoh.settings import PerceptionConfig
 
 log = logging.getLogger(__name__)
 
-MAP_TICKS = round(1e9 / TICK_NS)  # from one map to the next, at least
-MAP_AGAIN_TICKS = 2 * MAP_TICKS  # and at most, though nothing has changed
-FREE_M = 10.0  # a beam that hit nothing counts as free so far at most
-SHORT_M = 0.05  # and ends so much before the lidar's range
-SETTLE_NS, SETTLES = 20_000_000, 100  # a save waits for the work beside, and how often
-TIMED = 1000  # scans whose time is kept
+MAP_TICKS = round(1e9 / TICK_NS)  # shortest interval between published maps
+MAP_AGAIN_TICKS = 2 * MAP_TICKS  # interval after which an unchanged map is published again
+FREE_M = 10.0  # a beam without a hit marks free space up to this distance at most,
+SHORT_M = 0.05  # and ends this much before the lidar's range
+SETTLE_NS, SETTLES = 20_000_000, 100  # poll interval and count: a save waits for idle threads
+TIMED = 1000  # scans whose processing time is kept for the percentiles
 
 
 def chart_of(config: PerceptionConfig, in_time: InTime = done) -> Chart:
-    """The map that the settings ask for. Raises ConfigError."""
+    """Load or create the map that the settings request. Raises ConfigError."""
     path = map_file.path_of(config.map) if config.map else None
     if config.mapping == "localize":
         if path is None:
@@ -53,7 +53,7 @@ def chart_of(config: PerceptionConfig, in_time: InTime = done) -> Chart:
         if problem := map_file.what_is_wrong(saved):
             raise ConfigError(f"{path}: {problem}; expected one to find the way in")
         return KnownMap(saved, in_time=in_time)
-    from gigabrain_zenoh.mapping.growing import GrowingMap  # and gtsam: only who makes maps pays
+    from gigabrain_zenoh.mapping.growing import GrowingMap  # imports gtsam: for slam only
 
     if path:
         graph = map_file.load_graph(path)
@@ -65,7 +65,7 @@ def chart_of(config: PerceptionConfig, in_time: InTime = done) -> Chart:
 
 
 def view_of(lidar: Lidar, scan: LaserScan, ignore_below: float) -> View:
-    """The scan in the body's frame, as points and as ways that are free."""
+    """Convert a scan to hit points and the ends of free beams, in the body's frame [m]."""
     values = ranges(scan)
     points = np.column_stack(hits(lidar, scan, ignore_below))
     cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
@@ -77,35 +77,35 @@ def view_of(lidar: Lidar, scan: LaserScan, ignore_below: float) -> View:
 
 
 class Mapper:
-    """Publishes `robot/pose` and `robot/map`, and answers `robot/map_save`."""
+    """Publisher of `robot/pose` and `robot/map`, and server of `robot/map_save`."""
 
     def __init__(self, config: PerceptionConfig, bus: Bus, bodies: Latest[Body]) -> None:
         self._config, self._bus, self._bodies = config, bus, bodies
         self._chart = chart_of(config, bus.journal.in_time)
         self._fusion, self._boot = Fusion(), 0
-        self._last: Moment | None = None  # of the last scan that was taken
-        self._blank = not config.map  # nothing is in the map yet
-        self._mapped = False  # whether this process has taken a scan
+        self._last: Moment | None = None  # at the last scan that was processed
+        self._blank = not config.map  # the map is still empty
+        self._mapped = False  # this process has processed a scan, or restored a map
         self._shown: OccupancyGrid | None = None
         self._shown_tick = self._said_tick = 0
         saves = config.mapping == "slam" and config.state_dir and bus.journal.live
         self._autosave = Autosave(Path(config.state_dir)) if saves else None
-        self._before: Moment | None = None  # of the last scan of a process that has died
+        self._before: Moment | None = None  # at the last scan in a restored map
         self._said, self._left_out = "", ""
-        self._early = False  # a first scan has come without its odometry
+        self._early = False  # the first scan arrived without its odometry
         self._took_ms = Newest(TIMED)
-        self._saving = asyncio.Lock()  # two at once would write into each other's files
+        self._saving = asyncio.Lock()  # concurrent saves would write to the same files
         bus.serve(MAP_SAVE, self._save)
         bus.report = self._report
 
     def see(self, scan: LaserScan, problem: str) -> None:
-        """Take a scan, unless there is a `problem` with it."""
+        """Process a scan, or skip it if `problem` is not empty or its odometry is missing."""
         if problem:
             self._leave_out(problem)
             return
         moment = self._fusion.at(scan.basis) if scan.boot == self._boot else None
         if moment is None and self._last is None and not self._early:
-            self._early = True  # its odometry went by before this process could hear it
+            self._early = True  # its odometry was published before this process subscribed
             self._bus.counters["scans_left_out"] += 1
         elif moment is None or (self._last and moment.tick <= self._last.tick):
             self._leave_out("there is no odometry for its tick")
@@ -113,26 +113,26 @@ class Mapper:
             self._take(scan, moment)
 
     def miss(self, scan: LaserScan, tick: int) -> None:
-        """Leave out a scan whose tick has not come by `tick`, when the next scan has."""
+        """Skip a scan whose state had not arrived by `tick`, when the next scan came."""
         self._leave_out(f"it claims to be of tick {scan.basis}, which had not come by tick {tick}")
 
     def close(self) -> None:
-        """End what runs beside."""
+        """Stop the worker threads."""
         self._chart.close()
         if self._autosave:
             self._autosave.close()
 
     def hear(self, state: RobotState) -> None:
-        """Take a state, before any scan that rests on it."""
+        """Add a robot state; must be called before `see` for scans of the same tick."""
         body = self._bodies.current
         if body:
             self._begin_anew(state.boot)
             self._fusion.add(state, body.description)
 
     def _begin_anew(self, boot: int) -> None:
-        """After a new start of the driver the odometry begins elsewhere; the map stays.
+        """Reset the odometry when the driver has restarted; the map is kept.
 
-        After one of this process, the map of before goes on if the driver is still the same.
+        If this process has restarted and the driver has not, resume the last autosaved map.
         """
         if boot == self._boot:
             return
@@ -144,8 +144,8 @@ class Mapper:
             self._go_on(self._autosave, boot)
 
     def _go_on(self, autosave: Autosave, boot: int) -> None:
-        """Take the newest map of this start of the driver that is whole, if there is one."""
-        from gigabrain_zenoh.mapping.growing import GrowingMap  # and gtsam, as above
+        """Resume the newest intact map that was saved during this run of the driver, if any."""
+        from gigabrain_zenoh.mapping.growing import GrowingMap  # imports gtsam, as above
 
         for head, arrays in autosave.found(boot):
             last = None if head.place is None else np.array(head.place)
@@ -180,10 +180,10 @@ class Mapper:
         self._took_ms.add((time.perf_counter() - began) * 1e3)
 
     def _way(self, moment: Moment) -> tuple[Floats, Floats]:
-        """From the last scan to this one (3,), and its covariance (3, 3).
+        """Return the motion from the last scan to this one (3,), and its covariance (3, 3).
 
-        The first of a new map lies where odometry has it: should this process have died, places in
-        the map stay the same ones, but for what odometry has drifted since.
+        The first scan of a new map is placed at its odometry pose. After a crash of this process,
+        positions in the map thus stay the same, except for the odometry drift since then.
         """
         last = self._last or self._before or moment
         self._last, self._before = moment, None
@@ -194,9 +194,10 @@ class Mapper:
         return moment.fused if blank else step, noise
 
     def _keep(self, autosave: Autosave, before: Moment) -> None:
-        """Save the map as it was at the scan `before`, when it is time to.
+        """Save the map as it was at the scan `before`, when a save is due.
 
-        A copy costs little and changes nothing that follows, so runs that save are the same.
+        The copy is cheap and does not alter the map. A run with saves and a run without behave the
+        same.
         """
         still = self._chart.kept()
         if still:
@@ -205,9 +206,10 @@ class Mapper:
             self._chart.keep()
 
     def _show(self, tick: int) -> None:
-        """Publish the map when it is time to and it has changed, or has not been said for long.
+        """Publish the map when it has changed, at most every MAP_TICKS.
 
-        Somebody else's may have taken its place meanwhile.
+        An unchanged map is published again after MAP_AGAIN_TICKS, in case another publisher has
+        replaced it.
         """
         if self._shown and tick < self._shown_tick + MAP_TICKS:
             return
@@ -220,7 +222,7 @@ class Mapper:
             self._shown, self._said_tick = grid, tick
 
     def _tell_problems(self) -> None:
-        """Say what cannot be done: once in the log, and in the health for as long as it lasts."""
+        """Log each new problem once, and list all current problems in the health messages."""
         problems, known = self._chart.problems(), self._bus.problems
         if self._autosave and self._autosave.problem:
             problems = (*problems, self._autosave.problem)
@@ -231,7 +233,7 @@ class Mapper:
         self._bus.counters["optimiser_rebuilt"] = self._chart.report().get("optimiser_rebuilt", 0)
 
     def _tell(self, place: Place) -> None:
-        """Say once in the log whether it is known where the robot is, and why not."""
+        """Log changes of the localization, with the reason when the robot is not localized."""
         said = "localized" if place.localized else f"not localized: {place.why}"
         if said == self._said:
             return
@@ -277,7 +279,7 @@ class Mapper:
 
 
 def message_of(place: Place) -> PoseInMap:
-    """The place as others see it."""
+    """Convert a localizer's result to a PoseInMap message."""
     x, y, yaw = place.pose.tolist()
     return PoseInMap(
         x=x,

@@ -1,4 +1,4 @@
-"""A process's way to its session, and what is said while that takes longer than it should."""
+"""Opens a process's session, and logs what it waits for when that takes too long."""
 
 import asyncio
 import contextlib
@@ -16,15 +16,15 @@ from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 log = logging.getLogger("gigabrain")
 
-PATIENCE_S = 1.0  # how long the router may be missing before somebody is told
-AGAIN_S = 1.0  # between two looks at whether a host's name is known by now
+PATIENCE_S = 1.0  # how long the router may be missing before a warning is logged
+AGAIN_S = 1.0  # between attempts to resolve a host name
 
 
 async def join(endpoint: Endpoint) -> ZenohTransport:
-    """Open the session, and say so once when that takes longer than a person would wait.
+    """Open the session. Log a warning once if the router is missing for longer than PATIENCE_S.
 
-    Raises BusError when a router cannot listen, ConfigError for what can never be right, such as
-    our own keys.
+    Raises BusError when a router cannot listen. Raises ConfigError for errors that waiting cannot
+    mend, such as invalid keys of this process.
     """
     session_config(endpoint)
     await _know(endpoint.listen)
@@ -32,7 +32,7 @@ async def join(endpoint: Endpoint) -> ZenohTransport:
     try:
         done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
         if not done:
-            if endpoint.keys:  # a router turns bad ones away without a word
+            if endpoint.keys:  # a router rejects invalid keys without an error
                 await asyncio.to_thread(identity_in, Path(endpoint.keys))
             await _explain(endpoint, opening)
         return await opening
@@ -41,9 +41,10 @@ async def join(endpoint: Endpoint) -> ZenohTransport:
 
 
 async def unknown_host(endpoints: Iterable[str]) -> str:
-    """The first host in these endpoints whose name nobody knows here, or nothing.
+    """Return the first host in these endpoints whose name cannot be resolved, or an empty text.
 
-    In a daemon thread: a resolver may take many seconds, and the process must be able to end.
+    Resolves in a daemon thread: a resolver may take many seconds, and must not delay the process's
+    exit.
     """
     hosts = [host for host, _ in map(host_and_port, endpoints) if host and not is_ip(host)]
     if not hosts:
@@ -57,7 +58,7 @@ async def unknown_host(endpoints: Iterable[str]) -> str:
 
     def work() -> None:
         unknown = next((host for host in hosts if not _known(host)), "")
-        with contextlib.suppress(RuntimeError):  # the loop is gone
+        with contextlib.suppress(RuntimeError):  # the loop is closed
             loop.call_soon_threadsafe(settle, unknown)
 
     threading.Thread(target=work, name="resolver", daemon=True).start()
@@ -73,7 +74,10 @@ def _known(host: str) -> bool:
 
 
 async def _know(listen: Iterable[str]) -> None:
-    """Wait until a router's own address has a meaning: at boot, names may come later than it."""
+    """Wait until the router's own listen addresses resolve.
+
+    At boot, name resolution may start later than the router.
+    """
     said = ""
     while host := await unknown_host(listen):
         if host != said:
@@ -83,7 +87,7 @@ async def _know(listen: Iterable[str]) -> None:
 
 
 async def _explain(endpoint: Endpoint, opening: asyncio.Future[ZenohTransport]) -> None:
-    """Say what is waited for, unless that comes while the resolver still thinks."""
+    """Log what the session waits for, unless it opens while the host name is being resolved."""
     naming = asyncio.ensure_future(unknown_host(endpoint.connect))
     try:
         await asyncio.wait((opening, naming), return_when=asyncio.FIRST_COMPLETED)

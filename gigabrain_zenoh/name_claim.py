@@ -1,9 +1,10 @@
-"""Answers `robot/describe/<process>`, and sees to it that one process alone has that name.
+"""Serves `robot/describe/<process>`, and ensures that only one process has that name.
 
-A process answers first and asks afterwards, so of two that start together at least one hears of
-the other. Who has got further stays: it already works, or it has settled, having asked for some
-seconds more. Those seconds are for slow links, over which another process is heard of late. Of
-two that have got equally far the smaller instance number stays.
+A process starts to answer before it queries the name. Of two processes that start together, at
+least one therefore receives an answer from the other. The process that is further along stays:
+"settled" before "working" before "starting". A process settles after it has queried again for some
+seconds, because over a slow link another process's answers arrive late. If both are equally far,
+the smaller instance number stays.
 """
 
 import os
@@ -16,39 +17,45 @@ from gigabrain_schemas.topics import DESCRIBE
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import ConfigError, Refused
 
-ASK_S = 2.0  # how long an answer may take; who is alone does not wait
-AGAIN_NS = 100_000_000  # until one that has to leave, or refused to answer, is asked again
-TRIES = 10  # then a process that only refuses is ignored
-CONFIRM_NS = (1_000_000_000, 3_000_000_000)  # pauses before the questions that follow the first
+ASK_S = 2.0  # how long an answer may take; without other processes there is no wait
+AGAIN_NS = 100_000_000  # until a process that has to exit, or refused to answer, is queried again
+TRIES = 10  # after this many refusals a process is ignored
+CONFIRM_NS = (1_000_000_000, 3_000_000_000)  # pauses before each query after the first
 
 
 class NameClaim:
-    """The claim of one process to its name."""
+    """A process's claim to its name, from start to settled."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus, self.instance = bus, secrets.randbits(62)
         self.claim: Claim = "starting"
 
     async def take(self) -> None:
-        """Answer to the name. Raises ConfigError where another process has it."""
+        """Serve the name and wait until no other process has it.
+
+        Raises ConfigError where another process keeps the name.
+        """
         self._bus.serve(DESCRIBE, self._describe, name=self._bus.process)
         await self._alone()
         self.claim = "working"
 
     async def keep(self) -> None:
-        """Ask again while the process begins its work. Raises ConfigError, as `take`."""
+        """Query the name again after each pause, then settle. Raises ConfigError like `take`."""
         for pause_ns in CONFIRM_NS:
             await self._bus.clock.sleep_ns(pause_ns)
             await self._alone()
         self.claim = "settled"
 
     async def _alone(self) -> None:
-        """Wait until nobody else answers to the name."""
+        """Wait until no other process answers to the name."""
         while await self._others():
             await self._bus.clock.sleep_ns(AGAIN_NS)
 
     async def _others(self) -> bool:
-        """Whether others answer that have to leave. Raises ConfigError if this one has to."""
+        """Return whether other processes answer that have to exit.
+
+        Raises ConfigError if this process has to exit.
+        """
         name = self._bus.process
         others = [other for other in await self._told() if other.instance != self.instance]
         for other in others:
@@ -60,17 +67,17 @@ class NameClaim:
         return bool(others)
 
     async def _told(self) -> list[Description]:
-        """Ask every process of this name; ask again after a refusal, as during a flood."""
+        """Query every process of this name; retry after a refusal, as during a flood of queries."""
         for _ in range(TRIES):
             try:
                 name = self._bus.process
                 return await self._bus.ask(DESCRIBE, DescribeRequest(), timeout_s=ASK_S, name=name)
             except Refused:
                 await self._bus.clock.sleep_ns(AGAIN_NS)
-        return []  # errors alone claim no name
+        return []  # a process that only refuses does not claim the name
 
     async def _describe(self, _: DescribeRequest) -> Description:
-        from gigabrain_zenoh.version import __version__  # 25 ms, which no start should wait for
+        from gigabrain_zenoh.version import __version__  # 25 ms, so imported lazily
 
         bus = self._bus
         return Description(
@@ -87,5 +94,5 @@ class NameClaim:
 
 
 def _strength(claim: Claim, instance: int) -> tuple[int, int]:
-    """The greater one stays."""
+    """Return the rank of a claim; the process with the greater rank stays."""
     return get_args(Claim).index(claim), -instance

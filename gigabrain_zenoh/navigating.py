@@ -1,6 +1,6 @@
-"""What decision serves when its robot is sent to places.
+"""Inputs and services that decision needs for the behaviour `navigate`.
 
-Goals are taken from the start; what it takes to drive there is got ready meanwhile.
+Goals are accepted from the start, while the planning kernels still compile.
 """
 
 import asyncio
@@ -22,14 +22,14 @@ from gigabrain_zenoh.tasks.service import TaskService
 if TYPE_CHECKING:
     from gigabrain_zenoh.steering import Steering
 
-DRIVE_KERNELS = "gigabrain_zenoh.steering:warm_up"  # calls all that is compiled for it once
+DRIVE_KERNELS = "gigabrain_zenoh.steering:warm_up"  # calls each kernel once, to compile it
 GETTING_READY = "it is getting ready"
-TOLD_NS = 200_000_000  # from one word about that to the next
-PATIENCE_NS, LOOK_NS = 700_000_000, 50_000_000  # for the first word of the place, when asked
+TOLD_NS = 200_000_000  # interval between status updates while getting ready
+PATIENCE_NS, LOOK_NS = 700_000_000, 50_000_000  # wait for a first pose; poll interval
 
 
 class Navigating:
-    """The senses of the behaviour `navigate`: its orders, and by what it carries them out."""
+    """Provider of orders and situations for the behaviour `navigate`."""
 
     def __init__(self, config: DecisionConfig, bus: Bus) -> None:
         self._bus, self._config = bus, config
@@ -39,13 +39,13 @@ class Navigating:
         self._begun = False
 
     async def warm_up(self) -> None:
-        """Import and compile all that a driving robot calls. Raises ConfigError."""
+        """Import and compile everything that driving needs. Raises ConfigError."""
         telling = asyncio.ensure_future(self._tell())
         try:
             await compiled(DRIVE_KERNELS)
         finally:
             telling.cancel()
-        from gigabrain_zenoh.steering import Steering  # and numba: only who drives by it pays
+        from gigabrain_zenoh.steering import Steering  # imports numba: for `navigate` only
 
         self._ready = Steering(self._config, self._bus)
 
@@ -60,13 +60,13 @@ class Navigating:
         return self._ready
 
     def see(self, state: RobotState) -> None:
-        """Take note of each state."""
+        """Record a robot state; to be called with every state."""
         self._steering.see(state)
 
     def situation(
         self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
     ) -> Situation:
-        """Where the robot is, what it is to do, and which way."""
+        """Return the robot's pose, its current order and its route."""
         if self._config.begin == "roam" and not self._begun:
             self._service.begin(roaming(), "roaming", state.boot)
         self._begun = True
@@ -77,22 +77,22 @@ class Navigating:
         return self._steering.situation(state, world, verdict, order, waits)
 
     def heed(self, behaviour: Behaviour) -> None:
-        """What became of the order goes to the tasks."""
+        """Record the order's outcome, which the task service receives at the next step."""
         self._outcome = self._steering.heed(behaviour)
 
     @property
     def hung(self) -> bool:
-        """Whether a part of it never ends, while the rest goes on."""
+        """Return whether a plan in the worker thread is so overdue that it will never finish."""
         return self._ready is not None and self._ready.hung
 
     async def close(self) -> None:
-        """Once all is written down."""
+        """Close the task service after its last write, then stop the worker thread."""
         await self._service.close()
         if self._ready:
             self._ready.close()
 
     async def can_drive(self) -> None:
-        """Raises Refused where nobody says where the robot is, with what to change."""
+        """Wait briefly for a pose in the map; raise Refused, with a remedy, if there is none."""
         for _ in range(PATIENCE_NS // LOOK_NS):
             if self._waits or self._steering.placed:
                 return
@@ -100,7 +100,10 @@ class Navigating:
         raise Refused(self._steering.lost)
 
     async def can_reach(self, goal: Goal) -> str:
-        """How it would get there, or what that waits for, in words. Raises Refused, and why."""
+        """Return in words how the robot would reach `goal`, or what that waits for.
+
+        Raises Refused, with the reason, where the goal cannot be reached.
+        """
         await self.can_drive()
         waits = self._waits
         return f"accepted; {waits}" if waits else await self._steering.way_to(goal)

@@ -1,7 +1,7 @@
-"""Numba without what it looks for and we do not use.
+"""Imports numba without optional packages that it looks for and this project does not use.
 
-Where these packages happen to be installed, their import takes as long as loading all our kernels:
-scipy's BLAS, coverage's measuring of compiled functions, and cffi with its parser of C.
+Where these packages are installed, importing them takes as long as loading all our kernels. They
+are scipy's BLAS, coverage's measuring of compiled functions, and cffi with its C parser.
 """
 
 import importlib
@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from typing import Any
 
 UNUSED = ("scipy.linalg", "coverage", "cffi")
-# the others look for BLAS and for cffi, at the first call otherwise
+# the submodules look for BLAS and cffi; unless imported here, they do so at the first call
 PARTS = ("numba", "numba.np.arraymath", "numba.core.typing.cffi_utils")
 
 
 def load() -> Any:
-    """Import numba."""
+    """Import numba, and return its module."""
     with _as_if_missing(*UNUSED):
         for part in PARTS:
             importlib.import_module(part)
@@ -25,7 +25,7 @@ def load() -> Any:
 
 @contextmanager
 def _as_if_missing(*names: str) -> Iterator[None]:
-    """Modules that are not imported yet cannot be imported meanwhile."""
+    """Make modules that are not yet imported unimportable inside the block."""
     modules: dict[str, Any] = sys.modules
     hidden = [name for name in names if name not in modules]
     modules.update(dict.fromkeys(hidden))

@@ -1,4 +1,4 @@
-"""Answers `robot/param/<process>`, and logs who changed what."""
+"""Serves `robot/param/<process>`, and logs who changed which parameter."""
 
 import logging
 
@@ -9,13 +9,13 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.granting import grant
 from gigabrain_zenoh.log_text import LEVELS
 
-LOG_LEVEL = "log_level"  # changes nothing that a process does
+LOG_LEVEL = "log_level"  # does not affect behaviour, so a change need not be recorded
 
 log = logging.getLogger(__name__)
 
 
 def serve_params(bus: Bus) -> None:
-    """Serve the parameters of this process, its log level among them."""
+    """Serve this process's parameters, including its log level."""
     bus.params.add(LOG_LEVEL, f"one of: {', '.join(LEVELS)}", _level, _set_level)
 
     async def answer(request: ParamRequest) -> ParamReply:

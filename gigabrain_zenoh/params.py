@@ -1,4 +1,4 @@
-"""What may be changed while a process runs: a few named values, each with what it may be."""
+"""Parameters that can change while a process runs: named values with their allowed values."""
 
 import difflib
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from gigabrain_zenoh.errors import Refused
 
 S = TypeVar("S", bound=msgspec.Struct)
 Get = Callable[[], str]
-Set = Callable[[str], None]  # raises ValueError for what it cannot be
+Set = Callable[[str], None]  # raises ValueError for a value that is not allowed
 
 
 class Params:
@@ -21,13 +21,13 @@ class Params:
         self._known: dict[str, tuple[str, Get, Set]] = {}
 
     def add(self, name: str, expected: str, get: Get, put: Set) -> None:
-        """One more; `put` raises ValueError for what it cannot be."""
+        """Add a parameter; `put` raises ValueError for a value that is not allowed."""
         self._known[name] = expected, get, put
 
     def add_field(
         self, name: str, expected: str, settings: Callable[[], S], configure: Callable[[S], None]
     ) -> None:
-        """A field of the settings that a node goes by."""
+        """Add a field of a node's settings; `configure` receives the changed settings."""
 
         def put(text: str) -> None:
             before = settings()
@@ -37,7 +37,7 @@ class Params:
         self.add(name, expected, lambda: _shown(getattr(settings(), name)), put)
 
     def change(self, name: str, text: str) -> tuple[str, str]:
-        """Its value before and now. Raises Refused, which says what was expected."""
+        """Set a parameter; return its old and new value. Raises Refused with what is expected."""
         if name not in self._known:
             near = difflib.get_close_matches(name, self._known, n=1, cutoff=0.5)
             hint = f"; did you mean {near[0]!r}?" if near else ";"
@@ -47,12 +47,12 @@ class Params:
         before = get()
         try:
             put(text)
-        except ValueError:  # msgspec's are among them
+        except ValueError:  # msgspec.ValidationError is one
             raise Refused(f"{name}: expected {expected}, got {text!r}") from None
         return before, get()
 
     def all(self) -> tuple[Param, ...]:
-        """What there is."""
+        """Return all parameters with their current values."""
         return tuple(
             Param(name=name, value=get(), expected=expected)
             for name, (expected, get, _) in self._known.items()

@@ -7,14 +7,17 @@ from collections.abc import Sequence
 
 
 def percentile(ordered: Sequence[float], share: float) -> float | None:
-    """The smallest of `ordered` (ascending) that at least `share` of them do not exceed."""
+    """Return the smallest of `ordered` that at least `share` of the values do not exceed.
+
+    The values must be in ascending order. None if there are none.
+    """
     if not ordered:
         return None
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
 
 
 class Newest:
-    """The newest `most` values. Kept in order as they come: to ask must not hold a loop up."""
+    """The newest `most` values, kept sorted so that a percentile query does not block the loop."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -25,12 +28,12 @@ class Newest:
         return len(self._ordered)
 
     def add(self, value: float) -> None:
-        """Take one in; beyond `most` the oldest gives way."""
+        """Add a value; drop the oldest if there are more than `most`."""
         if len(self._arrived) == self._most:
             del self._ordered[bisect_left(self._ordered, self._arrived.popleft())]
         self._arrived.append(value)
         insort(self._ordered, value)
 
     def percentile(self, share: float) -> float | None:
-        """The value that `share` of them do not exceed; None before the first."""
+        """Return the value that `share` of the kept values do not exceed; None without values."""
         return percentile(self._ordered, share)

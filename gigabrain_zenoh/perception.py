@@ -1,4 +1,4 @@
-"""Perception: a scan becomes what is round the robot, and whether the scan can be believed."""
+"""Perception node: turns each scan into a world model, and checks whether the scan is plausible."""
 
 import math
 from collections.abc import Callable
@@ -26,12 +26,12 @@ from gigabrain_zenoh.settings import PerceptionConfig
 if TYPE_CHECKING:
     from gigabrain_zenoh.mapper import Mapper
 
-MAP_KERNELS = "gigabrain_zenoh.mapping.warm:warm_up"  # calls all that is compiled for it once
+MAP_KERNELS = "gigabrain_zenoh.mapping.warm:warm_up"  # calls each kernel once, to compile it
 LOCALIZE_KERNELS = "gigabrain_zenoh.mapping.warm:warm_up_finding"
 
 
 def step(config: PerceptionConfig, body: BodyDescription, scan: LaserScan) -> WorldModel:
-    """One scan, with numpy throughout: about 65 µs for 360 beams."""
+    """Convert one scan to a world model, with numpy only (about 65 µs for 360 beams)."""
     lidar = body.lidar
     if lidar is None:
         return _unknown("the body has no lidar")
@@ -54,7 +54,7 @@ def step(config: PerceptionConfig, body: BodyDescription, scan: LaserScan) -> Wo
 
 @lru_cache(maxsize=8)
 def _reach(footprint: tuple[tuple[float, float], ...]) -> tuple[float, float]:
-    """How far the footprint reaches ahead, and when it turns on the spot [m]."""
+    """Return the footprint's extent ahead, and its radius when turning on the spot [m]."""
     return max(x for x, _ in footprint), max(math.hypot(x, y) for x, y in footprint)
 
 
@@ -66,9 +66,9 @@ def _ahead(
     squares: Floats,
     bearings: Floats,
 ) -> NDArray[np.bool_]:
-    """Hits in the cone ahead, or in the strip that the body needs to drive on and still turn.
+    """Return the mask of hits in the cone ahead, or in the strip needed to drive on and still turn.
 
-    `squares` are those of the distances [m2], for only one of them needs its root.
+    `squares` are the squared distances [m2]; only the nearest hit needs a square root.
     """
     half_angle = math.radians(config.sector_deg) / 2 + EDGE
     cone = (np.abs(bearings) <= half_angle) & (squares <= (config.ahead + EDGE) ** 2)
@@ -78,7 +78,7 @@ def _ahead(
 
 
 def _nearest_per_sector(count: int, squares: Floats, bearings: Floats) -> tuple[float | None, ...]:
-    # shifted by a whole turn, so that cutting off the fraction rounds down
+    # shifted by a whole turn to be positive, so that truncation rounds down
     index = (bearings * (count / math.tau) + (count + 0.5 + EDGE)).astype(np.intp) % count
     nearest = np.full(count, np.inf)
     np.minimum.at(nearest, index, squares)
@@ -90,7 +90,7 @@ def _unknown(problem: str) -> WorldModel:
 
 
 async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> None:
-    """A world per scan, as soon as it comes; until the process ends."""
+    """Publish a world model as soon as each scan arrives, until the process ends."""
     body = bus.latest(BODY)
     needs = (SCAN.key,) if config.mapping == "off" else (SCAN.key, STATE.key)
 
@@ -109,7 +109,7 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         await bus.failed
         return
     await compiled(MAP_KERNELS if config.mapping == "slam" else LOCALIZE_KERNELS)
-    from gigabrain_zenoh.mapper import Mapper  # and numba: only who has a map pays
+    from gigabrain_zenoh.mapper import Mapper  # imports numba: for maps only
 
     with closing(Mapper(config, bus, body)) as mapper:
         _follow(config, bus, body, mapper)
@@ -118,7 +118,7 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
 
 
 def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body], mapper: "Mapper") -> None:
-    """Worlds with the obstacles in them, each in its place by the odometry; then the map."""
+    """Publish world models with obstacles placed by odometry; then pass each scan to the mapper."""
     surroundings = Surroundings()
 
     def see(scan: LaserScan, pose: Pose | None) -> None:

@@ -1,7 +1,8 @@
-"""Scans with the place that they were taken from.
+"""Pairs each scan with the odometry pose of its tick.
 
-A scan of a tick whose state is still on its way waits for it: no outcome may depend on which of two
-messages was quicker. One from the future waits until the next one takes its place, and is missed.
+A scan that arrives before the state of its tick waits for that state. The outcome thus never
+depends on which message came first. If the next scan comes first, the waiting one is reported as
+missed.
 """
 
 from collections.abc import Callable
@@ -13,9 +14,9 @@ from gigabrain_zenoh.pose_history import PoseHistory
 
 
 class PlacedScans:
-    """Calls `on_scan(scan, pose)`; the pose is None where the states of that time are missing.
+    """Calls `on_scan(scan, pose)` for each scan; the pose is None where states are missing.
 
-    A scan whose tick had not come when the next scan did goes to `on_missed`.
+    A scan whose state had not arrived when the next scan came goes to `on_missed`.
     """
 
     def __init__(
@@ -28,19 +29,19 @@ class PlacedScans:
         self.history = PoseHistory()
 
     def state(self, state: RobotState) -> None:
-        """Take one state."""
+        """Add a robot state; process the waiting scan if its tick has been reached."""
         self.history = self.history.then(state)
         if self._waiting:
             self._place(self._waiting)
 
     def scan(self, scan: LaserScan) -> None:
-        """Take one scan."""
+        """Process a scan, or keep it until the state of its tick arrives."""
         if self._waiting:
             self._on_missed(self._waiting)
         self._place(scan)
 
     def _place(self, scan: LaserScan) -> None:
-        """Hand a scan on, or have it wait."""
+        """Hand a scan on if its tick has been reached; otherwise keep it waiting."""
         here = self.history
         self._waiting = scan
         if scan.boot == here.boot and scan.basis <= here.newest_tick:

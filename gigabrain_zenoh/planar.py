@@ -1,4 +1,4 @@
-"""Planar poses put together and taken apart. Pure functions, without numpy."""
+"""Composition and inversion of planar poses. Pure functions, without numpy."""
 
 import math
 
@@ -8,12 +8,12 @@ ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
 
 
 def wrapped(angle: float) -> float:
-    """`angle` [rad] within -pi and pi."""
+    """Return `angle` [rad] wrapped to -pi to pi."""
     return math.remainder(angle, math.tau)
 
 
 def compose(frame: Pose, pose: Pose) -> Pose:
-    """`pose`, given in `frame`, in the frame that `frame` itself is given in."""
+    """Transform `pose` from `frame` to the parent frame, in which `frame` itself is given."""
     cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
     return Pose(
         x=frame.x + cosine * pose.x - sine * pose.y,
@@ -23,7 +23,7 @@ def compose(frame: Pose, pose: Pose) -> Pose:
 
 
 def relative(frame: Pose, pose: Pose) -> Pose:
-    """`pose` as seen from `frame`, both given in one frame. Undoes `compose`."""
+    """Return `pose` relative to `frame`, both given in the same frame. Inverse of `compose`."""
     cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
     dx, dy = pose.x - frame.x, pose.y - frame.y
     return Pose(
@@ -34,12 +34,12 @@ def relative(frame: Pose, pose: Pose) -> Pose:
 
 
 def inverse(pose: Pose) -> Pose:
-    """The frame that `pose` is given in, as seen from `pose`."""
+    """Return the inverse transform: the parent frame as seen from `pose`."""
     return relative(pose, ORIGIN)
 
 
 def between(before: Pose, after: Pose, share: float) -> Pose:
-    """The pose that lies `share` (0 to 1) of the way from `before` to `after`, the shorter way."""
+    """Interpolate from `before` (`share` 0) to `after` (1); yaw takes the shorter direction."""
     return Pose(
         x=before.x + share * (after.x - before.x),
         y=before.y + share * (after.y - before.y),

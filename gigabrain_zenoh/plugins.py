@@ -1,10 +1,10 @@
-"""Finds what is named by a string, "module:name", and imports it only then."""
+"""Lazy import of an object named by a string, "module:name"."""
 
 import importlib
 from typing import Any
 
 
 def find(path: str) -> Any:
-    """Return the object at "module:name". Raises ImportError, and AttributeError."""
+    """Import and return the object at "module:name". Raises ImportError or AttributeError."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(module), name)

@@ -1,4 +1,4 @@
-"""Where the odometry had the robot of late, by the robot's clock."""
+"""Recent odometry poses (the last 2 s), by the robot's clock."""
 
 from bisect import bisect_left
 
@@ -9,18 +9,22 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.planar import between
 
 KEPT = 100  # states; 2 s
-WIDEST_GAP_TICKS = 10  # between two states, over which a pose may still be worked out
+WIDEST_GAP_TICKS = 10  # between two states; over wider gaps no pose is interpolated
 
 
 class PoseHistory(Struct, frozen=True):
-    """The odometry of the newest states. It does not change: `then` returns another one."""
+    """Odometry poses of the newest states. Immutable: `then` returns a new history."""
 
     boot: int = 0
     ticks: tuple[int, ...] = ()  # ascending
     poses: tuple[Pose, ...] = ()
 
     def then(self, state: RobotState) -> "PoseHistory":
-        """With one state more. A new start of the driver begins anew, for so does the odometry."""
+        """Return a history with `state` added; it is cleared first if the driver has restarted.
+
+        A driver restart resets the odometry. A state that is not newer than the last one is
+        ignored.
+        """
         if state.boot != self.boot:
             return PoseHistory(state.boot, (state.tick,), (state.pose,))
         if self.ticks and state.tick <= self.ticks[-1]:
@@ -29,7 +33,7 @@ class PoseHistory(Struct, frozen=True):
         return PoseHistory(self.boot, ticks[-KEPT:], poses[-KEPT:])
 
     def at(self, boot: int, tick: int) -> Pose | None:
-        """The pose at `tick`, between two states where none came; None where it is not known."""
+        """Return the pose at `tick`, interpolated if necessary; None if unavailable."""
         if boot != self.boot:
             return None
         i = bisect_left(self.ticks, tick)
@@ -45,5 +49,5 @@ class PoseHistory(Struct, frozen=True):
 
     @property
     def newest_tick(self) -> int:
-        """The tick of the newest state; 0 while none has come."""
+        """Return the tick of the newest state; 0 before the first state."""
         return self.ticks[-1] if self.ticks else 0

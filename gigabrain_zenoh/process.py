@@ -1,4 +1,4 @@
-"""What every process is made of: logs, a session, health, and a node that runs until it is told.
+"""Common frame of every process: logs, a session, health, and a node that runs until stopped.
 
 Started as `python -m gigabrain_zenoh.process CONFIG`, with a ProcessConfig in JSON.
 """
@@ -44,13 +44,13 @@ MakeBus = Callable[[Transport, Clock, str], Bus]
 
 @dataclass(frozen=True)
 class Program:
-    """Where a process's node is, and the settings it takes, if any; imported only when used."""
+    """Import path of a process's node and of its settings type, if any; imported only when used."""
 
     run: str
     settings: str = ""
-    stops: bool = False  # commands and stops go through it: it goes before others where it may
-    repeats: bool = False  # it can be replayed, and says what it goes by
-    looks_on: bool = False  # the robot does without it: it naps, and lets the others go first
+    stops: bool = False  # carries commands and stops: gets a higher priority where permitted
+    repeats: bool = False  # can be replayed, so it publishes which input it used
+    looks_on: bool = False  # not needed by the robot: naps, and runs at low priority
 
 
 PROGRAMS = {
@@ -96,7 +96,7 @@ PROGRAMS = {
 
 
 def node_of(config: ProcessConfig) -> Node:
-    """The node with its settings filled in. Raises ConfigError, and UnknownName."""
+    """Return the process's node with its settings filled in. Raises ConfigError or UnknownName."""
     if config.name not in PROGRAMS:
         raise unknown("process", config.name, PROGRAMS)
     program = PROGRAMS[config.name]
@@ -107,7 +107,7 @@ def node_of(config: ProcessConfig) -> Node:
 
 
 def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
-    """uvloop's event loop where it is installed, else asyncio's own."""
+    """Return uvloop's event loop factory; None (asyncio's default) if uvloop is not installed."""
     try:
         return find("uvloop:new_event_loop")  # type: ignore[no-any-return]
     except ModuleNotFoundError:
@@ -115,8 +115,8 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
 
 
 def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
-    """Run one process to its end; the exit code."""
-    gc.disable()  # until ready: what is imported and set up is no garbage
+    """Run one process until it ends, and return its exit code."""
+    gc.disable()  # until ready: objects from imports and set-up are not garbage
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
     try:
         run_dir = Path(config.run_dir) if config.run_dir else None
@@ -124,7 +124,7 @@ def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
         node = node_of(config)
         program = PROGRAMS[config.name]
         if program.stops:
-            go_first()  # this and the next before there are threads, which inherit it
+            go_first()  # like the other branches, before any thread starts: threads inherit it
         elif program.looks_on:
             step_aside()
         else:
@@ -148,7 +148,7 @@ def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
 
 
 def _first(error: BaseException) -> BaseException:
-    """What went wrong first, within whatever groups."""
+    """Return the first exception within nested exception groups."""
     while isinstance(error, BaseExceptionGroup):
         error = error.exceptions[0]
     return error
@@ -182,7 +182,7 @@ async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
             tasks.create_task(publish_health(bus))
             tasks.create_task(claim.keep())
             if config.json_console:
-                out = os.dup(STDOUT)  # a router gives its standard output to Zenoh's log
+                out = os.dup(STDOUT)  # the router redirects its standard output to Zenoh's log
                 tasks.create_task(beat(bus.clock, lambda: bus.progress(), out))
             tasks.create_task(_failure(bus))
             tasks.create_task(_node(bus, node, PROGRAMS[config.name]))
@@ -195,7 +195,7 @@ async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
 
 
 async def _failure(bus: Bus) -> None:
-    """Raise what a handler of messages raised, whatever the node itself waits for."""
+    """Raise the exception of a message handler, even while the node waits for something else."""
     await bus.failed
 
 
@@ -207,13 +207,13 @@ def _ready(program: Program) -> None:
     if not program.stops:
         join_in()
     gc.collect()
-    gc.freeze()  # what set-up made stays: collections look at new objects only
+    gc.freeze()  # objects from set-up stay; later collections check new objects only
     gc.enable()
     log.info("ready", extra={"data": {"event": "ready", "pid": os.getpid()}})
 
 
 def main() -> None:
-    """Entry of a supervised process."""
+    """Run a supervised process, configured by its first argument, and exit."""
     lifeline.die_with_supervisor()
     heap.map_large_blocks()
     interrupts.install()

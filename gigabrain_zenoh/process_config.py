@@ -1,4 +1,4 @@
-"""What one process is told when it is started. Kept apart, so that starting one imports little."""
+"""Configuration that a process gets when it is started. A separate module, to keep imports few."""
 
 from typing import Any
 
@@ -8,11 +8,11 @@ from gigabrain_zenoh.settings import Endpoint
 
 
 class ProcessConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Everything that one process has to know."""
+    """Complete configuration of one process."""
 
     name: str
     endpoint: Endpoint
     settings: dict[str, Any] = field(default_factory=dict)
-    run_dir: str | None = None  # where its log file goes; none without
-    json_console: bool = False  # for a supervisor to read
+    run_dir: str | None = None  # folder of its log file; without it there is no log file
+    json_console: bool = False  # JSON log lines on the console, for a supervisor to read
     level: str = "info"

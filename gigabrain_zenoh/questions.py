@@ -1,7 +1,6 @@
-"""Queries on their way to the loop: bounded, a few at a time, and the urgent ones first.
+"""Queues queries for the event loop: bounded, a few per loop turn, urgent ones first.
 
-Whoever may ask anything at all can ask by the thousand; neither the robot's ticks nor an e-stop
-may wait for that.
+Any client may send thousands of queries. Neither the robot's ticks nor an e-stop may wait for them.
 """
 
 import asyncio
@@ -14,13 +13,13 @@ from gigabrain_zenoh.transport import Close
 
 T = TypeVar("T")
 
-WAITING = 32  # queries of a key that may wait; the oldest give way
-ANSWERING = 32  # queries of a key that are being answered
-SLICE = 4  # queries begun in one turn of the loop
+WAITING = 32  # queries of a key that may wait; beyond that the oldest are refused
+ANSWERING = 32  # queries of a key that are answered concurrently, unless urgent
+SLICE = 4  # queries started in one turn of the loop
 
 
 class _Key(Generic[T]):
-    """The queries of one key."""
+    """Waiting queries of one key."""
 
     def __init__(self, answer: Callable[[T], Awaitable[None]], urgent: bool) -> None:
         self.answer, self.urgent = answer, urgent
@@ -29,12 +28,15 @@ class _Key(Generic[T]):
 
     @property
     def ready(self) -> bool:
-        """Whether one can be begun; an urgent one always can, its answer may wait for a disk."""
+        """Return whether a waiting query may start.
+
+        Urgent queries are not limited, as their answers may wait for a disk.
+        """
         return bool(self.waiting) and (self.urgent or self.answering < ANSWERING)
 
 
 class Questions(Generic[T]):
-    """All queries of a process; `refuse` is called for those that give way, in any thread."""
+    """All queries of a process; `refuse` is called for dropped queries, from any thread."""
 
     def __init__(self, bridge: Bridge, refuse: Callable[[T], None]) -> None:
         self._bridge, self._refuse = bridge, refuse
@@ -46,7 +48,10 @@ class Questions(Generic[T]):
     def serve(
         self, answer: Callable[[T], Awaitable[None]], *, urgent: bool
     ) -> tuple[Callable[[T], None], Close]:
-        """Where to put queries of one more key, from any thread, and what ends it."""
+        """Register a key; return a function that adds a query, and one that closes the key.
+
+        Queries may be added from any thread.
+        """
         key = _Key(answer, urgent)
         keys = self._urgent if urgent else self._others
         keys.append(key)
@@ -66,7 +71,7 @@ class Questions(Generic[T]):
         return put, close
 
     def close(self) -> None:
-        """Answer no more."""
+        """Cancel running answers and start no more."""
         self._urgent.clear()
         self._others.clear()
         for task in self._tasks:
@@ -78,8 +83,8 @@ class Questions(Generic[T]):
             self._bridge.post(Questions._begin, self)
 
     def _begin(self) -> None:
-        """Begin a few; the others wait for the next turn of the loop."""
-        self._posted = False  # before looking: what comes now wakes again
+        """Start up to SLICE queries; the others wait for the next turn of the loop."""
+        self._posted = False  # before reading, so that new queries wake the loop again
         for _ in range(SLICE):
             if not (key := self._next()):
                 return
@@ -90,7 +95,7 @@ class Questions(Generic[T]):
         self._wake()
 
     def _next(self) -> _Key[T] | None:
-        """The next key's turn; those that are urgent always have it."""
+        """Return the next key with a query to start: urgent keys first, then round-robin."""
         for keys in (self._urgent, self._others):
             for _ in range(len(keys)):
                 keys.rotate(-1)

@@ -1,4 +1,4 @@
-"""What was dropped because it was not valid: counted, and told once when it begins and ends."""
+"""Counts dropped invalid messages, and logs once when such a fault begins and ends."""
 
 import logging
 from collections import Counter
@@ -8,19 +8,19 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
-QUIET_NS = 1_000_000_000  # a fault has ended when nothing bad has come for this long
+QUIET_NS = 1_000_000_000  # a fault ends after this long without an invalid message
 
 
 class Rejections:
-    """Dropped messages by key."""
+    """Counts and faults of dropped messages, by key."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
-        self._faults: dict[str, tuple[Fault, int]] = {}  # with the time of the last bad message
+        self._faults: dict[str, tuple[Fault, int]] = {}  # and the time of the last invalid message
         self.counts: Counter[str] = Counter()
 
     def reject(self, key: str, error: ValueError) -> None:
-        """A message on `key` was not valid."""
+        """Count an invalid message on `key`, and log the fault if it is new."""
         self.counts[key] += 1
         fault, _ = self._faults.get(key, (Fault(log), 0))
         self._faults[key] = fault, self._clock.now_ns()
@@ -28,7 +28,10 @@ class Rejections:
         fault.begin(f"dropped a message on {key}: {error}", about)
 
     def accept(self, key: str) -> None:
-        """A message on `key` was valid. With a good and a bad sender on it the fault goes on."""
+        """End the fault on `key` after a valid message, if no invalid one came within QUIET_NS.
+
+        While a valid and an invalid sender share the key, the fault stays.
+        """
         if key not in self._faults:
             return
         fault, last_ns = self._faults[key]

@@ -1,7 +1,7 @@
-"""A host's own router: its processes meet here, and one link leads on to the robot's router.
+"""Relay process: a host's own router, with one link to the robot's router.
 
-It judges nobody. The robot's router lets pass what the host's own certificate may say, as if each
-process had come there itself.
+It does no access control. The robot's router checks messages against the host's certificate, as if
+each process had connected to it directly.
 """
 
 import asyncio
@@ -17,18 +17,18 @@ from gigabrain_zenoh.transport import Link
 
 log = logging.getLogger(__name__)
 
-PATIENCE_S = 1.0  # how long the router may be missing before somebody is told
+PATIENCE_S = 1.0  # how long the router may be missing before a warning is logged
 
 
 class Way:
-    """The link to the robot's router."""
+    """State of the link to the robot's router."""
 
     def __init__(self, router: str) -> None:
         self.open = asyncio.Event()
         self._router = router
 
     def see(self, link: Link) -> None:
-        """Somebody has come, or has gone: by the socket the host's own, else the router."""
+        """Update the state when the router's link comes or goes; other links use the socket."""
         if link.address.startswith(SOCKET) or link.there == self.open.is_set():
             return
         if link.there:
@@ -40,16 +40,16 @@ class Way:
 
 
 async def run(config: RelayConfig, bus: Bus, ready: Callable[[], None]) -> None:
-    """Routing goes on by itself; ready once the robot's router is there.
+    """Report ready once the robot's router is linked; the session itself does the routing.
 
-    Raises ConfigError where the host's own keys are why it is not.
+    Raises ConfigError if the link fails because the host's own keys are invalid.
     """
     way = Way(config.router)
     bus.links(way.see)
     try:
         await asyncio.wait_for(way.open.wait(), PATIENCE_S)
     except TimeoutError:
-        if config.keys:  # a router turns bad ones away without a word
+        if config.keys:  # a router rejects invalid keys without an error
             await asyncio.to_thread(identity_in, Path(config.keys))
         text = "no router at %s yet; waiting for it (start one with: gigabrain router)"
         log.warning(text, config.router, extra={"data": {"event": "waiting"}})

@@ -1,7 +1,7 @@
-"""Which host has a relay, and who connects to whom there.
+"""Decides which host runs a relay, and which endpoints its processes connect to.
 
-Perception and decision on a host without the router would meet at the robot's: what a scan leads to
-would cross the network four times. At a router of their own host it crosses twice.
+Without a relay, perception and decision on a host without the router meet at the robot's router.
+The result of a scan would then cross the network four times; through a relay it crosses twice.
 """
 
 import sys
@@ -13,26 +13,29 @@ from gigabrain_zenoh.running import local_socket
 from gigabrain_zenoh.settings import Endpoint, RelayConfig
 
 RELAY = "relay"
-MEET = {"perception", "decision"}  # each runs once, so a robot has one relay at most
-AT_THE_ROBOT = {"router", "driver"}  # a body cut off from its router is to stop
+MEET = {"perception", "decision"}  # each runs once per robot, so there is one relay at most
+AT_THE_ROBOT = {"router", "driver"}  # no relay between them: a body without its router must stop
 
 
 def has_relay(processes: Collection[str]) -> bool:
-    """Whether a host with these processes has a relay; there are none without Unix sockets."""
+    """Return whether a host with these processes runs a relay; never on Windows.
+
+    A relay needs Unix sockets.
+    """
     here = set(processes)
     return sys.platform != "win32" and here >= MEET and not here & AT_THE_ROBOT
 
 
 def behind(endpoint: Endpoint) -> Endpoint:
-    """Where the host's processes connect: the socket that only this user can open."""
+    """Return the endpoint of the host's processes: a Unix socket that only this user can open."""
     return structs.replace(endpoint, connect=(local_socket(),), keys="")
 
 
 def between(endpoint: Endpoint) -> Endpoint:
-    """The relay's own side: it listens there, and connects to the robot's router with the keys."""
+    """Return the relay's endpoint: it listens on the socket, and connects to the robot's router."""
     return structs.replace(endpoint, listen=(local_socket(),))
 
 
 def relay_config(endpoint: Endpoint) -> RelayConfig:
-    """What the relay has to know in order to say whom it waits for."""
+    """Build the relay's settings, which name the router it connects to."""
     return RelayConfig(router=endpoint.connect[-1], keys=endpoint.keys)

@@ -1,4 +1,4 @@
-"""Run one node against recorded input, in fake time. The same input gives the same output."""
+"""Replays recorded input to one node in fake time. The same input gives the same output."""
 
 import asyncio
 import contextlib
@@ -17,13 +17,13 @@ from gigabrain_zenoh.transport import LocalNetwork
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 Event = tuple[int, str, bytes]  # time since the start [ns], key, payload
 ASKED = {service.key for service in SERVICES}
-GOES_ON = {MAP_SAVE.key}  # while it is answered, time does
-UNDONE = b"\0"  # of a wait: the work was not done in time
-PATIENCE_S = 30.0  # for an answer, which may take work beside the loop; it may wait for time, too
+GOES_ON = {MAP_SAVE.key}  # fake time continues while these are answered
+UNDONE = b"\0"  # payload on WAITED: the work was not done in time
+PATIENCE_S = 30.0  # longest wait for an answer: it may need a worker thread, or fake time to pass
 
 
 def record(network: LocalNetwork, clock: Clock) -> list[Event]:
-    """A list that grows with all that passes on the topics of `network` from now on."""
+    """Return a list to which every later message on the topics of `network` is appended."""
     events: list[Event] = []
     network.listen("robot/*", lambda key, data: events.append((clock.now_ns(), key, data)))
     return events
@@ -32,12 +32,12 @@ def record(network: LocalNetwork, clock: Clock) -> list[Event]:
 async def replay(
     node: Node, recording: Sequence[Event], process: str = ""
 ) -> list[tuple[str, bytes]]:
-    """Feed `recording` to `node` at its recorded times; return what the node itself sent.
+    """Feed `recording` to `node` at its recorded times; return the messages that the node sent.
 
-    `process` is its name, by which it is asked for its parameters. An event on a service's key is a
-    request, which is answered before time goes on, but for saving a map; one on WAITED
-    says how waiting for work beside had ended at the event before it. Raises whatever ended the
-    node, and ValueError for events that are not in order of time.
+    The node's parameters are served under the name `process`. An event on a service's key is a
+    request; it is answered before time continues, except when it saves a map. An event on WAITED
+    holds the outcome of a wait for a worker thread, at the event before it. Raises the node's own
+    error, and ValueError for events that are not in order of time.
     """
     clock, network = FakeClock(), LocalNetwork()
     bus = Bus(network.transport(), clock, process)
@@ -46,7 +46,7 @@ async def replay(
     ready, asked = asyncio.Event(), list[asyncio.Future[None]]()
     running = asyncio.ensure_future(node(bus, ready.set))
     try:
-        await _either(running, ready)  # a node may compile, beside the loop
+        await _either(running, ready)  # a node may compile in a worker thread first
         await clock.advance(0)
         for (at_ns, key, payload), past.outcomes in _with_waits(recording):
             if at_ns < clock.now_ns():
@@ -69,7 +69,7 @@ async def replay(
 
 
 def _with_waits(recording: Iterable[Event]) -> Iterator[tuple[Event, deque[bool]]]:
-    """Each event with the outcomes of the waits that follow it."""
+    """Yield each event with the outcomes of the waits that follow it."""
     event, outcomes = None, deque[bool]()
     for one in recording:
         if one[1] == WAITED:
@@ -90,5 +90,5 @@ async def _either(running: asyncio.Future[None], ready: asyncio.Event) -> None:
 
 async def _ask(network: LocalNetwork, key: str, payload: bytes) -> None:
     for answer in network.servers(key):
-        with contextlib.suppress(GigabrainError):  # a refusal; what was granted shows the change
+        with contextlib.suppress(GigabrainError):  # refused; accepted changes are recorded
             await answer(payload)

@@ -1,4 +1,4 @@
-"""What a demo run came to."""
+"""Report of a demo run, and its one-line summary."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,18 +8,18 @@ from msgspec import Struct
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.tasks import TaskStatus
 
-MOTION_M = 0.05  # less than this is no motion
+MOTION_M = 0.05  # a shorter distance counts as no motion
 
 
 class Latency(Struct, frozen=True, kw_only=True):
-    """From a scan's departure at the driver to the command that rests on it [ms]."""
+    """Latency from a scan's departure at the driver to the command based on it [ms]."""
 
     p50: float | None
     p99: float | None
 
 
 class Observed(Struct, frozen=True, kw_only=True):
-    """What was seen of a run from outside."""
+    """Observations of a run from outside the driver."""
 
     body: str
     world: str
@@ -32,17 +32,17 @@ class Observed(Struct, frozen=True, kw_only=True):
     restarts: int
     rejected: int
     problem: str = ""  # why the run could not be watched to its end
-    mapped_m2: float | None = None  # where a map is made
-    tasks: TaskStatus | None = None  # where anybody has any
-    answered: bool = True  # the driver told the truth in the end
+    mapped_m2: float | None = None  # None unless a map is built
+    tasks: TaskStatus | None = None  # None where no process has tasks
+    answered: bool = True  # the driver answered the final request for its report
 
 
 class Report(Struct, frozen=True, kw_only=True):
-    """One run. Contacts, clearance and distance are MuJoCo's truth, not the robot's own view.
+    """Results of one run. Contacts, clearance and distance are MuJoCo's ground truth.
 
-    A body that is not simulated knows no such truth: its contacts and clearance are null, and its
-    distance is that of its odometry. Where the driver did not answer in the end, they are null as
-    well, and so is what its last health message did not hold.
+    A body that is not simulated has no ground truth: contacts and clearance are null, and the
+    distance is from odometry. They are null too if the driver did not answer at the end. So are
+    figures that its last health message did not contain.
     """
 
     body: str
@@ -60,18 +60,18 @@ class Report(Struct, frozen=True, kw_only=True):
     speed: float
     lockstep_timeouts: int | None
     decisions: tuple[tuple[float, str], ...]  # simulated time [s] and the decision in words
-    mapped_m2: float | None = None  # of the map, known to be free or taken
-    tasks_done: int = 0  # of the last 16 that ended: goals reached, missions carried out
-    verdict: str  # "ok", or why not
+    mapped_m2: float | None = None  # area of the map known to be free or occupied
+    tasks_done: int = 0  # among the last 16 that ended: goals reached and missions completed
+    verdict: str  # "ok", or the faults in words
 
     @property
     def ok(self) -> bool:
-        """Whether the robot moved, touched nothing and lost no process."""
+        """Return whether the robot moved, touched nothing and lost no process."""
         return self.verdict == "ok"
 
 
 def make_report(told: Mapping[str, Any], seen: Observed) -> Report:
-    """Put together what the driver says of itself and of the truth, and what else was seen."""
+    """Combine the driver's own report (`told`) with the observations from outside (`seen`)."""
     distance, contacts = float(told.get("distance_m", seen.distance_m)), told.get("contacts")
     return Report(
         body=told.get("body", seen.body),
@@ -102,7 +102,10 @@ def _succeeded(status: TaskStatus | None) -> int:
 
 
 def last_told(health: Health | None) -> dict[str, Any]:
-    """What the last health message of a driver that no longer answers holds of its report."""
+    """Return the part of a driver's report that its last health message contains.
+
+    Used when the driver no longer answers.
+    """
     if health is None:
         return {}
     counted = ("stale_commands_executed", "lockstep_timeouts")
@@ -126,7 +129,7 @@ def _verdict(distance_m: float, contacts: int, seen: Observed) -> str:
 
 
 def summary(report: Report) -> str:
-    """One line for people."""
+    """Format the report as one line for people."""
     p50, p99 = report.scan_to_cmd_ms.p50 or 0.0, report.scan_to_cmd_ms.p99 or 0.0
     parts = [
         f"{report.verdict}: {report.distance_m:.2f} m in {report.sim_seconds:.0f} s",
@@ -138,7 +141,7 @@ def summary(report: Report) -> str:
 
 
 def _done(report: Report) -> list[str]:
-    """What it has done: a robot that maps does not count its turns."""
+    """Return the work done in words: turns, or mapped area and tasks for a robot that maps."""
     if report.mapped_m2 is None:
         return [_count(report.turns, "turn")]
     done = [_count(report.tasks_done, "task") + " done"] if report.tasks_done else []

@@ -1,10 +1,10 @@
-"""How late and how slowly a body answers, learnt from commands and measured speeds while it drives.
+"""Estimates a body's response delay and lag from commands and measured speeds while it drives.
 
-Every pair of a delay and a first-order lag on a grid predicts the measured speed from the commands;
-each axis has a gain of its own, and noise of a size that nobody knows. The answer is their mean,
-each weighted by how likely it is: a Gaussian prior times the profile likelihood, whose logarithm is
--n/2 log(squared error / n) summed over the axes, with old errors forgotten. A body that is told the
-same all the while says nothing of its response, and nothing is learnt from it.
+Each candidate is a pair of a delay and a first-order lag on a grid. It predicts the measured speed
+from the commands. Each axis has its own gain, and noise of unknown size. The estimate is the mean
+of all candidates, weighted by posterior: a Gaussian prior times the profile likelihood. The log
+likelihood is -n/2 log(squared error / n), summed over the axes, with exponential forgetting. A
+constant command carries no information about the response, so nothing is learnt from it.
 """
 
 import numpy as np
@@ -19,43 +19,43 @@ from gigabrain_zenoh.gate_state import BRAIN
 Floats = NDArray[np.float64]
 
 TICK_S = TICK_NS / 1e9
-PRIOR = Response(delay=0.04, lag=0.06)  # of a body of which nothing is known yet
+PRIOR = Response(delay=0.04, lag=0.06)  # used until enough has been learnt
 DELAYS = 16  # candidates, a tick apart: 0 to 0.3 s
 DELAYS_S = TICK_S * np.arange(DELAYS)
 LAGS_S = 0.02 * np.arange(26)  # candidates: 0 to 0.5 s
-LATE_TICKS = 5  # so long the messages of a tick may take; then no order of arrival matters
-SILENT_TICKS = 5  # without a command the gate stops the body by itself
-EXCITED_TICKS = 30  # a change of the command tells something of the response for so long
-LEAST_CHANGE = (0.04, 0.15)  # [m/s], [rad/s], within that time; smaller ones drown in noise
-NOISE = (0.004, 0.01)  # [m/s], [rad/s], at least; keeps an exact model from being too sure
-MEMORY_TICKS = 1000  # excited ones, until a squared error has lost most of its weight
-ENOUGH_TICKS = 40  # excited ones, before anything is believed
-LOOK_TICKS = 5  # from one look at all candidates to the next
-SPREAD_S = 0.1  # of the prior
-ALIKE = 4.0  # neighbouring ticks err alike: so many of them count as one
-GAINS = (0.5, 1.5)  # a body that is farther off than this is not driving freely
+LATE_TICKS = 5  # how late a tick's messages may arrive without affecting the result
+SILENT_TICKS = 5  # after this long without a command, the gate stops the body
+EXCITED_TICKS = 30  # how long a change of the command is informative
+LEAST_CHANGE = (0.04, 0.15)  # [m/s], [rad/s], within EXCITED_TICKS; smaller changes drown in noise
+NOISE = (0.004, 0.01)  # [m/s], [rad/s], minimum; prevents overconfidence in an exact model
+MEMORY_TICKS = 1000  # excited ticks; time constant with which squared errors are forgotten
+ENOUGH_TICKS = 40  # excited ticks before the estimate is used
+LOOK_TICKS = 5  # between evaluations of all candidates
+SPREAD_S = 0.1  # standard deviation of the prior
+ALIKE = 4.0  # errors of neighbouring ticks correlate: this many ticks count as one sample
+GAINS = (0.5, 1.5)  # range of plausible gains; outside it the body is not driving freely
 
 
 class Axis:
-    """What every candidate predicts of one axis, and how well it did."""
+    """Predictions and accumulated squared errors of all candidates, for one axis."""
 
     def __init__(self, least_change: float, noise: float) -> None:
         self._least_change, self._noise = least_change, noise
-        # a candidate without any lag has reached what it was told by the next tick
+        # a candidate with zero lag reaches the commanded speed by the next tick
         self._follows = 1.0 - np.exp(-TICK_S / np.maximum(LAGS_S, 1e-9))
-        self._outputs = np.zeros((DELAYS, len(LAGS_S)))  # row 0 without delay, row 1 a tick ago, …
+        self._outputs = np.zeros((DELAYS, len(LAGS_S)))  # row 0: no delay, row 1: one tick, …
         self._told = [0.0] * EXCITED_TICKS
         self._model_model, self._model_measured = np.zeros((2, DELAYS, len(LAGS_S)))
         self._measured_measured = 0.0
-        self.weight = 0.0  # of the ticks that count
+        self.weight = 0.0  # discounted number of excited ticks
 
     def rest(self, measured: float) -> None:
-        """The body obeys nobody: all that is known of it is its speed."""
+        """Reset the predictions to the measured speed, while the body follows no command."""
         self._outputs[:] = measured
         self._told = [measured] * EXCITED_TICKS
 
     def tick(self, told: float, measured: float) -> bool:
-        """One tick: what was measured in it, and what was told then. Says whether it learnt."""
+        """Process one tick's commanded and measured speed; return whether it was informative."""
         excited = max(self._told) - min(self._told) > self._least_change
         if excited:
             keep = 1.0 - 1.0 / MEMORY_TICKS
@@ -69,12 +69,12 @@ class Axis:
         return excited
 
     def gains(self) -> Floats:
-        """By how much each candidate's output has to be multiplied, (delays, lags)."""
+        """Return the gain that fits each candidate's output best, within GAINS, (delays, lags)."""
         found: Floats = self._model_measured / np.maximum(self._model_model, 1e-12)
         return np.clip(found, *GAINS)
 
     def cost(self) -> Floats:
-        """How unlikely each candidate is (negative log), (delays, lags)."""
+        """Return each candidate's negative log likelihood, (delays, lags)."""
         gains = self.gains()
         errors = self._measured_measured - gains * (
             2.0 * self._model_measured - gains * self._model_model
@@ -85,7 +85,7 @@ class Axis:
 
 
 class ResponseEstimator:
-    """Learns a body's response from the stream of its commands and states."""
+    """Estimates a body's response from its commands and states."""
 
     def __init__(self, prior: Response = PRIOR) -> None:
         self._prior, self._newest = prior, 0  # tick of the newest state
@@ -93,18 +93,18 @@ class ResponseEstimator:
 
     @property
     def response(self) -> Response:
-        """What it has learnt; the prior until it has learnt anything."""
+        """Return the current estimate; the prior until enough has been learnt."""
         return self._response
 
     @property
     def turn_gain(self) -> float:
-        """Measured over commanded turn rate, as in `response`."""
+        """Return the ratio of measured to commanded turn rate, as in `response`."""
         return self._response.turn_gain
 
     def command(self, command: CmdVel) -> None:
-        """Take a command of the commander or the brain; of a tick, the one of the highest `seq`.
+        """Add a command of the commander or the brain; for each tick, keep the highest `seq`.
 
-        The gate too goes by `seq`: others may publish under the commander's name.
+        The gate uses `seq` as well, because other clients may publish under the commander's name.
         """
         in_time = self._done < command.tick <= self._newest + LEAD_TICKS
         known = command.source in (BRAIN, self._commander)
@@ -115,7 +115,7 @@ class ResponseEstimator:
             self._commands[key] = command
 
     def state(self, state: RobotState) -> None:
-        """Take what the body did. It is looked at once the commands of its time are known too."""
+        """Add a robot state, to be evaluated LATE_TICKS later, when its commands have arrived."""
         if state.boot != self._boot:
             self._begin(state.boot)
         if state.tick <= self._done:
@@ -128,9 +128,9 @@ class ResponseEstimator:
                 self._look(self._states.pop(tick))
 
     def sent(self, after: int, until: int) -> tuple[tuple[int, Velocity], ...]:
-        """What the body was told after one tick and until another, with the tick of each command.
+        """Return the commander's commands with their ticks, for `after` < tick <= `until`.
 
-        The command of a tick may still be on its way when the state of the next one is here.
+        The command of a tick may still be in transit when the state of the next tick arrives.
         """
         mine = self._commander
         coming = {tick: told for (tick, source), told in self._commands.items() if source == mine}
@@ -144,7 +144,7 @@ class ResponseEstimator:
         self._newest = 0
         self._commander = BRAIN
         self._commands: dict[tuple[int, str], CmdVel] = {}  # by tick and source
-        self._past: dict[int, CmdVel] = {}  # the commander's, that have been looked at
+        self._past: dict[int, CmdVel] = {}  # the commander's, already evaluated
         self._states: dict[int, RobotState] = {}
         self._told: CmdVel | None = None
         self._axes = tuple(Axis(*each) for each in zip(LEAST_CHANGE, NOISE, strict=True))
@@ -153,7 +153,7 @@ class ResponseEstimator:
     def _look(self, state: RobotState) -> None:
         learnt = False
         for tick in range(max(self._done + 1, state.tick - SILENT_TICKS), state.tick + 1):
-            # a state that was missed is taken to be like the next one
+            # a missed state is assumed to equal the next one
             learnt |= self._one_tick(tick, state)
         self._done = state.tick
         for tick, source in [key for key in self._commands if key[0] <= self._done]:
@@ -179,7 +179,7 @@ class ResponseEstimator:
         return forward or turn
 
     def _weigh(self) -> None:
-        """The mean of all candidates, by how likely each is."""
+        """Set the response to the mean of all candidates, weighted by their likelihood."""
         x, z = self._axes
         if x.weight + z.weight < ENOUGH_TICKS:
             return
@@ -196,7 +196,7 @@ class ResponseEstimator:
 
 
 def velocity_of(command: CmdVel) -> Velocity:
-    """The velocity that `command` asks for."""
+    """Return the velocity that `command` requests."""
     return Velocity(
         linear_x=command.linear_x, linear_y=command.linear_y, angular_z=command.angular_z
     )

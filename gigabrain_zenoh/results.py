@@ -1,4 +1,4 @@
-"""Files that a long run leaves behind: looked at before it, written after it."""
+"""Result files of long runs: checked before the run, written after it."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from gigabrain_zenoh.errors import ConfigError
 
 
 def check_place(path: Path | None) -> None:
-    """Before the run rather than after it. Raises ConfigError where nothing can be written."""
+    """Raise ConfigError where `path` cannot be written; call this before a long run."""
     if path and not path.parent.is_dir():
         raise ConfigError(f"cannot write {path}: no such folder")
     if path and path.is_dir():
@@ -16,7 +16,7 @@ def check_place(path: Path | None) -> None:
 
 
 def write(results: object, path: Path | None) -> None:
-    """As JSON, where a file is wanted. Raises ConfigError where that cannot be written."""
+    """Write `results` as JSON, if a path is given. Raises ConfigError if that fails."""
     if path is None:
         return
     try:

@@ -1,4 +1,4 @@
-"""The router: a Zenoh session that joins the others, and with keys keeps the door."""
+"""Router process: a Zenoh session that connects the others; with keys it controls access."""
 
 import contextlib
 import resource
@@ -10,12 +10,12 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.keys.door import Door, zenoh_log
 from gigabrain_zenoh.settings import RouterConfig
 
-FILES = 65536  # as many as there may be links, also those that never say a word
+FILES = 65536  # one per possible link, including links that never send a message
 FLUSH_NS = 1_000_000_000
 
 
 async def run(config: RouterConfig, bus: Bus, ready: Callable[[], None]) -> None:
-    """Routing goes on by itself for as long as the session is open."""
+    """Run access control, if keys are configured; the session itself does the routing."""
     _make_room()
     if not config.knows:
         ready()
@@ -40,9 +40,9 @@ async def _keep(bus: Bus, trail: AuditTrail) -> None:
 
 
 def _make_room() -> None:
-    """Silent connections must not use up the files that this process may have open."""
+    """Raise the limit of open files, so that silent connections do not exhaust it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = FILES if hard == resource.RLIM_INFINITY else min(hard, FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:
-        with contextlib.suppress(ValueError, OSError):  # some systems allow less than they say
+        with contextlib.suppress(ValueError, OSError):  # some systems allow less than they report
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))

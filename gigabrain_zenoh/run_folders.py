@@ -1,4 +1,4 @@
-"""The folders of past runs: how many are kept, and which are in use."""
+"""Folders of past runs: limits their number and size, and marks those in use."""
 
 import contextlib
 import fcntl
@@ -11,7 +11,7 @@ from pathlib import Path
 log = logging.getLogger(__name__)
 
 MAX_RUNS = 50
-MAX_BYTES = 1_000_000_000  # of all together
+MAX_BYTES = 1_000_000_000  # of all folders together
 LOCK = ".in_use"  # locked by the supervisor for as long as it runs
 
 
@@ -22,11 +22,11 @@ def hold(folder: Path) -> None:
 
 @contextlib.contextmanager
 def tidied(base: Path) -> Iterator[None]:
-    """Make room in `base`, and keep others from tidying up before the new folder is held.
+    """Prune `base`, and keep other supervisors from pruning it while the block runs.
 
-    Raises OSError.
+    Create and `hold` the new folder inside the block. Raises OSError.
     """
-    with contextlib.suppress(FileExistsError):  # perhaps no folder, which the next line says
+    with contextlib.suppress(FileExistsError):  # if `base` is a file, the next line raises
         base.mkdir(parents=True)
     lock = os.open(base, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -38,9 +38,9 @@ def tidied(base: Path) -> Iterator[None]:
 
 
 def prune(base: Path, max_runs: int = MAX_RUNS, max_bytes: int = MAX_BYTES) -> None:
-    """Remove the oldest run folders until the rest, with one more to come, is within the limits.
+    """Remove the oldest run folders until there is room for one more within the limits.
 
-    Folders in use stay. What cannot be removed stays too: a run does not fail for that.
+    Folders in use are kept. Folders that cannot be removed are skipped, and do not fail the run.
     """
     runs = sorted((path for path in base.glob("*") if path.is_dir()), key=lambda path: path.name)
     sizes = {path: _size(path) for path in runs}
@@ -57,11 +57,11 @@ def prune(base: Path, max_runs: int = MAX_RUNS, max_bytes: int = MAX_BYTES) -> N
 
 
 def _size(folder: Path) -> int:
-    """The bytes of all files in it."""
+    """Return the total size of all files in `folder` [bytes]."""
     total = 0
     for parent, _, names in os.walk(folder):
         for name in names:
-            with contextlib.suppress(OSError):  # another supervisor is tidying up as well
+            with contextlib.suppress(OSError):  # another process has removed the file
                 total += os.lstat(os.path.join(parent, name)).st_size
     return total
 
@@ -69,7 +69,7 @@ def _size(folder: Path) -> int:
 def _in_use(folder: Path) -> bool:
     try:
         lock = os.open(folder / LOCK, os.O_RDWR)
-    except OSError:  # not marked, so nobody holds it
+    except OSError:  # not marked, so no process holds it
         return False
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,7 +1,8 @@
-"""How long threads waited for a core while they could run, by Linux's account of each.
+"""Time that threads spent waiting for a core, from Linux's per-thread scheduler statistics.
 
-A thread waits while others hold the cores; it does not wait while it sleeps, blocks or computes. So
-this tells a busy machine from a slow program. 0 on systems that keep no account.
+A thread waits while it is runnable and others hold the cores. Sleeping, blocking and computing do
+not count, so this distinguishes a busy machine from a slow program. 0 on systems without these
+statistics.
 """
 
 import os
@@ -13,25 +14,25 @@ STOLEN = 8  # field of a core's line in /proc/stat (proc_stat(5))
 
 
 def waited_ms() -> float:
-    """Return how long the threads of this process have waited in all [ms]."""
+    """Return how long the threads of this process have waited in total [ms]."""
     return sum(by_thread("self").values()) / 1e6
 
 
 def own_waited_ms() -> float:
-    """Return how long the calling thread has waited in all [ms]."""
+    """Return how long the calling thread has waited in total [ms]."""
     return _waited_ns(OWN) / 1e6
 
 
 def by_thread(process: int | str) -> dict[str, int]:
-    """Return how long each thread of `process` has waited in all [ns], by thread id."""
+    """Return how long each thread of `process` has waited in total [ns], by thread id."""
     files = (PROC / str(process) / "task").glob("*/schedstat")
     return {file.parent.name: _waited_ns(file) for file in files}
 
 
 def stolen() -> dict[str, int]:
-    """Return how long a virtual machine's host has kept each core from it in all [ns], by core.
+    """Return how long the host of a virtual machine has withheld each core in total [ns], by core.
 
-    The kernel counts in ticks of 10 ms, as a rule.
+    The kernel usually counts in ticks of 10 ms.
     """
     try:
         lines = (PROC / "stat").read_text().splitlines()
@@ -43,8 +44,8 @@ def stolen() -> dict[str, int]:
 
 
 def _waited_ns(schedstat: Path) -> int:
-    """Return a file's second number (kernel, Documentation/scheduler/sched-stats.rst)."""
+    """Return a schedstat file's second number (kernel, Documentation/scheduler/sched-stats.rst)."""
     try:
         return int(schedstat.read_text().split()[1])
-    except OSError:  # the thread has just ended, or the system keeps no account
+    except OSError:  # the thread has just ended, or the system has no statistics
         return 0

@@ -1,4 +1,4 @@
-"""Which robots run on this machine, so that tools and scripts find them by themselves."""
+"""Registry of the robots that run on this machine, so that tools and scripts can find them."""
 
 import contextlib
 import fcntl
@@ -19,21 +19,21 @@ from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.zenoh_config import secured
 
 SOCKET = "unixsock-stream"
-NOTE_BYTES = 65536  # at most
+NOTE_BYTES = 65536  # maximum size of a note
 
-Pid = Annotated[int, Meta(ge=1, le=2**31 - 1)]  # no group, and nobody's by default
+Pid = Annotated[int, Meta(ge=1, le=2**31 - 1)]  # 0 and negative pids address process groups
 
 
 class Running(Struct, frozen=True, kw_only=True):
-    """One robot on this machine."""
+    """A robot that runs on this machine."""
 
-    pid: Pid  # of its supervisor, or of its router where that was started by hand
-    label: str  # for people
+    pid: Pid  # of its supervisor, or of a router that was started by hand
+    label: str  # name shown to users
     endpoint: Endpoint
 
 
 def folder() -> Path:
-    """Where each supervisor leaves a note for as long as it runs."""
+    """Return the folder in which each supervisor keeps a note while it runs."""
     runtime = (
         os.environ.get("XDG_RUNTIME_DIR") or f"{tempfile.gettempdir()}/gigabrain-{os.getuid()}"
     )
@@ -41,15 +41,15 @@ def folder() -> Path:
 
 
 def local_socket() -> str:
-    """The Zenoh endpoint by which only this user reaches the router of this supervisor."""
+    """Return the Zenoh endpoint of this supervisor's router that only this user can reach."""
     return f"{SOCKET}/{folder() / str(os.getpid())}.sock"
 
 
 @contextmanager
 def announced(label: str, endpoint: Endpoint) -> Iterator[Path]:
-    """Leave a note while the block runs; its path. Raises ConfigError.
+    """Keep a note on disk while the block runs, and yield its path. Raises ConfigError.
 
-    The note is locked for as long as this process lives: its pid may be used again.
+    The note stays locked while this process lives, because its pid may be reused afterwards.
     """
     note = folder() / f"{os.getpid()}.json"
     robot = Running(pid=os.getpid(), label=label, endpoint=endpoint)
@@ -68,7 +68,7 @@ def announced(label: str, endpoint: Endpoint) -> Iterator[Path]:
 
 
 def _written(note: Path, text: bytes) -> BinaryIO:
-    """The note, written and locked; nobody finds half of it."""
+    """Write and lock the note, and return its open file. The note appears atomically."""
     fresh = note.with_suffix(".new")
     file = fresh.open("wb")
     try:
@@ -83,7 +83,7 @@ def _written(note: Path, text: bytes) -> BinaryIO:
 
 
 def _check_private(place: Path) -> None:
-    """Raises ConfigError where somebody else may put notes into the folder, or swap it."""
+    """Raise ConfigError where another user could put notes into the folder, or replace it."""
     for one in (place, place.parent):
         with contextlib.suppress(FileNotFoundError):
             about = one.stat()
@@ -95,15 +95,15 @@ def _check_private(place: Path) -> None:
 
 
 def _forget(note: Path) -> None:
-    """Take away a note, and the socket that a router beside it may have left."""
+    """Remove a note, and the socket that its router may have left."""
     for path in (note, note.with_suffix(".sock"), note.with_suffix(".sock.lock")):
         path.unlink(missing_ok=True)
 
 
 def running() -> list[Running]:
-    """The robots whose supervisors are alive; notes of dead ones are taken away.
+    """Return the robots whose supervisors are alive, and remove the notes of dead ones.
 
-    Raises ConfigError where others may have written them.
+    Raises ConfigError where other users may have written the notes.
     """
     _check_private(folder())
     notes = sorted(folder().glob("*.json"))
@@ -111,7 +111,7 @@ def running() -> list[Running]:
 
 
 def _read(note: Path) -> Running | None:
-    """The robot of a note; None where whoever left it is dead, or it cannot be read."""
+    """Return the robot of a note. If the note is invalid or its process is dead, remove it."""
     try:
         with open_regular(note) as file:
             if _locked(file):
@@ -123,7 +123,7 @@ def _read(note: Path) -> Running | None:
 
 
 def _locked(file: BinaryIO) -> bool:
-    """Whether whoever wrote the file still has it open."""
+    """Return whether the process that wrote the file still has it open."""
     try:
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -132,9 +132,10 @@ def _locked(file: BinaryIO) -> bool:
 
 
 def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> Endpoint:
-    """Where the robot is: as told, or the only one on this machine. Raises BusError.
+    """Return the endpoint given by `connect`, or that of the only robot on this machine.
 
-    `keys` is the folder of the asker's identity, for a router that wants one.
+    Raises BusError where there is no robot, Ambiguous where there are several. `keys` is the folder
+    of the client's identity, for a router that requires one.
     """
     if connect:
         folder = str(Path(keys).expanduser().absolute()) if keys else ""
@@ -150,7 +151,7 @@ def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> E
 
 
 def _place(robot: Running) -> tuple[str, str]:
-    """What two hosts of one robot have in common, where both are this machine."""
+    """Return the address and namespace, which two hosts of one robot on this machine share."""
     return robot.endpoint.connect[-1], robot.endpoint.namespace
 
 

@@ -1,4 +1,4 @@
-"""The newest message of a busy topic, for those who only show it."""
+"""Keeps only the newest message of a busy topic, for viewers."""
 
 from collections import deque
 from typing import Generic, TypeVar
@@ -11,27 +11,27 @@ from gigabrain_zenoh.freshness import CLOCK_KEYS, CONFIRMED
 
 M = TypeVar("M", bound=Message)
 
-SHOWN_NS = 500_000_000  # how old a message may be that is shown to people
+SHOWN_NS = 500_000_000  # maximum age of a message that is shown
 
 
 class Sampled(Generic[M]):
-    """The newest message of a topic, which is decoded no more often than somebody looks."""
+    """Newest message of a topic, decoded only when it is read."""
 
     def __init__(self, bus: Bus, topic: Topic[M]) -> None:
         self._latest = Latest(topic, bus.clock, bus.time)
         self._time = bus.time if topic.key in CLOCK_KEYS else None
         self._codec = Codec(topic.type, topic.max_bytes)
-        # of those that move the clock so many that they can confirm a jump between two looks
+        # topics that move the clock keep enough messages to confirm a jump between two reads
         self._raw: deque[bytes] = deque(maxlen=CONFIRMED if self._time else 1)
         if not topic.many:
             bus.tap(topic.key, self.take)
 
     def take(self, _key: str, _encoding: str, payload: bytes) -> None:
-        """Keep a payload, in whatever thread it comes."""
+        """Keep an encoded payload. May be called from any thread."""
         self._raw.append(payload)
 
     def look(self) -> M | None:
-        """The message that has come since the last look, if there is a valid one."""
+        """Return the newest valid message since the last call; None if there is none."""
         while self._raw:
             try:
                 message = self._codec.decode(self._raw.pop())
@@ -44,6 +44,6 @@ class Sampled(Generic[M]):
         return None
 
     def fresh(self) -> M | None:
-        """The newest message, while it is worth showing."""
+        """Return the newest message if it is recent enough to show (SHOWN_NS), else None."""
         self.look()
         return self._latest.fresh(SHOWN_NS)

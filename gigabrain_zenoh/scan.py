@@ -1,4 +1,4 @@
-"""What one scan of a planar lidar shows: where its beams end, and whether it can be believed."""
+"""Evaluates one scan of a planar lidar: positions of its hits, and whether it is plausible."""
 
 import math
 from functools import lru_cache
@@ -12,19 +12,19 @@ from gigabrain_schemas.sensors import LaserScan
 
 Floats = NDArray[np.float64]
 
-EDGE = 1e-9  # [rad], [m], so that rounding does not decide what lies on an edge
-STUCK_BEAMS = 8  # so many beams that all agree to the last bit come from a stuck lidar
+EDGE = 1e-9  # [rad], [m], tolerance, so that rounding does not decide at an edge
+STUCK_BEAMS = 8  # from this many beams on, exactly equal ranges mean a stuck lidar
 
 
 def scan_problem(lidar: Lidar, values: NDArray[np.float32], nearest: float) -> str:
-    """Why a scan must not be believed, or an empty text. A blind lidar is not free space.
+    """Return why a scan is not plausible, or an empty text. A blind lidar does not mean free space.
 
-    `values` are the ranges (n,) [m]; those below `nearest` [m] are the lidar's own housing.
+    The ranges `values` (n,) are in [m]; those below `nearest` [m] are the lidar's own housing.
     """
     count = len(values)
     if count != lidar.beams:
         return f"the scan has {count} beams, the body's lidar {lidar.beams}"
-    seen = values >= nearest  # nan is not, nor is -inf (REP-117: too close to measure)
+    seen = values >= nearest  # False for nan, and for -inf (REP-117: too close to measure)
     if lidar.no_return == "unknown":
         seen &= values < np.inf
     found = int(np.count_nonzero(seen))
@@ -39,7 +39,10 @@ def scan_problem(lidar: Lidar, values: NDArray[np.float32], nearest: float) -> s
 
 
 def blind_ahead(lidar: Lidar, scan: LaserScan, nearest: float, cone_deg: float) -> str:
-    """Why nothing is known of the cone ahead (whole angle [deg]), or an empty text."""
+    """Return a problem if half the beams or more ahead are missing, else an empty text.
+
+    The cone's whole angle is `cone_deg` [deg].
+    """
     values = ranges(scan)
     cone = _beams_ahead(len(values), scan.angle_min, scan.angle_increment, lidar.yaw, cone_deg)
     seen = int(np.count_nonzero(values[cone] >= nearest))
@@ -49,7 +52,7 @@ def blind_ahead(lidar: Lidar, scan: LaserScan, nearest: float, cone_deg: float) 
 
 
 def hits(lidar: Lidar, scan: LaserScan, nearest: float) -> tuple[Floats, Floats]:
-    """Where the beams of `scan` hit something: x and y in the body's frame [m], (n,) each."""
+    """Return x and y of the hits of `scan` in the body's frame [m], (n,) each."""
     values = ranges(scan)
     farthest = min(scan.range_max, lidar.range_max)
     hit = (values >= nearest) & (values <= farthest)  # nan and inf are neither
@@ -62,7 +65,7 @@ def hits(lidar: Lidar, scan: LaserScan, nearest: float) -> tuple[Floats, Floats]
 def beams(
     count: int, angle_min: float, angle_increment: float, yaw: float
 ) -> tuple[Floats, Floats]:
-    """Cosines and sines of the beams' angles in the body's frame, (count,) each."""
+    """Return cosines and sines of the beam angles in the body's frame, (count,) each."""
     angles = yaw + angle_min + angle_increment * np.arange(count)
     return np.cos(angles), np.sin(angles)
 
@@ -71,6 +74,6 @@ def beams(
 def _beams_ahead(
     count: int, angle_min: float, angle_increment: float, yaw: float, cone_deg: float
 ) -> NDArray[np.intp]:
-    """Indices of the beams that look into the cone ahead, as the lidar sees it."""
+    """Return the indices of the beams that point into the cone ahead, seen from the lidar."""
     cosines, _ = beams(count, angle_min, angle_increment, yaw)
     return np.flatnonzero(cosines >= math.cos(math.radians(cone_deg) / 2) - EDGE)

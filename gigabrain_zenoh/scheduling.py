@@ -1,20 +1,19 @@
-"""What a process asks of the kernel's scheduler: to go before others, or after them."""
+"""Scheduling priorities of processes: ahead of other programs, or after them."""
 
 import contextlib
 import os
 from pathlib import Path
 
-FIRST = -10  # as nice(1) counts: nine times the weight of a program that asks for nothing
+FIRST = -10  # nice value, see nice(1): nine times the weight of a program at nice 0
 AUTOGROUP = Path("/proc/self/autogroup")
 
 
 def go_first() -> None:
-    """Have this process run before others, on a busy machine as well, where it may: as root, or
-    with a RLIMIT_NICE that allows it.
+    """Raise the priority of this process permanently, as root or with a sufficient RLIMIT_NICE.
 
-    Linux shares the time out among sessions first, and niceness counts only within one ("The
-    autogroup feature", sched(7)). So it is said of the session, too; it is the supervisor that
-    gives each process one of its own.
+    Linux first shares the CPU among sessions; niceness counts only within one ("The autogroup
+    feature", sched(7)). The session's priority is therefore set too. The supervisor gives each
+    process its own session.
     """
     with contextlib.suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, 0, FIRST)
@@ -22,29 +21,29 @@ def go_first() -> None:
 
 
 def start_first() -> None:
-    """Have this process go before others until `join_in`, where it may.
+    """Raise the priority of this process's session until `join_in`, where permitted.
 
-    A robot stands still until the part of its brain that has died is back.
+    The robot is at rest until a crashed part of its brain has restarted, so start-up comes first.
     """
     _session(FIRST)
 
 
 def join_in() -> None:
-    """Take the same share as others from now on."""
+    """Return this process's session to normal priority."""
     _session(0)
 
 
 def _session(nice: int) -> None:
     if os.getsid(0) == os.getpid():
-        with contextlib.suppress(OSError):  # no rights, a kernel without, or another system
+        with contextlib.suppress(OSError):  # no permission, or no autogroups here
             AUTOGROUP.write_text(str(nice))
 
 
 def step_aside() -> None:
-    """Have this thread, and those that it starts, wait where they would push others aside.
+    """Make this thread, and threads it starts, wait rather than preempt others on waking.
 
-    Linux's SCHED_BATCH needs no rights and takes nothing of a process's share: what wakes up does
-    not interrupt what runs (sched(7)).
+    Linux's SCHED_BATCH needs no permission and does not reduce the process's share of the CPU. A
+    thread that wakes up does not interrupt a running one (sched(7)).
     """
     if hasattr(os, "SCHED_BATCH"):
         with contextlib.suppress(OSError):  # a container may forbid it

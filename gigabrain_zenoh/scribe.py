@@ -1,4 +1,4 @@
-"""Writes files behind the event loop: a slow or full disk must not hold up a body."""
+"""Writes files in a worker thread, so that a slow or full disk does not delay the event loop."""
 
 import asyncio
 import logging
@@ -12,10 +12,10 @@ T = TypeVar("T")
 
 
 class Scribe(Generic[T]):
-    """Hands items to `write` in a thread, in order; those that wait meanwhile go as one batch.
+    """Queue whose items are passed to `write` in a worker thread, in order and in batches.
 
-    `write` returns a problem in one line, or an empty text once all is on disk. When more than
-    `room` items wait, the oldest give way.
+    The function `write` returns a problem in one line, or an empty text once all is on disk. When
+    more than `room` items wait, the oldest are dropped.
     """
 
     def __init__(self, write: Callable[[Sequence[T]], str], room: int) -> None:
@@ -23,10 +23,10 @@ class Scribe(Generic[T]):
         self._items: deque[T] = deque(maxlen=room)
         self._waiting: list[asyncio.Future[str]] = []
         self._task: asyncio.Task[None] | None = None
-        self.lost = 0  # items that gave way
+        self.lost = 0  # number of dropped items
 
     def put(self, item: T) -> asyncio.Future[str]:
-        """Have `item` written; ends with the problem, or an empty text, once that is known."""
+        """Queue `item` for writing; the future resolves to the problem, or to an empty text."""
         self.lost += len(self._items) == self._items.maxlen
         self._items.append(item)
         done: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -36,7 +36,7 @@ class Scribe(Generic[T]):
         return done
 
     async def close(self) -> None:
-        """Wait until all is written."""
+        """Wait until all items are written."""
         if self._task:
             await self._task
 
@@ -47,7 +47,7 @@ class Scribe(Generic[T]):
             try:
                 problem = await asyncio.to_thread(self._write, items)
             except Exception as error:
-                # whatever it was: those who wait must hear of it, and the next must be written
+                # any error must reach the waiting futures, and later items must still be written
                 log.exception("writing failed")
                 problem = f"{type(error).__name__}: {error}"
             for done in waiting:

@@ -1,7 +1,7 @@
-"""Tells a service manager how this service is doing, as sd_notify(3) has it; nothing without one.
+"""Client for the service manager's sd_notify(3) protocol; does nothing without a service manager.
 
-A datagram to the Unix socket named in the environment. What is started from here is not to speak in
-this service's name, so the variables are taken out.
+Sends datagrams to the Unix socket named in the environment. The variables are removed from the
+environment, so that child processes do not notify in this service's name.
 """
 
 import contextlib
@@ -11,11 +11,11 @@ import time
 from collections.abc import Callable
 from typing import Self
 
-SHARE = 0.4  # of the watchdog's time that may pass before it is fed again
+SHARE = 0.4  # fraction of the watchdog's timeout between two keep-alives
 
 
 class Notifier:
-    """One service's word to its manager. The robot goes on where nobody listens any more."""
+    """Sends one service's state to its manager. Errors are ignored: the robot continues."""
 
     def __init__(
         self,
@@ -30,7 +30,7 @@ class Notifier:
 
     @classmethod
     def from_environment(cls) -> Self:
-        """What the service manager has left in the environment of this process."""
+        """Create a notifier from the service manager's variables, and unset them."""
         address = os.environ.pop("NOTIFY_SOCKET", "")
         microseconds = os.environ.pop("WATCHDOG_USEC", "")
         meant = os.environ.pop("WATCHDOG_PID", "") or str(os.getpid())
@@ -38,19 +38,23 @@ class Notifier:
         return cls(address, int(microseconds) / 1e6 if fed else None)
 
     def ready(self) -> None:
-        """The service does what it is there for; said once."""
+        """Report that the service is ready; sent only once."""
         if not self._ready:
             self._ready = True
             self._tell("READY=1")
 
     def status(self, text: str) -> None:
-        """A line for people; said when it changes."""
+        """Send a status line for people; sent only when it changes."""
         if text != self._status:
             self._status = text
             self._tell(f"STATUS={text}")
 
     def alive(self) -> None:
-        """All make progress; without this the service manager starts the service anew."""
+        """Feed the watchdog, if one is configured and it is due.
+
+        Call this while all processes make progress. Otherwise the service manager restarts the
+        service.
+        """
         now_s = self._now_s()
         if self._watchdog_s is None:
             return
@@ -59,7 +63,7 @@ class Notifier:
             self._tell("WATCHDOG=1")
 
     def stopping(self) -> None:
-        """The service ends because it was asked to."""
+        """Report that the service is stopping on request."""
         self._tell("STOPPING=1")
 
     def _tell(self, line: str) -> None:

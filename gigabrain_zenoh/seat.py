@@ -1,4 +1,4 @@
-"""Who of several viewers steers."""
+"""Arbitration between several viewers that can steer the robot."""
 
 from typing import Protocol
 
@@ -6,44 +6,47 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Body
 from gigabrain_zenoh.limits import ZERO, clamp, limits_of
 
-SEAT_S = 0.5  # after so long without a command another viewer may steer
-GAP_S = 0.2  # a stream with a longer gap begins anew
-SETTLE_S = 0.1  # what a network had stored comes at once: so much of a new stream is passed over
+SEAT_S = 0.5  # after this time without a command, another viewer may steer
+GAP_S = 0.2  # after a longer gap, commands count as a new stream
+SETTLE_S = 0.1  # start of a new stream that is ignored: commands the network had buffered
 
 
 class Steered(Protocol):
-    """The robot, as far as somebody who steers it has to know it."""
+    """Interface to the robot that steering needs."""
 
     @property
     def body(self) -> Body | None:
-        """What it is; None while that is not known."""
+        """Return the robot's body; None until it is received."""
         ...
 
     @property
     def enables(self) -> int | None:
-        """How often its gate was enabled; None while the robot is silent."""
+        """Return how often its gate was enabled; None while the robot sends nothing."""
         ...
 
     def steer(self, wanted: Velocity) -> None:
-        """Tell its control what an operator wants."""
+        """Send the operator's wanted velocity to the robot's control."""
         ...
 
 
 class Seat:
-    """One viewer steers at a time, for as long as commands come. Nothing is ever repeated here."""
+    """Lets one viewer steer at a time, while its commands come. Commands are never repeated."""
 
     def __init__(self, robot: Steered) -> None:
         self._robot = robot
         self._viewer = 0
         self._until_s = self._said_s = self._from_s = 0.0
-        self._enables: int | None = None  # of the gate, when a viewer last steered
+        self._enables: int | None = None  # the gate's count when a viewer last steered
 
     def driving(self, now_s: float) -> int:
-        """The number of the viewer who steers, or 0."""
+        """Return the number of the viewer that steers, or 0."""
         return self._viewer if now_s < self._until_s else 0
 
     def drive(self, viewer: int, wanted: Velocity, now_s: float) -> bool:
-        """Pass on what a viewer (1, 2, …) wants; False where another one steers."""
+        """Pass on the velocity that a viewer (1, 2, …) wants; return False if another one steers.
+
+        A zero velocity from another viewer is ignored, and returns True.
+        """
         if self.driving(now_s) not in (0, viewer):
             return wanted == ZERO
         body = self._robot.body
@@ -60,17 +63,20 @@ class Seat:
         return True
 
     def leave(self, viewer: int) -> None:
-        """A viewer is gone: whatever it wanted ends."""
+        """Stop the robot if the viewer that leaves was steering it."""
         if viewer == self._viewer:
             self._end()
 
     def clear(self) -> None:
-        """Nobody steers any more: an e-stop was pressed."""
+        """End steering by any viewer, because an e-stop was pressed."""
         if self._viewer:
             self._end()
 
     def _end(self) -> None:
-        """Stop what was steered, unless the body was handed over since: a zero would take it."""
+        """Publish a zero velocity, unless the gate was enabled again since the last command.
+
+        In that case a zero would take the body back from its new commander.
+        """
         self._viewer = 0
         if self._robot.enables in (None, self._enables):
             self._robot.steer(ZERO)

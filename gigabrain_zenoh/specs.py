@@ -1,4 +1,4 @@
-"""What a supervisor has to run: a deployment's processes on one host, and what each is told."""
+"""Builds the list of processes that a supervisor runs on one host, with each process's settings."""
 
 import sys
 from collections.abc import Mapping
@@ -14,10 +14,10 @@ from gigabrain_zenoh.relay_place import RELAY, behind, between, has_relay, relay
 from gigabrain_zenoh.settings import DriverConfig, EmulatorConfig, Endpoint, RecorderConfig
 from gigabrain_zenoh.zenoh_config import router_config
 
-# -P: a folder that happens to be the current one must not stand in for an installed package
+# -P: a package in the current folder must not shadow an installed one
 COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.process")
-LATER_S, SOON_S = 3600.0, 30.0  # where the router is elsewhere, it may come later
-COMPILING_S = 600.0  # what maps and navigates is compiled at its very first start
+LATER_S, SOON_S = 3600.0, 30.0  # a router on another host may start later
+COMPILING_S = 600.0  # mapping and navigation compile their kernels at the first start
 
 
 def process_specs(
@@ -29,7 +29,7 @@ def process_specs(
     seconds: float | None = None,
     level: str = "info",
 ) -> list[ProcessSpec]:
-    """What the supervisor of `host` has to run, in readiness order: the router or relay first."""
+    """Build the specs of the processes of `host`, in readiness order: the router or relay first."""
     names = _names(deployment, host)
     settings = dict(_settings(deployment, run_dir, state_dir, seconds))
     specs = []
@@ -58,14 +58,14 @@ def process_specs(
 
 
 def _patience_s(deployment: Deployment, name: str) -> float:
-    """How long a process may take until it is ready."""
+    """Return how long a process may take until it is ready [s]."""
     maps = name == "perception" and deployment.perception.mapping != "off"
     navigates = name == "decision" and deployment.decision.behaviour == "navigate"
     return COMPILING_S if maps or navigates else SOON_S
 
 
 def _names(deployment: Deployment, host: str) -> list[str]:
-    """The processes of `host`, with those that no file has to name."""
+    """Return the processes of `host`, including those that deployment files need not name."""
     names: list[str] = sorted(deployment.hosts[host], key=(*ALL, BUTTON).index)
     placed = any(BUTTON in others for others in deployment.hosts.values())
     if deployment.button and "driver" in names and not placed:
@@ -80,7 +80,7 @@ def _names(deployment: Deployment, host: str) -> list[str]:
 def _place(
     deployment: Deployment, host: str, name: str, names: list[str], state_dir: Path
 ) -> tuple[Endpoint, dict[str, Any]]:
-    """Where a process meets the others, and what a router or a relay is told of that."""
+    """Return a process's endpoint, and the settings of a router or relay that depend on it."""
     endpoint = local_endpoint(deployment, host)
     if name == "router":
         door = msgspec.structs.replace(
@@ -93,9 +93,9 @@ def _place(
 
 
 def _after(deployment: Deployment, name: str, names: list[str]) -> tuple[str, ...]:
-    """Which processes have to be ready before this one starts."""
+    """Return the processes that must be ready before this one starts."""
     first: tuple[str, ...] = ("router", EMULATOR) if name == "driver" else ("router", RELAY)
-    if name == "driver" and deployment.recorder.file:  # to be recorded from its first tick
+    if name == "driver" and deployment.recorder.file:  # to record the driver from its first tick
         first = (*first, "recorder")
     return tuple(other for other in first if other in names and other != name)
 
@@ -133,7 +133,7 @@ def _settings(
 
 
 def with_notes(deployment: Deployment) -> RecorderConfig:
-    """What to record, with what a replay has to know of the processes in the file."""
+    """Return the recorder's settings, with notes on the other processes that a replay needs."""
     about = {"perception": deployment.perception, "decision": deployment.decision}
     notes = {name: msgspec.json.encode(settings).decode() for name, settings in about.items()}
     plain = {"body": deployment.body, "link": deployment.link, "world": deployment.world}

@@ -1,7 +1,7 @@
-"""Keeps Python's own record of a foreign thread, for callbacks that come by the hundred a second.
+"""Keeps Python's thread state of a foreign thread, for hundreds of callbacks per second.
 
-A thread that is not Python's, such as Zenoh's, is given that record when a callback begins, and
-loses it with its memory when the callback ends: a quarter of what a small message costs.
+A foreign thread, such as Zenoh's, gets a Python thread state when a callback begins. It loses the
+state when the callback ends. This is a quarter of the cost of a small message.
 """
 
 import ctypes
@@ -11,10 +11,10 @@ _here = threading.local()
 
 
 def stay() -> None:
-    """Called within a callback: this thread keeps its record until it ends itself.
+    """Keep the thread state of the calling thread until the thread ends. Call it within a callback.
 
-    As PyGILState_Ensure has it, which counts how often it is called; the count of the callback
-    around this call goes back to one and never to zero.
+    PyGILState_Ensure counts its calls. The extra call here is never released, so the count returns
+    to one and never to zero when the callback ends.
     """
     if not getattr(_here, "stays", False):
         _here.stays = True

@@ -1,6 +1,6 @@
-"""Where the robot is in its map, and which way it is to take: what decision drives to places by.
+"""Localization and routing for decision: the robot's pose in the map, and a route for each order.
 
-It takes a while to import; `navigating` serves goals meanwhile.
+The import takes long; until it is done, `navigating` already serves goals.
 """
 
 import asyncio
@@ -35,14 +35,14 @@ from gigabrain_zenoh.response import ResponseEstimator, velocity_of
 from gigabrain_zenoh.settings import DecisionConfig
 from gigabrain_zenoh.tasks.orders import Order, Outcome
 
-POSE_NS = 1_000_000_000  # so old may be what was last heard of the place
-SENT_TICKS = 25  # commands of the last half second are planned with
-SMALL = 60_000  # cells; plans in larger maps are made in a thread,
-LARGE = 250_000  # and for each so many cells it may take a scan more than
-DUE_SCANS = 2
-HUNG_SCANS = 200  # a plan that is overdue for so many never ends
-PATIENCE_S = 0.05  # how long a scan waits for a plan that is due: control waits for no more
-AGAIN_TICKS = 25  # a route is looked at twice a second, whatever happens
+POSE_NS = 1_000_000_000  # maximum age of the last pose in the map
+SENT_TICKS = 25  # local planning uses the commands of the last half second
+SMALL = 60_000  # cells; routes in larger maps are planned in a worker thread,
+LARGE = 250_000  # every this many cells add one scan until a plan is due
+DUE_SCANS = 2  # scans until a plan is due, at least
+HUNG_SCANS = 200  # a plan that is overdue for this many scans will never finish
+PATIENCE_S = 0.05  # how long a scan waits for a due plan; control waits no longer
+AGAIN_TICKS = 25  # a route is checked at least twice a second
 OPERATOR_HOLDS = "an operator holds the body; `gigabrain enable` hands it back"
 NO_MAP = "nobody says yet where in a map the robot is; perception: {mapping: slam} would"
 
@@ -55,7 +55,7 @@ ANY_BODY = BodyDescription(
 
 
 class Steering:
-    """The robot's place, and a route for each order."""
+    """Tracks the robot's pose in the map, and plans a route for each order."""
 
     def __init__(self, config: DecisionConfig, bus: Bus) -> None:
         self._bus, self._config = bus, config
@@ -71,18 +71,18 @@ class Steering:
         self._guide = Guide(config.unknown)
         self._route: Route | None = None
         self._beside = Background(PATIENCE_S, bus.journal.in_time)
-        self._thought: tuple[int, OccupancyGrid] | None = None  # when, and about which map
+        self._thought: tuple[int, OccupancyGrid] | None = None  # tick and map of the last plan
         self._driven: Driven | None = None
         self._commands: Earlier[CmdVel] = Earlier()
         self._stands = False  # the behaviour did not follow its route in the last step
         self._counted = (0, 0)  # boot and tick until which `_held_ticks` has counted
-        self._held_ticks = 0  # since the last route was asked for
+        self._held_ticks = 0  # since the last route was requested
         self._here: Pose | None = None
-        self._seen = False  # a scan that can be believed, since the start
-        self._oriented = False  # it has known its place and a map since the start
+        self._seen = False  # a plausible scan has come since the start
+        self._oriented = False  # pose and map have both been known since the start
 
     def see(self, state: RobotState) -> None:
-        """Take note of each state."""
+        """Record a robot state; to be called with every state."""
         self._history = self._history.then(state)
         self._states.append(state)
         self._lateness.sees(state.boot, state.tick)
@@ -93,7 +93,7 @@ class Steering:
             self._bus.subscribe(command_topic(body.description), self._hear_command)
 
     def _hear_command(self, _key: str, command: CmdVel) -> None:
-        """What the gate would make of it is what the body answers."""
+        """Record a command, clamped as by the gate: the body follows the clamped one."""
         if body := self._bodies.current:
             told = clamp(velocity_of(command), limits_of(body.description))
             self._response.command(replace(command, **asdict(told)))
@@ -108,7 +108,7 @@ class Steering:
         order: Order | None,
         waits: str,
     ) -> Situation:
-        """Where the robot is, what it is to do, and which way."""
+        """Return the robot's pose, order and route; request a new route where one is due."""
         tick = world.basis if world else state.tick
         if world:
             self._seen = self._seen or world.scan_ok
@@ -143,7 +143,7 @@ class Steering:
         return Situation(world, pose or state.pose, must_charge(verdict), bearings)
 
     def heed(self, behaviour: Behaviour) -> Outcome | None:
-        """What became of the route goes to the guide; what became of the order is handed back."""
+        """Record how far the route was driven, for the guide; return the order's outcome."""
         if not isinstance(behaviour, Navigate):
             return None
         self._driven = behaviour.driven or self._driven
@@ -152,22 +152,22 @@ class Steering:
         return behaviour.outcome
 
     def close(self) -> None:
-        """End what runs beside."""
+        """Stop the worker thread."""
         self._beside.close()
 
     @property
     def hung(self) -> bool:
-        """Whether the plan in the making never ends."""
+        """Return whether the plan in the worker thread will never finish."""
         return self._beside.overdue > HUNG_SCANS
 
     @property
     def placed(self) -> bool:
-        """Whether it knows where in the map the robot is."""
+        """Return whether the robot's pose in the map is known."""
         return self._here is not None
 
     @property
     def waits(self) -> str:
-        """What there is to wait for at the start, until place and map are known; or nothing."""
+        """Return what start-up waits for; an empty text once pose and map were known."""
         if self._oriented:
             return ""
         if not self._seen:
@@ -176,28 +176,28 @@ class Steering:
         return "" if why == NO_MAP else why or "the map is on its way"
 
     async def way_to(self, goal: Goal) -> str:
-        """How it would get there, in words. Raises Refused, and why."""
+        """Return in words how the robot would reach `goal`. Raises Refused, with the reason."""
         grid = self._grid(self._bus.time.boot, self._bus.time.tick + 1)
         body = self._bodies.current
         if grid is None or body is None or self._here is None:
             raise Refused(self.lost)
-        # beside whatever the guide is at: it has a memory of its own
+        # a second guide, as the first may be planning in the worker thread
         guide = Guide(self._config.unknown)
         return await asyncio.to_thread(guide.check, grid, body.description, self._here, goal)
 
     @property
     def lost(self) -> str:
-        """Why it does not know where in the map the robot is, or has no map."""
+        """Return why the robot's pose in the map is unknown, or that there is no map."""
         _, why = self._place(self._bus.time.boot, self._bus.time.tick)
         return why or "nobody has sent a map yet; try again"
 
     def _velocity(self, state: RobotState, tick: int) -> Velocity:
-        """The speed measured at a tick, or last before it; of a scan long past, the newest."""
+        """Return the speed measured at `tick` or last before it; the newest if none is kept."""
         known = (one for one in reversed(self._states) if one.boot == state.boot)
         return next((one.velocity for one in known if one.tick <= tick), state.velocity)
 
     def _place(self, boot: int, tick: int) -> tuple[Pose | None, str]:
-        """The odometry's frame in the map, or why that is not known."""
+        """Return the odometry frame's pose in the map, or None and the reason."""
         place = self._places.at(boot, tick, POSE_NS)
         if place is None:
             return None, NO_MAP
@@ -209,12 +209,15 @@ class Steering:
         return compose(Pose(x=place.x, y=place.y, yaw=place.yaw), inverse(then)), ""
 
     def _grid(self, boot: int, tick: int) -> OccupancyGrid | None:
-        """The newest map of before a tick: it is sent when it changes, and outlives the driver."""
+        """Return the newest map from before `tick`, or from an earlier run of the driver.
+
+        A map is published only when it changes, and stays valid when the driver restarts.
+        """
         earlier = (one for one in reversed(self._maps) if one.boot != boot or one.tick < tick)
         return next(earlier, None)
 
     def _held(self, state: RobotState) -> str:
-        """Why the body does not follow decision now, in words; empty while it does."""
+        """Return in words why the body does not follow decision; an empty text while it does."""
         gate = state.gate
         if gate.mode != "enabled":
             why = "; ".join(cause.text for cause in gate.causes)
@@ -225,7 +228,7 @@ class Steering:
         return OPERATOR_HOLDS if command and command.operator else ""
 
     def _count_held(self, boot: int, tick: int, held: str) -> None:
-        """Count the ticks in which the body did not follow the route."""
+        """Add the ticks since the last call if the body did not follow its route in them."""
         counted_boot, counted = self._counted
         if boot != counted_boot:
             counted, self._held_ticks = tick, 0
@@ -241,7 +244,7 @@ class Steering:
         body: BodyDescription,
         verdict: SafetyState | None,
     ) -> None:
-        """Have a route thought of where one is due."""
+        """Plan a new route where one is due; in large maps this happens in a worker thread."""
         grid = self._grid(world.boot, world.basis)
         self._oriented = self._oriented or grid is not None
         if order is None or grid is None or self._here is None:
@@ -272,7 +275,7 @@ class Steering:
             self._beside.start(lambda: self._thought_of(asked), scans)
 
     def _thought_of(self, asked: Asked) -> Take:
-        """In a thread of its own: the route, and what makes it count."""
+        """Plan a route (in the worker thread), and return a function that installs it."""
         route = self._guide.think(asked)
 
         def take() -> None:
@@ -281,7 +284,7 @@ class Steering:
         return take
 
     def _due(self, order: Order, tick: int, grid: OccupancyGrid) -> bool:
-        """Whether a new route is wanted."""
+        """Return whether a new route is needed."""
         if self._route is None or self._thought is None or self._route.number != order.number:
             return True
         before, known = self._thought
@@ -291,6 +294,6 @@ class Steering:
 
 
 def warm_up() -> None:
-    """Call every kernel of planning and driving once."""
+    """Call every kernel of planning and driving once, so that it is compiled."""
     planner.warm_up()
     local.warm_up(ANY_BODY)

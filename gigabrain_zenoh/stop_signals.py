@@ -1,4 +1,4 @@
-"""Signals inside an event loop: what they stop ends in good order."""
+"""Stop signals inside an event loop: work stops in an orderly way."""
 
 import asyncio
 from collections.abc import Coroutine, Iterator
@@ -12,9 +12,9 @@ T = TypeVar("T")
 
 @contextmanager
 def stop_signals(limit_s: float = LIMIT_S) -> Iterator[asyncio.Event]:
-    """Yield an event that the first SIGINT, SIGTERM or SIGHUP sets; more of them do no harm.
+    """Yield an event that the first SIGINT, SIGTERM or SIGHUP sets; further signals do nothing.
 
-    A command that has not ended `limit_s` after the signal is ended by force.
+    A command that has not ended `limit_s` after the signal is terminated by force.
     """
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
 
@@ -27,11 +27,11 @@ def stop_signals(limit_s: float = LIMIT_S) -> Iterator[asyncio.Event]:
 
 
 def run_async(work: Coroutine[Any, Any, T]) -> T:
-    """Run a command's coroutine to its end; the first signal cancels it.
+    """Run a command's coroutine until it ends; the first signal cancels it.
 
-    Raises KeyboardInterrupt where that ended it. Unlike `asyncio.run`, it does so for SIGTERM and
-    SIGHUP too, never interrupts asyncio's own code, and hears SIGINT also where a shell has had it
-    ignored.
+    Raises KeyboardInterrupt if a signal ended it. Unlike `asyncio.run`, it also does so for SIGTERM
+    and SIGHUP, and never interrupts asyncio's own code. It also receives SIGINT where a shell has
+    set it to be ignored.
     """
 
     async def cancelled_by_signal() -> T:

@@ -1,7 +1,7 @@
-"""How far ahead must be free, and how fast the body may go with the room that there is.
+"""Stopping distance at a given speed, and the highest speed for a given free distance.
 
-`L(v) = v T + v² / 2a + margin`, where T is the time from scan to brake and a the deceleration; for
-turning the same with angles.
+The distance is `L(v) = v T + v² / 2a + margin`. T is the time from scan to brake, and a the
+deceleration. For turning, the same formula applies to angles.
 """
 
 import math
@@ -13,32 +13,33 @@ from gigabrain_schemas.body import BodyDescription
 
 
 class Brake(msgspec.Struct, frozen=True, kw_only=True):
-    """How a body comes to rest along one axis: in [m], or in [rad] for turning."""
+    """Braking of a body along one direction of motion: in [m], or in [rad] for turning."""
 
     reaction_time: float  # [s]
     deceleration: float  # [m/s2]
-    margin: float  # [m], kept free in front of the body at rest
-    resume: float  # [m], more than the stop zone before it may go on
-    fastest: float  # [m/s], its limit
+    margin: float  # [m], free space that remains in front of the stopped body
+    resume: float  # [m], free space beyond the stop zone before it may move again
+    fastest: float  # [m/s], the body's limit
 
     def distance(self, speed: float) -> float:
-        """L(v): how far must be free at `speed`."""
+        """Return L(v), the distance that must be free at `speed`."""
         return speed * self.reaction_time + speed * speed / (2 * self.deceleration) + self.margin
 
     def speed(self, free: float) -> float:
-        """The speed from which it stops within `free`: L(v) solved for v."""
+        """Return the speed from which the body stops within `free`: L(v) solved for v."""
         t, a = self.reaction_time, self.deceleration
         return -a * t + math.sqrt((a * t) ** 2 + 2 * a * max(0.0, free - self.margin))
 
     @property
     def reach(self) -> float:
-        """As far as it is worth looking: beyond that nothing is slowed and any zone opens."""
+        """Return the distance beyond which obstacles do not limit or stop the body."""
         return self.distance(self.fastest) + self.resume
 
     def in_zone(self, free: float | None, speed: float, stopped: bool) -> bool:
-        """Whether a body at `speed` towards what is `free` away must stop, or stay `stopped`.
+        """Return whether a body moving at `speed` must stop, or stay `stopped`, with `free` ahead.
 
-        Once stopped, only a clear margin opens the zone again.
+        Once stopped, the body may move again only with `resume` more free space. None means no
+        obstacle.
         """
         if free is None:
             return False
@@ -46,7 +47,7 @@ class Brake(msgspec.Struct, frozen=True, kw_only=True):
         return free < self.distance(max(0.0, speed)) + resume
 
     def cap(self, free: float | None, stopped: bool) -> float | None:
-        """The speed allowed towards what is `free` away; None where nothing limits it."""
+        """Return the highest speed allowed with `free` ahead; None without a limit."""
         if stopped:
             return 0.0
         if free is None:
@@ -57,7 +58,7 @@ class Brake(msgspec.Struct, frozen=True, kw_only=True):
 
 @lru_cache(maxsize=8)
 def brakes(body: BodyDescription) -> dict[str, Brake]:
-    """The brake for each direction of motion that the body has."""
+    """Return the brake for each direction in which the body can move."""
     limits = body.thresholds
     along = Brake(
         reaction_time=limits.reaction_time,
@@ -70,7 +71,7 @@ def brakes(body: BodyDescription) -> dict[str, Brake]:
     turning = Brake(
         reaction_time=limits.reaction_time,
         deceleration=body.max_angular_acceleration,
-        margin=0.0,  # the sweep keeps room round the footprint
+        margin=0.0,  # the sweep keeps a margin around the footprint
         resume=limits.resume_margin / max(math.hypot(x, y) for x, y in body.footprint),
         fastest=body.max_angular_speed,
     )

@@ -1,4 +1,4 @@
-"""Runs the processes of one host: starts them in readiness order, and ends them all."""
+"""Runs the processes of one host: starts them in readiness order, and stops them all."""
 
 import asyncio
 import contextlib
@@ -14,13 +14,13 @@ from gigabrain_zenoh.keeper import Keeper, OnRecord, ProcessSpec, ProcessStatus,
 
 __all__ = ["Backoff", "OnRecord", "ProcessSpec", "ProcessStatus", "State", "Supervisor"]
 
-# Shares of the time that a stop may take, after which the processes are killed, and then left to
-# the kernel. The router goes last, so the others are hurried when there is one.
+# Fractions of the time limit of a stop, after which processes are killed, and then abandoned to
+# the kernel. The router stops last, so the others get less time where there is one.
 _FIRST, _REAPED, _LAST = 0.55, 0.65, 0.85
 
 
 class Supervisor:
-    """Runs processes until told to stop; used once. Leaves none behind, however it ends."""
+    """Runs processes until stopped; used once. However it ends, no processes remain."""
 
     def __init__(
         self,
@@ -41,23 +41,23 @@ class Supervisor:
 
     @property
     def deaths(self) -> int:
-        """How often a process has ended that nobody had asked to."""
+        """Return how often a process has ended unexpectedly."""
         return sum(keeper.deaths for keeper in self._keepers.values())
 
     @property
     def given_up(self) -> tuple[str, ...]:
-        """Names of the processes that are not started any more."""
+        """Return the names of processes that are no longer restarted."""
         return tuple(name for name, status in self.statuses.items() if status.state == "given up")
 
     @property
     def misconfigured(self) -> tuple[str, ...]:
-        """Names of those given up because what they were given is wrong (exit code 2)."""
+        """Return the names of processes given up for a wrong configuration (exit code 2)."""
         given_up = (self.statuses[name] for name in self.given_up)
         return tuple(s.name for s in given_up if s.last_exit == ConfigError.exit_code)
 
     @property
     def stuck(self) -> tuple[str, ...]:
-        """Names of the processes that run and make no progress."""
+        """Return the names of processes that run and make no progress."""
         return tuple(name for name, keeper in self._keepers.items() if keeper.stuck)
 
     async def __aenter__(self) -> Self:
@@ -67,7 +67,7 @@ class Supervisor:
         await self.stop()
 
     async def run(self) -> None:
-        """Keep all processes running until `stop()` or cancellation, both of which end them."""
+        """Keep all processes running until `stop()` or cancellation; either stops them all."""
         self._tasks = {
             name: asyncio.create_task(keeper.run([self._keepers[n] for n in keeper.spec.after]))
             for name, keeper in self._keepers.items()
@@ -75,7 +75,7 @@ class Supervisor:
         halted = asyncio.create_task(self._shared.halt.wait())
         watching = asyncio.create_task(self._watch())
         try:
-            # a keeper ends when all are told to; before that it can only fail
+            # a keeper ends only when all are stopped, or with an exception
             ends = [halted, watching, *self._tasks.values()]
             await asyncio.wait(ends, return_when="FIRST_EXCEPTION")
         finally:
@@ -83,11 +83,11 @@ class Supervisor:
                 await self.stop()
                 await halted
                 await watching
-            finally:  # a second Ctrl-C may come before the stop has begun
+            finally:  # a second Ctrl-C may cancel the stop before it starts
                 self._abandon()
 
     async def _watch(self) -> None:
-        """Look for processes without progress until all are told to stop."""
+        """Check for processes without progress, until all are stopped."""
         loop, halt = asyncio.get_running_loop(), self._shared.halt
         looked_s = loop.time()
         while not halt.is_set():
@@ -99,7 +99,7 @@ class Supervisor:
                 keeper.look(passed_s)
 
     async def stop(self, within_s: float = 1.5) -> None:
-        """End all processes within `within_s`, politely at first, also those that hang."""
+        """Stop all processes within `within_s`: first by request, then by force."""
         if self._stopping is None:
             self._stopping = asyncio.create_task(self._stop(within_s))
         await asyncio.shield(self._stopping)
@@ -110,7 +110,7 @@ class Supervisor:
         for keeper in keepers:
             keeper.settled.set()
         try:
-            async with self._shared.starting:  # whatever is being started now has a pid after this
+            async with self._shared.starting:  # a starting process has its pid after this
                 running = [keeper for keeper in keepers if keeper.child]
             last = [keeper for keeper in running if keeper.spec.stop_last]
             first = [keeper for keeper in running if not keeper.spec.stop_last]
@@ -124,13 +124,13 @@ class Supervisor:
             self._abandon()
 
     def _abandon(self) -> None:
-        """Whatever still runs is killed, and left to the kernel."""
+        """Kill every process that still runs, without waiting for it."""
         for keeper in self._keepers.values():
             if keeper.child:
                 keeper.child.abandon()
 
     async def _end(self, keepers: Sequence[Keeper], kill_s: float, leave_s: float) -> None:
-        """Ask, kill at `kill_s` what has not ended, go on at `leave_s` regardless (loop times)."""
+        """Request the end, kill at `kill_s`, and stop waiting at `leave_s` (both loop times)."""
         for keeper in keepers:
             keeper.ask_to_end()
         await self._wait_for(keepers, kill_s)
@@ -146,7 +146,7 @@ class Supervisor:
 
 
 def _check(specs: Sequence[ProcessSpec]) -> None:
-    """Refuse names that are used twice, that nobody has, or that wait for each other."""
+    """Raise an error for duplicate names, unknown names in `after`, and circular dependencies."""
     after = {spec.name: spec.after for spec in specs}
     for name, times in Counter(spec.name for spec in specs).items():
         if times > 1:

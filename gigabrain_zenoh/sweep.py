@@ -1,6 +1,6 @@
-"""How far a footprint can go, straight, turning or along an arc, until it touches something.
+"""Free distance of a footprint until it touches a point: straight, turning or along an arc.
 
-Points (n, 2) [m] are in the body's frame. A footprint counts as its convex hull.
+Points (n, 2) [m] are in the body's frame. The footprint's convex hull is used.
 """
 
 import math
@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Corners = tuple[tuple[float, float], ...]
 
-STEP = 0.02  # [m], how far any part of the body moves between two looks
-MOST_STEPS = 1000  # looks along one way; a longer way is looked at in longer steps
-AT_ONCE = 1_000_000  # distances from points to edges that are worked out at a time
-NEARER = 0.005  # [m]: what is nearer than the margin from the start must not come nearer by this
+STEP = 0.02  # [m], how far any part of the body moves between two checks
+MOST_STEPS = 1000  # checks along one path; longer paths use longer steps
+AT_ONCE = 1_000_000  # distances from points to edges that are computed in one batch
+NEARER = 0.005  # [m], how much closer a point already within the margin may come
 
 
 class Edges(NamedTuple):
-    """The hull's edges: outward normals (e, 2), and their distances from the origin (e,) [m]."""
+    """Edges of a hull: outward normals (e, 2), and their distances from the origin (e,) [m]."""
 
     normals: Floats
     offsets: Floats
 
 
 class Box(NamedTuple):
-    """The footprint's extent [m]."""
+    """Extent of a footprint along the body's axes [m]."""
 
     front: float
     rear: float
@@ -37,20 +37,20 @@ class Box(NamedTuple):
 
 @lru_cache(maxsize=8)
 def box(footprint: Corners) -> Box:
-    """The extent of `footprint`."""
+    """Return the extent of `footprint`."""
     xs, ys = [x for x, _ in footprint], [y for _, y in footprint]
     return Box(max(xs), min(xs), max(ys), min(ys))
 
 
 @lru_cache(maxsize=8)
 def radius(footprint: Corners) -> float:
-    """How far it reaches when it turns on the spot [m]."""
+    """Return the radius that the footprint sweeps when it turns on the spot [m]."""
     return max(math.hypot(x, y) for x, y in footprint)
 
 
 @lru_cache(maxsize=8)
 def edges(footprint: Corners) -> Edges:
-    """The edges of the convex hull, by Andrew's monotone chain."""
+    """Return the edges of the convex hull, by Andrew's monotone chain."""
     corners = sorted(set(footprint))
     hull = _chain(corners)[:-1] + _chain(corners[::-1])[:-1]
     here = np.array(hull)
@@ -74,15 +74,16 @@ def _right_turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, 
 
 
 def depth(hull: Edges, points: Floats) -> Floats:
-    """How far `points` (..., 2) are outside the hull at least [m]; below 0 inside."""
+    """Return a lower bound of the distance of `points` (..., 2) to the hull [m]; < 0 inside."""
     found: Floats = (points @ hull.normals.T - hull.offsets).max(axis=-1)
     return found
 
 
 def straight(footprint: Corners, points: Floats, margin: float) -> tuple[float | None, ...]:
-    """Free distances forwards, backwards, to the left and to the right [m]; None: nothing there.
+    """Return the free distances forwards, backwards, left and right [m]; None without a point.
 
-    `margin` [m] is kept free beside the body; what it passes already within that is no obstacle.
+    A `margin` [m] is kept free on both sides of the body. Points next to the body, within that
+    margin, are no obstacle.
     """
     front, rear, left, right = box(footprint)
     x, y = points[:, 0], points[:, 1]
@@ -97,9 +98,9 @@ def straight(footprint: Corners, points: Floats, margin: float) -> tuple[float |
 def _along(
     ahead: Floats, across: Floats, front: float, rear: float, low: float, high: float, margin: float
 ) -> float | None:
-    """The least way from `front` to what is in the strip from `low` to `high`.
+    """Return the shortest distance from `front` to a point in the strip from `low` to `high`.
 
-    What is inside the footprint counts as ahead or behind by which half it is in.
+    A point inside the footprint counts as ahead or behind, by the half that it is in.
     """
     strip = (across >= low - margin) & (across <= high + margin)
     inside = (ahead > 0) & (ahead <= front) & (across >= low) & (across <= high)
@@ -111,7 +112,7 @@ def _along(
 def turning(
     footprint: Corners, points: Floats, margin: float, reach: float
 ) -> tuple[float | None, float | None]:
-    """Free angles to the left and to the right [rad] within `reach` [rad]; None: nothing there."""
+    """Return the free angles to the left and right [rad] within `reach` [rad]; None if all free."""
     outer = radius(footprint)
     near = points[np.hypot(points[:, 0], points[:, 1]) <= outer + margin]
     if not len(near):
@@ -131,14 +132,17 @@ def arc(
     reach: float,
     twist: tuple[float, float, float],
 ) -> float | None:
-    """Free way [m] within `reach` [m] along the arc of a twist (vx, vy, w) that is no mere turn."""
+    """Return the free distance [m] within `reach` [m] along the arc of a twist (vx, vy, w).
+
+    The twist must not be a turn on the spot. None if the body touches nothing.
+    """
     vx, vy, w = twist
     speed = math.hypot(vx, vy)
     outer = radius(footprint)
     near = points[np.hypot(points[:, 0], points[:, 1]) <= outer + margin + reach]
     if not len(near):
         return None
-    quickest = speed + abs(w) * outer  # of the corner that moves most
+    quickest = speed + abs(w) * outer  # upper bound of the speed of any corner
     ways = _steps(reach, STEP * speed / quickest)
     yaw = ways * (w / speed)
     if abs(w) < 1e-6:
@@ -163,11 +167,11 @@ def _free(
     y: Floats,
     yaw: Floats,
 ) -> float | None:
-    """The last of `ways` (k,) before the footprint at pose (x, y, yaw) (k,) touches a point.
+    """Return the last of `ways` (k,) before the footprint at pose (x, y, yaw) (k,) touches a point.
 
-    What is inside the margin from the start is touched when the body comes nearer to it; what is
-    inside the footprint itself is left to the straight directions, or the body could never turn
-    away from it.
+    A point within the margin from the start is touched when the body comes closer to it. Points
+    inside the footprint are ignored here, or the body could never turn away from them. The straight
+    directions check those.
     """
     hull = edges(footprint)
     begin = depth(hull, points)

@@ -1,4 +1,4 @@
-"""Tasks from a script: send the robot somewhere, and hear what becomes of it."""
+"""Client for tasks from a script: send the robot to a goal, and follow the task's progress."""
 
 import asyncio
 from collections.abc import Callable
@@ -20,10 +20,10 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.keys.checks import may_not_ask
 
-LARGEST = 1e9  # as on the bus
-PLAN_S = 5.0  # how long a way through a large map may take to be found
-SILENT_S = 5.0  # without a word of the tasks
-STARTING_S = 3.0  # how long a robot that starts may take until it serves goals
+LARGEST = 1e9  # limit of coordinates on the bus
+PLAN_S = 5.0  # how long path planning in a large map may take
+SILENT_S = 5.0  # after this long without a task status, the robot counts as lost
+STARTING_S = 3.0  # how long a starting robot may take until it serves goals
 AGAIN_S = 0.2
 OnNews = Callable[[TaskStatus], None]
 Q = TypeVar("Q", bound=Message)
@@ -32,7 +32,7 @@ OnWait = Callable[[str], None]
 
 
 class Tasks:
-    """What the robot was sent to do."""
+    """Client for the tasks of one robot."""
 
     def __init__(
         self,
@@ -43,9 +43,10 @@ class Tasks:
         starting_s: float = STARTING_S,
         silent_s: float = SILENT_S,
     ) -> None:
-        """Who serves goals is waited for `starting_s`; `on_wait` is told so.
+        """Create a client that waits up to `starting_s` for a process that serves goals.
 
-        Whoever says nothing of the tasks for `silent_s` is taken for gone.
+        The callback `on_wait` receives a text when it starts to wait. After `silent_s` without a
+        task status, BodyLost is raised.
         """
         self._bus, self._keys = bus, keys
         self._on_wait, self._starting_s, self._silent_s = on_wait, starting_s, silent_s
@@ -56,9 +57,9 @@ class Tasks:
     async def go_to(
         self, x: float, y: float, yaw: float | None = None, *, how: How = "replace"
     ) -> str:
-        """Send the robot to a place in its map [m, m, rad]; the task's name.
+        """Send the robot to a pose in its map [m, m, rad]; return the task's name.
 
-        Raises ConfigError for what is no number, and Refused.
+        Raises ConfigError for numbers that are not valid, and Refused.
         """
         given = (x, y) if yaw is None else (x, y, yaw)
         if not all(abs(value) <= LARGEST for value in given):
@@ -74,12 +75,12 @@ class Tasks:
     async def carry_out(
         self, mission: str | Path, *, how: How = "replace", label: str = "mission"
     ) -> str:
-        """Have a mission carried out, a file or its text; the task's name.
+        """Start a mission, given as a file or as its text; return the task's name.
 
-        Raises ConfigError for a file that is none, with its line, and Refused.
+        Raises ConfigError with the line number for an invalid mission, and Refused.
         """
         self._listen()
-        from gigabrain_zenoh.tasks.checks import load, refuse_long  # takes a while: only when used
+        from gigabrain_zenoh.tasks.checks import load, refuse_long  # slow import, only when used
 
         if isinstance(mission, Path):
             label = mission.stem
@@ -89,7 +90,7 @@ class Tasks:
             mission=mission,
             how=how,
             source=self._bus.process,
-            label=label.encode(errors="replace").decode()[:64],  # a file's name may be any bytes
+            label=label.encode(errors="replace").decode()[:64],  # file names may be any bytes
         )
         reply = await self._ask(MISSION, request, PLAN_S)
         if not reply.ok:
@@ -97,23 +98,26 @@ class Tasks:
         return reply.task
 
     async def explore(self, *, how: How = "replace") -> str:
-        """Have the robot drive until nothing is left to be seen; the task's name."""
+        """Start exploring until nothing unknown is reachable; return the task's name."""
         return await self.carry_out("do: [{explore: {}}]", how=how, label="exploring")
 
     async def cancel(self, task: str = "") -> str:
-        """End a task, the present one without a name, or `all`; in words. Raises Refused."""
+        """Cancel a task by name, the current one (empty name), or `all`; return the reply in words.
+
+        Raises Refused.
+        """
         return await self._change(TaskRequest(do="cancel", task=task, source=self._bus.process))
 
     async def pause(self, task: str = "") -> str:
-        """Have a task wait; in words. Raises Refused."""
+        """Pause a task; return the reply in words. Raises Refused."""
         return await self._change(TaskRequest(do="pause", task=task, source=self._bus.process))
 
     async def resume(self, task: str = "") -> str:
-        """Have a task that waits go on; in words. Raises Refused."""
+        """Resume a paused task; return the reply in words. Raises Refused."""
         return await self._change(TaskRequest(do="resume", task=task, source=self._bus.process))
 
     async def status(self) -> TaskStatus:
-        """What the robot is at, what waits and what was last. Raises BodyLost."""
+        """Return the current, the waiting and the most recent ended tasks. Raises BodyLost."""
         self._listen()
         if self._newest is None:
             await self._hear()
@@ -121,7 +125,10 @@ class Tasks:
         return self._newest
 
     async def result(self, task: str, on_news: OnNews | None = None) -> Task:
-        """How a task ended, once it has; `on_news` hears of it meanwhile. Raises BodyLost."""
+        """Wait until a task has ended, and return it. Raises BodyLost.
+
+        Meanwhile `on_news` is called with each status.
+        """
         self._listen()
         while True:
             status = self._newest
@@ -134,7 +141,7 @@ class Tasks:
             await self._hear()
 
     async def _ask(self, service: Service[Q, R], request: Q, timeout_s: float) -> R:
-        """The answer of who serves tasks, which a robot that starts does a moment later."""
+        """Return the first answer; retry while no process serves tasks, as on a starting robot."""
         now = asyncio.get_running_loop().time
         until, waits = now() + self._starting_s, False
         while True:
@@ -142,7 +149,7 @@ class Tasks:
             replies = await self._bus.ask(service, request, timeout_s=timeout_s)
             if replies:
                 return replies[0]
-            # whoever has not answered in time may have heard it, and is not asked again
+            # after a timeout the request may have been received: do not repeat it
             if now() >= min(until, asked + timeout_s) or may_not_ask(self._keys):
                 raise self._nobody()
             if self._on_wait and not waits:

@@ -1,4 +1,4 @@
-"""An operator's stream of velocities, and when it can be trusted."""
+"""An operator's stream of velocities, and the check whether it is live."""
 
 from collections.abc import Callable
 
@@ -6,20 +6,20 @@ from gigabrain_schemas.base import TICK_NS, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Twist
 
-GAP_NS = 200_000_000  # a stream with a longer gap has ended
-DEAF_NS = 500_000_000  # how long a stream without an echo is not believed after a gap
+GAP_NS = 200_000_000  # after a longer gap the stream has ended
+DEAF_NS = 500_000_000  # how long a stream without an echo is ignored after a gap
 
 
 class Teleop:
-    """An operator's stream, trusted only while it is plainly live.
+    """An operator's stream, accepted only while it is clearly live.
 
-    A network that was cut hands over what it had stored when it heals. Whoever echoes the newest
-    tick is told from that at once; of anybody else nothing is believed for half a second after a
-    gap, and on a real body nothing at all.
+    After an outage, a network delivers the messages it had buffered. A client may echo the robot's
+    newest tick in its messages, so its live messages are recognized immediately. A stream without
+    an echo is ignored for half a second after a gap, and always on a real body.
 
-    An enable of the gate hands the body over. What an operator sent before it does not count, even
-    where it arrives later: its tick is older than that of the first state after the enable. Without
-    an echo nothing is believed for half a second, as after a gap.
+    When the gate is enabled, the body gets a new commander. Messages sent before that do not count,
+    even if they arrive later: their tick is older than that of the first state after the enable. A
+    stream without an echo is ignored for half a second, as after a gap.
     """
 
     def __init__(self, now_ns: Callable[[], int]) -> None:
@@ -27,23 +27,26 @@ class Teleop:
         self._newest: Twist | None = None
         self._arrived_ns = 0
         self._trusted_from_ns = 0
-        self._handed_over = (0, -1)  # the boot and the gate's count of enables
+        self._handed_over = (0, -1)  # boot, and the gate's count of enables
         self._handed_over_tick = 0
 
     def receive(self, twist: Twist) -> None:
-        """Take one message."""
+        """Store a message of the operator's stream."""
         now = self._now_ns()
         if self._newest is None or now - self._arrived_ns > GAP_NS:
             self._trusted_from_ns = now + DEAF_NS
         self._newest, self._arrived_ns = twist, now
 
     def velocity(self, state: RobotState, echo_wanted: bool) -> Velocity | None:
-        """What the operator wants now, or None when nobody steers."""
+        """Return the operator's velocity, or None if no live stream exists.
+
+        With `echo_wanted`, as on a real body, a stream without an echo is never accepted.
+        """
         now, twist = self._now_ns(), self._newest
         self._see_hand_over(state, now)
         if twist is None or now - self._arrived_ns > GAP_NS:
             return None
-        off_ns = abs(state.tick - twist.tick) * TICK_NS  # of the future is as wrong as of the past
+        off_ns = abs(state.tick - twist.tick) * TICK_NS  # a future tick is as wrong as an old one
         if echo_wanted or twist.boot:
             if twist.boot != state.boot or off_ns > GAP_NS:
                 return None

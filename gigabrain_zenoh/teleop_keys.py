@@ -1,4 +1,4 @@
-"""What an operator's keys mean, in a terminal that tells of presses and never of releases. Pure."""
+"""Interprets an operator's keys in a terminal, which reports presses and no releases. Pure."""
 
 import re
 from typing import Final
@@ -7,10 +7,10 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.limits import ZERO
 
-# Until a terminal repeats a key that is held, 0.25 to 0.6 s pass, and from then on 30 to 50 ms.
-TAP_S = 0.4  # how long one press lasts
-HELD_S = 0.15  # how long a repeated one lasts: let go, and the robot brakes after that
-SHARES = (0.25, 0.5, 0.75, 1.0)  # of the body's own limits
+# A terminal repeats a held key first after 0.25 to 0.6 s, then every 30 to 50 ms.
+TAP_S = 0.4  # how long a first press counts as held
+HELD_S = 0.15  # the same for a repeated press: after release, the robot brakes this late
+SHARES = (0.25, 0.5, 0.75, 1.0)  # speed steps, as fractions of the body's limits
 
 Axes = tuple[int, int, int]  # ahead, left, counter-clockwise: -1, 0 or 1
 MOVES: Final[dict[str, Axes]] = {
@@ -25,7 +25,7 @@ KEY = re.compile(r"\x1b[\[O](?:\d+(?:;\d+)*)?([A-Za-z~])|(.)", re.DOTALL)
 
 
 def keys_of(typed: str) -> list[str]:
-    """The keys in what a terminal has sent; arrows by name, other sequences left out."""
+    """Return the keys in a terminal's input; arrows by name, other escape sequences are dropped."""
     found = []
     for sequence, plain in KEY.findall(typed):
         name = ARROWS.get(sequence, "") if sequence else plain.lower()
@@ -35,7 +35,7 @@ def keys_of(typed: str) -> list[str]:
 
 
 class HeldKeys:
-    """Which way the held keys point, and how fast the operator wants to go."""
+    """Keys that count as held, and the speed that the operator has chosen."""
 
     def __init__(self) -> None:
         self._until_s: dict[str, float] = {}
@@ -43,11 +43,11 @@ class HeldKeys:
 
     @property
     def share(self) -> float:
-        """Of the body's limits."""
+        """Return the chosen fraction of the body's limits."""
         return SHARES[self._share]
 
     def press(self, key: str, now_s: float) -> bool:
-        """Take a key; whether it is one of these at all."""
+        """Process a key press; return whether the key is one of those for driving."""
         if key in ("+", "-"):
             step = 1 if key == "+" else -1
             self._share = max(0, min(len(SHARES) - 1, self._share + step))
@@ -60,11 +60,11 @@ class HeldKeys:
         return True
 
     def let_go(self) -> None:
-        """Of all keys."""
+        """Count all keys as released."""
         self._until_s.clear()
 
     def velocity(self, body: BodyDescription, now_s: float) -> Velocity:
-        """What the keys ask for now."""
+        """Return the velocity for the keys that are held now."""
         held = [MOVES[key] for key, until_s in self._until_s.items() if now_s < until_s]
         if not held:
             return ZERO

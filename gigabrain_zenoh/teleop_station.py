@@ -1,4 +1,7 @@
-"""An operator's seat: keys and a gamepad become `robot/teleop`, and the robot's state is shown."""
+"""Operator's station in a terminal: keys and a gamepad publish `robot/teleop`.
+
+It also displays the robot's state.
+"""
 
 import asyncio
 import contextlib
@@ -26,7 +29,7 @@ PAD = "gamepad: hold a shoulder button to drive, B stops"
 
 
 class Station:
-    """Sends what the operator wants twenty times a second, zero included."""
+    """Publishes the operator's velocity 20 times a second, zero included."""
 
     def __init__(self, robot: Robot, pad: Gamepad) -> None:
         self._robot, self._pad = robot, pad
@@ -35,9 +38,9 @@ class Station:
         self._asking: set[asyncio.Task[None]] = set()
 
     async def drive(self, take: bool) -> None:
-        """Until the operator quits; then the body goes back to the brain, at rest.
+        """Drive until the operator quits; then stop the body and hand it back to the brain.
 
-        Raises Refused when somebody drives and it is not to be taken from them.
+        Raises Refused when another operator or the brain drives and `take` is not set.
         """
         body = await self._robot.read_body()
         state = await self._robot.read_state()
@@ -69,7 +72,7 @@ class Station:
                 self._keys.press(key, asyncio.get_running_loop().time())
 
     def _ask(self, what: str) -> None:
-        """Whatever is asked of the gate begins with all keys let go."""
+        """Release all keys, then send a request to the gate."""
         self._keys.let_go()
         self._robot.steer(ZERO)
         task = asyncio.create_task(self._answer(what))
@@ -92,7 +95,7 @@ class Station:
         self._said = (await self._robot.enable(BRAIN, take=take)).text
 
     async def _hand_back(self) -> None:
-        """The brain goes on only where this seat still had the body."""
+        """Stop the body; enable the brain again only if this station still had the body."""
         self._robot.steer(ZERO)
         for task in tuple(self._asking):
             await task
@@ -112,7 +115,7 @@ class Station:
 
 
 def readout(state: RobotState, wanted: Velocity, share: float) -> list[str]:
-    """Speed, gate, who drives, and what to do about what holds the robot back."""
+    """Return lines with the gate, its commander, the speed, and causes with their remedies."""
     now, gate = state.velocity, state.gate
     lines = [
         f"{state.robot_type}: {gate.mode}, driven by {gate.commander or 'nobody'}",
@@ -126,7 +129,7 @@ def readout(state: RobotState, wanted: Velocity, share: float) -> list[str]:
 
 @contextmanager
 def _typed(take: Callable[[str], None]) -> Iterator[None]:
-    """Keys as they are pressed, without Enter; the terminal is as before afterwards."""
+    """Pass keys to `take` as they are pressed, without Enter; restore the terminal afterwards."""
     if not sys.stdin.isatty():
         yield
         return
@@ -137,8 +140,8 @@ def _typed(take: Callable[[str], None]) -> Iterator[None]:
         take(os.read(fd, 1024).decode(errors="replace"))
 
     keys = termios.tcgetattr(fd)
-    keys[3] &= ~(termios.ICANON | termios.ECHO | termios.ISIG)  # Ctrl-C is a key: the body is left
-    termios.tcsetattr(fd, termios.TCSADRAIN, keys)  # at rest before this ends
+    keys[3] &= ~(termios.ICANON | termios.ECHO | termios.ISIG)  # Ctrl-C is a key here, so that the
+    termios.tcsetattr(fd, termios.TCSADRAIN, keys)  # body is stopped before the program ends
     loop.add_reader(fd, read)
     try:
         yield

@@ -1,7 +1,7 @@
-"""Keeping to a trajectory: where the body will be when a command takes effect decides the command.
+"""Trajectory tracking, based on the body's predicted pose when a command takes effect.
 
-Feed-forward undoes the body's lag; feedback is that of De Luca, Oriolo and Samson (1998, equation
-4.73) for bodies that cannot go sideways, and proportional along each axis for those that can.
+Feed-forward compensates the body's lag. Feedback for bodies that cannot move sideways is that of De
+Luca, Oriolo and Samson (1998, equation 4.73). For bodies that can, it is proportional on each axis.
 """
 
 import math
@@ -15,12 +15,12 @@ from gigabrain_zenoh.planar import between, compose, relative
 
 TICK_S = TICK_NS / 1e9
 LONGEST_DELAY_TICKS = 15
-FARTHEST_OFF_M, FARTHEST_OFF_RAD = 0.3, 0.8  # a body so far off is not driving this trajectory
-DAMPING, STIFFNESS = 0.7, 10.0  # of the feedback; [1/m2]
+FARTHEST_OFF_M, FARTHEST_OFF_RAD = 0.3, 0.8  # beyond these, it is not driving this trajectory
+DAMPING, STIFFNESS = 0.7, 10.0  # feedback parameters, the second in [1/m2]
 SLOWEST, QUICKEST = 0.8, 2.5  # [1/s], bounds of the feedback's bandwidth
-LATERAL_GAIN = 1.5  # [1/s], of bodies that can go sideways
+LATERAL_GAIN = 1.5  # [1/s], feedback for bodies that can move sideways
 SHORTEST_LAG_S, LONGEST_LAG_S = 1e-3, 0.5
-MOST_GAIN = 2.0  # by which a slipping body is told to turn more, at most
+MOST_GAIN = 2.0  # largest factor by which turn rates are increased or reduced
 
 
 def wanted(
@@ -32,11 +32,11 @@ def wanted(
     velocity: Velocity,
     told: tuple[Velocity, ...],
 ) -> Velocity | None:
-    """The command at `tick` that keeps to the trajectory of `intent`; None when it is too far off.
+    """Return the command at `tick` that tracks the trajectory; None when it is too far off.
 
-    `start` and `here` are the odometry at the intent's basis and now, `velocity` is measured, and
-    `told` are the commands of the ticks before, the newest last. When the trajectory is over, the
-    body shall stand.
+    The odometry poses `start` and `here` are at the intent's basis and now; `velocity` is measured.
+    The commands of the previous ticks are in `told`, newest last. After the end of the trajectory,
+    the command is zero.
     """
     late = min(round(intent.response.delay / TICK_S), LONGEST_DELAY_TICKS)
     t = (tick - intent.basis + late) * TICK_S
@@ -56,14 +56,14 @@ def wanted(
 
 
 def undone(turn_gain: float) -> float:
-    """By how much a turn rate has to be multiplied for a body that has this gain."""
+    """Return the factor for turn rates that undoes the body's `turn_gain`, within MOST_GAIN."""
     return max(1.0 / MOST_GAIN, min(MOST_GAIN, 1.0 / turn_gain))
 
 
 def predicted(
     here: Pose, velocity: Velocity, told: tuple[Velocity, ...], ticks: int, response: Response
 ) -> Pose:
-    """Where the body will be in so many ticks, for which its commands are given already."""
+    """Predict the body's pose after `ticks` ticks, from the commands already sent (`told`)."""
     follows = 1.0 - math.exp(-TICK_S / _lag(response))
     vx, vy, w = velocity.linear_x, velocity.linear_y, velocity.angular_z
     pose = here
@@ -91,7 +91,7 @@ def _share(before: TrajectoryPoint, after: TrajectoryPoint, t: float) -> float:
 
 
 def _without_lag(before: TrajectoryPoint, after: TrajectoryPoint, response: Response) -> Velocity:
-    """The steady command that takes a body with this lag from one point's velocity to the next."""
+    """Return the steady command that takes a body with this lag from one velocity to the next."""
     left = math.exp(-max(after.t - before.t, TICK_S) / _lag(response))
     return Velocity(
         linear_x=(after.linear_x - left * before.linear_x) / (1.0 - left),
@@ -123,7 +123,7 @@ def _holonomic(planned: Velocity, error: Pose) -> Velocity:
 
 
 def _tightest(body: BodyDescription, wish: Velocity) -> Velocity:
-    """A car cannot turn more tightly than at full speed with its largest yaw rate."""
+    """Limit a car's turn rate to its tightest curve: full speed with the largest yaw rate."""
     if body.drive_type != "ackermann":
         return wish
     most = abs(wish.linear_x) * body.max_angular_speed / body.max_linear_speed

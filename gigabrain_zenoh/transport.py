@@ -1,4 +1,4 @@
-"""What the bus asks of whatever moves its bytes, and one that stays inside the process."""
+"""Interface through which the bus moves bytes, and an implementation inside one process."""
 
 import asyncio
 import contextlib
@@ -9,67 +9,70 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from gigabrain_schemas.topics import Priority, Topic
 from gigabrain_zenoh.errors import GigabrainError
 
-OnSample = Callable[[str, bytes], bool | None]  # key, payload; False: it cannot be read
+OnSample = Callable[[str, bytes], bool | None]  # key, payload; returns False for an invalid payload
 OnRaw = Callable[[str, str, bytes], None]  # key, encoding, payload
-Answer = Callable[[bytes], Awaitable[tuple[bytes, str]]]  # payload; payload and its encoding
+Answer = Callable[[bytes], Awaitable[tuple[bytes, str]]]  # request; reply and its encoding
 Close = Callable[[], None]  # may be called twice
 T = TypeVar("T")
 
 
 class Link(NamedTuple):
-    """Somebody at the other end of a link."""
+    """A link between this process's session and another session."""
 
-    zid: str  # Zenoh's name of the session
-    name: str  # the common name of its certificate; empty without one
+    zid: str  # Zenoh's id of the other session
+    name: str  # common name of its certificate; empty without one
     address: str
-    there: bool  # False once it is gone
+    there: bool  # False once the link is closed
 
 
 OnLink = Callable[[Link], None]
 
 
 class Transport(Protocol):
-    """Moves bytes between processes. All calls and callbacks happen on the event loop's thread."""
+    """Moves bytes between processes.
+
+    Calls and callbacks run on the event loop's thread, except the callback of `tap`.
+    """
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes, encoding: str) -> None:
-        """Deliver to every listener on `key`, by the topic's QoS, without waiting for any."""
+        """Deliver to all listeners on `key` with the topic's QoS, without waiting for any."""
         ...
 
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
-        """Call `on_sample` for what arrives on `key`; of what piles up the newest `depth` stay.
+        """Call `on_sample` for each sample on `key`; a busy loop keeps the newest `depth` samples.
 
-        At a depth of one it is the newest for which `on_sample` does not say False.
+        With a depth of one, it keeps the newest sample for which `on_sample` does not return False.
         """
         ...
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
-        """Call `on_raw` at once, in whatever thread, for all that arrives on `pattern`."""
+        """Call `on_raw` immediately, from any thread, for every sample on `pattern`."""
         ...
 
     def serve(self, key: str, answer: Answer, *, urgent: bool = False) -> Close:
-        """Answer queries on `key`. A GigabrainError from `answer` travels back as its text.
+        """Answer queries on `key`. A GigabrainError from `answer` is sent back as its text.
 
-        What is `urgent` is answered before all others that wait.
+        Queries on an `urgent` key are answered before all others that wait.
         """
         ...
 
     async def query(
         self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
     ) -> list[bytes | str]:
-        """Ask all who serve `key`: a payload per answer that came in time, a text per error."""
+        """Query all servers of `key`; return a payload per answer in time, and a text per error."""
         ...
 
     def links(self, on_link: OnLink) -> Close:
-        """Tell of everybody who is linked to this process, from now on and so far."""
+        """Call `on_link` for every link of this process: existing ones first, then each change."""
         ...
 
     async def close(self) -> None:
-        """Release the connection, within half a second. May be called twice."""
+        """Close the connection within half a second. May be called twice."""
         ...
 
 
 class LocalNetwork:
-    """Joins transports inside this process, first in first out. For tests and replay."""
+    """Connects transports inside this process, first in first out. For tests and replay."""
 
     def __init__(self) -> None:
         self.sent: list[tuple[str, bytes]] = []
@@ -79,11 +82,11 @@ class LocalNetwork:
         self._delivering = False
 
     def transport(self) -> "LocalTransport":
-        """A new end."""
+        """Return a new transport on this network."""
         return LocalTransport(self)
 
     def deliver(self, key: str, payload: bytes) -> None:
-        """Hand `payload` to the listeners, after whatever is on its way already."""
+        """Hand `payload` to the listeners, after messages that are already queued."""
         self._queue.append((key, payload))
         if self._delivering:
             return
@@ -98,20 +101,20 @@ class LocalNetwork:
             self._delivering = False
 
     def listen(self, key: str, on_sample: OnSample) -> Close:
-        """Register a listener."""
+        """Register a listener; return a function that removes it."""
         return _added(self._listeners, (key, on_sample))
 
     def serve(self, key: str, answer: Answer) -> Close:
-        """Register one who answers on `key`."""
+        """Register a server on `key`; return a function that removes it."""
         return _added(self._servers, (key, answer))
 
     def servers(self, pattern: str) -> list[Answer]:
-        """Who answers on `pattern`."""
+        """Return the servers on keys that match `pattern`."""
         return [answer for key, answer in self._servers if _matches(pattern, key)]
 
 
 class LocalTransport:
-    """One process's end of a LocalNetwork."""
+    """One process's transport on a LocalNetwork."""
 
     def __init__(self, network: LocalNetwork) -> None:
         self._network = network
@@ -128,18 +131,18 @@ class LocalTransport:
         return self._closers[-1]
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
-        """Register a listener; encodings are not known here."""
+        """Register a listener; `on_raw` receives an empty encoding."""
         return self.subscribe(pattern, lambda key, payload: on_raw(key, "", payload), 1)
 
     def serve(self, key: str, answer: Answer, *, urgent: bool = False) -> Close:
-        """Register one who answers on `key`; here nothing waits."""
+        """Register a server on `key`; `urgent` has no effect, as queries never wait here."""
         self._closers.append(self._network.serve(key, answer))
         return self._closers[-1]
 
     async def query(
         self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
     ) -> list[bytes | str]:
-        """Ask all who serve `key`."""
+        """Query all servers of `key`."""
         replies = []
         for answer in self._network.servers(key):
             with contextlib.suppress(TimeoutError):
@@ -147,7 +150,7 @@ class LocalTransport:
         return replies
 
     def links(self, on_link: OnLink) -> Close:
-        """Inside one process nobody comes by a link."""
+        """Do nothing: inside one process there are no links."""
         return lambda: None
 
     async def close(self) -> None:
@@ -174,7 +177,7 @@ def _added(entries: list[T], entry: T) -> Close:
 
 
 def _matches(pattern: str, key: str) -> bool:
-    """As Zenoh does, of a pattern whose last part may be a star or two."""
+    """Match a key as Zenoh does, for patterns whose last part may be `*` or `**`."""
     start, _, last = pattern.rpartition("/")
     if last == "**":
         return not start or key == start or key.startswith(f"{start}/")

@@ -1,4 +1,4 @@
-"""What a person types into a running command."""
+"""Lines that a person types into a running command."""
 
 import asyncio
 import contextlib
@@ -13,7 +13,7 @@ READ_BYTES = 4096
 
 @contextlib.contextmanager
 def typed_lines(take: Callable[[str], None]) -> Iterator[None]:
-    """Call `take` with each line of standard input, where that can be waited for."""
+    """Call `take` with each line of standard input; does nothing if input is a file."""
     loop, fd, lines = asyncio.get_running_loop(), sys.stdin.fileno(), Lines()
 
     def readable() -> None:

@@ -1,7 +1,7 @@
-"""How those who only look on disturb the robot least: few wake-ups.
+"""Reduces the load of processes that only observe the robot, by waking up less often.
 
-A thread that wakes for each message does so with cold caches, which costs more than the message
-itself, and takes the processor from the robot three hundred times a second.
+A thread that wakes for each message runs with cold caches, which costs more than the message
+itself. It also takes the processor from the robot 300 times a second.
 """
 
 import time
@@ -11,15 +11,15 @@ from typing import TypeVar
 T = TypeVar("T")
 
 NAP_S = 0.04
-LONGEST_S = 0.06  # until a message is taken that came while the thread slept, and a little more
-IDLE_S = 0.0003  # since the last message: the thread that receives had nothing to do
+LONGEST_S = 0.06  # upper bound of the delay of a message that arrives during a nap
+IDLE_S = 0.0003  # since the last message; after that the receiving thread counts as idle
 
 
 class Nap:
-    """Sleeps in the thread that receives; meanwhile the kernel's buffer takes what comes.
+    """Sleeps in the receiving thread, while the kernel's buffer collects messages.
 
-    Only a message that found the thread idle is slept after. So what has gathered is taken in one
-    go, and a flood finds a thread that never sleeps.
+    The thread sleeps only after a message that found it idle. Collected messages are thus processed
+    in one batch, and during a flood the thread never sleeps.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class Nap:
         self._done_s = now_s()
 
     def after_each(self, take: Callable[[T], None]) -> Callable[[T], None]:
-        """`take` for the thread that receives, with a nap behind it where there is time for one."""
+        """Wrap `take` for the receiving thread: nap after a call that found the thread idle."""
 
         def take_and_nap(sample: T) -> None:
             idle_s = self._now_s() - self._done_s

@@ -1,4 +1,4 @@
-"""Watches a robot from outside: the newest of everything that people want to see."""
+"""Watches a robot from outside: keeps the newest message of everything shown to people."""
 
 import asyncio
 import contextlib
@@ -22,13 +22,13 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.causes import LATE
 from gigabrain_zenoh.errors import Refused
 
-UNKNOWN = b"\xff"  # a cell of which nothing is known
-PROCESSES = 64  # whose health is kept
-ASK_S, PAUSE_S = 1.0, 0.1  # of one question, and until the next
+UNKNOWN = b"\xff"  # an unknown cell
+PROCESSES = 64  # at most, whose health is kept
+ASK_S, PAUSE_S = 1.0, 0.1  # timeout of one query, and pause before the next
 
 
 class Watch:
-    """What the robot is doing, as far as it can be heard."""
+    """Newest state of a robot, from the messages it publishes."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -46,18 +46,18 @@ class Watch:
 
     @property
     def problem(self) -> str:
-        """Why nothing can be made of what is heard any more; empty while all is well."""
+        """Return why messages can no longer be processed; an empty text while they are."""
         failed = self._bus.failed
         return str(failed.exception()) if failed.done() else ""
 
     @property
     def seconds(self) -> float:
-        """Time of the robot since its driver's start [s]."""
+        """Return the robot's time since its driver started [s]."""
         return self._bus.time.tick * 0.02
 
     @property
     def mapped_m2(self) -> float | None:
-        """How much is known of the map: free or taken [m2]; None where there is no map."""
+        """Return the area of the map known to be free or occupied [m2]; None without a map."""
         grid = self.map.current
         if grid is None:
             return None
@@ -65,7 +65,7 @@ class Watch:
 
     @property
     def held_by_load(self) -> bool:
-        """Whether the brain is too late for the gate while the processors have no time to spare."""
+        """Return whether the brain is late for the gate while the processors are fully loaded."""
         state, verdict = self.state.newest, self.safety.current
         if state is None or verdict is None or not state.gate.enables:
             return False
@@ -74,10 +74,10 @@ class Watch:
         return busy and late and state.gate.mode in ("idle", "stopping")
 
     async def describe(self, process: str, timeout_s: float = 0.3) -> Description | None:
-        """What a process says of itself, or None when it does not answer.
+        """Return a process's description of itself; None without an answer in `timeout_s`.
 
-        Asked again until the time is over: a machine that stalled may have cost either side its
-        session, which comes back by itself, but a question in between goes nowhere.
+        The query is repeated until then. A machine that stalled may have cost either side its
+        session. The session recovers by itself, but queries in between are lost.
         """
         loop = asyncio.get_running_loop()
         end_s = loop.time() + timeout_s

@@ -1,7 +1,7 @@
-"""What a router bounds of all that comes in, whoever says it: how large and how urgent it may be.
+"""Limits on the size and priority of messages that enter a router, from any sender.
 
-Readers refuse what is too large or too frequent themselves, and count it. But what is far too much
-holds up what comes after it on the same lines, and an e-stop may be among that.
+Readers themselves reject and count messages that are too large or too frequent. But extreme sizes
+delay later messages on the same links, and an e-stop may be among those.
 """
 
 from collections.abc import Iterable
@@ -9,13 +9,13 @@ from typing import Any
 
 from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TOPICS, Priority, Service, Topic
 
-FAR_TOO_LARGE = 4  # times what a reader takes
+FAR_TOO_LARGE = 4  # times the size that a reader accepts
 SAID: tuple[Topic[Any], ...] = (*TOPICS, ESTOP_SAID)
 Rule = dict[str, Any]
 
 
 def bounds() -> dict[str, Any]:
-    """The settings of a router's session that bound what others may send through it."""
+    """Return the settings of a router's session that limit messages from others."""
     return {
         "low_pass_filter": [*_small("put", SAID), *_small("query", SERVICES)],
         "qos/network": [*_urgent("put", SAID), *_urgent("query", SERVICES)],
@@ -23,7 +23,7 @@ def bounds() -> dict[str, Any]:
 
 
 def _small(message: str, of: Iterable[Topic[Any] | Service[Any, Any]]) -> list[Rule]:
-    """Zenoh's low-pass filter: what is far too large ends at the router."""
+    """Return rules of Zenoh's low-pass filter that drop far too large messages at the router."""
     sizes = {each.key: each.max_bytes for each in of}
     return [
         _at_ingress(f"a {message} of at most {size // 1024} KB", message, _keys(sizes, size))
@@ -33,10 +33,10 @@ def _small(message: str, of: Iterable[Topic[Any] | Service[Any, Any]]) -> list[R
 
 
 def _urgent(message: str, of: Iterable[Topic[Any] | Service[Any, Any]]) -> list[Rule]:
-    """Everything as urgent as the table of topics has it, whatever its sender asks for.
+    """Return rules that set each message's priority to its topic's, whatever its sender requested.
 
-    Else a flood of what calls itself most urgent would fill the queue of the e-stop, and one that
-    may not be dropped would stand in everybody's way for as long as somebody does not read.
+    Otherwise a flood of messages sent at the highest priority would fill the e-stop's queue.
+    Messages that may not be dropped would block all others for as long as one reader does not read.
     """
     urgency: dict[str, Priority] = {each.key: each.priority for each in of}
     return [

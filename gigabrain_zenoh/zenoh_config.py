@@ -1,4 +1,4 @@
-"""How sessions are configured, and what a refusal means. Zenoh is not needed to read this."""
+"""Configuration of Zenoh sessions, and explanations of their errors. Does not import Zenoh."""
 
 import re
 from collections.abc import Mapping
@@ -15,23 +15,23 @@ from gigabrain_zenoh.keys.list_file import generations_in
 from gigabrain_zenoh.settings import Endpoint, RouterConfig
 from gigabrain_zenoh.zenoh_bounds import bounds
 
-# Zenoh's work in one thread, sending apart: a message wakes half as many threads on its way. A
-# documented variable of Zenoh's (zenoh_runtime::ZRuntime); a value set by the user wins.
+# Runs Zenoh in one thread, except for sending: a message then wakes half as many threads. The
+# variable is documented by Zenoh (zenoh_runtime::ZRuntime); a value set by the user wins.
 ZENOH_RUNTIME = "(rx: (handover: app), acc: (handover: app), net: (handover: app))"
 
 SECURE, PLAIN = "tls/", "tcp/"
 ROOMY = ("real_time", "interactive_high", "data_high", "data")
-PENDING = 4000  # links that may be on their way in; silent ones are dropped after a second
+PENDING = 4000  # links that may wait to be accepted; silent ones are dropped after a second
 
 
 def session_config(endpoint: Endpoint) -> dict[str, Any]:
-    """Client of a router, the router itself, or a relay, which both listens and connects.
+    """Build the configuration of a client, a router, or a relay (which listens and connects).
 
-    Explicit endpoints, no multicast, short leases.
+    It uses explicit endpoints, no multicast, and short leases.
 
-    With keys all that leaves the machine is TLS on both ends, and a router lets everybody do what
-    the certificate's role may. Raises ConfigError for an endpoint that Zenoh would wait for in
-    vain, and for keys that are not there.
+    With keys, all traffic that leaves the machine uses TLS with certificates on both ends. A router
+    grants each client its certificate's rights. Raises ConfigError for an endpoint that Zenoh would
+    wait for forever, and for missing keys.
     """
     endpoint = secured(endpoint)
     if not endpoint.listen and not endpoint.connect:
@@ -45,7 +45,7 @@ def session_config(endpoint: Endpoint) -> dict[str, Any]:
 
 
 def session_settings(endpoint: Endpoint) -> dict[str, Any]:
-    """What all sessions have in common, with keys or without."""
+    """Build the settings that all sessions share, with keys or without."""
     config: dict[str, Any] = {
         "mode": "router" if endpoint.listen else "client",
         "listen/endpoints": list(endpoint.listen),
@@ -58,13 +58,13 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
             "period_increase_factor": 2,
         },
         "scouting/multicast/enabled": False,
-        "scouting/delay": 0,  # a router would wait half a second for others to find it
+        "scouting/delay": 0,  # otherwise a router waits half a second for others to find it
         "transport/unicast/open_timeout": 1000,
         "transport/unicast/accept_timeout": 1000,
         "transport/unicast/accept_pending": PENDING,
         "transport/link/tx/lease": 400,
         "transport/link/tx/keep_alive": 4,
-        # small messages that are not batched take a place each
+        # each small message that is not batched occupies one slot
         "transport/link/tx/queue/size": dict.fromkeys(ROOMY, 16),
         "transport/link/rx/max_message_size": 16 << 20,
         "transport/shared_memory/enabled": False,
@@ -79,7 +79,7 @@ def session_settings(endpoint: Endpoint) -> dict[str, Any]:
 
 
 def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, Any]:
-    """What keys add to a session: TLS in both directions, and in a router who may do what."""
+    """Build the settings that keys add: TLS in both directions, and access control in a router."""
     folder, side = Path(endpoint.keys), "connect" if endpoint.connect else "listen"
     config: dict[str, Any] = {
         "transport/link/tls": {
@@ -90,7 +90,7 @@ def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, An
             f"{side}_certificate": str(folder / CERTIFICATE),
         }
     }
-    if endpoint.listen and not endpoint.connect:  # a relay is itself judged where it connects
+    if endpoint.listen and not endpoint.connect:  # a relay is checked by the router it connects to
         config["access_control"] = access_control(
             robots_of(endpoint), endpoint.namespace, generations
         )
@@ -98,13 +98,13 @@ def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, An
 
 
 def robots_of(endpoint: Endpoint) -> tuple[str, ...]:
-    """The namespaces of the robots that a router serves: its own, and the fleet's."""
+    """Return the namespaces of the robots that a router serves: its own, and the fleet's."""
     own = (endpoint.namespace,) if endpoint.namespace or not endpoint.fleet else ()
     return tuple(dict.fromkeys((*own, *endpoint.fleet)))
 
 
 def router_config(endpoint: Endpoint, state_dir: Path) -> RouterConfig:
-    """What the router process has to know of the rights that its session enforces."""
+    """Build the router process's settings, with the names that have rights in its session."""
     if not endpoint.keys:
         return RouterConfig(state_dir=str(state_dir))
     knows = known_names(robots_of(endpoint), generations_in(Path(endpoint.keys)))
@@ -112,7 +112,7 @@ def router_config(endpoint: Endpoint, state_dir: Path) -> RouterConfig:
 
 
 def secured(endpoint: Endpoint) -> Endpoint:
-    """The endpoint as its keys make it: TLS in place of TCP. Raises ConfigError."""
+    """Return the endpoint with TLS in place of TCP if it has keys. Raises ConfigError."""
     texts = (*endpoint.listen, *endpoint.connect)
     if not endpoint.keys:
         bare = [text for text in texts if text.startswith(SECURE)]
@@ -134,7 +134,7 @@ def _secure(text: str) -> str:
 
 
 def explain(endpoint: Endpoint, error: str) -> str:
-    """Why a session could not be opened, in one line."""
+    """Explain in one line why a session could not be opened."""
     text, listens = plain(error), ", ".join(endpoint.listen)
     if listens and "address already in use" in text.lower():
         return f"the router's port is taken ({listens}); stop what uses it, or choose another"
@@ -144,7 +144,7 @@ def explain(endpoint: Endpoint, error: str) -> str:
 
 
 def plain(error: str) -> str:
-    """Zenoh's message without the places in its source."""
+    """Return Zenoh's message without locations in its source code."""
     text = re.sub(r" at \S+\.rs:\d+\.?", "", " ".join(error.split()))
     inner = re.search(r'msg: "(.+?)", location', text)
     return inner[1] if inner else text

@@ -1,9 +1,9 @@
-"""A process's session, and a new one whenever its link to the router was lost.
+"""A process's Zenoh session, which is replaced whenever its link to the router is lost.
 
-A session of Zenoh 1.10 joins its router again by itself. But where one end notices the loss before
-the other, as short leases have it on a busy machine, the two may go on with what the old link had
-agreed on: messages come under the keys of others, or none come at all until the link is lost again
-(zenoh#2806 is of that kind). Of an old session nothing is left in a new one.
+A session of Zenoh 1.10 reconnects to its router by itself. With short leases on a busy machine,
+however, one end may notice the loss before the other. Both may then continue with the old link's
+state: messages arrive under wrong keys, or none arrive until the link is lost again (zenoh#2806 is
+similar). A new session keeps no state of the old one.
 """
 
 import asyncio
@@ -23,19 +23,19 @@ from gigabrain_zenoh.zenoh_session import close_session, open_session
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-AGAIN_S = 1.0  # until a session that cannot be opened is tried again
+AGAIN_S = 1.0  # pause after a failed attempt to open a session
 
 
 class Line:
-    """A session, until a client's link to its router is lost."""
+    """A session, valid until a client's link to its router is lost."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
         self.cut = False
-        self.watch: Any = None  # kept: it ends with its last holder
+        self.watch: Any = None  # keeps the listener alive
 
     def take(self, deliver: Callable[[T], object]) -> Callable[[T], None]:
-        """`deliver`, for what comes before the loss; later it may come under a wrong key."""
+        """Wrap `deliver` to drop messages after the loss, which may arrive under a wrong key."""
 
         def delivered(what: T) -> None:
             if not self.cut:
@@ -48,7 +48,7 @@ Make = Callable[[Line], Any]
 
 
 class Declared:
-    """What was declared, and how to do it again."""
+    """A declaration, and the function that repeats it on a new session."""
 
     def __init__(self, make: Make) -> None:
         self.make = make
@@ -56,12 +56,12 @@ class Declared:
 
 
 class Lines:
-    """The present line, and all that is declared on it. `on_lost` is called on the loop."""
+    """The current line and all declarations on it. Calls `on_lost` on the event loop."""
 
     def __init__(
         self, session: zenoh.Session, endpoint: Endpoint, bridge: Bridge, on_lost: Close
     ) -> None:
-        self.now: Line | None = None  # None until a new session has joined
+        self.now: Line | None = None  # None while there is no session
         self._endpoint, self._bridge, self._on_lost = endpoint, bridge, on_lost
         self._declared: list[Declared] = []
         self._tasks: set[asyncio.Task[None]] = set()
@@ -69,7 +69,7 @@ class Lines:
         self._join(session)
 
     def declare(self, make: Make) -> Close:
-        """Declare something here and on every line to come; the returned function ends it."""
+        """Declare something on this and every later line; return a function that undeclares it."""
         declared = Declared(make)
         if self.now:
             declared.made = make(self.now)
@@ -84,25 +84,25 @@ class Lines:
         return close
 
     async def within(self, timeout_s: float) -> Line | None:
-        """The line; None where there is none in time."""
+        """Wait for a line up to `timeout_s`; return None if there is none by then."""
         if self.now is None:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._joined.wait(), timeout_s)
         return self.now
 
     async def close(self) -> None:
-        """Close the session, and join no more."""
+        """Close the session, and open no more."""
         for task in self._tasks:
             task.cancel()
         line, self.now = self.now, None
-        self._joined.set()  # nobody waits for another
+        self._joined.set()  # release callers that wait for a new line
         if line:
             await close_session(line.session)
 
     def _join(self, session: zenoh.Session) -> None:
-        """Declare everything on a new session; it becomes the line once all is declared."""
+        """Repeat all declarations on a new session, then make it the current line."""
         line = Line(session)
-        renews = not self._endpoint.listen  # a router's links are those of others
+        renews = not self._endpoint.listen  # a router's links are its clients'
 
         def linked(event: zenoh.LinkEvent) -> None:
             close_in_background()
@@ -116,7 +116,7 @@ class Lines:
             declared.made = one
         self.now = line
         self._joined.set()
-        if renews and not session.info.links():  # lost before anybody listened: no event comes
+        if renews and not session.info.links():  # lost before the listener: no event
             line.cut = True
             self._bridge.post(self._lost, line)
 
@@ -140,7 +140,7 @@ class Lines:
                 return
             except Exception as error:  # noqa: BLE001 - without a line the process is deaf for good
                 log.warning("the router cannot be joined again: %s", error)
-                if session:  # what could not all be declared on
+                if session:  # some declarations failed on it
                     self._start(close_session(session))
                 await asyncio.sleep(AGAIN_S)
 

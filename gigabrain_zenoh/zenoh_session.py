@@ -1,4 +1,4 @@
-"""Zenoh sessions: opened and closed beside the event loop, which neither may hold up."""
+"""Zenoh sessions, opened and closed in worker threads so that they do not block the event loop."""
 
 import asyncio
 import contextlib
@@ -17,7 +17,7 @@ from gigabrain_zenoh.zenoh_config import explain, plain, session_config
 
 log = logging.getLogger(__name__)
 
-CLOSE_S = 0.5  # a session may take ten seconds to close on a link that loses packets
+CLOSE_S = 0.5  # without a limit, closing may take 10 s on a link that loses packets
 
 
 def _config(endpoint: Endpoint) -> zenoh.Config:
@@ -33,10 +33,10 @@ def _config(endpoint: Endpoint) -> zenoh.Config:
 
 
 async def open_session(endpoint: Endpoint) -> zenoh.Session:
-    """Open a session, waiting for the router as long as it takes.
+    """Open a session, waiting for the router without a time limit.
 
-    In a daemon thread, not in the loop's executor: the process must be able to end meanwhile.
-    Raises BusError when a router cannot listen, ConfigError for an endpoint that is none.
+    Uses a daemon thread rather than the loop's executor, so that the process can exit meanwhile.
+    Raises BusError when a router cannot listen, ConfigError for an endpoint that is not valid.
     """
     config = _config(endpoint)
     loop = asyncio.get_running_loop()
@@ -56,7 +56,7 @@ async def open_session(endpoint: Endpoint) -> zenoh.Session:
             fault = error
         try:
             loop.call_soon_threadsafe(settle, session, fault)
-        except RuntimeError:  # the loop is gone
+        except RuntimeError:  # the loop is closed
             if session:
                 _close(session)
 
@@ -71,7 +71,7 @@ async def open_session(endpoint: Endpoint) -> zenoh.Session:
 
 
 def _discard(opened: asyncio.Future[zenoh.Session]) -> None:
-    """Close a session that nobody waits for any more."""
+    """Close a session whose opening was cancelled."""
     if opened.exception() is None:
         _in_thread(functools.partial(_close, opened.result()))
 
@@ -88,13 +88,16 @@ def _close(session: zenoh.Session) -> None:
 
 
 async def close_session(session: zenoh.Session) -> None:
-    """Close within half a second, or leave the rest to the end of the process."""
+    """Close the session, waiting half a second at most.
+
+    After that, closing continues until the process ends.
+    """
     loop = asyncio.get_running_loop()
     done = asyncio.Event()
 
     def work() -> None:
         _close(session)
-        with contextlib.suppress(RuntimeError):  # the loop did not wait
+        with contextlib.suppress(RuntimeError):  # the loop is closed
             loop.call_soon_threadsafe(done.set)
 
     _in_thread(work)
@@ -105,9 +108,9 @@ async def close_session(session: zenoh.Session) -> None:
 
 
 def log_to_stdout(directives: str) -> None:
-    """Have Zenoh write its own log to standard output, once and for all of this process.
+    """Make Zenoh write its own log to standard output, for the life of this process.
 
-    `directives` are those of RUST_LOG, and are added to those that a user has set there.
+    The `directives` have the format of RUST_LOG, and are added to those set by the user there.
     """
     ours = os.environ.get("RUST_LOG", "")
     os.environ["RUST_LOG"] = f"{ours},{directives}" if ours else directives

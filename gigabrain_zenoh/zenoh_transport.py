@@ -1,4 +1,4 @@
-"""The bus over Zenoh: with `zenoh_session` and `zenoh_line` all that imports it."""
+"""Bus transport over Zenoh. Only this module, `zenoh_session` and `zenoh_line` import zenoh."""
 
 import asyncio
 import contextlib
@@ -33,7 +33,7 @@ CONGESTION = {"drop": zenoh.CongestionControl.DROP, "block": zenoh.CongestionCon
 
 
 class ZenohTransport:
-    """One Zenoh session at a time for the whole process."""
+    """Transport of a process, over one Zenoh session at a time."""
 
     def __init__(self, session: zenoh.Session, endpoint: Endpoint) -> None:
         self._nap = Nap(endpoint.nap_s) if endpoint.nap_s else None
@@ -47,14 +47,14 @@ class ZenohTransport:
 
     @classmethod
     async def open(cls, endpoint: Endpoint) -> "ZenohTransport":
-        """Join the network, waiting for its router. Raises BusError."""
+        """Open a session, waiting for its router. Raises BusError."""
         return cls(await open_session(endpoint), endpoint)
 
     def publish(self, topic: Topic[Any], key: str, payload: bytes, encoding: str) -> None:
-        """Send by the topic's QoS; a declared publisher sends nothing that nobody listens to."""
+        """Publish with the topic's QoS; Zenoh sends nothing if the topic has no subscriber."""
         line = self._lines.now
         if line is None:
-            return  # nobody is there who could hear it
+            return  # without a session there is no subscriber
         publisher = self._publishers.get(key)
         if publisher is None:
             publisher = self._publishers[key] = line.session.declare_publisher(
@@ -67,7 +67,7 @@ class ZenohTransport:
         publisher.put(payload)
 
     def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
-        """Listen; samples that pile up while the loop is busy give way to newer ones."""
+        """Subscribe; while the loop is busy, newer samples replace older ones beyond `depth`."""
         fixed = "" if "*" in key else key
 
         def deliver(sample: zenoh.Sample) -> bool | None:
@@ -79,9 +79,9 @@ class ZenohTransport:
         )
 
     def tap(self, pattern: str, on_raw: OnRaw) -> Close:
-        """Listen in Zenoh's own thread; nothing gives way to anything.
+        """Subscribe with a callback in Zenoh's own thread; no sample is dropped here.
 
-        A direct callback: an indirect one wakes a thread of its own for each message.
+        The callback is direct, because an indirect one wakes a separate thread for each message.
         """
 
         def deliver(sample: zenoh.Sample) -> None:
@@ -96,12 +96,12 @@ class ZenohTransport:
         )
 
     def serve(self, key: str, answer: Answer, *, urgent: bool = False) -> Close:
-        """Answer queries, each in a task of its own."""
+        """Answer queries on `key`, each in its own task."""
 
         async def run(query: zenoh.Query) -> None:
-            with query:  # dropped at the end, else the asker waits for its timeout
+            with query:  # released at the end, else the client waits for its timeout
                 asked = query.payload
-                with contextlib.suppress(zenoh.ZError):  # the asker's line is lost
+                with contextlib.suppress(zenoh.ZError):  # the client's session is lost
                     try:
                         payload, encoding = await answer(asked.to_bytes() if asked else b"")
                         query.reply(key, payload, encoding=encoding)
@@ -122,7 +122,10 @@ class ZenohTransport:
     async def query(
         self, key: str, payload: bytes, encoding: str, timeout_s: float, priority: Priority
     ) -> list[bytes | str]:
-        """Ask all who serve `key`. A direct callback: an indirect one costs a thread per query."""
+        """Query all servers of `key`.
+
+        The callback is direct, because an indirect one costs a thread per query.
+        """
         line = await self._lines.within(timeout_s)
         if line is None:
             return []
@@ -144,7 +147,7 @@ class ZenohTransport:
                 encoding=encoding or None,
                 timeout=timeout_s,
                 target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,  # else one answer per key is all we get
+                consolidation=zenoh.ConsolidationMode.NONE,  # else Zenoh keeps one answer per key
                 priority=PRIORITIES[priority],
                 congestion_control=zenoh.CongestionControl.DROP,  # never block the loop
                 express=True,
@@ -160,7 +163,7 @@ class ZenohTransport:
         return [_unpack(reply) for reply in replies if not _timed_out(reply)]
 
     def links(self, on_link: OnLink) -> Close:
-        """Tell of every link to somebody else, those that there are already first."""
+        """Call `on_link` for every link to another session: existing ones, then each change."""
 
         def told(event: zenoh.LinkEvent) -> None:
             link = event.link
@@ -185,7 +188,7 @@ class ZenohTransport:
         await self._lines.close()
 
     def _lost(self) -> None:
-        """Nothing comes of what was told to the old line."""
+        """Drop the old session's publishers, and end queries that will get no answer."""
         self._publishers.clear()
         self._give_up_asking()
 
@@ -196,7 +199,7 @@ class ZenohTransport:
 
 
 def _refuse(query: zenoh.Query) -> None:
-    """Somebody asks more than can be answered; the asker is told at once."""
+    """Reject a query immediately, because too many are waiting."""
     with query:
         query.reply_err(f"too many others ask for {query.key_expr}; try again")
 
@@ -209,5 +212,5 @@ def _unpack(reply: zenoh.Reply) -> bytes | str:
 
 
 def _timed_out(reply: zenoh.Reply) -> bool:
-    """Zenoh says so itself, here or in the router, in the form of an error."""
+    """Return whether a reply is Zenoh's own timeout, which arrives as an error reply."""
     return reply.err is not None and reply.err.payload.to_bytes() == b"Timeout"
