@@ -177,11 +177,14 @@ async def test_denials_and_strangers_are_in_the_audit_log(gate: Gate, tmp_path: 
         at = Endpoint(connect=gate.as_("").connect, keys=str(keys) if keys else "")
         with pytest.raises(zenoh.ZError), raw(at):
             pass
-    turned_away = {
-        ("stranger", "unknown", "received fatal alert: UnknownCA"),
-        ("stranger", "unknown", "received corrupt message of type InvalidContentType"),
-    }
-    await until(lambda: turned_away <= set(gate.audited), "so are those outside")
+    # How TLS names what is no TLS hangs on a few bytes: one session id in 256 is a byte shorter.
+    whys = ("received fatal alert: UnknownCA", "received corrupt message of type ")
+
+    def turned_away() -> bool:
+        codes = [code for what, who, code in gate.audited if (what, who) == ("stranger", "unknown")]
+        return all(any(code.startswith(why) for code in codes) for why in whys)
+
+    await until(turned_away, "so are those outside")
     record = gate.audited["refused", "viewer@red", "put robot/cmd_vel"]
     assert record.text.startswith("viewer@red at tls/127.0.0.1:")
     assert record.text.endswith(" may not put red/robot/cmd_vel")
