@@ -5,8 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle
 from gigabrain_zenoh.obstacles.arc import place_of
+from gigabrain_zenoh.obstacles.clusters import find_clusters
 from gigabrain_zenoh.obstacles.partly import discs_of
 from tests.test_obstacles import JACKAL, Watch, nearest
 
@@ -76,6 +78,23 @@ def test_what_leaves_the_field_of_view_does_not_seem_to_turn() -> None:
             one = nearest(obstacles, x, 1.4)
             assert off(one, -1.5, 0.0) < 0.3
             assert math.hypot(one.x - x, one.y - 1.4) < 0.15
+
+
+@pytest.mark.parametrize("yaw", [0.0, math.pi / 2, math.pi, -math.pi / 2])
+def test_the_field_of_view_turns_with_the_lidar(yaw: float) -> None:
+    lidar = Lidar(beams=181, rate_hz=10.0, range_min=0.1, range_max=10.0, yaw=yaw)
+
+    def is_whole(bearing: float) -> bool:
+        """Return whether an arc `bearing` [rad] off the lidar's axis is seen to both its ends."""
+        bearings = yaw + bearing + np.radians(np.arange(-5, 6))
+        hits = 2.0 * np.column_stack((np.cos(bearings), np.sin(bearings)))
+        (cluster,) = find_clusters(hits, lidar, math.radians(1.0))
+        return cluster.whole
+
+    assert is_whole(0.0)
+    assert is_whole(math.radians(60))
+    assert not is_whole(math.radians(85))  # reaches the last beam
+    assert not is_whole(math.radians(-85))
 
 
 def test_a_half_of_a_rim_is_a_disc_as_large_as_others() -> None:

@@ -61,7 +61,7 @@ def find_clusters(hits: Floats, lidar: Lidar, spacing: float) -> list[Cluster]:
     last = np.flatnonzero(breaks)
     first = np.concatenate(([0], last[:-1] + 1))
     in_front = _in_front(ranges, empty, first, last, lidar.range_max * IN_RANGE)
-    in_front &= _inside(bearings, first, last, lidar.beams * spacing / 2, spacing)
+    in_front &= _inside(bearings - lidar.yaw, first, last, lidar.beams * spacing / 2, spacing)
     sized = _sized(points, ranges, first, last)
     return [
         _disc(ranges[a : b + 1], float(bearings[a]), float(bearings[b]), spacing, whole=whole)
@@ -114,7 +114,10 @@ def _in_front(ranges: Floats, empty: Bools, first: Indices, last: Indices, reach
 
 
 def _inside(bearings: Floats, first: Indices, last: Indices, half: float, spacing: float) -> Bools:
-    """Which clusters do not reach the end of the field of view, `half` [rad] to each side, (k,)."""
+    """Return which clusters stay clear of both ends, `half` [rad] to each side, (k,).
+
+    `bearings` are from the middle of the field of view.
+    """
     if half > math.pi - spacing:
         return np.ones(len(first), dtype=np.bool_)
     most = half - EDGE_BEAMS * spacing
