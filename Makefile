@@ -60,7 +60,7 @@ faults: setup
 	$(BIN)/gigabrain faults --skip 39 43 44 --repeat 10 --into $(INTO)
 	$(BIN)/gigabrain faults --only 43 44 --repeat 30 --into $(INTO)
 
-# an hour's drive in which things happen
+# 70 minutes of driving in which things happen
 soak: setup
 	$(BIN)/gigabrain faults --only 39 --long --behaviour navigate --json soak.json
 

@@ -127,6 +127,7 @@ async def test_what_cannot_run_is_skipped_and_says_why(tmp_path: Path) -> None:
 
 
 Run = Callable[[], dict[str, float]]
+SHORT = Options()
 
 
 async def result_of(
@@ -134,6 +135,7 @@ async def result_of(
     monkeypatch: pytest.MonkeyPatch,
     repeat: int = 1,
     fault: Fault = FAULT,
+    options: Options = SHORT,
 ) -> Result:
     """What the suite makes of runs that do this, and wait for a core for so long [ms] meanwhile."""
     left, waits = iter(run for run, _ in runs), iter(wait for _, wait in runs)
@@ -146,7 +148,7 @@ async def result_of(
 
     monkeypatch.setattr(RunQueueWatch, "start", start)
     monkeypatch.setattr(suite, "find", lambda path: test)
-    (result,) = await run_suite([fault], Options(), Path(), repeat)
+    (result,) = await run_suite([fault], options, Path(), repeat)
     return result
 
 
@@ -218,6 +220,12 @@ async def test_a_fault_that_loads_the_machine_is_not_disturbed_by_itself(
     result = await result_of([(late, 500.0)], monkeypatch, fault=hogs)
     assert (result.verdict, verdicts(result)) == ("FAILED", [("FAILED", False)])
     assert result.tries[0].waited_ms == 500.0
+
+
+async def test_a_long_form_counts_in_any_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    result = await result_of([(late, 90.0)], monkeypatch, options=Options(long=True))
+    assert (result.verdict, verdicts(result)) == ("FAILED", [("FAILED", False)])
+    assert result.tries[0].waited_ms == 90.0
 
 
 async def test_no_garbage_is_collected_while_a_fault_is_tried(

@@ -20,6 +20,7 @@ from gigabrain_zenoh.recording.gaps import Gaps, header_of
 from gigabrain_zenoh.zenoh_transport import ZenohTransport
 
 QUIET_S = 20.0  # of driving that is judged, between two events of the long form
+WARM_UP_S = 600.0  # of the long form, whose memory is not judged: a robot that maps still learns
 HOUR_S = 3600.0
 WARM_TICKS = 1000  # 20 s; a robot that has just started still takes memory
 COUNTED = (STATE, SCAN, WORLD, CMD_VEL, SAFETY)
@@ -33,26 +34,28 @@ RECORD = (
 
 
 async def soak(rig: Rig) -> Measured:
-    """It drives: for twenty seconds, or in the long form for an hour in which things happen."""
+    """It drives: for twenty seconds, or in the long form for 70 min in which things happen."""
     subject = await rig.robot("sim")
     onlooker, gaps = subject.onlooker, Gaps()
     await subject.drive()
     await until(lambda: onlooker.state.tick >= WARM_TICKS, "it is warm")
     pids = {name: subject.pid(name) for name in subject.supervisor.statuses}
-    files, growth = {pid: open_files(pid) for pid in pids.values()}, Growth()
+    files = {pid: open_files(pid) for pid in pids.values()}
 
     def see(key: str, _encoding: str, payload: bytes) -> None:
         gaps.see(key, header_of(payload))
 
     closes = [onlooker.bus.tap(topic.key, see) for topic in COUNTED]
     begun, stopped, events = dict(pids), 0, Events(rig, subject, pids)
-    end_s = asyncio.get_running_loop().time() + (HOUR_S if rig.long else 0.0)
+    now_s = asyncio.get_running_loop().time
+    growth = Growth(now_s() + WARM_UP_S)
+    end_s = now_s() + (WARM_UP_S + HOUR_S if rig.long else 0.0)
     while True:
         stopped += await _quiet_stops(subject)
         if dead := [name for name, pid in pids.items() if subject.pid(name) != pid]:
             raise Failed(f"{', '.join(dead)} died of itself")
         growth.sample(subject, begun)
-        if asyncio.get_running_loop().time() >= end_s:
+        if now_s() >= end_s:
             break
         await events.next()
     for close in closes:
@@ -63,7 +66,7 @@ async def soak(rig: Rig) -> Measured:
         "open files grown": max(open_files(pid) - files[pid] for pid in survivors.values()),
         "lost": gaps.missing.total(),
     }
-    return measured | ({"memory slope": growth.steepest_mb_per_h(survivors)} if rig.long else {})
+    return measured | (growth.mb_per_h(survivors) if rig.long else {})
 
 
 async def _quiet_stops(subject: Subject) -> int:
@@ -77,19 +80,21 @@ async def _quiet_stops(subject: Subject) -> int:
 class Growth:
     """The memory of processes over time."""
 
-    def __init__(self) -> None:
+    def __init__(self, from_s: float) -> None:
+        """Sample from `from_s` on, by the loop's clock."""
+        self._from_s = from_s
         self._samples: dict[str, list[tuple[float, float]]] = {}
 
     def sample(self, subject: Subject, pids: dict[str, int]) -> None:
         """Note what each of `pids` holds that is still there."""
         now_s = asyncio.get_running_loop().time()
         for name, pid in pids.items():
-            if subject.supervisor.statuses[name].pid == pid:
+            if now_s >= self._from_s and subject.supervisor.statuses[name].pid == pid:
                 self._samples.setdefault(name, []).append((now_s, rss_mb(pid)))
 
-    def steepest_mb_per_h(self, names: Iterable[str]) -> float:
-        """Return the steepest growth of one of `names`, by linear regression [MB/h]."""
-        return max(slope_mb_per_h(self._samples[name]) for name in names)
+    def mb_per_h(self, names: Iterable[str]) -> dict[str, float]:
+        """Return how steeply each of `names` grows [MB/h]."""
+        return {f"{name} grows": slope_mb_per_h(self._samples[name]) for name in names}
 
 
 def slope_mb_per_h(samples: list[tuple[float, float]]) -> float:
@@ -99,7 +104,7 @@ def slope_mb_per_h(samples: list[tuple[float, float]]) -> float:
 
 
 class Events:
-    """What happens to a robot in an hour, at random: deaths, e-stops, viewers, recordings."""
+    """What happens to a robot, at random: deaths, e-stops, viewers, recordings."""
 
     def __init__(self, rig: Rig, subject: Subject, pids: dict[str, int]) -> None:
         """Have them happen to a subject; `pids` are kept those of its processes."""

@@ -137,7 +137,9 @@ FAULTS: tuple[Fault, ...] = (
     ),
     Fault(
         39, "soak", "soak", "sim",
-        "unexplained stops <= 0, open files grown <= 0, lost <= 0, memory slope <= 1 MB/h long",
+        "unexplained stops <= 0, open files grown <= 0, lost <= 0, "
+        "perception grows <= 1 MB/h long, driver grows <= 1 MB/h long, "
+        "safety grows <= 1 MB/h long, router grows <= 1 MB/h long",
     ),
     Fault(
         40, "unauthorised-publisher", SECURITY, "",
