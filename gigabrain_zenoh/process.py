@@ -1,7 +1,4 @@
-"""Common frame of every process: logs, a session, health, and a node that runs until stopped.
-
-Started as `python -m gigabrain_zenoh.process CONFIG`, with a ProcessConfig in JSON.
-"""
+"""Common frame of every process: logs, a session, health, and a node that runs until stopped."""
 
 import asyncio
 import contextlib
@@ -9,15 +6,15 @@ import functools
 import gc
 import logging
 import os
-import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from gigabrain_schemas.topics import HEARD, LOG
-from gigabrain_zenoh import heap, lifeline, logs
+from gigabrain_zenoh import logs
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, unknown
@@ -43,7 +40,7 @@ MakeBus = Callable[[Transport, Clock, str], Bus]
 
 
 @dataclass(frozen=True)
-class Program:
+class ProcessType:
     """Import path of a process's node and of its settings type, if any; imported only when used."""
 
     run: str
@@ -52,58 +49,12 @@ class Program:
     repeats: bool = False  # can be replayed, so it publishes which input it used
     looks_on: bool = False  # not needed by the robot: naps, and runs at low priority
 
-
-PROGRAMS = {
-    "router": Program(
-        "gigabrain_zenoh.router:run", "gigabrain_zenoh.settings:RouterConfig", stops=True
-    ),
-    "relay": Program(
-        "gigabrain_zenoh.relay:run", "gigabrain_zenoh.settings:RelayConfig", stops=True
-    ),
-    "driver": Program(
-        "gigabrain_drivers.process:run", "gigabrain_zenoh.settings:DriverConfig", stops=True
-    ),
-    "emulator": Program(
-        "gigabrain_drivers.emulators.process:run",
-        "gigabrain_zenoh.settings:EmulatorConfig",
-        stops=True,
-    ),
-    "button": Program(
-        "gigabrain_drivers.button:run", "gigabrain_zenoh.settings:ButtonConfig", stops=True
-    ),
-    "perception": Program(
-        "gigabrain_zenoh.perception:run", "gigabrain_zenoh.settings:PerceptionConfig", repeats=True
-    ),
-    "decision": Program(
-        "gigabrain_zenoh.decision:run", "gigabrain_zenoh.settings:DecisionConfig", repeats=True
-    ),
-    "control": Program("gigabrain_zenoh.control:run", stops=True, repeats=True),
-    "safety": Program("gigabrain_zenoh.safety.node:run", stops=True, repeats=True),
-    "recorder": Program(
-        "gigabrain_zenoh.recording.node:run",
-        "gigabrain_zenoh.settings:RecorderConfig",
-        looks_on=True,
-    ),
-    "page": Program(
-        "gigabrain_zenoh.page.node:run", "gigabrain_zenoh.settings:PageConfig", looks_on=True
-    ),
-    "foxglove": Program(
-        "gigabrain_zenoh.foxglove_bridge.node:run",
-        "gigabrain_zenoh.settings:FoxgloveConfig",
-        looks_on=True,
-    ),
-}
-
-
-def node_of(config: ProcessConfig) -> Node:
-    """Return the process's node with its settings filled in. Raises ConfigError or UnknownName."""
-    if config.name not in PROGRAMS:
-        raise unknown("process", config.name, PROGRAMS)
-    program = PROGRAMS[config.name]
-    run = find(program.run)
-    if not program.settings:
-        return run  # type: ignore[no-any-return]
-    return functools.partial(run, msgspec.convert(config.settings, find(program.settings)))
+    def node(self, settings: Mapping[str, Any]) -> Node:
+        """Return the process's node with its settings filled in. Raises ValidationError."""
+        run = find(self.run)
+        if not self.settings:
+            return run  # type: ignore[no-any-return]
+        return functools.partial(run, msgspec.convert(settings, find(self.settings)))
 
 
 def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
@@ -114,18 +65,23 @@ def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
         return None
 
 
-def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
-    """Run one process until it ends, and return its exit code."""
+def run(config: ProcessConfig, types: Mapping[str, ProcessType], make_bus: MakeBus = Bus) -> int:
+    """Run one process until it ends, and return its exit code.
+
+    `types` holds all types of processes, by name.
+    """
     gc.disable()  # until ready: objects from imports and set-up are not garbage
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
     try:
         run_dir = Path(config.run_dir) if config.run_dir else None
         logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
-        node = node_of(config)
-        program = PROGRAMS[config.name]
-        if program.stops:
+        if config.name not in types:
+            raise unknown("process", config.name, types)
+        process_type = types[config.name]
+        node = process_type.node(config.settings)
+        if process_type.stops:
             go_first()  # like the other branches, before any thread starts: threads inherit it
-        elif program.looks_on:
+        elif process_type.looks_on:
             step_aside()
         else:
             start_first()
@@ -133,7 +89,7 @@ def run(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
             interrupts.reacting(None),  # before `stop_signals` there is nothing to stop
             asyncio.Runner(loop_factory=loop_factory()) as runner,
         ):
-            runner.run(_run(config, node, make_bus))
+            runner.run(_run(config, process_type, node, make_bus))
     except GigabrainError as error:
         log.error("%s", error, extra={"data": {"event": "failed"}})
         return error.exit_code
@@ -154,9 +110,11 @@ def _first(error: BaseException) -> BaseException:
     return error
 
 
-async def _run(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
+async def _run(
+    config: ProcessConfig, process_type: ProcessType, node: Node, make_bus: MakeBus
+) -> None:
     with stop_signals() as stop:
-        work = asyncio.ensure_future(_work(config, node, make_bus))
+        work = asyncio.ensure_future(_work(config, process_type, node, make_bus))
         stopped = asyncio.ensure_future(stop.wait())
         await asyncio.wait((work, stopped), return_when=asyncio.FIRST_COMPLETED)
         work.cancel()
@@ -165,13 +123,15 @@ async def _run(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
             await work
 
 
-async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
-    nap_s = NAP_S if PROGRAMS[config.name].looks_on else 0.0
+async def _work(
+    config: ProcessConfig, process_type: ProcessType, node: Node, make_bus: MakeBus
+) -> None:
+    nap_s = NAP_S if process_type.looks_on else 0.0
     endpoint = msgspec.structs.replace(config.endpoint, nap_s=nap_s)
     bus = make_bus(await join(endpoint), Clock(), config.name)
     handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
     logging.getLogger().addHandler(handler)
-    if PROGRAMS[config.name].repeats:
+    if process_type.repeats:
         say = functools.partial(bus.publish, HEARD, name=config.name)
         bus.journal = SaidJournal(say, bus.clock.unix_ns)
     try:
@@ -185,7 +145,7 @@ async def _work(config: ProcessConfig, node: Node, make_bus: MakeBus) -> None:
                 out = os.dup(STDOUT)  # the router redirects its standard output to Zenoh's log
                 tasks.create_task(beat(bus.clock, lambda: bus.progress(), out))
             tasks.create_task(_failure(bus))
-            tasks.create_task(_node(bus, node, PROGRAMS[config.name]))
+            tasks.create_task(_node(bus, node, process_type))
     except* GigabrainError as group:
         raise group.exceptions[0] from None
     finally:
@@ -199,28 +159,14 @@ async def _failure(bus: Bus) -> None:
     await bus.failed
 
 
-async def _node(bus: Bus, node: Node, program: Program) -> None:
-    await node(bus, functools.partial(_ready, program))
+async def _node(bus: Bus, node: Node, process_type: ProcessType) -> None:
+    await node(bus, functools.partial(_ready, process_type))
 
 
-def _ready(program: Program) -> None:
-    if not program.stops:
+def _ready(process_type: ProcessType) -> None:
+    if not process_type.stops:
         join_in()
     gc.collect()
     gc.freeze()  # objects from set-up stay; later collections check new objects only
     gc.enable()
     log.info("ready", extra={"data": {"event": "ready", "pid": os.getpid()}})
-
-
-def main() -> None:
-    """Run a supervised process, configured by its first argument, and exit."""
-    lifeline.die_with_supervisor()
-    heap.map_large_blocks()
-    interrupts.install()
-    code = run(msgspec.json.decode(sys.argv[1], type=ProcessConfig))
-    sys.stdout.flush()
-    os._exit(code)  # Zenoh's threads must not keep a finished process alive
-
-
-if __name__ == "__main__":
-    main()

@@ -15,7 +15,7 @@ from gigabrain_zenoh.settings import DriverConfig, EmulatorConfig, Endpoint, Rec
 from gigabrain_zenoh.zenoh_config import router_config
 
 # -P: a package in the current folder must not shadow an installed one
-COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.process")
+COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.processes")
 LATER_S, SOON_S = 3600.0, 30.0  # a router on another host may start later
 COMPILING_S = 600.0  # mapping and navigation compile their kernels at the first start
 

@@ -130,7 +130,7 @@ def test_a_button_may_be_at_any_port(port: str) -> None:
 def test_a_button_whose_adapter_is_missing_is_told_of_before_there_is_a_robot(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("gigabrain_zenoh.cli.process.run", lambda config: 0)
+    monkeypatch.setattr("gigabrain_zenoh.cli.process.run_process", lambda config: 0)
     assert button(port="/dev/nope") == 0
     said = "gigabrain: no /dev/nope: is it plugged in? Waiting for it.\n"
     assert capsys.readouterr().err == said

@@ -18,7 +18,7 @@ PACKAGES = {
     "drivers/gigabrain_drivers": {"gigabrain_schemas", "gigabrain_zenoh", "gigabrain_drivers"},
 }
 ABOVE = ("gigabrain_zenoh/bench/", "gigabrain_zenoh/cli/", "gigabrain_zenoh/faults/")  # the drivers
-IN_STRINGS = {"gigabrain_zenoh/process.py"}  # the table of processes, which are found by name
+IN_STRINGS = {"gigabrain_zenoh/processes.py"}  # the table of processes, which are found by name
 ONLY_IN = {
     "zenoh": (
         "gigabrain_zenoh/zenoh_line.py",

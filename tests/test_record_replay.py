@@ -29,6 +29,7 @@ from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.param_service import serve_params
+from gigabrain_zenoh.processes import node_of
 from gigabrain_zenoh.recording.drives import DRIVES, file_of
 from gigabrain_zenoh.recording.fields import message_of
 from gigabrain_zenoh.recording.placing import placed
@@ -51,7 +52,7 @@ async def test_every_process_does_what_it_did_on_the_recorded_drive(
     name: str, process: str
 ) -> None:
     path = file_of(RECORDINGS, name)
-    outcome = await replay_process(path, process, settings_for(path, process, None))
+    outcome = await replay_process(path, process, settings_for(path, process, None), node_of)
     assert outcome.same, (outcome, RENEW)
     assert outcome.words > 30
     assert not outcome.begun_late

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from gigabrain_zenoh.process import PROGRAMS
+from gigabrain_zenoh.processes import PROCESSES
 from gigabrain_zenoh.scheduling import FIRST, step_aside
 from tests.bus_rig import in_thread
 from tests.onlooker import looking_on
@@ -109,10 +109,10 @@ def test_whoever_steps_aside_does_so_for_all_threads_that_it_starts() -> None:
 
 
 def test_only_those_without_whom_the_robot_drives_look_on() -> None:
-    looks_on = {name for name, program in PROGRAMS.items() if program.looks_on}
+    looks_on = {name for name, process in PROCESSES.items() if process.looks_on}
     assert looks_on == {"recorder", "page", "foxglove"}
 
 
 def test_commands_and_stops_pass_those_who_go_first() -> None:
-    stops = {name for name, program in PROGRAMS.items() if program.stops}
+    stops = {name for name, process in PROCESSES.items() if process.stops}
     assert stops == {"router", "relay", "driver", "emulator", "button", "control", "safety"}

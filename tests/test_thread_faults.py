@@ -95,7 +95,8 @@ async def test_a_handler_that_raises_ends_a_process_that_waits_for_other_things(
 
     monkeypatch.setattr(process, "join", join)
     config = ProcessConfig(name="control", endpoint=Endpoint())
-    working = asyncio.ensure_future(asyncio.wait_for(process._work(config, node, Bus), PATIENCE_S))
+    work = process._work(config, process.ProcessType("control:run"), node, Bus)
+    working = asyncio.ensure_future(asyncio.wait_for(work, PATIENCE_S))
     sender = Bus(network.transport(), Clock())
     while not working.done():
         sender.publish(CMD_VEL, CmdVel(linear_x=0.1, source="anybody"))

@@ -16,7 +16,7 @@ from gigabrain_zenoh.bench.relay import Role
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.keeper import ProcessSpec
-from gigabrain_zenoh.process import PROGRAMS
+from gigabrain_zenoh.processes import PROCESSES
 from gigabrain_zenoh.settings import Endpoint
 from gigabrain_zenoh.specs import process_specs
 
@@ -94,7 +94,7 @@ def relay_roles(
             puts=KEYS[i],
             size=sizes[i],
             endpoint=endpoints[i],
-            first=PROGRAMS[STANDS_FOR[i]].stops,
+            first=PROCESSES[STANDS_FOR[i]].stops,
             rate_hz=0.0 if i else rate_hz,
             settle_s=SETTLE_S,
             seconds=seconds,

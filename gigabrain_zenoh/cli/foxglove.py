@@ -32,8 +32,8 @@ def foxglove(
 
     from gigabrain_zenoh.cli.checked import checked
     from gigabrain_zenoh.foxglove_bridge.layout import write_layout
-    from gigabrain_zenoh.process import run
     from gigabrain_zenoh.process_config import ProcessConfig
+    from gigabrain_zenoh.processes import run_process
     from gigabrain_zenoh.running import find_endpoint
     from gigabrain_zenoh.settings import FoxgloveConfig
 
@@ -44,4 +44,4 @@ def foxglove(
         return 0
     endpoint = find_endpoint(at.connect, at.namespace, at.folder)
     settings = msgspec.to_builtins(config)
-    return run(ProcessConfig(name="foxglove", endpoint=endpoint, settings=settings))
+    return run_process(ProcessConfig(name="foxglove", endpoint=endpoint, settings=settings))

@@ -63,8 +63,8 @@ def page(*, served: Served = LOCALLY, at: Which = HERE) -> int:
     from gigabrain_zenoh.errors import ConfigError
     from gigabrain_zenoh.page.access import check
     from gigabrain_zenoh.page.node import INSTALL, installed
-    from gigabrain_zenoh.process import run
     from gigabrain_zenoh.process_config import ProcessConfig
+    from gigabrain_zenoh.processes import run_process
     from gigabrain_zenoh.running import find_endpoint
 
     if not installed():
@@ -72,4 +72,6 @@ def page(*, served: Served = LOCALLY, at: Which = HERE) -> int:
     config = served.config()
     check(config)
     endpoint = find_endpoint(at.connect, at.namespace, at.folder)
-    return run(ProcessConfig(name="page", endpoint=endpoint, settings=msgspec.to_builtins(config)))
+    return run_process(
+        ProcessConfig(name="page", endpoint=endpoint, settings=msgspec.to_builtins(config))
+    )

@@ -14,8 +14,8 @@ from gigabrain_zenoh.cli.checked import checked
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.keys.checks import identity_in
 from gigabrain_zenoh.logs import state_dir
-from gigabrain_zenoh.process import run
 from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.processes import run_process
 from gigabrain_zenoh.running import announced, find_endpoint
 from gigabrain_zenoh.settings import (
     ButtonConfig,
@@ -238,7 +238,7 @@ def _keys(place: Place) -> str:
 def _run(
     name: str, place: Place, settings: dict[str, Any], endpoint: Endpoint | None = None
 ) -> int:
-    return run(
+    return run_process(
         ProcessConfig(
             name=name,
             endpoint=endpoint or find_endpoint(place.connect, place.namespace, _keys(place)),

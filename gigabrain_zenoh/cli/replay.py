@@ -28,6 +28,7 @@ def replay(
     deployment
         A deployment file for its settings; without it, those that the recording holds.
     """
+    from gigabrain_zenoh.processes import node_of
     from gigabrain_zenoh.recording.process_replay import replay_file
 
-    return run_async(replay_file(check, process, deployment))
+    return run_async(replay_file(check, process, deployment, node_of))

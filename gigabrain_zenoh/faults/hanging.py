@@ -15,10 +15,11 @@ import msgspec
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import SCAN, STATE, WORLD, Topic
-from gigabrain_zenoh import lifeline, process
+from gigabrain_zenoh import lifeline
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.processes import run_process
 from gigabrain_zenoh.transport import Close, Transport
 
 M = TypeVar("M", bound=Message)
@@ -68,7 +69,7 @@ def main() -> None:
     hangs = threading.Event()
     signal.signal(signal.SIGUSR1, lambda _number, _frame: hangs.set())
     make_bus = functools.partial(HangingBus, PARTS[config.name], hangs)
-    code = process.run(config, make_bus)
+    code = run_process(config, make_bus)
     sys.stdout.flush()
     os._exit(code)  # Zenoh's threads must not keep a finished process alive
 

@@ -13,8 +13,9 @@ from unittest import mock
 
 import msgspec
 
-from gigabrain_zenoh import lifeline, process
+from gigabrain_zenoh import lifeline
 from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.processes import run_process
 
 HOUR_NS, YEAR_NS = 3_600_000_000_000, 31_557_600_000_000_000
 JUMPS_NS = (0, HOUR_NS, -HOUR_NS, 10 * YEAR_NS, -10 * YEAR_NS)  # one after the other
@@ -50,7 +51,7 @@ def main() -> None:
     lifeline.die_with_supervisor()
     config = msgspec.json.decode(sys.argv[2], type=ProcessConfig)
     with clocks(WALLS[sys.argv[1]], RATES[sys.argv[1]]):
-        code = process.run(config)
+        code = run_process(config)
     sys.stdout.flush()
     os._exit(code)  # Zenoh's threads must not keep a finished process alive
 

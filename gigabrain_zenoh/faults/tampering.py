@@ -22,10 +22,11 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN, STATE, Topic
-from gigabrain_zenoh import codec, lifeline, process
+from gigabrain_zenoh import codec, lifeline
 from gigabrain_zenoh.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.processes import run_process
 from gigabrain_zenoh.transport import Transport
 
 Ranges = NDArray[np.float32]
@@ -145,7 +146,7 @@ def main() -> None:
         steps.count += 1
 
     signal.signal(signal.SIGUSR1, go_on)
-    code = process.run(config, functools.partial(tampering_bus, steps))
+    code = run_process(config, functools.partial(tampering_bus, steps))
     sys.stdout.flush()
     os._exit(code)  # Zenoh's threads must not keep a finished process alive
 

@@ -13,6 +13,7 @@ import gigabrain_zenoh.recording.arithmetic  # noqa: F401  before anything impor
 from gigabrain_zenoh.demo import Demo, DemoOptions
 from gigabrain_zenoh.deployment import ALL, Deployment
 from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.processes import node_of
 from gigabrain_zenoh.recording.process_replay import SAYS, replay_process, settings_for
 from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig, RecorderConfig
 
@@ -70,8 +71,8 @@ def record(drive: Drive, to: Path) -> int:
 
 def repeats(path: Path) -> bool:
     """Whether every process does the same again: no tick was given up on a busy machine."""
-    outcomes = (asyncio.run(replay_process(path, p, settings_for(path, p, None))) for p in SAYS)
-    return all(outcome.same for outcome in outcomes)
+    replays = (replay_process(path, p, settings_for(path, p, None), node_of) for p in SAYS)
+    return all(asyncio.run(replayed).same for replayed in replays)
 
 
 def renew(folder: Path, name: str) -> None:

@@ -6,7 +6,7 @@ basis are one word, of which the last counts: which of two inputs within a tick 
 how often it is repeated.
 """
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.deployment import deployment_path, load_deployment
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import BRAIN
-from gigabrain_zenoh.process import node_of
+from gigabrain_zenoh.process import Node
 from gigabrain_zenoh.process_config import ProcessConfig
 from gigabrain_zenoh.recording.fields import message_of, row
 from gigabrain_zenoh.recording.heard import hearing
@@ -53,6 +53,7 @@ NOWHERE = {"perception": {"state_dir": ""}, "decision": {"scripts": "", "state_d
 ELSEWHEN = 0.1  # share of words that may be said in one of the two alone
 # A process that is busy for a tick passes over a state; a replay has all the time in the world.
 
+NodeOf = Callable[[ProcessConfig], Node]
 Word = tuple[str, int, int, int]  # key, boot, tick, basis
 
 
@@ -165,7 +166,9 @@ def _differs(word: Word, then: Message, now: Message) -> Difference | None:
     return None
 
 
-async def replay_process(path: Path, process: str, settings: dict[str, Any]) -> Outcome:
+async def replay_process(
+    path: Path, process: str, settings: dict[str, Any], node_of: NodeOf
+) -> Outcome:
     """Feed a recording to a process as it is now. Raises ConfigError, and what ends the process."""
     past = load(path, process)
     node = node_of(ProcessConfig(name=process, endpoint=Endpoint(), settings=settings))
@@ -206,9 +209,9 @@ def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, 
     return settings | NOWHERE.get(process, {})
 
 
-async def replay_file(path: Path, process: str, deployment: str | None) -> int:
+async def replay_file(path: Path, process: str, deployment: str | None, node_of: NodeOf) -> int:
     """Replay and tell; 0 where the process does what it did, 1 where it does not."""
-    outcome = await replay_process(path, process, settings_for(path, process, deployment))
+    outcome = await replay_process(path, process, settings_for(path, process, deployment), node_of)
     for line in in_words(path, process, outcome):
         print(line)
     return 0 if outcome.same else 1
