@@ -16,7 +16,7 @@ F = TypeVar("F", bound=Callable[..., object])
 numba = numba_alone.load()
 PACKAGE = Path(__file__).parent
 NONE, ONE, TWO = np.int64(0), np.int64(1), np.int64(2)  # as literals they are compiled for apart
-HOLDERS = ("mapping", "navigation", "obstacles", "bench")  # packages with kernels
+HOLDERS = ("mapping", "navigation", "bench")  # packages with kernels
 
 
 def kernel(function: F) -> F:
