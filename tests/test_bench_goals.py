@@ -1,22 +1,30 @@
 """What `gigabrain bench goals` makes of its figures."""
 
+import asyncio
+from pathlib import Path
 from typing import cast
 
 import pytest
 from msgspec.structs import replace
 from rich.console import Console
 
+from gigabrain_drivers.catalog import load_robot, robot_path
+from gigabrain_schemas.base import Cause
+from gigabrain_schemas.body import GateStatus, Pose, RobotState, Velocity
 from gigabrain_schemas.tasks import Goal
+from gigabrain_schemas.topics import STATE
 from gigabrain_zenoh.bench import goals_sender
-from gigabrain_zenoh.bench.goals import GoalFigures, GoalsResult
+from gigabrain_zenoh.bench.goals import CAPACITY_AH, GoalFigures, GoalsResult, with_capacity
 from gigabrain_zenoh.bench.goals_sender import Off, Sender, elsewhere
 from gigabrain_zenoh.bench.group import Group
 from gigabrain_zenoh.bench.growth import Growth
 from gigabrain_zenoh.cli.bench_goals import _table
 from gigabrain_zenoh.errors import BodyLost, GigabrainError
 from gigabrain_zenoh.task_client import Tasks
-from tests.bus_rig import Net
+from tests.bus_rig import Net, settle
 
+AT = Pose(x=0.0, y=0.0, yaw=0.0)
+STILL = RobotState(robot_type="mock", pose=AT, velocity=Velocity(), boot=7, tick=1)
 GOOD = GoalFigures(
     body="alpha",
     world="house",
@@ -99,6 +107,29 @@ async def test_a_robot_that_a_person_has_shut_in_is_sent_on_when_the_person_has_
     looks.extend([GigabrainError("none")] * 100)
     with pytest.raises(GigabrainError, match="none"):
         await sender._somewhere()
+
+
+async def test_a_robot_that_latches_ends_the_course() -> None:
+    net = Net()
+
+    class Alive:
+        async def look(self) -> None:
+            await settle()
+
+    sender = Sender(net.two, cast("Group", Alive()), seed=0)
+    low = Cause(code="battery_empty", text="battery at 5 %", latching=True)
+    gate = GateStatus(mode="latched", causes=(low,))
+    net.one.publish(STATE, replace(STILL, gate=gate))
+    with pytest.raises(GigabrainError, match="the robot has latched: battery at 5 %"):
+        await sender._while_all_live(asyncio.Event().wait())
+
+
+def test_a_body_that_drives_for_hours_has_a_large_battery(tmp_path: Path) -> None:
+    copy = with_capacity(robot_path("turtlebot3_waffle"), tmp_path / "body")
+    before, after = load_robot("turtlebot3_waffle"), load_robot(str(copy))
+    assert after.sim == {"driver": "mujoco", "battery_capacity": CAPACITY_AH}
+    assert replace(after, sim=before.sim) == before
+    assert (copy.parent / "model.xml").is_file()
 
 
 def test_the_table_says_what_was_measured() -> None:

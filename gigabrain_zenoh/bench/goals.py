@@ -6,12 +6,16 @@ simulation's truth.
 
 import asyncio
 import contextlib
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import msgspec
+import yaml
 from msgspec import Struct
 
+from gigabrain_drivers.catalog import robot_path
 from gigabrain_zenoh.bench.goals_sender import Failure, Off, Sender
 from gigabrain_zenoh.bench.group import client, running
 from gigabrain_zenoh.bench.growth import Growth
@@ -23,6 +27,7 @@ from gigabrain_zenoh.specs import process_specs
 
 START_S = 600.0  # a robot's processes and its first map, on a busy machine
 REACHED = 0.99  # of all goals
+CAPACITY_AH = 1000.0  # of a body that drives for hours: in two, a burger's own battery is empty
 
 Say = Callable[[str], None]
 
@@ -119,8 +124,12 @@ async def measure_goals(
 
 async def _run(deployment: Deployment, course: Course, say: Say) -> GoalFigures:
     """One body in one world, from its start to its end."""
-    name = f"{deployment.body} in {deployment.world}"
+    who = deployment.body
+    name = f"{who} in {deployment.world}"
     with _folder(course, name.replace(" ", "-")) as folder:
+        if course.hours:
+            body = str(with_capacity(robot_path(deployment.body), folder / "body"))
+            deployment = msgspec.structs.replace(deployment, body=body)
         specs = process_specs(deployment, "robot", folder, folder / "state")
         say(f"{name}: starting")
         began_s = asyncio.get_running_loop().time()
@@ -138,7 +147,7 @@ async def _run(deployment: Deployment, course: Course, say: Say) -> GoalFigures:
                 say(f"{name}: {sender.reached} of {sender.sent} reached")
             report, growth = await sender.report(), sender.growth()
     return GoalFigures(
-        body=deployment.body,
+        body=who,
         world=deployment.world,
         speed=deployment.speed,
         accepted_s=round(sender.accepted_s - began_s, 2),
@@ -156,6 +165,16 @@ async def _run(deployment: Deployment, course: Course, say: Say) -> GoalFigures:
         failures=tuple(sender.failures),
         growth=growth,
     )
+
+
+def with_capacity(robot: Path, folder: Path) -> Path:
+    """Copy a robot's folder and give its simulation a large battery; return the new file."""
+    shutil.copytree(robot.parent, folder, dirs_exist_ok=True)
+    described = yaml.safe_load(robot.read_text("utf-8"))
+    described["sim"] = (described.get("sim") or {}) | {"battery_capacity": CAPACITY_AH}
+    copy = folder / robot.name
+    copy.write_text(yaml.safe_dump(described), "utf-8")
+    return copy
 
 
 @contextlib.contextmanager

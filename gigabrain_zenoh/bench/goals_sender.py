@@ -60,7 +60,7 @@ class Sender:
     def __init__(self, bus: Bus, group: Group, seed: int) -> None:
         self._bus, self._group, self._tasks = bus, group, Tasks(bus, silent_s=SILENT_S)
         self._maps, self._poses, self._bodies = bus.latest(MAP), bus.latest(POSE), bus.latest(BODY)
-        bus.latest(STATE)  # which start of the driver all else has to be of
+        self._states = bus.latest(STATE)  # also: which start of the driver all else has to be of
         self._random, self._search = np.random.default_rng(seed), Search()
         self._world_from_map: Pose | None = None
         self._watch = Watch()
@@ -199,12 +199,20 @@ class Sender:
         return x, y
 
     async def _while_all_live(self, work: Awaitable[T]) -> T:
-        """Wait for `work`. Raises GigabrainError when a process dies meanwhile."""
+        """Wait for `work`. Raises GigabrainError when a process dies or the gate latches."""
         waiting = asyncio.ensure_future(work)
         try:
             while not waiting.done():
                 await self._group.look()
+                self._refuse_latched()
                 self._sample()
             return await waiting
         finally:
             waiting.cancel()
+
+    def _refuse_latched(self) -> None:
+        """Raise GigabrainError where only a person could have the robot drive again."""
+        state = self._states.current
+        latching = [cause.text for cause in state.gate.causes if cause.latching] if state else []
+        if state and state.gate.mode == "latched" and latching:
+            raise GigabrainError(f"the robot has latched: {', '.join(latching)}")
