@@ -48,7 +48,7 @@ unit: setup
 # before a release, on a machine with nothing else to do: hours, and continued where it was stopped
 qa: setup
 	$(BIN)/python -m tests.dockerfile_steps
-	$(BIN)/python -m gigabrain_zenoh.faults.extremes_run .qa/extremes.jsonl
+	$(BIN)/python -m gigabrain_zenoh.qa.faults.extremes_run .qa/extremes.jsonl
 
 bench: setup
 	$(BIN)/gigabrain bench chain
@@ -86,7 +86,7 @@ golden: setup
 	$(BIN)/python -m gigabrain_schemas.golden
 
 recordings: setup
-	$(BIN)/python -m gigabrain_zenoh.recording.drives tests/recordings
+	$(BIN)/python -m gigabrain_zenoh.qa.drives tests/recordings
 
 pictures: setup
 	$(BIN)/gigabrain view --png docs/pictures/waffle_in_house.png --world house --seed 1

@@ -10,7 +10,7 @@ __all__ = ["connect"]
 def __getattr__(name: str) -> "Any":
     """`gigabrain_zenoh.connect`, imported when first used: the processes have no need of it."""
     if name == "connect":
-        from gigabrain_zenoh.client import connect
+        from gigabrain_zenoh.client.robot import connect
 
         return connect
     raise AttributeError(f"module 'gigabrain_zenoh' has no attribute {name!r}")

@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from gigabrain_schemas.safety import LogRecord
-from gigabrain_zenoh import errors, log_text, run_folders
+from gigabrain_zenoh import errors
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
+from gigabrain_zenoh.host import log_text, run_folders
 
 log = logging.getLogger(__name__)
 

@@ -13,12 +13,12 @@ from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.recording.bagfile import BagFile, topic_of
 from gigabrain_zenoh.recording.gaps import header_of
 from gigabrain_zenoh.recording.intake import Arrival
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.recorder import Recorder, Status
-from gigabrain_zenoh.settings import RecorderConfig
 
 QUICK = RecorderConfig(viewers=False, flush_s=0.05, keep_free_mb=0)
 BEGIN_NS = 1_767_225_600_000_000_000

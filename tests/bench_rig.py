@@ -1,7 +1,7 @@
 """Figures of the benches, as if they had been measured."""
 
-from gigabrain_zenoh.bench.chain import Compared
-from gigabrain_zenoh.bench.figures import Figures
+from gigabrain_zenoh.qa.bench.chain import Compared
+from gigabrain_zenoh.qa.bench.figures import Figures
 
 
 def one(n: int, p50_ms: float, p99_ms: float) -> Figures:

@@ -14,14 +14,16 @@ from gigabrain_drivers.process import DriverProcess
 from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.topics import STATE
-from gigabrain_zenoh import control, decision, perception
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import Close, LocalNetwork, LocalTransport, OnSample
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.process import MakeBus
-from gigabrain_zenoh.replay import Node
+from gigabrain_zenoh.config.settings import DecisionConfig, DriverConfig, PerceptionConfig, Resume
+from gigabrain_zenoh.control import node as control
+from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.runtime.process import MakeBus
+from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.safety import node as safety
-from gigabrain_zenoh.settings import DecisionConfig, DriverConfig, PerceptionConfig, Resume
-from gigabrain_zenoh.transport import Close, LocalNetwork, LocalTransport, OnSample
 from tests.brain_rig import TICK_NS
 
 BRAIN: dict[str, Node] = {

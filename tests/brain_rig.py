@@ -23,9 +23,9 @@ from gigabrain_schemas.body import (
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh import codec
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.transport import LocalNetwork
 from tests.bus_rig import PatientJournal
 
 M = TypeVar("M", bound=Message)

@@ -4,11 +4,11 @@ import asyncio
 import threading
 from collections.abc import Callable
 
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.faults.waiting import PATIENCE_S
-from gigabrain_zenoh.journal import Job, Journal, done
-from gigabrain_zenoh.transport import LocalNetwork
+from gigabrain_zenoh.host.journal import Job, Journal, done
+from gigabrain_zenoh.qa.faults.waiting import PATIENCE_S
 
 
 class PatientJournal(Journal):

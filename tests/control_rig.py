@@ -6,7 +6,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import BodyDescription, GateStatus
 from gigabrain_schemas.brain import CmdVel, Intent
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.control import Inputs, Memory, step
+from gigabrain_zenoh.control.node import Inputs, Memory, step
 from tests.brain_rig import DRIVING, WAFFLE, state
 
 SHUT = {

@@ -41,11 +41,11 @@ from gigabrain_schemas.topics import (
     TELEOP,
     WORLD,
 )
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.page.server import run
-from gigabrain_zenoh.settings import PageConfig
-from gigabrain_zenoh.transport import LocalNetwork
+from gigabrain_zenoh.config.settings import PageConfig
+from gigabrain_zenoh.ui.page.server import run
 from tests.page_rig import OPERATOR, VIEWER
 from tests.stack import free_port
 

@@ -11,11 +11,11 @@ from gigabrain_drivers.catalog import load_robot
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.topics import BODY, TELEOP
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.foxglove_bridge.server import run
-from gigabrain_zenoh.settings import FoxgloveConfig
-from gigabrain_zenoh.transport import LocalNetwork
+from gigabrain_zenoh.config.settings import FoxgloveConfig
+from gigabrain_zenoh.ui.foxglove.server import run
 from tests.foxglove_rig import Viewer
 from tests.stack import PATIENCE_S, free_port
 

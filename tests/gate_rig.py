@@ -6,8 +6,8 @@ from typing import Literal
 from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
-from gigabrain_zenoh import gate
-from gigabrain_zenoh.limits import NO_CAPS, ZERO, Limits
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, Limits
 
 BOOT = 7
 LIMITS = Limits(

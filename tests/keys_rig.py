@@ -7,11 +7,11 @@ from pathlib import Path
 
 import zenoh
 
-from gigabrain_zenoh.keys.authority import issue, new_fleet
-from gigabrain_zenoh.keys.roles import Role
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_config import session_config
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
+from gigabrain_zenoh.bus.zenoh.config import session_config
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.security.authority import issue, new_fleet
+from gigabrain_zenoh.security.roles import Role
 from tests.zenoh_rig import free_endpoint
 
 OF_RED: tuple[Role, ...] = ("robot", "brain", "operator", "viewer")

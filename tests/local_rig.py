@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.brain import Obstacle, Response
+from gigabrain_zenoh.geometry.sweep import depth, edges
 from gigabrain_zenoh.navigation.local import (
     Goal,
     LocalPlan,
@@ -19,7 +20,6 @@ from gigabrain_zenoh.navigation.local import (
     Sent,
 )
 from gigabrain_zenoh.navigation.models import answer, lag_of
-from gigabrain_zenoh.sweep import depth, edges
 
 Floats = NDArray[np.float64]
 

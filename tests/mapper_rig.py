@@ -7,9 +7,9 @@ from typing import Self
 from gigabrain_schemas.requests import MapReply, MapRequest
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, MAP_SAVE, SCAN, STATE
-from gigabrain_zenoh import perception
-from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.settings import PerceptionConfig
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.perception import node as perception
 from tests.brain_rig import Bench, body, scan, state
 from tests.map_rig import HOUSE, Rooms, at
 

@@ -1,5 +1,5 @@
 """The fault suite's onlooker, for tests."""
 
-from gigabrain_zenoh.faults.onlooker import SYSTEMS, Onlooker, at_rest, looking_on
+from gigabrain_zenoh.qa.faults.onlooker import SYSTEMS, Onlooker, at_rest, looking_on
 
 __all__ = ["SYSTEMS", "Onlooker", "at_rest", "looking_on"]

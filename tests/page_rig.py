@@ -10,9 +10,9 @@ import pytest
 from playwright.async_api import BrowserContext, Page, async_playwright
 from websockets.asyncio.client import ClientConnection, connect
 
-from gigabrain_zenoh.deployment import ROBOT
-from gigabrain_zenoh.page import wire
-from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.runtime.deployment import ROBOT
+from gigabrain_zenoh.ui.page import wire
 from tests.stack import Command, Home, endpoint_of, free_port, listens, until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from playwright.async_api import Page, async_playwright
 
-from gigabrain_zenoh.watch import Watch
+from gigabrain_zenoh.ui.watch import Watch
 from tests.onlooker import looking_on
 from tests.page_rig import CHROMIUM, FLAGS, OPERATOR, Robot
 from tests.stack import Home, until

@@ -14,10 +14,11 @@ from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.brain import Intent, OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import BODY, INTENT, MAP, POSE, STATE, TASK, WORLD, Service
-from gigabrain_zenoh import decision, perception
-from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.limits import limits_of, ramp
-from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.geometry.limits import limits_of, ramp
+from gigabrain_zenoh.perception import node as perception
 from tests.brain_rig import BOOT, DRIVING, TICK_NS, WAFFLE, Bench, body, scan, state
 
 Q = TypeVar("Q", bound=Message)

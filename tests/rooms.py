@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_zenoh.geometry.se2 import Floats, compose
 from gigabrain_zenoh.mapping.points import Scan, from_beams
-from gigabrain_zenoh.mapping.se2 import Floats, compose
 
 Walls = Floats  # (n, 4): x and y of both ends [m]
 
@@ -44,7 +44,7 @@ class Lidar:
 
 def drifting(poses: Floats, turn: float, scale: float) -> Floats:
     """The steps (n, 3) between `poses`, as odometry would tell them that turns and stretches."""
-    from gigabrain_zenoh.mapping.se2 import between
+    from gigabrain_zenoh.geometry.se2 import between
 
     steps = between(poses[:-1], poses[1:])
     away = np.hypot(steps[:, 0], steps[:, 1])

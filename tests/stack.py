@@ -13,10 +13,10 @@ from typing import IO
 
 import msgspec
 
-from gigabrain_zenoh.faults.waiting import PATIENCE_S as PATIENCE_S
-from gigabrain_zenoh.faults.waiting import until as until
-from gigabrain_zenoh.running import Running
-from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.qa.faults.waiting import PATIENCE_S as PATIENCE_S
+from gigabrain_zenoh.qa.faults.waiting import until as until
+from gigabrain_zenoh.runtime.running import Running
 
 ROOT = Path(__file__).parent.parent
 SOURCES = (ROOT, ROOT / "drivers", ROOT / "schemas")

@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from gigabrain_zenoh.supervisor import Backoff, ProcessSpec, Supervisor
+from gigabrain_zenoh.runtime.supervisor import Backoff, ProcessSpec, Supervisor
 
 ROOT = Path(__file__).parent.parent
 QUICK = Backoff(first_s=0.01, factor=2.0, longest_s=0.04)
 CHILD = f"""
 import json, os, signal, subprocess, sys, time
 sys.path.insert(0, {str(ROOT)!r})
-from gigabrain_zenoh import lifeline
+from gigabrain_zenoh.host import lifeline
 def say(event, **data):
     print(json.dumps({{"event": event, **data}}), file=sys.stderr, flush=True)
 def wait():
@@ -100,7 +100,7 @@ PARENT = f"""
 import asyncio, json, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, where tests run beside a shell
 sys.path[:0] = [{str(ROOT)!r}, {str(Path(__file__).parent)!r}]
-from gigabrain_zenoh.supervisor import ProcessSpec, Supervisor
+from gigabrain_zenoh.runtime.supervisor import ProcessSpec, Supervisor
 codes = json.loads(sys.argv[1])
 specs = [ProcessSpec(n, (sys.executable, "-c", code)) for n, code in codes.items()]
 def show(name, record):

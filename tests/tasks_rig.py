@@ -20,12 +20,12 @@ from gigabrain_schemas.tasks import (
     TaskStatus,
 )
 from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, Topic
+from gigabrain_zenoh.decision.tasks import checks
+from gigabrain_zenoh.decision.tasks.executive import Executive, Saved
+from gigabrain_zenoh.decision.tasks.mission import Script
+from gigabrain_zenoh.decision.tasks.orders import Explore, GoTo, Order, Outcome
+from gigabrain_zenoh.decision.tasks.service import TaskService
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.tasks import checks
-from gigabrain_zenoh.tasks.executive import Executive, Saved
-from gigabrain_zenoh.tasks.mission import Script
-from gigabrain_zenoh.tasks.orders import Explore, GoTo, Order, Outcome
-from gigabrain_zenoh.tasks.service import TaskService
 from tests.brain_rig import BOOT, state
 from tests.bus_rig import Net, settle
 

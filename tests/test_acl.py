@@ -8,9 +8,9 @@ import pytest
 import zenoh
 
 from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TOPICS
-from gigabrain_zenoh.keys.acl import RIGHTS, access_control, known_names
-from gigabrain_zenoh.keys.authority import issue
-from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.security.acl import RIGHTS, access_control, known_names
+from gigabrain_zenoh.security.authority import issue
 from tests.bus_rig import until
 from tests.keys_rig import Site, make_fleet, raw, site
 from tests.zenoh_rig import Ear, repeat

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gigabrain_zenoh.addresses import exposed, host_and_port, is_host, is_loopback
+from gigabrain_zenoh.config.addresses import exposed, host_and_port, is_host, is_loopback
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,6 @@ import pytest
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Obstacle
-from gigabrain_zenoh.bench.barn_drive import drive
-from gigabrain_zenoh.bench.barn_worlds import Moving, World
-from gigabrain_zenoh.bench.plant import HARD, JACKAL
 from gigabrain_zenoh.navigation import among
 from gigabrain_zenoh.navigation.footprint import outline_of
 from gigabrain_zenoh.navigation.local import Goal, LocalPlan, LocalPlanner, LocalSettings, Moment
@@ -21,6 +18,9 @@ from gigabrain_zenoh.navigation.rating import NO_DISC, Weights
 from gigabrain_zenoh.navigation.rollout import AWAY, CLOSE, COSINE, LANES, STATE, X
 from gigabrain_zenoh.navigation.window import Window
 from gigabrain_zenoh.navigation.window_cells import Place
+from gigabrain_zenoh.qa.bench.barn_drive import drive
+from gigabrain_zenoh.qa.bench.barn_worlds import Moving, World
+from gigabrain_zenoh.qa.bench.plant import HARD, JACKAL
 from tests.local_rig import OMNI, WAFFLE, wall
 
 NOTHING = np.empty((0, 2))

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from gigabrain_drivers.latch import Latched, LatchFile
-from gigabrain_zenoh import atomic_write
-from gigabrain_zenoh.causes import estop
-from gigabrain_zenoh.keys.list_file import LIST
-from gigabrain_zenoh.keys.revoked import write_list
+from gigabrain_zenoh.decision.tasks.executive import Saved
+from gigabrain_zenoh.decision.tasks.store import TaskFile
+from gigabrain_zenoh.gate.causes import estop
+from gigabrain_zenoh.host import atomic_write
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.tasks.executive import Saved
-from gigabrain_zenoh.tasks.store import TaskFile
+from gigabrain_zenoh.security.list_file import LIST
+from gigabrain_zenoh.security.revoked import write_list
 
 
 class Disk:

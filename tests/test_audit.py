@@ -9,12 +9,12 @@ import msgspec
 
 from gigabrain_schemas.audit import AuditPage, AuditRecord, AuditRequest
 from gigabrain_schemas.topics import AUDIT, AUDIT_LOG
-from gigabrain_zenoh.audit import AuditTrail
-from gigabrain_zenoh.audit_file import AuditFile, in_order, read
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.scribe import Scribe
-from gigabrain_zenoh.transport import LocalNetwork
+from gigabrain_zenoh.host.scribe import Scribe
+from gigabrain_zenoh.runtime.audit import AuditTrail
+from gigabrain_zenoh.runtime.audit_file import AuditFile, in_order, read
 
 
 def entry(number: int, stamp_ns: int = 0) -> AuditRecord:

@@ -15,11 +15,11 @@ import pytest
 
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.topics import MAP, POSE, SCAN, STATE, WORLD
-from gigabrain_zenoh import perception
+from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.mapping import autosave
+from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.placing import placed
-from gigabrain_zenoh.replay import record, replay
-from gigabrain_zenoh.settings import PerceptionConfig
+from gigabrain_zenoh.runtime.replay import record, replay
 from tests.brain_rig import state
 from tests.mapper_rig import Robot
 

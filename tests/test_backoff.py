@@ -1,4 +1,4 @@
-from gigabrain_zenoh.backoff import Backoff, Patience
+from gigabrain_zenoh.host.backoff import Backoff, Patience
 
 
 def test_the_wait_doubles_from_a_fifth_of_a_second_to_five() -> None:

@@ -13,7 +13,7 @@ from gigabrain_schemas.body import GateStatus, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.recording.drives import file_of
+from gigabrain_zenoh.qa.drives import file_of
 from gigabrain_zenoh.recording.intake import Arrival
 from gigabrain_zenoh.recording.lerobot import columns, convert, episodes, frames
 from tests import bag_rig

@@ -9,14 +9,14 @@ from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import DescribeRequest, EnableRequest, ReleaseRequest
 from gigabrain_schemas.topics import CMD_VEL, DESCRIBE, ENABLE, MAP, RELEASE, TELEOP
 from gigabrain_zenoh import codec
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.recording.bagfile import BagFile
 from gigabrain_zenoh.recording.play import Player, PlayOptions, check_nobody_drives
 from gigabrain_zenoh.recording.reading import Bag
-from gigabrain_zenoh.transport import LocalNetwork
 from tests import bag_rig
 from tests.brain_in_memory import Robot
 from tests.bus_rig import Net, until

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gigabrain_drivers.sim.jackal import Jackal
 from gigabrain_schemas.base import Velocity
-from gigabrain_zenoh.bench import barn_nodes
-from gigabrain_zenoh.bench.barn_drive import drive
-from gigabrain_zenoh.bench.barn_worlds import Moving, World, choose, read_worlds
-from gigabrain_zenoh.bench.plant import HARD, IDEAL, LIDAR, MUJOCO, Conditions, Plant
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.qa.bench import barn_nodes
+from gigabrain_zenoh.qa.bench.barn_drive import drive
+from gigabrain_zenoh.qa.bench.barn_worlds import Moving, World, choose, read_worlds
+from gigabrain_zenoh.qa.bench.jackal import Jackal
+from gigabrain_zenoh.qa.bench.plant import HARD, IDEAL, LIDAR, MUJOCO, Conditions, Plant
 
 NONE = np.empty((0, 3))
 QUICK = 128  # plans per cycle

@@ -8,13 +8,13 @@ import msgspec
 import pytest
 from rich.console import Console, RenderableType
 
-from gigabrain_zenoh.bench.chain import ChainResult
-from gigabrain_zenoh.bench.costs import Hop
-from gigabrain_zenoh.bench.estop import EstopResult, Presses
-from gigabrain_zenoh.bench.first_goal import FirstGoal
-from gigabrain_zenoh.bench.stack import Process, StackResult, physics_share, targets
-from gigabrain_zenoh.bench.tables import chain_page, estop_page, stack_page, tools_page
-from gigabrain_zenoh.bench.with_tools import Beside, Tool, ToolsResult
+from gigabrain_zenoh.qa.bench.chain import ChainResult
+from gigabrain_zenoh.qa.bench.costs import Hop
+from gigabrain_zenoh.qa.bench.estop import EstopResult, Presses
+from gigabrain_zenoh.qa.bench.first_goal import FirstGoal
+from gigabrain_zenoh.qa.bench.stack import Process, StackResult, physics_share, targets
+from gigabrain_zenoh.qa.bench.tables import chain_page, estop_page, stack_page, tools_page
+from gigabrain_zenoh.qa.bench.with_tools import Beside, Tool, ToolsResult
 from tests.bench_rig import compared, one
 from tests.stack import Home
 

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from gigabrain_drivers.round_trip import RoundTrip
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, SCAN
-from gigabrain_zenoh.bench.costs import Hop, Timed
-from gigabrain_zenoh.bench.figures import figures, over_rounds
-from gigabrain_zenoh.bench.listening import Heard, median_ms
-from gigabrain_zenoh.bench.runs import relay_roles
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.diagnostics.rates import Heard, median_ms
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.percentile import Newest, percentile
-from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.host.percentile import Newest, percentile
+from gigabrain_zenoh.qa.bench.costs import Hop, Timed
+from gigabrain_zenoh.qa.bench.figures import figures, over_rounds
+from gigabrain_zenoh.qa.bench.runs import relay_roles
 from tests.bench_rig import compared, one
 
 MS = 1_000_000

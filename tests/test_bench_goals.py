@@ -13,14 +13,14 @@ from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import GateStatus, Pose, RobotState, Velocity
 from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.topics import STATE
-from gigabrain_zenoh.bench import goals_sender
-from gigabrain_zenoh.bench.goals import CAPACITY_AH, GoalFigures, GoalsResult, with_capacity
-from gigabrain_zenoh.bench.goals_sender import Off, Sender, elsewhere
-from gigabrain_zenoh.bench.group import Group
-from gigabrain_zenoh.bench.growth import Growth
 from gigabrain_zenoh.cli.bench_goals import _table
+from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.errors import BodyLost, GigabrainError
-from gigabrain_zenoh.task_client import Tasks
+from gigabrain_zenoh.qa.bench import goals_sender
+from gigabrain_zenoh.qa.bench.goals import CAPACITY_AH, GoalFigures, GoalsResult, with_capacity
+from gigabrain_zenoh.qa.bench.goals_sender import Off, Sender, elsewhere
+from gigabrain_zenoh.qa.bench.group import Group
+from gigabrain_zenoh.qa.bench.growth import Growth
 from tests.bus_rig import Net, settle
 
 AT = Pose(x=0.0, y=0.0, yaw=0.0)

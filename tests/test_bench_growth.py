@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.bench.growth import Watch
+from gigabrain_zenoh.qa.bench.growth import Watch
 from tests.navigation_rig import grid_of
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gigabrain_zenoh.bench.plan import PlanResult, measure_plan
-from gigabrain_zenoh.bench.plan_maps import office, scattered
 from gigabrain_zenoh.cli.bench_plan import _table, plan
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.qa.bench.plan import PlanResult, measure_plan
+from gigabrain_zenoh.qa.bench.plan_maps import office, scattered
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.bench.slam import drive, judged, total
-from gigabrain_zenoh.bench.slam_crispness import crispness
-from gigabrain_zenoh.bench.slam_logs import Log, errors, load, relations
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.mapping.se2 import Floats, compose
+from gigabrain_zenoh.geometry.se2 import Floats, compose
+from gigabrain_zenoh.qa.bench.slam import drive, judged, total
+from gigabrain_zenoh.qa.bench.slam_crispness import crispness
+from gigabrain_zenoh.qa.bench.slam_logs import Log, errors, load, relations
 
 DATA = os.environ.get("GIGABRAIN_DATA")
 

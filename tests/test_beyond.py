@@ -6,7 +6,7 @@ import pytest
 from gigabrain_schemas.arrays import cells
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.behaviours.beyond import widened
+from gigabrain_zenoh.decision.behaviours.beyond import widened
 
 
 def small() -> OccupancyGrid:

@@ -8,8 +8,8 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from gigabrain_schemas.body import Lidar
-from gigabrain_zenoh.perception import step
-from gigabrain_zenoh.settings import PerceptionConfig
+from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.perception.node import step
 from tests.brain_rig import LIDAR, WAFFLE, open_space, scan
 
 NAN, INF = math.nan, math.inf

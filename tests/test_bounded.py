@@ -5,12 +5,12 @@ from msgspec.structs import replace
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import BODY, HEALTH
-from gigabrain_zenoh.bounded import put
-from gigabrain_zenoh.journal import MOST_KEYS, SaidJournal
-from gigabrain_zenoh.page.scene import Scene
+from gigabrain_zenoh.host.bounded import put
+from gigabrain_zenoh.host.journal import MOST_KEYS, SaidJournal
 from gigabrain_zenoh.safety.host import Host
 from gigabrain_zenoh.safety.senses import Senses
-from gigabrain_zenoh.watch import Watch
+from gigabrain_zenoh.ui.page.scene import Scene
+from gigabrain_zenoh.ui.watch import Watch
 from tests.brain_rig import WAFFLE, body
 from tests.bus_rig import Net, settle
 

@@ -17,22 +17,23 @@ from gigabrain_drivers.links.address import written
 from gigabrain_drivers.links.link import LinkProblem
 from gigabrain_drivers.robot import Run
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
-from gigabrain_zenoh import audit_file, config
-from gigabrain_zenoh.bench import slam_logs
-from gigabrain_zenoh.config_places import located
-from gigabrain_zenoh.deployment import Deployment, load_deployment
+from gigabrain_zenoh.config import loading as config
+from gigabrain_zenoh.config.places import located
+from gigabrain_zenoh.decision.tasks import checks
+from gigabrain_zenoh.decision.tasks.executive import Saved
+from gigabrain_zenoh.decision.tasks.store import TaskFile
+from gigabrain_zenoh.diagnostics import log_reading
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.faults.rig import Options
-from gigabrain_zenoh.faults.tries_file import TriesFile
-from gigabrain_zenoh.keys import files, identity
-from gigabrain_zenoh.keys.list_file import LIST, generations_in
 from gigabrain_zenoh.mapping import arrays_file, map_file
+from gigabrain_zenoh.qa.bench import slam_logs
+from gigabrain_zenoh.qa.faults.rig import Options
+from gigabrain_zenoh.qa.faults.tries_file import TriesFile
 from gigabrain_zenoh.recording import records
 from gigabrain_zenoh.recording.reading import Bag
-from gigabrain_zenoh.tasks import checks
-from gigabrain_zenoh.tasks.executive import Saved
-from gigabrain_zenoh.tasks.store import TaskFile
-from gigabrain_zenoh.tools import log_reading
+from gigabrain_zenoh.runtime import audit_file
+from gigabrain_zenoh.runtime.deployment import Deployment, load_deployment
+from gigabrain_zenoh.security import files, identity
+from gigabrain_zenoh.security.list_file import LIST, generations_in
 
 YAML = "image: x\nresolution: 0.05\norigin: [0, 0, 0]\n"
 

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from gigabrain_schemas.topics import BUTTON, ESTOP_SAID, SAFETY, TELEOP
-from gigabrain_zenoh.faults.extremes import Case, fixed
+from gigabrain_zenoh.qa.faults.extremes import Case, fixed
 from tests.brain_in_memory import Robot
 
 STOPS = (ESTOP_SAID, BUTTON, TELEOP, SAFETY)  # by their purpose

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh.bridge import WAKER, Bridge, EventFd, SocketPair, Waker
+from gigabrain_zenoh.bus.bridge import WAKER, Bridge, EventFd, SocketPair, Waker
 from tests.bus_rig import in_thread, until
 
 pytestmark = pytest.mark.system

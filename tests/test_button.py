@@ -16,13 +16,13 @@ from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.button import ButtonState
 from gigabrain_schemas.requests import EstopRequest, GateReply
 from gigabrain_schemas.topics import BUTTON, ESTOP
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.deployment import Deployment
+from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.settings import ButtonConfig
-from gigabrain_zenoh.specs import process_specs
-from gigabrain_zenoh.transport import LocalNetwork
+from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.runtime.deployment import Deployment
 from tests.brain_in_memory import Robot
 from tests.bus_rig import Net
 

@@ -1,6 +1,6 @@
 """A machine that is too small for its robot is told in one line, a pause of it is not."""
 
-from gigabrain_zenoh.capacity import Capacity
+from gigabrain_zenoh.host.capacity import Capacity
 
 SMALL = (
     "this machine is too small for the robot, or too busy: its time runs at 60% of real time; "

@@ -1,7 +1,7 @@
 """The words for what holds a robot back."""
 
 from gigabrain_schemas.base import Cause
-from gigabrain_zenoh import causes
+from gigabrain_zenoh.gate import causes
 from tests.gate_rig import BLIND, HOT, LOST, ZONE
 
 

@@ -5,8 +5,8 @@ import random
 import pytest
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.faults.chaos import Chaos, Told, told
-from gigabrain_zenoh.faults.damage import Damage, Figures
+from gigabrain_zenoh.qa.proxy.chaos import Chaos, Told, told
+from gigabrain_zenoh.qa.proxy.damage import Damage, Figures
 
 
 def damaged(chaos: Chaos, pieces: list[bytes], seed: int = 0) -> tuple[bytes, list[float], Figures]:

@@ -8,10 +8,10 @@ from collections.abc import AsyncIterator
 import pytest
 
 from gigabrain_schemas.topics import TELEOP
-from gigabrain_zenoh.faults.chaos import CALM, Chaos
-from gigabrain_zenoh.faults.proxy import TcpProxy
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
+from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
 from tests.proxy_rig import Server, serving
 from tests.stack import until
 from tests.zenoh_rig import Ear, repeat, robot

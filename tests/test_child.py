@@ -1,4 +1,4 @@
-from gigabrain_zenoh.child import Lines, as_record
+from gigabrain_zenoh.host.child import Lines, as_record
 
 
 def test_lines_of_any_cut_are_put_together() -> None:

@@ -12,7 +12,7 @@ import gigabrain_zenoh
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.sensors import Imu, LaserScan
 from gigabrain_schemas.topics import SCAN
-from gigabrain_zenoh.client import Robot, connect
+from gigabrain_zenoh.client.robot import Robot, connect
 from gigabrain_zenoh.errors import (
     BodyLost,
     BusError,

@@ -26,10 +26,10 @@ from gigabrain_schemas.topics import (
     STATE,
     WORLD,
 )
-from gigabrain_zenoh import gate
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.stop_zone import brakes
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.step import Inputs, step
-from gigabrain_zenoh.stop_zone import brakes
 from tests.brain_rig import Bench, body, open_space, scan, state
 from tests.gate_rig import driving
 from tests.safety_rig import BODY, Patrol

@@ -12,10 +12,11 @@ import pytest
 
 pytest.importorskip("numba")
 
-from gigabrain_zenoh import compiling, kernels, numba_alone
 from gigabrain_zenoh.cli.warm import warm
-from gigabrain_zenoh.navigating import DRIVE_KERNELS
-from gigabrain_zenoh.perception import LOCALIZE_KERNELS, MAP_KERNELS
+from gigabrain_zenoh.decision.navigating import DRIVE_KERNELS
+from gigabrain_zenoh.kernels import compiling, numba_alone
+from gigabrain_zenoh.kernels import kernel as kernels
+from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 from gigabrain_zenoh.plugins import find
 
 pytestmark = pytest.mark.system
@@ -109,7 +110,7 @@ def test_a_child_that_fails_says_so(calls: Path) -> None:
 
 ALONE = """
 import importlib, sys
-from gigabrain_zenoh import kernels
+from gigabrain_zenoh.kernels import kernel as kernels
 @kernels.kernel
 def double(x):
     return 2 * x
@@ -130,7 +131,7 @@ def test_numba_imports_nothing_that_we_do_not_use_and_hides_nothing_for_good() -
 
 FINDING = """
 import sys
-import gigabrain_zenoh.mapper
+import gigabrain_zenoh.perception.mapper
 from gigabrain_zenoh.mapping.warm import warm_up_finding
 warm_up_finding()
 print("gtsam" in sys.modules)

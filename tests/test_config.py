@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import Meta
 
-from gigabrain_zenoh.config import load, loads
+from gigabrain_zenoh.config.loading import load, loads
 from gigabrain_zenoh.errors import ConfigError
 
 Speed = Annotated[float, Meta(ge=0.01)]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_drivers.catalog import links_of, load_robot, robot_files
-from gigabrain_drivers.conformance import kit
+from gigabrain_zenoh.qa.conformance import kit
 
 pytestmark = pytest.mark.system
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.conformance import kit
-from gigabrain_drivers.conformance.result import Failed, Finding, NotApplicable
-from gigabrain_zenoh import run_queue
+from gigabrain_zenoh.host import run_queue
+from gigabrain_zenoh.qa.conformance import kit
+from gigabrain_zenoh.qa.conformance.result import Failed, Finding, NotApplicable
 
 
 def waiting(monkeypatch: pytest.MonkeyPatch, each_ms: float) -> None:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.conformance import kit
-from gigabrain_drivers.conformance.result import Finding, summary
-from gigabrain_drivers.conformance.subject import Subject
+from gigabrain_zenoh.qa.conformance import kit
+from gigabrain_zenoh.qa.conformance.result import Finding, summary
+from gigabrain_zenoh.qa.conformance.subject import Subject
 
 pytestmark = pytest.mark.system
 

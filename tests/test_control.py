@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.control import Memory
+from gigabrain_zenoh.control.node import Memory
 from tests.brain_rig import DRIVING
 from tests.control_rig import SHUT, Drive, want
 

@@ -9,7 +9,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.control import Inputs, Memory, step
+from gigabrain_zenoh.control.node import Inputs, Memory, step
 from tests.brain_rig import DRIVING, WAFFLE, state
 from tests.control_rig import SHUT, Drive, want
 

@@ -10,10 +10,10 @@ from gigabrain_schemas.body import ControlGains, GateStatus
 from gigabrain_schemas.brain import Intent, Twist
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, STATE, TELEOP, Topic
-from gigabrain_zenoh import control
-from gigabrain_zenoh.control import EarlierCaps
-from gigabrain_zenoh.limits import NO_CAPS
-from gigabrain_zenoh.teleop import Teleop
+from gigabrain_zenoh.control import node as control
+from gigabrain_zenoh.control.node import EarlierCaps
+from gigabrain_zenoh.control.teleop import Teleop
+from gigabrain_zenoh.geometry.limits import NO_CAPS
 from tests.brain_rig import BOOT, DRIVING, TICK_NS, WAFFLE, Bench, body, state
 
 MS = 1_000_000

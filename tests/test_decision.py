@@ -7,11 +7,11 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import Intent, WorldModel
-from gigabrain_zenoh import behaviours
-from gigabrain_zenoh.behaviours import Situation
-from gigabrain_zenoh.behaviours.avoid import Avoid, expected_trajectory
+from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision import behaviours
+from gigabrain_zenoh.decision.behaviours import Situation
+from gigabrain_zenoh.decision.behaviours.avoid import Avoid, expected_trajectory
 from gigabrain_zenoh.errors import UnknownName
-from gigabrain_zenoh.settings import DecisionConfig
 
 CONFIG = DecisionConfig()
 

@@ -8,9 +8,9 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import BODY, CMD_VEL, GOAL
 from gigabrain_zenoh import codec
-from gigabrain_zenoh.faults.extremes import fixed
-from gigabrain_zenoh.settings import DecisionConfig
-from gigabrain_zenoh.steering import Steering
+from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision.steering import Steering
+from gigabrain_zenoh.qa.faults.extremes import fixed
 from tests.brain_rig import body, state
 from tests.bus_rig import Net, settle
 from tests.plane_rig import ROOM, Plane, as_map, drawn

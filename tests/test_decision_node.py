@@ -10,9 +10,9 @@ from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, WORLD
-from gigabrain_zenoh import decision
+from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import UnknownName
-from gigabrain_zenoh.settings import DecisionConfig
 from tests.brain_rig import LIDAR, WAFFLE, Bench, body, state
 
 CONFIG = DecisionConfig()
@@ -123,7 +123,7 @@ async def test_a_driver_that_starts_anew_is_met_with_an_open_mind() -> None:
 
 
 async def test_a_change_of_mind_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gigabrain_zenoh.decision")
+    caplog.set_level(logging.INFO, "gigabrain_zenoh.decision.node")
     async with bench() as node:
         for tick in range(10, 30, 5):
             node.send(STATE, state(tick))

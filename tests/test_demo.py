@@ -16,12 +16,12 @@ from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.tasks import Task, TaskStatus
 from gigabrain_schemas.topics import MAP, STATE
-from gigabrain_zenoh import demo as demo_module
-from gigabrain_zenoh.demo import Demo, DemoOptions, newest_fault
-from gigabrain_zenoh.deployment import ROBOT, Deployment
-from gigabrain_zenoh.live_view import doing
-from gigabrain_zenoh.report import Observed, last_told, make_report, summary
-from gigabrain_zenoh.watch import Watch
+from gigabrain_zenoh.launch import demo as demo_module
+from gigabrain_zenoh.launch.demo import Demo, DemoOptions, newest_fault
+from gigabrain_zenoh.runtime.deployment import ROBOT, Deployment
+from gigabrain_zenoh.ui.live_view import doing
+from gigabrain_zenoh.ui.report import Observed, last_told, make_report, summary
+from gigabrain_zenoh.ui.watch import Watch
 from tests.bus_rig import Net
 from tests.onlooker import looking_on
 from tests.stack import AVOID, ROOT, Command, Home, robot_of, until

@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from gigabrain_schemas.body import Thresholds
-from gigabrain_zenoh import config
 from gigabrain_zenoh.cli.process import button
 from gigabrain_zenoh.cli.up import up
-from gigabrain_zenoh.deployment import Deployment, host_of
+from gigabrain_zenoh.config import loading as config
+from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.settings import ButtonConfig
+from gigabrain_zenoh.runtime.deployment import Deployment, host_of
 
 PORT = "expected a path, or usb:VID:PID[:SERIAL], got"
 
@@ -74,7 +74,7 @@ def only_begun(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         raise Begun
 
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    monkeypatch.setattr("gigabrain_zenoh.launch.process_specs", begin)
+    monkeypatch.setattr("gigabrain_zenoh.launch.up.process_specs", begin)
 
 
 @pytest.mark.usefixtures("only_begun")

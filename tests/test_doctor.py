@@ -8,8 +8,8 @@ from msgspec.structs import replace
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import Description
 from gigabrain_schemas.safety import Health
-from gigabrain_zenoh.tools.doctor import Finding, examine, exit_code
-from gigabrain_zenoh.tools.doctor_facts import Certificate, Folder, Machine, Port, Robot
+from gigabrain_zenoh.diagnostics.doctor import Finding, examine, exit_code
+from gigabrain_zenoh.diagnostics.doctor_facts import Certificate, Folder, Machine, Port, Robot
 
 SENT = {
     "driver": {"robot/state": 50.0, "robot/scan": 10.0},

@@ -14,16 +14,16 @@ import zenoh
 
 from gigabrain_schemas.audit import AuditRecord
 from gigabrain_schemas.topics import AUDIT
-from gigabrain_zenoh import audit_file
-from gigabrain_zenoh.audit import AuditTrail
-from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.client import connect
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import Link, LocalNetwork
+from gigabrain_zenoh.client.robot import connect
 from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import NotConfirmed
-from gigabrain_zenoh.keys.door import Door
-from gigabrain_zenoh.keys.zenoh_log import Denied, TurnedAway, ZenohLog
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.transport import Link, LocalNetwork
+from gigabrain_zenoh.runtime import audit_file
+from gigabrain_zenoh.runtime.audit import AuditTrail
+from gigabrain_zenoh.runtime.door import Door
+from gigabrain_zenoh.runtime.zenoh_log import Denied, TurnedAway, ZenohLog
 from tests.keys_rig import make_fleet, raw
 from tests.stack import Command, Home, free_port, robot_of, until
 

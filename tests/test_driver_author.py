@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from gigabrain_drivers import catalog, links
-from gigabrain_drivers.conformance import direct, kit, new
-from gigabrain_drivers.conformance.subject import Subject
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.qa.conformance import direct, kit, new
+from gigabrain_zenoh.qa.conformance.subject import Subject
 
 pytestmark = pytest.mark.system
 

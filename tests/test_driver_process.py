@@ -13,10 +13,10 @@ from gigabrain_schemas.base import TICK_NS, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import BODY, CMD_VEL
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock, FakeClock
-from gigabrain_zenoh.settings import DriverConfig
-from gigabrain_zenoh.transport import LocalNetwork
+from gigabrain_zenoh.config.settings import DriverConfig
 from tests.brain_in_memory import Robot
 
 

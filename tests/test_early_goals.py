@@ -9,12 +9,13 @@ import pytest
 
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, MissionRequest, TaskStatus
 from gigabrain_schemas.topics import GOAL, INTENT, MISSION, TASK
-from gigabrain_zenoh import decision, navigating
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.cli.task_line import progress
-from gigabrain_zenoh.compiling import compiled
+from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision import navigating
+from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.settings import DecisionConfig
+from gigabrain_zenoh.kernels.compiling import compiled
 from tests.brain_rig import Bench
 from tests.plane_rig import ROOM, Plane, drawn
 
@@ -87,15 +88,15 @@ async def test_a_goal_waits_until_it_is_sure_for_the_first_time_where_it_is() ->
 async def test_what_is_missing_is_named_with_what_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name in ("gigabrain_zenoh.kernels", "numba"):
+    for name in ("gigabrain_zenoh.kernels.kernel", "numba"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ConfigError, match=r"pip install 'gigabrain-zenoh\[nav\]'"):
-        await compiled("gigabrain_zenoh.kernels:kernel")
+        await compiled("gigabrain_zenoh.kernels.kernel:kernel")
 
 
 SERVES = """
 import sys
-import gigabrain_zenoh.navigating
+import gigabrain_zenoh.decision.navigating
 print(*(name for name in ("numpy", "numba", "cv2", "scipy") if name in sys.modules))
 """
 

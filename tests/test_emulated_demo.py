@@ -6,9 +6,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gigabrain_zenoh.deployment import Deployment
-from gigabrain_zenoh.process_config import ProcessConfig
-from gigabrain_zenoh.specs import process_specs
+from gigabrain_zenoh.config.process_config import ProcessConfig
+from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.runtime.deployment import Deployment
 from tests.stack import AVOID, Home
 
 

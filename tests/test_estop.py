@@ -10,7 +10,7 @@ import pytest
 
 from gigabrain_schemas.requests import ReleaseRequest
 from gigabrain_schemas.topics import RELEASE
-from gigabrain_zenoh.client import Robot
+from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import Refused
 from tests.onlooker import Onlooker, looking_on
 from tests.stack import Home, endpoint_of, until

@@ -9,8 +9,8 @@ import pytest
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.requests import EstopRequest, GateReply
 from gigabrain_schemas.topics import ESTOP
+from gigabrain_zenoh.client.estop import press
 from gigabrain_zenoh.errors import NotConfirmed, Refused
-from gigabrain_zenoh.estop import press
 from tests.bus_rig import Net
 
 LATCHED = GateReply(ok=True, text="stopped", robot_type="mock", gate=GateStatus(mode="latched"))

@@ -7,10 +7,10 @@ import pytest
 
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, ESTOP, MAP, SCAN, SERVICES, TOPICS
-from gigabrain_zenoh.faults import extremes_run
-from gigabrain_zenoh.faults.extremes import KNOWN, cases, decodes, fixed, message_of
-from gigabrain_zenoh.faults.hostile import as_map, leaves
-from gigabrain_zenoh.faults.one_message import Outcome, figures
+from gigabrain_zenoh.qa.faults import extremes_run
+from gigabrain_zenoh.qa.faults.extremes import KNOWN, cases, decodes, fixed, message_of
+from gigabrain_zenoh.qa.faults.hostile import as_map, leaves
+from gigabrain_zenoh.qa.faults.one_message import Outcome, figures
 
 HEADER = {"boot": 7, "tick": 205, "basis": 205}
 

@@ -13,19 +13,19 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import BODY, CMD_VEL, STATE
-from gigabrain_zenoh.bus import Bus, Latest
+from gigabrain_zenoh.bus.bus import Bus, Latest
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.faults import clock
-from gigabrain_zenoh.faults.body_link import first_disobeyed
-from gigabrain_zenoh.faults.clock import OtherHost, age_error_ms
-from gigabrain_zenoh.faults.estop import Presses
-from gigabrain_zenoh.faults.onlooker import Onlooker
-from gigabrain_zenoh.faults.reversals import steps_in_window
-from gigabrain_zenoh.faults.smooth import starts_and_stops, stops
-from gigabrain_zenoh.faults.soak import slope_mb_per_h
-from gigabrain_zenoh.faults.stopping import first_slower, first_zero
-from gigabrain_zenoh.faults.subject import Subject
-from gigabrain_zenoh.transport import LocalNetwork
+from gigabrain_zenoh.qa.faults import clock
+from gigabrain_zenoh.qa.faults.body_link import first_disobeyed
+from gigabrain_zenoh.qa.faults.clock import OtherHost, age_error_ms
+from gigabrain_zenoh.qa.faults.estop import Presses
+from gigabrain_zenoh.qa.faults.onlooker import Onlooker
+from gigabrain_zenoh.qa.faults.reversals import steps_in_window
+from gigabrain_zenoh.qa.faults.smooth import starts_and_stops, stops
+from gigabrain_zenoh.qa.faults.soak import slope_mb_per_h
+from gigabrain_zenoh.qa.faults.stopping import first_slower, first_zero
+from gigabrain_zenoh.qa.faults.subject import Subject
 from tests.brain_rig import BOOT, DRIVING, body, state
 from tests.bus_rig import settle
 

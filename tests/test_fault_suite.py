@@ -12,20 +12,29 @@ import pytest
 
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.topics import INTENT, WORLD
-from gigabrain_zenoh import run_queue
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.errors import ConfigError, UnknownName
-from gigabrain_zenoh.faults import suite
-from gigabrain_zenoh.faults.disturbance import LOOK_S, RunQueueWatch
-from gigabrain_zenoh.faults.fault import Failed, Fault, Limit, Result, Skipped, Try, judge, worst_of
-from gigabrain_zenoh.faults.hanging import HangingBus
-from gigabrain_zenoh.faults.rig import Options, Rig, deployment_of
-from gigabrain_zenoh.faults.suite import failed, run_suite
-from gigabrain_zenoh.faults.table import FAULTS, choose
-from gigabrain_zenoh.faults.tries_file import TriesFile
+from gigabrain_zenoh.host import run_queue
 from gigabrain_zenoh.plugins import find
-from gigabrain_zenoh.transport import LocalNetwork
+from gigabrain_zenoh.qa.faults import suite
+from gigabrain_zenoh.qa.faults.disturbance import LOOK_S, RunQueueWatch
+from gigabrain_zenoh.qa.faults.fault import (
+    Failed,
+    Fault,
+    Limit,
+    Result,
+    Skipped,
+    Try,
+    judge,
+    worst_of,
+)
+from gigabrain_zenoh.qa.faults.hanging import HangingBus
+from gigabrain_zenoh.qa.faults.rig import Options, Rig, deployment_of
+from gigabrain_zenoh.qa.faults.suite import failed, run_suite
+from gigabrain_zenoh.qa.faults.table import FAULTS, choose
+from gigabrain_zenoh.qa.faults.tries_file import TriesFile
 from tests.bus_rig import settle
 
 FAULT = Fault(1, "decision-killed", "process", "", "brakes after <= 120 ms, travel <= 0.1 m")

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers.sim.track import Track
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN, STATE
 from gigabrain_zenoh import codec
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.faults.obstacles import nothing
-from gigabrain_zenoh.faults.skewed import clocks, jumps, other_host
-from gigabrain_zenoh.faults.tampering import Steps, tampering_bus
-from gigabrain_zenoh.transport import LocalNetwork
+from gigabrain_zenoh.qa.faults.obstacles import nothing
+from gigabrain_zenoh.qa.faults.skewed import clocks, jumps, other_host
+from gigabrain_zenoh.qa.faults.tampering import Steps, tampering_bus
+from gigabrain_zenoh.qa.track import Track
 
 SECOND_NS = 1_000_000_000
 

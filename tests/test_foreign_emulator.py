@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 
 from gigabrain_drivers import catalog
-from gigabrain_drivers.conformance.session import Session
-from gigabrain_drivers.conformance.subject import Subject
 from gigabrain_drivers.emulators.emulator import device_class
 from gigabrain_drivers.robot import Run
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import UnknownName
+from gigabrain_zenoh.qa.conformance.session import Session
+from gigabrain_zenoh.qa.conformance.subject import Subject
 
 pytestmark = pytest.mark.system
 

@@ -19,11 +19,11 @@ from gigabrain_schemas.brain import Obstacle, OccupancyGrid, PoseInMap, WorldMod
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.topics import IMAGE, LOG, MAP, POSE, SCAN, STATE, TASK, WORLD
+from gigabrain_zenoh.config.settings import FoxgloveConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.foxglove_bridge.layout import topic_to_steer, write_layout
-from gigabrain_zenoh.name_claim import NameClaim
-from gigabrain_zenoh.page.access import token_file, tokens
-from gigabrain_zenoh.settings import FoxgloveConfig
+from gigabrain_zenoh.runtime.name_claim import NameClaim
+from gigabrain_zenoh.ui.foxglove.layout import topic_to_steer, write_layout
+from gigabrain_zenoh.ui.page.access import token_file, tokens
 from tests.foxglove_bridge_rig import Bridge, bridged, hold
 from tests.foxglove_rig import Viewer, fields
 from tests.stack import Home, free_port, listens, until
@@ -183,7 +183,7 @@ def _panels(place: object) -> list[str]:
 async def test_a_robot_turns_as_a_viewer_tells_it_and_a_second_bridge_says_what_to_do(
     home: Home,
 ) -> None:
-    from gigabrain_zenoh.deployment import ROBOT
+    from gigabrain_zenoh.runtime.deployment import ROBOT
     from tests.onlooker import looking_on
     from tests.stack import endpoint_of
 

@@ -13,8 +13,8 @@ from websockets.exceptions import ConnectionClosed
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
-from gigabrain_zenoh.foxglove_bridge.layout import topic_to_steer
-from gigabrain_zenoh.foxglove_bridge.steering import velocity_of
+from gigabrain_zenoh.ui.foxglove.layout import topic_to_steer
+from gigabrain_zenoh.ui.foxglove.steering import velocity_of
 from tests.foxglove_bridge_rig import Bridge, bridged, hold
 from tests.stack import until
 

@@ -4,8 +4,8 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent, Twist, WorldModel
 from gigabrain_schemas.topics import INTENT, STATE, TELEOP, WORLD
+from gigabrain_zenoh.bus.freshness import Latest, RobotTime
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.freshness import Latest, RobotTime
 
 MS = 1_000_000
 

@@ -7,8 +7,8 @@ import pytest
 
 from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.body import GateStatus
-from gigabrain_zenoh import gate
-from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.limits import ZERO
 from tests.gate_rig import BLIND, BOOT, CRASHED, HOT, LIMITS, LOST, Rig, driving, enabled, idle
 
 

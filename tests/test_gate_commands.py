@@ -6,8 +6,8 @@ import pytest
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh import gate
-from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.limits import ZERO
 from tests.gate_rig import BOOT, ZONE, Rig, calm, driving, enabled, idle
 
 NAN, INF = float("nan"), float("inf")

@@ -14,8 +14,8 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
-from gigabrain_zenoh import gate
-from gigabrain_zenoh.limits import NO_CAPS, ZERO, Limits, clamp
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, Limits, clamp
 from tests.gate_rig import BLIND, BOOT, CRASHED, HOT, LIMITS, LOST, ZONE
 
 MS = 1_000_000

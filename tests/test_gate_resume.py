@@ -1,7 +1,7 @@
 """When the gate opens again by itself, where a deployment allows it."""
 
 from gigabrain_schemas.base import Velocity
-from gigabrain_zenoh import gate
+from gigabrain_zenoh.gate import gate
 from tests.gate_rig import BLIND, Rig, enabled, idle
 
 

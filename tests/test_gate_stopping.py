@@ -7,8 +7,8 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Cause, Velocity
-from gigabrain_zenoh import gate
-from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.limits import ZERO
 from tests.gate_rig import BLIND, CRASHED, HOT, LOST, Rig, driving, enabled, idle
 
 

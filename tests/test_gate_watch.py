@@ -5,8 +5,8 @@ from typing import Literal
 import pytest
 
 from gigabrain_schemas.base import Velocity
-from gigabrain_zenoh import gate
-from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.limits import ZERO
 from tests.gate_rig import BLIND, BOOT, HOT, LOST, ZONE, Rig, driving, enabled, idle, plain
 
 MS = 1_000_000

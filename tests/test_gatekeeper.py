@@ -13,7 +13,7 @@ from gigabrain_schemas.audit import AuditRecord
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, ESTOP_SAID, RELEASE
-from gigabrain_zenoh.audit_file import read
+from gigabrain_zenoh.runtime.audit_file import read
 from tests.brain_in_memory import Robot
 from tests.brain_rig import TICK_NS
 

@@ -8,11 +8,11 @@ import gtsam
 import numpy as np
 import pytest
 
+from gigabrain_zenoh.geometry.se2 import Floats, between, compose
 from gigabrain_zenoh.mapping import graph
 from gigabrain_zenoh.mapping.graph import Graph
 from gigabrain_zenoh.mapping.growing import GrowingMap
 from gigabrain_zenoh.mapping.keyframe import Edge
-from gigabrain_zenoh.mapping.se2 import Floats, between, compose
 from tests.map_rig import HOUSE, PATIENCE_S, Rooms, at, error, grown
 
 SURE = np.diag((0.05, 0.05, 0.01)) ** 2

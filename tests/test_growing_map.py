@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.mapping.background import Background
+from gigabrain_zenoh.geometry.se2 import between, compose
+from gigabrain_zenoh.host.background import Background
 from gigabrain_zenoh.mapping.growing import GrowingMap
-from gigabrain_zenoh.mapping.se2 import between, compose
 from tests.map_rig import HALL, HOUSE, PATIENCE_S, Rooms, Walker, at, error, grown
 
 START = (1.0, 2.5)

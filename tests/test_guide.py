@@ -10,10 +10,10 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.behaviours.bearings import Driven, Route
-from gigabrain_zenoh.behaviours.guide import Asked, Guide
+from gigabrain_zenoh.decision.behaviours.bearings import Driven, Route
+from gigabrain_zenoh.decision.behaviours.guide import Asked, Guide
+from gigabrain_zenoh.decision.tasks.orders import GoTo
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.tasks.orders import GoTo
 from tests.local_rig import WAFFLE
 from tests.navigation_rig import empty, grid_of
 

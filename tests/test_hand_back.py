@@ -9,7 +9,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.topics import BODY, CMD_VEL, STATE, TELEOP
-from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.geometry.limits import ZERO
 from tests.brain_rig import BOOT, body, state
 from tests.bus_rig import settle
 from tests.test_control_node import Chain

@@ -10,14 +10,15 @@ import pytest
 
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.topics import WORLD
-from gigabrain_zenoh import behaviours, codec
-from gigabrain_zenoh.backoff import Backoff
-from gigabrain_zenoh.behaviours import Plain
-from gigabrain_zenoh.child import Child
-from gigabrain_zenoh.faults.hanging import PARTS, HangingBus
-from gigabrain_zenoh.heartbeat import LOOK_S, Progress, Silence
-from gigabrain_zenoh.keeper import Keeper, ProcessSpec, Shared
-from gigabrain_zenoh.mapping.background import Background
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.bus.heartbeat import LOOK_S, Progress, Silence
+from gigabrain_zenoh.decision import behaviours
+from gigabrain_zenoh.decision.behaviours import Plain
+from gigabrain_zenoh.host.background import Background
+from gigabrain_zenoh.host.backoff import Backoff
+from gigabrain_zenoh.host.child import Child
+from gigabrain_zenoh.qa.faults.hanging import PARTS, HangingBus
+from gigabrain_zenoh.runtime.keeper import Keeper, ProcessSpec, Shared
 from tests.brain_in_memory import BRAIN, Robot
 
 SECOND_TICKS = 50

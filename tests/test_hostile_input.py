@@ -24,11 +24,11 @@ from gigabrain_schemas.topics import (
     Service,
     Topic,
 )
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.faults.hostile import replaced
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.qa.faults.hostile import replaced
 from tests.onlooker import SYSTEMS, Onlooker, looking_on
 from tests.stack import AVOID, Home, endpoint_of, robot_of, until
 from tests.wire_rig import as_map, numbers, refuses

@@ -12,13 +12,13 @@ from gigabrain_schemas.heard import WAITED, Heard
 from gigabrain_schemas.tasks import Granted
 from gigabrain_schemas.topics import BODY, GOAL, GRANTED, HEARD, SCAN, STATE
 from gigabrain_zenoh import codec
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.journal import Job, PastJournal, SaidJournal
+from gigabrain_zenoh.host.journal import Job, PastJournal, SaidJournal
 from gigabrain_zenoh.recording.heard import hearing
 from gigabrain_zenoh.recording.reading import Sample
-from gigabrain_zenoh.replay import replay
-from gigabrain_zenoh.transport import LocalNetwork
+from gigabrain_zenoh.runtime.replay import replay
 
 MS = 1_000_000
 AT = 1_700_000_000_000_000_000  # Unix time [ns]

@@ -10,7 +10,7 @@ from tests.stack import SOURCES
 
 numba = pytest.importorskip("numba")
 
-from gigabrain_zenoh import kernels  # noqa: E402
+from gigabrain_zenoh.kernels import kernel as kernels  # noqa: E402
 
 pytestmark = pytest.mark.system
 
@@ -38,7 +38,7 @@ def test_where_nothing_can_be_written_it_is_compiled_all_the_same(tmp_path: Path
         "NUMBA_CACHE_DIR": str(no_folder / "below"),
     }
     code = (
-        "import numba; from gigabrain_zenoh.kernels import kernel\n"
+        "import numba; from gigabrain_zenoh.kernels.kernel import kernel\n"
         "@kernel\ndef double(x: int) -> int:\n    return 2 * x\n"
         "print(double(21))"
     )

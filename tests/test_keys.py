@@ -10,13 +10,13 @@ import pytest
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
+from gigabrain_zenoh.bus.zenoh.config import session_config
 from gigabrain_zenoh.cli.keys import issue as issue_command
 from gigabrain_zenoh.cli.keys import new
+from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.keys.authority import issue, new_fleet
-from gigabrain_zenoh.keys.identity import load
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_config import session_config
+from gigabrain_zenoh.security.authority import issue, new_fleet
+from gigabrain_zenoh.security.identity import load
 from tests.stack import Home
 
 

@@ -5,13 +5,18 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_zenoh.bus.zenoh.config import session_config
 from gigabrain_zenoh.cli.process import router
 from gigabrain_zenoh.cli.proxy import proxy
-from gigabrain_zenoh.deployment import Deployment, check_keys, client_endpoint, load_deployment
+from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.specs import process_specs
-from gigabrain_zenoh.zenoh_config import session_config
+from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.runtime.deployment import (
+    Deployment,
+    check_keys,
+    client_endpoint,
+    load_deployment,
+)
 
 ROOT = Path(__file__).parent.parent
 
@@ -94,7 +99,7 @@ def test_the_router_listens_where_it_is_told_and_on_a_socket_of_its_user(
 
 
 def test_the_committed_router_of_a_larger_site_is_what_the_command_prints() -> None:
-    from gigabrain_zenoh.keys.zenohd import configuration
+    from gigabrain_zenoh.runtime.zenohd import configuration
 
     committed = (ROOT / "deploy" / "zenohd" / "zenohd.json5").read_text()
     made = configuration(("red", "blue"), "/etc/gigabrain/keys", "tls/0.0.0.0:7447")

@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 
 from gigabrain_drivers.latch import Latched, LatchFile
-from gigabrain_zenoh.causes import NAN_STORM, estop
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.gate.causes import NAN_STORM, estop
 
 
 def test_nothing_is_latched_before_anything_was(tmp_path: Path) -> None:

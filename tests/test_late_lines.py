@@ -11,12 +11,12 @@ from msgspec.structs import replace
 from gigabrain_drivers.emulators.ld import LdDevice
 from gigabrain_drivers.lidars.ld import Ld19
 from gigabrain_drivers.line import LineDriver
-from gigabrain_drivers.links.line_proxy import LineProxy
 from gigabrain_drivers.robot import ScanOptions
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.faults.chaos import CALM, Chaos
-from gigabrain_zenoh.limits import limits_of, ramp
+from gigabrain_zenoh.geometry.limits import limits_of, ramp
+from gigabrain_zenoh.qa.line_proxy import LineProxy
+from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
 from gigabrain_zenoh.safety import lag
 from tests.lidar_rig import LIDAR, Listener, emulated, until
 from tests.line_rig import Bench

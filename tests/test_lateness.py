@@ -1,6 +1,6 @@
 """How late scans are answered, in ticks of the robot."""
 
-from gigabrain_zenoh.lateness import Lateness
+from gigabrain_zenoh.decision.lateness import Lateness
 
 BOOT = 7
 

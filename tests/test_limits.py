@@ -8,7 +8,7 @@ import pytest
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import BodyDescription, DriveType
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.limits import ZERO, Limits, clamp, limits_of, ramp, slowed
+from gigabrain_zenoh.geometry.limits import ZERO, Limits, clamp, limits_of, ramp, slowed
 
 LIMITS = Limits(
     linear_speed=0.5,

@@ -4,7 +4,7 @@ import os
 import socket
 import struct
 
-from gigabrain_zenoh.linger import close_in_background
+from gigabrain_zenoh.bus.zenoh.linger import close_in_background
 
 
 def lingers(of: socket.socket) -> tuple[int, ...]:

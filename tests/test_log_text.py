@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from gigabrain_zenoh import log_text
+from gigabrain_zenoh.host import log_text
 
 
 def test_a_library_whose_arguments_do_not_fit_loses_no_line() -> None:

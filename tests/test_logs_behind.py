@@ -14,7 +14,7 @@ from typing import IO
 import pytest
 
 from gigabrain_zenoh import logs
-from gigabrain_zenoh.tools.log_reading import Wanted, read
+from gigabrain_zenoh.diagnostics.log_reading import Wanted, read
 
 log = logging.getLogger("a.module")
 PIPE_BYTES = 4096

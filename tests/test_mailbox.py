@@ -3,8 +3,8 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from gigabrain_zenoh.bridge import Bridge
-from gigabrain_zenoh.mailbox import Mailbox
+from gigabrain_zenoh.bus.bridge import Bridge
+from gigabrain_zenoh.bus.mailbox import Mailbox
 from tests.bus_rig import in_thread, until
 
 

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from gigabrain_schemas.requests import MapRequest
-from gigabrain_zenoh import atomic_write
 from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.host import atomic_write
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.map_file import SavedMap
 

@@ -10,13 +10,13 @@ from msgspec.structs import replace
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import HEALTH, MAP, POSE, SCAN, STATE, WORLD
-from gigabrain_zenoh import config
 from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.config import loading as config
+from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.health import publish_health
-from gigabrain_zenoh.mapper import chart_of
 from gigabrain_zenoh.mapping import grid, map_file
-from gigabrain_zenoh.settings import PerceptionConfig
+from gigabrain_zenoh.perception.mapper import chart_of
+from gigabrain_zenoh.runtime.health import publish_health
 from tests.brain_rig import scan, state
 from tests.map_rig import HOUSE, Rooms, at, drawn
 from tests.mapper_rig import Robot

@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE, WORLD
-from gigabrain_zenoh import perception
+from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.growing import Still
+from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.placing import placed
-from gigabrain_zenoh.replay import record, replay
-from gigabrain_zenoh.settings import PerceptionConfig
+from gigabrain_zenoh.runtime.replay import record, replay
 from tests.mapper_rig import SLAM, Robot
 
 

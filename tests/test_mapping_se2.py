@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.mapping.se2 import between, compose, inverse, transform, turned, wrap, wrapped
+from gigabrain_zenoh.geometry.se2 import between, compose, inverse, transform, turned, wrap, wrapped
 
 
 def test_what_lies_a_metre_north_is_a_metre_ahead_of_who_looks_north() -> None:

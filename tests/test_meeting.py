@@ -6,11 +6,11 @@ import socket
 
 import pytest
 
-from gigabrain_zenoh import meeting
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.meeting import join, unknown_host
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
+from gigabrain_zenoh.runtime import meeting
+from gigabrain_zenoh.runtime.meeting import join, unknown_host
 from tests.bus_rig import until
 from tests.zenoh_rig import free_endpoint, under_way
 

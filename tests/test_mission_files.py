@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_zenoh.decision.tasks import checks
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.tasks import checks
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 
 from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.tasks.mission import Script
+from gigabrain_zenoh.decision.tasks.mission import Script
 from tests.tasks_rig import Robot, one_robot
 
 

@@ -7,11 +7,11 @@ from collections.abc import Iterable
 import pytest
 
 from gigabrain_schemas.topics import Priority
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import Answer, Close, LocalNetwork, LocalTransport
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.name_claim import NameClaim
-from gigabrain_zenoh.transport import Answer, Close, LocalNetwork, LocalTransport
+from gigabrain_zenoh.runtime.name_claim import NameClaim
 
 SECOND_NS = 1_000_000_000
 
@@ -71,7 +71,7 @@ class SlowTransport(LocalTransport):
 
 
 async def life(network: SlowNetwork, begin_ns: int, stay: asyncio.Event) -> None:
-    """One process, as `gigabrain_zenoh.process` has it."""
+    """One process, as `gigabrain_zenoh.runtime.process` has it."""
     await network.clock.sleep_ns(begin_ns)
     transport = SlowTransport(network)
     claim = NameClaim(Bus(transport, network.clock, "driver"))

@@ -10,7 +10,7 @@ from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest
 from gigabrain_schemas.topics import GOAL, MISSION, SAFETY
-from gigabrain_zenoh.settings import DecisionConfig
+from gigabrain_zenoh.config.settings import DecisionConfig
 from tests.brain_rig import BOOT
 from tests.plane_rig import ROOM, Plane, drawn
 

@@ -10,11 +10,11 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, MAP
-from gigabrain_zenoh import steering
-from gigabrain_zenoh.behaviours.bearings import Route
-from gigabrain_zenoh.behaviours.guide import Asked, Guide
-from gigabrain_zenoh.navigating import Navigating
-from gigabrain_zenoh.settings import DecisionConfig
+from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision import steering
+from gigabrain_zenoh.decision.behaviours.bearings import Route
+from gigabrain_zenoh.decision.behaviours.guide import Asked, Guide
+from gigabrain_zenoh.decision.navigating import Navigating
 from tests.brain_rig import BOOT, state
 from tests.bus_rig import Net
 from tests.plane_rig import ROOM, Plane, as_map, drawn

@@ -7,7 +7,7 @@ from pathlib import Path
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest, TaskRequest
 from gigabrain_schemas.topics import GOAL, MISSION, TASK_CHANGE
-from gigabrain_zenoh.settings import DecisionConfig
+from gigabrain_zenoh.config.settings import DecisionConfig
 from tests.plane_rig import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)

@@ -16,10 +16,10 @@ import pytest
 
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL
-from gigabrain_zenoh.client import Robot
-from gigabrain_zenoh.faults.chaos import CALM, Chaos
-from gigabrain_zenoh.faults.proxy import TcpProxy
-from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
+from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
 from tests.netns_rig import Network, network
 from tests.onlooker import Onlooker, at_rest, looking_on
 from tests.stack import ROOT, Home, until

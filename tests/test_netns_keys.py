@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh.client import Robot
-from gigabrain_zenoh.keys.authority import issue, new_fleet
-from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.security.authority import issue, new_fleet
 from tests.netns_rig import network
 from tests.onlooker import looking_on
 from tests.stack import ROOT, Home, until

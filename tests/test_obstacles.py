@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle
-from gigabrain_zenoh.obstacles.tracker import MOST, ObstacleTracker
+from gigabrain_zenoh.perception.obstacles.tracker import MOST, ObstacleTracker
 
 Disc = tuple[float, float, float]  # x, y, radius [m]
 Wall = tuple[float, float, float, float]  # from x, y to x, y [m]

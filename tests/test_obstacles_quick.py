@@ -7,9 +7,9 @@ import pytest
 
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle
-from gigabrain_zenoh.obstacles.arc import place_of
-from gigabrain_zenoh.obstacles.clusters import find_clusters
-from gigabrain_zenoh.obstacles.partly import discs_of
+from gigabrain_zenoh.perception.obstacles.arc import place_of
+from gigabrain_zenoh.perception.obstacles.clusters import find_clusters
+from gigabrain_zenoh.perception.obstacles.partly import discs_of
 from tests.test_obstacles import JACKAL, Watch, nearest
 
 RADIUS = 0.5

@@ -8,22 +8,24 @@ from pathlib import Path
 
 import numpy as np
 
-from gigabrain_drivers.planted import node_of
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.tasks import GoalRequest, TaskStatus
 from gigabrain_schemas.topics import GOAL, STATE, TASK
-from gigabrain_zenoh import control, decision, perception
-from gigabrain_zenoh.bench.in_memory import InMemory
-from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.limits import ZERO
-from gigabrain_zenoh.replay import Node
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.control import node as control
+from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.geometry.sweep import depth, edges
+from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.qa.bench.in_memory import InMemory
+from gigabrain_zenoh.qa.planted import node_of
+from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.host import Host
-from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
-from gigabrain_zenoh.sweep import depth, edges
 from tests.local_rig import OMNI, wall
 from tests.rooms import box, ranges
 

@@ -11,7 +11,7 @@ from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest
 from gigabrain_schemas.topics import CMD_VEL, GOAL, MISSION
-from gigabrain_zenoh.causes import estop
+from gigabrain_zenoh.gate.causes import estop
 from tests.brain_rig import DRIVING
 from tests.plane_rig import ROOM, Plane, drawn
 

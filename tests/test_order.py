@@ -19,12 +19,12 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import STATE
-from gigabrain_zenoh import perception
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import Close, LocalNetwork, LocalTransport, OnSample
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.replay import Node
-from gigabrain_zenoh.settings import DriverConfig, PerceptionConfig
-from gigabrain_zenoh.transport import Close, LocalNetwork, LocalTransport, OnSample
+from gigabrain_zenoh.config.settings import DriverConfig, PerceptionConfig
+from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.runtime.replay import Node
 from tests.brain_in_memory import BRAIN
 from tests.brain_rig import round_room
 

@@ -9,9 +9,6 @@ import pytest
 
 from gigabrain_drivers import catalog
 from gigabrain_drivers.catalog import links_of, load_robot, robot_path
-from gigabrain_drivers.conformance import timing
-from gigabrain_drivers.conformance.result import Failed
-from gigabrain_drivers.conformance.subject import Subject
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.line_command import LineCommand
 from gigabrain_drivers.protocols.line import Template
@@ -22,6 +19,9 @@ from gigabrain_drivers.sim.scene import compile_scene
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.qa.conformance import timing
+from gigabrain_zenoh.qa.conformance.result import Failed
+from gigabrain_zenoh.qa.conformance.subject import Subject
 from tests.brain_rig import state
 
 MINE = robot_path("mycustombot")

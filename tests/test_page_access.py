@@ -13,18 +13,18 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.topics import BODY, TELEOP
-from gigabrain_zenoh.deployment import Deployment
+from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.limits import ZERO
-from gigabrain_zenoh.page.access import Access, check, tokens
-from gigabrain_zenoh.page.beside import free_port, with_page
-from gigabrain_zenoh.page.operator import Operator
-from gigabrain_zenoh.page.scene import Scene
-from gigabrain_zenoh.page.server import run
-from gigabrain_zenoh.page.viewer import Viewer
-from gigabrain_zenoh.page.wire import Ask, GoalRequest
-from gigabrain_zenoh.seat import Seat
-from gigabrain_zenoh.settings import PageConfig
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.runtime.deployment import Deployment
+from gigabrain_zenoh.ui.page.access import Access, check, tokens
+from gigabrain_zenoh.ui.page.beside import free_port, with_page
+from gigabrain_zenoh.ui.page.operator import Operator
+from gigabrain_zenoh.ui.page.scene import Scene
+from gigabrain_zenoh.ui.page.server import run
+from gigabrain_zenoh.ui.page.viewer import Viewer
+from gigabrain_zenoh.ui.page.wire import Ask, GoalRequest
+from gigabrain_zenoh.ui.seat import Seat
 from tests.bus_rig import Net, settle
 
 

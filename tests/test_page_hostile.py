@@ -14,7 +14,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from gigabrain_schemas.topics import TELEOP
-from gigabrain_zenoh.page import wire
+from gigabrain_zenoh.ui.page import wire
 from tests.onlooker import looking_on
 from tests.page_rig import OPERATOR, VIEWER, Robot, client
 from tests.stack import AVOID, Home, until

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from gigabrain_zenoh.page import wire
-from gigabrain_zenoh.page.access import Access, tokens
-from gigabrain_zenoh.page.operator import Operator
-from gigabrain_zenoh.page.scene import Scene
-from gigabrain_zenoh.page.sessions import Sessions
-from gigabrain_zenoh.seat import Seat
-from gigabrain_zenoh.settings import PageConfig
+from gigabrain_zenoh.config.settings import PageConfig
+from gigabrain_zenoh.ui.page import wire
+from gigabrain_zenoh.ui.page.access import Access, tokens
+from gigabrain_zenoh.ui.page.operator import Operator
+from gigabrain_zenoh.ui.page.scene import Scene
+from gigabrain_zenoh.ui.page.sessions import Sessions
+from gigabrain_zenoh.ui.seat import Seat
 from tests.bus_rig import Net, settle
 
 HOST = "127.0.0.1:8080"

@@ -13,12 +13,13 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, INTENT, STATE, WORLD
-from gigabrain_zenoh import behaviours, decision
-from gigabrain_zenoh.behaviours import BEHAVIOURS
+from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision import behaviours
+from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.decision.behaviours import BEHAVIOURS
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.navigation.local import Goal, LocalPlanner
-from gigabrain_zenoh.param_service import LOG_LEVEL, serve_params
-from gigabrain_zenoh.settings import DecisionConfig
+from gigabrain_zenoh.runtime.param_service import LOG_LEVEL, serve_params
 from tests.brain_rig import Bench, state
 from tests.local_rig import QUICK, WAFFLE, Drive, wall
 from tests.plane_rig import Plane, drawn

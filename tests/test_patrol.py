@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between
 from gigabrain_zenoh.mapping.familiar import Ground
 from gigabrain_zenoh.mapping.growing import GrowingMap
 from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.localizer import View
 from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.points import Scan
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between
 from gigabrain_zenoh.mapping.sweeps import Sweeps
 from tests.map_rig import HOUSE, PATIENCE_S, Rooms, Walker, at, box, error
 

@@ -14,9 +14,9 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, WORLD
-from gigabrain_zenoh import perception
-from gigabrain_zenoh.perception import step
-from gigabrain_zenoh.settings import PerceptionConfig
+from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.perception.node import step
 from tests.brain_rig import BOOT, LIDAR, WAFFLE, Bench, body, open_space, scan
 
 NAN, INF = math.nan, math.inf

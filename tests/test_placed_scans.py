@@ -8,9 +8,9 @@ import pytest
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
-from gigabrain_zenoh import perception
-from gigabrain_zenoh.placed_scans import PlacedScans
-from gigabrain_zenoh.settings import PerceptionConfig
+from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.geometry.placed_scans import PlacedScans
+from gigabrain_zenoh.perception import node as perception
 from tests.brain_rig import Bench, body, open_space, scan, state
 
 MAPPING = PerceptionConfig(mapping="slam")

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from gigabrain_zenoh.geometry.se2 import Floats, between, compose
 from gigabrain_zenoh.mapping.drift import Drift, Rates
 from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.places import PlaceSearch
-from gigabrain_zenoh.mapping.se2 import Floats, between, compose
 from tests.rooms import Lidar, Walls, box, line
 from tests.test_slam import BLOCK, lap
 

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from gigabrain_schemas.base import Pose
-from gigabrain_zenoh.planar import compose, inverse, relative
-from gigabrain_zenoh.pose_history import PoseHistory
+from gigabrain_zenoh.geometry.planar import compose, inverse, relative
+from gigabrain_zenoh.geometry.pose_history import PoseHistory
 from tests.brain_rig import BOOT, state
 
 

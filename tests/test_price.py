@@ -6,14 +6,14 @@ import cv2
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.bench.plant import JACKAL
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels.kernel import kernel
 from gigabrain_zenoh.navigation.among import WEIGHTS
 from gigabrain_zenoh.navigation.footprint import Grid, Outline, outline_of
 from gigabrain_zenoh.navigation.models import Model, lag_of, model_of
 from gigabrain_zenoh.navigation.price import look_round, price, rooms_of
 from gigabrain_zenoh.navigation.rating import Scene, Weights
 from gigabrain_zenoh.navigation.rollout import LANES, STATE, Floats, Start, move, obey
+from gigabrain_zenoh.qa.bench.plant import JACKAL
 
 STEPS, DT, BLOCKS = 30, 0.05, 25
 NOBODY = np.empty((0, 6))

@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 
 from gigabrain_schemas.topics import ESTOP, SERVICES
-from gigabrain_zenoh.bridge import Bridge
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bridge import Bridge
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.questions import Questions
+from gigabrain_zenoh.bus.transport import LocalNetwork, LocalTransport
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.questions import Questions
-from gigabrain_zenoh.transport import LocalNetwork, LocalTransport
 from tests.bus_rig import in_thread, until
 
 

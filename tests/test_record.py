@@ -12,6 +12,7 @@ from gigabrain_schemas.examples import EXAMPLES, example
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import IMAGE, INTENT, MAP, SCAN, STATE, TOPICS
 from gigabrain_zenoh import codec
+from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.bagfile import BagFile
 from gigabrain_zenoh.recording.info import info
@@ -19,7 +20,6 @@ from gigabrain_zenoh.recording.intake import MOST_PLACES, OTHERS, Intake
 from gigabrain_zenoh.recording.node import chosen, listening, run
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.recorder import Recorder
-from gigabrain_zenoh.settings import RecorderConfig
 from tests import bag_rig
 from tests.bag_rig import QUICK, kept
 from tests.bus_rig import Net, until

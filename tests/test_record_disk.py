@@ -15,10 +15,10 @@ import pytest
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.topics import MAP
 from gigabrain_zenoh import codec
+from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.recording import bagfile, tape
 from gigabrain_zenoh.recording.info import info
 from gigabrain_zenoh.recording.recorder import Recorder
-from gigabrain_zenoh.settings import RecorderConfig
 from tests import bag_rig
 from tests.bag_rig import QUICK, kept, wait
 
@@ -175,7 +175,7 @@ WRITER = """
 import sys, time
 from pathlib import Path
 from gigabrain_zenoh.recording.recorder import Recorder
-from gigabrain_zenoh.settings import RecorderConfig
+from gigabrain_zenoh.config.settings import RecorderConfig
 from tests import bag_rig
 with Recorder(Path(sys.argv[1]), RecorderConfig(viewers=False, keep_free_mb=0)) as recorder:
     for seq in range(1, 10_000):
@@ -210,7 +210,7 @@ from pathlib import Path
 resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
 from gigabrain_zenoh.recording import recorder as module
 from gigabrain_zenoh.recording.recorder import Recorder
-from gigabrain_zenoh.settings import RecorderConfig
+from gigabrain_zenoh.config.settings import RecorderConfig
 from tests import bag_rig
 module.RETRY_S = 1e9  # no second file
 config = RecorderConfig(viewers=False, keep_free_mb=0, flush_s=0)

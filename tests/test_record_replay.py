@@ -24,20 +24,21 @@ from gigabrain_schemas.topics import (
     WORLD,
     Topic,
 )
-from gigabrain_zenoh import codec, decision
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.cli.app import make_app
+from gigabrain_zenoh.config.settings import DecisionConfig, RecorderConfig
+from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.param_service import serve_params
-from gigabrain_zenoh.processes import node_of
-from gigabrain_zenoh.recording.drives import DRIVES, file_of
+from gigabrain_zenoh.launch.processes import node_of
+from gigabrain_zenoh.qa.drives import DRIVES, file_of
 from gigabrain_zenoh.recording.fields import message_of
 from gigabrain_zenoh.recording.placing import placed
 from gigabrain_zenoh.recording.process_replay import SAYS, replay_process, settings_for
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.recorder import Recorder
-from gigabrain_zenoh.replay import ASKED, Event, record, replay
-from gigabrain_zenoh.settings import DecisionConfig, RecorderConfig
+from gigabrain_zenoh.runtime.param_service import serve_params
+from gigabrain_zenoh.runtime.replay import ASKED, Event, record, replay
 from tests import bag_rig
 from tests.brain_in_memory import BRAIN, Robot
 from tests.plane_rig import ROOM, Plane, drawn

@@ -9,12 +9,12 @@ import pytest
 
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE
-from gigabrain_zenoh import audit_file
-from gigabrain_zenoh.deployment import Deployment, ProcessName
-from gigabrain_zenoh.keys.authority import issue, new_fleet
-from gigabrain_zenoh.process_config import ProcessConfig
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.specs import process_specs
+from gigabrain_zenoh.config.process_config import ProcessConfig
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.runtime import audit_file
+from gigabrain_zenoh.runtime.deployment import Deployment, ProcessName
+from gigabrain_zenoh.security.authority import issue, new_fleet
 from tests.onlooker import Onlooker, at_rest, looking_on
 from tests.stack import Home, free_port, until
 from tests.test_netns import REST_TICKS, STOP_TICKS, Ears

@@ -13,15 +13,17 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.brain import CmdVel, Intent, Twist, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import BODY, CMD_VEL, SCAN, STATE, TELEOP
-from gigabrain_zenoh import control, decision, perception
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.limits import ZERO
-from gigabrain_zenoh.replay import Event, Node, record, replay
+from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.control import node as control
+from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.runtime.replay import Event, Node, record, replay
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.host import Host
-from gigabrain_zenoh.settings import DecisionConfig, PerceptionConfig
-from gigabrain_zenoh.transport import LocalNetwork
 from tests.brain_rig import BOOT, DRIVING, TICK_NS, body, round_room, scan, state
 
 SYSTEMS: dict[str, tuple[Node, str]] = {

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import CmdVel, Response
-from gigabrain_zenoh.response import PRIOR, ResponseEstimator
+from gigabrain_zenoh.decision.response import PRIOR, ResponseEstimator
 from tests.brain_rig import BOOT, DRIVING, state
 
 PARTS = 4  # of a tick, in which the plant moves

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_zenoh.bus.zenoh.config import router_config, session_config
+from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.keys.authority import issue
-from gigabrain_zenoh.keys.identity import read
-from gigabrain_zenoh.keys.revoked import revoke
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_config import router_config, session_config
+from gigabrain_zenoh.security.authority import issue
+from gigabrain_zenoh.security.identity import read
+from gigabrain_zenoh.security.revoked import revoke
 from tests.keys_rig import site
 from tests.stack import Home
 from tests.test_acl import answer, ask, asked_until_answered

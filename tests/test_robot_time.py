@@ -9,10 +9,10 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.topics import STATE
 from gigabrain_zenoh import codec
-from gigabrain_zenoh.earlier import Earlier
+from gigabrain_zenoh.bus.earlier import Earlier
+from gigabrain_zenoh.bus.freshness import RobotTime
+from gigabrain_zenoh.bus.sampled import Sampled
 from gigabrain_zenoh.errors import ClockLost
-from gigabrain_zenoh.freshness import RobotTime
-from gigabrain_zenoh.sampled import Sampled
 from tests.brain_rig import BOOT, open_space, scan, state
 from tests.bus_rig import Net
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh import logs, run_folders
+from gigabrain_zenoh import logs
+from gigabrain_zenoh.host import run_folders
 
 
 def runs(base: Path, count: int, size: int = 10) -> list[Path]:
@@ -31,7 +32,7 @@ def test_a_new_run_removes_the_oldest_beyond_the_bytes_that_are_kept(tmp_path: P
 
 
 HOLDS = (
-    "import sys; from pathlib import Path; from gigabrain_zenoh import run_folders; "
+    "import sys; from pathlib import Path; from gigabrain_zenoh.host import run_folders; "
     "run_folders.hold(Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
 )
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
-from gigabrain_zenoh.running import Running, announced, find_endpoint, folder, running
-from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.runtime.running import Running, announced, find_endpoint, folder, running
 
 HERE = Endpoint(connect=("tcp/127.0.0.1:7001",), namespace="alpha")
 
@@ -52,7 +52,7 @@ def test_a_robot_is_found_for_as_long_as_its_supervisor_says(notes: Path) -> Non
 
 def test_the_note_of_a_dead_supervisor_is_taken_away(notes: Path) -> None:
     program = (
-        "import os\nfrom gigabrain_zenoh.running import announced, Endpoint\n"
+        "import os\nfrom gigabrain_zenoh.runtime.running import announced, Endpoint\n"
         "with announced('ghost', Endpoint(connect=('tcp/127.0.0.1:1',))): os.kill(os.getpid(), 9)"
     )
     subprocess.run((sys.executable, "-c", program), check=False)

@@ -12,8 +12,8 @@ from gigabrain_drivers.mock import MockBody, MockOptions
 from gigabrain_drivers.robot import Run
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState, SafeState
+from gigabrain_zenoh.config.settings import DriverConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError
-from gigabrain_zenoh.settings import DriverConfig
 from tests.bus_rig import Net
 
 

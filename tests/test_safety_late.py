@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus, Thresholds
-from gigabrain_zenoh.limits import clamp, limits_of
+from gigabrain_zenoh.geometry.limits import clamp, limits_of
 from tests.brain_rig import DRIVING
 from tests.safety_rig import BODY, Patrol
 

@@ -7,7 +7,7 @@ from msgspec.structs import fields
 from gigabrain_drivers.latch import UNREADABLE
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import Thresholds
-from gigabrain_zenoh import causes
+from gigabrain_zenoh.gate import causes
 from gigabrain_zenoh.safety.words import CAUSES, WARNINGS, say
 
 PAGE = Path(__file__).parent.parent / "docs" / "safety.md"

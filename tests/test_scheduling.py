@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from gigabrain_zenoh.processes import PROCESSES
-from gigabrain_zenoh.scheduling import FIRST, step_aside
+from gigabrain_zenoh.host.scheduling import FIRST, step_aside
+from gigabrain_zenoh.launch.processes import PROCESSES
 from tests.bus_rig import in_thread
 from tests.onlooker import looking_on
 from tests.stack import Home, endpoint_of
@@ -15,7 +15,7 @@ from tests.stack import Home, endpoint_of
 NOBODY = 65534
 ALONE = f"""
 import os, sys
-from gigabrain_zenoh.scheduling import AUTOGROUP, go_first
+from gigabrain_zenoh.host.scheduling import AUTOGROUP, go_first
 if "nobody" in sys.argv:
     os.setuid({NOBODY})
 go_first()
@@ -49,7 +49,7 @@ def test_whoever_goes_first_does_so_with_all_of_its_session() -> None:
 
 
 STARTING = """
-from gigabrain_zenoh.scheduling import AUTOGROUP, join_in, start_first
+from gigabrain_zenoh.host.scheduling import AUTOGROUP, join_in, start_first
 for change in (start_first, join_in):
     change()
     print(AUTOGROUP.read_text().strip() if AUTOGROUP.exists() else "")

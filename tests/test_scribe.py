@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from gigabrain_zenoh.scribe import Scribe
+from gigabrain_zenoh.host.scribe import Scribe
 
 
 async def test_who_waits_hears_of_any_exception_and_the_next_is_written() -> None:

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_zenoh.decision.tasks.executive import Saved
+from gigabrain_zenoh.decision.tasks.mission import Script
+from gigabrain_zenoh.decision.tasks.scripts import LEASHED, Run, Scripts
+from gigabrain_zenoh.decision.tasks.store import TaskFile
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.tasks.executive import Saved
-from gigabrain_zenoh.tasks.mission import Script
-from gigabrain_zenoh.tasks.scripts import LEASHED, Run, Scripts
-from gigabrain_zenoh.tasks.store import TaskFile
 from tests.bus_rig import until
 
 pytestmark = pytest.mark.system
@@ -98,8 +98,8 @@ async def test_a_program_does_not_outlive_a_decision_that_is_killed(tmp_path: Pa
     folder = program(tmp_path, f"sleep 600 & echo $! > {tmp_path}/child; wait")
     text = (
         "import asyncio\n"
-        "from gigabrain_zenoh.tasks.mission import Script\n"
-        "from gigabrain_zenoh.tasks.scripts import Scripts\n"
+        "from gigabrain_zenoh.decision.tasks.mission import Script\n"
+        "from gigabrain_zenoh.decision.tasks.scripts import Scripts\n"
         "async def main():\n"
         f"    Scripts({folder!r}).start(Script(run='beep'))\n"
         "    await asyncio.sleep(600)\n"

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh import heartbeat
+from gigabrain_zenoh.bus import heartbeat
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.sd_notify import Notifier
+from gigabrain_zenoh.host.sd_notify import Notifier
 from tests.onlooker import looking_on
 from tests.stack import Home, endpoint_of, until
 

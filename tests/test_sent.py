@@ -17,8 +17,8 @@ from gigabrain_drivers.protocols.line_fields import COMMAND
 from gigabrain_drivers.robot import Run
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
-from gigabrain_zenoh.faults.fault import Failed
-from gigabrain_zenoh.faults.reversals import let_through, over, told_over
+from gigabrain_zenoh.qa.faults.fault import Failed
+from gigabrain_zenoh.qa.faults.reversals import let_through, over, told_over
 from tests.brain_rig import DRIVING, state
 
 BODIES = ["alpha", "mock", "mycustombot", "turtlebot3_burger", "turtlebot3_waffle"]

@@ -4,7 +4,7 @@ import signal
 
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE
-from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.config.settings import Endpoint
 from tests.onlooker import looking_on
 from tests.stack import Home, free_port, until
 

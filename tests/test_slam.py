@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose
 from gigabrain_zenoh.mapping.front_end import FEW
 from gigabrain_zenoh.mapping.points import Scan
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose
 from gigabrain_zenoh.mapping.slam import Estimate, Slam
 from tests.rooms import Lidar, Walls, box, dead_reckoned, drifting, line
 

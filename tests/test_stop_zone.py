@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from gigabrain_schemas.body import BodyDescription, Thresholds
-from gigabrain_zenoh.stop_zone import Brake, brakes
+from gigabrain_zenoh.geometry.stop_zone import Brake, brakes
 from tests.brain_rig import WAFFLE
 
 

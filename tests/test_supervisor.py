@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from gigabrain_zenoh.child import Child
 from gigabrain_zenoh.errors import ConfigError, UnknownName
-from gigabrain_zenoh.specs import COMMAND
-from gigabrain_zenoh.supervisor import Backoff, ProcessSpec, Supervisor
+from gigabrain_zenoh.host.child import Child
+from gigabrain_zenoh.launch.specs import COMMAND
+from gigabrain_zenoh.runtime.supervisor import Backoff, ProcessSpec, Supervisor
 from tests.supervisor_rig import (
     HANG,
     QUICK,

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from gigabrain_zenoh.supervisor import Backoff, Supervisor
+from gigabrain_zenoh.runtime.supervisor import Backoff, Supervisor
 from tests.supervisor_rig import (
     CHILD,
     HANG,

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gigabrain_zenoh.sweep import arc, depth, edges, radius, straight, turning
+from gigabrain_zenoh.geometry.sweep import arc, depth, edges, radius, straight, turning
 
 WAFFLE = ((0.075, 0.155), (-0.200, 0.155), (-0.200, -0.155), (0.075, -0.155))
 ROUND = tuple(

@@ -12,9 +12,9 @@ import jsonschema
 import pytest
 import yaml
 
-from gigabrain_zenoh.addresses import exposed
-from gigabrain_zenoh.config import loads
-from gigabrain_zenoh.deployment import Deployment, load_deployment
+from gigabrain_zenoh.config.addresses import exposed
+from gigabrain_zenoh.config.loading import loads
+from gigabrain_zenoh.runtime.deployment import Deployment, load_deployment
 from tests.dockerfile_steps import command, extras
 from tests.onlooker import looking_on
 from tests.stack import ROOT, Home, endpoint_of, until

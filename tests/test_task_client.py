@@ -9,9 +9,9 @@ import pytest
 
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskStatus
 from gigabrain_schemas.topics import GOAL
+from gigabrain_zenoh.client.tasks import Tasks
+from gigabrain_zenoh.decision.tasks.orders import GoTo, Outcome
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
-from gigabrain_zenoh.task_client import Tasks
-from gigabrain_zenoh.tasks.orders import GoTo, Outcome
 from tests.bus_rig import Net, until
 from tests.tasks_rig import Site
 

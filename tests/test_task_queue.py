@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import pytest
 
 from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.decision.tasks.orders import became
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.tasks.orders import became
 from tests.tasks_rig import Robot, one_robot
 
 

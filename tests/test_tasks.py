@@ -9,10 +9,10 @@ import pytest
 
 from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest, Granted
 from gigabrain_schemas.topics import GRANTED
-from gigabrain_zenoh.tasks import checks, service
-from gigabrain_zenoh.tasks.mission import Mission
-from gigabrain_zenoh.tasks.orders import GoTo, Outcome
-from gigabrain_zenoh.tasks.store import TaskFile
+from gigabrain_zenoh.decision.tasks import checks, service
+from gigabrain_zenoh.decision.tasks.mission import Mission
+from gigabrain_zenoh.decision.tasks.orders import GoTo, Outcome
+from gigabrain_zenoh.decision.tasks.store import TaskFile
 from tests.brain_rig import BOOT, state
 from tests.bus_rig import settle
 from tests.tasks_rig import Site

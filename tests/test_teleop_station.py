@@ -10,11 +10,11 @@ from gigabrain_drivers.catalog import load_robot
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
 from gigabrain_schemas.examples import example
-from gigabrain_zenoh.causes import estop
-from gigabrain_zenoh.gamepad import Gamepad, Pad
-from gigabrain_zenoh.limits import ZERO
-from gigabrain_zenoh.teleop_keys import HeldKeys, keys_of
-from gigabrain_zenoh.teleop_station import readout
+from gigabrain_zenoh.gate.causes import estop
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.ui.gamepad import Gamepad, Pad
+from gigabrain_zenoh.ui.teleop_keys import HeldKeys, keys_of
+from gigabrain_zenoh.ui.teleop_station import readout
 from tests.bus_rig import until
 
 WAFFLE = load_robot("turtlebot3_waffle")  # 0.26 m/s, 1.82 rad/s

@@ -14,12 +14,12 @@ from gigabrain_drivers.sim.driver import MujocoDriver
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL
-from gigabrain_zenoh import process
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork, LocalTransport
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.process_config import ProcessConfig
-from gigabrain_zenoh.settings import DriverConfig, Endpoint
-from gigabrain_zenoh.transport import LocalNetwork, LocalTransport
+from gigabrain_zenoh.config.process_config import ProcessConfig
+from gigabrain_zenoh.config.settings import DriverConfig, Endpoint
+from gigabrain_zenoh.runtime import process
 from tests.bus_rig import until
 
 WAFFLE = "turtlebot3_waffle"

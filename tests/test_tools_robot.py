@@ -13,9 +13,9 @@ import pytest
 import yaml
 
 from gigabrain_drivers.catalog import robot_path
-from gigabrain_zenoh.gate_state import BRAIN
-from gigabrain_zenoh.running import Running
-from gigabrain_zenoh.tools.graph import ORDER
+from gigabrain_zenoh.diagnostics.graph import ORDER
+from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.runtime.running import Running
 from tests.onlooker import Onlooker, looking_on
 from tests.stack import AVOID, Home, free_port, robot_of, until
 

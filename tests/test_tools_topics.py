@@ -17,20 +17,20 @@ from gigabrain_schemas.examples import EXAMPLES, example
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, SERVICES, STATE, TOPICS, WORLD
 from gigabrain_zenoh import codec
+from gigabrain_zenoh.diagnostics.arrays_in_words import summary
+from gigabrain_zenoh.diagnostics.hearing import Heard, look
+from gigabrain_zenoh.diagnostics.keyexpr import matches
+from gigabrain_zenoh.diagnostics.names import Target, not_found, target
+from gigabrain_zenoh.diagnostics.nodes import census
+from gigabrain_zenoh.diagnostics.publishing import typed_in
+from gigabrain_zenoh.diagnostics.readable import as_json, in_a_line, lines, pick, read, tree
+from gigabrain_zenoh.diagnostics.roll_call import Flow, flows
+from gigabrain_zenoh.diagnostics.tally import Tally
+from gigabrain_zenoh.diagnostics.topic_table import about, rows
+from gigabrain_zenoh.diagnostics.topic_watch import Shown, echo, in_words, shown
 from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName
-from gigabrain_zenoh.health import publish_health
-from gigabrain_zenoh.name_claim import NameClaim
-from gigabrain_zenoh.tools.arrays_in_words import summary
-from gigabrain_zenoh.tools.hearing import Heard, look
-from gigabrain_zenoh.tools.keyexpr import matches
-from gigabrain_zenoh.tools.names import Target, not_found, target
-from gigabrain_zenoh.tools.nodes import census
-from gigabrain_zenoh.tools.publishing import typed_in
-from gigabrain_zenoh.tools.readable import as_json, in_a_line, lines, pick, read, tree
-from gigabrain_zenoh.tools.roll_call import Flow, flows
-from gigabrain_zenoh.tools.tally import Tally
-from gigabrain_zenoh.tools.topic_table import about, rows
-from gigabrain_zenoh.tools.topic_watch import Shown, echo, in_words, shown
+from gigabrain_zenoh.runtime.health import publish_health
+from gigabrain_zenoh.runtime.name_claim import NameClaim
 from tests.bus_rig import Net, settle
 
 SCAN_BYTES = codec.encode(example(LaserScan))

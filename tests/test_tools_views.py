@@ -13,18 +13,23 @@ from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import Description, ParamReply, ParamRequest
 from gigabrain_schemas.safety import Health, LogRecord
 from gigabrain_schemas.topics import PARAM
-from gigabrain_zenoh import decision
-from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
-from gigabrain_zenoh.param_service import serve_params
-from gigabrain_zenoh.settings import DecisionConfig
-from gigabrain_zenoh.tools.graph import as_dot, as_mermaid, as_text, chain, positions, write_png
-from gigabrain_zenoh.tools.log_reading import Wanted, ago_ns, as_line, read, run_folder
-from gigabrain_zenoh.tools.nodes import Nodes, about
-from gigabrain_zenoh.tools.plain_table import PlainTable
-from gigabrain_zenoh.tools.roll_call import Flow
-from gigabrain_zenoh.tools.top import Top
-from gigabrain_zenoh.tools.top_feed import Rows
-from gigabrain_zenoh.tools.top_rows import (
+from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.diagnostics.graph import (
+    as_dot,
+    as_mermaid,
+    as_text,
+    chain,
+    positions,
+    write_png,
+)
+from gigabrain_zenoh.diagnostics.log_reading import Wanted, ago_ns, as_line, read, run_folder
+from gigabrain_zenoh.diagnostics.nodes import Nodes, about
+from gigabrain_zenoh.diagnostics.plain_table import PlainTable
+from gigabrain_zenoh.diagnostics.roll_call import Flow
+from gigabrain_zenoh.diagnostics.top import Top
+from gigabrain_zenoh.diagnostics.top_feed import Rows
+from gigabrain_zenoh.diagnostics.top_rows import (
     PROCESS_COLUMNS,
     TOPIC_COLUMNS,
     Past,
@@ -36,6 +41,8 @@ from gigabrain_zenoh.tools.top_rows import (
     topic_cells,
     topic_row,
 )
+from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
+from gigabrain_zenoh.runtime.param_service import serve_params
 from tests.bus_rig import Net
 
 FLOWS = [

@@ -9,10 +9,10 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import Response, TrajectoryPoint
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, STATE
-from gigabrain_zenoh import control
-from gigabrain_zenoh.control import Inputs, step
-from gigabrain_zenoh.planar import compose
-from gigabrain_zenoh.tracking_control import predicted
+from gigabrain_zenoh.control import node as control
+from gigabrain_zenoh.control.node import Inputs, step
+from gigabrain_zenoh.control.tracking import predicted
+from gigabrain_zenoh.geometry.planar import compose
 from tests.brain_rig import Bench, body, state
 from tests.tracking_rig import SLOW, Course, Plant, errors, ess, relocated
 
@@ -72,7 +72,7 @@ def test_too_far_off_the_trajectory_it_brakes_and_says_so(jump: Pose) -> None:
 async def test_the_process_brakes_and_says_so_once_when_it_is_too_far_off(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    caplog.set_level("INFO", "gigabrain_zenoh.control")
+    caplog.set_level("INFO", "gigabrain_zenoh.control.node")
     course, speeds = Course(lambda t: Velocity(linear_x=0.2), 6.0), []
     async with Bench(control.run) as bench:
         bench.send(BODY, body())

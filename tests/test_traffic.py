@@ -8,16 +8,16 @@ import pytest
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import Obstacle
-from gigabrain_zenoh.bench.barn_drive import drive
-from gigabrain_zenoh.bench.barn_worlds import Moving, World
-from gigabrain_zenoh.bench.plant import HARD, JACKAL
+from gigabrain_zenoh.decision.steering import ANY_BODY
 from gigabrain_zenoh.navigation import among, cost_to_go, local, traffic
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import distance_at
 from gigabrain_zenoh.navigation.local import Goal, LocalPlan, LocalPlanner, LocalSettings, Moment
 from gigabrain_zenoh.navigation.traffic import EVERY_TICKS, Traffic
 from gigabrain_zenoh.navigation.window import Place, Window
-from gigabrain_zenoh.steering import ANY_BODY
+from gigabrain_zenoh.qa.bench.barn_drive import drive
+from gigabrain_zenoh.qa.bench.barn_worlds import Moving, World
+from gigabrain_zenoh.qa.bench.plant import HARD, JACKAL
 
 NOTHING = np.empty((0, 2))
 NOBODY = np.empty((0, 6))

@@ -1,6 +1,6 @@
 """Those who only look on wake seldom."""
 
-from gigabrain_zenoh.unobtrusive import Nap
+from gigabrain_zenoh.bus.zenoh.unobtrusive import Nap
 
 
 class Thread:

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh.client import Robot
-from gigabrain_zenoh.settings import Endpoint
+from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.config.settings import Endpoint
 from tests.onlooker import looking_on
 from tests.stack import AVOID, ROOT, Command, Home, endpoint_of, free_port, robot_of, until
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between
 from gigabrain_zenoh.mapping.points import Scan
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between
 from gigabrain_zenoh.mapping.slam import Slam
 from gigabrain_zenoh.mapping.visibility import seen_through
 from tests.rooms import Lidar, box, drifting, line

@@ -9,7 +9,7 @@ DRIVE = """
 import importlib, pkgutil
 from numba.core.registry import CPUDispatcher
 from gigabrain_zenoh import mapping
-from gigabrain_zenoh.bench.slam_world import tour
+from gigabrain_zenoh.qa.bench.slam_world import tour
 from gigabrain_zenoh.mapping.warm import warm_up
 
 def compiled():

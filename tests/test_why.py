@@ -16,12 +16,12 @@ from gigabrain_schemas.requests import EnableRequest, EstopRequest, ReleaseReque
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.tasks import Task, TaskStatus
 from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE, STATE, TELEOP
-from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.causes import estop
-from gigabrain_zenoh.health import publish_health
-from gigabrain_zenoh.name_claim import NameClaim
-from gigabrain_zenoh.tools.why import LINKS, Verdict, judge
-from gigabrain_zenoh.tools.why_facts import Facts, Watcher
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.diagnostics.why import LINKS, Verdict, judge
+from gigabrain_zenoh.diagnostics.why_facts import Facts, Watcher
+from gigabrain_zenoh.gate.causes import estop
+from gigabrain_zenoh.runtime.health import publish_health
+from gigabrain_zenoh.runtime.name_claim import NameClaim
 from tests.brain_in_memory import Robot
 
 Break = Callable[[Robot], Awaitable[None]]

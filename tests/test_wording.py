@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from gigabrain_drivers.conformance import kit
 from gigabrain_drivers.links import link as links
 from gigabrain_drivers.links.wording import Spelling, Wording, of_command, whole
 from gigabrain_drivers.protocols import (
@@ -22,11 +21,12 @@ from gigabrain_drivers.protocols import (
 )
 from gigabrain_drivers.protocols.line import Decoder, Template, describe
 from gigabrain_drivers.protocols.line_fields import COMMAND
-from gigabrain_drivers.trace import run
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.cli import driver_kit
 from gigabrain_zenoh.cli.driver_kit import trace
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.qa.conformance import kit
+from gigabrain_zenoh.qa.trace import run
 from tests.line_rig import BARE, bench
 
 LINE = Template("V,{linear_x:.3f},{angular_z|deg/s:.1f}\n", COMMAND)

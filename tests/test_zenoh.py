@@ -20,11 +20,11 @@ from gigabrain_schemas.topics import (
     STATE,
     TELEOP,
 )
-from gigabrain_zenoh import zenoh_transport
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.mailbox import Mailbox
+from gigabrain_zenoh.bus.zenoh import transport as zenoh_transport
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.mailbox import Mailbox
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.bus_rig import until
 from tests.zenoh_rig import Ear, Robot, repeat, robot
 

@@ -10,9 +10,9 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from gigabrain_schemas.topics import SCAN, TELEOP
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.bus_rig import until
 from tests.zenoh_rig import Ear, free_endpoint, repeat, robot, router_process, under_way
 
@@ -116,8 +116,8 @@ async def test_a_session_that_opens_just_as_it_is_given_up_is_closed() -> None:
 def test_a_process_that_gives_up_waiting_ends_by_itself() -> None:
     program = f"""
 import asyncio
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 async def main():
     endpoint = Endpoint(connect=("{free_endpoint()}",))
     try:

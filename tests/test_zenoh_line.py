@@ -7,11 +7,11 @@ from typing import Any
 import pytest
 import zenoh
 
-from gigabrain_zenoh import zenoh_line
-from gigabrain_zenoh.bridge import Bridge
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_line import Lines
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
+from gigabrain_zenoh.bus.bridge import Bridge
+from gigabrain_zenoh.bus.zenoh import line as zenoh_line
+from gigabrain_zenoh.bus.zenoh.line import Lines
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.config.settings import Endpoint
 from tests.bus_rig import until
 
 

@@ -6,7 +6,7 @@ from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import DESCRIBE, HEALTH, TELEOP
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.clock import Clock
 from tests.bus_rig import until
 from tests.zenoh_rig import Ear, Robot, repeat, robot

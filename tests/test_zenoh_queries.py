@@ -6,10 +6,10 @@ import pytest
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.requests import EstopRequest, GateReply
 from gigabrain_schemas.topics import ESTOP
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
 from tests.zenoh_rig import Robot, robot
 
 pytestmark = pytest.mark.system

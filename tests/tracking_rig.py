@@ -10,8 +10,8 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import CmdVel, Intent, Response, TrajectoryPoint
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.control import Inputs, Memory, step
-from gigabrain_zenoh.planar import compose, relative
+from gigabrain_zenoh.control.node import Inputs, Memory, step
+from gigabrain_zenoh.geometry.planar import compose, relative
 from tests.brain_rig import WAFFLE, state
 
 AGILE = replace(

@@ -12,9 +12,9 @@ from collections.abc import AsyncIterator, Callable, Iterator
 
 import zenoh
 
-from gigabrain_zenoh.settings import Endpoint
-from gigabrain_zenoh.zenoh_config import session_config
-from gigabrain_zenoh.zenoh_transport import ZenohTransport
+from gigabrain_zenoh.bus.zenoh.config import session_config
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.config.settings import Endpoint
 from tests.bus_rig import until
 
 PROGRAM = """

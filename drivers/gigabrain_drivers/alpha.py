@@ -27,7 +27,7 @@ from gigabrain_schemas.sensors import Imu, ImuData
 from gigabrain_schemas.topics import IMU
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported
-from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)

@@ -13,7 +13,7 @@ from gigabrain_schemas.body import Joint, RobotState, SafeState
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import GigabrainError, Unsupported
-from gigabrain_zenoh.limits import ZERO, clamp, limits_of
+from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
 
 log = logging.getLogger(__name__)
 

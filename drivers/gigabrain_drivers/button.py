@@ -8,10 +8,10 @@ from gigabrain_drivers.echo_loop import EchoLoop
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_schemas.button import ButtonState
 from gigabrain_schemas.topics import BUTTON, STATE
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.client.estop import press
+from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import NotConfirmed
-from gigabrain_zenoh.estop import press
-from gigabrain_zenoh.settings import ButtonConfig
 
 log = logging.getLogger(__name__)
 

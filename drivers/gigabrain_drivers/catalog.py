@@ -16,11 +16,11 @@ from gigabrain_drivers.base import Driver
 from gigabrain_drivers.lidars.base import check_turns, source_class
 from gigabrain_drivers.links.port_name import AUTO
 from gigabrain_drivers.robot import LINKS, LinkOptions, RobotFile, Run
-from gigabrain_zenoh import config
-from gigabrain_zenoh.config_places import located
+from gigabrain_zenoh.config import loading as config
+from gigabrain_zenoh.config.places import located
+from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
 from gigabrain_zenoh.logs import state_dir
-from gigabrain_zenoh.settings import LinkName
 
 EMULATOR = "{emulator}"  # in a robot's file: the folder of the emulator's ports
 Options = TypeVar("Options", bound=Struct)

@@ -1,8 +1,8 @@
 """Which causes come and go, and who raised them: each is audited when it comes and when it goes."""
 
 from gigabrain_schemas.base import Cause
-from gigabrain_zenoh.audit import AuditTrail
-from gigabrain_zenoh.gate import GateState
+from gigabrain_zenoh.gate.gate import GateState
+from gigabrain_zenoh.runtime.audit import AuditTrail
 
 Raised = dict[str, tuple[str, Cause]]  # by its code: who raised it, and the cause
 

@@ -13,12 +13,12 @@ from gigabrain_schemas.audit import What
 from gigabrain_schemas.base import TICK_NS, Cause
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, RELEASE
-from gigabrain_zenoh import causes as why
-from gigabrain_zenoh import gate
-from gigabrain_zenoh.audit import AuditTrail
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.gate import causes as why
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.host.scribe import Scribe
 from gigabrain_zenoh.logs import Fault
-from gigabrain_zenoh.scribe import Scribe
+from gigabrain_zenoh.runtime.audit import AuditTrail
 
 log = logging.getLogger(__name__)
 

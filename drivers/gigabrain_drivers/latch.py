@@ -7,10 +7,10 @@ import msgspec
 from msgspec import Meta
 
 from gigabrain_schemas.base import Cause
-from gigabrain_zenoh.atomic_write import make_folder, replace_file
-from gigabrain_zenoh.bounded_file import read_bounded
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.atomic_write import make_folder, replace_file
+from gigabrain_zenoh.host.bounded_file import read_bounded
 
 MOST_BYTES = 65_536
 UNREADABLE = Cause(

@@ -26,7 +26,7 @@ from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported
-from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported
-from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.geometry.limits import ZERO
 
 TICK_S = TICK_NS / 1e9
 ROOM_M = 3.0  # distance to the wall all round

@@ -32,14 +32,14 @@ from gigabrain_schemas.topics import (
     Topic,
     command_topic,
 )
-from gigabrain_zenoh import causes as why
-from gigabrain_zenoh import gate
-from gigabrain_zenoh.ages import scan_limit_ns
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.heartbeat import Progress
+from gigabrain_zenoh.config.settings import DriverConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.heartbeat import Progress
-from gigabrain_zenoh.limits import ZERO, limits_of
-from gigabrain_zenoh.settings import DriverConfig
+from gigabrain_zenoh.gate import causes as why
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.ages import scan_limit_ns
+from gigabrain_zenoh.geometry.limits import ZERO, limits_of
 
 log = logging.getLogger(__name__)
 

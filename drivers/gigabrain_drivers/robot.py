@@ -8,7 +8,7 @@ from msgspec import Struct
 from gigabrain_drivers.links.port_name import AUTO, check_port
 from gigabrain_schemas.base import Finite, Name, NonNegative, Positive
 from gigabrain_schemas.body import BodyDescription, Lidar
-from gigabrain_zenoh.settings import LinkName
+from gigabrain_zenoh.config.settings import LinkName
 
 LINKS: tuple[LinkName, ...] = ("sim", "emulated", "real")
 

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Mapping
 
-from gigabrain_zenoh.percentile import Newest
+from gigabrain_zenoh.host.percentile import Newest
 
 MOST = 20_000  # newest times that the figures are drawn from
 WAITING = 1_000  # scans that may be unanswered; a brain that is away answers none

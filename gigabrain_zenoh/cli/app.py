@@ -143,7 +143,7 @@ def main() -> None:
     try:
         from contextlib import suppress
 
-        from gigabrain_zenoh.interrupts import interrupts
+        from gigabrain_zenoh.host.interrupts import interrupts
 
         interrupts.install()
     except KeyboardInterrupt:
@@ -168,7 +168,7 @@ def _call(words: "Sequence[str]") -> object:
     from cyclopts import CycloptsError
 
     from gigabrain_zenoh.errors import ConfigError, GigabrainError
-    from gigabrain_zenoh.interrupts import interrupts
+    from gigabrain_zenoh.host.interrupts import interrupts
 
     try:
         app = make_app(words)

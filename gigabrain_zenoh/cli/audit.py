@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.audit import AuditRecord
@@ -41,7 +41,7 @@ def audit(
         One JSON object per line.
     """
 
-    from gigabrain_zenoh import audit_file, audit_text
+    from gigabrain_zenoh.runtime import audit_file, audit_text
 
     if not 0 < newest <= 1000:
         raise ConfigError(f"--newest: expected 1 to 1000, got {newest}")
@@ -57,7 +57,7 @@ def audit(
 
 async def _ask(at: Which, newest: int, follow: bool, show: "Callable[[AuditRecord], str]") -> None:
     """Show what a robot that runs has in its log, and with `follow` what comes."""
-    from gigabrain_zenoh.client import connect as connect_robot
+    from gigabrain_zenoh.client.robot import connect as connect_robot
 
     async with connect_robot(
         at.connect, namespace=at.namespace, keys=at.folder, wait=False
@@ -71,9 +71,9 @@ async def _ask(at: Which, newest: int, follow: bool, show: "Callable[[AuditRecor
 
 def _folder(robot: str) -> Path:
     """Where a robot has left its log. Raises ConfigError, and UnknownName."""
-    from gigabrain_zenoh.audit_file import FOLDER
     from gigabrain_zenoh.errors import unknown
     from gigabrain_zenoh.logs import state_dir
+    from gigabrain_zenoh.runtime.audit_file import FOLDER
 
     known = {path.parent.name: path.parent for path in (state_dir() / "robots").glob(f"*/{FOLDER}")}
     if robot in known:

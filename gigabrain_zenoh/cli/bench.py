@@ -9,10 +9,10 @@ import msgspec
 from cyclopts import Parameter
 from rich.console import Console, RenderableType
 
-from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host import results
+from gigabrain_zenoh.host.stop_signals import run_async
 
 FASTEST_HZ = 50.0  # one scan per tick of the robot's clock
 
@@ -43,7 +43,7 @@ def chain(
     json
         Write all figures into this file.
     """
-    from gigabrain_zenoh.bench.chain import measure_chain
+    from gigabrain_zenoh.qa.bench.chain import measure_chain
 
     results.check_place(json)
     above_zero("seconds", seconds)
@@ -53,7 +53,7 @@ def chain(
             raise ConfigError(f"--rates: expected above 0, at most {FASTEST_HZ:g}, got {rate:g}")
     if beside == "tools":
         return _with_tools(seconds, rounds, rates, json)
-    from gigabrain_zenoh.bench.tables import chain_page
+    from gigabrain_zenoh.qa.bench.tables import chain_page
 
     result = run_async(measure_chain(seconds, rounds, rates, _progress))
     _finish(chain_page(result), result, json)
@@ -64,8 +64,8 @@ def _with_tools(seconds: float, rounds: int, rates: tuple[float, ...], json: Pat
     for name, extra in (("websockets", "page"), ("starlette", "page"), ("foxglove", "record")):
         if not find_spec(name):
             raise ConfigError(f"this needs more: pip install 'gigabrain-zenoh[{extra}]'")
-    from gigabrain_zenoh.bench.tables import tools_page
-    from gigabrain_zenoh.bench.with_tools import measure_with_tools
+    from gigabrain_zenoh.qa.bench.tables import tools_page
+    from gigabrain_zenoh.qa.bench.with_tools import measure_with_tools
 
     result = run_async(measure_with_tools(seconds, rounds, rates, _progress))
     _finish(tools_page(result), result, json)
@@ -97,8 +97,8 @@ def stack(
     json
         Write all figures into this file.
     """
-    from gigabrain_zenoh.bench.stack import measure_stack
-    from gigabrain_zenoh.bench.tables import stack_page
+    from gigabrain_zenoh.qa.bench.stack import measure_stack
+    from gigabrain_zenoh.qa.bench.tables import stack_page
 
     results.check_place(json)
     above_zero("seconds", seconds)
@@ -129,8 +129,8 @@ def estop(
     json
         Write all figures into this file.
     """
-    from gigabrain_zenoh.bench.estop import measure_estop
-    from gigabrain_zenoh.bench.tables import estop_page
+    from gigabrain_zenoh.qa.bench.estop import measure_estop
+    from gigabrain_zenoh.qa.bench.tables import estop_page
 
     results.check_place(json)
     above_zero("driving", driving)

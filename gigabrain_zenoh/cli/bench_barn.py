@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Literal
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host import results
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.bench.barn import BarnResult
-    from gigabrain_zenoh.bench.course import Trial
+    from gigabrain_zenoh.qa.bench.barn import BarnResult
+    from gigabrain_zenoh.qa.bench.course import Trial
 
 
 @Parameter(name="*")
@@ -71,8 +71,8 @@ def barn(*, of: Trials, json: Path | None = None) -> int:
     """
     from rich.console import Console
 
-    from gigabrain_zenoh.bench.barn import measure_barn
-    from gigabrain_zenoh.bench.barn_worlds import choose, read_worlds
+    from gigabrain_zenoh.qa.bench.barn import measure_barn
+    from gigabrain_zenoh.qa.bench.barn_worlds import choose, read_worlds
 
     of.check()
     results.check_place(json)

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from gigabrain_zenoh.cli.checked import above_zero
-from gigabrain_zenoh.deployment import Deployment
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.runtime.deployment import Deployment
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.bench.bodies import BodiesResult
+    from gigabrain_zenoh.qa.bench.bodies import BodiesResult
 
 
 def bodies(
@@ -46,8 +46,8 @@ def bodies(
     from rich.console import Console
 
     from gigabrain_drivers.catalog import simulated
-    from gigabrain_zenoh import results
-    from gigabrain_zenoh.bench.bodies import measure_bodies
+    from gigabrain_zenoh.host import results
+    from gigabrain_zenoh.qa.bench.bodies import measure_bodies
 
     above_zero("seconds", seconds)
     results.check_place(json)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.checked import above_zero
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host import results
+from gigabrain_zenoh.host.stop_signals import run_async
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.bench.goals import GoalsResult
+    from gigabrain_zenoh.qa.bench.goals import GoalsResult
 
 BODIES = ("turtlebot3_waffle", "mycustombot", "alpha")
 WORLDS = ("house", "warehouse")
@@ -66,7 +66,7 @@ def goals(*, of: Runs = RUNS, json: Path | None = None, logs: Path | None = None
     logs
         Keep the logs of all processes in this folder.
     """
-    from gigabrain_zenoh.bench.goals import Course, measure_goals
+    from gigabrain_zenoh.qa.bench.goals import Course, measure_goals
 
     above_zero("goals", of.goals)
     above_zero("speed", of.speed)
@@ -89,7 +89,7 @@ def _show(result: "GoalsResult") -> None:
     """The table, and what was not reached and why."""
     from rich.console import Console
 
-    from gigabrain_zenoh.tasks.orders import where
+    from gigabrain_zenoh.decision.tasks.orders import where
 
     console = Console()
     console.print(_table(result))

@@ -10,7 +10,7 @@ from gigabrain_zenoh.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.bench.plan import PlanResult
+    from gigabrain_zenoh.qa.bench.plan import PlanResult
 
 LEAST = 400  # cells: below that no path is of the length that is asked for
 # what Nav2's own documents say, of other maps on other machines
@@ -53,8 +53,8 @@ def plan(
     """
     from rich.console import Console
 
-    from gigabrain_zenoh import results
-    from gigabrain_zenoh.bench.plan import measure_plan
+    from gigabrain_zenoh.host import results
+    from gigabrain_zenoh.qa.bench.plan import measure_plan
 
     above_zero("queries", queries)
     if any(one < LEAST for one in size):

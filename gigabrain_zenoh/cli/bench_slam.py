@@ -11,8 +11,8 @@ from gigabrain_zenoh.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.bench.slam import Drive, SlamResult
-    from gigabrain_zenoh.bench.slam_logs import Log
+    from gigabrain_zenoh.qa.bench.slam import Drive, SlamResult
+    from gigabrain_zenoh.qa.bench.slam_logs import Log
 
 
 def slam(
@@ -67,10 +67,10 @@ def _slam_logs(paths: tuple[Path, ...], png: Path | None, json: Path | None) -> 
     """Map what was recorded, and show how far the maps are from the reference."""
     from rich.console import Console
 
-    from gigabrain_zenoh import results
-    from gigabrain_zenoh.bench.slam import judged, total
-    from gigabrain_zenoh.bench.slam_logs import load, relations
-    from gigabrain_zenoh.bench.slam_picture import draw
+    from gigabrain_zenoh.host import results
+    from gigabrain_zenoh.qa.bench.slam import judged, total
+    from gigabrain_zenoh.qa.bench.slam_logs import load, relations
+    from gigabrain_zenoh.qa.bench.slam_picture import draw
 
     results.check_place(json)
     logs = [load(path) for path in paths]
@@ -91,8 +91,8 @@ def _driven(logs: "list[Log]") -> "list[tuple[Log, Drive]]":
     from rich.console import Console
     from rich.progress import Progress
 
-    from gigabrain_zenoh.bench.slam import drive
     from gigabrain_zenoh.mapping.warm import warm_up
+    from gigabrain_zenoh.qa.bench.slam import drive
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         compiling = progress.add_task("compiling", total=None)

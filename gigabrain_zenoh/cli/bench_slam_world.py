@@ -11,7 +11,7 @@ from gigabrain_zenoh.cli.side_by_side import side_by_side
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.bench.slam_world import Off, WorldResult
+    from gigabrain_zenoh.qa.bench.slam_world import Off, WorldResult
 
 
 def slam_world(
@@ -21,9 +21,9 @@ def slam_world(
     from rich.console import Console
     from rich.progress import Progress
 
-    from gigabrain_zenoh import results
-    from gigabrain_zenoh.bench.slam_world import WorldsResult, tour
-    from gigabrain_zenoh.bench.slam_world_picture import draw
+    from gigabrain_zenoh.host import results
+    from gigabrain_zenoh.qa.bench.slam_world import WorldsResult, tour
+    from gigabrain_zenoh.qa.bench.slam_world_picture import draw
 
     above_zero("minutes", minutes)
     results.check_place(json)

@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh import behaviours
 from gigabrain_zenoh.cli.checked import above_zero, checked
-from gigabrain_zenoh.deployment import Deployment, recorded
+from gigabrain_zenoh.config.settings import LinkName, Resume
+from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.settings import LinkName, Resume
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.runtime.deployment import Deployment, recorded
 
 
 @Parameter(name="*")
@@ -99,8 +99,8 @@ def demo(*, drive: Drive = DRIVE, shown: Shown = SHOWN) -> int:
 
     Ends with 1 after any contact, without motion, or when a process has died.
     """
-    from gigabrain_zenoh.demo import Demo, DemoOptions
-    from gigabrain_zenoh.page.beside import with_page
+    from gigabrain_zenoh.launch.demo import Demo, DemoOptions
+    from gigabrain_zenoh.ui.page.beside import with_page
 
     drive.check()
     if shown.record and shown.record.exists():

@@ -1,7 +1,7 @@
 """`gigabrain doctor`: what is wrong here, and the cure."""
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 MARKS = {"ok": "ok  ", "hint": "hint", "bad": "BAD "}
 
@@ -21,8 +21,8 @@ def doctor(*, at: Which = HERE, json: bool = False) -> int:
 
     import msgspec
 
-    from gigabrain_zenoh.tools.doctor import examine, exit_code
-    from gigabrain_zenoh.tools.doctor_facts import this_machine, this_robot
+    from gigabrain_zenoh.diagnostics.doctor import examine, exit_code
+    from gigabrain_zenoh.diagnostics.doctor_facts import this_machine, this_robot
 
     robot, keys = run_async(this_robot(at.where()))
     findings = examine(this_machine(keys), robot)

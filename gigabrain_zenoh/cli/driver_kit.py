@@ -12,8 +12,8 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from gigabrain_zenoh.cli.checked import above_zero, finite
-from gigabrain_zenoh.settings import LinkName
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.config.settings import LinkName
+from gigabrain_zenoh.host.stop_signals import run_async
 
 COLOURS = {"pass": "green", "fail": "bold red", "n/a": "dim"}
 
@@ -68,7 +68,7 @@ def test(
     from rich.table import Table
 
     from gigabrain_drivers.catalog import links_of, load_robot
-    from gigabrain_drivers.conformance import kit
+    from gigabrain_zenoh.qa.conformance import kit
 
     links = links_of(load_robot(name))
     chosen: LinkName = link or ("emulated" if "emulated" in links else "sim")
@@ -140,8 +140,8 @@ def trace(
 
 def _traced(name: str, link: LinkName, part: str, seconds: float, speeds: dict[str, float]) -> bool:
     """Print the bytes; whether any came from the body, or whoever was reading has seen enough."""
-    from gigabrain_drivers import trace
     from gigabrain_schemas.base import Velocity
+    from gigabrain_zenoh.qa import trace
 
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
         tracing = trace.run(
@@ -174,7 +174,7 @@ def new(name: str, *, folder: Path = Path()) -> int:
     folder
         Where the package's folder is made.
     """
-    from gigabrain_drivers.conformance.new import write
+    from gigabrain_zenoh.qa.conformance.new import write
 
     path = write(name, folder)
     print(f"{path}: edit robot.yaml and driver.py; README.md says how to go on")

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from gigabrain_zenoh import results
 from gigabrain_zenoh.cli.where import show
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host import results
+from gigabrain_zenoh.host.stop_signals import run_async
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.faults.fault import Fault, Result, Try
-    from gigabrain_zenoh.faults.rig import Options
+    from gigabrain_zenoh.qa.faults.fault import Fault, Result, Try
+    from gigabrain_zenoh.qa.faults.rig import Options
 
 COLOURS = {"passed": "green", "FAILED": "bold red", "skipped": "yellow"}
 
@@ -58,7 +58,7 @@ class Robot:
 
     def options(self) -> "Options":
         """As the suite takes it."""
-        from gigabrain_zenoh.faults.rig import Options
+        from gigabrain_zenoh.qa.faults.rig import Options
 
         return Options(self.body, self.world, self.behaviour, self.long)
 
@@ -98,8 +98,8 @@ def faults(
     json
         Write all results into this file.
     """
-    from gigabrain_zenoh.faults.suite import failed
-    from gigabrain_zenoh.faults.table import choose
+    from gigabrain_zenoh.qa.faults.suite import failed
+    from gigabrain_zenoh.qa.faults.table import choose
 
     left_out = choose(skip) if skip else ()
     chosen = tuple(fault for fault in choose(only) if fault not in left_out)
@@ -121,8 +121,8 @@ def _run(
     """Run them, with a line for each run that has ended."""
     from rich.console import Console
 
-    from gigabrain_zenoh.faults.suite import run_suite
-    from gigabrain_zenoh.faults.tries_file import TriesFile
+    from gigabrain_zenoh.qa.faults.suite import run_suite
+    from gigabrain_zenoh.qa.faults.tries_file import TriesFile
 
     # the suite hears what it forges itself; nobody has to read that
     logging.getLogger("gigabrain_zenoh").addHandler(logging.NullHandler())
@@ -164,7 +164,7 @@ def _table(results: "Sequence[Result]", chosen: "Sequence[Fault]") -> "Table":
     from rich.markup import escape
     from rich.table import Table
 
-    from gigabrain_zenoh.faults.fault import in_words
+    from gigabrain_zenoh.qa.faults.fault import in_words
 
     rows = {fault.number: fault for fault in chosen}
     passed = sum(result.verdict == "passed" for result in results)

@@ -31,11 +31,11 @@ def foxglove(
     import msgspec
 
     from gigabrain_zenoh.cli.checked import checked
-    from gigabrain_zenoh.foxglove_bridge.layout import write_layout
-    from gigabrain_zenoh.process_config import ProcessConfig
-    from gigabrain_zenoh.processes import run_process
-    from gigabrain_zenoh.running import find_endpoint
-    from gigabrain_zenoh.settings import FoxgloveConfig
+    from gigabrain_zenoh.config.process_config import ProcessConfig
+    from gigabrain_zenoh.config.settings import FoxgloveConfig
+    from gigabrain_zenoh.launch.processes import run_process
+    from gigabrain_zenoh.runtime.running import find_endpoint
+    from gigabrain_zenoh.ui.foxglove.layout import write_layout
 
     config = checked({"port": port, "origins": origin}, FoxgloveConfig)
     if layout:

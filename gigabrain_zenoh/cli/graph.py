@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 
 def graph(
@@ -33,12 +33,12 @@ def graph(
         Also health, log and audit, which everybody sends.
     """
 
+    from gigabrain_zenoh.diagnostics import graph as draw
+    from gigabrain_zenoh.diagnostics.hearing import NAME
+    from gigabrain_zenoh.diagnostics.nodes import Nodes, census
+    from gigabrain_zenoh.diagnostics.roll_call import flows
     from gigabrain_zenoh.errors import ConfigError
-    from gigabrain_zenoh.recording.joining import joined
-    from gigabrain_zenoh.tools import graph as draw
-    from gigabrain_zenoh.tools.hearing import NAME
-    from gigabrain_zenoh.tools.nodes import Nodes, census
-    from gigabrain_zenoh.tools.roll_call import flows
+    from gigabrain_zenoh.runtime.joining import joined
 
     if dot + mermaid + (png is not None) > 1:
         raise ConfigError("choose one of --dot, --mermaid and --png")

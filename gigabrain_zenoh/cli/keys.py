@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
-from gigabrain_zenoh.keys.checks import INSTALL
-from gigabrain_zenoh.keys.files import CA_KEY, CERTIFICATE
-from gigabrain_zenoh.keys.list_file import generations_in
-from gigabrain_zenoh.keys.roles import Role, common_name
+from gigabrain_zenoh.security.checks import INSTALL
+from gigabrain_zenoh.security.files import CA_KEY, CERTIFICATE
+from gigabrain_zenoh.security.list_file import generations_in
+from gigabrain_zenoh.security.roles import Role, common_name
 
 SOON_DAYS = 30
 
@@ -28,7 +28,7 @@ def new(fleet: str, *, dir: Path | None = None) -> None:
         The folder to make; without it, one named after the fleet.
     """
     with _importing():
-        from gigabrain_zenoh.keys.authority import new_fleet
+        from gigabrain_zenoh.security.authority import new_fleet
 
     folder = dir or Path(fleet)
     new_fleet(fleet, folder)
@@ -66,7 +66,7 @@ def issue(
         The fleet's folder; without it, the only one here.
     """
     with _importing():
-        from gigabrain_zenoh.keys import authority
+        from gigabrain_zenoh.security import authority
 
     folder = authority.issue(_fleet(dir), role, robot=robot, name=name, hosts=host, days=days)
     print(f"{folder}: copy it to its host, and let nobody else read it")
@@ -90,7 +90,7 @@ def revoke(role: Role, *, robot: str = "", dir: Path | None = None) -> None:
         The fleet's folder; without it, the only one here.
     """
     with _importing():
-        from gigabrain_zenoh.keys import revoked
+        from gigabrain_zenoh.security import revoked
 
     folder = _fleet(dir)
     lists = revoked.revoke(folder, role, robot)
@@ -145,7 +145,7 @@ def zenohd(
         The fleet's folder, where some of its identities were revoked.
     """
     with _importing():
-        from gigabrain_zenoh.keys.zenohd import configuration
+        from gigabrain_zenoh.runtime.zenohd import configuration
 
     generations = generations_in(_fleet(dir)) if dir else {}
     print(configuration(robot or ("",), str(keys), listen, generations), end="")
@@ -169,7 +169,7 @@ def _quoted(path: Path) -> str:
 def _listed(folder: Path) -> Iterator[tuple[str, bool]]:
     """A line for each identity in a fleet's folder, or for the only one, and whether it is good."""
     with _importing():
-        from gigabrain_zenoh.keys import identity as identities
+        from gigabrain_zenoh.security import identity as identities
 
     places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
     now, generations = datetime.datetime.now(datetime.UTC), generations_in(folder)

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.requests import Description
@@ -14,7 +14,7 @@ SOON_S = 0.3
 def topics(_: object) -> list[str]:
     """Names of topics: those that somebody sends on, or those of the table while none runs."""
     from gigabrain_schemas.topics import TOPICS
-    from gigabrain_zenoh.tools.names import short, topic_of
+    from gigabrain_zenoh.diagnostics.names import short, topic_of
 
     said = {key for one in _there() for key in one.publishes if topic_of(key)}
     return sorted(map(short, said or {topic.key for topic in TOPICS}))
@@ -26,8 +26,8 @@ def processes(_: object) -> list[str]:
 
 
 def _there() -> list["Description"]:
-    from gigabrain_zenoh.recording.joining import Where, joined
-    from gigabrain_zenoh.tools.roll_call import roll_call
+    from gigabrain_zenoh.diagnostics.roll_call import roll_call
+    from gigabrain_zenoh.runtime.joining import Where, joined
 
     async def ask() -> list["Description"]:
         async with joined(Where(), "completion") as (bus, _):

@@ -6,17 +6,17 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh import log_text
 from gigabrain_zenoh.cli.live_names import processes
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host import log_text
+from gigabrain_zenoh.host.stop_signals import run_async
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from gigabrain_schemas.safety import LogRecord
-    from gigabrain_zenoh.tools.log_reading import Line, Wanted
+    from gigabrain_zenoh.diagnostics.log_reading import Line, Wanted
 
 
 def log(
@@ -55,7 +55,7 @@ def log(
     json
         One JSON object per line.
     """
-    from gigabrain_zenoh.tools.log_reading import read, run_folder
+    from gigabrain_zenoh.diagnostics.log_reading import read, run_folder
 
     if not 0 < newest <= 1_000_000:
         raise ConfigError(f"--newest: expected 1 to 1000000, got {newest}")
@@ -72,7 +72,7 @@ def log(
 
 def _wanted(process: str, level: str, since: str) -> "Wanted":
     """Raises ConfigError, and UnknownName."""
-    from gigabrain_zenoh.tools.log_reading import Wanted, ago_ns
+    from gigabrain_zenoh.diagnostics.log_reading import Wanted, ago_ns
 
     since_ns = ago_ns(since, time.time_ns()) if since else 0
     return Wanted(process=process, level=level, since_ns=since_ns)
@@ -88,11 +88,11 @@ def _tell_json(line: "Line") -> None:
 
 async def _follow(at: Which, wanted: "Wanted", tell: "Callable[[Line], None]") -> None:
     from gigabrain_schemas.topics import LOG
-    from gigabrain_zenoh.recording.joining import joined
-    from gigabrain_zenoh.stop_signals import stop_signals
-    from gigabrain_zenoh.tools.hearing import NAME
-    from gigabrain_zenoh.tools.log_reading import as_line
-    from gigabrain_zenoh.tools.reader import ended_with_reader
+    from gigabrain_zenoh.diagnostics.hearing import NAME
+    from gigabrain_zenoh.diagnostics.log_reading import as_line
+    from gigabrain_zenoh.diagnostics.reader import ended_with_reader
+    from gigabrain_zenoh.host.stop_signals import stop_signals
+    from gigabrain_zenoh.runtime.joining import joined
 
     async with joined(at.where(), NAME) as (bus, _):
 

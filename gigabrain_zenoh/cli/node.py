@@ -6,10 +6,10 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.live_names import processes
 from gigabrain_zenoh.cli.where import HERE, Which, say, show
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.tools.nodes import Nodes
+    from gigabrain_zenoh.diagnostics.nodes import Nodes
 
 
 def list_(*, at: Which = HERE, json: bool = False) -> int:
@@ -24,7 +24,7 @@ def list_(*, at: Which = HERE, json: bool = False) -> int:
     """
     import msgspec
 
-    from gigabrain_zenoh.tools.nodes import table
+    from gigabrain_zenoh.diagnostics.nodes import table
 
     nodes = _census(at)
     if not json:
@@ -46,7 +46,7 @@ def info(process: Annotated[str, Parameter(completer=processes)], /, *, at: Whic
     process
         Its name.
     """
-    from gigabrain_zenoh.tools.nodes import about
+    from gigabrain_zenoh.diagnostics.nodes import about
 
     for line in about(_census(at), process):
         say(line)
@@ -54,9 +54,9 @@ def info(process: Annotated[str, Parameter(completer=processes)], /, *, at: Whic
 
 
 def _census(at: Which) -> "Nodes":
-    from gigabrain_zenoh.recording.joining import joined
-    from gigabrain_zenoh.tools.hearing import NAME
-    from gigabrain_zenoh.tools.nodes import census
+    from gigabrain_zenoh.diagnostics.hearing import NAME
+    from gigabrain_zenoh.diagnostics.nodes import census
+    from gigabrain_zenoh.runtime.joining import joined
 
     async def look() -> "Nodes":
         async with joined(at.where(), NAME) as (bus, _):

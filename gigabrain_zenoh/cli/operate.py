@@ -6,12 +6,12 @@ from collections.abc import Awaitable, Callable
 
 from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.cli.where import HERE, Which
-from gigabrain_zenoh.client import Robot
-from gigabrain_zenoh.client import connect as connect_robot
+from gigabrain_zenoh.client.estop import BY_HAND
+from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.client.robot import connect as connect_robot
 from gigabrain_zenoh.errors import GigabrainError, NotConfirmed
-from gigabrain_zenoh.estop import BY_HAND
-from gigabrain_zenoh.gate import BRAIN
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.gate.gate import BRAIN
+from gigabrain_zenoh.host.stop_signals import run_async
 
 
 def estop(*, at: Which = HERE, reason: str = "") -> int:

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.where import HERE, Which
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.settings import PageConfig
+    from gigabrain_zenoh.config.settings import PageConfig
 
 
 @Parameter(name="*")
@@ -33,7 +33,7 @@ class Served:
     def config(self) -> "PageConfig":
         """The settings of its process. Raises ConfigError."""
         from gigabrain_zenoh.cli.checked import checked
-        from gigabrain_zenoh.settings import PageConfig
+        from gigabrain_zenoh.config.settings import PageConfig
 
         values = {
             "port": self.port,
@@ -60,12 +60,12 @@ def page(*, served: Served = LOCALLY, at: Which = HERE) -> int:
     """
     import msgspec
 
+    from gigabrain_zenoh.config.process_config import ProcessConfig
     from gigabrain_zenoh.errors import ConfigError
-    from gigabrain_zenoh.page.access import check
-    from gigabrain_zenoh.page.node import INSTALL, installed
-    from gigabrain_zenoh.process_config import ProcessConfig
-    from gigabrain_zenoh.processes import run_process
-    from gigabrain_zenoh.running import find_endpoint
+    from gigabrain_zenoh.launch.processes import run_process
+    from gigabrain_zenoh.runtime.running import find_endpoint
+    from gigabrain_zenoh.ui.page.access import check
+    from gigabrain_zenoh.ui.page.node import INSTALL, installed
 
     if not installed():
         raise ConfigError(INSTALL)

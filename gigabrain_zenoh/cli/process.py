@@ -8,16 +8,11 @@ from typing import Annotated, Any, Literal
 import msgspec
 from cyclopts import Parameter
 
-from gigabrain_zenoh import behaviours
-from gigabrain_zenoh.addresses import exposed, reached_at
+from gigabrain_zenoh.bus.zenoh.config import router_config, secured
 from gigabrain_zenoh.cli.checked import checked
-from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.keys.checks import identity_in
-from gigabrain_zenoh.logs import state_dir
-from gigabrain_zenoh.process_config import ProcessConfig
-from gigabrain_zenoh.processes import run_process
-from gigabrain_zenoh.running import announced, find_endpoint
-from gigabrain_zenoh.settings import (
+from gigabrain_zenoh.config.addresses import exposed, reached_at
+from gigabrain_zenoh.config.process_config import ProcessConfig
+from gigabrain_zenoh.config.settings import (
     ButtonConfig,
     DecisionConfig,
     DriverConfig,
@@ -25,7 +20,12 @@ from gigabrain_zenoh.settings import (
     LinkName,
     Resume,
 )
-from gigabrain_zenoh.zenoh_config import router_config, secured
+from gigabrain_zenoh.decision import behaviours
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.launch.processes import run_process
+from gigabrain_zenoh.logs import state_dir
+from gigabrain_zenoh.runtime.running import announced, find_endpoint
+from gigabrain_zenoh.security.checks import identity_in
 
 ROUTER = "tcp/127.0.0.1:7447"
 
@@ -116,7 +116,7 @@ def decision(
     remember
         The folder for what must survive a restart: what it is to do.
     """
-    from gigabrain_zenoh.tasks.scripts import check_folder
+    from gigabrain_zenoh.decision.tasks.scripts import check_folder
 
     behaviours.load(behaviour)  # a wrong name is better told now than once there is a router
     programs = str(scripts.absolute()) if scripts else ""

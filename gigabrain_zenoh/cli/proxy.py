@@ -8,14 +8,14 @@ from typing import Protocol
 
 import msgspec
 
-from gigabrain_zenoh.addresses import is_loopback
+from gigabrain_zenoh.config.addresses import is_loopback
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.faults.call import Address
-from gigabrain_zenoh.faults.chaos import CALM, WAYS, Chaos, Told, Way, told
-from gigabrain_zenoh.faults.damage import Figures
-from gigabrain_zenoh.faults.proxy import TcpProxy
-from gigabrain_zenoh.stop_signals import run_async
-from gigabrain_zenoh.typed import typed_lines
+from gigabrain_zenoh.host.stdin_lines import typed_lines
+from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.qa.proxy.call import Address
+from gigabrain_zenoh.qa.proxy.chaos import CALM, WAYS, Chaos, Told, Way, told
+from gigabrain_zenoh.qa.proxy.damage import Figures
+from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
 
 ENDPOINT = re.compile(r"(?:(?:tcp|tls|ws)/)?(?P<host>\[[^\]]+\]|[^/:\[\]]+):(?P<port>\d+)")
 
@@ -55,7 +55,7 @@ def proxy(
     """
     begin = told(chaos)
     if to.startswith("/"):
-        from gigabrain_drivers.links.line_proxy import LineProxy
+        from gigabrain_zenoh.qa.line_proxy import LineProxy
 
         made: Spoiled = LineProxy(to, _path(listen), baud=baud, seed=seed)
     else:

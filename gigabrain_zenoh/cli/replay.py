@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 
 def replay(
@@ -28,7 +28,7 @@ def replay(
     deployment
         A deployment file for its settings; without it, those that the recording holds.
     """
-    from gigabrain_zenoh.processes import node_of
+    from gigabrain_zenoh.launch.processes import node_of
     from gigabrain_zenoh.recording.process_replay import replay_file
 
     return run_async(replay_file(check, process, deployment, node_of))

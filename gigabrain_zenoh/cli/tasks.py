@@ -9,11 +9,11 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.tasks import Task
-    from gigabrain_zenoh.task_client import Tasks
+    from gigabrain_zenoh.client.tasks import Tasks
 
 How = Literal["replace", "queue", "preempt"]
 Wait = Annotated[bool, Parameter(help="Wait for the end; Ctrl-C cancels the task meanwhile.")]
@@ -80,9 +80,9 @@ def patrol(
     loops
         How often; for ever without.
     """
+    from gigabrain_zenoh.decision.tasks.checks import load_patrol, round_of
+    from gigabrain_zenoh.decision.tasks.mission import MOST_LOOPS
     from gigabrain_zenoh.errors import ConfigError
-    from gigabrain_zenoh.tasks.checks import load_patrol, round_of
-    from gigabrain_zenoh.tasks.mission import MOST_LOOPS
 
     if loops is not None and not 1 <= loops <= MOST_LOOPS:
         raise ConfigError(f"--loops: expected 1 to {MOST_LOOPS}, got {loops}")
@@ -110,7 +110,7 @@ def mission(
     check
         Only say whether the file is right; no robot is needed.
     """
-    from gigabrain_zenoh.tasks.checks import load
+    from gigabrain_zenoh.decision.tasks.checks import load
 
     load(file)  # better told here than by the robot
     if check:
@@ -167,8 +167,8 @@ async def _told(answer: Awaitable[str]) -> None:
 def _with(at: Which, do: "Callable[[Tasks], Awaitable[None]]") -> int:
     import getpass
 
-    from gigabrain_zenoh.recording.joining import joined
-    from gigabrain_zenoh.task_client import Tasks
+    from gigabrain_zenoh.client.tasks import Tasks
+    from gigabrain_zenoh.runtime.joining import joined
 
     async def run() -> None:
         async with joined(at.where(), f"{getpass.getuser()}-cli") as (bus, _):
@@ -200,7 +200,7 @@ def _send(at: Which, send: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> i
 
 
 def _tell(ended: "Task") -> None:
-    from gigabrain_zenoh.tasks.orders import became
+    from gigabrain_zenoh.decision.tasks.orders import became
 
     if ended.state != "succeeded":
         raise Refused(became(ended))

@@ -1,7 +1,7 @@
 """`gigabrain teleop`: drive by keys or by a gamepad."""
 
 from gigabrain_zenoh.cli.where import HERE, Which
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 
 def teleop(
@@ -24,10 +24,10 @@ def teleop(
     import getpass
     import sys
 
-    from gigabrain_zenoh.client import connect as connect_robot
+    from gigabrain_zenoh.client.robot import connect as connect_robot
     from gigabrain_zenoh.errors import ConfigError
-    from gigabrain_zenoh.gamepad import Gamepad
-    from gigabrain_zenoh.teleop_station import Station
+    from gigabrain_zenoh.ui.gamepad import Gamepad
+    from gigabrain_zenoh.ui.teleop_station import Station
 
     async def run() -> None:
         pad = Gamepad()

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 from gigabrain_zenoh.cli.where import HERE, Which, show
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.stop_signals import run_async, stop_signals
+from gigabrain_zenoh.host.stop_signals import run_async, stop_signals
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.tools.top_feed import Feed
+    from gigabrain_zenoh.diagnostics.top_feed import Feed
 
 NEEDS = "for the live table: pip install 'gigabrain-zenoh[view]'; without it: gigabrain top --once"
 
@@ -26,10 +26,10 @@ def top(*, at: Which = HERE, once: bool = False) -> int:
     once
         Print two tables and end.
     """
-    from gigabrain_zenoh.recording.joining import joined
-    from gigabrain_zenoh.tools.hearing import NAME, everything
-    from gigabrain_zenoh.tools.tally import tallied
-    from gigabrain_zenoh.tools.top_feed import BusFeed
+    from gigabrain_zenoh.diagnostics.hearing import NAME, everything
+    from gigabrain_zenoh.diagnostics.tally import tallied
+    from gigabrain_zenoh.diagnostics.top_feed import BusFeed
+    from gigabrain_zenoh.runtime.joining import joined
 
     async def run() -> None:
         where = at.where()
@@ -47,7 +47,7 @@ def top(*, at: Which = HERE, once: bool = False) -> int:
 
 async def _live(feed: "Feed") -> None:
     try:
-        from gigabrain_zenoh.tools.top import Top
+        from gigabrain_zenoh.diagnostics.top import Top
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}; {NEEDS}") from None
     app = Top(feed, "")
@@ -65,7 +65,7 @@ async def _live(feed: "Feed") -> None:
 async def _once(feed: "Feed") -> None:
     from rich.table import Table
 
-    from gigabrain_zenoh.tools.top_rows import PROCESS_COLUMNS, TOPIC_COLUMNS, in_order, shown
+    from gigabrain_zenoh.diagnostics.top_rows import PROCESS_COLUMNS, TOPIC_COLUMNS, in_order, shown
 
     await asyncio.sleep(1.3)
     for columns, rows in zip((PROCESS_COLUMNS, TOPIC_COLUMNS), feed.refresh(), strict=True):

@@ -7,7 +7,7 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.cli.live_names import topics
 from gigabrain_zenoh.cli.where import HERE, Which, say, show
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.base import Message
@@ -31,9 +31,9 @@ def list_(*, at: Which = HERE, all_topics: bool = False, json: bool = False) -> 
     """
     import msgspec
 
-    from gigabrain_zenoh.recording.joining import joined
-    from gigabrain_zenoh.tools import topic_table
-    from gigabrain_zenoh.tools.hearing import NAME, everything, look
+    from gigabrain_zenoh.diagnostics import topic_table
+    from gigabrain_zenoh.diagnostics.hearing import NAME, everything, look
+    from gigabrain_zenoh.runtime.joining import joined
 
     async def run() -> None:
         where = at.where()
@@ -77,9 +77,9 @@ def echo(
     within
         End with 1 when none has come after so long [s].
     """
-    from gigabrain_zenoh.tools.hearing import aimed
-    from gigabrain_zenoh.tools.topic_watch import Shown
-    from gigabrain_zenoh.tools.topic_watch import echo as run_echo
+    from gigabrain_zenoh.diagnostics.hearing import aimed
+    from gigabrain_zenoh.diagnostics.topic_watch import Shown
+    from gigabrain_zenoh.diagnostics.topic_watch import echo as run_echo
 
     above_zero("count", count)
     above_zero("within", within)
@@ -139,8 +139,8 @@ def delay(topic: Name, /, *, at: Which = HERE, count: Count = None) -> int:
 
 
 def _measure(what: Literal["hz", "bw", "delay"], topic: str, at: Which, count: int | None) -> int:
-    from gigabrain_zenoh.tools.hearing import aimed
-    from gigabrain_zenoh.tools.topic_watch import measure
+    from gigabrain_zenoh.diagnostics.hearing import aimed
+    from gigabrain_zenoh.diagnostics.topic_watch import measure
 
     above_zero("count", count)
 
@@ -161,8 +161,8 @@ def info(topic: Name, /, *, at: Which = HERE) -> int:
     topic
         Its name, such as scan.
     """
-    from gigabrain_zenoh.tools.hearing import aimed, everything, look
-    from gigabrain_zenoh.tools.topic_table import about
+    from gigabrain_zenoh.diagnostics.hearing import aimed, everything, look
+    from gigabrain_zenoh.diagnostics.topic_table import about
 
     async def run() -> None:
         where = at.where()
@@ -204,8 +204,8 @@ def pub(
         Even when somebody else drives, the robot's own brain included.
     """
     from gigabrain_schemas.topics import CMD_VEL
-    from gigabrain_zenoh.tools.names import COMMANDS, not_found, short, target
-    from gigabrain_zenoh.tools.publishing import drive, typed_in
+    from gigabrain_zenoh.diagnostics.names import COMMANDS, not_found, short, target
+    from gigabrain_zenoh.diagnostics.publishing import drive, typed_in
 
     above_zero("rate", rate)
     above_zero("count", count)
@@ -232,8 +232,8 @@ async def _send(
     count: int | None,
 ) -> None:
     """Send a message, of the process `of` where each has its own topic, and say how often."""
-    from gigabrain_zenoh.recording.joining import joined
-    from gigabrain_zenoh.tools.publishing import send
+    from gigabrain_zenoh.diagnostics.publishing import send
+    from gigabrain_zenoh.runtime.joining import joined
 
     async with joined(at.where(), "pub") as (bus, _):
         say(f"sent {await send(bus, topic, message, rate, count, of)}")

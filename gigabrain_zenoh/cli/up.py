@@ -6,11 +6,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.config_places import located
-from gigabrain_zenoh.deployment import deployment_path, host_of, load_deployment
-from gigabrain_zenoh.display import LINES, Display, writer
+from gigabrain_zenoh.config.places import located
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.display import LINES, Display, writer
+from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.runtime.deployment import deployment_path, host_of, load_deployment
 
 
 def up(
@@ -38,7 +38,7 @@ def up(
     keep_stuck
         Leave a process alone that makes no progress, for a debugger; else it is started again.
     """
-    from gigabrain_zenoh.launch import up as run
+    from gigabrain_zenoh.launch.up import up as run
 
     path = deployment_path(deployment)
     loaded = load_deployment(path, str(keys.expanduser().absolute()) if keys else "")

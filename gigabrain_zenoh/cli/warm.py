@@ -3,7 +3,7 @@
 import asyncio
 import time
 
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 
 def warm() -> None:
@@ -19,8 +19,8 @@ def warm() -> None:
 
 async def _all() -> None:
     """Both at a time: they share no kernel."""
-    from gigabrain_zenoh.navigating import DRIVE_KERNELS
-    from gigabrain_zenoh.perception import LOCALIZE_KERNELS, MAP_KERNELS
+    from gigabrain_zenoh.decision.navigating import DRIVE_KERNELS
+    from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 
     print("compiling, which takes up to a minute", flush=True)
     await asyncio.gather(
@@ -30,7 +30,7 @@ async def _all() -> None:
 
 
 async def _compile(name: str, *warm_ups: str) -> None:
-    from gigabrain_zenoh.compiling import compile_all, in_child, needs
+    from gigabrain_zenoh.kernels.compiling import compile_all, in_child, needs
 
     began_s = time.monotonic()
     for warm_up in warm_ups:

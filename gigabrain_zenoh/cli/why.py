@@ -1,7 +1,7 @@
 """`gigabrain why`: why does it not move?"""
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
-from gigabrain_zenoh.stop_signals import run_async
+from gigabrain_zenoh.host.stop_signals import run_async
 
 
 def why(*, at: Which = HERE, json: bool = False) -> int:
@@ -22,11 +22,11 @@ def why(*, at: Which = HERE, json: bool = False) -> int:
 
     import msgspec
 
+    from gigabrain_zenoh.diagnostics.hearing import NAME
+    from gigabrain_zenoh.diagnostics.why import judge
+    from gigabrain_zenoh.diagnostics.why_facts import Facts, Watcher
     from gigabrain_zenoh.errors import Ambiguous, BusError
-    from gigabrain_zenoh.recording.joining import joined
-    from gigabrain_zenoh.tools.hearing import NAME
-    from gigabrain_zenoh.tools.why import judge
-    from gigabrain_zenoh.tools.why_facts import Facts, Watcher
+    from gigabrain_zenoh.runtime.joining import joined
 
     async def look() -> Facts:
         try:

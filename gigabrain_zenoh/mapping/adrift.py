@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gigabrain_zenoh.geometry.se2 import Floats
 from gigabrain_zenoh.mapping.correlative import Window
-from gigabrain_zenoh.mapping.se2 import Floats
 
 MISSES, MISSED_TRAVEL, MISSED_TURN = 3, 0.5, 0.5  # scans, [m], [rad]: after these it is broken,
 MISSES_STANDING = 30  # or after so many scans

@@ -18,8 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.bounded_file import open_regular
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.bounded_file import open_regular
 
 Arrays = Mapping[str, NDArray[Any]]
 

@@ -11,10 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel, lean_kernel
+from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_zenoh.kernels.kernel import kernel, lean_kernel
 from gigabrain_zenoh.mapping.local_map import BLOCK, Bytes, Image
 from gigabrain_zenoh.mapping.points import Points, thinned
-from gigabrain_zenoh.mapping.se2 import Floats
 
 SEARCHED = 90  # points of a scan are enough to search with
 ASIDE = 0.01  # of the score, at the window's rim: of equals, the one nearest to the guess

@@ -4,10 +4,10 @@ A map that drifts, or a room that changes, disagrees with what is seen little by
 who lifts the robot makes it disagree from one scan to the next.
 """
 
+from gigabrain_zenoh.geometry.se2 import Floats
 from gigabrain_zenoh.mapping.field import contradiction, field_of
 from gigabrain_zenoh.mapping.grid import CELL, Grid
 from gigabrain_zenoh.mapping.localizer import View
-from gigabrain_zenoh.mapping.se2 import Floats
 
 REACH_M = 5.0  # round the robot, beams that end farther off are not judged
 SUDDEN = 0.3  # so many more of all beams than before

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gigabrain_zenoh.geometry.se2 import Floats, between
 from gigabrain_zenoh.mapping.keyframe import Edge
-from gigabrain_zenoh.mapping.se2 import Floats, between
 
 JOINT = 0.03  # [m] and [rad], of every loop
 GATE = 16.3  # 99.9 % of chi-square with three degrees of freedom

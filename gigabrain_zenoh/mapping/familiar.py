@@ -7,8 +7,8 @@ a map grows with the ground and with what changes on it, and not with the time t
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_zenoh.geometry.se2 import Floats, wrap
 from gigabrain_zenoh.mapping.keyframe import Keyframe
-from gigabrain_zenoh.mapping.se2 import Floats, wrap
 
 TRAVEL = 12.0  # [m] since, or it is the same pass
 NEAR = 0.75  # [m], keyframes so near are of this place

@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_zenoh.kernels.kernel import kernel
 from gigabrain_zenoh.mapping.matching import solved
 from gigabrain_zenoh.mapping.points import Points
-from gigabrain_zenoh.mapping.se2 import Floats
 
 OCCUPIED, FREE = 65, 40  # percent: from here on a wall, and up to here free
 FAR = 2.0  # [m], farther from any wall is not told apart

@@ -1,10 +1,10 @@
 """A localizer whose searches of the whole map run beside the scans."""
 
-from gigabrain_zenoh.mapping.background import Background, Take
+from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, compose
+from gigabrain_zenoh.host.background import Background, Take
 from gigabrain_zenoh.mapping.field import Field
 from gigabrain_zenoh.mapping.localizer import Localizer, Place, View
 from gigabrain_zenoh.mapping.relocalize import search
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, compose
 
 SEARCH_SCANS = 8  # after which what a search has found is taken
 

@@ -8,13 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gigabrain_zenoh.mapping.adrift import UNKNOWN, Adrift
-from gigabrain_zenoh.mapping.correlative import Found, Window, search
-from gigabrain_zenoh.mapping.local_map import LocalMap, build, room_for
-from gigabrain_zenoh.mapping.match import Kind, Match
-from gigabrain_zenoh.mapping.matching import Fit, icp
-from gigabrain_zenoh.mapping.points import Scan, thinned
-from gigabrain_zenoh.mapping.se2 import (
+from gigabrain_zenoh.geometry.se2 import (
     Floats,
     between,
     compose,
@@ -23,6 +17,12 @@ from gigabrain_zenoh.mapping.se2 import (
     turned,
     wrapped,
 )
+from gigabrain_zenoh.mapping.adrift import UNKNOWN, Adrift
+from gigabrain_zenoh.mapping.correlative import Found, Window, search
+from gigabrain_zenoh.mapping.local_map import LocalMap, build, room_for
+from gigabrain_zenoh.mapping.match import Kind, Match
+from gigabrain_zenoh.mapping.matching import Fit, icp
+from gigabrain_zenoh.mapping.points import Scan, thinned
 from gigabrain_zenoh.mapping.spacing import Spacing
 from gigabrain_zenoh.mapping.visibility import seen_through
 

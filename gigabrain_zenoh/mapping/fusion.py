@@ -14,7 +14,7 @@ import numpy as np
 
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_zenoh.mapping.se2 import Floats, between, compose
+from gigabrain_zenoh.geometry.se2 import Floats, between, compose
 
 KEPT = 250  # states, so 5 s
 GAP_TICKS = 25  # no pose is made up between states that lie farther apart,

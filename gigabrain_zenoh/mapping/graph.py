@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 import gtsam
 import numpy as np
 
+from gigabrain_zenoh.geometry.se2 import Floats, compose
 from gigabrain_zenoh.mapping.keyframe import Edge
-from gigabrain_zenoh.mapping.se2 import Floats, compose
 
 ANCHOR = 1e-3  # [m] and [rad], how firmly the first pose is held
 ROBUST = 1.0  # standard deviations, doubtful edges beyond it lose their weight

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.brain import OccupancyGrid
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.geometry.se2 import Floats, transform
+from gigabrain_zenoh.kernels.kernel import kernel
 from gigabrain_zenoh.mapping.points import Points
-from gigabrain_zenoh.mapping.se2 import Floats, transform
 
 CELL = 0.05  # [m]
 HIT, PASS = 9, -5  # tenths of log-odds: one hit is 0.71, one beam that goes on is 0.38

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.journal import done
+from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose, wrap
+from gigabrain_zenoh.host.background import PATIENCE_S, Background, InTime, Take
+from gigabrain_zenoh.host.journal import done
 from gigabrain_zenoh.mapping.arrays_file import Arrays
-from gigabrain_zenoh.mapping.background import PATIENCE_S, Background, InTime, Take
 from gigabrain_zenoh.mapping.doubt import Doubt
 from gigabrain_zenoh.mapping.drift import Rates
 from gigabrain_zenoh.mapping.field import field_of
@@ -20,7 +21,6 @@ from gigabrain_zenoh.mapping.frozen import shaped
 from gigabrain_zenoh.mapping.grid import CELL, MOST_CELLS, Grid
 from gigabrain_zenoh.mapping.localizer import NOWHERE, Place, View
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, wrap
 from gigabrain_zenoh.mapping.slam import Correction, Estimate, Slam
 from gigabrain_zenoh.mapping.sweeps import Sweep, Sweeps
 

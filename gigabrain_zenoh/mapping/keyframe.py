@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from gigabrain_zenoh.geometry.se2 import Floats
 from gigabrain_zenoh.mapping.points import Points, Scan, normals
-from gigabrain_zenoh.mapping.se2 import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING, Protocol
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.journal import done
-from gigabrain_zenoh.mapping.background import PATIENCE_S, Background, InTime
+from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_zenoh.host.background import PATIENCE_S, Background, InTime
+from gigabrain_zenoh.host.journal import done
 from gigabrain_zenoh.mapping.field import field_of
 from gigabrain_zenoh.mapping.finder import Finder
 from gigabrain_zenoh.mapping.localizer import Place, View
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.mapping.se2 import Floats
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.mapping.growing import Still  # and gtsam: only who makes maps pays

@@ -7,8 +7,8 @@ what it would see at the same place in the first, and nothing it sees ever speak
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_zenoh.geometry.se2 import Floats, inverse, transform
 from gigabrain_zenoh.mapping.field import BLUR_M, Field
-from gigabrain_zenoh.mapping.se2 import Floats, inverse, transform
 
 NEAR_M = 0.15  # a wall that comes to lie so near another is alike
 ENOUGH = 40  # cells of wall, or next to nothing of the map comes to lie on what is known

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel, lean_kernel
+from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_zenoh.kernels.kernel import kernel, lean_kernel
 from gigabrain_zenoh.mapping.points import Points, Scan
-from gigabrain_zenoh.mapping.se2 import Floats
 
 BUCKET = 0.15  # [m]
 REACH = 30.0  # [m], points farther from the centre are left out

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose, inverse, turned
 from gigabrain_zenoh.mapping.field import Field, clearance, fit
 from gigabrain_zenoh.mapping.likeness import alike
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.relocalize import FEWEST_POINTS, Candidate, apart
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, inverse, turned
 
 LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somewhere else
 SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here

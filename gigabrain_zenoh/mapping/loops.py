@@ -8,14 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gigabrain_zenoh.mapping.correlative import Window, search
-from gigabrain_zenoh.mapping.drift import Drift, Rates
-from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
-from gigabrain_zenoh.mapping.local_map import build
-from gigabrain_zenoh.mapping.matching import icp
-from gigabrain_zenoh.mapping.places import PlaceSearch
-from gigabrain_zenoh.mapping.points import thinned
-from gigabrain_zenoh.mapping.se2 import (
+from gigabrain_zenoh.geometry.se2 import (
     IDENTITY,
     Floats,
     between,
@@ -25,6 +18,13 @@ from gigabrain_zenoh.mapping.se2 import (
     turned,
     wrapped,
 )
+from gigabrain_zenoh.mapping.correlative import Window, search
+from gigabrain_zenoh.mapping.drift import Drift, Rates
+from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
+from gigabrain_zenoh.mapping.local_map import build
+from gigabrain_zenoh.mapping.matching import icp
+from gigabrain_zenoh.mapping.places import PlaceSearch
+from gigabrain_zenoh.mapping.points import thinned
 
 RADIUS = 4.0  # [m] round the robot
 TRAVEL = 12.0  # [m] since, or it is no loop

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
-from gigabrain_zenoh.mapping.se2 import Floats
+from gigabrain_zenoh.geometry.se2 import Floats
 
 Kind = Literal["matched", "searched", "recovered", "odometry", "broken"]
 

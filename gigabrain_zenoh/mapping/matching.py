@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel, lean_kernel
+from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_zenoh.kernels.kernel import kernel, lean_kernel
 from gigabrain_zenoh.mapping.local_map import BUCKET, Buckets
 from gigabrain_zenoh.mapping.points import Points
-from gigabrain_zenoh.mapping.se2 import Floats
 
 ITERATIONS = 25
 STILL = 1e-4  # [m] and [rad], a step this small ends ICP

@@ -12,13 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.mapping.correlative import Window, search
-from gigabrain_zenoh.mapping.drift import Drift, explained
-from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
-from gigabrain_zenoh.mapping.local_map import build
-from gigabrain_zenoh.mapping.matching import icp
-from gigabrain_zenoh.mapping.points import Points, thinned
-from gigabrain_zenoh.mapping.se2 import (
+from gigabrain_zenoh.geometry.se2 import (
     IDENTITY,
     Floats,
     between,
@@ -29,6 +23,12 @@ from gigabrain_zenoh.mapping.se2 import (
     turned,
     wrapped,
 )
+from gigabrain_zenoh.mapping.correlative import Window, search
+from gigabrain_zenoh.mapping.drift import Drift, explained
+from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
+from gigabrain_zenoh.mapping.local_map import build
+from gigabrain_zenoh.mapping.matching import icp
+from gigabrain_zenoh.mapping.points import Points, thinned
 from gigabrain_zenoh.mapping.visibility import seen_through
 
 TRAVEL = 30.0  # [m] driven since, or it is the same visit

@@ -6,8 +6,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
-from gigabrain_zenoh.mapping.se2 import Floats
+from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_zenoh.kernels.kernel import kernel
 
 Points = NDArray[np.float32]
 

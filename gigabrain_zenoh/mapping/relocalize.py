@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.geometry.se2 import Floats, compose, inverse, wrap
+from gigabrain_zenoh.kernels.kernel import kernel
 from gigabrain_zenoh.mapping.field import JUDGED, Field, Fit, fit
 from gigabrain_zenoh.mapping.likeness import alike
 from gigabrain_zenoh.mapping.points import Points
-from gigabrain_zenoh.mapping.se2 import Floats, compose, inverse, wrap
 
 POINTS = 90  # of a scan, evenly chosen
 FEWEST_POINTS = 20

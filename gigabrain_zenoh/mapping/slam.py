@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose, inverse, turned
 from gigabrain_zenoh.mapping.drift import Rates
 from gigabrain_zenoh.mapping.familiar import Ground
 from gigabrain_zenoh.mapping.front_end import FrontEnd
@@ -27,7 +28,6 @@ from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.loops import LoopSearch, around
 from gigabrain_zenoh.mapping.match import Kind, Match
 from gigabrain_zenoh.mapping.points import Scan
-from gigabrain_zenoh.mapping.se2 import IDENTITY, Floats, between, compose, inverse, turned
 from gigabrain_zenoh.mapping.spacing import Spacing
 
 LINK = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance of a link beside that of its match,

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gigabrain_zenoh.mapping.se2 import Floats
+from gigabrain_zenoh.geometry.se2 import Floats
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_zenoh.geometry.se2 import Floats, between, compose
 from gigabrain_zenoh.mapping.frozen import REACH_M, split
 from gigabrain_zenoh.mapping.grid import Grid
 from gigabrain_zenoh.mapping.localizer import View
 from gigabrain_zenoh.mapping.points import Points
-from gigabrain_zenoh.mapping.se2 import Floats, between, compose
 
 APART_M, APART_RAD = 0.1, math.radians(10)  # nearer ones replace one another
 SQUARE_M, SECTOR_RAD = 0.5, math.pi / 2  # a place, and a direction in which it is looked from

@@ -8,9 +8,9 @@ from a wrong one.
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_zenoh.kernels.kernel import kernel
 from gigabrain_zenoh.mapping.points import Points
-from gigabrain_zenoh.mapping.se2 import Floats
 
 BINS = 360  # of bearing
 MARGIN = 0.3  # [m], what lies nearer than a beam's end by less was hit by it

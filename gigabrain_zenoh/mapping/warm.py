@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from gigabrain_zenoh.geometry.se2 import IDENTITY
 from gigabrain_zenoh.mapping import grid
 from gigabrain_zenoh.mapping.field import contradiction, field_of
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.relocalize import search
-from gigabrain_zenoh.mapping.se2 import IDENTITY
 
 BEAMS, ROOM_M = 60, 1.0
 

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import lean_kernel
+from gigabrain_zenoh.kernels.kernel import lean_kernel
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.models import Model
 from gigabrain_zenoh.navigation.rating import DISC_ROOM, NO_DISC, Weights, exponential

@@ -7,7 +7,7 @@ distanceTransform finds with DIST_MASK_5, in a third of its time.
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels.kernel import kernel
 
 RIM = 2  # cells round the window, from which nothing is near
 UNIT = 1 << 20  # of a cell

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import cells as cells_of
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import OccupancyGrid
-from gigabrain_zenoh import sweep
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.geometry import sweep
+from gigabrain_zenoh.kernels.kernel import kernel
 from gigabrain_zenoh.navigation.distance import Cells, Singles, squared_distance
 
 LETHAL = 100.0  # from here on the body does not fit; up to twice that where its centre touches

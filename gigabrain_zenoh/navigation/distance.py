@@ -7,7 +7,7 @@ With a cap of 16 cells that is a seventh of a whole distance transform (OpenCV's
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels.kernel import kernel
 
 OCCUPIED = 50  # a cell of at least this is taken for an obstacle: more likely than not
 

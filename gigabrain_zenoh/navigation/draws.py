@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import lean_kernel
+from gigabrain_zenoh.kernels.kernel import lean_kernel
 from gigabrain_zenoh.navigation.models import Model
 from gigabrain_zenoh.navigation.rollout import LANES
 

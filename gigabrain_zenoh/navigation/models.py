@@ -4,8 +4,8 @@ import math
 from typing import NamedTuple
 
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_zenoh.kernels import lean_kernel
-from gigabrain_zenoh.limits import limits_of
+from gigabrain_zenoh.geometry.limits import limits_of
+from gigabrain_zenoh.kernels.kernel import lean_kernel
 
 RESERVE = 0.9  # of the body's accelerations: what is planned must be possible on a bad floor too
 SLOWEST_REVERSE = 0.4  # [m/s], no faster backwards: the lidar may not see there

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import NONE, kernel, lean_kernel
+from gigabrain_zenoh.kernels.kernel import NONE, kernel, lean_kernel
 from gigabrain_zenoh.navigation.draws import STANDING, noise_of, propose, simple_of
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.models import Model

@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import NONE, lean_kernel
+from gigabrain_zenoh.kernels.kernel import NONE, lean_kernel
 from gigabrain_zenoh.navigation.among import near_discs, of_contact
 from gigabrain_zenoh.navigation.footprint import (
     ROOM,

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import lean_kernel
+from gigabrain_zenoh.kernels.kernel import lean_kernel
 from gigabrain_zenoh.navigation.footprint import ROOM, Grid, Outline, distance_at, free_ahead
 from gigabrain_zenoh.navigation.models import Model
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import lean_kernel
+from gigabrain_zenoh.kernels.kernel import lean_kernel
 from gigabrain_zenoh.navigation.models import Lag, Model, answer, feasible
 
 Floats = NDArray[np.float64]

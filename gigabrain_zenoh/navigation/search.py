@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import NONE, kernel
+from gigabrain_zenoh.kernels.kernel import NONE, kernel
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
 
 DIAGONAL = math.sqrt(2.0)

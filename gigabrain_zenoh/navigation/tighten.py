@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from gigabrain_zenoh.kernels import NONE, kernel
+from gigabrain_zenoh.kernels.kernel import NONE, kernel
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
 from gigabrain_zenoh.navigation.search import Floats
 

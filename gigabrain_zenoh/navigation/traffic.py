@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_schemas.base import TICK_NS
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels.kernel import kernel
 from gigabrain_zenoh.navigation.cost_to_go import FARTHEST, UNIT, CostToGo, Ways, seed, sweep
 from gigabrain_zenoh.navigation.footprint import Grid
 from gigabrain_zenoh.navigation.window import Window

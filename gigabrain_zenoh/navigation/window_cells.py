@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels.kernel import kernel
 
 CELL_M = 0.025
 BINS = 720  # of the bearings round the lidar

@@ -6,7 +6,7 @@ A disc is x, y [m], vx, vy [m/s] and a radius [m] first of all.
 import math
 
 from gigabrain_schemas.base import TICK_NS
-from gigabrain_zenoh.kernels import kernel
+from gigabrain_zenoh.kernels.kernel import kernel
 from gigabrain_zenoh.navigation.window_cells import CELL_M, Cells, Floats
 
 ROUND_DISC = 0.1  # [m], hits so near a moving thing are its own

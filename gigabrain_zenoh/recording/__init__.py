@@ -1,4 +1,8 @@
-"""Recording what a robot says into MCAP files ("bags"), and all that can be done with them."""
+"""Bags: recording into MCAP files, reading, playing, converting and replaying them.
+
+It may import bus, config, gate, host, runtime and safety.
+Diagnostics, ui, launch, commands and qa may import it.
+"""
 
 from importlib.util import find_spec
 

@@ -9,13 +9,13 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from gigabrain_zenoh.recording.joining import Where, joined
+from gigabrain_zenoh.config.settings import RecorderConfig
+from gigabrain_zenoh.host.stop_signals import stop_signals
 from gigabrain_zenoh.recording.node import listening, path_of, recover_others
 from gigabrain_zenoh.recording.play import Player, PlayOptions, check_nobody_drives
 from gigabrain_zenoh.recording.recorder import Recorder, Status
 from gigabrain_zenoh.recording.records import check_magic
-from gigabrain_zenoh.settings import RecorderConfig
-from gigabrain_zenoh.stop_signals import stop_signals
+from gigabrain_zenoh.runtime.joining import Where, joined
 
 LOOK_S = 0.5
 CLOSE_S = 10.0  # a slow disk may take as long to take the rest of a recording

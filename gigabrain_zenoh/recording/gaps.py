@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 
 from gigabrain_schemas.topics import BODY, IMAGE, IMU, SCAN, STATE
-from gigabrain_zenoh.bounded import put
+from gigabrain_zenoh.host.bounded import put
 
 OF_DRIVER = (STATE.key, SCAN.key, IMU.key, BODY.key, IMAGE.key)  # who makes the boot number
 

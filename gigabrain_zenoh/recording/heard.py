@@ -11,7 +11,7 @@ from gigabrain_schemas.topics import GRANTED, HEARD
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.recording.gaps import header_of
 from gigabrain_zenoh.recording.reading import Sample
-from gigabrain_zenoh.replay import Event
+from gigabrain_zenoh.runtime.replay import Event
 
 _heard = Codec(HEARD.type, HEARD.max_bytes)
 _granted = Codec(GRANTED.type, GRANTED.max_bytes)

@@ -5,8 +5,8 @@ from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
+from gigabrain_zenoh.bus.zenoh.unobtrusive import LONGEST_S
 from gigabrain_zenoh.recording.gaps import Gaps, Header, header_of
-from gigabrain_zenoh.unobtrusive import LONGEST_S
 
 MOST_PLACES = 1000  # keys and encodings; anybody may make up another
 OTHERS = "others"  # counts messages on keys beyond those

@@ -13,12 +13,12 @@ from pathlib import Path
 
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.topics import BODY, TOPICS
-from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.listening import topic_named
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.listening import topic_named
+from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.recording.recorder import Recorder
 from gigabrain_zenoh.recording.recover import recover_all
-from gigabrain_zenoh.settings import RecorderConfig
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from gigabrain_schemas.tasks import Granted
 from gigabrain_schemas.topics import GRANTED, STATE, WORLD
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.recording.gaps import header_of
-from gigabrain_zenoh.replay import Event
+from gigabrain_zenoh.runtime.replay import Event
 
 _granted = Codec(GRANTED.type, GRANTED.max_bytes)
 

@@ -11,12 +11,12 @@ from msgspec import Struct
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE, Topic
-from gigabrain_zenoh.bus import Bus
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import Transport
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.recording.bagfile import topic_of
 from gigabrain_zenoh.recording.node import chosen
 from gigabrain_zenoh.recording.reading import Bag, Sample
-from gigabrain_zenoh.transport import Transport
 
 LISTENERS_S = 0.5  # for those who listen to be known everywhere, before the first message goes
 ASK_S = 0.3

@@ -26,18 +26,18 @@ from gigabrain_schemas.topics import (
     Topic,
 )
 from gigabrain_zenoh.codec import Codec
-from gigabrain_zenoh.deployment import deployment_path, load_deployment
+from gigabrain_zenoh.config.process_config import ProcessConfig
+from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.gate import BRAIN
-from gigabrain_zenoh.process import Node
-from gigabrain_zenoh.process_config import ProcessConfig
+from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.recording.fields import message_of, row
 from gigabrain_zenoh.recording.heard import hearing
 from gigabrain_zenoh.recording.placing import placed
 from gigabrain_zenoh.recording.reading import Bag, Sample, samples
-from gigabrain_zenoh.replay import Event, replay
+from gigabrain_zenoh.runtime.deployment import deployment_path, load_deployment
+from gigabrain_zenoh.runtime.process import Node
+from gigabrain_zenoh.runtime.replay import Event, replay
 from gigabrain_zenoh.safety import host
-from gigabrain_zenoh.settings import Endpoint
 
 SAYS: dict[str, tuple[Topic[Any], ...]] = {
     "perception": (WORLD, POSE, MAP),

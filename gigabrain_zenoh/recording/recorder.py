@@ -10,11 +10,11 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.recording.bagfile import BagFile, topic_of
 from gigabrain_zenoh.recording.intake import Arrival, Intake
-from gigabrain_zenoh.settings import RecorderConfig
 
 log = logging.getLogger(__name__)
 

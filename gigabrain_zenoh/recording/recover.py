@@ -8,8 +8,8 @@ from mcap.records import Channel, Schema
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 
-from gigabrain_zenoh.bounded_file import open_regular
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.bounded_file import open_regular
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.records import MAGIC, Damage, Message, check_magic
 from gigabrain_zenoh.recording.tape import Tape, being_written

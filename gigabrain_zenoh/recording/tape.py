@@ -5,8 +5,8 @@ import fcntl
 import os
 from pathlib import Path
 
-from gigabrain_zenoh.bounded_file import open_regular
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.bounded_file import open_regular
 
 SYNC = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
 

@@ -1,4 +1,7 @@
-"""Safety: listens to all, trusts none, and says whether and how fast the body may move.
+"""Monitors that say whether and how fast the body may move, one file for each.
 
-One file for each thing that it looks after; `step` puts them side by side, `node` is the process.
+`step` puts them side by side, `node` is the process.
+
+It may import bus, gate, geometry and host; never perception, mapping or navigation.
+Launch, recording and qa may import it.
 """

@@ -13,7 +13,7 @@ from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import ImuData
-from gigabrain_zenoh.limits import ZERO, clamp, limits_of, ramp
+from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of, ramp
 from gigabrain_zenoh.safety.sustain import held, ticks_of
 from gigabrain_zenoh.safety.words import say
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
-from gigabrain_zenoh.limits import ZERO
+from gigabrain_zenoh.geometry.limits import ZERO
 
 Floats = NDArray[np.float64]
 

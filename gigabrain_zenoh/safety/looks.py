@@ -15,9 +15,9 @@ from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.planar import relative
-from gigabrain_zenoh.scan import Floats
-from gigabrain_zenoh.sweep import depth, edges, radius
+from gigabrain_zenoh.geometry.planar import relative
+from gigabrain_zenoh.geometry.scan import Floats
+from gigabrain_zenoh.geometry.sweep import depth, edges, radius
 
 OLDEST_TICKS = 30_000_000_000 // TICK_NS
 SPACING_M = 0.05  # of the places that are looked from; turns count by how far they take a corner

@@ -7,10 +7,10 @@ from gigabrain_schemas.base import Cause, Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import SAFETY, STATE
-from gigabrain_zenoh.ages import REPEAT_TICKS
-from gigabrain_zenoh.bus import Bus
-from gigabrain_zenoh.causes import in_words
-from gigabrain_zenoh.heartbeat import Progress
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.heartbeat import Progress
+from gigabrain_zenoh.gate.causes import in_words
+from gigabrain_zenoh.geometry.ages import REPEAT_TICKS
 from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.safety.host import HostWatch, Look
 from gigabrain_zenoh.safety.senses import Senses

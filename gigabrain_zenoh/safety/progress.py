@@ -9,7 +9,7 @@ import msgspec
 
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import RobotState, Thresholds
-from gigabrain_zenoh.gate_state import BRAIN
+from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.safety.sustain import held, ticks_of
 from gigabrain_zenoh.safety.words import say
 

@@ -24,11 +24,11 @@ from gigabrain_schemas.topics import (
     Topic,
     command_topic,
 )
-from gigabrain_zenoh.ages import scan_limit_ns
-from gigabrain_zenoh.bus import Bus, Latest
-from gigabrain_zenoh.earlier import Earlier
-from gigabrain_zenoh.freshness import LEAD_TICKS
-from gigabrain_zenoh.gate_state import BRAIN
+from gigabrain_zenoh.bus.bus import Bus, Latest
+from gigabrain_zenoh.bus.earlier import Earlier
+from gigabrain_zenoh.bus.freshness import LEAD_TICKS
+from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.geometry.ages import scan_limit_ns
 from gigabrain_zenoh.safety.attitude import horizontal
 from gigabrain_zenoh.safety.host import Look
 from gigabrain_zenoh.safety.progress import SYSTEMS, Bases

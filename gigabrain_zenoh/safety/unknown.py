@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.geometry.scan import Floats
+from gigabrain_zenoh.geometry.sweep import edges
 from gigabrain_zenoh.safety.looks import EDGE, Looks, free
-from gigabrain_zenoh.scan import Floats
-from gigabrain_zenoh.sweep import edges
 
 SECTORS = 36
 WIDTH = math.tau / SECTORS  # [rad]

@@ -68,7 +68,7 @@ class Velocity(Record, frozen=True, kw_only=True):
 class Cause(Record, frozen=True, kw_only=True):
     """Why the robot is held back."""
 
-    code: Name  # see gigabrain_zenoh.causes
+    code: Name  # see gigabrain_zenoh.gate.causes
     text: Text  # a sentence for people
     latching: bool = False  # stays until a person releases it
     remedy: Text = ""  # what to do about it, in the imperative

@@ -15,12 +15,12 @@ from gigabrain_drivers.links import port_name
 from gigabrain_drivers.links.address import address
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import GateStatus
-from gigabrain_zenoh import gate
-from gigabrain_zenoh.child import Lines, as_record
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.faults.chaos import told
-from gigabrain_zenoh.limits import limits_of
-from gigabrain_zenoh.running import folder, running
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.limits import limits_of
+from gigabrain_zenoh.host.child import Lines, as_record
+from gigabrain_zenoh.qa.proxy.chaos import told
+from gigabrain_zenoh.runtime.running import folder, running
 from tests.fuzz.harness import split
 
 PLACE = tempfile.TemporaryDirectory()  # removed at exit

@@ -9,9 +9,9 @@ import yaml
 
 from gigabrain_drivers.catalog import driver_class, link_options, robot_files
 from gigabrain_drivers.robot import LINKS, RobotFile
-from gigabrain_zenoh.config import loads
-from gigabrain_zenoh.deployment import Deployment
+from gigabrain_zenoh.config.loading import loads
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.runtime.deployment import Deployment
 from tests.fuzz.harness import ROOT, split
 
 KINDS = ("deployment", "robot")

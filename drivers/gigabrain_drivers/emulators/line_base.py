@@ -16,7 +16,7 @@ from gigabrain_drivers.line_options import LineOptions
 from gigabrain_drivers.protocols.line import LONGEST
 from gigabrain_drivers.protocols.line_number import Field
 from gigabrain_schemas.base import Velocity
-from gigabrain_zenoh.limits import clamp, limits_of
+from gigabrain_zenoh.geometry.limits import clamp, limits_of
 
 BOOT_NS = 300_000_000  # from power-on to the first state line
 BROWN_OUT_SHARE = 0.6  # of the battery's voltage; with less the board holds itself in reset

@@ -21,7 +21,7 @@ from gigabrain_schemas.base import TICK_NS, Message, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import Imu, LaserScan
 from gigabrain_schemas.topics import IMU, SCAN
-from gigabrain_zenoh.bridge import Bridge
+from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 

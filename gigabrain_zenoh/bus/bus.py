@@ -1,0 +1,276 @@
+"""Typed publish, subscribe and ask. The bus speaks messages; a transport speaks bytes."""
+
+import asyncio
+from collections import Counter
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any, TypeVar
+
+import msgspec
+
+from gigabrain_schemas.base import Cause, Message
+from gigabrain_schemas.topics import STATE, Service, Topic
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.bus.freshness import CLOCK_KEYS, Latest, RobotTime
+from gigabrain_zenoh.bus.params import Params
+from gigabrain_zenoh.bus.rejections import Rejections
+from gigabrain_zenoh.bus.transport import Close, OnLink, OnRaw, OnSample, Transport
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.errors import ClockLost, GigabrainError, Refused
+from gigabrain_zenoh.host.journal import Journal
+
+__all__ = ["Bus", "Latest", "RobotTime"]
+
+M = TypeVar("M", bound=Message)
+Q = TypeVar("Q", bound=Message)
+R = TypeVar("R", bound=Message)
+
+LOST_NS = 3_000_000_000  # without a state that can be believed, while others come
+PAUSE_NS = 1_000_000_000  # between two of them, and the count begins again
+FETCH_S = 1.0  # how long the one who keeps a value may take to hand it over
+
+
+class Bus:
+    """What a node sees of the outside world. Used on the event loop's thread only."""
+
+    def __init__(self, transport: Transport, clock: Clock, process: str = "") -> None:
+        self._transport, self.clock, self.process = transport, clock, process
+        self.time = RobotTime()
+        self.failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.sent: Counter[str] = Counter()
+        self.received: Counter[str] = Counter()
+        self._rejections = Rejections(clock)
+        self.rejected = self._rejections.counts
+        self.listens: list[str] = []
+        self.counters: Counter[str] = Counter()  # what a node counts of its own, for its health
+        self.problems: tuple[Cause, ...] = ()  # what a node cannot do now, for its health
+        self.latency_ms: dict[str, float] = {}  # what a node measures, for its health
+        self.report: Callable[[], Mapping[str, float | int | str | None]] = dict
+        self.journal = Journal()  # of what the node goes by
+        self.params = Params()  # what may be changed while the process runs
+        self.arrived: dict[str, tuple[int, int]] = {}  # boot and tick of the newest, by key
+        # whether work was done since the last call; a loop that turns, where a node says no more
+        self.progress: Callable[[], bool] = lambda: True
+        self._refusing_ns = self._refused_ns = 0  # since when, and when last
+        self._kept: dict[str, bytes] = {}
+        self._fetching: set[asyncio.Task[None]] = set()
+
+    def publish(self, topic: Topic[M], message: M, *, basis: int = 0, name: str = "") -> M:
+        """Send `message` with its header filled in; returns what was sent."""
+        key = topic.at(name)
+        self.sent[key] += 1
+        stamped = msgspec.structs.replace(
+            message,
+            stamp_ns=self.clock.unix_ns(),
+            seq=self.sent[key],
+            boot=self.time.boot,
+            tick=self.time.tick,
+            basis=basis,
+        )
+        payload, encoding = codec.encode(stamped), codec.encoding_of(topic.type)
+        if topic.keep:
+            self._keep(key, payload, encoding)
+        self._transport.publish(topic, key, payload, encoding)
+        return stamped
+
+    def latest(
+        self, topic: Topic[M], on_new: Callable[[M], None] | None = None, *, name: str = "*"
+    ) -> Latest[M]:
+        """Keep the newest message on `topic`; `on_new` is called with each as it arrives."""
+        latest = Latest(topic, self.clock, self.time)
+
+        def take(_key: str, message: M) -> None:
+            if latest.take(message) and on_new:
+                on_new(message)
+
+        self.subscribe(topic, take, name=name)
+        return latest
+
+    def subscribe(
+        self,
+        topic: Topic[M],
+        on_message: Callable[[str, M], None],
+        on_bad: Callable[[bytes], None] | None = None,
+        *,
+        name: str = "*",
+    ) -> Close:
+        """Call `on_message(key, message)` for each valid arrival, `on_bad(payload)` for others.
+
+        Returns the function that ends it.
+        """
+        decode, pattern = Codec(topic.type, topic.max_bytes).decode, topic.at(name)
+        moves_time = topic.key in CLOCK_KEYS
+
+        def receive(key: str, payload: bytes) -> bool:
+            self.received[pattern] += 1
+            try:
+                message = decode(payload)
+            except ValueError as error:
+                self._rejections.reject(pattern, error)
+                if on_bad:
+                    on_bad(payload)
+                return False
+            self._rejections.accept(pattern)
+            self.arrived[pattern] = message.boot, message.tick
+            self.journal.note(key, message.seq)
+            if moves_time and not self._in_time(topic, message):
+                return False
+            on_message(key, message)
+            return True
+
+        guarded = self._guard(receive)
+        if not topic.keep or topic.many:
+            return self._listening(
+                pattern, self._transport.subscribe(pattern, guarded, topic.depth)
+            )
+        live = False
+
+        def receive_live(key: str, payload: bytes) -> bool | None:
+            nonlocal live
+            taken = guarded(key, payload)
+            live = live or taken is True
+            return taken
+
+        ends = self._transport.subscribe(pattern, receive_live, topic.depth)
+        # what is said counts more than what anybody answers to have kept
+        self._fetch(topic, lambda key, payload: None if live else guarded(key, payload))
+        return self._listening(pattern, ends)
+
+    def tap(self, pattern: str, on_raw: OnRaw) -> Close:
+        """Call `on_raw(key, encoding, payload)` for all on `pattern`, valid or not, in any thread.
+
+        Returns the function that ends it.
+        """
+        return self._listening(pattern, self._transport.tap(pattern, on_raw))
+
+    async def kept(self, topic: Topic[Any]) -> list[bytes]:
+        """What those who keep the last value of `topic` hold now."""
+        replies = await self._transport.query(topic.key, b"", "", FETCH_S, topic.priority)
+        return [reply for reply in replies if not isinstance(reply, str)]
+
+    def serve(
+        self, service: Service[Q, R], answer: Callable[[Q], Awaitable[R]], *, name: str = ""
+    ) -> None:
+        """Answer `service`. An empty request counts as one with nothing but defaults."""
+        decode, key = Codec(service.request, service.max_bytes).decode, service.at(name)
+        encoding = codec.encoding_of(service.reply)
+
+        async def reply(payload: bytes) -> tuple[bytes, str]:
+            self.received[key] += 1
+            try:
+                request = decode(payload or b"{}")
+            except ValueError as error:
+                self._rejections.reject(key, error)
+                raise Refused(f"not a valid {service.request.__name__}: {error}") from None
+            self._rejections.accept(key)
+            try:
+                return codec.encode(await answer(request)), encoding
+            except GigabrainError:
+                raise
+            except Exception as error:
+                self._fail(error)
+                raise Refused(f"{self.process or key} failed: {error!r}") from error
+
+        self._transport.serve(key, reply, urgent=service.priority == "real_time")
+
+    async def ask(
+        self, service: Service[Q, R], request: Q, *, timeout_s: float = 1.0, name: str = ""
+    ) -> list[R]:
+        """Every answer that comes in time; none when nobody serves it. Raises Refused, with why."""
+        decode, key = Codec(service.reply, service.max_bytes).decode, service.at(name)
+        payload, encoding = codec.encode(request), codec.encoding_of(service.request)
+        answers = []
+        for reply in await self._transport.query(
+            key, payload, encoding, timeout_s, service.priority
+        ):
+            if isinstance(reply, str):
+                raise Refused(reply)
+            try:
+                answers.append(decode(reply))
+            except ValueError as error:
+                self._rejections.reject(key, error)
+        return answers
+
+    def links(self, on_link: OnLink) -> Close:
+        """Call `on_link` for everybody who is linked to this process, or is no more."""
+        return self._transport.links(on_link)
+
+    async def close(self) -> None:
+        """Leave the network."""
+        for task in self._fetching:
+            task.cancel()
+        await self._transport.close()
+
+    def _listening(self, pattern: str, ends: Close) -> Close:
+        """Note that somebody listens; the returned function ends that, any number of times."""
+        self.listens.append(pattern)
+        over = False
+
+        def close() -> None:
+            nonlocal over
+            if not over:
+                over = True
+                ends()
+                self.listens.remove(pattern)
+
+        return close
+
+    def _in_time(self, topic: Topic[Any], message: Message) -> bool:
+        """Move the robot's time. Return whether the message is to be believed.
+
+        Where it hears nothing but states that it refuses, its own time is wrong: the process ends.
+        """
+        believed, now_ns = self.time.see(message), self.clock.now_ns()
+        if not believed:
+            self.counters["refused_ticks"] += 1
+        if topic.key != STATE.key:
+            return believed
+        if believed or now_ns - self._refused_ns > PAUSE_NS:
+            self._refusing_ns = now_ns
+        self._refused_ns = now_ns
+        if not believed and now_ns - self._refusing_ns > LOST_NS:
+            self._fail(ClockLost(
+                f"every {topic.key} has been refused for {LOST_NS / 1e9:g} s: this process is at "
+                f"tick {self.time.tick}, the newest claims to be of tick {message.tick}"
+            ))  # fmt: skip
+        return believed
+
+    def _guard(self, receive: OnSample) -> OnSample:
+        """A fault in a node ends its process: `failed` carries it to whoever runs the node."""
+
+        def guarded(key: str, payload: bytes) -> bool | None:
+            try:
+                return receive(key, payload)
+            except Exception as error:  # noqa: BLE001 - handed on whole, to be raised by the runner
+                self._fail(error)
+                return None
+
+        return guarded
+
+    def _fail(self, error: Exception) -> None:
+        if not self.failed.done():
+            self.failed.set_exception(error)
+
+    def _keep(self, key: str, payload: bytes, encoding: str) -> None:
+        first = key not in self._kept
+        self._kept[key] = payload
+
+        async def answer(_payload: bytes) -> tuple[bytes, str]:
+            return self._kept[key], encoding
+
+        if first:
+            self._transport.serve(key, answer)
+
+    def _fetch(self, topic: Topic[Any], receive: OnSample) -> None:
+        """Ask for the kept value, for a subscriber that comes after it was sent."""
+
+        async def fetch() -> None:
+            try:
+                for payload in await self.kept(topic):
+                    receive(topic.key, payload)
+            except Exception as error:  # noqa: BLE001 - as in `_guard`: nobody waits for this task
+                self._fail(error)
+
+        task = asyncio.get_running_loop().create_task(fetch())
+        self._fetching.add(task)
+        task.add_done_callback(self._fetching.discard)

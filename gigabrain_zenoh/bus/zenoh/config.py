@@ -1,0 +1,157 @@
+"""Configuration of Zenoh sessions, and explanations of their errors. Does not import Zenoh."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from msgspec import structs
+
+from gigabrain_zenoh.bus.zenoh.bounds import bounds
+from gigabrain_zenoh.config.addresses import LOCAL_ENDPOINT, host_and_port
+from gigabrain_zenoh.config.settings import Endpoint, RouterConfig
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.security.acl import access_control, known_names
+from gigabrain_zenoh.security.files import CA, CERTIFICATE, KEY, check_files
+from gigabrain_zenoh.security.list_file import generations_in
+
+# Runs Zenoh in one thread, except for sending: a message then wakes half as many threads. The
+# variable is documented by Zenoh (zenoh_runtime::ZRuntime); a value set by the user wins.
+ZENOH_RUNTIME = "(rx: (handover: app), acc: (handover: app), net: (handover: app))"
+
+SECURE, PLAIN = "tls/", "tcp/"
+ROOMY = ("real_time", "interactive_high", "data_high", "data")
+PENDING = 4000  # links that may wait to be accepted; silent ones are dropped after a second
+
+
+def session_config(endpoint: Endpoint) -> dict[str, Any]:
+    """Build the configuration of a client, a router, or a relay (which listens and connects).
+
+    It uses explicit endpoints, no multicast, and short leases.
+
+    With keys, all traffic that leaves the machine uses TLS with certificates on both ends. A router
+    grants each client its certificate's rights. Raises ConfigError for an endpoint that Zenoh would
+    wait for forever, and for missing keys.
+    """
+    endpoint = secured(endpoint)
+    if not endpoint.listen and not endpoint.connect:
+        raise ConfigError("no router to connect to, and nowhere to listen")
+    for text in (*endpoint.listen, *endpoint.connect):
+        _check(text)
+    if not endpoint.keys:
+        return session_settings(endpoint)
+    check_files(Path(endpoint.keys))
+    return session_settings(endpoint) | security(endpoint, generations_in(Path(endpoint.keys)))
+
+
+def session_settings(endpoint: Endpoint) -> dict[str, Any]:
+    """Build the settings that all sessions share, with keys or without."""
+    config: dict[str, Any] = {
+        "mode": "router" if endpoint.listen else "client",
+        "listen/endpoints": list(endpoint.listen),
+        "connect/endpoints": list(endpoint.connect),
+        "connect/timeout_ms": -1,  # wait for the router as long as it takes
+        "connect/exit_on_failure": False,
+        "connect/retry": {
+            "period_init_ms": 100,
+            "period_max_ms": 500,
+            "period_increase_factor": 2,
+        },
+        "scouting/multicast/enabled": False,
+        "scouting/delay": 0,  # otherwise a router waits half a second for others to find it
+        "transport/unicast/open_timeout": 1000,
+        "transport/unicast/accept_timeout": 1000,
+        "transport/unicast/accept_pending": PENDING,
+        "transport/link/tx/lease": 400,
+        "transport/link/tx/keep_alive": 4,
+        # each small message that is not batched occupies one slot
+        "transport/link/tx/queue/size": dict.fromkeys(ROOMY, 16),
+        "transport/link/rx/max_message_size": 16 << 20,
+        "transport/shared_memory/enabled": False,
+    }
+    if endpoint.listen and (endpoint.keys or endpoint.connect):
+        config["adminspace/enabled"] = False
+    if endpoint.listen:
+        config |= bounds()
+    if endpoint.namespace:
+        config["namespace"] = endpoint.namespace
+    return config
+
+
+def security(endpoint: Endpoint, generations: Mapping[str, int]) -> dict[str, Any]:
+    """Build the settings that keys add: TLS in both directions, and access control in a router."""
+    folder, side = Path(endpoint.keys), "connect" if endpoint.connect else "listen"
+    config: dict[str, Any] = {
+        "transport/link/tls": {
+            "root_ca_certificate": str(folder / CA),
+            "enable_mtls": True,
+            "close_link_on_expiration": True,
+            f"{side}_private_key": str(folder / KEY),
+            f"{side}_certificate": str(folder / CERTIFICATE),
+        }
+    }
+    if endpoint.listen and not endpoint.connect:  # a relay is checked by the router it connects to
+        config["access_control"] = access_control(
+            robots_of(endpoint), endpoint.namespace, generations
+        )
+    return config
+
+
+def robots_of(endpoint: Endpoint) -> tuple[str, ...]:
+    """Return the namespaces of the robots that a router serves: its own, and the fleet's."""
+    own = (endpoint.namespace,) if endpoint.namespace or not endpoint.fleet else ()
+    return tuple(dict.fromkeys((*own, *endpoint.fleet)))
+
+
+def router_config(endpoint: Endpoint, state_dir: Path) -> RouterConfig:
+    """Build the router process's settings, with the names that have rights in its session."""
+    if not endpoint.keys:
+        return RouterConfig(state_dir=str(state_dir))
+    knows = known_names(robots_of(endpoint), generations_in(Path(endpoint.keys)))
+    return RouterConfig(state_dir=str(state_dir), knows=knows)
+
+
+def secured(endpoint: Endpoint) -> Endpoint:
+    """Return the endpoint with TLS in place of TCP if it has keys. Raises ConfigError."""
+    texts = (*endpoint.listen, *endpoint.connect)
+    if not endpoint.keys:
+        bare = [text for text in texts if text.startswith(SECURE)]
+        if bare:
+            raise ConfigError(f"{bare[0]} needs keys; name their folder, or use tcp/")
+        return endpoint
+    for text in texts:
+        if not text.startswith((SECURE, PLAIN)) and not LOCAL_ENDPOINT.fullmatch(text):
+            raise ConfigError(f"{text!r}: with keys, expected one like tls/192.168.1.10:7447")
+    return structs.replace(
+        endpoint,
+        connect=tuple(_secure(text) for text in endpoint.connect),
+        listen=tuple(_secure(text) for text in endpoint.listen),
+    )
+
+
+def _secure(text: str) -> str:
+    return SECURE + text.removeprefix(PLAIN) if text.startswith(PLAIN) else text
+
+
+def explain(endpoint: Endpoint, error: str) -> str:
+    """Explain in one line why a session could not be opened."""
+    text, listens = plain(error), ", ".join(endpoint.listen)
+    if listens and "address already in use" in text.lower():
+        return f"the router's port is taken ({listens}); stop what uses it, or choose another"
+    if listens:
+        return f"the router cannot listen on {listens}: {text}"
+    return f"no session with {', '.join(endpoint.connect)}: {text}"
+
+
+def plain(error: str) -> str:
+    """Return Zenoh's message without locations in its source code."""
+    text = re.sub(r" at \S+\.rs:\d+\.?", "", " ".join(error.split()))
+    inner = re.search(r'msg: "(.+?)", location', text)
+    return inner[1] if inner else text
+
+
+def _check(text: str) -> None:
+    try:
+        host_and_port(text)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None

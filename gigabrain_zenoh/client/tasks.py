@@ -1,0 +1,189 @@
+"""Client for tasks from a script: send the robot to a goal, and follow the task's progress."""
+
+import asyncio
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.tasks import (
+    GoalRequest,
+    How,
+    MissionRequest,
+    Task,
+    TaskRequest,
+    TaskStatus,
+)
+from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Service
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.client.asking import ANSWER_S
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
+from gigabrain_zenoh.security.checks import may_not_ask
+
+LARGEST = 1e9  # limit of coordinates on the bus
+PLAN_S = 5.0  # how long path planning in a large map may take
+SILENT_S = 5.0  # after this long without a task status, the robot counts as lost
+STARTING_S = 3.0  # how long a starting robot may take until it serves goals
+AGAIN_S = 0.2
+OnNews = Callable[[TaskStatus], None]
+Q = TypeVar("Q", bound=Message)
+R = TypeVar("R", bound=Message)
+OnWait = Callable[[str], None]
+
+
+class Tasks:
+    """Client for the tasks of one robot."""
+
+    def __init__(
+        self,
+        bus: Bus,
+        keys: str = "",
+        *,
+        on_wait: OnWait | None = None,
+        starting_s: float = STARTING_S,
+        silent_s: float = SILENT_S,
+    ) -> None:
+        """Create a client that waits up to `starting_s` for a process that serves goals.
+
+        The callback `on_wait` receives a text when it starts to wait. After `silent_s` without a
+        task status, BodyLost is raised.
+        """
+        self._bus, self._keys = bus, keys
+        self._on_wait, self._starting_s, self._silent_s = on_wait, starting_s, silent_s
+        self._news = asyncio.Event()
+        self._newest: TaskStatus | None = None
+        self._heard = False
+
+    async def go_to(
+        self, x: float, y: float, yaw: float | None = None, *, how: How = "replace"
+    ) -> str:
+        """Send the robot to a pose in its map [m, m, rad]; return the task's name.
+
+        Raises ConfigError for numbers that are not valid, and Refused.
+        """
+        given = (x, y) if yaw is None else (x, y, yaw)
+        if not all(abs(value) <= LARGEST for value in given):
+            numbers = " ".join(f"{value:g}" for value in given)
+            raise ConfigError(f"a goal takes numbers up to {LARGEST:g}, got {numbers}")
+        self._listen()
+        request = GoalRequest(x=x, y=y, yaw=yaw, how=how, source=self._bus.process)
+        reply = await self._ask(GOAL, request, PLAN_S)
+        if not reply.ok:
+            raise Refused(reply.text)
+        return reply.goal
+
+    async def carry_out(
+        self, mission: str | Path, *, how: How = "replace", label: str = "mission"
+    ) -> str:
+        """Start a mission, given as a file or as its text; return the task's name.
+
+        Raises ConfigError with the line number for an invalid mission, and Refused.
+        """
+        self._listen()
+        from gigabrain_zenoh.decision.tasks.checks import (  # slow import, only when used
+            load,
+            refuse_long,
+        )
+
+        if isinstance(mission, Path):
+            label = mission.stem
+            mission = load(mission)[1]
+        refuse_long(mission, label)
+        request = MissionRequest(
+            mission=mission,
+            how=how,
+            source=self._bus.process,
+            label=label.encode(errors="replace").decode()[:64],  # file names may be any bytes
+        )
+        reply = await self._ask(MISSION, request, PLAN_S)
+        if not reply.ok:
+            raise Refused(reply.text)
+        return reply.task
+
+    async def explore(self, *, how: How = "replace") -> str:
+        """Start exploring until nothing unknown is reachable; return the task's name."""
+        return await self.carry_out("do: [{explore: {}}]", how=how, label="exploring")
+
+    async def cancel(self, task: str = "") -> str:
+        """Cancel a task by name, the current one (empty name), or `all`; return the reply in words.
+
+        Raises Refused.
+        """
+        return await self._change(TaskRequest(do="cancel", task=task, source=self._bus.process))
+
+    async def pause(self, task: str = "") -> str:
+        """Pause a task; return the reply in words. Raises Refused."""
+        return await self._change(TaskRequest(do="pause", task=task, source=self._bus.process))
+
+    async def resume(self, task: str = "") -> str:
+        """Resume a paused task; return the reply in words. Raises Refused."""
+        return await self._change(TaskRequest(do="resume", task=task, source=self._bus.process))
+
+    async def status(self) -> TaskStatus:
+        """Return the current, the waiting and the most recent ended tasks. Raises BodyLost."""
+        self._listen()
+        if self._newest is None:
+            await self._hear()
+        assert self._newest
+        return self._newest
+
+    async def result(self, task: str, on_news: OnNews | None = None) -> Task:
+        """Wait until a task has ended, and return it. Raises BodyLost.
+
+        Meanwhile `on_news` is called with each status.
+        """
+        self._listen()
+        while True:
+            status = self._newest
+            if status:
+                for one in status.done:
+                    if one.id == task:
+                        return one
+                if on_news:
+                    on_news(status)
+            await self._hear()
+
+    async def _ask(self, service: Service[Q, R], request: Q, timeout_s: float) -> R:
+        """Return the first answer; retry while no process serves tasks, as on a starting robot."""
+        now = asyncio.get_running_loop().time
+        until, waits = now() + self._starting_s, False
+        while True:
+            asked = now()
+            replies = await self._bus.ask(service, request, timeout_s=timeout_s)
+            if replies:
+                return replies[0]
+            # after a timeout the request may have been received: do not repeat it
+            if now() >= min(until, asked + timeout_s) or may_not_ask(self._keys):
+                raise self._nobody()
+            if self._on_wait and not waits:
+                self._on_wait("waiting: nobody serves goals yet; is the robot just starting?")
+            waits = True
+            await asyncio.sleep(AGAIN_S)
+
+    def _listen(self) -> None:
+        if not self._heard:
+            self._heard = True
+            self._bus.subscribe(TASK, self._take)
+
+    def _take(self, _key: str, status: TaskStatus) -> None:
+        self._newest = status
+        self._news.set()
+
+    async def _hear(self) -> None:
+        self._news.clear()
+        try:
+            await asyncio.wait_for(self._news.wait(), self._silent_s)
+        except TimeoutError:
+            raise self._nobody() from None
+
+    async def _change(self, request: TaskRequest) -> str:
+        reply = await self._ask(TASK_CHANGE, request, ANSWER_S)
+        if not reply.ok:
+            raise Refused(reply.text)
+        return reply.text
+
+    def _nobody(self) -> BodyLost:
+        doubt = may_not_ask(self._keys)
+        return BodyLost(
+            f"nobody serves goals{doubt or '; does decision run with behaviour: navigate?'}"
+        )

@@ -1,0 +1,130 @@
+"""Trajectory tracking, based on the body's predicted pose when a command takes effect.
+
+Feed-forward compensates the body's lag. Feedback for bodies that cannot move sideways is that of De
+Luca, Oriolo and Samson (1998, equation 4.73). For bodies that can, it is proportional on each axis.
+"""
+
+import math
+from bisect import bisect_right
+
+from gigabrain_schemas.base import TICK_NS, Pose, Velocity
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.brain import Intent, Response, TrajectoryPoint
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.geometry.planar import between, compose, relative
+
+TICK_S = TICK_NS / 1e9
+LONGEST_DELAY_TICKS = 15
+FARTHEST_OFF_M, FARTHEST_OFF_RAD = 0.3, 0.8  # beyond these, it is not driving this trajectory
+DAMPING, STIFFNESS = 0.7, 10.0  # feedback parameters, the second in [1/m2]
+SLOWEST, QUICKEST = 0.8, 2.5  # [1/s], bounds of the feedback's bandwidth
+LATERAL_GAIN = 1.5  # [1/s], feedback for bodies that can move sideways
+SHORTEST_LAG_S, LONGEST_LAG_S = 1e-3, 0.5
+MOST_GAIN = 2.0  # largest factor by which turn rates are increased or reduced
+
+
+def wanted(
+    body: BodyDescription,
+    intent: Intent,
+    tick: int,
+    start: Pose,
+    here: Pose,
+    velocity: Velocity,
+    told: tuple[Velocity, ...],
+) -> Velocity | None:
+    """Return the command at `tick` that tracks the trajectory; None when it is too far off.
+
+    The odometry poses `start` and `here` are at the intent's basis and now; `velocity` is measured.
+    The commands of the previous ticks are in `told`, newest last. After the end of the trajectory,
+    the command is zero.
+    """
+    late = min(round(intent.response.delay / TICK_S), LONGEST_DELAY_TICKS)
+    t = (tick - intent.basis + late) * TICK_S
+    points = intent.trajectory
+    i = bisect_right(points, t, key=lambda point: point.t)
+    if i == len(points):
+        return ZERO
+    before, after = points[max(i - 1, 0)], points[i]
+    on_it = between(_pose(before), _pose(after), _share(before, after, t))
+    error = relative(predicted(here, velocity, told, late, intent.response), compose(start, on_it))
+    if math.hypot(error.x, error.y) > FARTHEST_OFF_M or abs(error.yaw) > FARTHEST_OFF_RAD:
+        return None
+    planned = _without_lag(before, after, intent.response)
+    if body.max_lateral_speed > 0 and body.drive_type != "ackermann":
+        return _holonomic(planned, error)
+    return _tightest(body, _unicycle(planned, error))
+
+
+def undone(turn_gain: float) -> float:
+    """Return the factor for turn rates that undoes the body's `turn_gain`, within MOST_GAIN."""
+    return max(1.0 / MOST_GAIN, min(MOST_GAIN, 1.0 / turn_gain))
+
+
+def predicted(
+    here: Pose, velocity: Velocity, told: tuple[Velocity, ...], ticks: int, response: Response
+) -> Pose:
+    """Predict the body's pose after `ticks` ticks, from the commands already sent (`told`)."""
+    follows = 1.0 - math.exp(-TICK_S / _lag(response))
+    vx, vy, w = velocity.linear_x, velocity.linear_y, velocity.angular_z
+    pose = here
+    for command in told[-ticks:] if ticks else ():
+        vx += follows * (command.linear_x - vx)
+        vy += follows * (command.linear_y - vy)
+        w += follows * (command.angular_z - w)
+        middle = Pose(x=pose.x, y=pose.y, yaw=pose.yaw + w * TICK_S / 2)
+        gone = compose(middle, Pose(x=vx * TICK_S, y=vy * TICK_S, yaw=w * TICK_S / 2))
+        pose = gone
+    return pose
+
+
+def _lag(response: Response) -> float:
+    return max(SHORTEST_LAG_S, min(LONGEST_LAG_S, response.lag))
+
+
+def _pose(point: TrajectoryPoint) -> Pose:
+    return Pose(x=point.x, y=point.y, yaw=point.yaw)
+
+
+def _share(before: TrajectoryPoint, after: TrajectoryPoint, t: float) -> float:
+    length = after.t - before.t
+    return max(0.0, min(1.0, (t - before.t) / length)) if length > 0 else 1.0
+
+
+def _without_lag(before: TrajectoryPoint, after: TrajectoryPoint, response: Response) -> Velocity:
+    """Return the steady command that takes a body with this lag from one velocity to the next."""
+    left = math.exp(-max(after.t - before.t, TICK_S) / _lag(response))
+    return Velocity(
+        linear_x=(after.linear_x - left * before.linear_x) / (1.0 - left),
+        linear_y=(after.linear_y - left * before.linear_y) / (1.0 - left),
+        angular_z=(after.angular_z - left * before.angular_z) / (1.0 - left),
+    )
+
+
+def _unicycle(planned: Velocity, error: Pose) -> Velocity:
+    v, w = planned.linear_x, planned.angular_z
+    bandwidth = min(max(math.sqrt(w * w + STIFFNESS * v * v), SLOWEST), QUICKEST)
+    along = 2 * DAMPING * bandwidth
+    across = min(STIFFNESS * abs(v), bandwidth * bandwidth / max(abs(v), 1e-6))
+    straight = math.sin(error.yaw) / error.yaw if abs(error.yaw) > 1e-6 else 1.0
+    return Velocity(
+        linear_x=v * math.cos(error.yaw) + along * error.x,
+        angular_z=w + math.copysign(across, v) * straight * error.y + along * error.yaw,
+    )
+
+
+def _holonomic(planned: Velocity, error: Pose) -> Velocity:
+    cosine, sine = math.cos(error.yaw), math.sin(error.yaw)
+    vx, vy = planned.linear_x, planned.linear_y
+    return Velocity(
+        linear_x=cosine * vx - sine * vy + LATERAL_GAIN * error.x,
+        linear_y=sine * vx + cosine * vy + LATERAL_GAIN * error.y,
+        angular_z=planned.angular_z + LATERAL_GAIN * error.yaw,
+    )
+
+
+def _tightest(body: BodyDescription, wish: Velocity) -> Velocity:
+    """Limit a car's turn rate to its tightest curve: full speed with the largest yaw rate."""
+    if body.drive_type != "ackermann":
+        return wish
+    most = abs(wish.linear_x) * body.max_angular_speed / body.max_linear_speed
+    return Velocity(linear_x=wish.linear_x, angular_z=max(-most, min(most, wish.angular_z)))

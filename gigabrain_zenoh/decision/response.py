@@ -1,0 +1,202 @@
+"""Estimates a body's response delay and lag from commands and measured speeds while it drives.
+
+Each candidate is a pair of a delay and a first-order lag on a grid. It predicts the measured speed
+from the commands. Each axis has its own gain, and noise of unknown size. The estimate is the mean
+of all candidates, weighted by posterior: a Gaussian prior times the profile likelihood. The log
+likelihood is -n/2 log(squared error / n), summed over the axes, with exponential forgetting. A
+constant command carries no information about the response, so nothing is learnt from it.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import CmdVel, Response
+from gigabrain_zenoh.bus.freshness import LEAD_TICKS
+from gigabrain_zenoh.gate.state import BRAIN
+
+Floats = NDArray[np.float64]
+
+TICK_S = TICK_NS / 1e9
+PRIOR = Response(delay=0.04, lag=0.06)  # used until enough has been learnt
+DELAYS = 16  # candidates, a tick apart: 0 to 0.3 s
+DELAYS_S = TICK_S * np.arange(DELAYS)
+LAGS_S = 0.02 * np.arange(26)  # candidates: 0 to 0.5 s
+LATE_TICKS = 5  # how late a tick's messages may arrive without affecting the result
+SILENT_TICKS = 5  # after this long without a command, the gate stops the body
+EXCITED_TICKS = 30  # how long a change of the command is informative
+LEAST_CHANGE = (0.04, 0.15)  # [m/s], [rad/s], within EXCITED_TICKS; smaller changes drown in noise
+NOISE = (0.004, 0.01)  # [m/s], [rad/s], minimum; prevents overconfidence in an exact model
+MEMORY_TICKS = 1000  # excited ticks; time constant with which squared errors are forgotten
+ENOUGH_TICKS = 40  # excited ticks before the estimate is used
+LOOK_TICKS = 5  # between evaluations of all candidates
+SPREAD_S = 0.1  # standard deviation of the prior
+ALIKE = 4.0  # errors of neighbouring ticks correlate: this many ticks count as one sample
+GAINS = (0.5, 1.5)  # range of plausible gains; outside it the body is not driving freely
+
+
+class Axis:
+    """Predictions and accumulated squared errors of all candidates, for one axis."""
+
+    def __init__(self, least_change: float, noise: float) -> None:
+        self._least_change, self._noise = least_change, noise
+        # a candidate with zero lag reaches the commanded speed by the next tick
+        self._follows = 1.0 - np.exp(-TICK_S / np.maximum(LAGS_S, 1e-9))
+        self._outputs = np.zeros((DELAYS, len(LAGS_S)))  # row 0: no delay, row 1: one tick, …
+        self._told = [0.0] * EXCITED_TICKS
+        self._model_model, self._model_measured = np.zeros((2, DELAYS, len(LAGS_S)))
+        self._measured_measured = 0.0
+        self.weight = 0.0  # discounted number of excited ticks
+
+    def rest(self, measured: float) -> None:
+        """Reset the predictions to the measured speed, while the body follows no command."""
+        self._outputs[:] = measured
+        self._told = [measured] * EXCITED_TICKS
+
+    def tick(self, told: float, measured: float) -> bool:
+        """Process one tick's commanded and measured speed; return whether it was informative."""
+        excited = max(self._told) - min(self._told) > self._least_change
+        if excited:
+            keep = 1.0 - 1.0 / MEMORY_TICKS
+            self._model_model = keep * self._model_model + self._outputs * self._outputs
+            self._model_measured = keep * self._model_measured + self._outputs * measured
+            self._measured_measured = keep * self._measured_measured + measured * measured
+            self.weight = keep * self.weight + 1.0
+        self._outputs[1:] = self._outputs[:-1]
+        self._outputs[0] += self._follows * (told - self._outputs[0])
+        self._told = [*self._told[1:], told]
+        return excited
+
+    def gains(self) -> Floats:
+        """Return the gain that fits each candidate's output best, within GAINS, (delays, lags)."""
+        found: Floats = self._model_measured / np.maximum(self._model_model, 1e-12)
+        return np.clip(found, *GAINS)
+
+    def cost(self) -> Floats:
+        """Return each candidate's negative log likelihood, (delays, lags)."""
+        gains = self.gains()
+        errors = self._measured_measured - gains * (
+            2.0 * self._model_measured - gains * self._model_model
+        )
+        mean = np.maximum(errors, 0.0) / max(self.weight, 1.0)
+        found: Floats = 0.5 * self.weight * np.log(mean + self._noise**2)
+        return found
+
+
+class ResponseEstimator:
+    """Estimates a body's response from its commands and states."""
+
+    def __init__(self, prior: Response = PRIOR) -> None:
+        self._prior, self._newest = prior, 0  # tick of the newest state
+        self._begin(0)
+
+    @property
+    def response(self) -> Response:
+        """Return the current estimate; the prior until enough has been learnt."""
+        return self._response
+
+    @property
+    def turn_gain(self) -> float:
+        """Return the ratio of measured to commanded turn rate, as in `response`."""
+        return self._response.turn_gain
+
+    def command(self, command: CmdVel) -> None:
+        """Add a command of the commander or the brain; for each tick, keep the highest `seq`.
+
+        The gate uses `seq` as well, because other clients may publish under the commander's name.
+        """
+        in_time = self._done < command.tick <= self._newest + LEAD_TICKS
+        known = command.source in (BRAIN, self._commander)
+        if command.boot != self._boot or not in_time or not known:
+            return
+        key = command.tick, command.source
+        if key not in self._commands or command.seq >= self._commands[key].seq:
+            self._commands[key] = command
+
+    def state(self, state: RobotState) -> None:
+        """Add a robot state, to be evaluated LATE_TICKS later, when its commands have arrived."""
+        if state.boot != self._boot:
+            self._begin(state.boot)
+        if state.tick <= self._done:
+            return
+        self._newest = max(self._newest, state.tick)
+        self._commander = state.gate.commander or BRAIN
+        self._states[state.tick] = state
+        for tick in sorted(self._states):
+            if tick <= state.tick - LATE_TICKS:
+                self._look(self._states.pop(tick))
+
+    def sent(self, after: int, until: int) -> tuple[tuple[int, Velocity], ...]:
+        """Return the commander's commands with their ticks, for `after` < tick <= `until`.
+
+        The command of a tick may still be in transit when the state of the next tick arrives.
+        """
+        mine = self._commander
+        coming = {tick: told for (tick, source), told in self._commands.items() if source == mine}
+        recent = {**self._past, **coming}
+        return tuple(
+            (tick, velocity_of(recent[tick])) for tick in sorted(recent) if after < tick <= until
+        )
+
+    def _begin(self, boot: int) -> None:
+        self._boot, self._done = boot, 0
+        self._newest = 0
+        self._commander = BRAIN
+        self._commands: dict[tuple[int, str], CmdVel] = {}  # by tick and source
+        self._past: dict[int, CmdVel] = {}  # the commander's, already evaluated
+        self._states: dict[int, RobotState] = {}
+        self._told: CmdVel | None = None
+        self._axes = tuple(Axis(*each) for each in zip(LEAST_CHANGE, NOISE, strict=True))
+        self._response = self._prior
+
+    def _look(self, state: RobotState) -> None:
+        learnt = False
+        for tick in range(max(self._done + 1, state.tick - SILENT_TICKS), state.tick + 1):
+            # a missed state is assumed to equal the next one
+            learnt |= self._one_tick(tick, state)
+        self._done = state.tick
+        for tick, source in [key for key in self._commands if key[0] <= self._done]:
+            told = self._commands.pop((tick, source))
+            if source == (state.gate.commander or BRAIN):
+                self._past[tick] = told
+        for tick in [tick for tick in self._past if tick <= self._done - DELAYS]:
+            del self._past[tick]
+        if learnt and self._done % LOOK_TICKS == 0:
+            self._weigh()
+
+    def _one_tick(self, tick: int, state: RobotState) -> bool:
+        gate, measured = state.gate, state.velocity
+        self._told = told = self._commands.get((tick, gate.commander), self._told)
+        x, z = self._axes
+        obeyed = told and gate.mode == "enabled" and told.source == gate.commander
+        if not told or not obeyed or told.tick < tick - SILENT_TICKS:
+            x.rest(measured.linear_x)
+            z.rest(measured.angular_z)
+            return False
+        forward = x.tick(told.linear_x, measured.linear_x)
+        turn = z.tick(told.angular_z, measured.angular_z)
+        return forward or turn
+
+    def _weigh(self) -> None:
+        """Set the response to the mean of all candidates, weighted by their likelihood."""
+        x, z = self._axes
+        if x.weight + z.weight < ENOUGH_TICKS:
+            return
+        off = (DELAYS_S[:, None] - self._prior.delay) ** 2 + (LAGS_S - self._prior.lag) ** 2
+        cost = (x.cost() + z.cost()) / ALIKE + off / (2 * SPREAD_S**2)
+        likely = np.exp(cost.min() - cost)
+        likely /= likely.sum()
+        known = z.weight >= ENOUGH_TICKS
+        self._response = Response(
+            delay=float((likely * DELAYS_S[:, None]).sum()),
+            lag=float((likely * LAGS_S).sum()),
+            turn_gain=float((likely * z.gains()).sum()) if known else self._prior.turn_gain,
+        )
+
+
+def velocity_of(command: CmdVel) -> Velocity:
+    """Return the velocity that `command` requests."""
+    return Velocity(
+        linear_x=command.linear_x, linear_y=command.linear_y, angular_z=command.angular_z
+    )

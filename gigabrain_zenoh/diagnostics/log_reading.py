@@ -1,0 +1,114 @@
+"""`gigabrain log`: what the processes of a run have written down, and what they say now."""
+
+import re
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gigabrain_schemas.safety import LogRecord
+from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.host.bounded_file import open_regular
+from gigabrain_zenoh.host.log_text import LEVELS
+from gigabrain_zenoh.logs import FILE_BYTES, state_dir
+
+LOGS = "*.jsonl*"  # driver.jsonl, and driver.jsonl.1 before it
+UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
+Line = Mapping[str, Any]
+
+
+class Wanted(msgspec.Struct, frozen=True, kw_only=True):
+    """Which lines."""
+
+    process: str = ""  # all without
+    level: str = "debug"  # and above
+    since_ns: int = 0  # Unix time
+
+    def __post_init__(self) -> None:
+        if self.level not in LEVELS:
+            raise unknown("log level", self.level, LEVELS)
+
+    def has(self, line: Line) -> bool:
+        """Whether a line is among them."""
+        return (
+            self.process in ("", line["process"])
+            and LEVELS.index(line["level"]) >= LEVELS.index(self.level)
+            and line["t"] >= self.since_ns
+        )
+
+
+def ago_ns(text: str, now_ns: int) -> int:
+    """Unix time of `90s`, `10m`, `2h` or `1d` ago. Raises ConfigError."""
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", text)
+    if not found:
+        raise ConfigError(f"--since {text}: expected a time such as 90s, 10m, 2h or 1d")
+    return now_ns - round(float(found[1]) * UNITS[found[2]] * 1e9)
+
+
+def run_folder(name: str = "") -> Path:
+    """The folder of a run, by path or by part of its name; without one the newest.
+
+    Raises ConfigError, and UnknownName.
+    """
+    if name and Path(name).is_dir():
+        if not any(Path(name).glob(LOGS)):
+            raise ConfigError(f"{name}: holds no logs; expected files such as decision.jsonl")
+        return Path(name)
+    base = state_dir() / "runs"
+    runs = sorted((p for p in base.glob("*") if p.is_dir()), key=lambda p: p.name)
+    if not runs:
+        raise ConfigError(f"no run has left a log in {base}; start one with `gigabrain demo`")
+    found = [run for run in runs if name in run.name]
+    if not found:
+        raise unknown("run", name, [run.name for run in runs[-5:]])
+    return found[-1]
+
+
+def read(folder: Path, wanted: Wanted, newest: int) -> list[Line]:
+    """The newest lines of all processes of a run, oldest first. Raises ConfigError."""
+    files = sorted(folder.glob(LOGS))
+    names = {path.name.partition(".jsonl")[0] for path in files}
+    if wanted.process and wanted.process not in names:
+        raise unknown("log of a process", wanted.process, names)
+    try:
+        lines = [line for path in files for line in _lines(path) if wanted.has(line)]
+    except OSError as error:
+        raise ConfigError(f"cannot read {error.filename}: {error.strerror}") from None
+    return sorted(lines, key=lambda line: int(line["t"]))[-newest:]
+
+
+def _lines(path: Path) -> Iterator[Line]:
+    """Every line that is whole: the last one of a process that died may not be."""
+    with open_regular(path, 2 * FILE_BYTES) as file:
+        for text in file:
+            try:
+                line = msgspec.json.decode(text)
+            except DECODE_ERRORS:
+                continue
+            if _whole(line):
+                yield line
+
+
+def _whole(line: object) -> bool:
+    return (
+        isinstance(line, dict)
+        and isinstance(line.get("t"), int)
+        and line.get("level") in LEVELS
+        and isinstance(line.get("process"), str)
+        and isinstance(line.get("event"), str)
+    )
+
+
+def as_line(record: LogRecord) -> Line:
+    """A record from the bus as one from a file."""
+    known = {
+        "t": record.stamp_ns or time.time_ns(),
+        "level": record.level,
+        "process": record.process,
+        "event": record.event,
+        "text": record.text,
+    }
+    return known | {name: value for name, value in record.data.items() if name not in known}

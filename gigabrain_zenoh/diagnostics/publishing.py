@@ -1,0 +1,159 @@
+"""`gigabrain topic pub`: what people type becomes messages, and drives the body where it must."""
+
+import asyncio
+import getpass
+import re
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import msgspec
+
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.topics import CMD_VEL, Topic
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.client.robot import Robot, connect
+from gigabrain_zenoh.diagnostics.names import OURS, not_found, short
+from gigabrain_zenoh.errors import ConfigError, Refused, unknown
+from gigabrain_zenoh.gate.gate import BRAIN
+from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.runtime.joining import Where
+
+M = TypeVar("M", bound=Message)
+NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+LISTENERS_S = 0.5  # for those who listen to be known everywhere, before the first message goes
+
+
+def typed_in(topic: Topic[M], words: Sequence[str]) -> M:
+    """The message in `{"json": 1}`, or in words such as `linear_x=0.1 pose.x=2`.
+
+    Raises ConfigError, which says what was expected, and UnknownName for a field.
+    """
+    if len(words) == 1 and words[0].lstrip().startswith("{"):
+        try:
+            values = msgspec.json.decode(words[0])
+        except msgspec.DecodeError as error:
+            raise ConfigError(f"not JSON: {error}") from None
+    else:
+        values = _tree(words)
+    known = {field.name for field in msgspec.structs.fields(topic.type)}
+    for name in values:
+        if name not in known:
+            raise unknown(f"field of {topic.type.__name__}", name, known)
+    try:
+        made = msgspec.convert(values, topic.type)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"not a valid {topic.type.__name__}: {error}") from None
+    return made
+
+
+def _tree(words: Sequence[str]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for word in words:
+        path, equals, text = word.partition("=")
+        if not equals or not path:
+            raise ConfigError(f"{word!r}: expected field=value, or one JSON object")
+        *parents, name = path.split(".")
+        here = tree
+        for parent in parents:
+            here = here.setdefault(parent, {})
+            if not isinstance(here, dict):
+                raise ConfigError(f"{word!r}: {parent} is given a value already")
+        here[name] = _value(text)
+    return tree
+
+
+def _value(text: str) -> Any:
+    """A number, true, false, null, a list or an object in JSON; else the text itself."""
+    if NUMBER.fullmatch(text):
+        return int(text) if re.fullmatch(r"[-+]?\d+", text) else float(text)
+    if text in ("true", "false", "null") or text[:1] in '[{"':
+        try:
+            return msgspec.json.decode(text)
+        except msgspec.DecodeError as error:
+            raise ConfigError(f"{text!r}: {error}") from None
+    return text
+
+
+async def send(
+    bus: Bus,
+    topic: Topic[Any],
+    message: Message,
+    rate: float | None,
+    count: int | None,
+    name: str = "",
+) -> int:
+    """Send it once, `count` times, or at `rate` [Hz] until Ctrl-C; how often it was sent."""
+    left = count if count is not None else (None if rate else 1)
+    sent = 0
+    with stop_signals() as stop:
+        await asyncio.sleep(LISTENERS_S)
+        async for _ in bus.clock.every(round(1e9 / (rate or 10.0))):
+            if stop.is_set() or left == sent:
+                break
+            bus.publish(topic, message, name=name)
+            sent += 1
+        await bus.clock.sleep_ns(50_000_000)  # for the last one to leave
+    return sent
+
+
+async def drive(
+    where: Where, name: str, words: Sequence[str], seconds: float | None, *, take: bool
+) -> str:
+    """Drive by cmd_vel, or by the key of its own that this body obeys; what became of it.
+
+    Raises UnknownName for any other key, ConfigError, and Refused.
+    """
+    command = typed_in(CMD_VEL, words)
+    async with connect(
+        where.connect,
+        namespace=where.namespace,
+        keys=where.keys,
+        source=command.source or f"{getpass.getuser()}-pub",
+        take=take,
+    ) as robot:
+        obeyed = (await robot.read_body()).control_topic
+        if OURS + short(name) not in (CMD_VEL.key, obeyed) and name != obeyed:
+            raise not_found(name, (obeyed,))
+        return await obey(robot, command, seconds, take=take)
+
+
+async def obey(robot: Robot, command: CmdVel, seconds: float | None, *, take: bool) -> str:
+    """Have the body obey a command for `seconds` of its time, or until Ctrl-C; what became of it.
+
+    It is asked for first, and goes back to whoever had it. Raises Refused where it is not given.
+    """
+    before = (await robot.read_state()).gate
+    if before.mode == "enabled" and not take:
+        raise Refused(f"{before.commander} drives; take it over with --take")
+    await robot.enable(take=take)
+    start_tick = (await robot.read_state()).tick
+    try:
+        with stop_signals() as stop:
+            driving = asyncio.ensure_future(_hold(robot, command, seconds))
+            stopped = asyncio.ensure_future(stop.wait())
+            await asyncio.wait((driving, stopped), return_when=asyncio.FIRST_COMPLETED)
+            stopped.cancel()
+            if not driving.cancel():
+                driving.result()
+    finally:
+        await robot.stop()
+    ticks = (await robot.read_state()).tick - start_tick
+    return f"driven for {ticks * 0.02:.1f} s; {await _give_back(robot, before.commander)}"
+
+
+async def _hold(robot: Robot, command: CmdVel, seconds: float | None) -> None:
+    start = (await robot.read_state()).tick
+    while seconds is None or (await robot.read_state()).tick - start < seconds * 50:
+        await robot.set_base_velocity(command.linear_x, command.linear_y, command.angular_z)
+        await asyncio.sleep(0.1)
+
+
+async def _give_back(robot: Robot, commander: str) -> str:
+    """Only the brain goes on by itself; for anybody else silence closes the gate."""
+    if commander != BRAIN:
+        return "the body is nobody's now"
+    try:
+        return (await robot.enable(BRAIN, take=True)).text
+    except Refused as error:
+        return f"the brain has not got it back: {error}"

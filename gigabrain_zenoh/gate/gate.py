@@ -1,0 +1,228 @@
+"""The gate: alone lets a command through to the body. A pure function, no I/O, no clock.
+
+    latched ──release──► idle ──enable──► enabled ──any cause──► stopping ──► idle or latched
+
+`step(config, state, event) -> (state, outcome)`. Its time is the robot's tick (20 ms). Where there
+is a wall clock worth trusting (not when time is lock-stepped), events carry it as well, and the age
+of an echoed tick is bounded by both.
+"""
+
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import TICK_NS, Cause, Velocity
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_zenoh.gate import causes as why
+from gigabrain_zenoh.gate.checks import ISSUED_TICKS, against, age_ns, at_rest, is_finite, refusal
+from gigabrain_zenoh.gate.requests import estop, no, release
+from gigabrain_zenoh.gate.state import (
+    BRAIN,
+    Command,
+    Enable,
+    Estop,
+    Event,
+    GateConfig,
+    GateState,
+    NotFinite,
+    Outcome,
+    Release,
+    Safety,
+    Tick,
+    status,
+)
+from gigabrain_zenoh.geometry.limits import ZERO, clamp, ramp, slowed
+
+__all__ = [
+    "BRAIN",
+    "Command",
+    "Enable",
+    "Estop",
+    "Event",
+    "GateConfig",
+    "GateState",
+    "NotFinite",
+    "Outcome",
+    "Release",
+    "Safety",
+    "Tick",
+    "age_ns",
+    "status",
+    "step",
+]
+
+TICK_S = TICK_NS / 1e9
+STOPPING_TICKS = 15  # 300 ms, then idle
+CALM_TICKS = 5  # 100 ms at zero after an enable, however hard somebody holds a joystick
+HEALTHY_TICKS = 25  # 0.5 s without a cause before an automatic resume
+RESUME_TICKS = 110  # from one start to an automatic one: starts and stops stay under 1 Hz
+NAN_STORM_COUNT, NAN_STORM_TICKS = 5, 50  # five in a second
+
+
+def step(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:
+    """One event. Whether the body may go on, and how fast, follows from the state it leads to."""
+    taken, outcome = _take(config, state, event)
+    if taken is state:
+        return state, outcome
+    if taken.mode == "enabled":
+        found = against(config, taken, taken.commander)
+        taken = _stop(taken, found) if found else taken
+    return replace(taken, output=_output(config, taken)), outcome
+
+
+def _take(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:
+    match event:
+        case Tick():
+            return _tick(config, state, event), Outcome()
+        case Command():
+            return _command(state, event)
+        case NotFinite():
+            return _not_finite(state, event)
+        case Safety():
+            return _safety(state, event.state), Outcome()
+        case Release():
+            return release(state, event)
+        case Enable():
+            return _enable(config, state, event)
+        case _:
+            return estop(state, event)
+
+
+def _tick(config: GateConfig, state: GateState, event: Tick) -> GateState:
+    issued = () if event.wall_ns is None else (*state.issued_ns, event.wall_ns)
+    state = replace(
+        state,
+        tick=state.tick + 1,
+        issued_ns=issued[-ISSUED_TICKS:],
+        faults=event.faults,
+        still_ticks=state.still_ticks + 1 if at_rest(event.measured) else 0,
+        late=event.late,
+        before=state.output,
+    )
+    if state.mode == "enabled":
+        return state
+    now = against(config, state, BRAIN)
+    state = replace(state, healthy_ticks=0 if now else state.healthy_ticks + 1)
+    if state.mode == "stopping":
+        return _stopping(state, now)
+    return _waiting(config, state, now)
+
+
+def _stop(state: GateState, found: tuple[Cause, ...]) -> GateState:
+    return replace(state, mode="stopping", causes=found, stopped_tick=state.tick, healthy_ticks=0)
+
+
+def _stopping(state: GateState, now: tuple[Cause, ...]) -> GateState:
+    """No way back to enabled from here: whoever stopped is asked again."""
+    state = replace(state, causes=why.merge(state.causes, why.latching(now)))
+    if state.tick - state.stopped_tick < STOPPING_TICKS or state.before != ZERO:
+        return state
+    held = why.latching(state.causes)
+    return replace(state, mode="latched" if held else "idle", causes=held or now, commander="")
+
+
+def _waiting(config: GateConfig, state: GateState, now: tuple[Cause, ...]) -> GateState:
+    """Idle or latched."""
+    held = why.merge(why.latching(state.causes), why.latching(now))
+    if held:
+        return replace(state, mode="latched", causes=held)
+    rested = min(state.healthy_ticks, state.still_ticks) >= HEALTHY_TICKS
+    again = state.tick - state.enabled_tick >= RESUME_TICKS
+    if config.auto_resume and not state.by_hand and rested and again:
+        return _enabled(state, BRAIN)
+    boot = (why.BOOT,) if state.mode == "latched" else ()
+    return replace(state, causes=boot + now)
+
+
+def _enabled(state: GateState, source: str) -> GateState:
+    return replace(
+        state,
+        mode="enabled",
+        causes=(),
+        by_hand=False,
+        commander=source,
+        enables=state.enables + 1,
+        enabled_tick=state.tick,
+        command=None,
+        command_tick=state.tick,
+        next_seq=0,
+        nan_ticks=(),
+    )
+
+
+def _output(config: GateConfig, state: GateState) -> Velocity:
+    """One step from what the body was told in the last tick, however much happens in this one.
+
+    Ticks that are made up for come all at once: a stop takes the steps that it has missed, but the
+    body is not sped up by several of them within a moment.
+    """
+    if state.mode in ("latched", "idle"):
+        return ZERO
+    target, asked = ZERO, state.command
+    calm = state.tick - state.enabled_tick < CALM_TICKS
+    if state.mode == "enabled" and asked and state.safety and not calm:
+        target = clamp(
+            Velocity(linear_x=asked.linear_x, linear_y=asked.linear_y, angular_z=asked.angular_z),
+            config.limits,
+            state.safety.caps,
+        )
+    change = slowed if state.late else ramp
+    return change(state.before, target, config.limits, TICK_S)
+
+
+def _command(state: GateState, event: Command) -> tuple[GateState, Outcome]:
+    command = event.command
+    if not is_finite(command):
+        return _not_finite(state, NotFinite(command.source, command.boot))
+    refused = refusal(state, command, event.wall_ns)
+    if refused:
+        return state, Outcome(refused=refused, ok=False)
+    if command.source == BRAIN:
+        state = replace(state, heard=command, heard_tick=state.tick)
+    if state.mode != "enabled":
+        return state, Outcome(refused="not_enabled", ok=False)
+    if command.source != state.commander:
+        return state, Outcome(refused="commander", ok=False)
+    if command.seq < state.next_seq:
+        return state, Outcome(refused="seq", ok=False)
+    state = replace(state, command=command, command_tick=state.tick, next_seq=command.seq + 1)
+    return state, Outcome()
+
+
+def _not_finite(state: GateState, event: NotFinite) -> tuple[GateState, Outcome]:
+    """Zero at once when it comes from the commander; from anybody else it is only counted."""
+    refused = Outcome(refused="not_finite", ok=False)
+    if event.boot != state.boot or not state.commander or event.source != state.commander:
+        return state, refused
+    recent = (*(t for t in state.nan_ticks if state.tick - t < NAN_STORM_TICKS), state.tick)
+    cause = why.NAN_STORM if len(recent) >= NAN_STORM_COUNT else why.NOT_FINITE
+    causes = why.merge(state.causes, (cause,))
+    state = _stop(state, causes) if state.mode == "enabled" else replace(state, causes=causes)
+    return replace(state, nan_ticks=recent, healthy_ticks=0, before=ZERO), refused
+
+
+def _safety(state: GateState, said: SafetyState) -> GateState:
+    if said.boot != state.boot or said.tick > state.tick:
+        return state
+    if state.safety and said.tick < state.safety.tick:
+        return state
+    return replace(state, safety=said)
+
+
+def _enable(config: GateConfig, state: GateState, event: Enable) -> tuple[GateState, Outcome]:
+    if not event.source:
+        return no(state, "say who asks: the source must not be empty")
+    if state.mode == "latched":
+        return no(state, f"latched: {why.in_words(state.causes)}; release it first")
+    if state.mode == "stopping":
+        return no(state, "still stopping; try again when it is idle")
+    if state.commander not in ("", event.source):
+        if not event.take:
+            return no(state, f"{state.commander} drives; take it over with take=true")
+        if event.source == BRAIN and event.by in ("", BRAIN):
+            return no(state, f"{state.commander} drives; only a person hands it to the brain")
+    found = against(config, state, event.source)
+    if found:
+        return no(state, f"not now: {why.in_words(found)}")
+    granted = Outcome(text=f"{event.source} drives")
+    if state.commander == event.source:  # it goes on: a second enable is no command
+        return replace(state, enables=state.enables + 1), granted
+    return _enabled(state, event.source), granted

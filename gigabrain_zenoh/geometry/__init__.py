@@ -1,0 +1,5 @@
+"""SE(2), swept footprints, limits of motion, scans and the poses they were taken at. Pure.
+
+It imports no other room.
+Every room that computes with poses may import it.
+"""

@@ -1,0 +1,5 @@
+"""What the operating system gives: files, signals, child processes, threads, cores, memory.
+
+It imports no other room.
+Every room may import it.
+"""

@@ -1,0 +1,253 @@
+"""The demo: a whole robot on this machine, watched until it is stopped or its time is over."""
+
+import asyncio
+import contextlib
+import sys
+import time
+from collections import deque
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from msgspec import Struct
+
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import BodyLost, ConfigError
+from gigabrain_zenoh.host import results
+from gigabrain_zenoh.host.capacity import Capacity
+from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.launch.up import LIMIT_S, STOP_S
+from gigabrain_zenoh.logs import new_run_dir
+from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
+from gigabrain_zenoh.runtime.running import announced
+from gigabrain_zenoh.runtime.supervisor import Supervisor
+from gigabrain_zenoh.ui.live_view import HeadlessView, LiveView, View
+from gigabrain_zenoh.ui.report import Observed, Report, last_told, make_report, summary
+from gigabrain_zenoh.ui.watch import Watch
+
+SYSTEMS = ("perception", "decision", "control")
+LOOK_S = 0.1  # how often the run is looked at
+RELEASE_FIRST = (
+    "a real body drives only when somebody has released and enabled it: while the demo runs, in "
+    "another terminal, `gigabrain release` and `gigabrain enable`"
+)
+STALLED_S = 60.0  # without a tick of the robot's clock
+ANSWER_S, HASTY_S = 5.0, 0.2  # how long the truth may take; and once a person wants it to end
+
+
+class DemoOptions(Struct, frozen=True, kw_only=True):
+    """How the demo is run."""
+
+    seconds: float | None = None  # of the robot's time; None for until Ctrl-C
+    headless: bool = False
+    report: Path | None = None
+    page: str = ""  # where the operator page is, or how to get it
+    keep_stuck: bool = False  # processes without progress are left alone, for a debugger
+
+
+class Demo:
+    """One run."""
+
+    def __init__(self, deployment: Deployment, options: DemoOptions) -> None:
+        self._deployment, self._options = with_free_port(deployment), options
+        results.check_place(options.report)
+        self._run_dir = new_run_dir(None, "demo")
+        specs = process_specs(
+            self._deployment,
+            "robot",
+            self._run_dir,
+            self._run_dir / "state",
+            seconds=options.seconds,
+        )
+        self._supervisor = Supervisor(specs, self._record, keep_stuck=options.keep_stuck)
+        self._decisions: list[tuple[float, str]] = []
+        self._failures: list[str] = []
+        self._compiling: set[str] = set()  # processes that have said so
+        self._refusal = ""  # what a process said before it ended
+        self._faults: deque[tuple[float, str]] = deque(maxlen=4)  # when [s], and what
+        self._capacity = Capacity()
+        self._last_fault = ""  # before all were asked to end, the driver's first
+
+    async def run(self) -> int:
+        """The exit code: 0 for a run without contact, with motion, with all processes alive.
+
+        A run that a person ends is not judged. Raises GigabrainError when it cannot be started.
+        """
+        label = f"{self._deployment.body} in {self._deployment.world}"
+        endpoint = client_endpoint(self._deployment)
+        with stop_signals(LIMIT_S) as stop, announced(label, endpoint):
+            async with self._supervisor:
+                running = asyncio.ensure_future(self._supervisor.run())
+                bus = await self._join(stop)
+                try:
+                    report = await self._watch(Watch(bus), stop) if bus else None
+                finally:
+                    closing = asyncio.ensure_future(bus.close()) if bus else None
+                    await self._supervisor.stop(STOP_S)
+                    await running
+                    if closing:
+                        await closing
+        return self._finish(report, stopped=stop.is_set())
+
+    async def _join(self, stop: asyncio.Event) -> Bus | None:
+        """A session of our own, or None when the run ended before there was a router."""
+        opening = asyncio.ensure_future(ZenohTransport.open(client_endpoint(self._deployment)))
+        while not opening.done() and not stop.is_set() and not self._supervisor.given_up:
+            await asyncio.wait((opening,), timeout=LOOK_S)
+        if not opening.done():
+            opening.cancel()
+            return None
+        return Bus(opening.result(), Clock(), "demo")
+
+    async def _watch(self, watch: Watch, stop: asyncio.Event) -> Report | None:
+        """Look on until the end, then ask the driver for the truth."""
+        view = self._view(watch)
+        loop = asyncio.get_running_loop()
+        moved_s, seconds = loop.time(), watch.seconds
+        with view:
+            while not (stop.is_set() or self._supervisor.given_up or self._over(watch)):
+                view.show()
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(stop.wait(), LOOK_S)
+                self._look_at_capacity(watch, view)
+                if watch.problem:
+                    self._failures.append(watch.problem)
+                    break
+                if watch.seconds != seconds or self._starting:
+                    moved_s, seconds = loop.time(), watch.seconds
+                elif loop.time() - moved_s > STALLED_S:
+                    self._failures.append(f"the robot's clock stood still for {STALLED_S:.0f} s")
+                    break
+            view.show()
+        self._last_fault = newest_fault(text for _, text in self._faults)
+        return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)
+
+    def _look_at_capacity(self, watch: Watch, view: View) -> None:
+        """Say once that this machine is too small; in lock-step time may wait for the brain."""
+        capacity, known = self._capacity, self._capacity.problem
+        if self._starting or self._deployment.speed != 1.0:
+            capacity.restart()
+            return
+        capacity.look(asyncio.get_running_loop().time(), watch.seconds, held=watch.held_by_load)
+        if capacity.problem != known:
+            self._faults.append((time.monotonic(), capacity.problem))
+            view.say(capacity.problem)
+
+    @property
+    def _starting(self) -> bool:
+        """Whether a process is on its way: the very first start compiles, and time may wait."""
+        statuses = self._supervisor.statuses.values()
+        return any(status.state in ("waiting", "starting") for status in statuses)
+
+    def _starting_up(self) -> str:
+        """Which of the three systems is not there yet, and why that takes long; or nothing."""
+        statuses = self._supervisor.statuses
+        late = [one for one in SYSTEMS if one in statuses and statuses[one].state == "starting"]
+        if not late:
+            return ""
+        why = ", compiling, once per installation" if self._compiling & set(late) else ""
+        return f"{' and '.join(late)} {'is' if len(late) == 1 else 'are'} getting ready{why}"
+
+    def _served(self) -> str:
+        """Where the operator page is, once it is there, or how to get it."""
+        status = self._supervisor.statuses.get("page")
+        return self._options.page if status is None or status.state == "ready" else ""
+
+    def _over(self, watch: Watch) -> bool:
+        seconds = self._options.seconds
+        return seconds is not None and watch.seconds >= seconds - 1e-6
+
+    @property
+    def _live(self) -> bool:
+        """Whether there is a page in the terminal."""
+        return not self._options.headless and sys.stdout.isatty()
+
+    def _view(self, watch: Watch) -> View:
+        seconds, page = self._options.seconds, self._options.page
+        if not self._live:
+            return HeadlessView(watch, seconds, self._served, self._starting_up)
+        faults = self._faults
+        return LiveView(
+            watch, self._supervisor, self._deployment, faults, seconds, page, self._starting_up
+        )
+
+    async def _ask_for_truth(self, watch: Watch, within_s: float) -> Report | None:
+        statuses = self._supervisor.statuses
+        names = [name for name, status in statuses.items() if status.state == "ready"]
+        told = await asyncio.gather(*(watch.describe(name, within_s) for name in names))
+        answers = {answer.process: answer.report for answer in told if answer}
+        state = watch.state.newest
+        if "driver" not in answers and state is None:
+            return None
+        told_of_all = last_told(watch.health.get("driver"))
+        for answer in answers.values():
+            told_of_all |= answer
+        seen = Observed(
+            body=state.robot_type if state else self._deployment.body,
+            answered="driver" in answers,
+            world=self._deployment.world,
+            seed=self._deployment.seed,
+            speed=self._deployment.speed,
+            seconds=watch.seconds,
+            distance_m=watch.distance_m,
+            decisions=tuple(self._decisions),
+            deaths=self._supervisor.deaths,
+            restarts=sum(status.restarts for status in statuses.values()),
+            mapped_m2=watch.mapped_m2,
+            tasks=watch.task.current,
+            problem=watch.problem,
+            rejected=sum(int(report.get("rejected_messages") or 0) for report in answers.values()),
+        )
+        return make_report(told_of_all, seen)  # the truth is the simulator's, wherever it runs
+
+    def _record(self, _name: str, record: Mapping[str, Any]) -> None:
+        """A line of somebody's log."""
+        event, level = record.get("event"), record.get("level")
+        if event == "decision":
+            decided = round(record["tick"] * 0.02, 2), str(record["reason"])
+            if self._decisions and self._decisions[-1][0] == decided[0]:
+                self._decisions.pop()  # the last word of a tick counts
+            self._decisions.append(decided)
+        if event == "compiling":
+            self._compiling.add(str(record["process"]))
+        if event == "failed":
+            self._refusal = str(record.get("text", ""))
+        if event in ("given up", "died"):
+            self._failures.append(str(record.get("text", "")))
+        if level in ("warning", "error", "critical"):
+            text = f"{record['process']}: {record.get('text', '')}"
+            self._faults.append((time.monotonic(), text))
+
+    def _finish(self, report: Report | None, *, stopped: bool) -> int:
+        if self._capacity.problem and self._live:
+            print(self._capacity.problem, file=sys.stderr)
+        if report:
+            results.write(report, self._options.report)
+            print(summary(report))
+        if stopped and report is None:
+            print("ended; the driver did not answer, so there is no report", file=sys.stderr)
+        if stopped:
+            return 0
+        if report and report.ok and not self._failures:
+            return 0
+        if self._supervisor.misconfigured:
+            raise ConfigError(self._refusal)
+        if report is None:
+            reason = self._failures[-1] if self._failures else "the driver did not answer"
+            raise BodyLost(f"no report: {reason}; logs in {self._run_dir}")
+        if self._last_fault:
+            print(f"newest fault: {self._last_fault}", file=sys.stderr)
+        if self._deployment.link == "real":
+            print(RELEASE_FIRST, file=sys.stderr)
+        why = f"{self._failures[-1]}; " if self._failures else ""
+        print(f"{why}logs in {self._run_dir}", file=sys.stderr)
+        return 1
+
+
+def newest_fault(texts: Iterable[str]) -> str:
+    """The one that tells most of why nothing moved: the driver's newest, else the newest at all."""
+    newest = list(texts)[::-1]
+    return next((text for text in newest if text.startswith("driver:")), "".join(newest[:1]))

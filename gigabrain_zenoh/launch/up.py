@@ -1,0 +1,113 @@
+"""Runs a deployment's processes on this host, logging to a run folder and to the console."""
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from gigabrain_zenoh.decision.tasks.scripts import check_folder
+from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.host import log_text
+from gigabrain_zenoh.host.sd_notify import Notifier
+from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.logs import new_run_dir, state_dir
+from gigabrain_zenoh.runtime.deployment import (
+    Deployment,
+    check_keys,
+    local_endpoint,
+    with_free_port,
+)
+from gigabrain_zenoh.runtime.relay_place import RELAY
+from gigabrain_zenoh.runtime.running import announced
+from gigabrain_zenoh.runtime.supervisor import Supervisor
+
+STOP_S = 1.5  # until processes that do not end are killed
+LIMIT_S = STOP_S + 2.0  # until the supervisor itself is ended by force
+LOOK_S = 0.1
+ROUTERS = {"router", RELAY}  # without the one or the other nobody on the host hears anything
+
+
+async def up(
+    deployment: Deployment,
+    host: str,
+    say: Callable[[str], None],
+    level: str = "info",
+    *,
+    keep_stuck: bool = False,
+) -> int:
+    """Keep a host's processes running until Ctrl-C; the exit code.
+
+    What makes no progress is started again, or with `keep_stuck` left to a debugger.
+    Raises ConfigError when what a process was given is wrong, or a folder cannot be written, and
+    BusError when the router cannot run, without which nothing else can.
+    """
+    check_keys(deployment, host)
+    if "decision" in deployment.hosts[host]:
+        check_folder(deployment.decision.scripts)
+    deployment = with_free_port(deployment)
+    label = deployment.namespace or deployment.body.replace("/", "-")
+    notifier = Notifier.from_environment()
+    run_dir = new_run_dir(None, label)
+    remembers = state_dir() / "robots" / label
+    specs = process_specs(deployment, host, run_dir, remembers, level=level)
+
+    refusal = ""
+
+    def show(_name: str, record: Mapping[str, Any]) -> None:
+        nonlocal refusal
+        if record.get("event") == "failed":
+            before, refusal = refusal, str(record.get("text", ""))
+            if refusal == before:  # told already, when it was tried the first time
+                return
+        say(log_text.readable(record, colour=False))
+
+    say(f"{deployment.body} on {host}: {', '.join(spec.name for spec in specs)}; logs in {run_dir}")
+    with (
+        stop_signals(LIMIT_S) as stop,
+        announced(label, local_endpoint(deployment, host)) as note,
+    ):
+        async with Supervisor(specs, show, keep_stuck=keep_stuck) as supervisor:
+            running = asyncio.ensure_future(supervisor.run())
+            while not stop.is_set() and not running.done() and not _hopeless(supervisor):
+                _report(supervisor, notifier, note)
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(stop.wait(), LOOK_S)
+            notifier.stopping()
+            await supervisor.stop(STOP_S)
+            await running
+            if supervisor.misconfigured:
+                raise ConfigError(refusal)
+            if lost := ROUTERS & set(supervisor.given_up):
+                raise BusError(refusal or f"the {lost.pop()} keeps dying")
+            return 1 if supervisor.given_up else 0
+
+
+def _hopeless(supervisor: Supervisor) -> bool:
+    """Whether what has been given up leaves nothing to keep running."""
+    return bool(supervisor.misconfigured) or bool(ROUTERS & set(supervisor.given_up))
+
+
+def _report(supervisor: Supervisor, notifier: Notifier, note: Path) -> None:
+    """Tell the service manager how all are doing; what was given up is told, not waited for.
+
+    The note of a robot that is well is touched: whoever has no service manager looks at its age.
+    """
+    states = {name: status.state for name, status in supervisor.statuses.items()}
+    not_yet = [name for name, state in states.items() if state not in ("ready", "given up")]
+    problems = {
+        "given up": supervisor.given_up,
+        "stuck": supervisor.stuck,
+        "not ready": tuple(not_yet),
+    }
+    told = [f"{what}: {', '.join(names)}" for what, names in problems.items() if names]
+    notifier.status("; ".join(told) or f"all ready: {', '.join(states)}")
+    if not not_yet:
+        notifier.ready()
+    if not supervisor.stuck:
+        notifier.alive()
+    if not told:
+        with contextlib.suppress(OSError):  # somebody has tidied up
+            os.utime(note)

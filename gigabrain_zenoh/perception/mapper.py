@@ -1,0 +1,290 @@
+"""Localization and mapping in the perception process: the robot's pose in the map, and the map.
+
+Each scan is processed after its world model is published, with the odometry of the scan's tick.
+"""
+
+import asyncio
+import logging
+import time
+from pathlib import Path
+
+import numpy as np
+
+from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.body import Body, Lidar, RobotState
+from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
+from gigabrain_schemas.requests import MapReply, MapRequest
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE
+from gigabrain_zenoh.bus.bus import Bus, Latest
+from gigabrain_zenoh.bus.granting import grant
+from gigabrain_zenoh.config.settings import PerceptionConfig
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.geometry.scan import beams, hits
+from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_zenoh.host.background import InTime
+from gigabrain_zenoh.host.journal import done
+from gigabrain_zenoh.host.percentile import Newest
+from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping.autosave import Autosave, refuse
+from gigabrain_zenoh.mapping.fusion import Fusion, Moment, way
+from gigabrain_zenoh.mapping.known import Chart, KnownMap
+from gigabrain_zenoh.mapping.localizer import Place, View
+from gigabrain_zenoh.mapping.points import Scan
+
+log = logging.getLogger(__name__)
+
+MAP_TICKS = round(1e9 / TICK_NS)  # shortest interval between published maps
+MAP_AGAIN_TICKS = 2 * MAP_TICKS  # interval after which an unchanged map is published again
+FREE_M = 10.0  # a beam without a hit marks free space up to this distance at most,
+SHORT_M = 0.05  # and ends this much before the lidar's range
+SETTLE_NS, SETTLES = 20_000_000, 100  # poll interval and count: a save waits for idle threads
+TIMED = 1000  # scans whose processing time is kept for the percentiles
+
+
+def chart_of(config: PerceptionConfig, in_time: InTime = done) -> Chart:
+    """Load or create the map that the settings request. Raises ConfigError."""
+    path = map_file.path_of(config.map) if config.map else None
+    if config.mapping == "localize":
+        if path is None:
+            raise ConfigError("perception: map: expected a saved map, as mapping is 'localize'")
+        saved = map_file.load(path)
+        if problem := map_file.what_is_wrong(saved):
+            raise ConfigError(f"{path}: {problem}; expected one to find the way in")
+        return KnownMap(saved, in_time=in_time)
+    from gigabrain_zenoh.mapping.growing import GrowingMap  # imports gtsam: for slam only
+
+    if path:
+        graph = map_file.load_graph(path)
+        try:
+            return GrowingMap.thaw(graph, in_time=in_time)
+        except ConfigError as error:
+            raise ConfigError(f"{path.with_suffix(map_file.GRAPH)}: {error}") from None
+    return GrowingMap(in_time=in_time)
+
+
+def view_of(lidar: Lidar, scan: LaserScan, ignore_below: float) -> View:
+    """Convert a scan to hit points and the ends of free beams, in the body's frame [m]."""
+    values = ranges(scan)
+    points = np.column_stack(hits(lidar, scan, ignore_below))
+    cosines, sines = beams(len(values), scan.angle_min, scan.angle_increment, lidar.yaw)
+    sensor = np.array((lidar.x, lidar.y))
+    clear = values == np.inf if lidar.no_return == "free" else np.zeros(len(values), np.bool_)
+    reach = min(scan.range_max - SHORT_M, FREE_M)
+    free = sensor + reach * np.column_stack((cosines[clear], sines[clear]))
+    return View(Scan.of(points, free), sensor)
+
+
+class Mapper:
+    """Publisher of `robot/pose` and `robot/map`, and server of `robot/map_save`."""
+
+    def __init__(self, config: PerceptionConfig, bus: Bus, bodies: Latest[Body]) -> None:
+        self._config, self._bus, self._bodies = config, bus, bodies
+        self._chart = chart_of(config, bus.journal.in_time)
+        self._fusion, self._boot = Fusion(), 0
+        self._last: Moment | None = None  # at the last scan that was processed
+        self._blank = not config.map  # the map is still empty
+        self._mapped = False  # this process has processed a scan, or restored a map
+        self._shown: OccupancyGrid | None = None
+        self._shown_tick = self._said_tick = 0
+        saves = config.mapping == "slam" and config.state_dir and bus.journal.live
+        self._autosave = Autosave(Path(config.state_dir)) if saves else None
+        self._before: Moment | None = None  # at the last scan in a restored map
+        self._said, self._left_out = "", ""
+        self._early = False  # the first scan arrived without its odometry
+        self._took_ms = Newest(TIMED)
+        self._saving = asyncio.Lock()  # concurrent saves would write to the same files
+        bus.serve(MAP_SAVE, self._save)
+        bus.report = self._report
+
+    def see(self, scan: LaserScan, problem: str) -> None:
+        """Process a scan, or skip it if `problem` is not empty or its odometry is missing."""
+        if problem:
+            self._leave_out(problem)
+            return
+        moment = self._fusion.at(scan.basis) if scan.boot == self._boot else None
+        if moment is None and self._last is None and not self._early:
+            self._early = True  # its odometry was published before this process subscribed
+            self._bus.counters["scans_left_out"] += 1
+        elif moment is None or (self._last and moment.tick <= self._last.tick):
+            self._leave_out("there is no odometry for its tick")
+        else:
+            self._take(scan, moment)
+
+    def miss(self, scan: LaserScan, tick: int) -> None:
+        """Skip a scan whose state had not arrived by `tick`, when the next scan came."""
+        self._leave_out(f"it claims to be of tick {scan.basis}, which had not come by tick {tick}")
+
+    def close(self) -> None:
+        """Stop the worker threads."""
+        self._chart.close()
+        if self._autosave:
+            self._autosave.close()
+
+    def hear(self, state: RobotState) -> None:
+        """Add a robot state; must be called before `see` for scans of the same tick."""
+        body = self._bodies.current
+        if body:
+            self._begin_anew(state.boot)
+            self._fusion.add(state, body.description)
+
+    def _begin_anew(self, boot: int) -> None:
+        """Reset the odometry when the driver has restarted; the map is kept.
+
+        If this process has restarted and the driver has not, resume the last autosaved map.
+        """
+        if boot == self._boot:
+            return
+        if self._boot:
+            self._chart.lose("the driver has started anew")
+        self._boot, self._fusion, self._last, self._shown = boot, Fusion(), None, None
+        self._before, self._early = None, False
+        if self._autosave and not self._mapped:
+            self._go_on(self._autosave, boot)
+
+    def _go_on(self, autosave: Autosave, boot: int) -> None:
+        """Resume the newest intact map that was saved during this run of the driver, if any."""
+        from gigabrain_zenoh.mapping.growing import GrowingMap  # imports gtsam, as above
+
+        for head, arrays in autosave.found(boot):
+            last = None if head.place is None else np.array(head.place)
+            try:
+                chart = GrowingMap.thaw(arrays, in_time=self._bus.journal.in_time, last=last)
+            except ConfigError as error:
+                refuse(str(error))
+                continue
+            self._chart.close()
+            self._chart, self._blank, self._mapped = chart, False, True
+            odometry = np.array(head.odometry)
+            self._before = Moment(head.tick, odometry, odometry, slipping=False, jumps=0)
+            text = f"the map of tick {head.tick} goes on"
+            log.info(text, extra={"data": {"event": "map"}})
+            return
+
+    def _take(self, scan: LaserScan, moment: Moment) -> None:
+        body = self._bodies.current
+        if body is None or body.description.lidar is None:
+            return
+        began = time.perf_counter()
+        view = view_of(body.description.lidar, scan, self._config.ignore_below)
+        before = self._last
+        place = self._chart.step(view, *self._way(moment))
+        self._mapped = True
+        if self._autosave and before:
+            self._keep(self._autosave, before)
+        self._bus.publish(POSE, message_of(place), basis=scan.basis)
+        self._tell(place)
+        self._show(scan.basis)
+        self._left_out = ""
+        self._took_ms.add((time.perf_counter() - began) * 1e3)
+
+    def _way(self, moment: Moment) -> tuple[Floats, Floats]:
+        """Return the motion from the last scan to this one (3,), and its covariance (3, 3).
+
+        The first scan of a new map is placed at its odometry pose. After a crash of this process,
+        positions in the map thus stay the same, except for the odometry drift since then.
+        """
+        last = self._last or self._before or moment
+        self._last, self._before = moment, None
+        blank, self._blank = self._blank, False
+        step, noise = way(last, moment)
+        if last.jumps != moment.jumps:
+            self._chart.lose("the odometry has jumped")
+        return moment.fused if blank else step, noise
+
+    def _keep(self, autosave: Autosave, before: Moment) -> None:
+        """Save the map as it was at the scan `before`, when a save is due.
+
+        The copy is cheap and does not alter the map. A run with saves and a run without behave the
+        same.
+        """
+        still = self._chart.kept()
+        if still:
+            autosave.save(self._boot, before.tick, before.odometry, still)
+        elif autosave.due(self._boot, before.tick):
+            self._chart.keep()
+
+    def _show(self, tick: int) -> None:
+        """Publish the map when it has changed, at most every MAP_TICKS.
+
+        An unchanged map is published again after MAP_AGAIN_TICKS, in case another publisher has
+        replaced it.
+        """
+        if self._shown and tick < self._shown_tick + MAP_TICKS:
+            return
+        self._shown_tick = tick
+        self._tell_problems()
+        grid = self._chart.grid()
+        due = grid != self._shown or tick >= self._said_tick + MAP_AGAIN_TICKS
+        if due and grid.cells:
+            self._bus.publish(MAP, grid, basis=tick)
+            self._shown, self._said_tick = grid, tick
+
+    def _tell_problems(self) -> None:
+        """Log each new problem once, and list all current problems in the health messages."""
+        problems, known = self._chart.problems(), self._bus.problems
+        if self._autosave and self._autosave.problem:
+            problems = (*problems, self._autosave.problem)
+        for problem in problems:
+            if problem.code not in {one.code for one in known}:
+                log.warning("%s", problem.text, extra={"data": {"event": problem.code}})
+        self._bus.problems = problems
+        self._bus.counters["optimiser_rebuilt"] = self._chart.report().get("optimiser_rebuilt", 0)
+
+    def _tell(self, place: Place) -> None:
+        """Log changes of the localization, with the reason when the robot is not localized."""
+        said = "localized" if place.localized else f"not localized: {place.why}"
+        if said == self._said:
+            return
+        self._said = said
+        level = logging.INFO if place.localized else logging.WARNING
+        x, y, yaw = place.pose.tolist()
+        text = f"{said} at ({x:.2f}, {y:.2f}), {np.degrees(yaw):.0f} degrees"
+        log.log(level, text if place.localized else said, extra={"data": {"event": "localized"}})
+
+    def _leave_out(self, why: str) -> None:
+        self._bus.counters["scans_left_out"] += 1
+        if why != self._left_out:
+            self._left_out = why
+            log.warning("a scan is left out of the map: %s", why, extra={"data": {"event": "scan"}})
+
+    async def _save(self, request: MapRequest) -> MapReply:
+        grant(self._bus, MAP_SAVE.key, request, self._last.tick if self._last else 0)
+        path = map_file.saved_as(request.name)
+        same = bool(self._config.map) and path == map_file.path_of(self._config.map)
+        try:
+            async with self._saving:
+                text = await self._saved(path, replace=request.replace or same)
+        except Refused as error:
+            log.warning("map for %s: %s", request.source, error, extra={"data": {"event": "map"}})
+            return MapReply(ok=False, text=str(error)[:500])
+        log.info("map by %s: %s", request.source, text, extra={"data": {"event": "map"}})
+        return MapReply(ok=True, text=text[:500])
+
+    async def _saved(self, path: Path, *, replace: bool) -> str:
+        for _ in range(SETTLES):
+            if self._chart.settle():
+                break
+            await self._bus.clock.sleep_ns(SETTLE_NS)
+        saved, graph = await asyncio.to_thread(self._chart.still().to_save)
+        if self._bus.journal.live:
+            await asyncio.to_thread(map_file.save, path, saved, graph, replace=replace)
+        return f"saved {path}: {map_file.in_words(saved)}"
+
+    def _report(self) -> dict[str, float | int | str | None]:
+        times = {f"map_ms_p{p}": self._took_ms.percentile(p / 100) for p in (50, 99)}
+        saves = self._autosave.report() if self._autosave else {}
+        return {**times, **self._chart.report(), **saves}
+
+
+def message_of(place: Place) -> PoseInMap:
+    """Convert a localizer's result to a PoseInMap message."""
+    x, y, yaw = place.pose.tolist()
+    return PoseInMap(
+        x=x,
+        y=y,
+        yaw=yaw,
+        covariance=tuple(place.covariance.ravel().tolist()),
+        localized=place.localized,
+    )

@@ -1,0 +1,129 @@
+"""The BARN bench's Jackal in MuJoCo: four wheels that skid in every turn, among solid posts.
+
+It stands in for `gigabrain_zenoh.qa.bench.plant.Plant`: the same delay, the same lag of its motors'
+controller, the same errors of odometry and lidar. What slips, and how fast it can speed up, is the
+physics' own.
+"""
+
+import math
+from collections import deque
+from importlib.resources import files
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_drivers.sim.body import SimLidar, SimModel
+from gigabrain_drivers.sim.geometry import Cylinder
+from gigabrain_drivers.sim.geometry import Pose as Place
+from gigabrain_drivers.sim.lidar import Lidar
+from gigabrain_drivers.sim.scene import ROBOT, compile_scene
+from gigabrain_drivers.sim.world import World
+from gigabrain_schemas.base import TICK_NS, Pose, Velocity
+from gigabrain_schemas.body import Lidar as LidarDescription
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.qa.bench.plant import FIELD_OF_VIEW, Conditions, clearance
+
+Floats = NDArray[np.float64]
+
+TICK_S = TICK_NS / 1e9
+SUBSTEPS = 4  # of a tick: as often the motors are told something new
+PHYSICS_STEPS = 4  # in 10 ms: two for each time that the motors are told
+WHEEL_RADIUS, TRACK = 0.098, 0.37559  # [m]
+TRACK_FACTOR = 1.5  # its maker's: by so much it has to turn its wheels more than if they rolled
+POST_HEIGHT, FAR = 1.0, 50.0  # [m], of the posts, and to the walls that every world has
+LEFT = (f"{ROBOT}front_left", f"{ROBOT}rear_left")
+RIGHT = (f"{ROBOT}front_right", f"{ROBOT}rear_right")
+
+
+class Jackal:
+    """One trial's body. It knows the truth, which the robot never hears of."""
+
+    def __init__(
+        self, conditions: Conditions, start: tuple[float, float, float], posts: Floats, seed: int
+    ) -> None:
+        self._random = np.random.default_rng(seed)
+        self._conditions = conditions
+        way, turn = self._random.uniform(-conditions.drift, conditions.drift, 2).tolist()
+        self._way, self._turn = 1.0 + way, 1.0 + turn
+        self._queue = deque([ZERO] * round(conditions.delay / TICK_S * SUBSTEPS))
+        model = (files("gigabrain_drivers") / "sim" / "jackal.xml").read_text(encoding="utf-8")
+        body = SimModel(model=model, substeps=PHYSICS_STEPS)
+        self._model = compile_scene(body, _world(start, posts))
+        self._data = mujoco.MjData(self._model)
+        self._left = [self._model.actuator(name).id for name in LEFT]
+        self._right = [self._model.actuator(name).id for name in RIGHT]
+        names = (*LEFT, *RIGHT)
+        self._wheels = [int(self._model.joint(f"{name}_joint").dofadr[0]) for name in names]
+        self._place = int(self._model.joint(f"{ROBOT}free").qposadr[0])
+        self._gyro = int(self._model.sensor(f"{ROBOT}gyro").adr[0]) + 2
+        self._lidar: Lidar | None = None
+        self._told = (0.0, 0.0)  # what the motors aim for: forward [m/s], turning [rad/s]
+        self.x, self.y, self.yaw = start  # the truth
+        self.odometry = Pose(x=0.0, y=0.0, yaw=0.0)
+        mujoco.mj_forward(self._model, self._data)
+
+    @property
+    def velocity(self) -> Velocity:
+        """By the wheels and the gyro."""
+        v = WHEEL_RADIUS * float(self._data.qvel[self._wheels].mean())
+        w = float(self._data.sensordata[self._gyro])
+        return Velocity(linear_x=v * self._way, angular_z=w * self._turn)
+
+    def tick(self, command: Velocity) -> None:
+        """20 ms with `command`."""
+        for _ in range(SUBSTEPS):
+            self._queue.append(command)
+            self._substep(self._queue.popleft(), TICK_S / SUBSTEPS)
+        x, y, _, a, b, c, d = self._data.qpos[self._place : self._place + 7].tolist()
+        self.x, self.y = x, y
+        self.yaw = math.atan2(2 * (a * d + b * c), 1 - 2 * (c * c + d * d))
+
+    def _substep(self, command: Velocity, dt: float) -> None:
+        lag = self._conditions.lag
+        share = 1.0 - math.exp(-dt / lag) if lag > 0 else 1.0
+        v, w = self._told
+        v, w = v + share * (command.linear_x - v), w + share * (command.angular_z - w)
+        self._told = v, w
+        across = w * TRACK_FACTOR * TRACK / 2
+        self._data.ctrl[self._left] = (v - across) / WHEEL_RADIUS
+        self._data.ctrl[self._right] = (v + across) / WHEEL_RADIUS
+        mujoco.mj_step(self._model, self._data, nstep=round(dt / self._model.opt.timestep))
+        seen, measured = self.odometry, self.velocity
+        middle = seen.yaw + 0.5 * measured.angular_z * dt
+        self.odometry = Pose(
+            x=seen.x + measured.linear_x * math.cos(middle) * dt,
+            y=seen.y + measured.linear_x * math.sin(middle) * dt,
+            yaw=math.remainder(seen.yaw + measured.angular_z * dt, math.tau),
+        )
+
+    def scan(self, lidar: LidarDescription, _discs: Floats) -> NDArray[np.float32]:
+        """One turn of the lidar among the posts: (beams,) [m], inf where nothing is."""
+        if self._lidar is None:
+            config = SimLidar(
+                beams=lidar.beams,
+                range_min=lidar.range_min,
+                range_max=lidar.range_max,
+                noise_m=self._conditions.noise,
+            )
+            self._lidar = Lidar(config, self._model, f"{ROBOT}lidar", self._random)
+        angles = np.linspace(-FIELD_OF_VIEW / 2, FIELD_OF_VIEW / 2, lidar.beams)
+        ways = np.stack((np.cos(angles), np.sin(angles), np.zeros_like(angles)), axis=1)
+        ranges = self._lidar.cast(self._data, ways)
+        ranges[self._random.random(lidar.beams) < self._conditions.dropouts] = np.inf
+        return ranges
+
+    def clearance(self, discs: Floats) -> float:
+        """How far the body is from the nearest of `discs`, exactly [m]; 0 or less in contact."""
+        return clearance(self, discs)
+
+
+def _world(start: tuple[float, float, float], posts: Floats) -> World:
+    return World(
+        name="barn",
+        description="posts",
+        half_x=FAR,
+        half_y=FAR,
+        shapes=tuple(Cylinder(x, y, radius, POST_HEIGHT) for x, y, radius in posts.tolist()),
+        start=Place(*start),
+    )

@@ -1,0 +1,204 @@
+"""Global planning, timed: costs of a map, the first plan on a changed one, paths, optimality."""
+
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path as File
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from msgspec import Struct
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.percentile import percentile
+from gigabrain_zenoh.navigation.costmap import Costmap, Costs, Inflation, costmap
+from gigabrain_zenoh.navigation.planner import Path, Planner, Point, warm_up
+from gigabrain_zenoh.navigation.search import Ints, Search
+from gigabrain_zenoh.qa.bench.plan_maps import grid_of, office, scattered, something_new
+
+RULES = Inflation(fits=0.2, turns=0.3)
+ROUNDS = 7  # of what is timed on one and the same map
+GOALS = 4  # from one start: they share the Dijkstra that finds and checks them
+SHARE, SPREAD = 0.75, 0.1  # of the map's side a path costs, more or less
+
+
+class Timing(Struct, frozen=True, kw_only=True):
+    """How long one thing took."""
+
+    what: str
+    n: int
+    p50_ms: float
+    p95_ms: float
+    cpu_p50_ms: float  # what it would take on a core of its own
+
+
+class SizeFigures(Struct, frozen=True, kw_only=True):
+    """One size of map."""
+
+    size: int  # cells a side
+    path_m: float  # mean length of the paths
+    timings: tuple[Timing, ...]
+    ratio: float  # the worst of A* to Dijkstra, over all queries: 1 is optimal
+
+
+class PlanResult(Struct, frozen=True, kw_only=True):
+    """All sizes."""
+
+    seed: int
+    sizes: tuple[SizeFigures, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether every path was optimal."""
+        return all(abs(one.ratio - 1) < 1e-6 for one in self.sizes)
+
+
+class Query(NamedTuple):
+    """A start and a goal, and what Dijkstra pays."""
+
+    begin: tuple[int, int]  # row, column
+    end: tuple[int, int]
+    start: Point
+    goal: Point
+    cheapest: float
+
+
+class Stopwatch:
+    """Times of one thing, again and again."""
+
+    def __init__(self) -> None:
+        self.wall_ms: list[float] = []
+        self.cpu_ms: list[float] = []
+
+    def __enter__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.thread_time()
+
+    def __exit__(self, *_: object) -> None:
+        self.wall_ms.append((time.perf_counter() - self._wall) * 1e3)
+        self.cpu_ms.append((time.thread_time() - self._cpu) * 1e3)
+
+    def timing(self, what: str) -> Timing:
+        """The figures so far."""
+        wall, cpu = sorted(self.wall_ms), sorted(self.cpu_ms)
+        return Timing(
+            what=what,
+            n=len(wall),
+            p50_ms=round(percentile(wall, 0.5) or 0.0, 2),
+            p95_ms=round(percentile(wall, 0.95) or 0.0, 2),
+            cpu_p50_ms=round(percentile(cpu, 0.5) or 0.0, 2),
+        )
+
+
+def measure_plan(
+    sizes: tuple[int, ...], queries: int, seed: int, png: File | None, say: Callable[[str], None]
+) -> PlanResult:
+    """Measure maps of so many cells a side. The last is drawn into `png`. Raises ConfigError."""
+    warm_up()
+    figures = []
+    for size in sizes:
+        say(f"{size} x {size} cells")
+        one, made, paths = _measure(size, queries, np.random.default_rng(seed))
+        figures.append(one)
+    if png is not None and not cv2.imwrite(str(png), _drawing(made, paths)):
+        raise ConfigError(f"cannot write {png}")
+    return PlanResult(seed=seed, sizes=tuple(figures))
+
+
+def _measure(
+    size: int, queries: int, rng: np.random.Generator
+) -> tuple[SizeFigures, Costmap, list[Path]]:
+    cells = office(size, rng)
+    grid, planner = grid_of(cells), Planner()
+    made, anew, changed, first = costmap(grid, RULES), Stopwatch(), Stopwatch(), Stopwatch()
+    asked = list(itertools.islice(_queries(made, planner.search, rng), queries))
+    for i in range(ROUNDS):
+        with anew:
+            costmap(grid, RULES)
+        now = grid_of(something_new(cells, rng))
+        with changed:
+            costmap(now, RULES, None, made)
+        one = asked[i % len(asked)]
+        with first:
+            planner.plan(costmap(now, RULES, None, made), one.start, one.goal)
+    searching, planning, ratios, paths = Stopwatch(), Stopwatch(), [], []
+    for one in asked:
+        with searching:
+            cells_on = planner.search.path(made.cost, one.begin, one.end)
+        ratios.append(_paid(made.cost, cells_on) / one.cheapest)
+        with planning:
+            found = planner.plan(made, one.start, one.goal)
+        paths += [found] if isinstance(found, Path) else []
+    timings = (
+        anew.timing("costs of the whole map"),
+        changed.timing("costs after a change"),
+        first.timing("costs after a change, and a plan"),
+        searching.timing("optimal way, office"),
+        planning.timing("the same, pulled tight"),
+        *_corner_to_corner(size, rng, ratios),
+    )
+    length = float(np.mean([one.remaining[0] for one in paths]))
+    worst = max(ratios, key=lambda ratio: abs(ratio - 1))
+    return SizeFigures(size=size, path_m=length, timings=timings, ratio=worst), made, paths
+
+
+def _queries(made: Costmap, search: Search, rng: np.random.Generator) -> Iterator[Query]:
+    """Starts and goals as far apart as wanted, by Dijkstra."""
+    wanted = SHARE * len(made.cost)
+    open_ = np.argwhere(made.cost < 2)
+    while True:
+        begin = _cell(open_[rng.integers(len(open_))])
+        field = search.field(made.cost, begin, "from")
+        far = np.argwhere((np.abs(field / wanted - 1) < SPREAD) & (made.cost < 2))
+        for _ in range(GOALS if len(far) else 0):
+            end = _cell(far[rng.integers(len(far))])
+            start, goal = _middle(made, begin), _middle(made, end)
+            yield Query(begin, end, start, goal, float(field[end]))
+
+
+def _cell(at: NDArray[np.intp]) -> tuple[int, int]:
+    return int(at[0]), int(at[1])
+
+
+def _middle(made: Costmap, cell: tuple[int, int]) -> Point:
+    x, y = made.points(np.array(cell[:1]), np.array(cell[1:]))[0].tolist()
+    return x, y
+
+
+def _corner_to_corner(
+    size: int, rng: np.random.Generator, ratios: list[float]
+) -> tuple[Timing, Timing]:
+    """A* and a whole field of Dijkstra's over a random map; their ratio joins `ratios`."""
+    cost, search, one, all_ = scattered(size, rng), Search(), Stopwatch(), Stopwatch()
+    goal = (size - 1, size - 1)
+    for _ in range(ROUNDS):
+        with one:
+            cells = search.path(cost, (0, 0), goal)
+        with all_:
+            field = search.field(cost, (0, 0), "from")
+    ratios.append(_paid(cost, cells) / float(field[goal]))
+    return one.timing("optimal way, random map, corner to corner"), all_.timing(
+        "Dijkstra of it all"
+    )
+
+
+def _paid(cost: Costs, cells: Ints | None) -> float:
+    """What a way over cells costs; inf for none."""
+    if cells is None:
+        return float("inf")
+    on = cost[cells[:, 0], cells[:, 1]].astype(np.float64)
+    return float((np.hypot(*np.diff(cells, axis=0).T) * (on[1:] + on[:-1]) / 2).sum())
+
+
+def _drawing(made: Costmap, paths: list[Path]) -> NDArray[np.uint8]:
+    """The costs, the dearer the darker, and the paths in colours; y goes up."""
+    grey = (255 - 12 * made.cost.clip(1, 14)).astype(np.uint8)
+    grey[made.cells > 0] = 0
+    picture = np.repeat(grey[:, :, np.newaxis], 3, axis=2)
+    for i, path in enumerate(paths):
+        hue = np.array([[[180 * i // len(paths), 255, 220]]], np.uint8)
+        colour = tuple(int(v) for v in cv2.cvtColor(hue, cv2.COLOR_HSV2BGR)[0, 0])
+        places = np.rint(path.points / made.resolution - 0.5).astype(np.int32)
+        cv2.polylines(picture, [places], False, colour, 3)
+    return picture[::-1]

@@ -1,0 +1,135 @@
+"""The bare relay: four plain Zenoh processes that only put what they get. The chain's yardstick.
+
+    source ──scan──► first ──world──► second ──intent──► third ──cmd──► source
+
+A callback puts straight away: no asyncio, no decoding, no work. Each has the Zenoh threads and the
+niceness of the process that it stands for. Started as
+`python -m gigabrain_zenoh.qa.bench.relay ROLE`, with a Role in JSON.
+"""
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import msgspec
+import zenoh
+from msgspec import Struct
+
+from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME, session_config
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.host import lifeline
+from gigabrain_zenoh.host.scheduling import go_first
+from gigabrain_zenoh.qa.bench.figures import figures
+
+STAMP_BYTES = 8
+LOST_S = 0.3  # what has not come back by then never will
+ENDS = {signal.SIGTERM, signal.SIGINT}
+
+
+class Role(Struct, frozen=True, kw_only=True):
+    """What one process of the relay does."""
+
+    gets: str  # key
+    puts: str  # key
+    size: int  # bytes of what it puts
+    endpoint: Endpoint  # its router; or where it is met and whom it meets, as a peer
+    first: bool = False  # it goes before others where it may, as driver and control do
+    rate_hz: float = 0.0  # of the source; 0 for the others
+    settle_s: float = 0.0  # of the source: for how long it does not measure
+    seconds: float = 0.0  # of the source: for how long it does
+
+
+def open_session(endpoint: Endpoint) -> zenoh.Session:
+    """A session configured as all of ours are; one that listens is a peer here, not a router."""
+    settings = session_config(endpoint)
+    if endpoint.listen:
+        settings["mode"] = "peer"
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+    """As the bus declares one for a stream."""
+    return session.declare_publisher(
+        key, priority=zenoh.Priority.DATA, congestion_control=zenoh.CongestionControl.DROP
+    )
+
+
+def pass_on(session: zenoh.Session, role: Role) -> None:
+    """Put what comes, cut or filled up to this hop's size, until told to end."""
+    put, filler = publisher(session, role.puts).put, bytes(role.size)
+
+    def relay(sample: zenoh.Sample) -> None:
+        payload = sample.payload.to_bytes()
+        put(payload[: role.size] + filler[len(payload) :])
+
+    subscriber = session.declare_subscriber(role.gets, relay)
+    say({"event": "ready"})
+    signal.sigwait(ENDS)
+    subscriber.undeclare()
+
+
+def measure(session: zenoh.Session, role: Role) -> None:
+    """Send at a steady rate, and tell how long each message took to come round."""
+    put, filler = publisher(session, role.puts).put, bytes(role.size - STAMP_BYTES)
+    times_ms: list[float] = []
+    settled = threading.Event()
+
+    def back(sample: zenoh.Sample) -> None:
+        sent_ns = int.from_bytes(sample.payload.to_bytes()[:STAMP_BYTES], "little")
+        if settled.is_set():
+            times_ms.append((time.monotonic_ns() - sent_ns) / 1e6)
+
+    def send() -> None:
+        put(time.monotonic_ns().to_bytes(STAMP_BYTES, "little") + filler)
+
+    subscriber = session.declare_subscriber(role.gets, back)
+    say({"event": "ready"})
+    paced(role.rate_hz, role.settle_s, send)
+    settled.set()
+    paced(role.rate_hz, role.seconds, send)
+    time.sleep(LOST_S)
+    say({"event": "figures", "figures": msgspec.to_builtins(figures(times_ms))})
+    signal.sigwait(ENDS)
+    subscriber.undeclare()
+
+
+def paced(rate_hz: float, seconds: float, act: Callable[[], None]) -> None:
+    """Call `act` at a steady rate, by absolute deadlines."""
+    begin = time.monotonic()
+    for i in range(round(rate_hz * seconds)):
+        time.sleep(max(0.0, begin + i / rate_hz - time.monotonic()))
+        act()
+
+
+def say(record: Mapping[str, Any]) -> None:
+    """A line that the supervisor understands."""
+    print(msgspec.json.encode(record).decode(), flush=True)
+
+
+def main() -> None:
+    """Entry of a process of the relay."""
+    lifeline.die_with_supervisor()
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDS)  # before Zenoh's threads inherit the mask
+    role = msgspec.json.decode(sys.argv[1], type=Role)
+    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
+    if role.first:  # before there are threads, which inherit it
+        go_first()
+    session = open_session(role.endpoint)
+    if role.rate_hz:
+        measure(session, role)
+    else:
+        pass_on(session, role)
+    session.close()
+    os._exit(0)  # Zenoh's threads must not keep a finished process alive
+
+
+if __name__ == "__main__":
+    main()

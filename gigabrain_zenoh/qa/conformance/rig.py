@@ -1,0 +1,182 @@
+"""A driver in its real process, behind the real gate, on a network inside this program."""
+
+import asyncio
+from typing import Any, Self
+
+import msgspec
+
+from gigabrain_drivers.process import DriverProcess
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.requests import EnableRequest, ReleaseRequest
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import ENABLE, RELEASE, SAFETY, SCAN, STATE, command_topic
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.settings import DriverConfig
+from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.qa.conformance.result import Failed
+from gigabrain_zenoh.qa.conformance.subject import Subject
+from gigabrain_zenoh.qa.conformance.tap import Tap
+from gigabrain_zenoh.qa.conformance.timeline import Timeline
+
+KIT = "kit"  # the commander
+ENABLE_TICKS = 250
+MOVE_TICKS = 100
+SETTLE_TICKS = 15  # of the body, after the ramp of its commands
+STEP_TICKS = 30  # of a body that walks
+ATTEMPTS = 3  # a machine that stands still for 100 ms has the gate shut
+SHARE = 0.5  # of the body's greatest speed, which the checks drive at
+MOVING = 0.6  # of the wanted speed, from which the body counts as moving
+
+
+class Rig(Timeline):
+    """Plays the brain and the safety process: a command per state while `wanted` is not None."""
+
+    def __init__(self, subject: Subject) -> None:
+        super().__init__()
+        self.subject, self.robot = subject, subject.robot
+        self.speed = SHARE * self.robot.max_linear_speed
+        self.wanted: Velocity | None = None
+        self.state: RobotState | None = None
+        self.states = self.scans = 0
+        self.scan: LaserScan | None = None
+        self.tap = Tap(subject.driver())
+        self.network, clock = LocalNetwork(), Clock()
+        self.topic = command_topic(self.robot)
+        self._bus = Bus(self.network.transport(), clock, KIT)
+        self._bus.subscribe(STATE, self._see)
+        self._bus.subscribe(SCAN, self._scanned)
+        self._driver_bus = Bus(self.network.transport(), clock, "driver")
+        config = DriverConfig(
+            body=subject.name, link=subject.link, state_dir=str(subject.folder / "state")
+        )
+        self._process = DriverProcess(config, self.robot, self.tap, self._driver_bus)
+        self._running: asyncio.Task[None] | None = None
+        self.last: CmdVel | None = None  # what was commanded last, as it went out
+
+    async def __aenter__(self) -> Self:
+        self._running = asyncio.create_task(self._process.run(lambda: None), name="driver process")
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.wanted = None
+        if self._running:
+            self._running.cancel()
+            await asyncio.gather(self._running, return_exceptions=True)  # told by `check_alive`
+        for bus in (self._bus, self._driver_bus):
+            await bus.close()
+
+    def check_alive(self) -> None:
+        """Raise what has ended the driver's process."""
+        for ended in (self._running, self._driver_bus.failed, self._bus.failed):
+            if ended and ended.done():
+                ended.result()
+                raise Failed("the driver's process has ended")
+
+    @property
+    def causes(self) -> list[str]:
+        """Why the gate holds the body back, as codes."""
+        return [cause.code for cause in self.state.gate.causes] if self.state else []
+
+    @property
+    def mode(self) -> str:
+        """The gate's."""
+        return self.state.gate.mode if self.state else ""
+
+    @property
+    def rests(self) -> bool:
+        """Whether the body stands still."""
+        return self.subject.rests(self.state)
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Commands that the gate did not let through, by reason."""
+        counters = self._driver_bus.counters
+        return {k.removeprefix("refused_"): n for k, n in counters.items() if "refused_" in k}
+
+    def command(self, velocity: Velocity) -> None:
+        """One command, as a brain sends it."""
+        fields: dict[str, Any] = msgspec.structs.asdict(velocity)
+        self.last = self._bus.publish(self.topic, CmdVel(**fields, source=KIT))
+
+    def deliver(self, command: CmdVel | dict[str, Any]) -> None:
+        """A command as it is, header and all."""
+        self.network.deliver(self.topic.at(), codec.encode(command))
+
+    async def drive(self) -> Velocity:
+        """Have the gate opened and the body moving, to and fro in turn.
+
+        Returns the velocity that is commanded from then on.
+        """
+        wanted = Velocity(linear_x=self.subject.way() * self.speed)
+        for _ in range(ATTEMPTS):
+            self.wanted = ZERO
+            await self._enable()
+            self.wanted = wanted
+            if await self.until(lambda: self._moves(wanted), MOVE_TICKS) is not None:
+                return wanted
+            if self.mode == "enabled":
+                break
+        raise Failed(f"the body did not move; gate {self.mode}: {', '.join(self.causes)}")
+
+    async def pause(self) -> None:
+        """Command zero until the body stands."""
+        self.wanted = ZERO
+        if await self.until(lambda: self.rests, MOVE_TICKS) is None:
+            raise Failed("the body did not come to rest on commands of zero")
+
+    async def _enable(self) -> None:
+        """Release and enable as soon as the gate agrees."""
+        why = "no state from the driver"
+        begin = self.tick
+        while not self.state or self.mode != "enabled" or self.state.gate.commander != KIT:
+            if self.state:
+                why = await self._ask(self.state)
+            if self.tick - begin > ENABLE_TICKS:
+                raise Failed(f"the gate did not open: {why}")
+            await self.until(lambda: False, 5)
+
+    async def _ask(self, state: RobotState) -> str:
+        try:
+            if state.gate.mode == "latched":
+                generation = state.gate.estop_generation
+                release = ReleaseRequest(estop_generation=generation, source=KIT)
+                replies = await self._bus.ask(RELEASE, release)
+            else:
+                replies = await self._bus.ask(ENABLE, EnableRequest(source=KIT, take=True))
+        except Refused as error:
+            return str(error)
+        return replies[0].text if replies else "the driver does not answer"
+
+    def _moves(self, wanted: Velocity) -> bool:
+        told = self.subject.told(self.state)[0]
+        measured = self.state.velocity.linear_x if self.state else 0.0
+        return min(told / wanted.linear_x, measured / wanted.linear_x) >= MOVING
+
+    def _see(self, _key: str, state: RobotState) -> None:
+        self.state, self.tick = state, state.tick
+        self.states += 1
+        self._bus.time.see(state)
+        if self.states % 2:
+            self._bus.publish(SAFETY, SafetyState(verdict="ok"))
+        if self.wanted is not None:
+            self.command(self.wanted)
+
+    def _scanned(self, _key: str, scan: LaserScan) -> None:
+        self.scan, self.scans = scan, self.scans + 1
+
+
+def stop_ticks(rig: Rig, reaction: int) -> int:
+    """The most ticks from a cause to standstill: until it is seen, the ramp, and the body's own.
+
+    What walks has to end its step, and to settle.
+    """
+    ramp = rig.speed / rig.robot.max_linear_deceleration / 0.02
+    own = STEP_TICKS if rig.robot.drive_type == "quadruped" else SETTLE_TICKS
+    return reaction + round(ramp + 0.5) + own

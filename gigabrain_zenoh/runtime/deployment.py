@@ -1,0 +1,205 @@
+"""A deployment file: which body on which link, and which process runs on which host."""
+
+from collections import Counter
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+from msgspec import Struct
+
+from gigabrain_zenoh.bus.zenoh.config import secured
+from gigabrain_zenoh.config import loading as config
+from gigabrain_zenoh.config.addresses import exposed, host_and_port
+from gigabrain_zenoh.config.settings import (
+    ButtonConfig,
+    DecisionConfig,
+    Endpoint,
+    FoxgloveConfig,
+    LinkName,
+    LockstepTimeout,
+    PageConfig,
+    PerceptionConfig,
+    RecorderConfig,
+    Resume,
+    Seed,
+    Speed,
+)
+from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.host.free_port import reserve_port
+from gigabrain_zenoh.runtime.running import local_socket
+from gigabrain_zenoh.security.checks import check_identity
+from gigabrain_zenoh.security.files import identity_folder
+
+MOST_HOSTS = 64
+EMULATOR = "emulator"  # runs beside the driver where the link is `emulated`; not in `hosts`
+BUTTON = "button"  # runs beside the driver where there is one, unless `hosts` says where
+ProcessName = Literal[
+    "router",
+    "driver",
+    "perception",
+    "decision",
+    "control",
+    "safety",
+    "recorder",
+    "page",
+    "foxglove",
+    "button",
+]
+ROBOT: tuple[ProcessName, ...] = (
+    "router", "driver", "perception", "decision", "control", "safety",
+)  # fmt: skip
+ALL: tuple[ProcessName, ...] = (*ROBOT, "recorder", "page", "foxglove")
+
+
+class Deployment(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A whole deployment file."""
+
+    body: str = "turtlebot3_waffle"
+    link: LinkName = "sim"
+    world: str = "arena"
+    seed: Seed = 0
+    speed: Speed = 1.0
+    lockstep_timeout_s: LockstepTimeout = 0.15  # longer: the same decisions on a slow machine, too
+    resume: Resume = "manual"
+    namespace: str = ""  # the robot's own part of the key space, where one router serves several
+    router: str = "tcp/127.0.0.1:7447"  # where it listens; port 0 for any, where all is on one host
+    keys: str = ""  # the folder of this host's identity, or of one for each host: TLS for all
+    fleet: tuple[str, ...] = ()  # namespaces of other robots that this one's router serves
+    insecure: bool = False  # allow a router that other machines can reach, without keys
+    hosts: dict[str, tuple[ProcessName, ...]] = msgspec.field(
+        default_factory=lambda: {"robot": ROBOT}
+    )
+    button: ButtonConfig | None = None  # an e-stop button; without its word nothing moves
+    perception: PerceptionConfig = PerceptionConfig()
+    decision: DecisionConfig = DecisionConfig()
+    recorder: RecorderConfig = RecorderConfig()
+    page: PageConfig = PageConfig()
+    foxglove: FoxgloveConfig = FoxgloveConfig()
+
+    def __post_init__(self) -> None:
+        if not self.hosts:
+            raise ValueError("hosts: expected at least one, with the processes that it runs")
+        if len(self.hosts) > MOST_HOSTS:
+            raise ValueError(f"hosts: {len(self.hosts)} of them; expected at most {MOST_HOSTS}")
+        placed = Counter(name for names in self.hosts.values() for name in names)
+        twice = sorted(name for name, times in placed.items() if times > 1)
+        if twice:
+            raise ValueError(f"hosts: {', '.join(twice)} must run once, on one host")
+        if BUTTON in placed and self.button is None:
+            raise ValueError("hosts: a button runs nowhere unless `button: {port: …}` says which")
+        if self.button and self.speed != 1.0:
+            raise ValueError("button: a person presses it in real time, so leave out `speed`")
+        self._check_router()
+        if self.fleet and not self.namespace:
+            raise ValueError("fleet: this robot needs a namespace of its own as well")
+        if self.resume == "auto" and self.link == "real":
+            raise ValueError("resume: auto is for simulation; a real body is enabled by a person")
+        if self.speed != 1.0 and self.link != "sim":
+            raise ValueError("speed is for the simulation; other links run in real time")
+
+    def _check_router(self) -> None:
+        try:
+            host, port = host_and_port(self.router)
+        except ValueError as error:
+            raise ValueError(f"router: {error}") from None
+        if len(self.hosts) > 1 and host and not port:
+            raise ValueError(f"router: {self.router}: several hosts must know its port")
+        if exposed((self.router,)) and not (self.insecure or self.keys):
+            raise ValueError(
+                f"router: {self.router} can be reached by anybody on the network; "
+                "name `keys:` that `gigabrain keys new` and `keys issue` made, use a loopback "
+                "address, or write `insecure: true`"
+            )
+
+
+def deployment_folder() -> Path:
+    """The deployment files that come with the package, in a wheel as in a checkout."""
+    package = Path(str(resources.files("gigabrain_zenoh")))
+    installed = package / "deploy"
+    return installed if installed.is_dir() else package.parent / "deploy"
+
+
+def deployment_path(name: str) -> Path:
+    """The deployment file at a path, or the one of ours with that name. Raises UnknownName."""
+    path = Path(name)
+    ours = {file.stem: file for file in sorted(deployment_folder().glob("*.yaml"))}
+    if not path.exists() and not name.endswith((".yaml", ".yml")):
+        if name not in ours:
+            raise unknown("deployment", name, ours)
+        return ours[name]
+    if not path.exists() and path.stem in ours and path.parent in (Path(), Path("deploy")):
+        return ours[path.stem]
+    return path
+
+
+def load_deployment(path: Path, keys: str = "") -> Deployment:
+    """Read a deployment file; its keys are found beside it, unless `keys` stand in for them.
+
+    Raises ConfigError with file, line and what was expected.
+    """
+    loaded = config.load(path, Deployment)
+    if loaded.keys and not keys:
+        keys = str(path.absolute().parent / Path(loaded.keys).expanduser())
+    return msgspec.structs.replace(loaded, keys=keys)
+
+
+def host_of(deployment: Deployment, name: str | None) -> str:
+    """The host to start: `name`, or the only one there is. Raises ConfigError."""
+    hosts = deployment.hosts
+    if name is None:
+        if len(hosts) > 1:
+            raise ConfigError(f"which host is this? choose one with --host: {', '.join(hosts)}")
+        return next(iter(hosts), "")
+    if name not in hosts:
+        raise unknown("host", name, hosts)
+    return name
+
+
+def with_free_port(deployment: Deployment) -> Deployment:
+    """The deployment with a free port in place of port 0."""
+    protocol, _, address = deployment.router.partition("/")
+    host, _, port = address.rpartition(":")
+    if port != "0":
+        return deployment
+    try:
+        free = reserve_port(host.strip("[]"))
+    except OSError as error:
+        raise ConfigError(f"router {deployment.router}: {error.strerror}") from None
+    return msgspec.structs.replace(deployment, router=f"{protocol}/{host}:{free}")
+
+
+def client_endpoint(deployment: Deployment, host: str = "") -> Endpoint:
+    """Where the processes of `host` meet this deployment. Raises ConfigError."""
+    keys = str(identity_folder(deployment.keys, host)) if deployment.keys else ""
+    return secured(
+        Endpoint(connect=(deployment.router,), namespace=deployment.namespace, keys=keys)
+    )
+
+
+def local_endpoint(deployment: Deployment, host: str) -> Endpoint:
+    """Where `host` meets it itself: with keys by the Unix socket of its own router, if it has one.
+
+    Nobody on the network can be in the way there.
+    """
+    endpoint = client_endpoint(deployment, host)
+    if not endpoint.keys or "router" not in deployment.hosts[host]:
+        return endpoint
+    return msgspec.structs.replace(endpoint, connect=(local_socket(), *endpoint.connect))
+
+
+def check_keys(deployment: Deployment, host: str) -> None:
+    """Whether the identity of `host` is good for what it runs. Raises ConfigError."""
+    if deployment.keys:
+        check_identity(
+            identity_folder(deployment.keys, host),
+            deployment.hosts[host],
+            deployment.namespace,
+            deployment.router,
+        )
+
+
+def recorded(path: Path) -> dict[str, Any]:
+    """What makes a deployment record itself into one file, raw, for a replay."""
+    recorder = {"file": str(path.absolute()), "viewers": False}
+    return {"hosts": {"robot": (*ROBOT, "recorder")}, "recorder": recorder}

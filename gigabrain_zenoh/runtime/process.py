@@ -1,0 +1,172 @@
+"""Common frame of every process: logs, a session, health, and a node that runs until stopped."""
+
+import asyncio
+import contextlib
+import functools
+import gc
+import logging
+import os
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gigabrain_schemas.topics import HEARD, LOG
+from gigabrain_zenoh import logs
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.heartbeat import STDOUT, beat
+from gigabrain_zenoh.bus.transport import Transport
+from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME
+from gigabrain_zenoh.bus.zenoh.unobtrusive import NAP_S
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.process_config import ProcessConfig
+from gigabrain_zenoh.errors import GigabrainError, unknown
+from gigabrain_zenoh.host.interrupts import interrupts
+from gigabrain_zenoh.host.journal import SaidJournal
+from gigabrain_zenoh.host.scheduling import go_first, join_in, start_first, step_aside
+from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.plugins import find
+from gigabrain_zenoh.runtime.health import publish_health
+from gigabrain_zenoh.runtime.meeting import join
+from gigabrain_zenoh.runtime.name_claim import NameClaim
+from gigabrain_zenoh.runtime.param_service import serve_params
+
+log = logging.getLogger("gigabrain")
+
+Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
+MakeBus = Callable[[Transport, Clock, str], Bus]
+
+
+@dataclass(frozen=True)
+class ProcessType:
+    """Import path of a process's node and of its settings type, if any; imported only when used."""
+
+    run: str
+    settings: str = ""
+    stops: bool = False  # carries commands and stops: gets a higher priority where permitted
+    repeats: bool = False  # can be replayed, so it publishes which input it used
+    looks_on: bool = False  # not needed by the robot: naps, and runs at low priority
+
+    def node(self, settings: Mapping[str, Any]) -> Node:
+        """Return the process's node with its settings filled in. Raises ValidationError."""
+        run = find(self.run)
+        if not self.settings:
+            return run  # type: ignore[no-any-return]
+        return functools.partial(run, msgspec.convert(settings, find(self.settings)))
+
+
+def loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
+    """Return uvloop's event loop factory; None (asyncio's default) if uvloop is not installed."""
+    try:
+        return find("uvloop:new_event_loop")  # type: ignore[no-any-return]
+    except ModuleNotFoundError:
+        return None
+
+
+def run(config: ProcessConfig, types: Mapping[str, ProcessType], make_bus: MakeBus = Bus) -> int:
+    """Run one process until it ends, and return its exit code.
+
+    `types` holds all types of processes, by name.
+    """
+    gc.disable()  # until ready: objects from imports and set-up are not garbage
+    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
+    try:
+        run_dir = Path(config.run_dir) if config.run_dir else None
+        logs.setup(config.name, run_dir, json_console=config.json_console, level=config.level)
+        if config.name not in types:
+            raise unknown("process", config.name, types)
+        process_type = types[config.name]
+        node = process_type.node(config.settings)
+        if process_type.stops:
+            go_first()  # like the other branches, before any thread starts: threads inherit it
+        elif process_type.looks_on:
+            step_aside()
+        else:
+            start_first()
+        with (
+            interrupts.reacting(None),  # before `stop_signals` there is nothing to stop
+            asyncio.Runner(loop_factory=loop_factory()) as runner,
+        ):
+            runner.run(_run(config, process_type, node, make_bus))
+    except GigabrainError as error:
+        log.error("%s", error, extra={"data": {"event": "failed"}})
+        return error.exit_code
+    except Exception as error:
+        first = _first(error)
+        log.critical("died of %s: %s", type(first).__name__, first, exc_info=True)
+        return 1
+    finally:
+        logs.flush()
+        gc.enable()
+    return 0
+
+
+def _first(error: BaseException) -> BaseException:
+    """Return the first exception within nested exception groups."""
+    while isinstance(error, BaseExceptionGroup):
+        error = error.exceptions[0]
+    return error
+
+
+async def _run(
+    config: ProcessConfig, process_type: ProcessType, node: Node, make_bus: MakeBus
+) -> None:
+    with stop_signals() as stop:
+        work = asyncio.ensure_future(_work(config, process_type, node, make_bus))
+        stopped = asyncio.ensure_future(stop.wait())
+        await asyncio.wait((work, stopped), return_when=asyncio.FIRST_COMPLETED)
+        work.cancel()
+        stopped.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await work
+
+
+async def _work(
+    config: ProcessConfig, process_type: ProcessType, node: Node, make_bus: MakeBus
+) -> None:
+    nap_s = NAP_S if process_type.looks_on else 0.0
+    endpoint = msgspec.structs.replace(config.endpoint, nap_s=nap_s)
+    bus = make_bus(await join(endpoint), Clock(), config.name)
+    handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
+    logging.getLogger().addHandler(handler)
+    if process_type.repeats:
+        say = functools.partial(bus.publish, HEARD, name=config.name)
+        bus.journal = SaidJournal(say, bus.clock.unix_ns)
+    try:
+        claim = NameClaim(bus)
+        await claim.take()
+        serve_params(bus)
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(publish_health(bus))
+            tasks.create_task(claim.keep())
+            if config.json_console:
+                out = os.dup(STDOUT)  # the router redirects its standard output to Zenoh's log
+                tasks.create_task(beat(bus.clock, lambda: bus.progress(), out))
+            tasks.create_task(_failure(bus))
+            tasks.create_task(_node(bus, node, process_type))
+    except* GigabrainError as group:
+        raise group.exceptions[0] from None
+    finally:
+        logging.getLogger().removeHandler(handler)
+        bus.journal.flush()
+        await bus.close()
+
+
+async def _failure(bus: Bus) -> None:
+    """Raise the exception of a message handler, even while the node waits for something else."""
+    await bus.failed
+
+
+async def _node(bus: Bus, node: Node, process_type: ProcessType) -> None:
+    await node(bus, functools.partial(_ready, process_type))
+
+
+def _ready(process_type: ProcessType) -> None:
+    if not process_type.stops:
+        join_in()
+    gc.collect()
+    gc.freeze()  # objects from set-up stay; later collections check new objects only
+    gc.enable()
+    log.info("ready", extra={"data": {"event": "ready", "pid": os.getpid()}})

@@ -1,0 +1,159 @@
+"""Registry of the robots that run on this machine, so that tools and scripts can find them."""
+
+import contextlib
+import fcntl
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, BinaryIO
+
+import msgspec
+from msgspec import Meta, Struct
+
+from gigabrain_zenoh.bus.zenoh.config import secured
+from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
+from gigabrain_zenoh.host.bounded_file import open_regular
+
+SOCKET = "unixsock-stream"
+NOTE_BYTES = 65536  # maximum size of a note
+
+Pid = Annotated[int, Meta(ge=1, le=2**31 - 1)]  # 0 and negative pids address process groups
+
+
+class Running(Struct, frozen=True, kw_only=True):
+    """A robot that runs on this machine."""
+
+    pid: Pid  # of its supervisor, or of a router that was started by hand
+    label: str  # name shown to users
+    endpoint: Endpoint
+
+
+def folder() -> Path:
+    """Return the folder in which each supervisor keeps a note while it runs."""
+    runtime = (
+        os.environ.get("XDG_RUNTIME_DIR") or f"{tempfile.gettempdir()}/gigabrain-{os.getuid()}"
+    )
+    return Path(runtime) / "gigabrain"
+
+
+def local_socket() -> str:
+    """Return the Zenoh endpoint of this supervisor's router that only this user can reach."""
+    return f"{SOCKET}/{folder() / str(os.getpid())}.sock"
+
+
+@contextmanager
+def announced(label: str, endpoint: Endpoint) -> Iterator[Path]:
+    """Keep a note on disk while the block runs, and yield its path. Raises ConfigError.
+
+    The note stays locked while this process lives, because its pid may be reused afterwards.
+    """
+    note = folder() / f"{os.getpid()}.json"
+    robot = Running(pid=os.getpid(), label=label, endpoint=endpoint)
+    try:
+        for place in (note.parent.parent, note.parent):
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        _check_private(note.parent)
+        file = _written(note, msgspec.json.encode(robot))
+    except OSError as error:
+        raise ConfigError(f"cannot write {note}: {error.strerror}; set XDG_RUNTIME_DIR") from None
+    with file:
+        try:
+            yield note
+        finally:
+            _forget(note)
+
+
+def _written(note: Path, text: bytes) -> BinaryIO:
+    """Write and lock the note, and return its open file. The note appears atomically."""
+    fresh = note.with_suffix(".new")
+    file = fresh.open("wb")
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.write(text)
+        file.flush()
+        fresh.replace(note)
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+def _check_private(place: Path) -> None:
+    """Raise ConfigError where another user could put notes into the folder, or replace it."""
+    for one in (place, place.parent):
+        with contextlib.suppress(FileNotFoundError):
+            about = one.stat()
+            if about.st_uid != os.getuid() or about.st_mode & 0o022:
+                raise ConfigError(
+                    f"{one} belongs to another user, or others may write it, so it cannot say "
+                    "which robots run; set XDG_RUNTIME_DIR to a folder of your own, of mode 0700"
+                )
+
+
+def _forget(note: Path) -> None:
+    """Remove a note, and the socket that its router may have left."""
+    for path in (note, note.with_suffix(".sock"), note.with_suffix(".sock.lock")):
+        path.unlink(missing_ok=True)
+
+
+def running() -> list[Running]:
+    """Return the robots whose supervisors are alive, and remove the notes of dead ones.
+
+    Raises ConfigError where other users may have written the notes.
+    """
+    _check_private(folder())
+    notes = sorted(folder().glob("*.json"))
+    return [robot for note in notes if (robot := _read(note)) is not None]
+
+
+def _read(note: Path) -> Running | None:
+    """Return the robot of a note. If the note is invalid or its process is dead, remove it."""
+    try:
+        with open_regular(note) as file:
+            if _locked(file):
+                return msgspec.json.decode(file.read(NOTE_BYTES), type=Running)
+    except (OSError, ConfigError, *DECODE_ERRORS):
+        pass
+    _forget(note)
+    return None
+
+
+def _locked(file: BinaryIO) -> bool:
+    """Return whether the process that wrote the file still has it open."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    return False
+
+
+def find_endpoint(connect: str | None, namespace: str = "", keys: str = "") -> Endpoint:
+    """Return the endpoint given by `connect`, or that of the only robot on this machine.
+
+    Raises BusError where there is no robot, Ambiguous where there are several. `keys` is the folder
+    of the client's identity, for a router that requires one.
+    """
+    if connect:
+        folder = str(Path(keys).expanduser().absolute()) if keys else ""
+        return secured(Endpoint(connect=(connect,), namespace=namespace, keys=folder))
+    robots = [r for r in running() if not namespace or r.endpoint.namespace == namespace]
+    if not robots:
+        raise BusError("no robot runs here; start one with `gigabrain demo`, or name its router")
+    nearest = {_place(robot): robot for robot in sorted(robots, key=_ways)}
+    if len(nearest) > 1:
+        where = ", ".join(f"{r.endpoint.connect[-1]} ({r.label})" for r in nearest.values())
+        raise Ambiguous(f"several robots run here; choose one with --connect: {where}")
+    return next(iter(nearest.values())).endpoint
+
+
+def _place(robot: Running) -> tuple[str, str]:
+    """Return the address and namespace, which two hosts of one robot on this machine share."""
+    return robot.endpoint.connect[-1], robot.endpoint.namespace
+
+
+def _ways(robot: Running) -> int:
+    return len(robot.endpoint.connect)

@@ -1,0 +1,170 @@
+"""Runs the processes of one host: starts them in readiness order, and stops them all."""
+
+import asyncio
+import contextlib
+import graphlib
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Self
+
+from gigabrain_zenoh import errors
+from gigabrain_zenoh.bus import heartbeat
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.backoff import Backoff
+from gigabrain_zenoh.runtime.keeper import (
+    Keeper,
+    OnRecord,
+    ProcessSpec,
+    ProcessStatus,
+    Shared,
+    State,
+)
+
+__all__ = ["Backoff", "OnRecord", "ProcessSpec", "ProcessStatus", "State", "Supervisor"]
+
+# Fractions of the time limit of a stop, after which processes are killed, and then abandoned to
+# the kernel. The router stops last, so the others get less time where there is one.
+_FIRST, _REAPED, _LAST = 0.55, 0.65, 0.85
+
+
+class Supervisor:
+    """Runs processes until stopped; used once. However it ends, no processes remain."""
+
+    def __init__(
+        self,
+        specs: Sequence[ProcessSpec],
+        on_record: OnRecord,
+        backoff: Backoff | None = None,
+        *,
+        keep_stuck: bool = False,
+    ) -> None:
+        _check(specs)
+        self._shared = Shared(on_record, backoff or Backoff(), keep_stuck)
+        self._keepers = {spec.name: Keeper(spec, self._shared) for spec in specs}
+        self.statuses: Mapping[str, ProcessStatus] = {
+            name: keeper.status for name, keeper in self._keepers.items()
+        }
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._stopping: asyncio.Task[None] | None = None
+
+    @property
+    def deaths(self) -> int:
+        """Return how often a process has ended unexpectedly."""
+        return sum(keeper.deaths for keeper in self._keepers.values())
+
+    @property
+    def given_up(self) -> tuple[str, ...]:
+        """Return the names of processes that are no longer restarted."""
+        return tuple(name for name, status in self.statuses.items() if status.state == "given up")
+
+    @property
+    def misconfigured(self) -> tuple[str, ...]:
+        """Return the names of processes given up for a wrong configuration (exit code 2)."""
+        given_up = (self.statuses[name] for name in self.given_up)
+        return tuple(s.name for s in given_up if s.last_exit == ConfigError.exit_code)
+
+    @property
+    def stuck(self) -> tuple[str, ...]:
+        """Return the names of processes that run and make no progress."""
+        return tuple(name for name, keeper in self._keepers.items() if keeper.stuck)
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.stop()
+
+    async def run(self) -> None:
+        """Keep all processes running until `stop()` or cancellation; either stops them all."""
+        self._tasks = {
+            name: asyncio.create_task(keeper.run([self._keepers[n] for n in keeper.spec.after]))
+            for name, keeper in self._keepers.items()
+        }
+        halted = asyncio.create_task(self._shared.halt.wait())
+        watching = asyncio.create_task(self._watch())
+        try:
+            # a keeper ends only when all are stopped, or with an exception
+            ends = [halted, watching, *self._tasks.values()]
+            await asyncio.wait(ends, return_when="FIRST_EXCEPTION")
+        finally:
+            try:
+                await self.stop()
+                await halted
+                await watching
+            finally:  # a second Ctrl-C may cancel the stop before it starts
+                self._abandon()
+
+    async def _watch(self) -> None:
+        """Check for processes without progress, until all are stopped."""
+        loop, halt = asyncio.get_running_loop(), self._shared.halt
+        looked_s = loop.time()
+        while not halt.is_set():
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(heartbeat.LOOK_S):
+                    await halt.wait()
+            passed_s, looked_s = loop.time() - looked_s, loop.time()
+            for keeper in self._keepers.values():
+                keeper.look(passed_s)
+
+    async def stop(self, within_s: float = 1.5) -> None:
+        """Stop all processes within `within_s`: first by request, then by force."""
+        if self._stopping is None:
+            self._stopping = asyncio.create_task(self._stop(within_s))
+        await asyncio.shield(self._stopping)
+
+    async def _stop(self, within_s: float) -> None:
+        begin_s, keepers = asyncio.get_running_loop().time(), self._keepers.values()
+        self._shared.halt.set()
+        for keeper in keepers:
+            keeper.settled.set()
+        try:
+            async with self._shared.starting:  # a starting process has its pid after this
+                running = [keeper for keeper in keepers if keeper.child]
+            last = [keeper for keeper in running if keeper.spec.stop_last]
+            first = [keeper for keeper in running if not keeper.spec.stop_last]
+            if last:
+                await self._end(first, begin_s + _FIRST * within_s, begin_s + _REAPED * within_s)
+            await self._end(last or first, begin_s + _LAST * within_s, begin_s + within_s)
+            for task in self._tasks.values():
+                if task.done():
+                    task.result()
+        finally:
+            self._abandon()
+
+    def _abandon(self) -> None:
+        """Kill every process that still runs, without waiting for it."""
+        for keeper in self._keepers.values():
+            if keeper.child:
+                keeper.child.abandon()
+
+    async def _end(self, keepers: Sequence[Keeper], kill_s: float, leave_s: float) -> None:
+        """Request the end, kill at `kill_s`, and stop waiting at `leave_s` (both loop times)."""
+        for keeper in keepers:
+            keeper.ask_to_end()
+        await self._wait_for(keepers, kill_s)
+        for keeper in keepers:
+            keeper.force_to_end()
+        await self._wait_for(keepers, leave_s)
+
+    async def _wait_for(self, keepers: Sequence[Keeper], until_s: float) -> None:
+        tasks = [self._tasks[keeper.spec.name] for keeper in keepers]
+        if tasks:
+            left_s = until_s - asyncio.get_running_loop().time()
+            await asyncio.wait(tasks, timeout=max(left_s, 0.0))
+
+
+def _check(specs: Sequence[ProcessSpec]) -> None:
+    """Raise an error for duplicate names, unknown names in `after`, and circular dependencies."""
+    after = {spec.name: spec.after for spec in specs}
+    for name, times in Counter(spec.name for spec in specs).items():
+        if times > 1:
+            raise ConfigError(f"{times} processes are called {name!r}; expected one")
+    for others in after.values():
+        for other in others:
+            if other not in after:
+                raise errors.unknown("process", other, after)
+    try:
+        graphlib.TopologicalSorter(after).prepare()
+    except graphlib.CycleError as error:
+        circle = " after ".join(reversed(error.args[1]))
+        raise ConfigError(f"no process can be first: {circle}; expected an order") from None

@@ -1,0 +1,192 @@
+"""What each role may do, in one table, and the router's rules that follow from it.
+
+What a role may *say* is decided where it enters the router. To hear and see all of its own robot
+is everybody's right who has an identity; somebody without one does not even get a session.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from gigabrain_schemas.topics import (
+    AUDIT_LOG,
+    BUTTON,
+    CMD_VEL,
+    DESCRIBE,
+    ENABLE,
+    ESTOP,
+    ESTOP_SAID,
+    GOAL,
+    GRANTED,
+    HEALTH,
+    HEARD,
+    INTENT,
+    JOINT_CMD,
+    LOG,
+    MAP,
+    MAP_SAVE,
+    MISSION,
+    PARAM,
+    POSE,
+    RELEASE,
+    TASK,
+    TASK_CHANGE,
+    TELEOP,
+    TOPICS,
+    WORLD,
+    Service,
+    Topic,
+)
+from gigabrain_zenoh.security.roles import Role, common_name, of_generation
+
+ALL = "robot/**"  # all that there is of one robot
+TO_LISTENERS = ("put", "query", "reply", "declare_queryable")
+FIRST: Mapping[str, int] = {}  # nobody has been called back
+LOCAL = "local"  # who comes by the router's Unix socket, which only this user can open
+
+
+@dataclass(frozen=True)
+class Rights:
+    """What a role may say of its robot, beyond listening."""
+
+    says: tuple[Topic[Any], ...] = ()
+    asks: tuple[Service[Any, Any], ...] = (DESCRIBE,)
+    answers: tuple[Service[Any, Any], ...] = ()
+    names: tuple[str, ...] = ()  # of the processes that it may be, where a key ends in one
+
+
+BRAIN = Rights(
+    says=(WORLD, POSE, MAP, INTENT, TASK, GRANTED, HEARD, HEALTH, LOG, ESTOP_SAID),
+    asks=(DESCRIBE, ESTOP),
+    answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
+    names=("perception", "decision", "relay"),
+)
+OPERATOR = Rights(
+    says=(TELEOP, BUTTON, CMD_VEL, JOINT_CMD, HEALTH, LOG, ESTOP_SAID),
+    asks=(
+        DESCRIBE,
+        AUDIT_LOG,
+        PARAM,
+        ESTOP,
+        RELEASE,
+        ENABLE,
+        GOAL,
+        MISSION,
+        TASK_CHANGE,
+        MAP_SAVE,
+    ),
+    answers=(PARAM, DESCRIBE),
+    names=("page", "foxglove", "recorder", "button"),
+)
+FLEET_WIDE: tuple[Role, ...] = ("operator", "viewer")  # where no robot is named
+Rule = dict[str, Any]
+RIGHTS: Mapping[Role, Rights | None] = {
+    "robot": None,  # everything below its own name
+    "brain": BRAIN,
+    "operator": OPERATOR,
+    "viewer": Rights(asks=(DESCRIBE, AUDIT_LOG)),
+}
+
+
+def access_control(
+    robots: Sequence[str], own: str = "", generations: Mapping[str, int] = FIRST
+) -> dict[str, Any]:
+    """Zenoh's `access_control` for a router of these robots (their namespaces); deny by default.
+
+    Of each name only one of the `generations` has rights, the first unless told otherwise.
+
+    Whoever comes by the Unix socket is the robot `own`: only the user who runs it can, and could
+    read its key as well. Beside a router of no robot it is an operator of all.
+    """
+    of = {
+        common_name(role, robot): list(_rules(role, robot)) for robot in robots for role in RIGHTS
+    }
+    rules = [FLEET_LISTENS, *(rule for each in of.values() for rule in each)]
+    subjects, policies = [], []
+    for name, own_names in _known(robots):
+        ids = [rule["id"] for own_name in own_names for rule in of[own_name]]
+        if name in FLEET_WIDE:
+            ids.append(FLEET_LISTENS["id"])
+        subjects.append({"id": name, "cert_common_names": [_good(name, generations)]})
+        policies.append({"subjects": [name], "rules": ids})
+    subjects.append({"id": LOCAL, "link_protocols": ["unixsock-stream"]})
+    near = [common_name("operator", robot) for robot in robots]
+    if own in robots:
+        near = [common_name("robot", own)]
+    ids = [rule["id"] for name in near for rule in of[name]]
+    policies.append({"subjects": [LOCAL], "rules": ids})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def known_names(robots: Sequence[str], generations: Mapping[str, int] = FIRST) -> tuple[str, ...]:
+    """The common names that have rights at a router of these robots."""
+    return tuple(_good(name, generations) for name, _ in _known(robots))
+
+
+def _good(name: str, generations: Mapping[str, int]) -> str:
+    return of_generation(name, generations.get(name, 1))
+
+
+def _known(robots: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Each common name, and those of one robot whose rights it has together."""
+    for role in RIGHTS:
+        if role in FLEET_WIDE:
+            yield role, tuple(common_name(role, robot) for robot in robots)
+        for robot in robots:
+            if robot or role not in FLEET_WIDE:
+                yield common_name(role, robot), (common_name(role, robot),)
+
+
+def _rules(role: Role, robot: str) -> Iterator[Rule]:
+    """One role's rules for one robot."""
+    rights, who, everything = RIGHTS[role], common_name(role, robot), under(robot, [ALL])
+    says, asks, answers = _keys(rights) if rights else ([ALL], [ALL], [ALL])
+    yield _rule(f"{who} hears", "egress", TO_LISTENERS, everything)
+    # that somebody listens is no secret: a fleet's operator may listen to `**`
+    yield _rule(f"{who} is heard", "egress", ["declare_subscriber"], ["**"])
+    yield _rule(f"{who} listens", "ingress", ["declare_subscriber"], everything)
+    for verb, messages, keys in (
+        ("says", ["put"], says),
+        ("asks", ["query"], asks),
+        ("answers", ["declare_queryable", "reply"], answers),
+    ):
+        if keys:
+            yield _rule(f"{who} {verb}", "ingress", messages, under(robot, keys))
+
+
+def _keys(rights: Rights) -> tuple[list[str], list[str], list[str]]:
+    """The keys on which a role may say something, ask, and answer."""
+    kept = [topic.key for topic in TOPICS if topic.keep]  # whoever comes late asks for these
+    says = [key for topic in rights.says for key in _own(topic, rights)]
+    asks = [*kept, *(service.at("*") for service in rights.asks)]
+    held = [key for key in says if key in kept]
+    answers = [*held, *(key for service in rights.answers for key in _own(service, rights))]
+    return says, asks, answers
+
+
+def _rule(name: str, flow: str, messages: Sequence[str], keys: Sequence[str]) -> Rule:
+    return {
+        "id": name,
+        "permission": "allow",
+        "flows": [flow],
+        "messages": list(messages),
+        "key_exprs": list(keys),
+    }
+
+
+FLEET_LISTENS = _rule("the fleet listens", "ingress", ["declare_subscriber"], ["**"])
+
+
+def _own(of: Topic[Any] | Service[Any, Any], rights: Rights) -> list[str]:
+    return [of.at(name) for name in rights.names] if of.many else [of.key]
+
+
+def under(robot: str, keys: Iterable[str]) -> list[str]:
+    """The keys as the router sees them."""
+    return [f"{robot}/{key}" if robot else key for key in keys]

@@ -1,0 +1,122 @@
+"""Who may open the page, and what for: tokens, and the names under which it is asked for."""
+
+import hmac
+import ipaddress
+import os
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+from msgspec import Struct
+
+from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.config.addresses import is_ip, is_loopback
+from gigabrain_zenoh.config.settings import PageConfig
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.logs import state_dir
+from gigabrain_zenoh.security.files import made_once
+
+Role = Literal["operator", "viewer"]
+LOOPBACK_NAMES = ("127.0.0.1", "localhost", "::1")
+PORTS = {"http": 80, "https": 443}
+TOKEN_BYTES = 24
+
+
+class Tokens(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One secret for those who drive, one for those who look."""
+
+    operator: str
+    viewer: str
+
+    def __post_init__(self) -> None:
+        if min(len(self.operator), len(self.viewer)) < 16 or self.operator == self.viewer:
+            raise ValueError("two tokens of 16 characters or more are expected")
+
+
+def wants_login(config: PageConfig) -> bool:
+    """Whether somebody who opens the page has to have a token."""
+    return config.login or not is_loopback(config.listen)
+
+
+def check(config: PageConfig) -> None:
+    """Raises ConfigError for a page that others can reach without TLS."""
+    if bool(config.certificate) != bool(config.certificate_key):
+        raise ConfigError("page: a certificate and its key belong together")
+    if not is_loopback(config.listen) and not config.certificate:
+        raise ConfigError(
+            f"page: {config.listen} can be reached from the network; name a certificate and its "
+            "key (PEM files), or leave it on 127.0.0.1 and use an SSH tunnel"
+        )
+    for file in filter(None, (config.certificate, config.certificate_key)):
+        if not os.access(file, os.R_OK):
+            raise ConfigError(f"page: cannot read {file}")
+
+
+def token_file(named: str) -> Path:
+    """Where the tokens are kept; in the file that is `named`, where one is."""
+    return Path(named) if named else state_dir() / "page" / "tokens.json"
+
+
+def tokens(path: Path) -> tuple[Tokens, bool]:
+    """The tokens in a file that only its owner can read, and whether it had to be made.
+
+    Raises ConfigError where it cannot be used.
+    """
+    fresh = Tokens(
+        operator=secrets.token_urlsafe(TOKEN_BYTES), viewer=secrets.token_urlsafe(TOKEN_BYTES)
+    )
+    held, made = made_once(path, msgspec.json.encode(fresh))
+    try:
+        return msgspec.json.decode(held, type=Tokens), made
+    except DECODE_ERRORS as error:
+        raise ConfigError(f"{path}: {error}; remove it, and new tokens are made") from None
+
+
+class Access:
+    """Decides who is let in."""
+
+    def __init__(self, config: PageConfig, port: int) -> None:
+        self._tokens, self.made = None, False
+        if wants_login(config):
+            self._tokens, self.made = tokens(token_file(config.tokens))
+        self._scheme = "https" if config.certificate else "http"
+        local = LOOPBACK_NAMES if is_loopback(config.listen) else ()
+        names = {_in_header(name) for name in (config.listen, *local, *config.names)}
+        self._hosts = {f"{name}:{port}" for name in names}
+        if port == PORTS[self._scheme]:
+            self._hosts |= names  # browsers leave out the port that goes without saying
+
+    def told(self) -> str:
+        """The tokens, for whoever has just had them made; else nothing."""
+        if self._tokens is None or not self.made:
+            return ""
+        return f"to drive: {self._tokens.operator}\nto look:  {self._tokens.viewer}"
+
+    def role(self, token: str) -> Role | None:
+        """What a token allows; None for a stranger's."""
+        if self._tokens is None:
+            return "operator"
+        if _same(token, self._tokens.operator):
+            return "operator"
+        return "viewer" if _same(token, self._tokens.viewer) else None
+
+    def named(self, headers: Mapping[str, str]) -> bool:
+        """Whether the page was asked for by a name of its own (DNS rebinding, RFC 9110 7.2)."""
+        return headers.get("host", "").lower() in self._hosts
+
+    def own_page(self, headers: Mapping[str, str]) -> bool:
+        """Whether it is this page that opens a WebSocket, and no other site's."""
+        origin = headers.get("origin", "").lower()
+        return self.named(headers) and origin == f"{self._scheme}://{headers['host'].lower()}"
+
+
+def _in_header(name: str) -> str:
+    """A name or an address as browsers put it into `Host` and `Origin` (RFC 3986, 3.2.2)."""
+    name = name.strip("[]").lower()
+    return f"[{ipaddress.ip_address(name)}]" if ":" in name and is_ip(name) else name
+
+
+def _same(one: str, other: str) -> bool:
+    return hmac.compare_digest(one.encode(), other.encode())
