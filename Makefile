@@ -1,6 +1,6 @@
 # make demo   set up, and drive a robot round a room        make test   set up, and run all checks
-# make setup  the set-up alone                              make bench  measure this machine
-#                                                         make qa     and what takes hours
+# make setup  the set-up alone                              make check  those that start no robot
+# make bench  measure this machine                          make qa     what takes hours
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -8,7 +8,7 @@ PYTHON ?= python3
 INSTALLED := $(VENV)/.installed
 DONE := $(VENV)/.done
 
-.PHONY: setup demo test lint unit bench faults soak mutation fuzz golden recordings pictures clean qa
+.PHONY: setup demo test check lint unit system bench faults soak mutation fuzz golden recordings pictures clean qa
 
 setup: $(DONE)
 
@@ -33,6 +33,10 @@ demo: setup
 	@$(BIN)/gigabrain demo $(ARGS)
 
 test:
+	@$(MAKE) --no-print-directory check
+	@$(MAKE) --no-print-directory system
+
+check:
 	@$(MAKE) --no-print-directory --jobs 2 setup lint  # one compiles while the other checks
 	@$(MAKE) --no-print-directory unit
 
@@ -40,9 +44,13 @@ lint: $(INSTALLED)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m gigabrain_zenoh.qa.house
 
 unit: setup
 	$(BIN)/pytest -n 2 --dist loadfile -m 'not system' $(ARGS)
+
+system: setup
 	$(BIN)/pytest -m system $(ARGS)  # these start robots, which have the machine to themselves
 
 # before a release, on a machine with nothing else to do: hours, and continued where it was stopped
