@@ -14,6 +14,7 @@ import yaml
 # libyaml's loader is nine times faster than the Python one; not every platform's wheel has it.
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DEEPEST = 32  # libyaml's composer recurses in C and overruns the stack on deep nesting
+_TOO_DEEP = f"nested too deeply; expected at most {_DEEPEST} levels"
 _LONGEST_NUMBER = 64  # characters
 _NUMBER = re.compile(r"[-+]?(?:(?:0|[1-9][0-9]*)(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 
@@ -56,6 +57,8 @@ def read(text: str) -> Node:
         raise YamlFault(line, f"not YAML: {error.reason}") from None
     except yaml.MarkedYAMLError as error:
         line = _line(error.problem_mark or error.context_mark)
+        if "nesting depth" in (error.problem or ""):  # libyaml 0.2.6 scans ahead to level 1000
+            raise YamlFault(line, _TOO_DEEP) from None
         raise YamlFault(line, f"not YAML: {error.problem or error.context}") from None
     if root is None:
         raise YamlFault(1, "the file is empty; expected a mapping of fields")
@@ -73,7 +76,7 @@ def _refuse_indirections(text: str) -> None:
         if documents > 1:
             raise YamlFault(line, "a second document begins here; expected one")
         if depth > _DEEPEST:
-            raise YamlFault(line, f"nested too deeply; expected at most {_DEEPEST} levels")
+            raise YamlFault(line, _TOO_DEEP)
         if isinstance(event, yaml.AliasEvent):
             raise YamlFault(line, f"alias '*{event.anchor}' is not allowed; write the value out")
         tag = getattr(event, "tag", None)
