@@ -43,7 +43,7 @@ from tests import bag_rig
 from tests.brain_in_memory import BRAIN, Robot
 from tests.plane_rig import ROOM, Plane, drawn
 
-RECORDINGS = Path(__file__).parent / "recordings"
+RECORDINGS = Path(__file__).parents[1] / "recordings"
 RENEW = "was the change meant? then: make recordings"
 
 

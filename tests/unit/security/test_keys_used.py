@@ -18,7 +18,7 @@ from gigabrain_zenoh.runtime.deployment import (
     load_deployment,
 )
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[3]
 
 
 def test_with_keys_everything_is_tls_and_without_nothing_is(fleet: Path) -> None:

@@ -13,7 +13,7 @@ from gigabrain_zenoh.security.identity import read
 from gigabrain_zenoh.security.revoked import revoke
 from tests.keys_rig import site
 from tests.stack import Home
-from tests.test_acl import answer, ask, asked_until_answered
+from tests.unit.security.test_acl import answer, ask, asked_until_answered
 from tests.zenoh_rig import Ear, repeat
 
 HELLO = "red/robot/teleop"

@@ -17,7 +17,7 @@ from gigabrain_zenoh.qa.drives import file_of
 from gigabrain_zenoh.recording.intake import Arrival
 from gigabrain_zenoh.recording.lerobot import columns, convert, episodes, frames
 from tests import bag_rig
-from tests.test_record_replay import RECORDINGS
+from tests.node.test_record_replay import RECORDINGS
 
 
 def enabled(states: range) -> Iterator[Arrival]:

@@ -8,7 +8,7 @@ from gigabrain_zenoh.mapping.drift import Drift, Rates
 from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.places import PlaceSearch
 from tests.rooms import Lidar, Walls, box, line
-from tests.test_slam import BLOCK, lap
+from tests.unit.geometry.test_slam import BLOCK, lap
 
 BAD = Rates(away=0.2, turn=0.02)
 

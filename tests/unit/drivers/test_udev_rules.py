@@ -9,7 +9,7 @@ import pytest
 
 from gigabrain_drivers.catalog import load_robot, robot_files
 
-RULES = Path(__file__).parent.parent / "deploy" / "70-gigabrain.rules"
+RULES = Path(__file__).parents[3] / "deploy" / "70-gigabrain.rules"
 MATCHES = {"ACTION", "SUBSYSTEM", "DRIVER", "ATTR", "ATTRS", "KERNEL", "ENV"}
 ASSIGNS = {"MODE", "GROUP", "SYMLINK", "ENV", "ATTR", "GOTO", "LABEL", "TAG"}
 PART = re.compile(r'([A-Z]+)(?:\{([A-Za-z_]+)\})?(==|!=|\+=|:=|=)"([^"]*)"')

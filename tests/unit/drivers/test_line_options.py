@@ -11,7 +11,7 @@ from gigabrain_drivers.robot import Run
 from gigabrain_zenoh.errors import ConfigError
 from tests.line_rig import BARE
 
-THIRD = Path(__file__).parent / "third_base" / "robot.yaml"
+THIRD = Path(__file__).parents[2] / "third_base" / "robot.yaml"
 COMMAND = 'command: "V,{linear_x:.3f},{angular_z:.3f}\\n"'
 STATE = '"S,{wheel_left_position|tick},{wheel_right_position|tick},{flags:02x}*{crc16}\\n"'
 
@@ -186,7 +186,7 @@ def test_a_third_base_takes_fewer_than_twenty_lines() -> None:
 
 
 def test_the_third_base_stands_in_the_docs_as_it_is_here() -> None:
-    page = Path(__file__).parent.parent / "docs" / "firmware_line.md"
+    page = Path(__file__).parents[3] / "docs" / "firmware_line.md"
     assert THIRD.read_text() in page.read_text()
 
 

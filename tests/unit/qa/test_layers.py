@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 STANDARD = sys.stdlib_module_names
 PACKAGES = ("schemas/gigabrain_schemas", "gigabrain_zenoh", "drivers/gigabrain_drivers")
 ONLY_IN = {

@@ -17,7 +17,7 @@ from gigabrain_zenoh.runtime.deployment import Deployment, ProcessName
 from gigabrain_zenoh.security.authority import issue, new_fleet
 from tests.onlooker import Onlooker, at_rest, looking_on
 from tests.stack import Home, free_port, until
-from tests.test_netns import REST_TICKS, STOP_TICKS, Ears
+from tests.system.test_netns import REST_TICKS, STOP_TICKS, Ears
 
 ROBOT: tuple[ProcessName, ...] = ("router", "driver", "control", "safety")
 BRAIN: tuple[ProcessName, ...] = ("perception", "decision")

@@ -13,7 +13,7 @@ from gigabrain_drivers.robot import Run, ScanOptions
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import FakeClock
-from tests.test_alpha_protocol import a_state
+from tests.unit.drivers.test_alpha_protocol import a_state
 
 MS = 1_000_000
 LIDAR = Lidar(beams=360, rate_hz=10, range_min=0.12, range_max=3.5)

@@ -227,7 +227,7 @@ async def closed_while_threads_post() -> None:
 def test_closing_while_threads_post_leaves_nothing_open() -> None:
     program = "import asyncio; from tests import test_bridge as here; asyncio.run(here.{}())"
     lines = program.format(closed_while_threads_post.__name__)
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     ran = subprocess.run((sys.executable, "-c", lines), cwd=root, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
 

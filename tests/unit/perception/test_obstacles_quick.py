@@ -10,7 +10,7 @@ from gigabrain_schemas.brain import Obstacle
 from gigabrain_zenoh.perception.obstacles.arc import place_of
 from gigabrain_zenoh.perception.obstacles.clusters import find_clusters
 from gigabrain_zenoh.perception.obstacles.partly import discs_of
-from tests.test_obstacles import JACKAL, Watch, nearest
+from tests.unit.perception.test_obstacles import JACKAL, Watch, nearest
 
 RADIUS = 0.5
 

@@ -12,8 +12,8 @@ from gigabrain_schemas.topics import BODY, CMD_VEL, STATE, TELEOP
 from gigabrain_zenoh.geometry.limits import ZERO
 from tests.brain_rig import BOOT, body, state
 from tests.bus_rig import settle
-from tests.test_control_node import Chain
-from tests.test_page_access import Seated
+from tests.unit.control.test_control_node import Chain
+from tests.unit.ui.test_page_access import Seated
 
 MINE = GateStatus(mode="enabled", commander="control", enables=1)
 HANDED_BACK = GateStatus(mode="enabled", commander="control", enables=2)
