@@ -167,9 +167,11 @@ def _call(words: "Sequence[str]") -> object:
     """Parse and run a command. What it imports is done by then, so that a signal leaves nothing."""
     from cyclopts import CycloptsError
 
+    from gigabrain_zenoh.config.renames import renamed_arguments
     from gigabrain_zenoh.errors import ConfigError, GigabrainError
     from gigabrain_zenoh.host.interrupts import interrupts
 
+    words = renamed_arguments(words)
     try:
         app = make_app(words)
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)

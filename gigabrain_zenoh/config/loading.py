@@ -8,6 +8,7 @@ import msgspec
 
 from gigabrain_zenoh.config import faults as config_faults
 from gigabrain_zenoh.config import yaml_text as config_yaml
+from gigabrain_zenoh.config.renames import renamed_fields
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.bounded_file import read_bounded
 
@@ -42,7 +43,7 @@ def read(path: Path) -> str:
 def loads(text: str, type: type[T], source: str) -> T:
     """The `type` that a YAML text describes; `source` stands for the file name in errors."""
     try:
-        root = config_yaml.read(text)
+        root = renamed_fields(config_yaml.read(text), source)
         return msgspec.convert(root.value, type)
     except config_yaml.YamlFault as fault:
         raise _error(source, fault.line, str(fault)) from None

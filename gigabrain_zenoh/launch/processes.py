@@ -11,6 +11,7 @@ import msgspec
 
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.process_config import ProcessConfig
+from gigabrain_zenoh.config.renames import renamed_settings
 from gigabrain_zenoh.host import heap, lifeline
 from gigabrain_zenoh.host.interrupts import interrupts
 from gigabrain_zenoh.runtime import process
@@ -70,7 +71,7 @@ PROCESSES = {
 
 def node_of(config: ProcessConfig) -> Node:
     """Return the node of a process with its settings filled in. Raises ValidationError."""
-    return PROCESSES[config.name].node(config.settings)
+    return PROCESSES[config.name].node(renamed_settings(config.settings, config.name))
 
 
 def run_process(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:

@@ -1,0 +1,159 @@
+"""Old words of YAML files and of the command line that still work, each with a one-line notice.
+
+A row goes in the release that `REMOVED_IN` names. Until then the old word means the new one.
+"""
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # PyYAML takes long to import, and a command line does not need it
+    from gigabrain_zenoh.config.yaml_text import Node
+
+REMOVED_IN = "0.3"
+
+
+@dataclass(frozen=True)
+class Rename:
+    """One old word and its replacement, with the values that were renamed with it.
+
+    In YAML, `old` ends with the field and the mappings around it (`decision.begin`), and `new` is
+    relative to the same mapping (`start`, or `avoid.turn` for a field that moved one level down).
+
+    On the command line, `old` is a command (`warm`, `task list`), an option of a command
+    (`goto --how`) or an option of every command (`--remember`); `new` is the new words.
+    """
+
+    old: str
+    new: str
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+
+YAML_WORDS: tuple[Rename, ...] = ()
+CLI_WORDS: tuple[Rename, ...] = ()
+
+_printed: set[str] = set()
+
+
+def renamed_fields(root: "Node", source: str, table: Sequence[Rename] = YAML_WORDS) -> "Node":
+    """Return a YAML document with the current words, and print a notice for each old one.
+
+    Where a file has both words the old one stays, so that reading it names the unknown field.
+    """
+    return _renamed_node(root, "", source, table) if table else root
+
+
+def renamed_settings(
+    settings: dict[str, Any], part: str, table: Sequence[Rename] = YAML_WORDS
+) -> dict[str, Any]:
+    """Return the settings of one part of a deployment, such as `decision`, with current words.
+
+    For settings that a recording keeps; prints nothing.
+    """
+    result = dict(settings)
+    for rename in table:
+        prefix, _, old = rename.old.rpartition(".")
+        *outer, new = rename.new.split(".")
+        if prefix != part or old not in result:
+            continue
+        value, inner = result.pop(old), result
+        for key in outer:
+            inner = inner.setdefault(key, {})
+        inner[new] = rename.values.get(value, value) if isinstance(value, str) else value
+    return result
+
+
+def renamed_arguments(arguments: Iterable[str], table: Sequence[Rename] = CLI_WORDS) -> list[str]:
+    """Return the arguments of `gigabrain` in current words; print a notice for each old one."""
+    result = list(arguments)
+    for rename in table:
+        command, dashes, option = rename.old.partition("--")
+        words, new = command.split(), rename.new.split()
+        if result[: len(words)] != words:
+            continue
+        if dashes:
+            result = _renamed_option(result, f"--{option}", rename)
+        else:
+            result[: len(words)] = new
+            _notice("", rename.old, rename.new)
+    return result
+
+
+def _renamed_option(arguments: list[str], option: str, rename: Rename) -> list[str]:
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    for i, argument in enumerate(arguments[:end]):
+        name, equals, value = argument.partition("=")
+        if name != option:
+            continue
+        apart = not equals and bool(rename.values) and i + 1 < end
+        value = arguments[i + 1] if apart else value
+        if option == rename.new and value not in rename.values:
+            continue
+        arguments[i] = rename.new + equals + (rename.values.get(value, value) if equals else "")
+        if apart:
+            arguments[i + 1] = rename.values.get(value, value)
+        if value in rename.values:
+            _notice("", f"{option} {value}", f"{rename.new} {rename.values[value]}")
+        else:
+            _notice("", option, rename.new)
+    return arguments
+
+
+def _renamed_node(node: "Node", path: str, source: str, table: Sequence[Rename]) -> "Node":
+    if node.items is not None:
+        items = tuple(_renamed_node(item, path, source, table) for item in node.items)
+        return replace(node, items=items, value=[item.value for item in items])
+    if node.entries is None:
+        return node
+    result = replace(node, entries=(), value={})
+    taken = {entry.key for entry in node.entries}
+    for entry in node.entries:
+        below = f"{path}.{entry.key}"
+        inner = _renamed_node(entry.node, below, source, table)
+        rename = _found(below, inner, table)
+        if rename and (rename.new == entry.key or rename.new not in taken):
+            value = rename.values.get(inner.value) if isinstance(inner.value, str) else None
+            new = rename.new if value is None else f"{rename.new}: {value}"
+            old = entry.key if value is None else f"{entry.key}: {inner.value}"
+            _notice(f"{source}:{entry.line}: ", old, new)
+            if value is not None:
+                inner = replace(inner, value=value, text=str(value))
+            result = _with(result, rename.new, entry.line, inner)
+        else:
+            result = _with(result, entry.key, entry.line, inner, whole=True)
+    return result
+
+
+def _found(path: str, node: "Node", table: Sequence[Rename]) -> Rename | None:
+    value = node.value if isinstance(node.value, str) else ""
+    for rename in table:
+        same_word = rename.old.rpartition(".")[2] == rename.new
+        if path.endswith(f".{rename.old}") and (not same_word or value in rename.values):
+            return rename
+    return None
+
+
+def _with(node: "Node", key: str, line: int, value: "Node", *, whole: bool = False) -> "Node":
+    """Return mapping `node` with `value` at `key`; a dotted key leads into inner mappings."""
+    from gigabrain_zenoh.config.yaml_text import Entry, Node
+
+    entries = node.entries or ()
+    first, _, rest = (key, "", "") if whole else key.partition(".")
+    same = next((entry for entry in entries if entry.key == first), None)
+    if rest:
+        outer = same.node if same else Node(line, {}, entries=())
+        value = _with(outer, rest, line, value)
+    elif same:  # mapping that an earlier, dotted rename began
+        for entry in same.node.entries or ():
+            value = _with(value, entry.key, entry.line, entry.node, whole=True)
+    kept = tuple(entry for entry in entries if entry is not same)
+    entries = (*kept, Entry(first, line, value))
+    return replace(node, entries=entries, value={e.key: e.node.value for e in entries})
+
+
+def _notice(where: str, old: str, new: str) -> None:
+    text = f"{where}'{old}' is now '{new}'; the old word goes in {REMOVED_IN}"
+    if text not in _printed:
+        _printed.add(text)
+        print(text, file=sys.stderr)
