@@ -33,12 +33,15 @@ os._exit(code or 0)
 def ended(body: str, sigint: object = signal.default_int_handler) -> tuple[int, str, str]:
     """The exit code, the output and the complaints of a program whose `main` has this body."""
     lines = "".join(f"    {line}\n" for line in body.strip().splitlines())
-    before = signal.signal(signal.SIGINT, sigint)  # type: ignore[arg-type]
+    # a child inherits what is ignored, SIGHUP of a suite under nohup as well
+    wanted = {signal.SIGINT: sigint, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, action) for number, action in wanted.items()}  # type: ignore[arg-type]
     try:
         words = (sys.executable, "-c", BEGIN + lines + END)
         done = subprocess.run(words, capture_output=True, text=True, timeout=60)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, action in before.items():
+            signal.signal(number, action)
     return done.returncode, done.stdout, done.stderr
 
 
