@@ -1,6 +1,7 @@
 """Configuration: a YAML file becomes a frozen msgspec Struct, or one line says why not."""
 
 import difflib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -40,10 +41,16 @@ def read(path: Path) -> str:
         raise ConfigError(f"{path}:{line}: byte 0x{byte:02x}; expected UTF-8 text") from None
 
 
-def loads(text: str, type: type[T], source: str) -> T:
-    """The `type` that a YAML text describes; `source` stands for the file name in errors."""
+def loads(text: str, type: type[T], source: str, at: Sequence[str] = ()) -> T:
+    """Return the `type` that a YAML text describes; `source` is the file name in errors.
+
+    With `at`, such as ("decision", "settings"), only that section is read; missing ones are empty.
+    """
     try:
         root = renamed_fields(config_yaml.read(text), source)
+        for name in at:
+            found = (entry.node for entry in root.entries or () if entry.key == name)
+            root = next(found, config_yaml.Node(root.line, {}, entries=()))
         return msgspec.convert(root.value, type)
     except config_yaml.YamlFault as fault:
         raise _error(source, fault.line, str(fault)) from None

@@ -4,7 +4,7 @@ A row goes in the release that `REMOVED_IN` names. Until then the old word means
 """
 
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +20,8 @@ class Rename:
 
     In YAML, `old` ends with the field and the mappings around it (`decision.begin`), and `new` is
     relative to the same mapping (`start`, or `avoid.turn` for a field that moved one level down).
+    With `when`, the row holds only where it returns True for the mapping that has the field. An empty
+    `new` drops a field that has no effect there.
 
     On the command line, `old` is a command (`warm`, `task list`), an option of a command
     (`goto --how`) or an option of every command (`--remember`); `new` is the new words.
@@ -28,6 +30,11 @@ class Rename:
     old: str
     new: str
     values: Mapping[str, Any] = field(default_factory=dict)
+    when: Callable[[Mapping[str, Any]], bool] | None = None
+
+    def holds_for(self, mapping: Mapping[str, Any]) -> bool:
+        """Return whether the row holds for a field of `mapping`."""
+        return self.when is None or self.when(mapping)
 
 
 YAML_WORDS: tuple[Rename, ...] = ()
@@ -55,9 +62,11 @@ def renamed_settings(
     for rename in table:
         prefix, _, old = rename.old.rpartition(".")
         *outer, new = rename.new.split(".")
-        if prefix != part or old not in result:
+        if prefix != part or old not in result or not rename.holds_for(settings):
             continue
         value, inner = result.pop(old), result
+        if not rename.new:
+            continue
         for key in outer:
             inner = inner.setdefault(key, {})
         inner[new] = rename.values.get(value, value) if isinstance(value, str) else value
@@ -111,8 +120,10 @@ def _renamed_node(node: "Node", path: str, source: str, table: Sequence[Rename])
     for entry in node.entries:
         below = f"{path}.{entry.key}"
         inner = _renamed_node(entry.node, below, source, table)
-        rename = _found(below, inner, table)
-        if rename and (rename.new == entry.key or rename.new not in taken):
+        rename = _found(below, inner, node.value, table)
+        if rename and not rename.new:
+            _notice(f"{source}:{entry.line}: ", entry.key, "")
+        elif rename and (rename.new == entry.key or rename.new not in taken):
             value = rename.values.get(inner.value) if isinstance(inner.value, str) else None
             new = rename.new if value is None else f"{rename.new}: {value}"
             old = entry.key if value is None else f"{entry.key}: {inner.value}"
@@ -125,11 +136,15 @@ def _renamed_node(node: "Node", path: str, source: str, table: Sequence[Rename])
     return result
 
 
-def _found(path: str, node: "Node", table: Sequence[Rename]) -> Rename | None:
+def _found(
+    path: str, node: "Node", mapping: Mapping[str, Any], table: Sequence[Rename]
+) -> Rename | None:
     value = node.value if isinstance(node.value, str) else ""
     for rename in table:
         same_word = rename.old.rpartition(".")[2] == rename.new
-        if path.endswith(f".{rename.old}") and (not same_word or value in rename.values):
+        if not path.endswith(f".{rename.old}") or not rename.holds_for(mapping):
+            continue
+        if not same_word or value in rename.values:
             return rename
     return None
 
@@ -153,7 +168,8 @@ def _with(node: "Node", key: str, line: int, value: "Node", *, whole: bool = Fal
 
 
 def _notice(where: str, old: str, new: str) -> None:
-    text = f"{where}'{old}' is now '{new}'; the old word goes in {REMOVED_IN}"
+    now = f"is now '{new}'" if new else "has no effect here"
+    text = f"{where}'{old}' {now}; the old word goes in {REMOVED_IN}"
     if text not in _printed:
         _printed.add(text)
         print(text, file=sys.stderr)

@@ -282,3 +282,11 @@ def test_any_text_becomes_a_robot_or_one_line_of_error(pieces: list[str]) -> Non
 
 def test_a_bad_configuration_ends_a_process_with_exit_code_2() -> None:
     assert ConfigError.exit_code == 2
+
+
+def test_one_section_of_a_file_is_read_with_its_lines() -> None:
+    text = "body: alpha\ndecision:\n  settings:\n    lin: 3\n"
+    assert loads(text, dict[str, int], "a.yaml", ("decision", "settings")) == {"lin": 3}
+    assert loads("body: alpha", dict[str, int], "a.yaml", ("decision", "settings")) == {}
+    with pytest.raises(ConfigError, match=r"^a\.yaml:4: lin: expected a string, got 3$"):
+        loads(text, dict[str, str], "a.yaml", ("decision", "settings"))

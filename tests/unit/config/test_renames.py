@@ -1,5 +1,7 @@
 """Old words of files and of the command line still work, and each prints one line."""
 
+from collections.abc import Mapping
+
 import pytest
 
 from gigabrain_zenoh.config import renames, yaml_text
@@ -66,6 +68,28 @@ def test_a_field_moves_into_a_mapping_that_is_there_or_not() -> None:
     both = {"decision": {"avoid": {"turn": "left", "linear_speed": 0.2}}}
     assert values("decision: {avoid: {turn: left}, linear_speed: 0.2}") == both
     assert values("decision: {linear_speed: 0.2, avoid: {turn: left}}") == both
+
+
+def test_a_row_with_a_condition_holds_only_where_it_is_true(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def navigates(decision: Mapping[str, object]) -> bool:
+        return decision.get("behaviour") == "navigate"
+
+    table = (
+        Rename("decision.speed", "", when=navigates),
+        Rename("decision.speed", "settings.max_speed"),
+    )
+    kept, dropped = {"speed": 0.2}, {"behaviour": "navigate", "speed": 0.2}
+    moved = {"settings": {"max_speed": 0.2}}
+    text = "decision: {speed: 0.2}"
+    assert renamed_fields(yaml_text.read(text), "a", table).value == {"decision": moved}
+    text = "decision: {behaviour: navigate, speed: 0.2}"
+    without = {"behaviour": "navigate"}
+    assert renamed_fields(yaml_text.read(text), "a", table).value == {"decision": without}
+    assert "a:1: 'speed' has no effect here;" in capsys.readouterr().err
+    assert renamed_settings(kept, "decision", table) == moved
+    assert renamed_settings(dropped, "decision", table) == without
 
 
 def test_a_file_with_both_words_keeps_both_for_the_loader_to_refuse() -> None:
