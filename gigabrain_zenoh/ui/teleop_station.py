@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.text import Text
 
 from gigabrain_schemas.base import Velocity
-from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.gate.gate import BRAIN
@@ -40,7 +40,7 @@ class Station:
     async def drive(self, take: bool) -> None:
         """Drive until the operator quits; then stop the body and hand it back to the brain.
 
-        Raises Refused when another operator or the brain drives and `take` is not set.
+        It also hands back when it is cancelled. Raises Refused when another operator or the brain drives and `take` is not set.
         """
         body = await self._robot.read_body()
         state = await self._robot.read_state()
@@ -48,6 +48,12 @@ class Station:
             raise Refused(f"{state.gate.commander} drives; take it over with --take")
         if state.gate.mode != "latched":
             await self._enable(take)
+        try:
+            await self._until_quit(body)
+        finally:  # a signal, and a terminal that was closed, hand back as well
+            await self._hand_back()
+
+    async def _until_quit(self, body: BodyDescription) -> None:
         loop = asyncio.get_running_loop()
         with _typed(self._type), Live(auto_refresh=False, screen=False) as live:
             while not self._quit:
@@ -60,7 +66,6 @@ class Station:
                 self._robot.steer(wanted)
                 live.update(Text("\n".join(self._lines(wanted))), refresh=True)
                 await asyncio.sleep(PERIOD_S)
-        await self._hand_back()
 
     def _type(self, typed: str) -> None:
         for key in keys_of(typed):
@@ -97,12 +102,15 @@ class Station:
     async def _hand_back(self) -> None:
         """Stop the body; enable the brain again only if this station still had the body."""
         self._robot.steer(ZERO)
-        for task in tuple(self._asking):
-            await task
-        state = await self._robot.read_state()
-        if state.gate.mode == "enabled" and state.gate.commander == BRAIN:
-            with contextlib.suppress(Refused):
-                await self._enable(take=False)
+        try:
+            for task in tuple(self._asking):
+                await task
+            state = await self._robot.read_state()
+            if state.gate.mode == "enabled" and state.gate.commander == BRAIN:
+                with contextlib.suppress(Refused):
+                    await self._enable(take=False)
+        except GigabrainError as error:
+            print(f"the body was not handed back: {error}", file=sys.stderr)
 
     def _lines(self, wanted: Velocity) -> list[str]:
         state = self._robot.state

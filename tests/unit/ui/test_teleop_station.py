@@ -1,20 +1,28 @@
 """What keys and a gamepad mean, and that letting go of either stops the robot."""
 
+import asyncio
 import os
 import struct
+from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import pytest
+from msgspec.structs import replace
 
 from gigabrain_drivers.catalog import load_robot
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
 from gigabrain_schemas.examples import example
+from gigabrain_schemas.requests import GateReply
+from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.gate.causes import estop
+from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.ui.gamepad import Gamepad, Pad
 from gigabrain_zenoh.ui.teleop_keys import HeldKeys, keys_of
-from gigabrain_zenoh.ui.teleop_station import readout
+from gigabrain_zenoh.ui.teleop_station import Station, readout
 from tests.bus_rig import until
 
 WAFFLE = load_robot("turtlebot3_waffle")  # 0.26 m/s, 1.82 rad/s
@@ -114,3 +122,56 @@ def test_the_display_says_who_drives_and_what_to_do_about_what_holds_it_back() -
         "speed +0.20 m/s -0.50 rad/s, wanted +0.10 +0.00 (25% of its limits)",
         "  e-stop pressed by ann: find out why it was pressed",
     ]
+
+
+class Held:
+    """The robot as a station sees it: the gate is open for the brain, whose place it takes."""
+
+    def __init__(self, asked: Callable[[], None] = lambda: None) -> None:
+        self.state: RobotState | None = None
+        self.steered: list[Velocity] = []
+        self.enabled = 0
+        self._asked = asked
+
+    async def read_body(self) -> object:
+        return WAFFLE
+
+    async def read_state(self) -> RobotState:
+        if self.enabled:
+            self._asked()
+        return replace(example(RobotState), gate=GateStatus(mode="enabled", commander=BRAIN))
+
+    def steer(self, wanted: Velocity) -> None:
+        self.steered.append(wanted)
+
+    async def enable(self, source: str, *, take: bool) -> object:
+        self.enabled += source == BRAIN
+        return replace(example(GateReply), text="open")
+
+
+async def cancelled_while_driving(robot: Held, folder: Path) -> None:
+    station = Station(cast(Robot, robot), Gamepad(folder))
+    driving = asyncio.create_task(station.drive(take=True))
+    await until(lambda: len(robot.steered) > 1)
+    driving.cancel()  # as a signal does
+    with pytest.raises(asyncio.CancelledError):
+        await driving
+
+
+async def test_a_station_that_a_signal_ends_stops_the_body_and_hands_it_back(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = Held()
+    await cancelled_while_driving(robot, tmp_path)
+    assert robot.steered[-1] == ZERO
+    assert robot.enabled == 2  # for the station, and for the brain again
+
+
+async def test_a_station_that_cannot_hand_back_says_so_and_ends(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def lost() -> None:
+        raise BodyLost("robot/state has stopped")
+
+    await cancelled_while_driving(Held(lost), tmp_path)
+    assert "not handed back" in capsys.readouterr().err
