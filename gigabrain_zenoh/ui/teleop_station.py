@@ -40,7 +40,8 @@ class Station:
     async def drive(self, take: bool) -> None:
         """Drive until the operator quits; then stop the body and hand it back to the brain.
 
-        It also hands back when it is cancelled. Raises Refused when another operator or the brain drives and `take` is not set.
+        It also hands back when it is cancelled. Raises Refused when another operator or the brain
+        drives and `take` is not set.
         """
         body = await self._robot.read_body()
         state = await self._robot.read_state()
