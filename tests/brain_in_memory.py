@@ -8,10 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Self
 
-from gigabrain_drivers.catalog import load_robot
-from gigabrain_drivers.mock import MockBody, MockOptions
-from gigabrain_drivers.process import DriverProcess
-from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.driver.process import DriverProcess
+from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.topics import STATE
 from gigabrain_zenoh.bus.bus import Bus

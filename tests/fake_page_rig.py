@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from gigabrain_drivers.catalog import load_robot
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Body, RobotState

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from websockets.asyncio.client import connect
 
-from gigabrain_drivers.catalog import load_robot
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.topics import BODY, TELEOP

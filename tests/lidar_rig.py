@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import Device, EmulatedBody
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.emulators.station import Station
 from gigabrain_drivers.lidars.serial_source import SerialSource
-from gigabrain_drivers.robot import Run
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan

@@ -7,15 +7,15 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-from gigabrain_drivers import catalog
+from gigabrain_drivers.bodies.line.driver import LineDriver
+from gigabrain_drivers.bodies.line.emulator import LineBase
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.emulators.base import Snapshot
 from gigabrain_drivers.emulators.faults import NONE
-from gigabrain_drivers.emulators.line_base import LineBase
 from gigabrain_drivers.emulators.station import Station
 from gigabrain_drivers.kinematics import Twist, base_of
-from gigabrain_drivers.line import LineDriver
 from gigabrain_drivers.odometry import advanced
-from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Odometry, Wheel
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import RobotState

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.catalog import load_robot
-from gigabrain_drivers.emulators.opencr import OpenCr
+from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrDriver, OpenCrOptions
+from gigabrain_drivers.bodies.turtlebot3.dynamixel import Decoder, Packet
+from gigabrain_drivers.bodies.turtlebot3.emulator import OpenCr
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.links.link import Link
-from gigabrain_drivers.opencr.driver import OpenCrDriver, OpenCrOptions
-from gigabrain_drivers.protocols.dynamixel import Decoder, Packet
-from gigabrain_drivers.robot import Run
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import Imu

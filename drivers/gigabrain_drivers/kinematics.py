@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gigabrain_drivers.robot import RobotFile
+from gigabrain_drivers.driver.robot import RobotFile
 
 
 class Twist(NamedTuple):

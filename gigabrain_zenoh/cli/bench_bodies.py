@@ -45,7 +45,7 @@ def bodies(
     """
     from rich.console import Console
 
-    from gigabrain_drivers.catalog import simulated
+    from gigabrain_drivers.driver.catalog import simulated
     from gigabrain_zenoh.host import results
     from gigabrain_zenoh.qa.bench.bodies import measure_bodies
 

@@ -42,7 +42,7 @@ class Drive:
 
     def check(self) -> None:
         """Raises ConfigError, and UnknownName, for what can be told before anything starts."""
-        from gigabrain_drivers.catalog import load_robot
+        from gigabrain_drivers.driver.catalog import load_robot
         from gigabrain_drivers.sim.worlds import load_world
 
         behaviours.check(self.behaviour)

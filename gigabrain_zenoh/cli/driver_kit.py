@@ -67,7 +67,7 @@ def test(
     from rich.console import Console
     from rich.table import Table
 
-    from gigabrain_drivers.catalog import links_of, load_robot
+    from gigabrain_drivers.driver.catalog import links_of, load_robot
     from gigabrain_zenoh.qa.conformance import kit
 
     links = links_of(load_robot(name))

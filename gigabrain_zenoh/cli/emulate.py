@@ -27,7 +27,7 @@ def emulate(name: str, *, world: str = "arena", seed: int = 0, ports: Path | Non
     ports
         The folder in which its ports appear.
     """
-    from gigabrain_drivers.catalog import ports_folder
+    from gigabrain_drivers.driver.catalog import ports_folder
     from gigabrain_drivers.emulators.process import emulate as emulated
 
     folder = ports or ports_folder(name)

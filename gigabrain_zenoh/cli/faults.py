@@ -43,7 +43,7 @@ class Robot:
 
     def check(self) -> None:
         """Raises ConfigError for what the suite cannot be run with."""
-        from gigabrain_drivers.catalog import load_robot, simulated
+        from gigabrain_drivers.driver.catalog import load_robot, simulated
         from gigabrain_drivers.sim.worlds import load_world
 
         load_world(self.world, 0)

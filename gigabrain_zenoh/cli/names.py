@@ -6,7 +6,7 @@ def robots() -> None:
 
     Example: gigabrain robots
     """
-    from gigabrain_drivers.catalog import links_of, load_robot, robot_files
+    from gigabrain_drivers.driver.catalog import links_of, load_robot, robot_files
 
     for name, path in robot_files().items():
         robot = load_robot(name)

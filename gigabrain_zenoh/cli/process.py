@@ -182,7 +182,7 @@ def driver(
     remember
         The folder for what must survive a restart: what latched it.
     """
-    from gigabrain_drivers.catalog import load_robot
+    from gigabrain_drivers.driver.catalog import load_robot
 
     label = place.namespace or Path(name).stem
     values = {

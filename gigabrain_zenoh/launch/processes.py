@@ -29,7 +29,9 @@ PROCESSES = {
         stops=True,
     ),
     "driver": ProcessType(
-        "gigabrain_drivers.process:run", "gigabrain_zenoh.config.settings:DriverConfig", stops=True
+        "gigabrain_drivers.driver.process:run",
+        "gigabrain_zenoh.config.settings:DriverConfig",
+        stops=True,
     ),
     "emulator": ProcessType(
         "gigabrain_drivers.emulators.process:run",

@@ -5,9 +5,9 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Protocol
 
-from gigabrain_drivers.base import Driver
-from gigabrain_drivers.process import DriverProcess
-from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.process import DriverProcess
+from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_schemas.base import TICK_NS, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.sensors import LaserScan

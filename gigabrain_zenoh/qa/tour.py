@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from gigabrain_drivers.catalog import make_driver
-from gigabrain_drivers.robot import Run
+from gigabrain_drivers.driver.catalog import make_driver
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.driver import STEPS, MujocoDriver
 from gigabrain_drivers.sim.options import sim_body
 from gigabrain_drivers.sim.physics import Simulation

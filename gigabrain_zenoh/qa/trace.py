@@ -7,12 +7,12 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from gigabrain_drivers import catalog
-from gigabrain_drivers.base import Driver
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import BASE, SCAN, Emulator
 from gigabrain_drivers.links import link as links
 from gigabrain_drivers.links.wording import of_command
-from gigabrain_drivers.robot import Run
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import LinkName

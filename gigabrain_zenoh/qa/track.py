@@ -13,8 +13,8 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from gigabrain_drivers.catalog import make_driver
-from gigabrain_drivers.robot import Run
+from gigabrain_drivers.driver.catalog import make_driver
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.driver import STEPS, MujocoDriver
 from gigabrain_drivers.sim.geometry import Cylinder, Pose
 from gigabrain_drivers.sim.options import sim_body

@@ -2,10 +2,16 @@
 
 from typing import Any
 
+from gigabrain_drivers.bodies.alpha import protocol as alpha
+from gigabrain_drivers.bodies.line.protocol import Template
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.legs.senses import Senses
-from gigabrain_drivers.protocols import alpha, dynamixel, ld, lds01, lds03, opencr, rplidar
-from gigabrain_drivers.protocols.line import Template
-from gigabrain_drivers.protocols.rplidar_scans import dense_capsule, express_capsule, node
+from gigabrain_drivers.lidars.ld import protocol as ld
+from gigabrain_drivers.lidars.lds import lds01 as lds01
+from gigabrain_drivers.lidars.lds import lds03 as lds03
+from gigabrain_drivers.lidars.rplidar import protocol as rplidar
+from gigabrain_drivers.lidars.rplidar.scan_formats import dense_capsule, express_capsule, node
 
 TWELVE = (1.0,) * 12
 

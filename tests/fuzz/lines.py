@@ -8,25 +8,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gigabrain_drivers.alpha import AlphaDriver
-from gigabrain_drivers.catalog import load_link
-from gigabrain_drivers.clip import clipped
+from gigabrain_drivers.bodies.alpha import protocol as alpha
+from gigabrain_drivers.bodies.alpha.driver import AlphaDriver
+from gigabrain_drivers.bodies.line import protocol as line
+from gigabrain_drivers.bodies.line.driver import LineDriver
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
+from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrDriver
+from gigabrain_drivers.driver.catalog import load_link
+from gigabrain_drivers.driver.clip import clipped
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.lidars import SCAN_SOURCES
 from gigabrain_drivers.lidars.base import source_class
-from gigabrain_drivers.line import LineDriver
-from gigabrain_drivers.opencr.driver import OpenCrDriver
-from gigabrain_drivers.protocols import (
-    alpha,
-    dynamixel,
-    ld,
-    lds01,
-    lds03,
-    line,
-    opencr,
-    rplidar,
-    rplidar_requests,
-)
-from gigabrain_drivers.robot import Run
+from gigabrain_drivers.lidars.ld import protocol as ld
+from gigabrain_drivers.lidars.lds import lds01 as lds01
+from gigabrain_drivers.lidars.lds import lds03 as lds03
+from gigabrain_drivers.lidars.rplidar import protocol as rplidar
+from gigabrain_drivers.lidars.rplidar import requests as rplidar_requests
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import FakeClock

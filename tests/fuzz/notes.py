@@ -9,8 +9,8 @@ from pathlib import Path
 
 import msgspec
 
-from gigabrain_drivers.catalog import load_robot
-from gigabrain_drivers.latch import LatchFile
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.driver.latch import LatchFile
 from gigabrain_drivers.links import port_name
 from gigabrain_drivers.links.address import address
 from gigabrain_schemas.base import Cause

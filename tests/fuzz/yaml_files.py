@@ -7,8 +7,8 @@ from typing import Any
 import msgspec
 import yaml
 
-from gigabrain_drivers.catalog import driver_class, link_options, robot_files
-from gigabrain_drivers.robot import LINKS, RobotFile
+from gigabrain_drivers.driver.catalog import driver_class, link_options, robot_files
+from gigabrain_drivers.driver.robot import LINKS, RobotFile
 from gigabrain_zenoh.config.loading import loads
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime.deployment import Deployment

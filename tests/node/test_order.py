@@ -10,10 +10,10 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers.catalog import load_robot
-from gigabrain_drivers.mock import MockBody, MockOptions
-from gigabrain_drivers.process import DriverProcess
-from gigabrain_drivers.robot import Run
+from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.driver.process import DriverProcess
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import RobotState

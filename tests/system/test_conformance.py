@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.catalog import links_of, load_robot, robot_files
+from gigabrain_drivers.driver.catalog import links_of, load_robot, robot_files
 from gigabrain_zenoh.qa.conformance import kit
 
 pytestmark = pytest.mark.system

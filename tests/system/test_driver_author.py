@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers import catalog, links
+from gigabrain_drivers import links
+from gigabrain_drivers.driver import catalog
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.conformance import direct, kit, new
 from gigabrain_zenoh.qa.conformance.subject import Subject
@@ -44,7 +45,9 @@ def test_a_driver_that_cannot_be_imported_is_refused_in_one_line(
     tmp_path: Path, site: Path
 ) -> None:
     with pytest.raises(ConfigError, match=r"driver 'kit_import' of .*No module named 'nowhere'"):
-        broken("kit_import", tmp_path, site, "from gigabrain_drivers.base", "from nowhere.base")
+        broken(
+            "kit_import", tmp_path, site, "from gigabrain_drivers.driver.base", "from nowhere.base"
+        )
 
 
 def test_what_the_docs_name_can_be_imported() -> None:

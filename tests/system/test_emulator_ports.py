@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.claim import claimed
 from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.robot import Run
 from gigabrain_zenoh.errors import ConfigError
 from tests.line_rig import until
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers import catalog
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import device_class
-from gigabrain_drivers.robot import Run
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import UnknownName
 from gigabrain_zenoh.qa.conformance.session import Session
@@ -17,8 +17,8 @@ pytestmark = pytest.mark.system
 NAME = "foreign_base"
 DRIVER = '''"""Somebody's driver, and the board that it talks to."""
 
-from gigabrain_drivers.emulators.line_base import LineBase
-from gigabrain_drivers.line import LineDriver
+from gigabrain_drivers.bodies.line.emulator import LineBase
+from gigabrain_drivers.bodies.line.driver import LineDriver
 
 
 class ForeignDriver(LineDriver):

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gigabrain_drivers import catalog
-from gigabrain_drivers.base import Driver
+from gigabrain_drivers.bodies.line.emulator import LineBase
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.faults import NONE, Faults
-from gigabrain_drivers.emulators.line_base import LineBase
-from gigabrain_drivers.robot import Run
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.world import World

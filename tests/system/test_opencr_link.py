@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.catalog import make_driver
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3.board import is_opencr
+from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrDriver
+from gigabrain_drivers.bodies.turtlebot3.emulator import OpenCr
+from gigabrain_drivers.driver.catalog import make_driver
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.faults import Faults
-from gigabrain_drivers.emulators.opencr import OpenCr
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.emulators.station import Station
-from gigabrain_drivers.opencr.board import is_opencr
-from gigabrain_drivers.opencr.driver import OpenCrDriver
-from gigabrain_drivers.protocols import dynamixel
-from gigabrain_drivers.robot import Run
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
 from tests.opencr_rig import Rig, make_rig  # noqa: F401

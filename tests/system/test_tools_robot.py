@@ -12,7 +12,7 @@ import msgspec
 import pytest
 import yaml
 
-from gigabrain_drivers.catalog import robot_path
+from gigabrain_drivers.driver.catalog import robot_path
 from gigabrain_zenoh.diagnostics.graph import ORDER
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.runtime.running import Running

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.catalog import make_driver, robot_path
+from gigabrain_drivers.driver.catalog import make_driver, robot_path
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import Emulator
-from gigabrain_drivers.robot import Run
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.sensors import Imu, LaserScan

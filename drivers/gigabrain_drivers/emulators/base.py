@@ -12,10 +12,10 @@ from typing import Any, ClassVar, NamedTuple, Protocol
 
 from msgspec import Struct
 
+from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.kinematics import Gait, Twist, base_of
 from gigabrain_drivers.legs.gait import WALKER
-from gigabrain_drivers.robot import RobotFile, Run
 from gigabrain_drivers.sim.account import account_of
 from gigabrain_drivers.sim.pace import Pace
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry, Simulation

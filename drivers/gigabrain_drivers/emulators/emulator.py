@@ -10,7 +10,8 @@ from typing import Any, Literal, Self
 
 import msgspec
 
-from gigabrain_drivers import catalog
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.robot import LinkOptions, Run
 from gigabrain_drivers.emulators import DEVICES
 from gigabrain_drivers.emulators.base import Broken, Device, EmulatedBody
 from gigabrain_drivers.emulators.claim import claimed, no_ports
@@ -18,7 +19,6 @@ from gigabrain_drivers.emulators.faults import NONE, Faults, faults_in
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.emulators.station import Station
 from gigabrain_drivers.emulators.tcp import TcpPort
-from gigabrain_drivers.robot import LinkOptions, Run
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import unknown
 

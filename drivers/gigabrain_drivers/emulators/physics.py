@@ -4,10 +4,10 @@ import dataclasses
 
 from msgspec.structs import replace
 
-from gigabrain_drivers import catalog
+from gigabrain_drivers.bodies.line.options import LineOptions
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import EmulatedBody
-from gigabrain_drivers.line_options import LineOptions
-from gigabrain_drivers.robot import Run
 from gigabrain_drivers.sim.body import SimBattery
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_drivers.sim.physics import Simulation

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import msgspec
 
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.faults import Faults
-from gigabrain_drivers.robot import Run
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.heartbeat import Progress
 from gigabrain_zenoh.config.settings import EmulatorConfig

@@ -5,9 +5,9 @@ import importlib
 from collections.abc import Callable
 from typing import Any, ClassVar, cast
 
-from gigabrain_drivers.base import Driver
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.lidars import SCAN_SOURCES
-from gigabrain_drivers.robot import ScanOptions
 from gigabrain_schemas.body import Lidar, LinkHealth
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN

@@ -2,7 +2,7 @@
 
 import re
 
-from gigabrain_drivers.protocols import ld
+from gigabrain_drivers.lidars.ld import protocol as ld
 
 _LDS01 = re.compile(rb"\xfa[\xa0-\xdb].{40}\xfa[\xa0-\xdb]", re.DOTALL)
 _COIN_D4 = re.compile(rb"\xaa\x55.{8}", re.DOTALL)

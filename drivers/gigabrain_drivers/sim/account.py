@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim.physics import Simulation
 
 

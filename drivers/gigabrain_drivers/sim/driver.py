@@ -8,8 +8,8 @@ import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import NamedTuple, TypeVar
 
-from gigabrain_drivers.base import Driver
-from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim.account import account_of
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_drivers.sim.pace import Pace

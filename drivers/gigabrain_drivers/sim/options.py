@@ -5,7 +5,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from gigabrain_drivers.robot import LinkOptions, RobotFile, Run
+from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
 from gigabrain_drivers.sim.body import (
     LEG_BATTERY,
     SimBattery,

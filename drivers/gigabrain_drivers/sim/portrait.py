@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from gigabrain_drivers.catalog import make_driver
-from gigabrain_drivers.robot import Run
+from gigabrain_drivers.driver.catalog import make_driver
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.driver import MujocoDriver
 from gigabrain_drivers.sim.options import sim_body
 from gigabrain_drivers.sim.picture import render

@@ -15,7 +15,7 @@ import msgspec
 import yaml
 from msgspec import Struct
 
-from gigabrain_drivers.catalog import robot_path
+from gigabrain_drivers.driver.catalog import robot_path
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.navigation.planner import warm_up

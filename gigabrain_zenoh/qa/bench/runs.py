@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import yaml
 
-from gigabrain_drivers.catalog import robot_path
+from gigabrain_drivers.driver.catalog import robot_path
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.diagnostics.rates import Heard, listen

@@ -6,7 +6,7 @@ from importlib import resources
 from pathlib import Path
 from string import Template
 
-from gigabrain_drivers.catalog import known_drivers, robot_files
+from gigabrain_drivers.driver.catalog import known_drivers, robot_files
 from gigabrain_zenoh.errors import ConfigError
 
 _NAME = re.compile(r"[a-z][a-z0-9_]*[a-z0-9]")

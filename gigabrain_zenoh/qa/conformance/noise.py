@@ -7,8 +7,8 @@ from collections import deque
 
 import numpy as np
 
-from gigabrain_drivers.protocols.line import Decoder, Template
-from gigabrain_drivers.protocols.line_fields import COMMAND
+from gigabrain_drivers.bodies.line.fields import COMMAND
+from gigabrain_drivers.bodies.line.protocol import Decoder, Template
 
 CHUNK = 1000  # lines
 GARBAGE = 64  # bytes, at most

@@ -5,7 +5,7 @@ from typing import Any, Self
 
 import msgspec
 
-from gigabrain_drivers.process import DriverProcess
+from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel

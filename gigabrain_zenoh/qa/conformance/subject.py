@@ -4,12 +4,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from gigabrain_drivers import catalog
-from gigabrain_drivers.base import Driver
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import Device
 from gigabrain_drivers.emulators.emulator import BASE, Emulator
 from gigabrain_drivers.links.link import Link
-from gigabrain_drivers.robot import Run
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import ConfigError

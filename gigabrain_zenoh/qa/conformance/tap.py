@@ -3,7 +3,7 @@
 from collections.abc import AsyncIterator, Mapping
 from typing import Any, NamedTuple
 
-from gigabrain_drivers.base import Driver
+from gigabrain_drivers.driver.base import Driver
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import Joint, RobotState
 from gigabrain_schemas.topics import Topic

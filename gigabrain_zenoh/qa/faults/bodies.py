@@ -1,6 +1,6 @@
 """The body that is tried where no robot runs."""
 
-from gigabrain_drivers.catalog import load_robot
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.qa.faults.rig import BODIES, Rig
 

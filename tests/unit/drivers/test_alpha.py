@@ -10,10 +10,12 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers import catalog
-from gigabrain_drivers.alpha import AlphaDriver, AlphaOptions
+from gigabrain_drivers.bodies.alpha import protocol as alpha
+from gigabrain_drivers.bodies.alpha.driver import AlphaDriver, AlphaOptions
+from gigabrain_drivers.bodies.alpha.emulator import REST, Alpha
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators import tcp
-from gigabrain_drivers.emulators.alpha import REST, Alpha
 from gigabrain_drivers.emulators.faults import NONE, Faults
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.emulators.station import Station
@@ -21,8 +23,6 @@ from gigabrain_drivers.emulators.tcp import TcpPort
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.legs.geometry import JOINT_NAMES
 from gigabrain_drivers.links.address import address
-from gigabrain_drivers.protocols import alpha
-from gigabrain_drivers.robot import Run
 from gigabrain_schemas.topics import IMU
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported

@@ -7,14 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gigabrain_drivers.alpha import AlphaOptions
-from gigabrain_drivers.emulators.alpha import REST, Alpha
+from gigabrain_drivers.bodies.alpha import protocol as alpha
+from gigabrain_drivers.bodies.alpha.driver import AlphaOptions
+from gigabrain_drivers.bodies.alpha.emulator import REST, Alpha
+from gigabrain_drivers.bodies.alpha.protocol import Decoder, State, Walk
 from gigabrain_drivers.emulators.base import Snapshot
 from gigabrain_drivers.kinematics import Gait, Twist
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.legs.geometry import JOINT_NAMES
-from gigabrain_drivers.protocols import alpha
-from gigabrain_drivers.protocols.alpha import Decoder, State, Walk
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry
 
 FORWARD = WALKER.to_gait(Twist(0.3, 0.0, 0.0))

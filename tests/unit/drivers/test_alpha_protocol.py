@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gigabrain_drivers.bodies.alpha import protocol as alpha
+from gigabrain_drivers.bodies.alpha.protocol import Decoder, Frame, State, Walk
 from gigabrain_drivers.kinematics import Gait, Twist
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.legs.senses import Senses
 from gigabrain_drivers.links.address import address
-from gigabrain_drivers.protocols import alpha
-from gigabrain_drivers.protocols.alpha import Decoder, Frame, State, Walk
 from gigabrain_zenoh.errors import ConfigError
 
 # the vectors of docs/firmware_alpha.md

@@ -9,7 +9,7 @@ import pytest
 
 from gigabrain_drivers import button
 from gigabrain_drivers.button import Button
-from gigabrain_drivers.button_watch import ButtonWatch
+from gigabrain_drivers.driver.button_watch import ButtonWatch
 from gigabrain_drivers.echo_loop import EchoLoop
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_schemas.body import GateStatus

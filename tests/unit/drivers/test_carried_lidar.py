@@ -2,13 +2,13 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.base import Driver
-from gigabrain_drivers.catalog import make_driver
-from gigabrain_drivers.emulators.ld import LdDevice
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.catalog import make_driver
+from gigabrain_drivers.driver.robot import Run, ScanOptions
 from gigabrain_drivers.lidars import SCAN_SOURCES
 from gigabrain_drivers.lidars.base import ScanSource, source_class
-from gigabrain_drivers.lidars.rplidar import RplidarOptions
-from gigabrain_drivers.robot import Run, ScanOptions
+from gigabrain_drivers.lidars.ld.emulator import LdDevice
+from gigabrain_drivers.lidars.rplidar.source import RplidarOptions
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers import DRIVERS, catalog
-from gigabrain_drivers.base import Driver
-from gigabrain_drivers.robot import Run
+from gigabrain_drivers import DRIVERS
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 
 

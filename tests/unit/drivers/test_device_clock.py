@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 import pytest
 
-from gigabrain_drivers.device_clock import DeviceClock, EchoClock
+from gigabrain_drivers.links.device_clock import DeviceClock, EchoClock
 
 MS = 1_000_000
 WRAP = 30_000

@@ -5,10 +5,10 @@ from collections.abc import AsyncIterator
 from itertools import pairwise
 from pathlib import Path
 
-from gigabrain_drivers.catalog import load_robot
-from gigabrain_drivers.mock import MockBody, MockOptions
-from gigabrain_drivers.process import DriverProcess
-from gigabrain_drivers.robot import Run
+from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.driver.process import DriverProcess
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.base import TICK_NS, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel

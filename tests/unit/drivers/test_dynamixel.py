@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.protocols.dynamixel import (
+from gigabrain_drivers.bodies.turtlebot3.dynamixel import (
     READ,
     STATUS,
     WRITE,

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from gigabrain_drivers import catalog
+from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.kinematics import (
     Ackermann,
     Base,

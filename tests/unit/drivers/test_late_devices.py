@@ -4,12 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers import alpha as alpha_driver
-from gigabrain_drivers import catalog
-from gigabrain_drivers.alpha import AlphaDriver, AlphaOptions
-from gigabrain_drivers.lidars.ld import Ld19
-from gigabrain_drivers.protocols import alpha, ld
-from gigabrain_drivers.robot import Run, ScanOptions
+from gigabrain_drivers.bodies.alpha import driver as alpha_driver
+from gigabrain_drivers.bodies.alpha import protocol as alpha
+from gigabrain_drivers.bodies.alpha.driver import AlphaDriver, AlphaOptions
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.robot import Run, ScanOptions
+from gigabrain_drivers.lidars.ld import protocol as ld
+from gigabrain_drivers.lidars.ld.source import Ld19
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import FakeClock

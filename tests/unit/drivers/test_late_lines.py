@@ -8,10 +8,10 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from gigabrain_drivers.emulators.ld import LdDevice
-from gigabrain_drivers.lidars.ld import Ld19
-from gigabrain_drivers.line import LineDriver
-from gigabrain_drivers.robot import ScanOptions
+from gigabrain_drivers.bodies.line.driver import LineDriver
+from gigabrain_drivers.driver.robot import ScanOptions
+from gigabrain_drivers.lidars.ld.emulator import LdDevice
+from gigabrain_drivers.lidars.ld.source import Ld19
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.geometry.limits import limits_of, ramp

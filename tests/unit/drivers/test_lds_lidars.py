@@ -6,15 +6,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.emulators.base import Device
 from gigabrain_drivers.emulators.faults import NONE, Faults
-from gigabrain_drivers.emulators.lds import Lds01Device, Lds02Device, Lds03Device, lens_distance
-from gigabrain_drivers.lidars.lds01 import Lds01
-from gigabrain_drivers.lidars.lds02 import Lds02, from_axis
-from gigabrain_drivers.lidars.lds03 import Lds03, trusted
+from gigabrain_drivers.lidars.ld import protocol as ld
+from gigabrain_drivers.lidars.ld.lds02 import Lds02, from_axis
+from gigabrain_drivers.lidars.lds import lds01 as lds01
+from gigabrain_drivers.lidars.lds import lds03 as lds03
+from gigabrain_drivers.lidars.lds.emulator import (
+    Lds01Device,
+    Lds02Device,
+    Lds03Device,
+    lens_distance,
+)
+from gigabrain_drivers.lidars.lds.lds01_source import Lds01
+from gigabrain_drivers.lidars.lds.lds03_source import Lds03, trusted
 from gigabrain_drivers.lidars.serial_source import SerialSource
-from gigabrain_drivers.protocols import ld, lds01, lds03
-from gigabrain_drivers.robot import ScanOptions
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan

@@ -3,7 +3,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.protocols import lds01, lds03
+from gigabrain_drivers.lidars.lds import lds01 as lds01
+from gigabrain_drivers.lidars.lds import lds03 as lds03
 
 LDS01 = (
     "fa a0 b8 0b 01 00 e8 03 00 00 02 00 e9 03 00 00 03 00 ea 03 00 00 "

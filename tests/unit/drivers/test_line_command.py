@@ -2,10 +2,10 @@
 
 import pytest
 
+from gigabrain_drivers.bodies.line.command import LineCommand, Spoken
+from gigabrain_drivers.bodies.line.fields import COMMAND
+from gigabrain_drivers.bodies.line.protocol import Template
 from gigabrain_drivers.kinematics import Ackermann, Differential
-from gigabrain_drivers.line_command import LineCommand, Spoken
-from gigabrain_drivers.protocols.line import Template
-from gigabrain_drivers.protocols.line_fields import COMMAND
 from gigabrain_schemas.base import Velocity
 
 BASE = Differential(0.033, 0.287)

@@ -167,7 +167,7 @@ async def test_flags_are_logged_once_and_bumpers_reported(
 async def test_a_loss_is_said_once_with_the_reason_and_its_end_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO", "gigabrain_drivers.line")
+    caplog.set_level("INFO", "gigabrain_drivers.bodies.line.driver")
     async with bench(tmp_path, plugged=False) as it:
         async with asyncio.timeout(5):
             while not caplog.records:

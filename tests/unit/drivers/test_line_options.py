@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers import catalog
-from gigabrain_drivers.line import LineDriver
-from gigabrain_drivers.line_options import LineOptions
-from gigabrain_drivers.robot import Run
+from gigabrain_drivers.bodies.line.driver import LineDriver
+from gigabrain_drivers.bodies.line.options import LineOptions
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_zenoh.errors import ConfigError
 from tests.line_rig import BARE
 

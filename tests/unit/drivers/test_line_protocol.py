@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.protocols.checks import CHECKS
-from gigabrain_drivers.protocols.line import LONGEST, Decoder, Template
-from gigabrain_drivers.protocols.line_fields import COMMAND, STATE, UNITS, factor
+from gigabrain_drivers.bodies.line.checks import CHECKS
+from gigabrain_drivers.bodies.line.fields import COMMAND, STATE, UNITS, factor
+from gigabrain_drivers.bodies.line.protocol import LONGEST, Decoder, Template
 
 BARE = Template("V,{linear_x:.3f},{angular_z:.3f}\n", COMMAND)
 TICKS = Template(

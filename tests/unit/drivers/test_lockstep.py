@@ -1,6 +1,6 @@
 import asyncio
 
-from gigabrain_drivers.lockstep import Lockstep
+from gigabrain_drivers.driver.lockstep import Lockstep
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.safety.words import say

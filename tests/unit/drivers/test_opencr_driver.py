@@ -5,8 +5,9 @@ import struct
 
 import pytest
 
-from gigabrain_drivers.opencr.driver import imu_of
-from gigabrain_drivers.protocols import dynamixel, opencr
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
+from gigabrain_drivers.bodies.turtlebot3.driver import imu_of
 from gigabrain_schemas.sensors import Imu
 from gigabrain_zenoh.errors import BodyLost, Unsupported
 from tests.opencr_rig import MS, Rig, make_rig  # noqa: F401

@@ -11,16 +11,17 @@ from typing import Any
 import dynamixel_sdk
 import pytest
 
-from gigabrain_drivers.catalog import load_robot
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
+from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrOptions
+from gigabrain_drivers.bodies.turtlebot3.dynamixel import Decoder, Packet
+from gigabrain_drivers.bodies.turtlebot3.emulator import OpenCr
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import EmulatedBody
-from gigabrain_drivers.emulators.opencr import OpenCr
 from gigabrain_drivers.emulators.physics import emulated_body
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.emulators.station import Station
-from gigabrain_drivers.opencr.driver import OpenCrOptions
-from gigabrain_drivers.protocols import dynamixel, opencr
-from gigabrain_drivers.protocols.dynamixel import Decoder, Packet
-from gigabrain_drivers.robot import Run
 from gigabrain_zenoh.clock import Clock
 
 MS = 1_000_000

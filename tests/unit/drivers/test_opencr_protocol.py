@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.protocols import opencr
-from gigabrain_drivers.protocols.dynamixel import Decoder
+from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
+from gigabrain_drivers.bodies.turtlebot3.dynamixel import Decoder
 
 
 def table(**items: bytes) -> bytes:

@@ -19,8 +19,8 @@ import pytest
 import rplidar as roboticia
 import serial
 
-from gigabrain_drivers.emulators.rplidar import RplidarDevice
-from gigabrain_drivers.lidars.rplidar import RplidarOptions
+from gigabrain_drivers.lidars.rplidar.emulator import RplidarDevice
+from gigabrain_drivers.lidars.rplidar.source import RplidarOptions
 from tests.lidar_rig import emulated, truth
 
 Point = tuple[float, float]  # [deg] clockwise, [mm]

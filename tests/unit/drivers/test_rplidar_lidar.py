@@ -10,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_drivers.emulators.faults import NONE, Faults
-from gigabrain_drivers.emulators.ld import LdDevice
-from gigabrain_drivers.emulators.rplidar import RplidarDevice
-from gigabrain_drivers.lidars import rplidar_start, serial_source
-from gigabrain_drivers.lidars.ld import Ld19
-from gigabrain_drivers.lidars.rplidar import Rplidar, RplidarOptions
-from gigabrain_drivers.protocols import rplidar
-from gigabrain_drivers.protocols.rplidar import DENSE, EXPRESS, STANDARD, Health
+from gigabrain_drivers.lidars import serial_source
+from gigabrain_drivers.lidars.ld.emulator import LdDevice
+from gigabrain_drivers.lidars.ld.source import Ld19
+from gigabrain_drivers.lidars.rplidar import protocol as rplidar
+from gigabrain_drivers.lidars.rplidar import startup as rplidar_start
+from gigabrain_drivers.lidars.rplidar.emulator import RplidarDevice
+from gigabrain_drivers.lidars.rplidar.protocol import DENSE, EXPRESS, STANDARD, Health
+from gigabrain_drivers.lidars.rplidar.source import Rplidar, RplidarOptions
 from gigabrain_schemas.arrays import ranges
 from gigabrain_zenoh.clock import Clock, FakeClock
 from tests.lidar_rig import LIDAR, Listener, agree, emulated, truth, until

@@ -4,10 +4,10 @@ import rplidar as roboticia
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.protocols import rplidar
-from gigabrain_drivers.protocols.rplidar import Answer, Decoder, Info
-from gigabrain_drivers.protocols.rplidar_requests import Request, RequestDecoder
-from gigabrain_drivers.protocols.rplidar_scans import (
+from gigabrain_drivers.lidars.rplidar import protocol as rplidar
+from gigabrain_drivers.lidars.rplidar.protocol import Answer, Decoder, Info
+from gigabrain_drivers.lidars.rplidar.requests import Request, RequestDecoder
+from gigabrain_drivers.lidars.rplidar.scan_formats import (
     Dense,
     Express,
     Samples,

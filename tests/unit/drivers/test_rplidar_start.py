@@ -2,11 +2,11 @@ from typing import Any
 
 import pytest
 
-from gigabrain_drivers.emulators.rplidar import RplidarDevice
-from gigabrain_drivers.lidars.rplidar import RplidarOptions
-from gigabrain_drivers.lidars.rplidar_start import Trouble, choose
-from gigabrain_drivers.protocols import rplidar
-from gigabrain_drivers.protocols.rplidar import EXPRESS, STANDARD, Decoder, Info
+from gigabrain_drivers.lidars.rplidar import protocol as rplidar
+from gigabrain_drivers.lidars.rplidar.emulator import RplidarDevice
+from gigabrain_drivers.lidars.rplidar.protocol import EXPRESS, STANDARD, Decoder, Info
+from gigabrain_drivers.lidars.rplidar.source import RplidarOptions
+from gigabrain_drivers.lidars.rplidar.startup import Trouble, choose
 from tests.lidar_rig import Wire, run_for, waffle
 
 

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.protocols import rplidar
-from gigabrain_drivers.protocols.rplidar import Answer, Decoder, Info
-from gigabrain_drivers.protocols.rplidar_requests import RequestDecoder
-from gigabrain_drivers.protocols.rplidar_scans import Dense, Samples, dense_capsule, node
+from gigabrain_drivers.lidars.rplidar import protocol as rplidar
+from gigabrain_drivers.lidars.rplidar.protocol import Answer, Decoder, Info
+from gigabrain_drivers.lidars.rplidar.requests import RequestDecoder
+from gigabrain_drivers.lidars.rplidar.scan_formats import Dense, Samples, dense_capsule, node
 
 STANDARD = bytes.fromhex("a55a0500004081")
 DENSE = rplidar.descriptor(0x85, 84, endless=True)

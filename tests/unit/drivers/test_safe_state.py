@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers import process
-from gigabrain_drivers.catalog import load_robot
-from gigabrain_drivers.mock import MockBody, MockOptions
-from gigabrain_drivers.robot import Run
+from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
+from gigabrain_drivers.driver import process
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState, SafeState
 from gigabrain_zenoh.config.settings import DriverConfig

@@ -6,15 +6,15 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers import catalog
-from gigabrain_drivers.base import Driver
+from gigabrain_drivers.bodies.line.command import LineCommand
+from gigabrain_drivers.bodies.line.fields import COMMAND
+from gigabrain_drivers.bodies.line.protocol import Template
+from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.kinematics import Twist, base_of
 from gigabrain_drivers.legs.gait import WALKER
-from gigabrain_drivers.line_command import LineCommand
-from gigabrain_drivers.protocols import opencr
-from gigabrain_drivers.protocols.line import Template
-from gigabrain_drivers.protocols.line_fields import COMMAND
-from gigabrain_drivers.robot import Run
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.qa.faults.fault import Failed

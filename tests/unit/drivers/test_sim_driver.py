@@ -9,9 +9,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gigabrain_drivers import catalog
-from gigabrain_drivers.process import DriverProcess
-from gigabrain_drivers.robot import RobotFile, Run
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.process import DriverProcess
+from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim import driver as sim_driver
 from gigabrain_drivers.sim.account import account_of
 from gigabrain_drivers.sim.driver import MujocoDriver

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gigabrain_drivers import catalog
+from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.kinematics import Twist
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_drivers.legs.geometry import JOINT_NAMES

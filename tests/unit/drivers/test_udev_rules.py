@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.catalog import load_robot, robot_files
+from gigabrain_drivers.driver.catalog import load_robot, robot_files
 
 RULES = Path(__file__).parents[3] / "deploy" / "70-gigabrain.rules"
 MATCHES = {"ACTION", "SUBSYSTEM", "DRIVER", "ATTR", "ATTRS", "KERNEL", "ENV"}

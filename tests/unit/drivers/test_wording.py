@@ -8,19 +8,17 @@ from typing import Any
 
 import pytest
 
+from gigabrain_drivers.bodies.alpha import protocol as alpha
+from gigabrain_drivers.bodies.line.fields import COMMAND
+from gigabrain_drivers.bodies.line.protocol import Decoder, Template, describe
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
+from gigabrain_drivers.lidars.ld import protocol as ld
+from gigabrain_drivers.lidars.lds import lds01 as lds01
+from gigabrain_drivers.lidars.lds import lds03 as lds03
+from gigabrain_drivers.lidars.rplidar import requests as rplidar_requests
 from gigabrain_drivers.links import link as links
 from gigabrain_drivers.links.wording import Spelling, Wording, of_command, whole
-from gigabrain_drivers.protocols import (
-    alpha,
-    dynamixel,
-    ld,
-    lds01,
-    lds03,
-    opencr,
-    rplidar_requests,
-)
-from gigabrain_drivers.protocols.line import Decoder, Template, describe
-from gigabrain_drivers.protocols.line_fields import COMMAND
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.cli import driver_kit
 from gigabrain_zenoh.cli.driver_kit import trace

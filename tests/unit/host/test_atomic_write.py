@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gigabrain_drivers.latch import Latched, LatchFile
+from gigabrain_drivers.driver.latch import Latched, LatchFile
 from gigabrain_zenoh.decision.tasks.executive import Saved
 from gigabrain_zenoh.decision.tasks.store import TaskFile
 from gigabrain_zenoh.gate.causes import estop

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import zstandard
 
-from gigabrain_drivers.catalog import load_robot
-from gigabrain_drivers.latch import UNREADABLE, LatchFile
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.driver.latch import UNREADABLE, LatchFile
+from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.links.address import written
 from gigabrain_drivers.links.link import LinkProblem
-from gigabrain_drivers.robot import Run
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.places import located

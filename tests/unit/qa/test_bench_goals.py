@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 from rich.console import Console
 
-from gigabrain_drivers.catalog import load_robot, robot_path
+from gigabrain_drivers.driver.catalog import load_robot, robot_path
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import GateStatus, Pose, RobotState, Velocity
 from gigabrain_schemas.tasks import Goal

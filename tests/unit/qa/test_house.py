@@ -44,7 +44,7 @@ def test_no_string_names_a_module_that_its_room_must_not_import() -> None:
     [
         ("safety/step.py", "gigabrain_zenoh.perception.node:run", "safety trusts"),
         ("mapping/slam.py", "gigabrain_zenoh.bus.bus:Bus", "gate, geometry"),
-        ("decision/node.py", "gigabrain_drivers.mock:Mock", "only the commands"),
+        ("decision/node.py", "gigabrain_drivers.bodies.mock.driver:Mock", "only the commands"),
         ("host/heap.py", "gigabrain_zenoh.bus.bus:Bus", "each room"),
     ],
 )
@@ -61,7 +61,11 @@ def test_a_name_in_a_string_is_found(copy: Path, where: str, name: str, contract
         ("safety/step.py", "from gigabrain_zenoh.mapping.field import OCCUPIED", "safety trusts"),
         ("mapping/slam.py", "def late():\n    import gigabrain_zenoh.bus.bus", "gate, geometry"),
         ("host/heap.py", "from gigabrain_zenoh.bus.bus import Bus", "each room"),
-        ("ui/seat.py", "from gigabrain_drivers.mock import Mock", "only the commands and qa"),
+        (
+            "ui/seat.py",
+            "from gigabrain_drivers.bodies.mock.driver import Mock",
+            "only the commands and qa",
+        ),
     ],
 )
 def test_an_import_against_the_order_is_found(

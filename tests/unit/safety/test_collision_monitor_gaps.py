@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers.robot import RobotFile
+from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import BodyDescription, Thresholds
 from gigabrain_schemas.topics import BODY as BODY_TOPIC

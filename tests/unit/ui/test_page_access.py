@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.catalog import load_robot
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.brain import Twist

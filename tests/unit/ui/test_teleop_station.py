@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers.catalog import load_robot
+from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
 from gigabrain_schemas.examples import example

@@ -1,0 +1,1 @@
+"""Bodies: a folder each, with `robot.yaml`, its model, and the driver of its wire."""

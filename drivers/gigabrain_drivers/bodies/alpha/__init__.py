@@ -1,0 +1,1 @@
+"""Alpha, a quadruped behind a TCP port: driver, protocol and firmware emulator."""

@@ -1,0 +1,233 @@
+"""Alpha on its real link: a quadruped behind a TCP port, told how to walk fifty times a second.
+
+The driver never speaks by itself: when nobody commands, the stream ends, and the firmware stops
+the body 100 ms later (docs/firmware_alpha.md).
+"""
+
+import logging
+
+from msgspec.structs import replace
+
+from gigabrain_drivers.bodies.alpha import protocol as alpha
+from gigabrain_drivers.bodies.alpha.protocol import Decoder, Frame, State
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
+from gigabrain_drivers.kinematics import Twist
+from gigabrain_drivers.legs.gait import WALKER
+from gigabrain_drivers.legs.geometry import JOINT_NAMES, LegGeometry
+from gigabrain_drivers.legs.odometry import LegOdometry
+from gigabrain_drivers.lidars.base import ScanSource, carry
+from gigabrain_drivers.links.address import AddressLink
+from gigabrain_drivers.links.device_clock import DeviceClock, EchoClock
+from gigabrain_drivers.links.hearing import Hearing
+from gigabrain_drivers.links.wording import Spelling, Wording
+from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.body import Battery, Joint, LinkHealth, RobotState
+from gigabrain_schemas.sensors import Imu, ImuData
+from gigabrain_schemas.topics import IMU
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import BodyLost, Unsupported
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.logs import Fault
+
+log = logging.getLogger(__name__)
+
+SENSELESS = "nothing that makes sense comes: is this the right port?"
+SILENT_NS = 100_000_000  # without a state, and the body counts as lost
+LAST_WORD_NS = 10_000_000  # for the last command to arrive before the connection is closed
+MILLISECONDS = 1 << 32  # after which the firmware's clock begins anew
+USUAL_MS = 30.0  # from a command to the state that echoes it
+
+
+class AlphaOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The quadruped's part of a robot's file."""
+
+    port: str = f"192.168.123.10:{alpha.PORT}"  # HOST:PORT, or a file that holds it
+
+
+class AlphaDriver(Driver):
+    """Silent until the body has been heard; the first command then is to stop, as after a loss."""
+
+    Options = AlphaOptions
+
+    def __init__(self, robot: RobotFile, options: AlphaOptions, run: Run) -> None:
+        super().__init__(robot, options, run)
+        self._clock = Clock()
+        self.link = AddressLink(options.port, self._clock)
+        self.link.wording = Wording(
+            Spelling(alpha.Decoder().feed, alpha.describe),
+            Spelling(alpha.Decoder().feed, alpha.describe),
+        )
+        self.link.on_bytes, self.link.on_open = self._received, self._opened
+        self.link.on_lost = self._lost
+        self._decoder, self._odometry = Decoder(), LegOdometry(LegGeometry())
+        self._sequence = 0  # of the newest command
+        self._unsound = 0  # whole frames without sense
+        self._last: tuple[int, int] | None = None  # sequence and milliseconds of the newest state
+        self._state: State | None = None
+        self._hearing = Hearing(self.link, self._clock, SILENT_NS, SENSELESS, log)
+        self._stamps, self._echoes = DeviceClock(MILLISECONDS), EchoClock(USUAL_MS)
+        self._untold = False  # whether a loss has not been reported yet
+        self._open = self._parked = False
+        self._fall = Fault(log)
+        self._imu: Imu | None = None
+        self._lidar: ScanSource | None = None
+
+    async def open(self) -> None:
+        """Begin to look for the body and its lidar; neither has to be there yet."""
+        self._open = True
+        self.link.open()
+        self._lidar = carry(self, self._clock)
+
+    async def close(self) -> None:
+        """Stop, and let go of the connection."""
+        if self._open:
+            await self.stop()
+            if self.link.connected:
+                await self._clock.sleep_ns(LAST_WORD_NS)
+        self._open = False
+        await self.link.close()
+        if self._lidar:
+            await self._lidar.close()
+
+    async def stop(self) -> None:
+        """Come to rest and stand; a body that lies goes on lying."""
+        if self._hearing.heard:
+            say = alpha.park if self._parked else alpha.stop
+            self.link.write(say(self._next()))
+
+    async def park(self) -> None:
+        """Lie down; only a step gets it up again."""
+        if not self._hearing.heard:
+            raise BodyLost(f"{self.link}: {self.link.problem or 'the body is silent'}")
+        self._parked = True
+        self.link.write(alpha.park(self._next()))
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        """Walk; a value that is not a number is zero for all, and so is all while it is lost."""
+        if not self._open:
+            raise BodyLost("the connection is not open")
+        if not self._hearing.heard:  # it may still be starting
+            return ZERO
+        to = self.bounded(linear_x, linear_y, angular_z)
+        if self._untold or self._fallen:
+            to = ZERO
+        if self._parked and to == ZERO:
+            self.link.write(alpha.park(self._next()))
+            return ZERO
+        self._parked = False
+        gait = WALKER.to_gait(Twist(to.linear_x, to.linear_y, to.angular_z))
+        seen = self._last[1] if self._last else 0
+        if not self.link.write(alpha.walk(alpha.Walk(seen, gait), self._next())):
+            return ZERO
+        return Velocity(**WALKER.to_body(gait)._asdict())
+
+    async def read_state(self) -> RobotState:
+        """What the body said last; `link` says whether that is still so."""
+        velocity = self._odometry.velocity if self._hearing.heard else Twist(0.0, 0.0, 0.0)
+        state = RobotState(
+            robot_type=self.robot.robot_type,
+            pose=self._odometry.pose,
+            velocity=Velocity(**velocity._asdict()),
+            link=self._health(),
+        )
+        return _with(state, self._state) if self._state else state
+
+    async def get_sensor_data(self, sensor_name: str) -> Message | None:
+        """The newest `imu`, and `scan` where a lidar is carried."""
+        if sensor_name == "imu":
+            return self._imu
+        if sensor_name == "scan" and self.options.scan:
+            return self._lidar.newest if self._lidar else None
+        has = "imu, scan" if self.options.scan else "imu"
+        raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}; it has: {has}")
+
+    @property
+    def _fallen(self) -> bool:
+        return self._state is not None and bool(self._state.flags & alpha.FALLEN)
+
+    def _next(self) -> int:
+        self._sequence = (self._sequence + 1) % alpha.SEQUENCES
+        self._echoes.sent(self._sequence, self._clock.now_ns())
+        return self._sequence
+
+    def _opened(self) -> None:
+        """A new connection: nothing from before counts."""
+        self._decoder.clear()
+        self._hearing.forget()
+        self._last = None
+
+    def _lost(self, why: str) -> None:
+        self._untold = self._untold or self._hearing.heard
+        self._hearing.forget()
+
+    def _received(self, data: bytes) -> None:
+        for frame in self._decoder.feed(data):
+            state = alpha.state_of(frame) if frame.type == alpha.STATE else None
+            if state is None:
+                self._unsound += 1
+            else:
+                self._take(frame, state)
+        self.link.errors = self._decoder.errors + self._unsound
+
+    def _take(self, frame: Frame, state: State) -> None:
+        """One report. Its own clock says how much time has passed since the last."""
+        last, self._last = self._last, (frame.sequence, state.milliseconds)
+        if last and not alpha.newer(frame.sequence, last[0]):
+            self._last = last
+            return
+        first, self._state = self._hearing.hear(), state
+        now_ns = self._clock.now_ns()
+        self._stamps.arrived(state.milliseconds, now_ns)
+        self._echoes.echoed(state.echo, now_ns)
+        if last:
+            passed = (state.milliseconds - last[1]) % MILLISECONDS
+            self._odometry.update(state.senses, passed / 1000)
+        if first:  # what lies stays so until somebody wants it to walk
+            self._parked = bool(state.flags & alpha.PARKED)
+            say = alpha.park if self._parked else alpha.stop
+            self.link.write(say(self._next()))
+        senses = state.senses
+        self._imu = Imu(
+            orientation=senses.orientation,
+            angular_velocity=senses.angular_velocity,
+            linear_acceleration=senses.linear_acceleration,
+        )
+        self.emit(IMU, self._imu)
+        if self._fallen:
+            self._fall.begin("the body has fallen over; it stands up when its firmware starts anew")
+        else:
+            self._fall.end("the body stands again")
+
+    def _health(self) -> LinkHealth:
+        """The connection's; connected means that the body has been heard lately.
+
+        A loss is told at least once, however soon the body is back.
+        """
+        alive = self._hearing.alive()
+        told, self._untold = not self._untold, False
+        late_ms = max(self._stamps.late_ms, self._echoes.late_ms)
+        return replace(self.link.health, connected=alive and told, late_ms=late_ms)
+
+
+def _with(state: RobotState, now: State) -> RobotState:
+    """What the body has reported, for `robot/state`."""
+    senses = now.senses
+    positions = (angle for leg in senses.joints for angle in leg)
+    rates = (rate for leg in senses.rates for rate in leg)
+    each = zip(JOINT_NAMES, positions, rates, now.torques, now.temperatures, strict=True)
+    return replace(
+        state,
+        joints=tuple(
+            Joint(name=name, position=at, velocity=rate, effort=torque, temperature=celsius)
+            for name, at, rate, torque, celsius in each
+        ),
+        battery=Battery(voltage=now.voltage, percentage=now.percentage, current=now.current),
+        imu=ImuData(
+            orientation=senses.orientation,
+            angular_velocity=senses.angular_velocity,
+            linear_acceleration=senses.linear_acceleration,
+        ),
+    )

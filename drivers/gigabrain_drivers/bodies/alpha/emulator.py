@@ -1,0 +1,152 @@
+"""Alpha's firmware, as docs/firmware_alpha.md asks it to be: a TCP server, and a trot."""
+
+from collections import deque
+from pathlib import Path
+from typing import Any, ClassVar
+
+from gigabrain_drivers.bodies.alpha import protocol as alpha
+from gigabrain_drivers.bodies.alpha.driver import AlphaOptions
+from gigabrain_drivers.bodies.alpha.protocol import Decoder, Frame, State
+from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Snapshot, Wire
+from gigabrain_drivers.emulators.tcp import TcpPort
+from gigabrain_drivers.kinematics import Gait, Twist
+from gigabrain_drivers.legs.gait import WALKER, sound
+from gigabrain_drivers.legs.senses import Senses
+
+LYING_M = 0.13  # height of the hips of a body that lies
+REST = WALKER.to_gait(Twist(0.0, 0.0, 0.0))
+RISE_NS = 1_800_000_000  # from lying to standing
+LYING = REST._replace(height=LYING_M)
+BROWN_OUT_SHARE = 0.6  # of the battery's voltage, below which the firmware is off
+KEPT = 1000  # commands, for tests to look at
+
+
+class Alpha(Device):
+    """Obeys sound commands newer than the last; stops by itself; reports each step of its body.
+
+    After silence the first sound command begins a new count.
+    """
+
+    Options = AlphaOptions
+    period_s: ClassVar[float] = 1 / alpha.STATE_HZ
+    watchdog_ns = alpha.SILENCE_NS
+    promised_in = "firmware_alpha.md"
+
+    def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
+        super().__init__(body, options, wire)
+        self.executed: deque[Gait] = deque(maxlen=KEPT)  # what the legs were told
+        self.reset()
+
+    @classmethod
+    def port(cls, options: Any) -> Port:
+        """A TCP port, the usual one where it is free; its address in the file of the options."""
+        return TcpPort(Path(options.port), alpha.PORT)
+
+    def reset(self) -> None:
+        """Power has come: it stands."""
+        self._decoder = Decoder()
+        self._echo = self._sent = self._refused = 0
+        self._last: int | None = None  # sequence of the newest command
+        self._obeyed_ns: int | None = None  # when it came
+        self._now_ns = 0
+        self.body.fresh()  # what was measured before is none of its business
+        self._began_ns = self.body.snapshot.time_ns
+        self._silent, self._on = True, True
+        self._gait, self._up_ns = REST, 0
+        self.body.walk(REST)
+
+    @property
+    def parked(self) -> bool:
+        """Whether it lies, or is on its way down."""
+        return self._gait == LYING
+
+    def feed(self, data: bytes) -> None:
+        """Bytes from whoever is connected."""
+        if not self._on:
+            return
+        errors = self._decoder.errors
+        for frame in self._decoder.feed(data):
+            gait = self._wanted(frame)
+            if gait is None:
+                self._refused += 1
+            else:
+                self._obey(gait, frame.sequence)
+        self._refused += self._decoder.errors - errors
+
+    def step(self, now_ns: int) -> None:
+        """Watchdog and report."""
+        supply = self.body.snapshot.battery.voltage
+        on = supply - self.sag_volts >= BROWN_OUT_SHARE * supply
+        if on != self._on:
+            self.reset()
+            self._on = on
+        if not on:
+            return
+        self._now_ns = now_ns
+        if self._obeyed_ns is None or now_ns - self._obeyed_ns >= self.watchdog_ns:
+            self._silent, self._last = True, None
+            self._walk(LYING if self.parked else REST)
+        for sample in self.body.fresh() or [self.body.snapshot]:
+            self._sent += 1
+            self.wire.write(alpha.state(self._report(sample), self._sent))
+
+    def _wanted(self, frame: Frame) -> Gait | None:
+        """What a frame asks for, or None where it is not a sound, new and fresh command."""
+        if frame.type == alpha.STOP:
+            return REST
+        if frame.type == alpha.PARK:
+            return LYING
+        command = alpha.walk_of(frame) if frame.type == alpha.WALK else None
+        if command is None or not sound(command.gait):
+            return None
+        if self._last is not None and not alpha.newer(frame.sequence, self._last):
+            return None
+        now_ms = self._milliseconds(self.body.snapshot)
+        return None if alpha.stale(command.seen, now_ms) else command.gait
+
+    def _milliseconds(self, sample: Snapshot) -> int:
+        """The firmware's clock is the body's: it stands still where a busy host holds both up."""
+        return max(0, sample.time_ns - self._began_ns) // 1_000_000
+
+    def _obey(self, gait: Gait, sequence: int) -> None:
+        self._last = self._echo = sequence
+        self._obeyed_ns, self._silent = self._now_ns, False
+        self.executed.append(gait)
+        self._walk(gait)
+
+    def _walk(self, gait: Gait) -> None:
+        """Have the legs do it; a body that lies stands up before the first step."""
+        if self.parked and gait != LYING:
+            self._up_ns = self._now_ns + RISE_NS
+        if gait != LYING and self._now_ns < self._up_ns:
+            gait = REST
+        if gait != self._gait:
+            self._gait = gait
+            self.body.walk(gait)
+
+    def _report(self, now: Snapshot) -> State:
+        flags = alpha.SILENT if self._silent else 0
+        flags |= alpha.PARKED if self.parked else 0
+        flags |= alpha.FALLEN if now.fallen else 0
+        flags |= alpha.WALKING if max(map(abs, WALKER.to_body(self._gait))) > 0 else 0
+        angles = iter([motor.position for motor in now.wheels])
+        rates = iter([motor.velocity for motor in now.wheels])
+        return State(
+            milliseconds=self._milliseconds(now),
+            echo=self._echo,
+            refused=self._refused,
+            flags=flags,
+            voltage=max(now.battery.voltage - self.sag_volts, 0.0),
+            current=now.battery.current,
+            percentage=now.battery.percentage,
+            senses=Senses(
+                joints=tuple(zip(angles, angles, angles, strict=True)),
+                rates=tuple(zip(rates, rates, rates, strict=True)),
+                contacts=now.contacts,
+                orientation=now.imu.orientation,
+                angular_velocity=now.imu.angular_velocity,
+                linear_acceleration=now.imu.linear_acceleration,
+            ),
+            torques=tuple(motor.effort for motor in now.wheels),
+            temperatures=tuple(motor.temperature for motor in now.wheels),
+        )

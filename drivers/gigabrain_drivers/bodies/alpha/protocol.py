@@ -1,0 +1,214 @@
+"""Alpha's protocol: gaits to the body, its state back, in frames with a CRC-32.
+
+docs/firmware_alpha.md describes it for those who write the firmware. All numbers are little-endian:
+
+    0   2  magic a5 5a          4   1  type                  6   4  sequence, counts up, wraps
+    2   2  bytes of payload     5   1  version, 1           10   n  payload, then 4 of CRC-32
+
+A frame is believed when its CRC is right, its type known, of that type's length, and all numbers
+in it are numbers. Encoders and decoders for both ends, pure.
+"""
+
+import math
+import struct
+import zlib
+from typing import NamedTuple
+
+from gigabrain_drivers.kinematics import Gait
+from gigabrain_drivers.legs.senses import Senses
+from gigabrain_drivers.links.frames import FrameDecoder
+
+PORT = 8080
+SILENCE_NS = 100_000_000  # without a sound command, after which the body stops
+STALE_MS = 150  # a command that rests on an older state than this is refused
+STATE_HZ = 100
+MAGIC, VERSION = b"\xa5\x5a", 1
+WALK, STOP, PARK, STATE = 0x01, 0x02, 0x03, 0x81
+SEQUENCES = 1 << 32
+
+WALKING, SILENT, FALLEN, PARKED = 1, 2, 4, 8  # flags: feet step; stopped by silence; fell; lies
+
+_HEADER = struct.Struct("<2sHBBI")
+_CRC = struct.Struct("<I")
+_GAIT = struct.Struct("<I10f")
+_STATE = struct.Struct("<III B B 3f 4f3f3f 36f 12h")
+_LENGTHS = {WALK: _GAIT.size, STOP: 0, PARK: 0, STATE: _STATE.size}
+_FASTEST = 1e4  # beyond which, either way, no number in a state is a measurement
+
+
+class Frame(NamedTuple):
+    """One frame; what its payload holds depends on its type."""
+
+    type: int
+    sequence: int
+    payload: bytes = b""
+
+
+class Walk(NamedTuple):
+    """A command to walk."""
+
+    seen: int  # [ms], the body's own clock in the newest state that the sender knows
+    gait: Gait
+
+
+class State(NamedTuple):
+    """What the body says of itself, 100 times a second."""
+
+    milliseconds: int  # since the firmware began, wraps
+    echo: int  # sequence of the newest command that was obeyed; 0 for none
+    refused: int  # how many frames were no sound command
+    flags: int
+    voltage: float  # [V]
+    current: float  # [A], positive while it drains
+    percentage: float  # [%]
+    senses: Senses
+    torques: tuple[float, ...]  # [N m], of the twelve joints, leg by leg
+    temperatures: tuple[float, ...]  # [deg C], of their motors
+
+
+def encode(frame: Frame) -> bytes:
+    """The bytes of a frame on the wire."""
+    length, sequence = len(frame.payload), frame.sequence % SEQUENCES
+    head = _HEADER.pack(MAGIC, length, frame.type, VERSION, sequence)
+    body = head + frame.payload
+    return body + _CRC.pack(zlib.crc32(body))
+
+
+def walk(command: Walk, sequence: int) -> bytes:
+    """A command to walk."""
+    seen, gait = command
+    values = (gait.stride_x, gait.stride_y, gait.turn, gait.frequency, gait.duty)
+    return encode(Frame(WALK, sequence, _GAIT.pack(seen, *values, *gait.phases, gait.height)))
+
+
+def stop(sequence: int) -> bytes:
+    """A command to come to rest and stand."""
+    return encode(Frame(STOP, sequence))
+
+
+def park(sequence: int) -> bytes:
+    """A command to come to rest and lie down, and to stay so until the next step is asked for."""
+    return encode(Frame(PARK, sequence))
+
+
+def walk_of(frame: Frame) -> Walk | None:
+    """The command in a frame, or None where it holds what is not a number."""
+    seen, x, y, turn, frequency, duty, a, b, c, d, height = _GAIT.unpack(frame.payload)
+    if not all(map(math.isfinite, (x, y, turn, frequency, duty, a, b, c, d, height))):
+        return None
+    return Walk(seen, Gait(x, y, turn, frequency, duty, (a, b, c, d), height))
+
+
+def stale(seen: int, now: int) -> bool:
+    """Whether a command that has `seen` this time [ms] is too old at `now`, across the wrap."""
+    return (now - seen) % SEQUENCES > STALE_MS
+
+
+def state(now: State, sequence: int) -> bytes:
+    """The body's report."""
+    senses = now.senses
+    feet = sum(1 << foot for foot, touches in enumerate(senses.contacts) if touches)
+    joints = [angle for leg in senses.joints for angle in leg]
+    rates = [rate for leg in senses.rates for rate in leg]
+    each = zip(joints, rates, now.torques, strict=True)
+    payload = _STATE.pack(
+        now.milliseconds % SEQUENCES,
+        now.echo,
+        now.refused % SEQUENCES,
+        now.flags,
+        feet,
+        now.voltage,
+        now.current,
+        now.percentage,
+        *senses.orientation,
+        *senses.angular_velocity,
+        *senses.linear_acceleration,
+        *(value for joint in each for value in joint),
+        *(max(-32768, min(32767, round(10 * value))) for value in now.temperatures),
+    )
+    return encode(Frame(STATE, sequence, payload))
+
+
+def state_of(frame: Frame) -> State | None:
+    """The report in a frame, or None where it holds what cannot have been measured."""
+    milliseconds, echo, refused, flags, feet, *rest = _STATE.unpack(frame.payload)
+    numbers, temperatures = rest[:49], rest[49:]
+    if not all(abs(value) < _FASTEST for value in numbers):
+        return None
+    voltage, current, percentage, *rest = numbers
+    (x, y, z, w), rate, acceleration, joints = rest[:4], rest[4:7], rest[7:10], rest[10:]
+    norm = math.hypot(x, y, z, w)
+    if not 0.9 < norm < 1.1 or voltage < 0 or not 0 <= percentage <= 100:
+        return None
+    senses = Senses(
+        joints=_by_leg(joints[0::3]),
+        rates=_by_leg(joints[1::3]),
+        contacts=tuple(bool(feet >> foot & 1) for foot in range(4)),
+        orientation=(x / norm, y / norm, z / norm, w / norm),
+        angular_velocity=(rate[0], rate[1], rate[2]),
+        linear_acceleration=(acceleration[0], acceleration[1], acceleration[2]),
+    )
+    return State(
+        milliseconds=milliseconds,
+        echo=echo,
+        refused=refused,
+        flags=flags,
+        voltage=voltage,
+        current=current,
+        percentage=percentage,
+        senses=senses,
+        torques=tuple(joints[2::3]),
+        temperatures=tuple(value / 10 for value in temperatures),
+    )
+
+
+def newer(sequence: int, than: int) -> bool:
+    """Whether one sequence number comes after another, across the wrap."""
+    return 0 < (sequence - than) % SEQUENCES < SEQUENCES // 2
+
+
+def describe(frame: Frame) -> str:
+    """A frame in words."""
+    if frame.type == WALK and (command := walk_of(frame)):
+        gait = command.gait
+        return (
+            f"{frame.sequence} walk: stride {gait.stride_x:.4f} {gait.stride_y:.4f} m, "
+            f"turn {gait.turn:.4f} rad, frequency {gait.frequency:.2f} Hz, duty {gait.duty:.2f}, "
+            f"height {gait.height:.3f} m; seen {command.seen} ms"
+        )
+    if frame.type == PARK:
+        return f"{frame.sequence} park"
+    if frame.type == STOP:
+        return f"{frame.sequence} stop"
+    if frame.type == STATE and (now := state_of(frame)):
+        feet = "".join("x" if touches else "." for touches in now.senses.contacts)
+        return (
+            f"{frame.sequence} state: {now.milliseconds} ms, echo {now.echo}, refused "
+            f"{now.refused}, flags {now.flags}, {now.voltage:.2f} V, feet {feet}"
+        )
+    return f"{frame.sequence} unsound frame of type {frame.type:#04x}"
+
+
+class Decoder(FrameDecoder[Frame]):
+    """Finds frames in whatever comes in."""
+
+    HEADER = MAGIC
+
+    def _size(self, buffer: bytearray) -> int | None:
+        if len(buffer) < _HEADER.size:
+            return None
+        _, length, kind, version, _ = _HEADER.unpack_from(buffer)
+        right = version == VERSION and _LENGTHS.get(kind) == length
+        return _HEADER.size + int(length) + _CRC.size if right else 0
+
+    def _frame(self, data: bytes) -> Frame | None:
+        body, (crc,) = data[: -_CRC.size], _CRC.unpack(data[-_CRC.size :])
+        if zlib.crc32(body) != crc:
+            return None
+        _, _, kind, _, sequence = _HEADER.unpack_from(body)
+        return Frame(kind, sequence, body[_HEADER.size :])
+
+
+def _by_leg(values: list[float]) -> tuple[tuple[float, float, float], ...]:
+    each = iter(values)
+    return tuple(zip(each, each, each, strict=True))

@@ -1,0 +1,1 @@
+"""A base on a line of text, described in YAML: options, protocol, driver and emulator."""

@@ -1,0 +1,202 @@
+"""A body without code: one text line out, text lines in, all described in the robot's file.
+
+The driver never speaks by itself: when nobody commands, the line falls silent, and the firmware
+stops the body (docs/firmware_line.md).
+"""
+
+import logging
+import time
+
+import serial
+from msgspec.structs import replace
+
+from gigabrain_drivers.bodies.line import check as line_check
+from gigabrain_drivers.bodies.line.command import LineCommand, Spoken
+from gigabrain_drivers.bodies.line.options import BITS_PER_BYTE, LineOptions
+from gigabrain_drivers.bodies.line.protocol import Decoder, describe
+from gigabrain_drivers.bodies.line.report import LineReport
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_drivers.kinematics import base_of
+from gigabrain_drivers.lidars.base import ScanSource, carry
+from gigabrain_drivers.links.hearing import Hearing
+from gigabrain_drivers.links.serial_link import SerialLink
+from gigabrain_drivers.links.wording import Spelling, Wording
+from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.body import RobotState
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import BodyLost, Unsupported
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.logs import Fault
+
+log = logging.getLogger(__name__)
+
+MISSED = 3  # state lines in a row, and the body counts as lost
+LEAST_SILENT_NS = 100_000_000
+REPEAT_SHARE = 0.9  # of the repetition's period: ticks are not that even
+SENSELESS = "no line that makes sense comes: firmware, baud rate, wiring?"
+BUMPER = "bumper"  # flags of such names are bumpers
+PROBE_S = 2.5  # an Arduino that opening has reset takes two seconds to say anything
+LAST_WORD_NS = 10_000_000  # and the time of one line, before a port is closed
+SEQUENCES = 1 << 16
+
+
+class LineDriver(Driver):
+    """Silent until the body has been heard; the first command then is zero, as after a loss."""
+
+    Options = LineOptions
+
+    def __init__(self, robot: RobotFile, options: LineOptions, run: Run) -> None:
+        super().__init__(robot, options, run)
+        base = base_of(robot)
+        self._command = LineCommand(options.command_template(), base)
+        self._decoder = Decoder(options.state_templates())
+        self._clock = Clock()
+        self.link = SerialLink(options.port, options.baud, self._clock, probe=self._is_ours)
+        self.link.wording = Wording(
+            Spelling(Spoken(self._command.template, options.strings()).feed, str),
+            Spelling(Decoder(options.state_templates()).feed, describe),
+        )
+        self.link.on_bytes, self.link.on_open = self._received, self._opened
+        self.link.on_lost = self._lost
+        self._report = LineReport(options, robot, base)
+        silent_ns = max(round(MISSED / options.state_hz * 1e9), LEAST_SILENT_NS)
+        self._hearing = Hearing(self.link, self._clock, silent_ns, SENSELESS, log)
+        self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
+        self._started = False  # whether start went out and no stop since: then a stop is owed
+        self._wanted = self._as_sent = self._sent = ZERO  # the second is what the line keeps of it
+        self._sent_ns = self._seq = 0
+        self._open = False
+        self._told_flags = 0
+        self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
+        self._lidar: ScanSource | None = None
+
+    @classmethod
+    def check(cls, robot: RobotFile, options: LineOptions) -> None:
+        """Raises ValueError where the lines do not fit the body."""
+        line_check.check(options, robot)
+
+    async def open(self) -> None:
+        """Begin to look for the body and its lidar; neither has to be there yet."""
+        self._open = True
+        self.link.open()
+        self._lidar = carry(self, self._clock)
+
+    async def close(self) -> None:
+        """Stop, and let go of the ports."""
+        if self._open:
+            await self.stop()
+            if self.link.connected:  # what is still in the port when it is closed is lost
+                bits = self._command.template.longest() * BITS_PER_BYTE
+                await self._clock.sleep_ns(LAST_WORD_NS + round(bits / self.options.baud * 1e9))
+        self._open = False
+        await self.link.close()
+        if self._lidar:
+            await self._lidar.close()
+
+    async def stop(self) -> None:
+        """A command of zero, and the stop string where the body has one and may be going."""
+        self._still()
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        """Drive; a value that is not a number is zero for all, and so is all while it is lost."""
+        if not self._open:
+            raise BodyLost("the line is not open")
+        self._send(self.bounded(linear_x, linear_y, angular_z))
+        return self._sent
+
+    async def read_state(self) -> RobotState:
+        """What the lines said last; `link` says whether that is still so."""
+        report = self._report
+        return RobotState(
+            robot_type=self.robot.robot_type,
+            pose=report.pose,
+            velocity=report.velocity(),
+            joints=report.joints(),
+            battery=report.battery(),
+            bumpers=self._bumpers(),
+            link=replace(self.link.health, connected=self._hearing.alive()),
+        )
+
+    async def get_sensor_data(self, sensor_name: str) -> Message | None:
+        """The newest `scan`."""
+        if sensor_name != "scan" or self.robot.lidar is None:
+            raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}")
+        return self._lidar.newest if self._lidar else None
+
+    def _still(self) -> None:
+        self._send(ZERO)
+        if self._started and self._hearing.heard:
+            stop = self.options.stop.encode()
+            self._started = bool(stop) and not self.link.write(stop)
+
+    def _send(self, wanted: Velocity) -> None:
+        """Write a command that is new, or due again; `_sent` is what the body then goes by."""
+        if not self._hearing.heard:  # it may still be booting: nothing that could disturb it
+            self._sent = ZERO
+            return
+        now_ns = self._clock.now_ns()
+        if wanted != self._wanted:
+            self._wanted, self._as_sent = wanted, self._command.sent(wanted)
+        sent = self._as_sent
+        if sent == self._sent and now_ns - self._sent_ns < self._repeat_ns:
+            return
+        if sent != ZERO and not self._started:
+            self._start()
+        self._seq = (self._seq + 1) % SEQUENCES
+        line = self._command.line(wanted, self._seq)
+        self._sent, self._sent_ns = (sent if self.link.write(line) else ZERO), now_ns
+
+    def _start(self) -> None:
+        start = self.options.start.encode()
+        self._started = not start or self.link.write(start)
+
+    def _opened(self) -> None:
+        """A new line: nothing from before counts, and nothing is said before the body was heard."""
+        self._decoder.clear()
+        self._report.restart()
+        self._hearing.forget()
+
+    def _lost(self, why: str) -> None:
+        self._hearing.forget()
+        self._sent = ZERO
+
+    def _received(self, data: bytes) -> None:
+        now_ns = self._clock.now_ns()
+        for values in self._decoder.feed(data):
+            moves = self._report.take(values, now_ns)
+            if (
+                moves and self._hearing.hear()
+            ):  # after a boot or a loss: at rest, whatever it was told
+                self._sent_ns = 0
+                self._still()
+            self._tell_flags()
+        self.link.errors = self._decoder.errors
+
+    def _bumpers(self) -> tuple[bool, ...]:
+        """The flags whose names begin with `bumper`."""
+        names = enumerate(self.options.flags)
+        return tuple(bool(self._report.flags >> bit & 1) for bit, name in names if BUMPER in name)
+
+    def _tell_flags(self) -> None:
+        """Say once when a flag is raised and once when it falls."""
+        if self._report.flags == self._told_flags:
+            return
+        self._told_flags = self._report.flags
+        for bit, name in enumerate(self.options.flags):
+            if BUMPER in name:
+                continue
+            if self._report.flags >> bit & 1:
+                self._flags[bit].begin(f"the firmware reports: {name}")
+            else:
+                self._flags[bit].end(f"the firmware no longer reports: {name}")
+
+    def _is_ours(self, port: serial.Serial) -> bool:
+        """Whether a good line comes from this port. Runs in a thread."""
+        decoder, until = Decoder(self.options.state_templates()), time.monotonic() + PROBE_S
+        while time.monotonic() < until:
+            if decoder.feed(port.read(max(1, port.in_waiting))):
+                return True
+        return False

@@ -1,0 +1,141 @@
+"""The firmware of a base on a text line, as docs/firmware_line.md asks it to be.
+
+It is made from the same templates as the driver, read the other way round.
+"""
+
+import math
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from gigabrain_drivers.bodies.line.command import LineCommand
+from gigabrain_drivers.bodies.line.number import Field
+from gigabrain_drivers.bodies.line.options import LineOptions
+from gigabrain_drivers.bodies.line.protocol import LONGEST
+from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
+from gigabrain_drivers.emulators.pty import Pty
+from gigabrain_drivers.kinematics import base_of
+from gigabrain_schemas.base import Velocity
+from gigabrain_zenoh.geometry.limits import clamp, limits_of
+
+BOOT_NS = 300_000_000  # from power-on to the first state line
+BROWN_OUT_SHARE = 0.6  # of the battery's voltage; with less the board holds itself in reset
+BANNER = b"\x00\xf8firmware of a base on a text line\r\nready\r\n"
+KEPT = 1000  # commands, for tests to look at
+WATCHDOG = "watchdog"  # the flag that is raised while the motors are stopped for silence
+
+
+class LineBase(Device):
+    """Boots stopped; obeys whole, right lines within the body's limits; stops by itself."""
+
+    Options = LineOptions
+    period_s = 0.005
+    watchdog_ns = 150_000_000
+    promised_in = "firmware_line.md"
+
+    def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
+        super().__init__(body, options, wire)
+        self._options: LineOptions = options
+        self._command = options.command_template()
+        self._said = LineCommand(self._command, base_of(body.robot))
+        self._state = options.state_templates()
+        self._limits = limits_of(body.robot)
+        self._state_ns = round(1e9 / options.state_hz)
+        self._start = options.start.encode().strip()
+        self._stop = options.stop.encode().strip()
+        self.executed: deque[Velocity] = deque(maxlen=KEPT)  # what the motors were told
+        self._now_ns = 0
+        self.reset()
+
+    @classmethod
+    def port(cls, options: Any) -> Port:
+        """A pty as slow as the line."""
+        return Pty(Path(options.port), options.baud)
+
+    def reset(self) -> None:
+        """Motors at rest, counters from where the wheels stand, a banner, and a moment of boot."""
+        self._rest = b""
+        self._enabled = not self._start
+        self._obeyed_ns: int | None = None  # when the last command came; none yet
+        self._booted_ns: int | None = None
+        self._next_ns = 0
+        wheels = self.body.snapshot.wheels
+        self._zero = {wheel.name: wheel.position for wheel in wheels}
+        self.body.command(0.0, 0.0, 0.0)
+
+    def feed(self, data: bytes) -> None:
+        """Lines, or parts of them; what is too long or wrong is dropped up to the next end."""
+        *lines, rest = (self._rest + data).split(self._command.end)
+        self._rest = rest if len(rest) <= LONGEST else rest[-LONGEST:]
+        if self._booted_ns is None or self._now_ns < self._booted_ns:
+            return
+        for line in lines:
+            self._obey(line.strip(b"\r\n"))
+
+    def step(self, now_ns: int) -> None:
+        """Watch the time since the last command, and report."""
+        self._now_ns = now_ns
+        if self._browned_out():
+            self.reset()
+            return
+        if self._booted_ns is None:
+            self._booted_ns = self._next_ns = now_ns + BOOT_NS
+            self.wire.write(BANNER)
+        if self._silent():
+            self.body.command(0.0, 0.0, 0.0)
+        if now_ns >= self._next_ns:
+            self._next_ns = max(self._next_ns + self._state_ns, now_ns - self._state_ns)
+            for template in self._state:
+                self.wire.write(template.encode(self._measured(template.fields)))
+
+    def _obey(self, line: bytes) -> None:
+        if self._start and line == self._start:
+            self._enabled = True
+        elif self._stop and line == self._stop:
+            self._enabled = not self._start
+            self.body.command(0.0, 0.0, 0.0)
+        elif self._enabled and (values := self._command.decode(line)) is not None:
+            self._obeyed_ns = self._now_ns
+            wanted = clamp(self._said.means(values), self._limits)
+            self.executed.append(wanted)
+            self.body.command(wanted.linear_x, wanted.linear_y, wanted.angular_z)
+
+    def _silent(self) -> bool:
+        """Whether the last command will be too old by the next step."""
+        if self._obeyed_ns is None:
+            return True
+        return self._now_ns + self.period_s * 1e9 - self._obeyed_ns > self.watchdog_ns
+
+    def _browned_out(self) -> bool:
+        voltage = self.body.snapshot.battery.voltage
+        return voltage - self.sag_volts < BROWN_OUT_SHARE * voltage
+
+    def _measured(self, fields: tuple[Field, ...]) -> dict[str, float]:
+        """What the sensors say, in SI units; counters wrap."""
+        shot = self.body.snapshot
+        values: dict[str, float] = shot.odometry._asdict()
+        values["yaw"] = math.remainder(values["yaw"], math.tau)
+        for wheel in shot.wheels:
+            name = wheel.name.removesuffix("_joint")
+            values[f"{name}_position"] = wheel.position - self._zero[wheel.name]
+            values[f"{name}_velocity"] = wheel.velocity
+            values[f"{name}_effort"] = wheel.effort
+            values[f"{name}_temperature"] = wheel.temperature
+        values["battery_voltage"] = shot.battery.voltage - self.sag_volts
+        values["battery_percentage"] = shot.battery.percentage
+        values["battery_current"] = shot.battery.current
+        values["flags"] = float(self._raised())
+        return {f.name: self._wrapped(f, values.get(f.name, 0.0)) for f in fields}
+
+    def _raised(self) -> int:
+        conditions = {WATCHDOG: self._silent(), "bumper": self.body.snapshot.bumper}
+        names = enumerate(self._options.flags)
+        return sum(1 << bit for bit, name in names if conditions.get(name, False))
+
+    def _wrapped(self, field: Field, value: float) -> float:
+        """As an encoder's counter of so many bits has it."""
+        if not field.unit.endswith("tick"):
+            return value
+        span = 1 << self._options.tick_bits
+        count = (round(value / field.factor) + span // 2) % span - span // 2
+        return count * field.factor

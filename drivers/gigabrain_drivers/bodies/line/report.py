@@ -1,0 +1,195 @@
+"""What the lines of a body say, put together to what it measures."""
+
+import math
+from collections import deque
+from collections.abc import Mapping
+
+from gigabrain_drivers.bodies.line.check import POSE, positions_of, speeds_of
+from gigabrain_drivers.bodies.line.fields import ANGLES, BODY
+from gigabrain_drivers.bodies.line.options import LineOptions
+from gigabrain_drivers.kinematics import Base, Twist
+from gigabrain_drivers.odometry import advanced, between
+from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.body import Battery, BodyDescription, Joint
+
+VELOCITY_S = 0.05  # a velocity from positions is taken over so much time: one line is noise
+SLACK = 3.0  # a step so many times longer than the body can go is no step ...
+SLACK_M = 0.05  # ... but the lines' own unevenness is
+GAP_NS = 100_000_000  # without a line: the firmware may have restarted
+LONGEST_S = 0.2  # a speed says nothing of a longer time
+STILL = Twist(0.0, 0.0, 0.0)
+ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
+
+
+class LineReport:
+    """Takes line after line; has the newest of everything, and the pose by dead reckoning.
+
+    Counters that wrap go on; counters that jump, as after a restart of the firmware, count from
+    where they jumped to.
+    """
+
+    def __init__(self, options: LineOptions, body: BodyDescription, base: Base | None) -> None:
+        self._options, self._body, self._base = options, body, base
+        self._wheels = base.wheels if base else ()
+        self._spans = _spans(options, self._wheels)
+        self._positions = positions_of(base) if base else ()
+        self._speeds = speeds_of(base) if base else ()
+        self._whole_pose = frozenset(POSE)
+        self._speaking = {*BODY, *self._speeds}
+        self._values: dict[str, float] = {}
+        self._angles: tuple[float, ...] | None = None  # the wheels', as reported last
+        self._pose: Pose | None = None  # as reported last
+        self._now_ns = 0
+        self._turned = dict.fromkeys(self._wheels, 0.0)  # [rad], since the start
+        self._steps: deque[tuple[float, Twist]] = deque()  # (seconds, way) of the newest lines
+        self.pose = ORIGIN  # since the start
+
+    @property
+    def flags(self) -> int:
+        """The bits that the firmware reports."""
+        return int(self._values.get("flags", 0))
+
+    def take(self, values: Mapping[str, float], now_ns: int) -> bool:
+        """One line has come; whether it says how the body moves."""
+        self._values.update(values)
+        if self._whole_pose <= values.keys():
+            pose = Pose(x=values["x"], y=values["y"], yaw=values["yaw"])
+            last, self._pose = self._pose or pose, pose
+            step = between(last, pose)
+            if self._after_gap(now_ns) and _length(between(ORIGIN, pose)) < _length(step):
+                step = between(ORIGIN, pose)
+            self._move(step, now_ns)
+        elif (angles := _all_of(self._positions, values)) and self._base:
+            self._roll(angles, now_ns)
+        elif not self._speaking & values.keys():
+            return False
+        elif self._pose is None and self._angles is None:
+            self._go_on(now_ns)
+        return True
+
+    def restart(self) -> None:
+        """The line was cut: what comes next continues from here."""
+        self._angles = self._pose = None
+        self._now_ns = 0
+        self._steps.clear()
+
+    def velocity(self) -> Velocity:
+        """Each part as reported, or by the wheels' speeds, or by how the position has changed."""
+        own, (linear_x, linear_y, angular_z) = self._values, self._measured()
+        return Velocity(
+            linear_x=own.get("linear_x", linear_x),
+            linear_y=own.get("linear_y", linear_y),
+            angular_z=own.get("angular_z", angular_z),
+        )
+
+    def joints(self) -> tuple[Joint, ...]:
+        """The wheels of which anything is known."""
+        found = []
+        for name in self._wheels:
+            prefix = f"wheel_{name}_"
+            known = self._values.items()
+            own = {k.removeprefix(prefix): v for k, v in known if k.startswith(prefix)}
+            if own:
+                own["position"] = self._turned[name]
+                found.append(Joint(name=f"wheel_{name}_joint", **own))
+        return tuple(found)
+
+    def battery(self) -> Battery | None:
+        """Its percentage as reported, or by its voltage."""
+        values, options = self._values, self._options
+        voltage, percentage = values.get("battery_voltage"), values.get("battery_percentage")
+        if voltage is not None and percentage is None:
+            empty, full = options.battery_empty or 0.0, options.battery_full or math.inf
+            percentage = 100 * (voltage - empty) / (full - empty)
+        if percentage is None:
+            return None
+        return Battery(
+            voltage=max(voltage or 0.0, 0.0),
+            percentage=min(max(percentage, 0.0), 100.0),
+            current=values.get("battery_current", 0.0),
+        )
+
+    def _measured(self) -> Twist:
+        """The velocity by the wheels' speeds, or by the way of the newest lines."""
+        if self._base and (speeds := _all_of(self._speeds, self._values)):
+            return self._base.to_body(speeds)
+        seconds = sum(took for took, _ in self._steps)
+        if not seconds:
+            return STILL
+        way = Twist(*map(sum, zip(*(step for _, step in self._steps), strict=True)))
+        return _scaled(way, 1 / seconds)
+
+    def _go_on(self, now_ns: int) -> None:
+        """There are speeds alone: it has gone on as fast as it was said to."""
+        seconds = min((now_ns - (self._now_ns or now_ns)) / 1e9, LONGEST_S)
+        v = self.velocity()
+        self._move(_scaled(Twist(v.linear_x, v.linear_y, v.angular_z), seconds), now_ns)
+        speeds = _all_of(self._speeds, self._values)
+        for name, speed in zip(self._wheels if speeds else (), speeds, strict=True):
+            turned = self._turned[name] + speed * seconds
+            self._turned[name] = speed if name in ANGLES else turned
+
+    def _roll(self, angles: tuple[float, ...], now_ns: int) -> None:
+        """The wheels stand at these angles."""
+        assert self._base is not None
+        last, self._angles = self._angles or angles, angles
+        turned = self._differences(angles, last)
+        if self._after_gap(now_ns) and sum(map(abs, angles)) < sum(map(abs, turned)):
+            turned = angles
+        if self._move(self._base.to_body(turned), now_ns):
+            for name, angle in zip(self._wheels, turned, strict=True):
+                self._turned[name] = angle if name in ANGLES else self._turned[name] + angle
+
+    def _differences(self, now: tuple[float, ...], before: tuple[float, ...]) -> tuple[float, ...]:
+        """By how much each wheel turned; a wheel that steers has an angle of its own."""
+        steps = []
+        for name, angle, last, span in zip(self._wheels, now, before, self._spans, strict=True):
+            way = angle if name in ANGLES else angle - last
+            steps.append(math.remainder(way, span) if span else way)
+        return tuple(steps)
+
+    def _after_gap(self, now_ns: int) -> bool:
+        """Whether the firmware may have been started anew since the last line.
+
+        If so, what counts is the shorter way: from where it stopped, or from zero.
+        """
+        return now_ns - (self._now_ns or now_ns) > GAP_NS
+
+    def _move(self, step: Twist, now_ns: int) -> bool:
+        """The body has made a step since the last line, if it can have made it."""
+        seconds = (now_ns - (self._now_ns or now_ns)) / 1e9
+        self._now_ns = now_ns
+        body, room = self._body, SLACK * seconds
+        speed = max(body.max_linear_speed, body.max_lateral_speed)
+        too_far = math.hypot(step.linear_x, step.linear_y) > speed * room + SLACK_M
+        if too_far or abs(step.angular_z) > body.max_angular_speed * room + SLACK_M:
+            step = STILL
+        self.pose = advanced(self.pose, step)
+        self._steps.append((seconds, step))
+        while sum(took for took, _ in self._steps) - self._steps[0][0] >= VELOCITY_S:
+            self._steps.popleft()
+        return step is not STILL
+
+
+def _all_of(names: tuple[str, ...], values: Mapping[str, float]) -> tuple[float, ...]:
+    """The values of all these names, or nothing where one is missing."""
+    return tuple(values[n] for n in names) if all(n in values for n in names) else ()
+
+
+def _length(step: Twist) -> float:
+    return math.hypot(step.linear_x, step.linear_y)
+
+
+def _scaled(twist: Twist, by: float) -> Twist:
+    return Twist(*(part * by for part in twist))
+
+
+def _spans(options: LineOptions, wheels: tuple[str, ...]) -> tuple[float, ...]:
+    """After what angle [rad] each wheel's count wraps; 0 where it is no count."""
+    spans = dict.fromkeys(wheels, 0.0)
+    for template in options.state_templates():
+        for field in template.fields:
+            name = field.name.removeprefix("wheel_").removesuffix("_position")
+            if name in spans and field.unit.endswith("tick"):
+                spans[name] = abs(field.factor) * 2.0**options.tick_bits
+    return tuple(spans[name] for name in wheels)

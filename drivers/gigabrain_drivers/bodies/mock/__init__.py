@@ -1,0 +1,1 @@
+"""A body in memory, for tests and benchmarks."""

@@ -1,0 +1,139 @@
+"""A body that exists only in memory, in the middle of an empty room: for tests and benchmarks."""
+
+import math
+from collections.abc import AsyncIterator
+
+import numpy as np
+
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
+from gigabrain_drivers.lidars.base import ScanSource, carry
+from gigabrain_schemas.arrays import ranges_bytes
+from gigabrain_schemas.base import TICK_NS, Message, Pose, Velocity
+from gigabrain_schemas.body import Battery, RobotState
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import SCAN
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import BodyLost, Unsupported
+from gigabrain_zenoh.geometry.limits import ZERO
+
+TICK_S = TICK_NS / 1e9
+ROOM_M = 3.0  # distance to the wall all round
+
+
+class MockOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The mock's part of a robot's file."""
+
+    gain: float = 1.0  # how much of the commanded speed the body really has
+
+
+class MockBody(Driver):
+    """Goes at once as fast as it is told. Its room goes with it."""
+
+    Options = MockOptions
+
+    def __init__(self, robot: RobotFile, options: MockOptions, run: Run) -> None:
+        super().__init__(robot, options, run)
+        self.lockstep = run.speed != 1.0
+        self._gain = options.gain
+        self._open = False
+        self._velocity = ZERO
+        self._pose = Pose(x=0.0, y=0.0, yaw=0.0)
+        self._noise = np.random.default_rng(run.seed)
+        self._ticks = self._next_scan = 0
+        self._scan: LaserScan | None = None
+        self._lidar: ScanSource | None = None  # a real one, where its link has one
+
+    async def open(self) -> None:
+        """Nothing to connect to but a lidar that it may carry; else a scan is there at once."""
+        self._open = True
+        self._lidar = carry(self, Clock())
+        if self._lidar is None:
+            self._scan = self._look()
+
+    async def close(self) -> None:
+        """Forget the connection."""
+        self._open, self._velocity = False, ZERO
+        lidar, self._lidar = self._lidar, None
+        if lidar:
+            await lidar.close()
+
+    async def stop(self) -> None:
+        """At rest at once."""
+        self._velocity = ZERO
+
+    async def ticks(self, clock: Clock) -> AsyncIterator[int]:
+        """By the host's clock, or as fast as the brain answers when time is lock-stepped."""
+        if self.lockstep:
+            while True:
+                self._turn()
+                self._advance()
+                yield 1
+        async for passed in super().ticks(clock):
+            for _ in range(passed):
+                self._advance()
+            yield passed
+            await clock.sleep_ns(TICK_NS // 2)  # a lidar keeps no step with the body's states
+            self._turn()
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        """Take on the velocity at once."""
+        if not self._open:
+            raise BodyLost("the mock is not open")
+        to = self.bounded(linear_x, 0.0, angular_z)
+        self._velocity = Velocity(
+            linear_x=to.linear_x * self._gain, angular_z=to.angular_z * self._gain
+        )
+        return to
+
+    async def read_state(self) -> RobotState:
+        """Where it has driven to."""
+        if not self._open:
+            raise BodyLost("the mock is not open")
+        return RobotState(
+            robot_type=self.robot.robot_type,
+            pose=self._pose,
+            velocity=self._velocity,
+            battery=Battery(voltage=12.0, percentage=100.0),
+        )
+
+    async def get_sensor_data(self, sensor_name: str) -> Message | None:
+        """The scan of a round room, with a centimetre of noise."""
+        if sensor_name != "scan":
+            raise Unsupported(f"the mock has no sensor {sensor_name!r}; it has: scan")
+        return self._lidar.newest if self._lidar else self._scan
+
+    def _advance(self) -> None:
+        v, pose = self._velocity, self._pose
+        yaw = pose.yaw + v.angular_z * TICK_S / 2
+        self._pose = Pose(
+            x=pose.x + v.linear_x * math.cos(yaw) * TICK_S,
+            y=pose.y + v.linear_x * math.sin(yaw) * TICK_S,
+            yaw=math.remainder(pose.yaw + v.angular_z * TICK_S, 2 * math.pi),
+        )
+        self._ticks += 1
+
+    def _turn(self) -> None:
+        """Emit a scan whenever the lidar has finished a turn."""
+        lidar = None if self._lidar else self.robot.lidar
+        if lidar and self._ticks >= self._next_scan:
+            period = max(1, round(1 / (lidar.rate_hz * TICK_S)))
+            self._next_scan = (self._ticks // period + 1) * period
+            self._scan = self._look()
+            if self._scan:
+                self.emit(SCAN, self._scan)
+
+    def _look(self) -> LaserScan | None:
+        lidar = self.robot.lidar
+        if lidar is None:
+            return None
+        ranges = ROOM_M + self._noise.normal(0.0, 0.01, lidar.beams)
+        return LaserScan(
+            angle_min=0.0,
+            angle_increment=2 * math.pi / lidar.beams,
+            range_min=lidar.range_min,
+            range_max=lidar.range_max,
+            ranges=ranges_bytes(ranges),
+        )

@@ -1,0 +1,193 @@
+"""TurtleBot3 on its real link: the OpenCR board on USB, and its lidar on a port of its own.
+
+The vendor's stack lets the body drive on when the commands end (turtlebot3#1154). Here the driver
+stops it after 100 ms; should the driver itself die, the board does after 500 ms.
+"""
+
+import asyncio
+import contextlib
+import math
+
+from msgspec.structs import replace
+
+from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
+from gigabrain_drivers.bodies.turtlebot3.board import Board, is_opencr
+from gigabrain_drivers.bodies.turtlebot3.protocol import Readings
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
+from gigabrain_drivers.kinematics import Differential, Twist, base_of
+from gigabrain_drivers.lidars.base import ScanSource, carry
+from gigabrain_drivers.links.link import Link
+from gigabrain_drivers.links.port_name import check_port
+from gigabrain_drivers.links.serial_link import SerialLink
+from gigabrain_drivers.odometry import Encoders, Odometry
+from gigabrain_schemas.base import Message, Pose, Velocity
+from gigabrain_schemas.body import Battery, Joint, RobotState
+from gigabrain_schemas.sensors import Imu, ImuData
+from gigabrain_schemas.topics import IMU
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
+
+GUARD_NS = 20_000_000  # how often the driver looks after itself
+SILENT_NS = 80_000_000  # without a command; zero is then out by 100 ms
+LAST_WORD_S = 0.05  # how long the last zero is given to arrive before the port is closed
+JOINTS = ("wheel_left_joint", "wheel_right_joint")
+PUSHED = 1.5  # times as fast as it can drive a body may be pushed, and
+SLACK = 0.1  # [rad] more between two looks; counters that jump further were set anew
+MOST_ACCELERATION = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit is talking nonsense
+
+
+class OpenCrOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The board's part of a robot's file."""
+
+    port: str = f"usb:{opencr.USB_ID}"  # a path, usb:VID:PID[:SERIAL], or auto
+
+    def __post_init__(self) -> None:
+        check_port(self.port)
+
+
+class OpenCrDriver(Driver):
+    """Asks for the board's whole state once a tick, and sends commands as they come."""
+
+    Options = OpenCrOptions
+
+    def __init__(
+        self,
+        robot: RobotFile,
+        options: OpenCrOptions,
+        run: Run,
+        *,
+        clock: Clock | None = None,
+        link: Link | None = None,
+    ) -> None:
+        """`link` instead of the serial port that the options name."""
+        super().__init__(robot, options, run)
+        base = base_of(robot)
+        if not isinstance(base, Differential):
+            raise ConfigError(
+                f"{robot.robot_type}: OpenCR drives a differential base; expected its "
+                "wheel_radius and wheel_separation"
+            )
+        self._clock = clock or Clock()
+        self.link = link or SerialLink(options.port, opencr.BAUD, self._clock, probe=is_opencr)
+        self._board = Board(self.link, self._clock)
+        self._board.on_readings = self._take
+        self._base, self._odometry = base, Odometry(base)
+        self._encoders = Encoders(opencr.TICKS, bits=32)
+        self._commanded_ns = self._clock.now_ns()
+        self._milliseconds = 0  # the board's clock
+        self._state = RobotState(
+            robot_type=robot.robot_type, pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity()
+        )
+        self._imu: Imu | None = None
+        self._lidar: ScanSource | None = None
+        self._guard: asyncio.Task[None] | None = None
+
+    @property
+    def problem(self) -> str:
+        """In one line why the body cannot be driven, or an empty text."""
+        return self._board.problem
+
+    async def open(self) -> None:
+        """Begin to look for the board and the lidar; neither has to be there yet."""
+        self._lidar = carry(self, self._clock)
+        self.link.open()
+        self._guard = asyncio.create_task(self._look_after(), name="opencr guard")
+
+    async def close(self) -> None:
+        """Stop, and let go of the ports."""
+        await self.stop()
+        guard, self._guard = self._guard, None
+        if guard:
+            guard.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await guard
+            await self._board.ask(LAST_WORD_S)  # once it answers, it has read the zero too
+        await self.link.close()
+        if self._lidar:
+            await self._lidar.close()
+
+    async def stop(self) -> None:
+        """Zero velocity, at once."""
+        self._commanded_ns = self._clock.now_ns()
+        self._board.halt()
+
+    async def limp(self) -> None:
+        """Wheels that turn freely; the next start of a driver holds them again."""
+        if not self._board.let_go():
+            raise BodyLost(self.problem or f"{self.link} takes no commands")
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        """Drive, in hundredths; where one value is not a number, all are zero."""
+        self._commanded_ns = self._clock.now_ns()
+        to = self.bounded(linear_x, linear_y, angular_z)
+        wanted = Twist(to.linear_x, 0.0, to.angular_z)
+        # the board slows down the faster wheel alone, which would bend the way
+        too_fast = max(1.0, *(abs(w) / opencr.FASTEST_WHEEL for w in self._base.to_wheels(wanted)))
+        forward, turn = self._board.drive(wanted.linear_x / too_fast, wanted.angular_z / too_fast)
+        return Velocity(linear_x=forward, angular_z=turn)
+
+    async def read_state(self) -> RobotState:
+        """The board's state of this moment; without an answer the last one, and how old it is."""
+        await self._board.ask()
+        return replace(self._state, link=self._board.health)
+
+    async def get_sensor_data(self, sensor_name: str) -> Message | None:
+        """The newest `imu`, and `scan` where a lidar is carried."""
+        if sensor_name == "imu":
+            return self._imu
+        if sensor_name == "scan" and self.options.scan:
+            return self._lidar.newest if self._lidar else None
+        has = "imu, scan" if self.options.scan else "imu"
+        raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}; it has: {has}")
+
+    async def _look_after(self) -> None:
+        """Zero where nobody commands, again and again; a single frame may get lost."""
+        async for now_ns in self._clock.every(GUARD_NS):
+            if now_ns - self._commanded_ns >= SILENT_NS and self._board.ready:
+                self._board.halt()
+            self._board.look(now_ns)
+
+    def _take(self, now: Readings) -> None:
+        turned = self._encoders.turned(now.ticks)
+        passed = now.milliseconds - self._milliseconds
+        self._milliseconds = now.milliseconds
+        if max(map(abs, turned)) <= PUSHED * opencr.FASTEST_WHEEL * passed / 1000 + SLACK:
+            self._odometry.add(turned)
+        moves = self._base.to_body(now.velocities)
+        wheels = zip(JOINTS, now.ticks, now.velocities, strict=True)
+        self._state = replace(
+            self._state,
+            pose=self._odometry.pose,
+            velocity=Velocity(linear_x=moves.linear_x, angular_z=moves.angular_z),
+            joints=tuple(
+                Joint(name=name, position=ticks * opencr.RADIANS_PER_TICK, velocity=velocity)
+                for name, ticks, velocity in wheels
+            ),
+            battery=Battery(voltage=now.voltage, percentage=now.percentage),
+            imu=imu_of(now),
+            bumpers=now.bumpers,
+        )
+        if imu := self._state.imu:
+            self._imu = Imu(
+                orientation=imu.orientation,
+                angular_velocity=imu.angular_velocity,
+                linear_acceleration=imu.linear_acceleration,
+            )
+            self.emit(IMU, self._imu)
+
+
+def imu_of(now: Readings) -> ImuData | None:
+    """The board's inertial unit, or None while it says what cannot be: starting, or broken."""
+    rates = (*now.angular_velocity, *now.linear_acceleration)
+    norm = math.hypot(*now.orientation)
+    if not 0.9 < norm < 1.1 or not all(abs(value) < MOST_ACCELERATION for value in rates):
+        return None
+    x, y, z, w = (part / norm for part in now.orientation)
+    return ImuData(
+        orientation=(x, y, z, w),
+        angular_velocity=now.angular_velocity,
+        linear_acceleration=now.linear_acceleration,
+    )

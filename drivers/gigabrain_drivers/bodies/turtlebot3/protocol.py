@@ -1,0 +1,172 @@
+"""TurtleBot3's OpenCR board: its control table, read and written by Dynamixel Protocol 2.0.
+
+Source: the firmware, OpenCR `libraries/turtlebot3_ros2`. Address 14 switches the firmware's
+watchdog off; nothing here can write it.
+"""
+
+import math
+import struct
+from typing import NamedTuple
+
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+
+ID = 200
+MODEL = 0x5000  # of the board; which TurtleBot3 it is stands at MODEL_INFO
+USB_ID = "0483:5740"
+BAUD = 1_000_000  # USB, so any does
+
+FIRST, LENGTH = 10, 172  # what one read per cycle fetches
+HEARTBEAT, TORQUE, VELOCITY = 19, 149, 150
+
+RUNNING, MOTORS_SILENT = 0, -1  # device status; silent mostly means that their switch is off
+
+TICKS = 4096  # of a wheel's encoder per turn
+RADIANS_PER_TICK = math.tau / TICKS
+VELOCITY_UNIT = 0.229 * math.tau / 60  # [rad/s]
+FASTEST_WHEEL = 337 * VELOCITY_UNIT  # [rad/s], beyond which the firmware cuts off
+CURRENT_UNIT = 0.00269  # [A]
+SPEED_UNIT = 0.01  # [m/s] and [rad/s], of a command
+EMPTY_VOLTAGE = 10.5  # [V], below which the percentage stands still
+
+_TABLE = struct.Struct(
+    "<I??"  # 10 milliseconds; debug mode, host connected
+    "?xbB"  # 16 manipulator, device status, heartbeat
+    "4?2x2?2?H2x"  # 20 LEDs, buttons, bumpers, illumination
+    "IfII"  # 34 cliff, sonar, battery voltage and percentage
+    "B8x?3f3f3f4f8x"  # 50 sound; 59 calibration, gyro, acceleration, magnetic, orientation w x y z
+    "2i2i2i4x"  # 120 current, velocity, position
+    "??6i2I"  # 148 motors connected, torque; 150 command; 174 profile acceleration
+)
+assert _TABLE.size == LENGTH
+
+Pair = tuple[int, int]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Readings(NamedTuple):
+    """The board's part of the table in SI units; pairs are left and right."""
+
+    milliseconds: int  # since the board's start, renewed every 20 ms
+    watchdog_off: bool  # debug mode: the firmware would not stop by itself
+    device_status: int
+    heartbeat: int  # as last written: an answer that holds the newest is none of an older question
+    buttons: tuple[bool, bool]
+    bumpers: tuple[bool, bool]
+    voltage: float  # [V]
+    percentage: float  # 0-100
+    angular_velocity: Vector  # [rad/s]
+    linear_acceleration: Vector  # [m/s2]
+    orientation: Quaternion  # x, y, z, w
+    currents: tuple[float, float]  # [A]
+    velocities: tuple[float, float]  # [rad/s]
+    ticks: Pair  # of the encoders, 4096 a turn, signed 32 bit that wrap
+    torque: bool
+
+
+def ask() -> bytes:
+    """The one read of a cycle."""
+    return dynamixel.read(ID, FIRST, LENGTH)
+
+
+def model_of(answer: bytes) -> tuple[int, int] | None:
+    """(model number, firmware version) in the answer to a ping; None: it is another answer."""
+    return (answer[0] | answer[1] << 8, answer[2]) if len(answer) == 3 else None
+
+
+def readings(data: bytes) -> Readings:
+    """What the answer's `data` (172 bytes) says. Raises ValueError when it is not that long."""
+    if len(data) != LENGTH:
+        raise ValueError(f"expected {LENGTH} bytes of the control table, got {len(data)}")
+    v = _TABLE.unpack(data)
+    voltage = v[17] * 0.01
+    return Readings(
+        milliseconds=v[0],
+        watchdog_off=v[1],
+        device_status=v[4],
+        heartbeat=v[5],
+        buttons=(v[10], v[11]),
+        bumpers=(v[12], v[13]),
+        voltage=voltage,
+        percentage=min(v[18] * 0.01, 100.0) if voltage >= EMPTY_VOLTAGE else 0.0,
+        angular_velocity=v[21:24],
+        linear_acceleration=v[24:27],
+        orientation=(v[31], v[32], v[33], v[30]),
+        currents=(v[34] * CURRENT_UNIT, v[35] * CURRENT_UNIT),
+        velocities=(v[36] * VELOCITY_UNIT, v[37] * VELOCITY_UNIT),
+        ticks=(v[38], v[39]),
+        torque=v[41],
+    )
+
+
+class Sent(NamedTuple):
+    """A command as the board takes it."""
+
+    frame: bytes
+    linear_x: float  # [m/s], rounded to the board's units
+    angular_z: float  # [rad/s]
+
+
+def velocity(linear_x: float, angular_z: float) -> Sent:
+    """Drive [m/s], [rad/s], both finite. The board knows hundredths, and cuts off what is more."""
+    forward, turn = _hundredths(linear_x), _hundredths(angular_z)
+    data = struct.pack("<6i", forward, 0, 0, 0, 0, turn)
+    return Sent(dynamixel.write(ID, VELOCITY, data), forward * SPEED_UNIT, turn * SPEED_UNIT)
+
+
+def heartbeat(count: int) -> bytes:
+    """A sign of life: the board stops 500 ms after the lowest 8 bits of `count` last changed."""
+    return dynamixel.write(ID, HEARTBEAT, bytes([count & 0xFF]))
+
+
+def torque(on: bool) -> bytes:
+    """Switch the motors on or off."""
+    return dynamixel.write(ID, TORQUE, bytes([on]))
+
+
+def describe(packet: dynamixel.Packet) -> str:
+    """A packet between a host and the board, in words."""
+    kind, params = packet.instruction, packet.params
+    if kind == dynamixel.STATUS:
+        return _answer_in_words(params)
+    if kind == dynamixel.PING:
+        return f"ping {packet.id}"
+    if kind == dynamixel.READ and len(params) == 4:
+        address, length = struct.unpack("<HH", params)
+        return f"read {length} bytes at {address}"
+    if kind != dynamixel.WRITE or len(params) < 3:
+        return f"instruction {kind:02x}"
+    address, data = params[0] | params[1] << 8, params[2:]
+    if address == HEARTBEAT and len(data) == 1:
+        return f"heartbeat {data[0]}"
+    if address == TORQUE and len(data) == 1:
+        return f"motors {'on' if data[0] else 'off'}"
+    if address == VELOCITY and len(data) == 24:
+        forward, _, _, _, _, turn = struct.unpack("<6i", data)
+        return (
+            f"velocity: linear x {forward} x 0.01 m/s = {forward * SPEED_UNIT:.2f} m/s, "
+            f"angular z {turn} x 0.01 rad/s = {turn * SPEED_UNIT:.2f} rad/s"
+        )
+    return f"write {len(data)} bytes at {address}"
+
+
+def _answer_in_words(params: bytes) -> str:
+    if not params:
+        return "status without an error byte"
+    error, data = params[0] & 0x7F, params[1:]
+    if error:
+        return f"status: error {error}"
+    if model := model_of(data):
+        return f"status: model {model[0]:#06x}, firmware {model[1]}"
+    if len(data) != LENGTH:
+        return f"status: ok, {len(data)} bytes" if data else "status: ok"
+    now = readings(data)
+    left, right = now.velocities
+    return (
+        f"state: heartbeat {now.heartbeat}, {now.voltage:.2f} V, wheels {left:.3f} {right:.3f} "
+        f"rad/s at {now.ticks[0]} {now.ticks[1]} ticks, device status {now.device_status}"
+    )
+
+
+def _hundredths(value: float) -> int:
+    return max(-10_000, min(10_000, round(value / SPEED_UNIT)))

@@ -1,0 +1,1 @@
+"""The driver process: a body on the bus, behind the gate, whatever its wire."""

@@ -1,0 +1,148 @@
+"""The hardware abstraction layer: what every body offers."""
+
+import abc
+import asyncio
+import logging
+import math
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import Any, ClassVar, Self
+
+from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
+from gigabrain_schemas.base import TICK_NS, Message, Velocity
+from gigabrain_schemas.body import Joint, RobotState, SafeState
+from gigabrain_schemas.topics import Topic
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import GigabrainError, Unsupported
+from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
+
+log = logging.getLogger(__name__)
+
+EARLY_NS = 2_000_000  # before its time an event loop may call, as its own clock is coarse
+STILL = 0.02  # [m/s], [rad/s]
+REST_LOOKS = 40  # 0.8 s: a supervisor that ends this process waits little longer
+
+Emit = Callable[[Topic[Any], Message], None]
+
+
+class Driver(abc.ABC):
+    """One body. Used as `async with driver:`; leaving the block always makes the body safe.
+
+    A body implements the primitives that it has; the others raise Unsupported. `stop` and `close`
+    work in any state, any number of times, and never raise.
+    """
+
+    Options: ClassVar[type[LinkOptions]] = LinkOptions  # the link's part of the robot's file
+    lockstep = False  # whether time waits for the brain (simulation at other speeds than 1)
+    finished = False  # whether the body's time has come to its end (simulation with a duration)
+
+    def __init__(self, robot: RobotFile, options: Any, run: Run) -> None:
+        self.robot, self.options, self.run = robot, options, run
+        self.emit: Emit = lambda topic, message: None  # the driver's process puts its own here
+
+    @classmethod  # noqa: B027 - most drivers fit any body
+    def check(cls, robot: RobotFile, options: Any) -> None:
+        """Raises ValueError, as `FIELD: ...`, where its options do not fit the body."""
+
+    async def __aenter__(self) -> Self:
+        try:
+            await self.open()
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        try:
+            await self.make_safe()
+        finally:  # it may be cancelled
+            await self.close()
+
+    @abc.abstractmethod
+    async def open(self) -> None:
+        """Connect. Raises BodyLost if the body does not answer."""
+
+    @abc.abstractmethod
+    async def close(self) -> None:
+        """Let go of the body."""
+
+    @abc.abstractmethod
+    async def stop(self) -> None:
+        """Bring the body to rest."""
+
+    @abc.abstractmethod
+    async def read_state(self) -> RobotState:
+        """What the body measures; header and gate are filled in later. Raises BodyLost."""
+
+    async def ticks(self, clock: Clock) -> AsyncIterator[int]:
+        """Yield whenever time has gone on, and by how many ticks of 20 ms of the body's time."""
+        start, told = clock.now_ns(), 0
+        async for now_ns in clock.every(TICK_NS):
+            passed = (now_ns - start + EARLY_NS) // TICK_NS + 1 - told
+            if passed > 0:
+                told += passed
+                yield passed
+
+    async def hold(self) -> None:
+        """Keep the present position; an arm without brakes must not go limp."""
+        await self.stop()
+
+    async def park(self) -> None:
+        """Take up a posture in which the body may be left alone. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} cannot park its body")
+
+    async def limp(self) -> None:
+        """Let go of all joints, so that a person can move them. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} cannot let go of its body's joints")
+
+    def can(self, state: SafeState) -> bool:
+        """Whether this driver can bring its body into a safe state."""
+        return getattr(type(self), state) is not getattr(Driver, state) or state == "hold"
+
+    async def make_safe(self) -> None:
+        """Come to rest, then take up the safe state that the robot's file names. Never raises."""
+        state = self.robot.safe_state
+        await (self.hold() if state == "hold" else self.stop())
+        if state in ("stop", "hold"):
+            return
+        try:
+            await self._rest()
+            await (self.park() if state == "park" else self.limp())
+        except GigabrainError as error:
+            log.error("the body has stopped, but %s could not be done: %s", state, error)
+
+    async def _rest(self) -> None:
+        """Wait until the body stands still, but no longer than it may take to brake."""
+        for _ in range(REST_LOOKS):
+            now = (await self.read_state()).velocity
+            if max(abs(now.linear_x), abs(now.linear_y), abs(now.angular_z)) < STILL:
+                return
+            await asyncio.sleep(TICK_NS / 1e9)
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        """Drive [m/s, m/s, rad/s]; returns what was really sent. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} has no base to drive")
+
+    def bounded(self, linear_x: float, linear_y: float, angular_z: float) -> Velocity:
+        """A command within the body's own limits; where one value is no number, all are zero."""
+        if not all(map(math.isfinite, (linear_x, linear_y, angular_z))):
+            return ZERO
+        wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
+        return clamp(wanted, limits_of(self.robot))
+
+    async def set_joint_position(self, joint_name: str, position: float) -> float:
+        """Move one joint [rad or m]; returns what was really sent. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} has no joints to position")
+
+    async def get_joint_states(self) -> tuple[Joint, ...]:
+        """All joints as measured. Raises BodyLost."""
+        return (await self.read_state()).joints
+
+    async def get_sensor_data(self, sensor_name: str) -> Message | None:
+        """The newest reading of a sensor, or None before its first. Raises BodyLost."""
+        raise Unsupported(f"{type(self).__name__} has no sensor {sensor_name!r}")
+
+    def report(self) -> Mapping[str, float | int | str | None]:
+        """Figures for reports that only this driver knows, such as a simulation's truth."""
+        return {}

@@ -1,0 +1,236 @@
+"""Finds robots and drivers by name: ours, those of installed packages, and people's own files."""
+
+import difflib
+import importlib
+import importlib.util
+from importlib import resources
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import msgspec
+from msgspec import Struct
+
+from gigabrain_drivers import DRIVERS
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import LINKS, LinkOptions, RobotFile, Run
+from gigabrain_drivers.lidars.base import check_turns, source_class
+from gigabrain_drivers.links.port_name import AUTO
+from gigabrain_zenoh.config import loading as config
+from gigabrain_zenoh.config.places import located
+from gigabrain_zenoh.config.settings import LinkName
+from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
+from gigabrain_zenoh.logs import state_dir
+
+EMULATOR = "{emulator}"  # in a robot's file: the folder of the emulator's ports
+Options = TypeVar("Options", bound=Struct)
+
+
+def robot_files() -> dict[str, Path]:
+    """Every known robot and its file, by name."""
+    bodies = Path(str(resources.files("gigabrain_drivers") / "bodies"))
+    ours = {path.parent.name: path for path in sorted(bodies.glob("*/robot.yaml"))}
+    return {**_robots_of_packages(), **ours}
+
+
+def _robots_of_packages() -> dict[str, Path]:
+    """A package that offers a driver may have a robot.yaml of the driver's name in its folder."""
+    found = {}
+    for point in entry_points(group="gigabrain.drivers"):
+        spec = importlib.util.find_spec(point.module.partition(".")[0])
+        for folder in (spec.submodule_search_locations or ()) if spec else ():
+            if (path := Path(folder) / "robot.yaml").is_file():
+                found[point.name] = path
+    return found
+
+
+def known_drivers() -> list[str]:
+    """The names of all drivers: ours, and those that installed packages offer."""
+    return [*DRIVERS, *(point.name for point in entry_points(group="gigabrain.drivers"))]
+
+
+def robot_path(name: str) -> Path:
+    """The file of a robot: a known name, or a path to somebody's own. Raises ConfigError."""
+    if name.endswith((".yaml", ".yml")):
+        return Path(name)
+    known = robot_files()
+    if name not in known:
+        package = Path(f"gigabrain-{name.replace('_', '-')}")  # as `gigabrain driver new` calls it
+        if package.is_dir():
+            raise UnknownName(
+                f"no robot {name!r} yet: its package has to be installed: pip install -e {package}"
+            )
+        raise unknown("robot", name, known)
+    return known[name]
+
+
+def load_robot(name: str) -> RobotFile:
+    """Read a robot's file. Raises ConfigError with file, line and what was expected."""
+    return config.load(robot_path(name), RobotFile)
+
+
+def ports_folder(name: str) -> Path:
+    """Where the emulator of a robot (name or file) puts its ports, and its driver looks."""
+    return state_dir() / "ports" / robot_path(name).absolute().parent.name
+
+
+def links_of(robot: RobotFile) -> list[LinkName]:
+    """By which links a robot can be reached; what is real and has physics can be emulated."""
+    known = {name for name in LINKS if getattr(robot, name) is not None}
+    if robot.real is not None and (robot.sim or {}).get("driver") == "mujoco":
+        known.add("emulated")
+    return [name for name in LINKS if name in known]
+
+
+def simulated(link: LinkName) -> list[str]:
+    """The robots that can be had over `link` with MuJoCo behind it, which knows the truth."""
+    known = {name: load_robot(name) for name in robot_files()}
+    return [
+        name
+        for name, robot in known.items()
+        if link in links_of(robot) and robot.sim and robot.sim.get("driver") == "mujoco"
+    ]
+
+
+def driver_class(name: str) -> type[Driver]:
+    """The driver called `name`: one of ours, or one that an installed package offers.
+
+    Raises UnknownName listing the known ones, and ConfigError when what it needs is missing.
+    """
+    offered = {point.name: point for point in entry_points(group="gigabrain.drivers")}
+    if name in DRIVERS:
+        module, _, attribute = DRIVERS[name].partition(":")
+        try:
+            return cast("type[Driver]", getattr(importlib.import_module(module), attribute))
+        except ModuleNotFoundError as error:
+            raise ConfigError(
+                f"driver {name!r} needs the package {error.name!r}; "
+                "install it with: pip install 'gigabrain-zenoh[sim]'"
+            ) from None
+    if name in offered:
+        try:
+            return cast("type[Driver]", offered[name].load())
+        except (ImportError, AttributeError) as error:
+            raise ConfigError(f"driver {name!r} of {offered[name].value}: {error}") from None
+    raise unknown("driver", name, {**DRIVERS, **offered})
+
+
+def make_driver(name: str, run: Run) -> tuple[RobotFile, Driver]:
+    """The robot called `name` and the driver of its link. Raises ConfigError."""
+    robot, driver, options, folder = load_link(name, run)
+    return robot, driver(robot, options, msgspec.structs.replace(run, folder=folder))
+
+
+def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions, Path]:
+    """A robot, the driver of the link of `run`, its options and the file's folder.
+
+    A link `emulated` that the file does not have is its `real` one with the emulator's ports.
+    Raises ConfigError.
+    """
+    path = robot_path(name)
+    robot = config.load(path, RobotFile)
+    if run.link not in links_of(robot):
+        has = ", ".join(links_of(robot)) or "none"
+        raise ConfigError(f"{robot.robot_type} has no link {run.link!r}; it has: {has}")
+    borrowed = run.link == "emulated" and robot.emulated is None
+    section: LinkName = "real" if borrowed else run.link
+    driver = _driver_of(path, section, getattr(robot, section))
+    # read once more, now that it is known what this driver's part looks like: errors name the line
+    try:
+        own = link_options(driver, robot, getattr(robot, section))
+    except ConfigError as error:
+        raise located(path, error) from None
+    exact = _with_section(section, own)
+    options = getattr(config.load(path, exact), section)
+    if options.lidar:
+        robot = msgspec.structs.replace(robot, lidar=options.lidar)
+    if borrowed:
+        options = with_ports(options)
+    return robot, driver, at_emulator(options, run.emulator), path.parent
+
+
+def _with_section(section: LinkName, type_: Any) -> type[RobotFile]:
+    """A robot's file in which it is known what one link may hold."""
+    exact = msgspec.defstruct(
+        "RobotFile",
+        [(section, type_)],
+        bases=(RobotFile,),
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+    )
+    return cast("type[RobotFile]", exact)
+
+
+def _driver_of(path: Path, section: LinkName, link: dict[str, Any]) -> type[Driver]:
+    """The driver that a link names. Raises ConfigError with file and line."""
+    if not isinstance(link.get("driver"), str):
+        others = [key for key in link if not difflib.get_close_matches(key, ["driver"])]
+        fields: list[tuple[str, Any] | tuple[str, Any, Any]] = [("driver", str)]
+        fields += [(key, Any, None) for key in others if key.isidentifier()]
+        named = msgspec.defstruct("Link", fields, kw_only=True, forbid_unknown_fields=True)
+        config.load(path, _with_section(section, named))  # which refuses it
+    try:
+        return driver_class(link["driver"])
+    except ConfigError as error:
+        raise located(path, error) from None
+
+
+def with_ports(options: LinkOptions) -> LinkOptions:
+    """The options of a real link with the emulator's ports in place of the real ones."""
+    if hasattr(options, "port"):
+        options = msgspec.structs.replace(options, port=f"{EMULATOR}/base")
+    if options.scan:
+        scan = msgspec.structs.replace(options.scan, port=f"{EMULATOR}/scan")
+        options = msgspec.structs.replace(options, scan=scan)
+    return options
+
+
+def at_emulator(options: Options, folder: str) -> Options:
+    """The options with the folder of the emulator's ports wherever they say `{emulator}`."""
+    changes: dict[str, Any] = {}
+    for field in options.__struct_fields__:
+        value = getattr(options, field)
+        if isinstance(value, Struct):
+            changes[field] = at_emulator(value, folder)
+        elif isinstance(value, str) and EMULATOR in value:
+            changes[field] = value.replace(EMULATOR, folder)
+    return msgspec.structs.replace(options, **changes)
+
+
+def link_options(driver: type[Driver], robot: RobotFile, link: dict[str, Any]) -> type[LinkOptions]:
+    """What a link of `driver` may hold, down to the lidar that it carries, on this very body."""
+    scan = link.get("scan")
+    name = scan.get("driver") if isinstance(scan, dict) else None
+    # where the lidar is not named, the driver's own options refuse it, with the line
+    fields = [("scan", source_class(name).Options)] if isinstance(name, str) else []
+
+    def fit(options: LinkOptions) -> None:
+        if own := getattr(driver.Options, "__post_init__", None):
+            own(options)
+        _check_scan(options, robot)
+        driver.check(robot, options)
+
+    exact = msgspec.defstruct(
+        driver.Options.__name__,
+        fields,
+        bases=(driver.Options,),
+        namespace={"__post_init__": fit},
+        frozen=True,
+        kw_only=True,
+        forbid_unknown_fields=True,
+    )
+    return cast("type[LinkOptions]", exact)
+
+
+def _check_scan(options: LinkOptions, robot: RobotFile) -> None:
+    """Raises ValueError where a lidar cannot be had as it is described."""
+    scan = options.scan
+    if scan is None:
+        return
+    if scan.port == getattr(options, "port", None) != AUTO:
+        raise ValueError(f"scan: {scan.port} is the port of the base; expected one of its own")
+    try:
+        check_turns(scan.driver, options.lidar or robot.lidar)
+    except ConfigError as error:
+        raise ValueError(f"scan: {error}") from None

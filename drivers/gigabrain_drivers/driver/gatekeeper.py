@@ -1,0 +1,206 @@
+"""The gate of one body: what it remembers on disk, what people ask of it, and what is audited."""
+
+import logging
+import secrets
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from gigabrain_drivers.driver.cause_watch import CauseWatch
+from gigabrain_drivers.driver.latch import Latched, LatchFile
+from gigabrain_schemas.audit import What
+from gigabrain_schemas.base import TICK_NS, Cause
+from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, RELEASE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.gate import causes as why
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.host.scribe import Scribe
+from gigabrain_zenoh.logs import Fault
+from gigabrain_zenoh.runtime.audit import AuditTrail
+
+log = logging.getLogger(__name__)
+
+STEP_NS = TICK_NS // 2  # so long after a tick at least, the next one is no longer late
+EVERY_TICKS = 50  # once a second: what the disk did not take is tried again
+Stop = Callable[[], Awaitable[None]]
+
+
+class Gatekeeper:
+    """Steps the gate, and answers for it. An e-stop is on disk before it is confirmed.
+
+    `changed` is called whenever the body has to be told something new.
+    """
+
+    def __init__(
+        self,
+        config: gate.GateConfig,
+        robot_type: str,
+        bus: Bus,
+        folder: Path,
+        changed: Callable[[], None],
+    ) -> None:
+        self._config, self._robot_type, self._bus = config, robot_type, bus
+        self._output_changed = changed
+        file = LatchFile(folder)
+        latched = file.read()
+        self._scribe: Scribe[Latched] = Scribe(lambda newest: file.keep(newest[-1]), room=1)
+        self._latched, self._on_disk = latched, self._scribe.put(latched)
+        self._on_time_ns = -STEP_NS  # when the newest tick came that was not late
+        self._forgetful = Fault(log, logging.ERROR)
+        self.state = gate.GateState(
+            boot=secrets.randbits(47) + 1,
+            causes=latched.causes or (why.BOOT,),
+            estop_generation=latched.estop_generation,
+        )
+        bus.time.boot = self.state.boot
+        self._trail = AuditTrail(bus, folder)
+        self._causes = CauseWatch(self._trail)
+        self._trail.note("boot", bus.process, f"the driver of {robot_type} has started")
+
+    def serve(self, stop: Stop) -> None:
+        """Answer requests from now on; `stop` brings the body to rest."""
+        self._stop = stop
+        self._bus.serve(ESTOP, self._on_estop)
+        self._bus.subscribe(ESTOP_SAID, lambda _, said: self._told_to_stop(said), self._no_request)
+        self._bus.serve(RELEASE, self._on_release)
+        self._bus.serve(ENABLE, self._on_enable)
+
+    def step(self, event: gate.Event) -> gate.Outcome:
+        """One event through the gate."""
+        before = self.state
+        self.state, outcome = gate.step(self._config, before, event)
+        if self.state.output != before.output:
+            self._output_changed()
+        if _differs(before, self.state):
+            self._note_change(before)
+        return outcome
+
+    def command(self, event: gate.Command) -> gate.Outcome:
+        """A command through the gate; one that is refused is counted, and its sender named."""
+        outcome = self.step(event)
+        reason, source = outcome.refused, event.command.source
+        if reason:
+            self._bus.counters[f"refused_{reason}"] += 1
+        if reason and source != gate.BRAIN:  # the brain keeps talking while others drive
+            drives = self.state.commander or "nobody"
+            text = f"its commands are not obeyed ({reason}); {drives} drives"
+            self._trail.note("refused", source or "anonymous", text, code=reason, ok=False)
+        return outcome
+
+    def ticks(self, passed: int, tick: gate.Tick) -> None:
+        """So many ticks have passed since the last call, all but one of them missed."""
+        for _ in range(passed):
+            late = self._is_late(tick.wall_ns)
+            self._bus.counters["late_ticks"] += late
+            self.step(replace(tick, late=True) if late else tick)
+            self._look_after_disk()
+
+    def _is_late(self, wall_ns: int | None) -> bool:
+        """Whether a tick comes in the wake of another one, to make up for lost time."""
+        if wall_ns is None:
+            return False
+        late = wall_ns - self._on_time_ns < STEP_NS
+        self._on_time_ns = self._on_time_ns if late else wall_ns
+        return late
+
+    def _look_after_disk(self) -> None:
+        if self.state.tick % EVERY_TICKS == 0:
+            self._trail.flush()
+            if self._on_disk.done() and self._on_disk.result():
+                self._remember(self._latched)
+
+    async def close(self) -> None:
+        """Have all written down."""
+        self._trail.note("end", self._bus.process, "the driver ends")
+        await self._trail.close()
+        await self._scribe.close()
+
+    def _note_change(self, before: gate.GateState) -> None:
+        now = self.state
+        latched = Latched(causes=why.latching(now.causes), estop_generation=now.estop_generation)
+        if latched != self._latched:
+            self._remember(latched)
+        self._causes.look(now)
+        if now.mode != before.mode:
+            reason = why.in_words(now.causes) or f"commander {now.commander or 'nobody'}"
+            data = {"event": "gate", "mode": now.mode, "tick": now.tick, "reason": reason}
+            log.info("gate %s: %s", now.mode, reason, extra={"data": data})
+            who = now.commander or before.commander or "gate"
+            self._trail.note("mode", who, f"{before.mode} -> {now.mode}: {reason}", code=now.mode)
+
+    def _remember(self, latched: Latched) -> None:
+        self._latched, self._on_disk = latched, self._scribe.put(latched)
+
+    async def _remembered(self) -> str:
+        """Wait for the disk; what is to be said when it did not take it."""
+        problem = await self._on_disk
+        if not problem:
+            self._forgetful.end("what latches the gate is remembered again")
+            return ""
+        self._forgetful.begin(problem)
+        return f"; but a restart would forget it: {problem}"
+
+    def press(self, text: str) -> None:
+        """The e-stop button of this robot is pressed."""
+        self._told_to_stop(EstopRequest(source="button", reason=text))
+
+    def _told_to_stop(self, said: EstopRequest) -> None:
+        """Stop where nobody waits for an answer."""
+        outcome = self.step(gate.Estop(said.source))
+        self._output_changed()
+        log.warning("e-stop by %s %s", said.source, said.reason)
+        self._audit("estop", said.source, outcome, said.reason)
+
+    def _no_request(self, payload: bytes) -> None:
+        if not payload:
+            self._told_to_stop(EstopRequest())
+
+    async def _on_estop(self, request: EstopRequest) -> GateReply:
+        outcome = self.step(gate.Estop(request.source))
+        await self._stop()  # before disk and log
+        log.warning("e-stop by %s %s", request.source, request.reason)
+        self._audit("estop", request.source, outcome, request.reason)
+        return self._reply(outcome, await self._remembered())
+
+    async def _on_release(self, request: ReleaseRequest) -> GateReply:
+        outcome = self.step(gate.Release(request.estop_generation))
+        self._audit("release", request.source, outcome)
+        return self._reply(outcome, await self._remembered())
+
+    async def _on_enable(self, request: EnableRequest) -> GateReply:
+        before = self.state.commander
+        outcome = self.step(gate.Enable(request.source, request.take, request.by))
+        taken = outcome.ok and before not in ("", request.source)
+        detail = f"taken over from {before}" if taken else ""
+        who = request.by or request.source
+        self._audit("take" if taken else "enable", who, outcome, detail)
+        return self._reply(outcome)
+
+    def _audit(self, what: What, source: str, outcome: gate.Outcome, detail: str = "") -> None:
+        text = ", ".join(part for part in (outcome.text, detail) if part)
+        self._trail.note(what, source or "anonymous", text, ok=outcome.ok)
+
+    def _reply(self, outcome: gate.Outcome, more: str = "") -> GateReply:
+        return GateReply(
+            ok=outcome.ok,
+            text=(outcome.text + more)[:500],
+            robot_type=self._robot_type,
+            gate=gate.status(self.state),
+        )
+
+
+def _differs(before: gate.GateState, now: gate.GateState) -> bool:
+    """Whether anybody may want to know; nearly all ticks and commands change none of this."""
+    return (
+        now.mode != before.mode
+        or now.estop_generation != before.estop_generation
+        or now.causes is not before.causes
+        or now.faults is not before.faults
+        or _said(now) != _said(before)
+    )
+
+
+def _said(state: gate.GateState) -> tuple[tuple[Cause, ...], ...]:
+    return (state.safety.causes, state.safety.warnings) if state.safety else ()

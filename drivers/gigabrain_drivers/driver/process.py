@@ -1,0 +1,269 @@
+"""The driver process: joins a body to the bus, through the gate. Written once for all bodies."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+from msgspec.structs import replace
+
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.button_watch import ButtonWatch
+from gigabrain_drivers.driver.catalog import make_driver, ports_folder
+from gigabrain_drivers.driver.clip import clipped
+from gigabrain_drivers.driver.gatekeeper import Gatekeeper
+from gigabrain_drivers.driver.lockstep import REPEAT_S, Lockstep
+from gigabrain_drivers.driver.raw_speeds import not_finite
+from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_drivers.driver.round_trip import RoundTrip
+from gigabrain_drivers.links.wording import of_command
+from gigabrain_drivers.sim.worlds import load_world
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.body import Body, RobotState, SafeState
+from gigabrain_schemas.brain import CmdVel, JointCommand
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.topics import (
+    BODY,
+    JOINT_CMD,
+    SAFETY,
+    SCAN,
+    STATE,
+    Topic,
+    command_topic,
+)
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.heartbeat import Progress
+from gigabrain_zenoh.config.settings import DriverConfig
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.gate import causes as why
+from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.geometry.ages import scan_limit_ns
+from gigabrain_zenoh.geometry.limits import ZERO, limits_of
+
+log = logging.getLogger(__name__)
+
+BODY_EVERY_TICKS = 50  # once a second
+STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
+
+
+class DriverProcess:
+    """One body on the bus."""
+
+    def __init__(self, config: DriverConfig, robot: RobotFile, driver: Driver, bus: Bus) -> None:
+        self._config, self._robot, self._driver, self._bus = config, robot, driver, bus
+        self._body = Body(description=robot.description(), link=config.link)
+        gate_config = gate.GateConfig(
+            limits=limits_of(robot),
+            basis_ns=scan_limit_ns(robot),
+            auto_resume=config.resume == "auto",
+        )
+        self._wake = asyncio.Event()
+        self._gatekeeper = Gatekeeper(
+            gate_config, robot.robot_type, bus, Path(config.state_dir), self._wake.set
+        )
+        press = self._gatekeeper.press
+        self._button = ButtonWatch(bus, press) if config.button else None
+        wait_s = config.lockstep_timeout_s
+        self._lockstep = Lockstep(robot.control.period_ticks, wait_s) if driver.lockstep else None
+        self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
+        self._round_trip = RoundTrip()
+        self._line = asyncio.Lock()  # one call at a time goes out to the body
+        self._sent = ZERO  # what it was told last
+        self._body_tick = 0  # when BODY was last published
+        driver.emit = self._emit
+        bus.report = self.report
+        bus.progress = Progress(self._time_goes_on, lambda: bus.sent[STATE.key])
+
+    async def run(self, ready: Callable[[], None]) -> None:
+        """Serve the body until cancelled; it is safe when this ends, however it ends."""
+        try:
+            async with self._driver:
+                await self._serve(ready)
+        finally:
+            await self._gatekeeper.close()
+
+    async def _serve(self, ready: Callable[[], None]) -> None:
+        bus = self._bus
+        bus.subscribe(command_topic(self._robot), self._on_command, self._on_bad_command)
+        bus.subscribe(JOINT_CMD, self._on_joint_command)
+        bus.latest(SAFETY, self._on_safety)
+        self._gatekeeper.serve(self._driver.stop)
+        bus.publish(BODY, self._body)
+        ready()
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(self._live())
+            tasks.create_task(self._obeying())
+
+    async def _live(self) -> None:
+        async for passed in self._driver.ticks(self._bus.clock):
+            await self._tick(passed)
+        self._measure()
+        log.info("the simulation has come to its end", extra={"data": {"event": "finished"}})
+        await self._bus.failed
+
+    async def _obeying(self) -> None:
+        """Between two ticks as well: a command need not wait for anybody's period."""
+        while True:
+            await self._wake.wait()
+            await self._obey()
+
+    def report(self) -> Mapping[str, float | int | str | None]:
+        """What the body and this process can say of the whole run."""
+        figures: dict[str, float | int | str | None] = {
+            "stale_commands_executed": self._bus.counters["stale_commands_executed"],
+            "lockstep_timeouts": self._lockstep.timeouts if self._lockstep else 0,
+            "ticks": self._gate.tick,
+        }
+        return {**self._driver.report(), **self._round_trip.report(), **figures}
+
+    def _time_goes_on(self) -> tuple[object, ...]:
+        """The body's time, which is to go on until a simulation is over."""
+        return () if self._driver.finished else (self._bus.clock.now_ns(),)
+
+    async def _tick(self, passed: int) -> None:
+        """20 ms of the body's time, or several where the process was held up."""
+        state = clipped(await self._driver.read_state())
+        if self._wake.is_set():
+            await self._obey()  # the gate goes on from what the body has been told
+        button = self._button.faults() if self._button else ()
+        faults = button if state.link.connected else (why.LINK_LOST, *button)
+        self._gatekeeper.ticks(passed, gate.Tick(state.velocity, self._wall_ns(), faults))
+        self._bus.time.tick = self._gate.tick
+        if self._lockstep:
+            await self._in_step(self._lockstep, state)
+        else:
+            self._announce(state)
+        await self._obey()
+
+    def _emit(self, topic: Topic[Any], message: Message) -> None:
+        """A sensor has something: it waits for nobody's period, unless time waits for the brain."""
+        message = clipped(message)
+        if self._lockstep or not self._gate.tick:
+            self._sensors.append((topic, message))
+        else:
+            self._send(topic, message)
+
+    def _send(self, topic: Topic[Any], message: Message) -> None:
+        tick = self._gate.tick
+        if topic is SCAN:
+            self._round_trip.sent(tick, self._bus.clock.now_ns())
+        self._bus.publish(topic, message, basis=tick)
+
+    def _announce(self, state: RobotState) -> None:
+        bus, tick = self._bus, self._gate.tick
+        state = replace(state, gate=gate.status(self._gate), sent=self._sent)
+        bus.publish(STATE, state, basis=tick)
+        for topic, message in self._sensors:
+            self._send(topic, message)
+        self._sensors.clear()
+        if tick - self._body_tick >= BODY_EVERY_TICKS:
+            self._body_tick = tick
+            bus.publish(BODY, self._body)
+            self._measure()
+
+    async def _in_step(self, lockstep: Lockstep, state: RobotState) -> None:
+        """Announce the tick and wait until it is answered.
+
+        The first one waits until the whole brain has answered a scan, so that runs can be repeated.
+        """
+        if self._gate.tick > 1:
+            self._announce(state)
+            lockstep.begin(self._gate.tick, self._round_trip.scan_tick)
+            await lockstep.answered()
+            return
+        scan, answered = await self._newest_scan(), False
+        while not answered:
+            if scan:
+                self._sensors.append((SCAN, scan))
+            self._announce(state)
+            lockstep.begin(self._gate.tick, self._round_trip.scan_tick)
+            answered = await lockstep.wait(REPEAT_S)
+
+    async def _newest_scan(self) -> Message | None:
+        return await self._driver.get_sensor_data("scan") if self._robot.lidar else None
+
+    @property
+    def _gate(self) -> gate.GateState:
+        return self._gatekeeper.state
+
+    async def _obey(self) -> None:
+        """Have the body do what the gate lets through."""
+        async with self._line:
+            self._wake.clear()
+            now = self._gate
+            if now.mode == "latched":
+                self._sent = ZERO
+                await self._driver.stop()
+                return
+            to = now.output
+            sent = await self._driver.set_base_velocity(to.linear_x, to.linear_y, to.angular_z)
+            self._sent = sent
+            if log.isEnabledFor(logging.DEBUG):
+                log.debug("%s", of_command(to, sent))
+        if now.mode == "enabled" and now.command and to != ZERO:
+            late = gate.age_ns(now, now.command.tick, self._wall_ns()) > STALE_NS
+            self._bus.counters["stale_commands_executed"] += late
+
+    def _on_command(self, _key: str, command: CmdVel) -> None:
+        arrived_ns = self._bus.clock.now_ns()
+        self._gatekeeper.command(gate.Command(command, self._wall_ns()))
+        if command.boot == self._gate.boot:
+            counts = self._gate.mode == "enabled"
+            self._round_trip.answered(command.basis, arrived_ns, counts=counts)
+            if self._lockstep and command.source == (self._gate.commander or gate.BRAIN):
+                self._lockstep.command(command)
+
+    def _on_joint_command(self, _key: str, _command: JointCommand) -> None:
+        """No body of this package has joints to command; a refusal that can be seen."""
+        self._bus.counters["refused_no_joints"] += 1
+
+    def _on_bad_command(self, payload: bytes) -> None:
+        """Not a valid command: was it the commander, with a value that is not a number?"""
+        if sender := not_finite(payload):
+            self._gatekeeper.step(gate.NotFinite(*sender))
+
+    def _on_safety(self, said: SafetyState) -> None:
+        self._gatekeeper.step(gate.Safety(said))
+        if self._lockstep and said.boot == self._gate.boot:
+            self._lockstep.verdict(said)
+
+    def _wall_ns(self) -> int | None:
+        """The host's clock; none where time is lock-stepped and the wall says nothing."""
+        return None if self._lockstep else self._bus.clock.now_ns()
+
+    def _measure(self) -> None:
+        figures = self._round_trip.report()
+        for name in ("scan_to_cmd_p50", "scan_to_cmd_p99"):
+            value = figures[f"{name}_ms"]
+            if value is not None:
+                self._bus.latency_ms[name] = value
+        if self._lockstep:
+            self._bus.counters["lockstep_timeouts"] = self._lockstep.timeouts
+
+
+async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None:
+    """Drive one body until the process ends. Raises ConfigError for what cannot be driven."""
+    if config.link != "sim" and config.speed != 1.0:
+        raise ConfigError(f"link {config.link!r} runs in real time; --speed is for simulation")
+    if config.link == "real" and config.resume == "auto":
+        raise ConfigError("resume: auto is for simulation; a real body is enabled by a person")
+    if config.link != "real":
+        load_world(config.world, config.seed)  # a mock takes any, and would hide a wrong one
+    where = Run(
+        folder=Path(),
+        link=config.link,
+        world=config.world,
+        seed=config.seed,
+        speed=config.speed,
+        seconds=config.seconds,
+        emulator=config.emulator or str(ports_folder(config.body)),
+    )
+    robot, driver = make_driver(config.body, where)
+    if not driver.can(robot.safe_state):
+        known = ", ".join(name for name in get_args(SafeState) if driver.can(name))
+        raise ConfigError(
+            f"safe_state: {robot.safe_state} is more than {type(driver).__name__} can do; "
+            f"expected one of: {known}"
+        )
+    await DriverProcess(config, robot, driver, bus).run(ready)

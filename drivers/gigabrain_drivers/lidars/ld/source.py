@@ -1,0 +1,121 @@
+"""LDROBOT's lidars: they turn and send by themselves as soon as they have power."""
+
+import math
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+import serial
+from msgspec.structs import replace
+
+from gigabrain_drivers.lidars.ld import protocol as ld
+from gigabrain_drivers.lidars.serial_source import SerialSource
+from gigabrain_drivers.lidars.turn import Gathered, Samples
+from gigabrain_drivers.links.device_clock import DeviceClock
+from gigabrain_drivers.links.wording import Spelling, Wording
+from gigabrain_schemas.body import Lidar
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.clock import Clock
+
+Place = Callable[[Samples, Samples], tuple[Samples, Samples]]
+
+POINTS, WHOLE = np.arange(ld.POINTS), slice(None)
+PROBE_BYTES = 300  # at least five frames
+PROBE_FRAMES = 3
+
+
+class Frames(Gathered[tuple[bytes, slice]]):
+    """A turn in frames; of the first and of the last one perhaps a part only."""
+
+    def __init__(self, lidar: Lidar, place: Place) -> None:
+        super().__init__(lidar)
+        self._place = place
+
+    def unpack(self, pieces: list[tuple[bytes, slice]]) -> tuple[Samples, Samples]:
+        """All frames at once."""
+        angles, distances = self._place(*ld.points(b"".join(raw for raw, _ in pieces)))
+        kept = np.concatenate([POINTS[part] + n * ld.POINTS for n, (_, part) in enumerate(pieces)])
+        return angles[kept], distances[kept]
+
+    def take(self, raw: bytes, turn_at: int | None, now_ns: int) -> LaserScan | None:
+        """A frame more; `turn_at` is its first point in a new turn, whose end is a scan."""
+        if turn_at is None:
+            self.add((raw, WHOLE), ld.POINTS, now_ns)
+            return None
+        if turn_at:
+            self.add((raw, slice(turn_at)), turn_at, now_ns)
+        scan = self.finish(now_ns)
+        self.add((raw, slice(turn_at, None)), ld.POINTS - turn_at, now_ns)
+        return scan
+
+
+class Ld(SerialSource):
+    """A lidar that sends LD frames. Subclasses name the model, its baud rate and its corrections.
+
+    It has no way of saying whether a 0 means free space or nothing measurable, so a body's file
+    says `no_return: unknown` of it where that matters.
+    """
+
+    samples_hz = 4500.0
+    rate_baud: ClassVar[int]
+
+    def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
+        super().__init__(options, lidar, clock, self.rate_baud)
+        self.link.wording = Wording(received=Spelling(ld.Decoder().feed, ld.describe))
+        self._decoder = ld.Decoder()
+        self._frames = Frames(lidar, self.place)
+        self._stamps = DeviceClock(ld.CLOCK_MS)
+        self._last: int | None = None  # [0.01 deg], of the newest sample
+        self._understood = False
+
+    def place(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
+        """Angles (n,) [deg], clockwise, and distances (n,) [mm], as they are seen from the axis."""
+        return angles, distances
+
+    def connected(self) -> None:
+        """A new stream."""
+        self._decoder.clear()
+        self._frames.clear()
+        self._stamps.clear()
+        self._last, self._understood = None, False
+
+    def received(self, data: bytes) -> None:
+        """Frames, or parts of them."""
+        now_ns = self.clock.now_ns()
+        for raw in self._decoder.cut(data):
+            self._understood = True
+            self._stamps.arrived(raw.time_ms, now_ns)
+            turn_at, self._last = turn_start(raw, self._last), raw.end
+            scan = self._frames.take(raw.data, turn_at, now_ns)
+            self.finished(replace(scan, late_ms=self._stamps.late_ms) if scan else None)
+        self.link.errors = self._decoder.errors
+
+    def understands(self) -> bool:
+        """Whether frames come."""
+        return self._understood
+
+    def probe(self, port: serial.Serial) -> bool:
+        """Whether frames come from this port."""
+        return len(ld.Decoder().feed(port.read(PROBE_BYTES))) >= PROBE_FRAMES
+
+
+class Ld06(Ld):
+    """LDROBOT LD06."""
+
+    name, rate_baud = "LD06", 230_400
+
+
+class Ld19(Ld):
+    """LDROBOT LD19, also sold as STL-19P, D200 and D300."""
+
+    name, rate_baud = "LD19", 230_400
+
+
+def turn_start(raw: ld.Raw, last: int | None) -> int | None:
+    """Index of the first point of a frame that is in another turn than `last` [0.01 deg]."""
+    if last is not None and raw.start < last - ld.TURN // 2:
+        return 0
+    if raw.end >= raw.start:
+        return None
+    step = (raw.end - raw.start) % ld.TURN / (ld.POINTS - 1)
+    return min(math.ceil((ld.TURN - raw.start) / step), ld.POINTS - 1)

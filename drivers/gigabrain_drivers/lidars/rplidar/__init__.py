@@ -1,0 +1,1 @@
+"""Slamtec RPLIDARs: source, protocol and emulator."""

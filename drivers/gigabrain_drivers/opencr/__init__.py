@@ -1,1 +1,0 @@
-"""TurtleBot3's OpenCR: the board on its line, and the driver of the body that it moves."""

@@ -1,1 +1,0 @@
-"""Wire protocols: pure encoders and incremental decoders, without I/O and without a clock."""
