@@ -55,7 +55,7 @@ system: setup
 
 # before a release, on a machine with nothing else to do: hours, and continued where it was stopped
 qa: setup
-	$(BIN)/python -m tests.dockerfile_steps
+	$(BIN)/python -m tests.qa.dockerfile_steps
 	$(BIN)/python -m gigabrain_zenoh.qa.faults.extremes_run .qa/extremes.jsonl
 
 bench: setup
@@ -88,7 +88,7 @@ fuzz: setup
 .PHONY: signals qa
 qa: signals
 signals: setup
-	$(BIN)/python -m tests.signal_sweep --results .signals.jsonl $(ARGS)
+	$(BIN)/python -m tests.qa.signal_sweep --results .signals.jsonl $(ARGS)
 
 golden: setup
 	$(BIN)/python -m gigabrain_schemas.golden
@@ -98,7 +98,7 @@ recordings: setup
 
 pictures: setup
 	$(BIN)/gigabrain view --png docs/pictures/waffle_in_house.png --world house --seed 1
-	$(BIN)/python -m tests.pictures docs/pictures
+	$(BIN)/python -m tests.qa.pictures docs/pictures
 
 clean:
 	rm -rf .signals.jsonl $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .fuzz .fuzz-* .qa mutants

@@ -1,61 +1,33 @@
-"""Fixtures that several tests share."""
+"""Marks tests by their folders; fixtures and settings that all folders share."""
 
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 import gigabrain_zenoh.recording.arithmetic  # noqa: F401  before anything imports numpy
-from tests.stack import Home
 
-STARTS_PROCESSES = {"home", "shared_home"}  # fixtures
+pytest_plugins = ["gigabrain_zenoh.testing.fixtures"]
+
+TESTS = Path(__file__).parent
+MARKS = {"unit": "unit", "fuzz": "unit", "node": "node", "system": "system"}
 
 # how long an example takes says something of the machine, and nothing of the code
-settings.register_profile("gigabrain", deadline=None)
-settings.load_profile("gigabrain")
+settings.register_profile("quick", deadline=None, max_examples=20)
+settings.register_profile("qa", deadline=None, max_examples=1000)
+settings.load_profile("quick")  # `make qa` loads the other
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what starts processes as `system`: those tests have the machine to themselves."""
+    """Mark each test by the folder that it lies in."""
     for item in items:
-        if STARTS_PROCESSES & set(getattr(item, "fixturenames", ())):
-            item.add_marker(pytest.mark.system)
-
-
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[Home]:
-    """Folders of its own for what a test starts; whatever it starts ends with the test."""
-    place = Home(tmp_path)
-    yield place
-    place.close()
-
-
-@pytest.fixture(scope="module")
-def shared_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Home]:
-    """The same for all tests of a module."""
-    place = Home(tmp_path_factory.mktemp("home"))
-    yield place
-    place.close()
-
-
-@pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder of packages; what was imported from it goes with it."""
-    folder = tmp_path / "site"
-    folder.mkdir()
-    monkeypatch.syspath_prepend(str(folder))
-    yield folder
-    for name, module in list(sys.modules.items()):
-        if folder in Path(getattr(module, "__file__", None) or "").parents:
-            del sys.modules[name]
+        item.add_marker(MARKS[item.path.relative_to(TESTS).parts[0]])
 
 
 @pytest.fixture(scope="session")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The keys of a fleet with the robots red and blue; nobody may change them."""
+    """The keys of a fleet with the robots red and blue; no test may change them."""
     pytest.importorskip("cryptography")
-    from tests.keys_rig import make_fleet
+    from tests.system.keys import make_fleet
 
     return make_fleet(tmp_path_factory.mktemp("keys") / "home", "home")

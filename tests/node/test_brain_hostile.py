@@ -7,7 +7,7 @@ import pytest
 
 from gigabrain_schemas.topics import BUTTON, ESTOP_SAID, SAFETY, TELEOP
 from gigabrain_zenoh.qa.faults.extremes import Case, fixed
-from tests.brain_in_memory import Robot
+from gigabrain_zenoh.testing.brain import RobotInMemory
 
 STOPS = (ESTOP_SAID, BUTTON, TELEOP, SAFETY)  # by their purpose
 MEASURED = ("linear_acceleration", "orientation")  # of an accident, which latches
@@ -28,7 +28,7 @@ def harmless() -> list[Case]:
 async def test_it_drives_again_within_three_seconds_of_any_message(
     tmp_path: Path, harmless: list[Case]
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         newest: dict[str, bytes] = {}
         ends = robot.operator.tap("robot/**", lambda key, _, payload: newest.update({key: payload}))
         await robot.go(3 * SECONDS)

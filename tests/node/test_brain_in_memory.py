@@ -9,7 +9,7 @@ import pytest
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE
-from tests.brain_in_memory import Robot, ticks_until, travelled
+from gigabrain_zenoh.testing.brain import RobotInMemory, ticks_until, travelled
 
 # after how many ticks the body brakes, and how far it may go until it stands still [m]
 SILENCES = [
@@ -20,23 +20,23 @@ SILENCES = [
 ]
 
 
-async def driving(robot: Robot) -> None:
+async def driving(robot: RobotInMemory) -> None:
     """Wait until it is at full speed."""
     await robot.go(100)
     assert robot.mode == "enabled"
     assert robot.body.speeds[-1] == pytest.approx(0.26)
 
 
-async def release(robot: Robot, generation: int) -> GateReply:
+async def release(robot: RobotInMemory, generation: int) -> GateReply:
     request = ReleaseRequest(estop_generation=generation, source="test")
     return (await robot.operator.ask(RELEASE, request))[0]
 
 
-async def enable(robot: Robot) -> GateReply:
+async def enable(robot: RobotInMemory) -> GateReply:
     return (await robot.operator.ask(ENABLE, EnableRequest(source="control")))[0]
 
 
-async def press(robot: Robot) -> GateReply:
+async def press(robot: RobotInMemory) -> GateReply:
     return (await robot.operator.ask(ESTOP, EstopRequest(source="test")))[0]
 
 
@@ -51,7 +51,7 @@ def stops(speeds: list[float], ticks: int, metres: float) -> None:
 
 
 async def test_it_enables_itself_and_drives_straight_on(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         speeds = await robot.go(200)
         assert robot.state
         pose = robot.state.pose
@@ -68,7 +68,7 @@ async def test_it_enables_itself_and_drives_straight_on(tmp_path: Path) -> None:
 async def test_a_process_that_dies_stops_the_body_and_it_goes_on_when_it_is_back(
     name: str, ticks: int, metres: float, tmp_path: Path
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         await robot.kill(name)
         stops(await robot.go(100), ticks, metres)
@@ -83,7 +83,7 @@ async def test_a_process_that_dies_stops_the_body_and_it_goes_on_when_it_is_back
 async def test_a_process_that_freezes_stops_the_body_and_nothing_stale_comes_of_it(
     name: str, ticks: int, metres: float, tmp_path: Path
 ) -> None:
-    async with Robot(tmp_path, resume="manual") as robot:
+    async with RobotInMemory(tmp_path, resume="manual") as robot:
         await robot.go(50)
         await release(robot, 0)
         await enable(robot)
@@ -99,7 +99,7 @@ async def test_a_process_that_freezes_stops_the_body_and_nothing_stale_comes_of_
 
 
 async def test_with_manual_resume_it_moves_only_when_released_and_enabled(tmp_path: Path) -> None:
-    async with Robot(tmp_path, resume="manual") as robot:
+    async with RobotInMemory(tmp_path, resume="manual") as robot:
         assert set(await robot.go(100)) == {0.0}
         assert (robot.mode, robot.causes) == ("latched", ["boot"])
         assert not (await enable(robot)).ok
@@ -112,7 +112,7 @@ async def test_with_manual_resume_it_moves_only_when_released_and_enabled(tmp_pa
 
 
 async def test_an_estop_stops_in_the_same_tick_and_stays_latched(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         reply = await press(robot)
         assert (reply.ok, reply.gate.mode, reply.gate.estop_generation) == (True, "latched", 1)
@@ -127,7 +127,7 @@ async def test_an_estop_stops_in_the_same_tick_and_stays_latched(tmp_path: Path)
 
 
 async def test_an_estop_survives_a_restart_of_the_driver(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         await press(robot)
         await robot.kill("driver")
@@ -138,7 +138,7 @@ async def test_an_estop_survives_a_restart_of_the_driver(tmp_path: Path) -> None
 
 
 async def test_a_driver_that_starts_anew_finds_a_brain_that_begins_anew(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         assert robot.state
         boot = robot.state.boot
@@ -150,7 +150,7 @@ async def test_a_driver_that_starts_anew_finds_a_brain_that_begins_anew(tmp_path
 
 
 async def test_commands_that_are_played_back_move_nothing(tmp_path: Path) -> None:
-    async with Robot(tmp_path, resume="manual") as robot:
+    async with RobotInMemory(tmp_path, resume="manual") as robot:
         await robot.go(50)
         await release(robot, 0)
         await enable(robot)
@@ -169,7 +169,7 @@ async def test_commands_that_are_played_back_move_nothing(tmp_path: Path) -> Non
 
 
 async def test_a_second_estop_counts_after_a_restart_too(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         await press(robot)
         assert (await press(robot)).gate.estop_generation == 2
@@ -181,7 +181,7 @@ async def test_a_second_estop_counts_after_a_restart_too(tmp_path: Path) -> None
 
 
 async def test_a_speed_that_is_not_a_number_stops_the_body_at_once(tmp_path: Path) -> None:
-    async with Robot(tmp_path, resume="manual") as robot:
+    async with RobotInMemory(tmp_path, resume="manual") as robot:
         await robot.go(50)
         await release(robot, 0)
         await enable(robot)
@@ -206,7 +206,7 @@ async def test_garbage_on_every_key_leaves_the_drive_alone(tmp_path: Path) -> No
         b'{"linear_x": true}',
         b"x" * 2**21,
     )
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         keys = {key for key, _ in robot.network.sent}
         assert len(keys) == 8

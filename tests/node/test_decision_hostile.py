@@ -11,9 +11,10 @@ from gigabrain_zenoh import codec
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision.steering import Steering
 from gigabrain_zenoh.qa.faults.extremes import fixed
-from tests.brain_rig import body, state
-from tests.bus_rig import Net, settle
-from tests.plane_rig import ROOM, Plane, as_map, drawn
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.samples import body, state
+from gigabrain_zenoh.testing.waiting import settle
+from tests.node.plane import ROOM, Plane, as_map, drawn
 
 
 async def test_the_brains_own_commands_count_as_the_gate_lets_them_through() -> None:

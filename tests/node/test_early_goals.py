@@ -16,8 +16,8 @@ from gigabrain_zenoh.decision import navigating
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.kernels.compiling import compiled
-from tests.brain_rig import Bench
-from tests.plane_rig import ROOM, Plane, drawn
+from gigabrain_zenoh.testing.bus import NodeBench
+from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
 NAVIGATE = DecisionConfig(behaviour="navigate")
@@ -34,7 +34,7 @@ async def test_a_goal_is_taken_while_decision_still_gets_ready(
 
     monkeypatch.setattr(navigating, "compiled", compiled_later)
     told: list[TaskStatus] = []
-    async with Bench(functools.partial(decision.run, NAVIGATE)) as bench:
+    async with NodeBench(functools.partial(decision.run, NAVIGATE)) as bench:
         operator = Bus(bench.network.transport(), bench.clock, "operator")
         operator.subscribe(TASK, lambda _key, status: told.append(status))
         replies = await operator.ask(GOAL, GoalRequest(x=4.0, y=0.8, source="ann"))

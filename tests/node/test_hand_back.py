@@ -10,8 +10,8 @@ from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.topics import BODY, CMD_VEL, STATE, TELEOP
 from gigabrain_zenoh.geometry.limits import ZERO
-from tests.brain_rig import BOOT, body, state
-from tests.bus_rig import settle
+from gigabrain_zenoh.testing.samples import BOOT, body, state
+from gigabrain_zenoh.testing.waiting import settle
 from tests.unit.control.test_control_node import Chain
 from tests.unit.ui.test_page_access import Seated
 

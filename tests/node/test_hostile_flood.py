@@ -12,7 +12,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE, TOPICS, Service
 from gigabrain_zenoh.config.settings import Resume
 from gigabrain_zenoh.qa.faults.hostile import codec_of, hostile_payloads, hostile_values
-from tests.brain_in_memory import Robot
+from gigabrain_zenoh.testing.brain import RobotInMemory
 
 TICKS = 200
 PER_TICK = 100  # 20000 payloads in all
@@ -21,7 +21,7 @@ PER_TICK = 100  # 20000 payloads in all
 async def speeds(folder: Path, resume: Resume, per_tick: int) -> list[float]:
     """What the body did in each tick while so many payloads came in each."""
     payloads = flood(seed=3)
-    async with Robot(folder, resume=resume) as robot:
+    async with RobotInMemory(folder, resume=resume) as robot:
         for _ in range(TICKS):
             for key, payload in itertools.islice(payloads, per_tick):
                 robot.network.deliver(key, payload)
@@ -55,7 +55,7 @@ async def test_values_that_are_valid_all_the_same_move_nothing(tmp_path: Path) -
     In the name of control they make safety think that control has fallen silent: that stops.
     """
     values, valid = hostile_values(CmdVel, 5), 0
-    async with Robot(tmp_path, resume="auto") as robot:
+    async with RobotInMemory(tmp_path, resume="auto") as robot:
         await robot.go(100)
         assert robot.body.speeds[-1] == pytest.approx(0.26)
         for _ in range(100):
@@ -84,7 +84,7 @@ def is_valid(payload: bytes) -> bool:
 async def test_hostile_requests_are_refused_with_a_reason(
     tmp_path: Path, service: Service[Any, Any]
 ) -> None:
-    async with Robot(tmp_path, resume="manual") as robot:
+    async with RobotInMemory(tmp_path, resume="manual") as robot:
         await robot.go(30)
         stranger = robot.network.transport()
         for payload in itertools.islice(hostile_payloads(service.request, 7), 500):

@@ -11,8 +11,8 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest
 from gigabrain_schemas.topics import GOAL, MISSION, SAFETY
 from gigabrain_zenoh.config.settings import DecisionConfig
-from tests.brain_rig import BOOT
-from tests.plane_rig import ROOM, Plane, drawn
+from gigabrain_zenoh.testing.samples import BOOT
+from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
 STANDS = Velocity()

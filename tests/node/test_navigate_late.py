@@ -15,9 +15,9 @@ from gigabrain_zenoh.decision import steering
 from gigabrain_zenoh.decision.behaviours.bearings import Route
 from gigabrain_zenoh.decision.behaviours.guide import Asked, Guide
 from gigabrain_zenoh.decision.navigating import Navigating
-from tests.brain_rig import BOOT, state
-from tests.bus_rig import Net
-from tests.plane_rig import ROOM, Plane, as_map, drawn
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.samples import BOOT, state
+from tests.node.plane import ROOM, Plane, as_map, drawn
 
 CELLS = drawn(ROOM)
 STANDS = Velocity()

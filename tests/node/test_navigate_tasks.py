@@ -8,7 +8,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest, TaskRequest
 from gigabrain_schemas.topics import GOAL, MISSION, TASK_CHANGE
 from gigabrain_zenoh.config.settings import DecisionConfig
-from tests.plane_rig import ROOM, Plane, drawn
+from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
 STANDS = Velocity()

@@ -26,8 +26,8 @@ from gigabrain_zenoh.qa.planted import node_of
 from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.host import Host
-from tests.local_rig import OMNI, wall
-from tests.rooms import box, ranges
+from tests.unit.mapping.rooms import box, ranges
+from tests.unit.navigation.drives import OMNI, wall
 
 TICK_S, SCAN_TICKS, DELAY_TICKS, LAG_S = 0.02, 5, 3, 0.1
 THICK = 0.1  # [m], the wall at y 1.2 to 1.3; its gap is 0.56 m wide, the body 0.24 x 0.6 m

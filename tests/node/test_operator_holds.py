@@ -12,8 +12,8 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest
 from gigabrain_schemas.topics import CMD_VEL, GOAL, MISSION
 from gigabrain_zenoh.gate.causes import estop
-from tests.brain_rig import DRIVING
-from tests.plane_rig import ROOM, Plane, drawn
+from gigabrain_zenoh.testing.samples import DRIVING
+from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
 HOLDS = "an operator holds the body; `gigabrain enable` hands it back"

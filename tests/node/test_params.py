@@ -20,9 +20,10 @@ from gigabrain_zenoh.decision.behaviours import BEHAVIOURS
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.navigation.local import Goal, LocalPlanner
 from gigabrain_zenoh.runtime.param_service import LOG_LEVEL, serve_params
-from tests.brain_rig import Bench, state
-from tests.local_rig import QUICK, WAFFLE, Drive, wall
-from tests.plane_rig import Plane, drawn
+from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.samples import state
+from tests.node.plane import Plane, drawn
+from tests.unit.navigation.drives import QUICK, WAFFLE, Drive, wall
 
 HALL = drawn("####################\n" + "#..................#\n" * 12 + "####################")
 MORE_ROOM_LEFT = (0.8, 3.0, 3.0, 1.0, 1.0, 1.0)
@@ -38,7 +39,7 @@ def root_level() -> Iterator[None]:
 async def wants(name: str, value: str, *, ahead: bool) -> list[Velocity | None]:
     """What the behaviour `avoid` wants before a parameter is set, and after."""
     wanted, world = [], WorldModel(scan_ok=True, obstacle_ahead=False, sectors=MORE_ROOM_LEFT)
-    async with Bench(functools.partial(decision.run, DecisionConfig())) as bench:
+    async with NodeBench(functools.partial(decision.run, DecisionConfig())) as bench:
         for tick in (10, 20):
             for now, seen in ((tick, False), (tick + 5, ahead)):  # each turn is a new one
                 bench.send(STATE, state(now))
@@ -94,7 +95,7 @@ async def speed_limit() -> None:
 
 
 async def log_level() -> None:
-    async with Bench(functools.partial(decision.run, DecisionConfig())) as bench:
+    async with NodeBench(functools.partial(decision.run, DecisionConfig())) as bench:
         serve_params(bench.bus)
         for level in ("error", "info"):
             bench.bus.params.change(LOG_LEVEL, level)
@@ -140,7 +141,9 @@ async def test_the_log_level_of_a_process_is_obeyed(root_level: None) -> None:
 async def test_what_the_present_behaviour_does_not_read_is_refused_with_what_can_be_set(
     behaviour: str, foreign: str, known: str
 ) -> None:
-    async with Bench(functools.partial(decision.run, DecisionConfig(behaviour=behaviour))) as bench:
+    async with NodeBench(
+        functools.partial(decision.run, DecisionConfig(behaviour=behaviour))
+    ) as bench:
         await bench.ready()
         with pytest.raises(Refused) as refused:
             bench.bus.params.change(foreign, "0.1")
@@ -174,6 +177,6 @@ def test_settings_that_the_behaviour_does_not_read_are_named(
 
 
 async def test_they_are_named_in_the_log_at_the_start(caplog: pytest.LogCaptureFixture) -> None:
-    async with Bench(functools.partial(decision.run, DecisionConfig(samples=400))) as bench:
+    async with NodeBench(functools.partial(decision.run, DecisionConfig(samples=400))) as bench:
         await bench.ready()
     assert "samples has no effect: behaviour avoid does not read it" in caplog.messages

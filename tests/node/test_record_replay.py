@@ -39,9 +39,9 @@ from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.recorder import Recorder
 from gigabrain_zenoh.runtime.param_service import serve_params
 from gigabrain_zenoh.runtime.replay import ASKED, Event, record, replay
-from tests import bag_rig
-from tests.brain_in_memory import BRAIN, Robot
-from tests.plane_rig import ROOM, Plane, drawn
+from gigabrain_zenoh.testing.brain import BRAIN, RobotInMemory
+from tests.node.plane import ROOM, Plane, drawn
+from tests.unit.recording import bags
 
 RECORDINGS = Path(__file__).parents[1] / "recordings"
 RENEW = "was the change meant? then: make recordings"
@@ -106,14 +106,14 @@ def test_of_a_process_that_was_changed_the_first_difference_is_shown(
 
 def test_a_recording_without_the_process_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    bag_rig.write(path, bag_rig.drive(10))
+    bags.write(path, bags.drive(10))
     with pytest.raises(ConfigError, match="holds nothing that safety has said"):
         call("replay", "--check", str(path), "--process", "safety")
 
 
 def test_without_its_settings_a_process_is_not_replayed_as_another(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    bag_rig.write(path, bag_rig.drive(10))
+    bags.write(path, bags.drive(10))
     with pytest.raises(ConfigError, match=r"not hold the settings of decision, .* --deployment F"):
         call("replay", "--check", str(path), "--process", "decision")
 
@@ -201,7 +201,7 @@ async def test_a_decision_that_was_sent_to_a_place_does_the_same_again() -> None
 
 
 async def test_a_parameter_that_was_changed_meanwhile_is_changed_again(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         events = record(robot.network, robot.clock)
         serve_params(robot.bus("decision"))
         await robot.go(100)

@@ -12,9 +12,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_zenoh.bus.bridge import WAKER, Bridge, EventFd, SocketPair, Waker
-from tests.bus_rig import in_thread, until
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import in_thread, until
 
 KINDS: list[Callable[[], Waker]] = [SocketPair]
 if hasattr(os, "eventfd"):
@@ -225,7 +223,7 @@ async def closed_while_threads_post() -> None:
 
 
 def test_closing_while_threads_post_leaves_nothing_open() -> None:
-    program = "import asyncio; from tests import test_bridge as here; asyncio.run(here.{}())"
+    program = "import asyncio; from tests.system import test_bridge as here; asyncio.run(here.{}())"
     lines = program.format(closed_while_threads_post.__name__)
     root = Path(__file__).parents[2]
     ran = subprocess.run((sys.executable, "-c", lines), cwd=root, capture_output=True, text=True)

@@ -12,11 +12,9 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
 from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
-from tests.proxy_rig import Server, serving
-from tests.stack import until
-from tests.zenoh_rig import Ear, repeat, robot
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.zenoh import Ear, repeat, robot
+from tests.system.server import Server, serving
 
 LONG = bytes(range(256)) * 400  # more than is read at once
 

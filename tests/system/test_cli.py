@@ -11,7 +11,7 @@ import pytest
 from cyclopts import App
 
 from gigabrain_zenoh.cli.app import COMMANDS, make_app
-from tests.stack import GIGABRAIN, Home, free_port
+from gigabrain_zenoh.testing.processes import GIGABRAIN, Home, free_port
 
 # takes longer than all the rest of `gigabrain --help` together
 HEAVY = {"numpy", "zenoh", "mujoco", "asyncio", "yaml", "rich.markdown", "importlib.metadata"}

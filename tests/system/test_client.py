@@ -21,8 +21,9 @@ from gigabrain_zenoh.errors import (
     UnknownName,
     Unsupported,
 )
-from tests.onlooker import Onlooker, looking_on
-from tests.stack import AVOID, Command, Home, free_port, robot_of, until
+from gigabrain_zenoh.qa.faults.onlooker import Onlooker, looking_on
+from gigabrain_zenoh.testing.processes import AVOID, Command, Home, free_port, robot_of
+from gigabrain_zenoh.testing.waiting import until
 
 
 @pytest.fixture(scope="module")

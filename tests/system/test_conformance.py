@@ -8,8 +8,6 @@ import pytest
 from gigabrain_drivers.driver.catalog import links_of, load_robot, robot_files
 from gigabrain_zenoh.qa.conformance import kit
 
-pytestmark = pytest.mark.system
-
 NEEDS_A_PEER = {
     "stops when it is killed",
     "stops unplugged",

@@ -8,8 +8,6 @@ from gigabrain_zenoh.qa.conformance import kit
 from gigabrain_zenoh.qa.conformance.result import Finding, summary
 from gigabrain_zenoh.qa.conformance.subject import Subject
 
-pytestmark = pytest.mark.system
-
 
 def test_the_worst_and_the_median_of_each_time_are_told() -> None:
     found = [

@@ -18,13 +18,15 @@ from gigabrain_schemas.tasks import Task, TaskStatus
 from gigabrain_schemas.topics import MAP, STATE
 from gigabrain_zenoh.launch import demo as demo_module
 from gigabrain_zenoh.launch.demo import Demo, DemoOptions, newest_fault
+from gigabrain_zenoh.qa.faults.onlooker import looking_on
 from gigabrain_zenoh.runtime.deployment import ROBOT, Deployment
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.processes import AVOID, Command, Home, robot_of
+from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.live_view import doing
 from gigabrain_zenoh.ui.report import Observed, last_told, make_report, summary
 from gigabrain_zenoh.ui.watch import Watch
-from tests.bus_rig import Net
-from tests.onlooker import looking_on
-from tests.stack import AVOID, ROOT, Command, Home, robot_of, until
+from tests.places import ROOT
 
 BODIES = ROOT / "drivers" / "gigabrain_drivers" / "bodies"
 DRIVER_HEALTH = Health(

@@ -11,8 +11,6 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.conformance import direct, kit, new
 from gigabrain_zenoh.qa.conformance.subject import Subject
 
-pytestmark = pytest.mark.system
-
 
 def installed(folder: Path, site: Path) -> Path:
     """What pip makes of a package: its modules, and beside them what says so; the folder."""

@@ -9,7 +9,7 @@ import pytest
 from gigabrain_zenoh.config.process_config import ProcessConfig
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.runtime.deployment import Deployment
-from tests.stack import AVOID, Home
+from gigabrain_zenoh.testing.processes import AVOID, Home
 
 
 def specs(tmp_path: Path, link: str) -> dict[str, tuple[tuple[str, ...], ProcessConfig]]:

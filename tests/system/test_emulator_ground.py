@@ -16,9 +16,7 @@ from gigabrain_drivers.emulators.faults import Faults, FaultyWire
 from gigabrain_drivers.emulators.station import Station
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import UnknownName
-from tests.line_rig import until
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
 
 
 class Collector:

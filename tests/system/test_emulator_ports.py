@@ -16,9 +16,7 @@ from gigabrain_drivers.emulators.claim import claimed
 from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_zenoh.errors import ConfigError
-from tests.line_rig import until
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
 
 
 def opened(path: Path) -> int:

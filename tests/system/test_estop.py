@@ -12,8 +12,9 @@ from gigabrain_schemas.requests import ReleaseRequest
 from gigabrain_schemas.topics import RELEASE
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import Refused
-from tests.onlooker import Onlooker, looking_on
-from tests.stack import Home, endpoint_of, until
+from gigabrain_zenoh.qa.faults.onlooker import Onlooker, looking_on
+from gigabrain_zenoh.testing.processes import Home, endpoint_of
+from gigabrain_zenoh.testing.waiting import until
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,6 @@ from gigabrain_zenoh.errors import UnknownName
 from gigabrain_zenoh.qa.conformance.session import Session
 from gigabrain_zenoh.qa.conformance.subject import Subject
 
-pytestmark = pytest.mark.system
-
 NAME = "foreign_base"
 DRIVER = '''"""Somebody's driver, and the board that it talks to."""
 

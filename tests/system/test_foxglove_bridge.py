@@ -22,11 +22,12 @@ from gigabrain_schemas.topics import IMAGE, LOG, MAP, POSE, SCAN, STATE, TASK, W
 from gigabrain_zenoh.config.settings import FoxgloveConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime.name_claim import NameClaim
+from gigabrain_zenoh.testing.processes import Home, free_port, listens
+from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.foxglove.layout import topic_to_steer, write_layout
 from gigabrain_zenoh.ui.page.access import token_file, tokens
-from tests.foxglove_bridge_rig import Bridge, bridged, hold
-from tests.foxglove_rig import Viewer, fields
-from tests.stack import Home, free_port, listens, until
+from tests.unit.ui.foxglove_bridge import Bridge, bridged, hold
+from tests.unit.ui.foxglove_viewer import Viewer, fields
 
 LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
 
@@ -183,9 +184,9 @@ def _panels(place: object) -> list[str]:
 async def test_a_robot_turns_as_a_viewer_tells_it_and_a_second_bridge_says_what_to_do(
     home: Home,
 ) -> None:
+    from gigabrain_zenoh.qa.faults.onlooker import looking_on
     from gigabrain_zenoh.runtime.deployment import ROBOT
-    from tests.onlooker import looking_on
-    from tests.stack import endpoint_of
+    from gigabrain_zenoh.testing.processes import endpoint_of
 
     layout = home.folder / "robot.json"
     wrote = await home.run("foxglove", "--layout", str(layout))

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.onlooker import looking_on
-from tests.stack import Home, robot_of, until
+from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.testing.processes import Home, robot_of
+from gigabrain_zenoh.testing.waiting import until
 
 COMPILING_S = 600.0  # at the very first start
 

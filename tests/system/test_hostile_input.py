@@ -29,9 +29,10 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.qa.faults.hostile import replaced
-from tests.onlooker import SYSTEMS, Onlooker, looking_on
-from tests.stack import AVOID, Home, endpoint_of, robot_of, until
-from tests.wire_rig import as_map, numbers, refuses
+from gigabrain_zenoh.qa.faults.onlooker import SYSTEMS, Onlooker, looking_on
+from gigabrain_zenoh.testing.processes import AVOID, Home, endpoint_of, robot_of
+from gigabrain_zenoh.testing.waiting import until
+from tests.unit.schemas.plain import as_map, numbers, refuses
 
 LISTENERS = {
     "robot/scan": ("perception", "safety"),

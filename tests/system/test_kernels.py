@@ -6,13 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.stack import SOURCES
+from gigabrain_zenoh.testing.processes import SOURCES
 
 numba = pytest.importorskip("numba")
 
 from gigabrain_zenoh.kernels import kernel as kernels  # noqa: E402
-
-pytestmark = pytest.mark.system
 
 
 def test_a_change_in_any_source_with_kernels_asks_for_a_folder_of_its_own(

@@ -4,10 +4,9 @@ import sys
 
 import pytest
 
-from tests.supervisor_rig import CHILD
+from tests.system.children import CHILD
 
 pytestmark = [
-    pytest.mark.system,
     pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts"),
 ]
 

@@ -11,9 +11,8 @@ from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.links import port_name, ports
 from gigabrain_drivers.links.serial_link import SerialLink, open_port
 from gigabrain_zenoh.clock import Clock
-from tests.links_rig import Heard, until
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
+from tests.unit.drivers.links import Heard
 
 
 @pytest.fixture

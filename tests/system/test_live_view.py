@@ -13,7 +13,8 @@ from collections.abc import Iterator
 import pytest
 from rich.cells import cell_len
 
-from tests.stack import AVOID, GIGABRAIN, Home, until
+from gigabrain_zenoh.testing.processes import AVOID, GIGABRAIN, Home
+from gigabrain_zenoh.testing.waiting import until
 
 # becomes the leader of the terminal's session, as a shell would, and then the command
 AT_TERMINAL = "import os, sys; os.login_tty(0); os.execv(sys.argv[1], sys.argv[1:])"

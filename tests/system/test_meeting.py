@@ -11,10 +11,8 @@ from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime import meeting
 from gigabrain_zenoh.runtime.meeting import join, unknown_host
-from tests.bus_rig import until
-from tests.zenoh_rig import free_endpoint, under_way
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.zenoh import free_endpoint, under_way
 
 NOBODY = "nobody here knows a host {!r}; waiting for its name (is it spelt right?)"
 

@@ -22,9 +22,7 @@ from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.errors import ConfigError
-from tests.line_rig import until
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
 
 EMPTY = World(name="empty", description="", half_x=5.0, half_y=5.0, shapes=())
 

@@ -18,13 +18,13 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.qa.faults.onlooker import Onlooker, at_rest, looking_on
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
 from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
-from tests.netns_rig import Network, network
-from tests.onlooker import Onlooker, at_rest, looking_on
-from tests.stack import ROOT, Home, until
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.processes import Home
+from gigabrain_zenoh.testing.waiting import until
+from tests.places import ROOT
+from tests.system.netns import Network, network
 
 STOP_TICKS = 6  # 120 ms
 REST_TICKS = 40  # by then the ramp has ended

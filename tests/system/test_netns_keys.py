@@ -3,16 +3,14 @@
 import re
 from pathlib import Path
 
-import pytest
-
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.qa.faults.onlooker import looking_on
 from gigabrain_zenoh.security.authority import issue, new_fleet
-from tests.netns_rig import network
-from tests.onlooker import looking_on
-from tests.stack import ROOT, Home, until
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.processes import Home
+from gigabrain_zenoh.testing.waiting import until
+from tests.places import ROOT
+from tests.system.netns import network
 
 HOSTS = ("robot", "brain", "operator")
 

@@ -19,9 +19,7 @@ from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.emulators.station import Station
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
-from tests.opencr_rig import Rig, make_rig  # noqa: F401
-
-pytestmark = pytest.mark.system
+from tests.unit.drivers.opencr import Rig, make_rig  # noqa: F401
 
 
 async def test_a_failed_read_is_never_taken_for_a_fresh_one(rig: Rig) -> None:

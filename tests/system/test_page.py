@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 from playwright.async_api import Page
 
-from tests.onlooker import Onlooker, at_rest, looking_on
-from tests.page_rig import VIEWER, Browser, Robot, browser, needs_browser
-from tests.stack import Home, until
+from gigabrain_zenoh.qa.faults.onlooker import Onlooker, at_rest, looking_on
+from gigabrain_zenoh.testing.processes import Home
+from gigabrain_zenoh.testing.waiting import until
+from tests.system.page import VIEWER, Browser, Robot, browser, needs_browser
 
 pytestmark = needs_browser
 

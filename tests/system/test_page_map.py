@@ -9,11 +9,11 @@ from playwright.async_api import Page
 
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import IMAGE
-from tests.fake_page_rig import Fake, serving
-from tests.page_rig import Browser, browser, needs_browser
-from tests.stack import until
+from gigabrain_zenoh.testing.waiting import until
+from tests.system.fake_page import Fake, serving
+from tests.system.page import Browser, browser, needs_browser
 
-pytestmark = [pytest.mark.system, needs_browser, pytest.mark.asyncio(loop_scope="module")]
+pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
 PAD = """
 const button = (pressed) => ({ pressed, value: pressed ? 1 : 0 })

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.fake_page_rig import Fake, serving
-from tests.page_rig import OPERATOR, VIEWER, browser, needs_browser
-from tests.stack import until
+from gigabrain_zenoh.testing.waiting import until
+from tests.system.fake_page import Fake, serving
+from tests.system.page import OPERATOR, VIEWER, browser, needs_browser
 
-pytestmark = [pytest.mark.system, needs_browser]
+pytestmark = needs_browser
 
 
 def certificate(folder: Path) -> dict[str, str]:

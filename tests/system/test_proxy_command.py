@@ -6,8 +6,9 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from tests.proxy_rig import Server, serving
-from tests.stack import Home, until
+from gigabrain_zenoh.testing.processes import Home
+from gigabrain_zenoh.testing.waiting import until
+from tests.system.server import Server, serving
 
 
 @pytest.fixture

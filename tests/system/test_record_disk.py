@@ -19,10 +19,8 @@ from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.recording import bagfile, tape
 from gigabrain_zenoh.recording.info import info
 from gigabrain_zenoh.recording.recorder import Recorder
-from tests import bag_rig
-from tests.bag_rig import QUICK, kept, wait
-
-pytestmark = pytest.mark.system
+from tests.unit.recording import bags
+from tests.unit.recording.bags import QUICK, kept, wait
 
 
 class SlowTape(tape.Tape):
@@ -58,13 +56,13 @@ def test_on_a_slow_disk_what_is_written_and_what_was_dropped_is_what_came(
         count = 0
         while recorder.status().dropped < 500:  # of 1.5 kB that do not compress
             count += 1
-            recorder.intake.take("robot/scan", "", bag_rig.scan(count))
+            recorder.intake.take("robot/scan", "", bags.scan(count))
     status = recorder.status()
     assert status.seen == count
     assert status.written + status.dropped == count
     assert kept(path)["robot/scan"] == status.written
     found = info(path)
-    assert found.keys[0].missing == bag_rig.seqs(path, "robot/scan")[-1] - status.written
+    assert found.keys[0].missing == bags.seqs(path, "robot/scan")[-1] - status.written
     assert found.notes["gigabrain.recorded"]["dropped"] == str(status.dropped)
 
 
@@ -86,9 +84,9 @@ def test_whoever_hands_messages_over_never_waits_for_the_disk(
         first = 0
         while not stood.wait(0.01):  # until the disk stands still
             first += 1
-            recorder.intake.take("robot/scan", "", bag_rig.scan(first))
+            recorder.intake.take("robot/scan", "", bags.scan(first))
         for seq in range(first + 1, first + 1001):
-            recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
+            recorder.intake.take("robot/scan", "", bags.scan(seq))
         stuck = recorder.status()
         gate.set()
     assert stuck.seen == first + 1000  # all were taken while the disk stood still
@@ -106,7 +104,7 @@ def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_f
 
     def send(first: int, count: int) -> None:
         for seq in range(first, first + count):
-            recorder.intake.take("robot/state", "", bag_rig.state(seq))
+            recorder.intake.take("robot/state", "", bags.state(seq))
 
     with Recorder(path, QUICK) as recorder:
         send(1, 100)
@@ -127,15 +125,15 @@ def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_f
     assert status.seen == 300 == status.written + status.dropped
     assert status.fault == ""
     second = tmp_path / "full_1.mcap"
-    assert bag_rig.seqs(path) == list(range(1, 101))
-    assert bag_rig.seqs(second)[-100:] == list(range(201, 301))
+    assert bags.seqs(path) == list(range(1, 101))
+    assert bags.seqs(second)[-100:] == list(range(201, 301))
     assert info(second).finished
 
 
 def test_what_must_stay_free_of_the_disk_stays_free(tmp_path: Path) -> None:
     config = RecorderConfig(viewers=False, flush_s=0.02, keep_free_mb=1e9)
     with Recorder(tmp_path / "a.mcap", config) as recorder:
-        recorder.intake.take("robot/state", "", bag_rig.state(1))
+        recorder.intake.take("robot/state", "", bags.state(1))
         wait(recorder, lambda now: "less than 1e+09 MB are free" in now.fault)
     assert recorder.status().dropped == 1
     assert recorder.status().written == 0
@@ -148,7 +146,7 @@ def test_a_recording_is_split_by_size_and_each_part_has_the_map(tmp_path: Path) 
     with Recorder(tmp_path / "s.mcap", config) as recorder:
         recorder.intake.take("robot/map", "", grid)
         for seq in range(1, 301):
-            recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
+            recorder.intake.take("robot/scan", "", bags.scan(seq))
             if seq % 20 == 0:  # 30 kB, more than a quarter of the queue, so it is written at once
                 wait(recorder, lambda now, seq=seq: now.written > seq - 10)
     paths = [tmp_path / name for name in ("s.mcap", "s_1.mcap", "s_2.mcap", "s_3.mcap")]
@@ -157,7 +155,7 @@ def test_a_recording_is_split_by_size_and_each_part_has_the_map(tmp_path: Path) 
     for path in paths[: recorder.status().files]:
         assert info(path).finished
         assert kept(path)["robot/map"] == 1
-    seqs = [seq for path in sorted(tmp_path.iterdir()) for seq in bag_rig.seqs(path, "robot/scan")]
+    seqs = [seq for path in sorted(tmp_path.iterdir()) for seq in bags.seqs(path, "robot/scan")]
     assert sorted(seqs) == list(range(1, 301))
 
 
@@ -165,7 +163,7 @@ def test_a_recording_is_split_by_time(tmp_path: Path) -> None:
     config = RecorderConfig(viewers=False, flush_s=0.01, keep_free_mb=0, split_s=0.2)
     with Recorder(tmp_path / "s.mcap", config) as recorder:
         for seq in range(1, 61):
-            recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
+            recorder.intake.take("robot/scan", "", bags.scan(seq))
             time.sleep(0.01)
     assert recorder.status().files >= 3
     assert sum(kept(path)["robot/scan"] for path in tmp_path.iterdir()) == 60
@@ -199,7 +197,7 @@ def test_killed_at_any_moment_it_loses_less_than_half_a_second(tmp_path: Path, s
             told = int(line)
             if told == stop:
                 process.send_signal(signal.SIGKILL)
-    seqs = bag_rig.seqs(path)
+    seqs = bags.seqs(path)
     assert seqs == list(range(1, seqs[-1] + 1))
     assert told - seqs[-1] <= 100
 
@@ -235,4 +233,4 @@ def test_a_disk_that_truly_takes_no_more_is_survived(tmp_path: Path) -> None:
     assert "cannot write" in told.stderr
     seen, written, dropped = map(int, told.stdout.split())
     assert seen == 100 == written + dropped
-    assert 20 < len(bag_rig.seqs(path, "robot/scan")) == written < 100
+    assert 20 < len(bags.seqs(path, "robot/scan")) == written < 100

@@ -4,9 +4,10 @@ import os
 import signal
 from pathlib import Path
 
+from gigabrain_zenoh.qa.faults.onlooker import looking_on
 from gigabrain_zenoh.recording.info import faults, info
-from tests.onlooker import looking_on
-from tests.stack import Home, endpoint_of, until
+from gigabrain_zenoh.testing.processes import Home, endpoint_of
+from gigabrain_zenoh.testing.waiting import until
 
 ALL = ["router", "driver", "perception", "decision", "control", "safety", "recorder"]
 

@@ -12,11 +12,12 @@ from gigabrain_schemas.topics import DESCRIBE
 from gigabrain_zenoh.config.process_config import ProcessConfig
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.qa.faults.onlooker import Onlooker, at_rest, looking_on
 from gigabrain_zenoh.runtime import audit_file
 from gigabrain_zenoh.runtime.deployment import Deployment, ProcessName
 from gigabrain_zenoh.security.authority import issue, new_fleet
-from tests.onlooker import Onlooker, at_rest, looking_on
-from tests.stack import Home, free_port, until
+from gigabrain_zenoh.testing.processes import Home, free_port
+from gigabrain_zenoh.testing.waiting import until
 from tests.system.test_netns import REST_TICKS, STOP_TICKS, Ears
 
 ROBOT: tuple[ProcessName, ...] = ("router", "driver", "control", "safety")

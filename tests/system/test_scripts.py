@@ -14,9 +14,7 @@ from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.scripts import LEASHED, Run, Scripts
 from gigabrain_zenoh.decision.tasks.store import TaskFile
 from gigabrain_zenoh.errors import ConfigError, Refused
-from tests.bus_rig import until
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
 
 
 def test_nothing_is_written_where_there_is_no_folder() -> None:

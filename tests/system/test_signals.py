@@ -1,4 +1,4 @@
-"""A few commands get signals at random moments; `python -m tests.signal_sweep` tries them all."""
+"""A few commands get signals at random moments; `tests.qa.signal_sweep` tries them all."""
 
 import random
 from collections.abc import Iterator
@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import pytest
 
 from gigabrain_zenoh.cli.app import COMMANDS
-from tests.signal_commands import CALLS
-from tests.signal_sweep import PATIENCE_S, Stage, attempt
+from tests.qa.signal_commands import CALLS
+from tests.qa.signal_sweep import PATIENCE_S, Stage, attempt
 
 FIRST_S = 1.5  # of a life: imports, start-up, and what it is for
 

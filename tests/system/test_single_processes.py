@@ -5,8 +5,9 @@ import signal
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE
 from gigabrain_zenoh.config.settings import Endpoint
-from tests.onlooker import looking_on
-from tests.stack import Home, free_port, until
+from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.testing.processes import Home, free_port
+from gigabrain_zenoh.testing.waiting import until
 
 
 async def test_a_missing_router_is_waited_for_and_said_in_one_line(home: Home) -> None:

@@ -14,19 +14,10 @@ from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.host.child import Child
 from gigabrain_zenoh.launch.specs import COMMAND
 from gigabrain_zenoh.runtime.supervisor import Backoff, ProcessSpec, Supervisor
-from tests.supervisor_rig import (
-    HANG,
-    QUICK,
-    SERVE,
-    Records,
-    freeze,
-    running,
-    spec,
-    until,
-)
+from gigabrain_zenoh.testing.waiting import until
+from tests.system.children import HANG, QUICK, SERVE, Records, freeze, running, spec
 
 pytestmark = [
-    pytest.mark.system,
     pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts"),
 ]
 

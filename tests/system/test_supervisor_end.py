@@ -6,7 +6,8 @@ import sys
 import pytest
 
 from gigabrain_zenoh.runtime.supervisor import Backoff, Supervisor
-from tests.supervisor_rig import (
+from gigabrain_zenoh.testing.waiting import until
+from tests.system.children import (
     CHILD,
     HANG,
     QUICK,
@@ -17,11 +18,9 @@ from tests.supervisor_rig import (
     freeze,
     running,
     spec,
-    until,
 )
 
 pytestmark = [
-    pytest.mark.system,
     pytest.mark.skipif(os.name != "posix", reason="the supervisor is for POSIX hosts"),
 ]
 

@@ -14,10 +14,12 @@ import yaml
 
 from gigabrain_zenoh.config.addresses import exposed
 from gigabrain_zenoh.config.loading import loads
+from gigabrain_zenoh.qa.faults.onlooker import looking_on
 from gigabrain_zenoh.runtime.deployment import Deployment, load_deployment
-from tests.dockerfile_steps import command, extras
-from tests.onlooker import looking_on
-from tests.stack import ROOT, Home, endpoint_of, until
+from gigabrain_zenoh.testing.processes import Home, endpoint_of
+from gigabrain_zenoh.testing.waiting import until
+from tests.places import ROOT
+from tests.qa.dockerfile_steps import command, extras
 
 UNIT = ROOT / "deploy" / "systemd" / "gigabrain@.service"
 DOCKER = ROOT / "deploy" / "docker"

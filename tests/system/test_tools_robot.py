@@ -15,9 +15,10 @@ import yaml
 from gigabrain_drivers.driver.catalog import robot_path
 from gigabrain_zenoh.diagnostics.graph import ORDER
 from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.qa.faults.onlooker import Onlooker, looking_on
 from gigabrain_zenoh.runtime.running import Running
-from tests.onlooker import Onlooker, looking_on
-from tests.stack import AVOID, Home, free_port, robot_of, until
+from gigabrain_zenoh.testing.processes import AVOID, Home, free_port, robot_of
+from gigabrain_zenoh.testing.waiting import until
 
 
 @pytest.fixture

@@ -15,9 +15,7 @@ from gigabrain_schemas.sensors import Imu, LaserScan
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
-from tests.lidar_rig import until
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
 
 ROBOTS = ["turtlebot3_burger", "turtlebot3_waffle"]
 

@@ -14,8 +14,10 @@ import pytest
 
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.config.settings import Endpoint
-from tests.onlooker import looking_on
-from tests.stack import AVOID, ROOT, Command, Home, endpoint_of, free_port, robot_of, until
+from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.testing.processes import AVOID, Command, Home, endpoint_of, free_port, robot_of
+from gigabrain_zenoh.testing.waiting import until
+from tests.places import ROOT
 
 ALL = ["router", "driver", "perception", "decision", "control", "safety"]
 READY = re.compile(r"^\S+ (\w+) +info +ready pid=\d+$", re.MULTILINE)

@@ -1,10 +1,6 @@
 import subprocess
 import sys
 
-import pytest
-
-pytestmark = pytest.mark.system
-
 DRIVE = """
 import importlib, pkgutil
 from numba.core.registry import CPUDispatcher

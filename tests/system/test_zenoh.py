@@ -25,22 +25,20 @@ from gigabrain_zenoh.bus.mailbox import Mailbox
 from gigabrain_zenoh.bus.zenoh import transport as zenoh_transport
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
-from tests.bus_rig import until
-from tests.zenoh_rig import Ear, Robot, repeat, robot
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.zenoh import Ear, ZenohNetwork, repeat, robot
 
 REPLY = GateReply(ok=True, text="stopped", robot_type="mock", gate=GateStatus())
 
 
 @pytest.fixture
-async def net() -> AsyncIterator[Robot]:
+async def net() -> AsyncIterator[ZenohNetwork]:
     async with robot() as made:
         await made.router()
         yield made
 
 
-async def test_what_is_sent_arrives_unchanged(net: Robot) -> None:
+async def test_what_is_sent_arrives_unchanged(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
     ear, star = Ear(receiver, "robot/teleop"), Ear(receiver, "robot/image/*")
     payload = bytes(range(256)) * 3
@@ -55,7 +53,7 @@ async def test_what_is_sent_arrives_unchanged(net: Robot) -> None:
     assert set(star.heard) == {("robot/image/front", b""), ("robot/image/rear", payload)}
 
 
-async def test_a_message_of_a_megabyte_arrives_whole(net: Robot) -> None:
+async def test_a_message_of_a_megabyte_arrives_whole(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
     ear = Ear(receiver, "robot/map")
     payload = bytes(range(256)) * 4096
@@ -63,7 +61,7 @@ async def test_a_message_of_a_megabyte_arrives_whole(net: Robot) -> None:
     assert set(ear.payloads) == {payload}
 
 
-async def test_messages_keep_their_order(net: Robot) -> None:
+async def test_messages_keep_their_order(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
     ear = Ear(receiver, "robot/cmd_vel")
     count = itertools.count()
@@ -77,7 +75,9 @@ async def test_messages_keep_their_order(net: Robot) -> None:
     assert numbers == sorted(set(numbers))
 
 
-async def test_each_topic_goes_out_with_the_quality_of_service_of_its_line(net: Robot) -> None:
+async def test_each_topic_goes_out_with_the_quality_of_service_of_its_line(
+    net: ZenohNetwork,
+) -> None:
     samples: dict[str, zenoh.Sample] = {}
     net.raw().declare_subscriber("robot/**", lambda s: samples.update({str(s.key_expr): s}))
     bus = Bus(await net.client(), Clock())
@@ -116,7 +116,7 @@ def publish_200_without_leaving_the_loop(sender: ZenohTransport, arrived: list[b
 
 @pytest.mark.parametrize("depth", [1, 16])
 async def test_a_busy_loop_gets_the_newest_and_not_the_backlog(
-    net: Robot, depth: int, monkeypatch: pytest.MonkeyPatch
+    net: ZenohNetwork, depth: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arrived: list[bytes] = []
 
@@ -136,7 +136,7 @@ async def test_a_busy_loop_gets_the_newest_and_not_the_backlog(
     assert ear.payloads[:depth] == newest
 
 
-async def test_who_has_stopped_listening_hears_nothing(net: Robot) -> None:
+async def test_who_has_stopped_listening_hears_nothing(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
     ear, other = Ear(receiver, "robot/teleop"), Ear(receiver, "robot/teleop")
     ear.close()
@@ -145,7 +145,7 @@ async def test_who_has_stopped_listening_hears_nothing(net: Robot) -> None:
     assert ear.heard == []
 
 
-async def test_a_message_on_the_bus_is_the_same_over_zenoh(net: Robot) -> None:
+async def test_a_message_on_the_bus_is_the_same_over_zenoh(net: ZenohNetwork) -> None:
     one, two = Bus(await net.client(), Clock(), "one"), Bus(await net.client(), Clock(), "two")
     states = two.latest(STATE)
     one.time.boot, one.time.tick = 7, 50
@@ -158,7 +158,7 @@ async def test_a_message_on_the_bus_is_the_same_over_zenoh(net: Robot) -> None:
     assert (two.time.boot, two.time.tick) == (7, 50)
 
 
-async def test_a_client_of_another_language_may_send_json(net: Robot) -> None:
+async def test_a_client_of_another_language_may_send_json(net: ZenohNetwork) -> None:
     bus, raw = Bus(await net.client(), Clock()), net.raw()
     seen: set[float] = set()
     bus.subscribe(TELEOP, lambda _, twist: seen.add(twist.linear_x))
@@ -177,7 +177,7 @@ async def test_a_client_of_another_language_may_send_json(net: Robot) -> None:
     ids=["random", "nan", "oversized", "delete"],
 )
 async def test_what_a_hostile_client_sends_is_dropped_and_counted(
-    net: Robot, payload: bytes | None
+    net: ZenohNetwork, payload: bytes | None
 ) -> None:
     bus, raw = Bus(await net.client(), Clock()), net.raw()
     twists = bus.latest(TELEOP)
@@ -194,7 +194,7 @@ async def test_what_a_hostile_client_sends_is_dropped_and_counted(
     assert not bus.failed.done()
 
 
-async def test_what_is_far_too_large_ends_at_the_router(net: Robot) -> None:
+async def test_what_is_far_too_large_ends_at_the_router(net: ZenohNetwork) -> None:
     bus, raw = Bus(await net.client(), Clock()), net.raw()
     twists = bus.latest(TELEOP)
 
@@ -206,7 +206,7 @@ async def test_what_is_far_too_large_ends_at_the_router(net: Robot) -> None:
     assert bus.rejected["robot/teleop"] == 0
 
 
-async def test_nobody_is_more_urgent_than_what_he_says(net: Robot) -> None:
+async def test_nobody_is_more_urgent_than_what_he_says(net: ZenohNetwork) -> None:
     samples: dict[str, zenoh.Sample] = {}
     net.raw().declare_subscriber("red/**", lambda s: samples.update({str(s.key_expr): s}))
     raw = net.raw()
@@ -229,7 +229,7 @@ async def test_nobody_is_more_urgent_than_what_he_says(net: Robot) -> None:
     }
 
 
-async def test_late_joiners_get_the_kept_value(net: Robot) -> None:
+async def test_late_joiners_get_the_kept_value(net: ZenohNetwork) -> None:
     one = Bus(await net.client(), Clock(), "one")
     one.publish(MAP, example(OccupancyGrid))
     sent = one.publish(MAP, example(OccupancyGrid))

@@ -13,10 +13,15 @@ from gigabrain_schemas.topics import SCAN, TELEOP
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
-from tests.bus_rig import until
-from tests.zenoh_rig import Ear, free_endpoint, repeat, robot, router_process, under_way
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.zenoh import (
+    Ear,
+    free_endpoint,
+    repeat,
+    robot,
+    router_process,
+    under_way,
+)
 
 
 def client_of(endpoint: str) -> Awaitable[ZenohTransport]:

@@ -8,14 +8,12 @@ from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import DESCRIBE, HEALTH, TELEOP
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.clock import Clock
-from tests.bus_rig import until
-from tests.zenoh_rig import Ear, Robot, repeat, robot
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.zenoh import Ear, ZenohNetwork, repeat, robot
 
 
 @pytest.fixture
-async def net() -> AsyncIterator[Robot]:
+async def net() -> AsyncIterator[ZenohNetwork]:
     async with robot() as made:
         yield made
 
@@ -24,7 +22,7 @@ async def describe(_: DescribeRequest) -> Description:
     return example(Description)
 
 
-async def test_two_robots_on_one_router_do_not_hear_each_other(net: Robot) -> None:
+async def test_two_robots_on_one_router_do_not_hear_each_other(net: ZenohNetwork) -> None:
     await net.router()
     red, blue = await net.client("red"), await net.client("blue")
     red_ear, blue_ear = Ear(await net.client("red"), "robot/*"), Ear(blue, "robot/*")
@@ -38,7 +36,7 @@ async def test_two_robots_on_one_router_do_not_hear_each_other(net: Robot) -> No
     assert set(blue_ear.heard) == {("robot/teleop", b"blue")}
 
 
-async def test_the_fleet_hears_each_robot_under_its_name(net: Robot) -> None:
+async def test_the_fleet_hears_each_robot_under_its_name(net: ZenohNetwork) -> None:
     await net.router()
     red, fleet = await net.client("red"), await net.client()
     ear = Ear(fleet, "red/robot/*")
@@ -46,7 +44,7 @@ async def test_the_fleet_hears_each_robot_under_its_name(net: Robot) -> None:
     assert set(ear.heard) == {("red/robot/teleop", b"x")}
 
 
-async def test_a_question_stays_within_its_robot(net: Robot) -> None:
+async def test_a_question_stays_within_its_robot(net: ZenohNetwork) -> None:
     await net.router()
     red, blue = Bus(await net.client("red"), Clock()), Bus(await net.client("blue"), Clock())
     asker = Bus(await net.client("red"), Clock())
@@ -58,7 +56,7 @@ async def test_a_question_stays_within_its_robot(net: Robot) -> None:
     assert replies == [example(Description)]
 
 
-async def test_a_router_in_a_namespace_is_one_of_the_robots_processes(net: Robot) -> None:
+async def test_a_router_in_a_namespace_is_one_of_the_robots_processes(net: ZenohNetwork) -> None:
     """It answers and reports there, and still joins those of any other namespace."""
     router = Bus(await net.router("red"), Clock(), "router")
     red, fleet = Bus(await net.client("red"), Clock()), await net.client()
@@ -80,7 +78,7 @@ async def test_a_router_in_a_namespace_is_one_of_the_robots_processes(net: Robot
     assert not await Bus(blue, Clock()).ask(DESCRIBE, DescribeRequest(), name="router")
 
 
-async def test_a_router_in_a_namespace_hears_its_robot(net: Robot) -> None:
+async def test_a_router_in_a_namespace_hears_its_robot(net: ZenohNetwork) -> None:
     router, red = await net.router("red"), await net.client("red")
     ear = Ear(router, "robot/teleop")
     await repeat(lambda: red.publish(TELEOP, "robot/teleop", b"x", ""), lambda: ear.heard)

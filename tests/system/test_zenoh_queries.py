@@ -10,13 +10,11 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import Refused
-from tests.zenoh_rig import Robot, robot
-
-pytestmark = pytest.mark.system
+from gigabrain_zenoh.testing.zenoh import ZenohNetwork, robot
 
 
 @pytest.fixture
-async def net() -> AsyncIterator[Robot]:
+async def net() -> AsyncIterator[ZenohNetwork]:
     async with robot() as made:
         await made.router()
         yield made
@@ -64,7 +62,7 @@ async def ask(
                 return replies
 
 
-async def test_a_query_has_its_answer(net: Robot) -> None:
+async def test_a_query_has_its_answer(net: ZenohNetwork) -> None:
     server, asker = await net.client(), await net.client()
     server.serve("robot/goal", echo)
     assert await ask(asker, "robot/goal", b"abc") == [b"cba"]
@@ -72,7 +70,7 @@ async def test_a_query_has_its_answer(net: Robot) -> None:
     assert await ask(asker, "robot/goal", bytes(64 * 1024)) == [bytes(64 * 1024)]
 
 
-async def test_a_kept_value_of_a_megabyte_is_answered_whole(net: Robot) -> None:
+async def test_a_kept_value_of_a_megabyte_is_answered_whole(net: ZenohNetwork) -> None:
     async def answer(_: bytes) -> tuple[bytes, str]:
         return bytes(range(256)) * 4096, ""
 
@@ -81,18 +79,18 @@ async def test_a_kept_value_of_a_megabyte_is_answered_whole(net: Robot) -> None:
     assert await ask(asker, "robot/map") == [bytes(range(256)) * 4096]
 
 
-async def test_a_refusal_is_a_text(net: Robot) -> None:
+async def test_a_refusal_is_a_text(net: ZenohNetwork) -> None:
     server, asker = await net.client(), await net.client()
     server.serve("robot/goal", refuse)
     assert await ask(asker, "robot/goal", b"now") == ["not now: ümläut"]
 
 
-async def test_a_query_that_nobody_serves_has_no_answer(net: Robot) -> None:
+async def test_a_query_that_nobody_serves_has_no_answer(net: ZenohNetwork) -> None:
     asker = await net.client()
     assert await asker.query("robot/goal", b"", "", 30.0, "data") == []
 
 
-async def test_an_answer_that_is_late_is_none(net: Robot) -> None:
+async def test_an_answer_that_is_late_is_none(net: ZenohNetwork) -> None:
     late = Late()
     server, asker = await net.client(), await net.client()
     server.serve("robot/goal", late.answer)
@@ -100,7 +98,7 @@ async def test_an_answer_that_is_late_is_none(net: Robot) -> None:
         assert await asker.query("robot/goal", b"", "", 0.2, "data") == []
 
 
-async def test_all_who_serve_a_key_answer(net: Robot) -> None:
+async def test_all_who_serve_a_key_answer(net: ZenohNetwork) -> None:
     one, two, asker = await net.client(), await net.client(), await net.client()
     one.serve("robot/goal", echo)
     two.serve("robot/goal", refuse)
@@ -108,7 +106,7 @@ async def test_all_who_serve_a_key_answer(net: Robot) -> None:
     assert set(replies) == {b"cba", "not abc: ümläut"}
 
 
-async def test_a_query_may_name_many_keys_at_once(net: Robot) -> None:
+async def test_a_query_may_name_many_keys_at_once(net: ZenohNetwork) -> None:
     server, asker = await net.client(), await net.client()
     for process in ("driver", "control", "safety"):
         server.serve(f"robot/describe/{process}", echo)
@@ -116,13 +114,13 @@ async def test_a_query_may_name_many_keys_at_once(net: Robot) -> None:
     assert await ask(asker, "robot/describe/*", b"ab", 3) == [b"ba"] * 3
 
 
-async def test_a_session_answers_its_own_queries(net: Robot) -> None:
+async def test_a_session_answers_its_own_queries(net: ZenohNetwork) -> None:
     client = await net.client()
     client.serve("robot/goal", echo)
     assert await ask(client, "robot/goal", b"ab") == [b"ba"]
 
 
-async def test_who_serves_no_more_does_not_answer(net: Robot) -> None:
+async def test_who_serves_no_more_does_not_answer(net: ZenohNetwork) -> None:
     server, asker = await net.client(), await net.client()
     close = server.serve("robot/goal", echo)
     server.serve("robot/mission", echo)
@@ -133,7 +131,7 @@ async def test_who_serves_no_more_does_not_answer(net: Robot) -> None:
     assert await ask(asker, "robot/goal", b"ab", 0) == []
 
 
-async def test_an_asker_gets_nothing_at_once_when_the_server_leaves(net: Robot) -> None:
+async def test_an_asker_gets_nothing_at_once_when_the_server_leaves(net: ZenohNetwork) -> None:
     late = Late()
     server, asker = await net.client(), await net.client()
     server.serve("robot/goal", late.answer)
@@ -143,7 +141,7 @@ async def test_an_asker_gets_nothing_at_once_when_the_server_leaves(net: Robot) 
         assert await asking == []
 
 
-async def test_an_asker_that_leaves_does_not_wait(net: Robot) -> None:
+async def test_an_asker_that_leaves_does_not_wait(net: ZenohNetwork) -> None:
     server, asker = await net.client(), await net.client()
     late = Late()
     server.serve("robot/goal", late.answer)
@@ -153,7 +151,7 @@ async def test_an_asker_that_leaves_does_not_wait(net: Robot) -> None:
         assert await asking == []
 
 
-async def test_an_asker_that_is_cancelled_leaves_nothing_behind(net: Robot) -> None:
+async def test_an_asker_that_is_cancelled_leaves_nothing_behind(net: ZenohNetwork) -> None:
     server, asker = await net.client(), await net.client()
     late = Late()
     server.serve("robot/goal", late.answer)
@@ -165,7 +163,9 @@ async def test_an_asker_that_is_cancelled_leaves_nothing_behind(net: Robot) -> N
     assert await ask(asker, "robot/mission", b"ab") == [b"ba"]
 
 
-async def test_a_question_on_the_bus_crosses_zenoh_and_so_does_its_answer(net: Robot) -> None:
+async def test_a_question_on_the_bus_crosses_zenoh_and_so_does_its_answer(
+    net: ZenohNetwork,
+) -> None:
     async def answer(request: EstopRequest) -> GateReply:
         if request.reason == "fun":
             raise Refused("not for fun")
@@ -182,7 +182,7 @@ async def test_a_question_on_the_bus_crosses_zenoh_and_so_does_its_answer(net: R
         await two.ask(ESTOP, EstopRequest(reason="fun"), timeout_s=20)
 
 
-async def test_garbage_is_refused_over_zenoh_in_words(net: Robot) -> None:
+async def test_garbage_is_refused_over_zenoh_in_words(net: ZenohNetwork) -> None:
     async def answer(_: EstopRequest) -> GateReply:
         return GateReply(ok=True, text="", robot_type="mock", gate=GateStatus())
 

@@ -25,7 +25,8 @@ from gigabrain_schemas.topics import (
     WORLD,
     Topic,
 )
-from tests.bus_rig import Net, settle
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.waiting import settle
 
 SECOND_NS = 1_000_000_000
 GRID = example(OccupancyGrid)

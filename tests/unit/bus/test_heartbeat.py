@@ -19,7 +19,7 @@ from gigabrain_zenoh.host.backoff import Backoff
 from gigabrain_zenoh.host.child import Child
 from gigabrain_zenoh.qa.faults.hanging import PARTS, HangingBus
 from gigabrain_zenoh.runtime.keeper import Keeper, ProcessSpec, Shared
-from tests.brain_in_memory import BRAIN, Robot
+from gigabrain_zenoh.testing.brain import BRAIN, RobotInMemory
 
 SECOND_TICKS = 50
 
@@ -138,7 +138,7 @@ async def test_a_debugger_has_all_the_time_it_wants() -> None:
     assert not keeper.stuck
 
 
-async def beats(robot: Robot, name: str, seconds: int) -> list[bool]:
+async def beats(robot: RobotInMemory, name: str, seconds: int) -> list[bool]:
     """In which seconds a process of the robot makes progress."""
     made = []
     for _ in range(seconds):
@@ -148,7 +148,7 @@ async def beats(robot: Robot, name: str, seconds: int) -> list[bool]:
 
 
 async def test_a_robot_that_drives_makes_progress_in_every_second(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(SECOND_TICKS)
         for name in (*BRAIN, "driver"):
             robot.bus(name).progress()
@@ -158,7 +158,7 @@ async def test_a_robot_that_drives_makes_progress_in_every_second(tmp_path: Path
 @pytest.mark.parametrize("name", BRAIN)
 async def test_who_hears_nothing_any_more_is_well(name: str, tmp_path: Path) -> None:
     """Its upstream is dead, or the link is."""
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(2 * SECOND_TICKS)
         robot.freeze(name)
         await beats(robot, name, 1)
@@ -170,7 +170,7 @@ async def test_who_is_not_reached_by_its_own_input_makes_no_progress(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Messages come and are decoded; the part that should handle them never does."""
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(SECOND_TICKS)
         await robot.kill(name)
         hangs = threading.Event()
@@ -194,7 +194,7 @@ async def test_a_plan_that_never_ends_is_no_progress(
             return beside.overdue > 200
 
     monkeypatch.setattr(behaviours, "senses", lambda _config, _bus: Beside())
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(SECOND_TICKS)
         robot.bus("decision").progress()
         for _ in range(210):
@@ -209,7 +209,7 @@ async def test_a_plan_that_never_ends_is_no_progress(
     beside.close()
 
 
-def world_of(robot: Robot, late_ticks: int) -> WorldModel:
+def world_of(robot: RobotInMemory, late_ticks: int) -> WorldModel:
     """A world that took so long to come."""
     assert robot.state
     then = robot.state.tick - late_ticks
@@ -219,7 +219,7 @@ def world_of(robot: Robot, late_ticks: int) -> WorldModel:
 
 
 async def test_old_worlds_are_looked_at_and_refused_which_is_progress(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(SECOND_TICKS)
         await robot.kill("perception")
         await robot.go(SECOND_TICKS)
@@ -234,7 +234,7 @@ async def test_old_worlds_are_looked_at_and_refused_which_is_progress(tmp_path: 
 
 
 async def test_a_driver_whose_body_stands_still_makes_no_progress(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(SECOND_TICKS)
         bus = robot.bus("driver")
         robot.clock.stall(1_000_000_000)  # time goes on, and no tick

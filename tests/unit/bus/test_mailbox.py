@@ -5,7 +5,7 @@ import pytest
 
 from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.bus.mailbox import Mailbox
-from tests.bus_rig import in_thread, until
+from gigabrain_zenoh.testing.waiting import in_thread, until
 
 
 class Hand:

@@ -12,7 +12,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.questions import Questions
 from gigabrain_zenoh.bus.transport import LocalNetwork, LocalTransport
 from gigabrain_zenoh.clock import FakeClock
-from tests.bus_rig import in_thread, until
+from gigabrain_zenoh.testing.waiting import in_thread, until
 
 
 class Rig:

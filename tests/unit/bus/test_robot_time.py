@@ -13,8 +13,8 @@ from gigabrain_zenoh.bus.earlier import Earlier
 from gigabrain_zenoh.bus.freshness import RobotTime
 from gigabrain_zenoh.bus.sampled import Sampled
 from gigabrain_zenoh.errors import ClockLost
-from tests.brain_rig import BOOT, open_space, scan, state
-from tests.bus_rig import Net
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.samples import BOOT, open_space, scan, state
 
 SECOND_NS = 1_000_000_000
 FAR = 2**37

@@ -12,8 +12,9 @@ from gigabrain_schemas.topics import GOAL
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.decision.tasks.orders import GoTo, Outcome
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
-from tests.bus_rig import Net, until
-from tests.tasks_rig import Site
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.waiting import until
+from tests.unit.decision.sites import Site
 
 
 @pytest.fixture

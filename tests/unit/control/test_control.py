@@ -10,8 +10,8 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_zenoh.control.node import Memory
-from tests.brain_rig import DRIVING
-from tests.control_rig import SHUT, Drive, want
+from gigabrain_zenoh.testing.samples import DRIVING
+from tests.unit.control.straight import SHUT, Drive, want
 
 
 def test_it_ramps_from_zero_to_what_decision_wants() -> None:

@@ -10,8 +10,8 @@ from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_zenoh.control.node import Inputs, Memory, step
-from tests.brain_rig import DRIVING, WAFFLE, state
-from tests.control_rig import SHUT, Drive, want
+from gigabrain_zenoh.testing.samples import DRIVING, WAFFLE, state
+from tests.unit.control.straight import SHUT, Drive, want
 
 
 @pytest.mark.parametrize(("passed", "step_up"), [(1, 0.02), (2, 0.04), (5, 0.1), (50, 0.1)])

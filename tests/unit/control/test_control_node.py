@@ -14,7 +14,8 @@ from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.control.node import EarlierCaps
 from gigabrain_zenoh.control.teleop import Teleop
 from gigabrain_zenoh.geometry.limits import NO_CAPS
-from tests.brain_rig import BOOT, DRIVING, TICK_NS, WAFFLE, Bench, body, state
+from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, WAFFLE, body, state
 
 MS = 1_000_000
 
@@ -34,7 +35,7 @@ def verdict(tick: int, forward: float | None = None, *, boot: int = BOOT) -> Saf
     return SafetyState(verdict="ok", caps=SpeedCaps(forward=forward), boot=boot, tick=tick)
 
 
-class Chain(Bench):
+class Chain(NodeBench):
     """Control, with the messages that drive it, and a body that follows at once."""
 
     def __init__(self) -> None:

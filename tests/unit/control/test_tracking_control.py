@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Response
-from tests.tracking_rig import AGILE, SLOW, Course, Path, Plant, errors, ess
+from tests.unit.control.tracking import AGILE, SLOW, Course, Path, Plant, errors, ess
 
 SIDEWAYS = replace(AGILE, drive_type="omni", max_lateral_speed=1.0)
 CAR = replace(AGILE, drive_type="ackermann", max_angular_speed=2.0)

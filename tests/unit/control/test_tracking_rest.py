@@ -13,8 +13,9 @@ from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.control.node import Inputs, step
 from gigabrain_zenoh.control.tracking import predicted
 from gigabrain_zenoh.geometry.planar import compose
-from tests.brain_rig import Bench, body, state
-from tests.tracking_rig import SLOW, Course, Plant, errors, ess, relocated
+from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.samples import body, state
+from tests.unit.control.tracking import SLOW, Course, Plant, errors, ess, relocated
 
 
 def test_beside_its_trajectory_a_body_comes_back_to_it() -> None:
@@ -74,7 +75,7 @@ async def test_the_process_brakes_and_says_so_once_when_it_is_too_far_off(
 ) -> None:
     caplog.set_level("INFO", "gigabrain_zenoh.control.node")
     course, speeds = Course(lambda t: Velocity(linear_x=0.2), 6.0), []
-    async with Bench(control.run) as bench:
+    async with NodeBench(control.run) as bench:
         bench.send(BODY, body())
         x = 0.0
         for tick in range(1, 121):

@@ -13,7 +13,8 @@ from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, WORLD
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import UnknownName
-from tests.brain_rig import LIDAR, WAFFLE, Bench, body, state
+from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, body, state
 
 CONFIG = DecisionConfig()
 
@@ -29,8 +30,8 @@ def world(tick: int, *, ahead: bool = False, boot: int = 7) -> WorldModel:
     )
 
 
-def bench(config: DecisionConfig = CONFIG) -> Bench:
-    return Bench(functools.partial(decision.run, config))
+def bench(config: DecisionConfig = CONFIG) -> NodeBench:
+    return NodeBench(functools.partial(decision.run, config))
 
 
 def heads(intents: list[Intent]) -> list[tuple[int, int, str]]:
@@ -153,7 +154,7 @@ async def test_an_unknown_behaviour_ends_the_process_before_it_begins() -> None:
 
 async def test_it_comes_to_rest_when_safety_warns_of_an_empty_battery() -> None:
     low = Cause(code="battery_return", text="battery at 6 %")
-    async with Bench(functools.partial(decision.run, CONFIG)) as bench:
+    async with NodeBench(functools.partial(decision.run, CONFIG)) as bench:
         bench.send(BODY, body())
         found = []
         for tick in range(1, 5):

@@ -14,8 +14,8 @@ from gigabrain_zenoh.decision.behaviours.bearings import Driven, Route
 from gigabrain_zenoh.decision.behaviours.guide import Asked, Guide
 from gigabrain_zenoh.decision.tasks.orders import GoTo
 from gigabrain_zenoh.errors import Refused
-from tests.local_rig import WAFFLE
-from tests.navigation_rig import empty, grid_of
+from tests.unit.navigation.drives import WAFFLE
+from tests.unit.navigation.grids import empty, grid_of
 
 OPEN = empty(6.0, 2.0)
 SHUT = OPEN.copy()

@@ -7,7 +7,7 @@ import pytest
 from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.tasks.mission import Script
-from tests.tasks_rig import Robot, one_robot
+from tests.unit.decision.sites import Robot, one_robot
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import CmdVel, Response
 from gigabrain_zenoh.decision.response import PRIOR, ResponseEstimator
-from tests.brain_rig import BOOT, DRIVING, state
+from gigabrain_zenoh.testing.samples import BOOT, DRIVING, state
 
 PARTS = 4  # of a tick, in which the plant moves
 

@@ -7,7 +7,7 @@ import pytest
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.tasks.orders import became
 from gigabrain_zenoh.errors import Refused
-from tests.tasks_rig import Robot, one_robot
+from tests.unit.decision.sites import Robot, one_robot
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ from gigabrain_zenoh.decision.tasks import checks, service
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.tasks.orders import GoTo, Outcome
 from gigabrain_zenoh.decision.tasks.store import TaskFile
-from tests.brain_rig import BOOT, state
-from tests.bus_rig import settle
-from tests.tasks_rig import Site
+from gigabrain_zenoh.testing.samples import BOOT, state
+from gigabrain_zenoh.testing.waiting import settle
+from tests.unit.decision.sites import Site
 
 
 @pytest.fixture

@@ -31,7 +31,8 @@ from gigabrain_zenoh.diagnostics.topic_watch import Shown, echo, in_words, shown
 from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName
 from gigabrain_zenoh.runtime.health import publish_health
 from gigabrain_zenoh.runtime.name_claim import NameClaim
-from tests.bus_rig import Net, settle
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.waiting import settle
 
 SCAN_BYTES = codec.encode(example(LaserScan))
 

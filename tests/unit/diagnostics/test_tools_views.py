@@ -43,7 +43,7 @@ from gigabrain_zenoh.diagnostics.top_rows import (
 )
 from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
 from gigabrain_zenoh.runtime.param_service import serve_params
-from tests.bus_rig import Net
+from gigabrain_zenoh.testing.bus import Net
 
 FLOWS = [
     Flow("control", "robot/cmd_vel", "driver", 50.0),

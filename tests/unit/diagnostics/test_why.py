@@ -22,12 +22,12 @@ from gigabrain_zenoh.diagnostics.why_facts import Facts, Watcher
 from gigabrain_zenoh.gate.causes import estop
 from gigabrain_zenoh.runtime.health import publish_health
 from gigabrain_zenoh.runtime.name_claim import NameClaim
-from tests.brain_in_memory import Robot
+from gigabrain_zenoh.testing.brain import RobotInMemory
 
-Break = Callable[[Robot], Awaitable[None]]
+Break = Callable[[RobotInMemory], Awaitable[None]]
 
 
-async def asked(robot: Robot, command: CmdVel | None = None) -> Verdict:
+async def asked(robot: RobotInMemory, command: CmdVel | None = None) -> Verdict:
     """What `why` says of the next second and a half, in which somebody may send a command."""
     bus = Bus(robot.network.transport(), robot.clock, "why")
     look = asyncio.ensure_future(Watcher(bus).look())
@@ -41,7 +41,7 @@ async def asked(robot: Robot, command: CmdVel | None = None) -> Verdict:
 
 async def broken(folder: Path, do: Break, *, wait: int = 60) -> tuple[str, int, str, str]:
     """The broken link once `do` has been done: its exit code, what is said, what to do."""
-    async with Robot(folder) as robot:
+    async with RobotInMemory(folder) as robot:
         await robot.go(100)
         await do(robot)
         await robot.go(wait)
@@ -54,7 +54,7 @@ async def broken(folder: Path, do: Break, *, wait: int = 60) -> tuple[str, int, 
 async def test_a_robot_that_moves_is_said_to_move_with_figures_for_each_link(
     tmp_path: Path,
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(100)
         verdict = await asked(robot)
     assert (verdict.broken, verdict.exit_code, verdict.notes) == (None, 0, ())
@@ -89,7 +89,7 @@ def test_without_a_router_nothing_else_is_judged() -> None:
 async def test_a_process_that_is_dead_or_hangs_is_named(
     how: str, process: str, link: str, code: int, what: str, tmp_path: Path
 ) -> None:
-    async def do(robot: Robot) -> None:
+    async def do(robot: RobotInMemory) -> None:
         if how == "kill":
             await robot.kill(process)
         else:
@@ -103,7 +103,7 @@ async def test_a_process_that_is_dead_or_hangs_is_named(
 async def test_a_process_that_answers_and_says_nothing_is_told_from_one_that_is_gone(
     tmp_path: Path,
 ) -> None:
-    async def do(robot: Robot) -> None:
+    async def do(robot: RobotInMemory) -> None:
         await robot.kill("perception")
         answering = asyncio.ensure_future(
             NameClaim(Bus(robot.network.transport(), robot.clock, "perception")).take()
@@ -118,7 +118,7 @@ async def test_a_process_that_answers_and_says_nothing_is_told_from_one_that_is_
 async def test_a_driver_that_is_gone_is_named_and_nothing_behind_it_is_judged(
     tmp_path: Path,
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(100)
         await robot.kill("driver")
         await robot.go(60)
@@ -127,7 +127,7 @@ async def test_a_driver_that_is_gone_is_named_and_nothing_behind_it_is_judged(
     assert verdict.exit_code == 11
 
 
-def telling(robot: Robot, change: Callable[[RobotState], RobotState]) -> None:
+def telling(robot: RobotInMemory, change: Callable[[RobotState], RobotState]) -> None:
     """From now on the body says something else of itself."""
     read = robot.body.read_state
 
@@ -140,7 +140,7 @@ def telling(robot: Robot, change: Callable[[RobotState], RobotState]) -> None:
 async def test_an_unplugged_body_is_named_before_all_that_follows_from_it(tmp_path: Path) -> None:
     gone = LinkHealth(connected=False, age_ms=2400)
 
-    async def do(robot: Robot) -> None:
+    async def do(robot: RobotInMemory) -> None:
         robot.body._look = lambda: None  # type: ignore[method-assign]
         telling(robot, lambda state: replace(state, link=gone))
 
@@ -149,7 +149,7 @@ async def test_an_unplugged_body_is_named_before_all_that_follows_from_it(tmp_pa
     assert "power" in found[3]
 
 
-def seeing(robot: Robot, ranges: float) -> None:
+def seeing(robot: RobotInMemory, ranges: float) -> None:
     """From now on the lidar sees nothing but this distance [m], about."""
     look = robot.body._look
 
@@ -162,7 +162,7 @@ def seeing(robot: Robot, ranges: float) -> None:
 
 
 async def test_a_blind_lidar_is_named(tmp_path: Path) -> None:
-    async def do(robot: Robot) -> None:
+    async def do(robot: RobotInMemory) -> None:
         seeing(robot, float("nan"))
 
     found = await broken(tmp_path, do)
@@ -170,7 +170,7 @@ async def test_a_blind_lidar_is_named(tmp_path: Path) -> None:
 
 
 async def test_a_lidar_that_sends_nothing_is_named(tmp_path: Path) -> None:
-    async def do(robot: Robot) -> None:
+    async def do(robot: RobotInMemory) -> None:
         robot.body._look = lambda: None  # type: ignore[method-assign]
 
     found = await broken(tmp_path, do)
@@ -184,7 +184,7 @@ async def test_a_scan_that_is_too_old_is_named(tmp_path: Path) -> None:
 
 
 async def test_walls_all_round_are_named(tmp_path: Path) -> None:
-    async def do(robot: Robot) -> None:
+    async def do(robot: RobotInMemory) -> None:
         seeing(robot, 0.16)
 
     found = await broken(tmp_path, do)
@@ -205,7 +205,7 @@ async def test_walls_all_round_are_named(tmp_path: Path) -> None:
 async def test_a_hot_motor_and_an_empty_battery_are_named(
     change: Callable[[RobotState], RobotState], words: str, tmp_path: Path
 ) -> None:
-    async def do(robot: Robot) -> None:
+    async def do(robot: RobotInMemory) -> None:
         telling(robot, change)
 
     link, code, text, remedy = await broken(tmp_path, do, wait=150)
@@ -216,7 +216,7 @@ async def test_a_hot_motor_and_an_empty_battery_are_named(
 
 
 async def test_a_latched_gate_is_named_with_the_way_out(tmp_path: Path) -> None:
-    async def do(robot: Robot) -> None:
+    async def do(robot: RobotInMemory) -> None:
         await robot.operator.ask(ESTOP, EstopRequest(source="ann"))
 
     found = await broken(tmp_path, do)
@@ -225,7 +225,7 @@ async def test_a_latched_gate_is_named_with_the_way_out(tmp_path: Path) -> None:
 
 
 async def test_a_gate_that_nobody_enables_is_named(tmp_path: Path) -> None:
-    async def do(robot: Robot) -> None:
+    async def do(robot: RobotInMemory) -> None:
         await robot.operator.ask(ESTOP, EstopRequest(source="ann"))
         await robot.go(40)
         await robot.operator.ask(RELEASE, ReleaseRequest(estop_generation=1, source="ann"))
@@ -237,7 +237,7 @@ async def test_a_gate_that_nobody_enables_is_named(tmp_path: Path) -> None:
 
 
 async def test_a_second_commander_that_has_the_body_is_named(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(100)
         await robot.operator.ask(ENABLE, EnableRequest(source="bob", take=True, by="bob"))
         sending = Bus(robot.network.transport(), robot.clock, "bob")
@@ -253,7 +253,7 @@ async def test_a_second_commander_that_has_the_body_is_named(tmp_path: Path) -> 
 
 
 async def test_a_second_commander_in_vain_is_noted(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(100)
         verdict = await asked(robot, CmdVel(linear_x=0.1, source="eve"))
     assert verdict.broken is None
@@ -261,7 +261,7 @@ async def test_a_second_commander_in_vain_is_noted(tmp_path: Path) -> None:
 
 
 async def test_an_operator_s_seat_that_holds_still_is_named(tmp_path: Path) -> None:
-    async def do(robot: Robot) -> None:
+    async def do(robot: RobotInMemory) -> None:
         for _ in range(40):  # half a second of it is not believed
             robot.operator.publish(TELEOP, Twist(linear_x=0.0))
             await robot.go(2)
@@ -392,7 +392,7 @@ def test_a_decision_that_is_starting_up_is_told_from_one_that_is_mute(moving: Fa
 
 async def facts_of(folder: Path) -> Facts:
     """One look at a robot that drives."""
-    async with Robot(folder) as robot:
+    async with RobotInMemory(folder) as robot:
         await robot.go(100)
         bus = Bus(robot.network.transport(), robot.clock, "why")
         look = asyncio.ensure_future(Watcher(bus).look())
@@ -404,7 +404,7 @@ async def facts_of(folder: Path) -> Facts:
 
 async def test_what_a_process_cannot_do_is_told_beside_the_links(tmp_path: Path) -> None:
     full = Cause(code="map_full", text="the map is full", remedy="map in parts")
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         robot.operator.problems = (full,)
         telling = asyncio.ensure_future(publish_health(robot.operator))
         await robot.go(100)

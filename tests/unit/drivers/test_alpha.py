@@ -26,7 +26,7 @@ from gigabrain_drivers.links.address import address
 from gigabrain_schemas.topics import IMU
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported
-from tests.bus_rig import until
+from gigabrain_zenoh.testing.waiting import until
 
 MS = 1_000_000
 

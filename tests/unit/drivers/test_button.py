@@ -23,8 +23,8 @@ from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.runtime.deployment import Deployment
-from tests.brain_in_memory import Robot
-from tests.bus_rig import Net
+from gigabrain_zenoh.testing.brain import RobotInMemory
+from gigabrain_zenoh.testing.bus import Net
 
 MS = 1_000_000
 OPEN = "the contact is open, or its wire is broken"
@@ -208,7 +208,7 @@ async def test_the_driver_takes_silence_for_a_latching_cause_once_it_was_heard()
 
 
 async def test_a_robot_with_a_button_does_not_move_without_its_word(tmp_path: Path) -> None:
-    async with Robot(tmp_path, button=True) as robot:
+    async with RobotInMemory(tmp_path, button=True) as robot:
 
         async def tell(ticks: int, pressed: bool) -> list[float]:
             speeds: list[float] = []

@@ -13,7 +13,8 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.errors import ConfigError, UnknownName
-from tests.lidar_rig import agree, emulated, truth, until
+from gigabrain_zenoh.testing.waiting import until
+from tests.unit.drivers.lidars import agree, emulated, truth
 
 BODY = """\
 summary: a body in memory that carries a lidar

@@ -9,7 +9,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Battery, Joint, RobotState
 from gigabrain_schemas.sensors import ImuData
 from gigabrain_zenoh.codec import Codec, encode
-from tests.brain_rig import state
+from gigabrain_zenoh.testing.samples import state
 
 SOUND = replace(
     state(7),

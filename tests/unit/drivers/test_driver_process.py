@@ -17,7 +17,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.config.settings import DriverConfig
-from tests.brain_in_memory import Robot
+from gigabrain_zenoh.testing.brain import RobotInMemory
 
 
 class HeldUp(MockBody):
@@ -48,7 +48,7 @@ async def test_the_body_is_described_once_a_second_whatever_ticks_are_missed(
 
 
 async def test_a_state_says_what_the_body_was_told_last(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         for _ in range(200):
             await robot.go(1)
             assert robot.state
@@ -57,7 +57,7 @@ async def test_a_state_says_what_the_body_was_told_last(tmp_path: Path) -> None:
 
 
 async def test_what_comes_just_before_a_tick_counts_as_told_before_it(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await robot.go(200)
         brain, read = robot.operator, robot.body.read_state
         brain.sent[CMD_VEL.key] = 10**6  # so it is these that the gate obeys

@@ -14,14 +14,14 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, ESTOP_SAID, RELEASE
 from gigabrain_zenoh.runtime.audit_file import read
-from tests.brain_in_memory import Robot
-from tests.brain_rig import TICK_NS
+from gigabrain_zenoh.testing.brain import RobotInMemory
+from gigabrain_zenoh.testing.samples import TICK_NS
 
 
 class Log:
     """The audit log of a robot, as others hear it."""
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: RobotInMemory) -> None:
         self._records: list[AuditRecord] = []
         robot.operator.subscribe(AUDIT, lambda _key, record: self._records.append(record))
 
@@ -29,12 +29,12 @@ class Log:
         return [(r.what, r.source, r.ok, r.text) for r in self._records if r.what in what]
 
 
-async def enable(robot: Robot, source: str, take: bool = False, by: str = "") -> GateReply:
+async def enable(robot: RobotInMemory, source: str, take: bool = False, by: str = "") -> GateReply:
     [reply] = await robot.operator.ask(ENABLE, EnableRequest(source=source, take=take, by=by))
     return reply
 
 
-async def driving(robot: Robot) -> None:
+async def driving(robot: RobotInMemory) -> None:
     for _ in range(20):
         if (await robot.go(10))[-1] == pytest.approx(0.26):
             return
@@ -44,7 +44,7 @@ async def driving(robot: Robot) -> None:
 async def test_whoever_just_publishes_commands_is_not_obeyed_counted_and_named(
     tmp_path: Path,
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         log = Log(robot)
         await driving(robot)
         for _ in range(50):
@@ -64,7 +64,7 @@ async def test_whoever_just_publishes_commands_is_not_obeyed_counted_and_named(
 async def test_a_second_commander_is_told_who_drives_and_a_take_over_names_both(
     tmp_path: Path,
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         log = Log(robot)
         await driving(robot)
         reply = await enable(robot, "ann")
@@ -87,7 +87,7 @@ async def test_a_second_commander_is_told_who_drives_and_a_take_over_names_both(
 async def test_an_e_stop_that_is_said_and_not_asked_for_stops_just_the_same(
     tmp_path: Path, payload: bytes
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         client = robot.network.transport()
         client.publish(ESTOP_SAID, "robot/estop", payload, "")
@@ -97,7 +97,7 @@ async def test_an_e_stop_that_is_said_and_not_asked_for_stops_just_the_same(
 
 
 async def test_garbage_that_is_said_on_the_key_of_the_e_stop_stops_nobody(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         for payload in (b"\xc1", b"{", b'{"source": 3}', b"x" * 2000):
             robot.network.transport().publish(ESTOP_SAID, "robot/estop", payload, "")
@@ -105,7 +105,7 @@ async def test_garbage_that_is_said_on_the_key_of_the_e_stop_stops_nobody(tmp_pa
 
 
 async def test_an_e_stop_is_on_disk_when_it_is_confirmed(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         [reply] = await robot.operator.ask(ESTOP, EstopRequest(source="ann", reason="a child"))
         assert reply.text == "stopped and latched; e-stop number 1"
@@ -122,7 +122,7 @@ async def test_an_e_stop_is_on_disk_when_it_is_confirmed(tmp_path: Path) -> None
 async def test_a_disk_that_hangs_holds_up_the_confirmation_and_no_tick(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         wakes = threading.Event()
         monkeypatch.setattr("os.fsync", lambda _fd: wakes.wait(10.0))
@@ -136,7 +136,7 @@ async def test_a_disk_that_hangs_holds_up_the_confirmation_and_no_tick(
 
 
 async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: Path) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         (tmp_path / ".latch.json.new").mkdir()  # where the file would be written first
         [reply] = await robot.operator.ask(ESTOP, EstopRequest(source="ann"))
@@ -154,7 +154,7 @@ async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: P
 async def test_causes_are_written_down_when_they_come_and_go_with_who_raised_them(
     tmp_path: Path,
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         log = Log(robot)
         await driving(robot)
         robot.freeze("control")
@@ -173,7 +173,7 @@ async def test_causes_are_written_down_when_they_come_and_go_with_who_raised_the
 async def test_a_driver_that_was_held_up_keeps_its_count_and_speeds_up_by_one_step(
     tmp_path: Path,
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         while not 0.0 < (await robot.go(1))[-1] < 0.1:
             pass
         assert robot.state
@@ -190,7 +190,7 @@ async def test_a_driver_that_was_held_up_keeps_its_count_and_speeds_up_by_one_st
 async def test_a_driver_that_was_held_up_stops_the_body_as_soon_as_it_goes_on(
     tmp_path: Path,
 ) -> None:
-    async with Robot(tmp_path) as robot:
+    async with RobotInMemory(tmp_path) as robot:
         await driving(robot)
         robot.clock.stall(40 * TICK_NS)
         assert (await robot.go(1))[-1] == 0.0

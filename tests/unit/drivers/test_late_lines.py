@@ -18,8 +18,9 @@ from gigabrain_zenoh.geometry.limits import limits_of, ramp
 from gigabrain_zenoh.qa.line_proxy import LineProxy
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
 from gigabrain_zenoh.safety import lag
-from tests.lidar_rig import LIDAR, Listener, emulated, until
-from tests.line_rig import Bench
+from gigabrain_zenoh.testing.line import EmulatedLine
+from gigabrain_zenoh.testing.waiting import until
+from tests.unit.drivers.lidars import LIDAR, Listener, emulated
 
 TICK_S = 0.02
 
@@ -63,7 +64,7 @@ class Swaying:
 
 
 @asynccontextmanager
-async def swaying(bench: Bench, port: Path) -> AsyncIterator[Swaying]:
+async def swaying(bench: EmulatedLine, port: Path) -> AsyncIterator[Swaying]:
     options = replace(bench.driver.options, port=str(port))
     driver = LineDriver(bench.robot, options, bench.driver.run)
     bench.station.start()
@@ -77,7 +78,7 @@ async def swaying(bench: Bench, port: Path) -> AsyncIterator[Swaying]:
 
 
 async def test_a_base_without_a_clock_is_seen_to_follow_late(tmp_path: Path) -> None:
-    bench, port = Bench(tmp_path), tmp_path / "behind"
+    bench, port = EmulatedLine(tmp_path), tmp_path / "behind"
     async with (
         LineProxy(str(tmp_path / "base"), port) as proxy,
         swaying(bench, port) as body,

@@ -10,7 +10,8 @@ from gigabrain_drivers.emulators.faults import NONE, Faults
 from gigabrain_drivers.links import ports
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import BodyLost
-from tests.line_rig import BARE, bench, until
+from gigabrain_zenoh.testing.line import BARE, bench
+from gigabrain_zenoh.testing.waiting import until
 
 ZERO = Velocity()
 STARTED = BARE.replace(

@@ -9,7 +9,7 @@ from gigabrain_drivers.bodies.line.options import LineOptions
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_zenoh.errors import ConfigError
-from tests.line_rig import BARE
+from gigabrain_zenoh.testing.line import BARE
 
 THIRD = Path(__file__).parents[2] / "third_base" / "robot.yaml"
 COMMAND = 'command: "V,{linear_x:.3f},{angular_z:.3f}\\n"'

@@ -14,7 +14,7 @@ from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.qa.line_proxy import LineProxy, in_front_of
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
-from tests.stack import until
+from gigabrain_zenoh.testing.waiting import until
 
 
 class Line:

@@ -16,7 +16,8 @@ from gigabrain_drivers.links.link import Link, LinkProblem
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_drivers.links.tcp_link import TcpLink
 from gigabrain_zenoh.clock import Clock
-from tests.links_rig import Heard, until
+from gigabrain_zenoh.testing.waiting import until
+from tests.unit.drivers.links import Heard
 
 
 class Flaky(Link):

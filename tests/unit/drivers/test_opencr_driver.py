@@ -10,7 +10,7 @@ from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.bodies.turtlebot3.driver import imu_of
 from gigabrain_schemas.sensors import Imu
 from gigabrain_zenoh.errors import BodyLost, Unsupported
-from tests.opencr_rig import MS, Rig, make_rig  # noqa: F401
+from tests.unit.drivers.opencr import MS, Rig, make_rig  # noqa: F401
 
 
 async def test_a_connection_begins_with_zero_and_with_the_question_who_is_there(rig: Rig) -> None:

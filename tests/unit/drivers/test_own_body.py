@@ -22,7 +22,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.conformance import timing
 from gigabrain_zenoh.qa.conformance.result import Failed
 from gigabrain_zenoh.qa.conformance.subject import Subject
-from tests.brain_rig import state
+from gigabrain_zenoh.testing.samples import state
 
 MINE = robot_path("mycustombot")
 MODEL = MINE.with_name("model.xml")

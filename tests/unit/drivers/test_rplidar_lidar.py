@@ -20,7 +20,8 @@ from gigabrain_drivers.lidars.rplidar.protocol import DENSE, EXPRESS, STANDARD, 
 from gigabrain_drivers.lidars.rplidar.source import Rplidar, RplidarOptions
 from gigabrain_schemas.arrays import ranges
 from gigabrain_zenoh.clock import Clock, FakeClock
-from tests.lidar_rig import LIDAR, Listener, agree, emulated, truth, until
+from gigabrain_zenoh.testing.waiting import until
+from tests.unit.drivers.lidars import LIDAR, Listener, agree, emulated, truth
 
 
 def options(folder: Path, **settings: Any) -> RplidarOptions:

@@ -7,7 +7,7 @@ from gigabrain_drivers.lidars.rplidar.emulator import RplidarDevice
 from gigabrain_drivers.lidars.rplidar.protocol import EXPRESS, STANDARD, Decoder, Info
 from gigabrain_drivers.lidars.rplidar.source import RplidarOptions
 from gigabrain_drivers.lidars.rplidar.startup import Trouble, choose
-from tests.lidar_rig import Wire, run_for, waffle
+from tests.unit.drivers.lidars import Wire, run_for, waffle
 
 
 def decoded(model: Any, request: bytes, seconds: float) -> tuple[bytes, Decoder, int]:

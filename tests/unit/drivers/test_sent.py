@@ -19,7 +19,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.qa.faults.fault import Failed
 from gigabrain_zenoh.qa.faults.reversals import let_through, over, told_over
-from tests.brain_rig import DRIVING, state
+from gigabrain_zenoh.testing.samples import DRIVING, state
 
 BODIES = ["alpha", "mock", "mycustombot", "turtlebot3_burger", "turtlebot3_waffle"]
 COMMANDS = 5_000

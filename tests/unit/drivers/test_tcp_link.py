@@ -7,12 +7,13 @@ import pytest
 
 from gigabrain_drivers.links.tcp_link import TcpLink
 from gigabrain_zenoh.clock import Clock
-from tests.links_rig import GENEROUS_S, Heard, until
+from gigabrain_zenoh.testing.waiting import PATIENCE_S, until
+from tests.unit.drivers.links import Heard
 
 
 def server() -> socket.socket:
     listening = socket.create_server(("127.0.0.1", 0))
-    listening.settimeout(GENEROUS_S)
+    listening.settimeout(PATIENCE_S)
     return listening
 
 

@@ -20,7 +20,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.process_config import ProcessConfig
 from gigabrain_zenoh.config.settings import DriverConfig, Endpoint
 from gigabrain_zenoh.runtime import process
-from tests.bus_rig import until
+from gigabrain_zenoh.testing.waiting import until
 
 WAFFLE = "turtlebot3_waffle"
 PATIENCE_S = 20.0

@@ -25,7 +25,7 @@ from gigabrain_zenoh.cli.driver_kit import trace
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.conformance import kit
 from gigabrain_zenoh.qa.trace import run
-from tests.line_rig import BARE, bench
+from gigabrain_zenoh.testing.line import BARE, bench
 
 LINE = Template("V,{linear_x:.3f},{angular_z|deg/s:.1f}\n", COMMAND)
 FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [

@@ -2,7 +2,7 @@
 
 from gigabrain_schemas.base import Cause
 from gigabrain_zenoh.gate import causes
-from tests.gate_rig import BLIND, HOT, LOST, ZONE
+from tests.unit.gate.rig import BLIND, HOT, LOST, ZONE
 
 
 def test_a_latching_cause_by_name() -> None:

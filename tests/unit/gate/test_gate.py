@@ -9,7 +9,7 @@ from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.body import GateStatus
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import ZERO
-from tests.gate_rig import BLIND, BOOT, CRASHED, HOT, LIMITS, LOST, Rig, driving, enabled, idle
+from tests.unit.gate.rig import BLIND, BOOT, CRASHED, HOT, LIMITS, LOST, Rig, driving, enabled, idle
 
 
 def test_it_boots_latched_and_at_rest() -> None:

@@ -8,7 +8,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import ZERO
-from tests.gate_rig import BOOT, ZONE, Rig, calm, driving, enabled, idle
+from tests.unit.gate.rig import BOOT, ZONE, Rig, calm, driving, enabled, idle
 
 NAN, INF = float("nan"), float("inf")
 MS = 1_000_000

@@ -7,7 +7,7 @@ import pytest
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import ZERO
-from tests.gate_rig import BLIND, LOST, ZONE, Rig, enabled, idle
+from tests.unit.gate.rig import BLIND, LOST, ZONE, Rig, enabled, idle
 
 
 def test_a_latched_gate_is_not_enabled() -> None:

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import ZERO
-from tests.gate_rig import BOOT, Rig, driving, enabled, idle
+from tests.unit.gate.rig import BOOT, Rig, driving, enabled, idle
 
 NAN, INF = float("nan"), float("inf")
 

@@ -2,7 +2,7 @@
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.gate import gate
-from tests.gate_rig import BLIND, Rig, enabled, idle
+from tests.unit.gate.rig import BLIND, Rig, enabled, idle
 
 
 def test_auto_resume_opens_it_after_half_a_second_of_health() -> None:

@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import ZERO
-from tests.gate_rig import BLIND, CRASHED, HOT, LOST, Rig, driving, enabled, idle
+from tests.unit.gate.rig import BLIND, CRASHED, HOT, LOST, Rig, driving, enabled, idle
 
 
 def test_it_stops_for_300_ms_and_is_idle_then() -> None:

@@ -7,7 +7,7 @@ import pytest
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import ZERO
-from tests.gate_rig import BLIND, BOOT, HOT, LOST, ZONE, Rig, driving, enabled, idle, plain
+from tests.unit.gate.rig import BLIND, BOOT, HOT, LOST, ZONE, Rig, driving, enabled, idle, plain
 
 MS = 1_000_000
 

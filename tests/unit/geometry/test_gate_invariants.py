@@ -16,7 +16,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, Limits, clamp
-from tests.gate_rig import BLIND, BOOT, CRASHED, HOT, LIMITS, LOST, ZONE
+from tests.unit.gate.rig import BLIND, BOOT, CRASHED, HOT, LIMITS, LOST, ZONE
 
 MS = 1_000_000
 GAIN = (0.02, 0.02, 0.06)  # of speed in a tick, by axis, as LIMITS say

@@ -7,7 +7,7 @@ from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.host.background import Background
 from gigabrain_zenoh.mapping.growing import GrowingMap
-from tests.map_rig import HALL, HOUSE, PATIENCE_S, Rooms, Walker, at, error, grown
+from tests.unit.mapping.houses import HALL, HOUSE, PATIENCE_S, Rooms, Walker, at, error, grown
 
 START = (1.0, 2.5)
 ROUND = ((3.0, 3.0), (5.5, 3.0), (6.5, 4.8), (6.5, 1.8), (5.0, 3.0), (3.0, 4.5), (1.2, 3.8), START)

@@ -7,7 +7,7 @@ import pytest
 from gigabrain_schemas.base import Pose
 from gigabrain_zenoh.geometry.planar import compose, inverse, relative
 from gigabrain_zenoh.geometry.pose_history import PoseHistory
-from tests.brain_rig import BOOT, state
+from gigabrain_zenoh.testing.samples import BOOT, state
 
 
 def of(*poses: tuple[int, tuple[float, float, float]]) -> PoseHistory:

@@ -10,7 +10,7 @@ from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose
 from gigabrain_zenoh.mapping.front_end import FEW
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.slam import Estimate, Slam
-from tests.rooms import Lidar, Walls, box, dead_reckoned, drifting, line
+from tests.unit.mapping.rooms import Lidar, Walls, box, dead_reckoned, drifting, line
 
 # a corridor round a block, with pillars on both sides so that no stretch is like another
 BLOCK = np.array(

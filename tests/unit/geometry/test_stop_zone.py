@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import BodyDescription, Thresholds
 from gigabrain_zenoh.geometry.stop_zone import Brake, brakes
-from tests.brain_rig import WAFFLE
+from gigabrain_zenoh.testing.samples import WAFFLE
 
 
 def body(reaction_time: float = 0.32) -> BodyDescription:

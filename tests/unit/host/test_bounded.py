@@ -9,10 +9,11 @@ from gigabrain_zenoh.host.bounded import put
 from gigabrain_zenoh.host.journal import MOST_KEYS, SaidJournal
 from gigabrain_zenoh.safety.host import Host
 from gigabrain_zenoh.safety.senses import Senses
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.samples import WAFFLE, body
+from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page.scene import Scene
 from gigabrain_zenoh.ui.watch import Watch
-from tests.brain_rig import WAFFLE, body
-from tests.bus_rig import Net, settle
 
 
 def health(name: str) -> Health:

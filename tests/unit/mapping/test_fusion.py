@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import ImuData
 from gigabrain_zenoh.mapping.fusion import Fusion, uncertainty, way
-from tests.brain_rig import WAFFLE, state
+from gigabrain_zenoh.testing.samples import WAFFLE, state
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 

@@ -13,7 +13,7 @@ from gigabrain_zenoh.mapping import graph
 from gigabrain_zenoh.mapping.graph import Graph
 from gigabrain_zenoh.mapping.growing import GrowingMap
 from gigabrain_zenoh.mapping.keyframe import Edge
-from tests.map_rig import HOUSE, PATIENCE_S, Rooms, at, error, grown
+from tests.unit.mapping.houses import HOUSE, PATIENCE_S, Rooms, at, error, grown
 
 SURE = np.diag((0.05, 0.05, 0.01)) ** 2
 SIDE = 10  # keyframes along each side of a square of 1 m steps

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from gigabrain_zenoh.mapping import grid as grids
 from gigabrain_zenoh.mapping.grid import Grid
-from tests.map_rig import HOUSE, Rooms, at
+from tests.unit.mapping.houses import HOUSE, Rooms, at
 
 NONE = np.empty((0, 2), np.float32)
 

@@ -9,7 +9,7 @@ from gigabrain_zenoh.mapping.likeness import alike
 from gigabrain_zenoh.mapping.localizer import Localizer
 from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.relocalize import Candidate, search
-from tests.map_rig import (
+from tests.unit.mapping.houses import (
     BEAMS,
     CORRIDOR,
     HALL,

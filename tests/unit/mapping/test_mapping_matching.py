@@ -8,7 +8,7 @@ from gigabrain_zenoh.mapping.correlative import Window, search
 from gigabrain_zenoh.mapping.local_map import LocalMap, build
 from gigabrain_zenoh.mapping.matching import icp
 from gigabrain_zenoh.mapping.points import Scan, from_beams
-from tests.rooms import Lidar, box
+from tests.unit.mapping.rooms import Lidar, box
 
 ROOM = np.array([*box(-3, -2, 6, 4), *box(1, 0.5, 0.6, 0.4)])
 CORRIDOR = np.array([(-100.0, -1.0, 100.0, -1.0), (-100.0, 1.0, 100.0, 1.0)])

@@ -11,7 +11,7 @@ from gigabrain_zenoh.mapping.localizer import View
 from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.points import Scan
 from gigabrain_zenoh.mapping.sweeps import Sweeps
-from tests.map_rig import HOUSE, PATIENCE_S, Rooms, Walker, at, box, error
+from tests.unit.mapping.houses import HOUSE, PATIENCE_S, Rooms, Walker, at, box, error
 
 START = (1.0, 2.5)
 ROUND = ((3.0, 3.0), (5.5, 3.0), (6.5, 4.8), (6.5, 1.8), (5.0, 3.0), (3.0, 4.5), (1.2, 3.8), START)

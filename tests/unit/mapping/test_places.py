@@ -7,8 +7,8 @@ from gigabrain_zenoh.geometry.se2 import Floats, between, compose
 from gigabrain_zenoh.mapping.drift import Drift, Rates
 from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
 from gigabrain_zenoh.mapping.places import PlaceSearch
-from tests.rooms import Lidar, Walls, box, line
 from tests.unit.geometry.test_slam import BLOCK, lap
+from tests.unit.mapping.rooms import Lidar, Walls, box, line
 
 BAD = Rates(away=0.2, turn=0.02)
 

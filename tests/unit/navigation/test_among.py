@@ -21,7 +21,7 @@ from gigabrain_zenoh.navigation.window_cells import Place
 from gigabrain_zenoh.qa.bench.barn_drive import drive
 from gigabrain_zenoh.qa.bench.barn_worlds import Moving, World
 from gigabrain_zenoh.qa.bench.plant import HARD, JACKAL
-from tests.local_rig import OMNI, WAFFLE, wall
+from tests.unit.navigation.drives import OMNI, WAFFLE, wall
 
 NOTHING = np.empty((0, 2))
 NOBODY = np.empty((0, 6))

@@ -6,7 +6,7 @@ import pytest
 from gigabrain_zenoh.navigation.costmap import Costmap, Inflation, costmap
 from gigabrain_zenoh.navigation.frontiers import frontiers, next_frontier
 from gigabrain_zenoh.navigation.search import Search
-from tests.navigation_rig import grid_of
+from tests.unit.navigation.grids import grid_of
 
 HERE = (1.05, 1.05)
 

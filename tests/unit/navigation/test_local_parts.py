@@ -23,7 +23,7 @@ from gigabrain_zenoh.navigation.models import answer, feasible, lag_of, model_of
 from gigabrain_zenoh.navigation.mppi import past_of
 from gigabrain_zenoh.navigation.window import Window
 from gigabrain_zenoh.navigation.window_cells import Place
-from tests.local_rig import CAR, WAFFLE, wall
+from tests.unit.navigation.drives import CAR, WAFFLE, wall
 
 NOBODY = np.empty((0, 6))
 NOTHING = np.empty((0, 2))

@@ -10,7 +10,7 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Obstacle, Response
 from gigabrain_zenoh.navigation.local import Goal, LocalPlanner, Moment, Sent
-from tests.local_rig import CAR, OMNI, QUICK, WAFFLE, Drive, wall
+from tests.unit.navigation.drives import CAR, OMNI, QUICK, WAFFLE, Drive, wall
 
 NOTHING = np.empty((0, 2))
 LATE = Response(delay=0.1, lag=0.15)

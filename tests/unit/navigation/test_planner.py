@@ -7,7 +7,7 @@ import pytest
 
 from gigabrain_zenoh.navigation.costmap import Costmap, Inflation, Unknown, costmap
 from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable, rest_of, valid
-from tests.navigation_rig import drawn, empty, grid_of
+from tests.unit.navigation.grids import drawn, empty, grid_of
 
 NAN, INF = float("nan"), float("inf")
 

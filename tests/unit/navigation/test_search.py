@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.navigation.search import Search
-from tests.navigation_rig import cheapest
+from tests.unit.navigation.grids import cheapest
 
 OPEN = np.ones((9, 9), np.float32)
 

@@ -20,8 +20,8 @@ from gigabrain_zenoh.mapping import autosave
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.placing import placed
 from gigabrain_zenoh.runtime.replay import record, replay
-from tests.brain_rig import state
-from tests.mapper_rig import Robot
+from gigabrain_zenoh.testing.samples import state
+from tests.unit.perception.mapping_robot import Robot
 
 SCANS_IN_5_S = 50
 Usage = namedtuple("Usage", "total used free")

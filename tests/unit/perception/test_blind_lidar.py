@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.perception.node import step
-from tests.brain_rig import LIDAR, WAFFLE, open_space, scan
+from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, open_space, scan
 
 NAN, INF = math.nan, math.inf
 CONFIG = PerceptionConfig()

@@ -17,9 +17,9 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapping import grid, map_file
 from gigabrain_zenoh.perception.mapper import chart_of
 from gigabrain_zenoh.runtime.health import publish_health
-from tests.brain_rig import scan, state
-from tests.map_rig import HOUSE, Rooms, at, drawn
-from tests.mapper_rig import Robot
+from gigabrain_zenoh.testing.samples import scan, state
+from tests.unit.mapping.houses import HOUSE, Rooms, at, drawn
+from tests.unit.perception.mapping_robot import Robot
 
 START = at(3.0, 2.0)
 

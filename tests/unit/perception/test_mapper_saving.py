@@ -16,7 +16,7 @@ from gigabrain_zenoh.mapping.growing import Still
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.placing import placed
 from gigabrain_zenoh.runtime.replay import record, replay
-from tests.mapper_rig import SLAM, Robot
+from tests.unit.perception.mapping_robot import SLAM, Robot
 
 
 @pytest.fixture(autouse=True)

@@ -17,7 +17,8 @@ from gigabrain_schemas.topics import BODY, SCAN, WORLD
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.perception.node import step
-from tests.brain_rig import BOOT, LIDAR, WAFFLE, Bench, body, open_space, scan
+from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.samples import BOOT, LIDAR, WAFFLE, body, open_space, scan
 
 NAN, INF = math.nan, math.inf
 CONFIG = PerceptionConfig()
@@ -230,7 +231,7 @@ def test_no_bit_pattern_breaks_it(raw: bytes) -> None:
 
 
 async def test_each_scan_becomes_a_world_that_rests_on_it() -> None:
-    async with Bench(functools.partial(perception.run, CONFIG)) as bench:
+    async with NodeBench(functools.partial(perception.run, CONFIG)) as bench:
         bench.send(BODY, body())
         bench.send(SCAN, scan(open_space(deg_0=0.8), tick=5))
         bench.send(SCAN, scan(open_space(), tick=10))
@@ -242,7 +243,7 @@ async def test_each_scan_becomes_a_world_that_rests_on_it() -> None:
 
 
 async def test_without_its_body_it_says_nothing() -> None:
-    async with Bench(functools.partial(perception.run, CONFIG)) as bench:
+    async with NodeBench(functools.partial(perception.run, CONFIG)) as bench:
         bench.send(SCAN, scan(open_space(), tick=5))
         bench.send(BODY, body())
         for tick in (4, 7, 10):

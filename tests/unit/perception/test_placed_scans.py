@@ -11,7 +11,8 @@ from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.geometry.placed_scans import PlacedScans
 from gigabrain_zenoh.perception import node as perception
-from tests.brain_rig import Bench, body, open_space, scan, state
+from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.samples import body, open_space, scan, state
 
 MAPPING = PerceptionConfig(mapping="slam")
 
@@ -89,7 +90,7 @@ def round_post(x: float, y: float) -> np.ndarray[tuple[int], np.dtype[np.float64
 
 async def drive(config: PerceptionConfig) -> list[tuple[float, float, float]]:
     """The robot drives 0.5 m/s past somebody who walks towards it at 0.5 m/s; what it follows."""
-    async with Bench(functools.partial(perception.run, config)) as bench:
+    async with NodeBench(functools.partial(perception.run, config)) as bench:
         await bench.ready()
         bench.send(BODY, body())
         for tick in range(1, 101):

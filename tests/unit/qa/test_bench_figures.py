@@ -14,7 +14,7 @@ from gigabrain_zenoh.host.percentile import Newest, percentile
 from gigabrain_zenoh.qa.bench.costs import Hop, Timed
 from gigabrain_zenoh.qa.bench.figures import figures, over_rounds
 from gigabrain_zenoh.qa.bench.runs import relay_roles
-from tests.bench_rig import compared, one
+from tests.unit.qa.figures import compared, one
 
 MS = 1_000_000
 

@@ -21,7 +21,8 @@ from gigabrain_zenoh.qa.bench.goals import CAPACITY_AH, GoalFigures, GoalsResult
 from gigabrain_zenoh.qa.bench.goals_sender import Off, Sender, elsewhere
 from gigabrain_zenoh.qa.bench.group import Group
 from gigabrain_zenoh.qa.bench.growth import Growth
-from tests.bus_rig import Net, settle
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.waiting import settle
 
 AT = Pose(x=0.0, y=0.0, yaw=0.0)
 STILL = RobotState(robot_type="mock", pose=AT, velocity=Velocity(), boot=7, tick=1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.qa.bench.growth import Watch
-from tests.navigation_rig import grid_of
+from tests.unit.navigation.grids import grid_of
 
 
 def test_the_slope_leaves_out_the_first_quarter_and_walls_are_counted_by_the_hour() -> None:

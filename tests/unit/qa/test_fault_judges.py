@@ -26,8 +26,8 @@ from gigabrain_zenoh.qa.faults.smooth import starts_and_stops, stops
 from gigabrain_zenoh.qa.faults.soak import slope_mb_per_h
 from gigabrain_zenoh.qa.faults.stopping import first_slower, first_zero
 from gigabrain_zenoh.qa.faults.subject import Subject
-from tests.brain_rig import BOOT, DRIVING, body, state
-from tests.bus_rig import settle
+from gigabrain_zenoh.testing.samples import BOOT, DRIVING, body, state
+from gigabrain_zenoh.testing.waiting import settle
 
 MB = 1_000_000
 

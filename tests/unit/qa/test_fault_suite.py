@@ -35,7 +35,7 @@ from gigabrain_zenoh.qa.faults.rig import Options, Rig, deployment_of
 from gigabrain_zenoh.qa.faults.suite import failed, run_suite
 from gigabrain_zenoh.qa.faults.table import FAULTS, choose
 from gigabrain_zenoh.qa.faults.tries_file import TriesFile
-from tests.bus_rig import settle
+from gigabrain_zenoh.testing.waiting import settle
 
 FAULT = Fault(1, "decision-killed", "process", "", "brakes after <= 120 ms, travel <= 0.1 m")
 
@@ -320,20 +320,3 @@ async def test_a_part_that_hangs_leaves_the_rest_of_its_process_running() -> Non
         await settle()
         hangs.set()
     assert heard == ["world", "intent", "intent"]
-
-
-@pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Result]:
-    """What came of each fault, judged by ticks alone; they share robots, so they run in one go."""
-    options = Options(wall=False)
-    done = asyncio.run(run_suite(FAULTS, options, tmp_path_factory.mktemp("faults")))
-    return {result.number: result for result in done}
-
-
-@pytest.mark.system
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
-def test_the_robot_stops_whatever_breaks(fault: Fault, results: dict[int, Result]) -> None:
-    result = results[fault.number]
-    if result.verdict == "skipped":
-        pytest.skip(result.reason)
-    assert result.verdict == "passed", result.tries

@@ -1,9 +1,6 @@
 """The order of rooms is judged: by import-linter, and in strings by a lint of our own."""
 
-import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -20,15 +17,6 @@ def copy(tmp_path: Path) -> Path:
         shutil.copytree(house.ROOT / package, tmp_path / package, ignore=SKIPPED)
     shutil.copy(house.ROOT / "pyproject.toml", tmp_path)
     return tmp_path
-
-
-def imports_linted(root: Path) -> subprocess.CompletedProcess[str]:
-    linter = Path(sys.executable).with_name("lint-imports")
-    path = os.pathsep.join(str((root / package).parent) for package in house.PACKAGES)
-    return subprocess.run(
-        (linter, "--no-cache"), cwd=root, env=os.environ | {"PYTHONPATH": path},
-        capture_output=True, text=True,
-    )  # fmt: skip
 
 
 def add(path: Path, text: str) -> None:
@@ -53,29 +41,6 @@ def test_a_name_in_a_string_is_found(copy: Path, where: str, name: str, contract
     (line,) = house.broken(copy)
     assert line.startswith(f"gigabrain_zenoh/{where}:")
     assert line.partition("the contract is: ")[2].startswith(contract)
-
-
-@pytest.mark.parametrize(
-    ("where", "statement", "contract"),
-    [
-        ("safety/step.py", "from gigabrain_zenoh.mapping.field import OCCUPIED", "safety trusts"),
-        ("mapping/slam.py", "def late():\n    import gigabrain_zenoh.bus.bus", "gate, geometry"),
-        ("host/heap.py", "from gigabrain_zenoh.bus.bus import Bus", "each room"),
-        (
-            "ui/seat.py",
-            "from gigabrain_drivers.bodies.mock.driver import Mock",
-            "only the commands and qa",
-        ),
-    ],
-)
-def test_an_import_against_the_order_is_found(
-    copy: Path, where: str, statement: str, contract: str
-) -> None:
-    assert imports_linted(copy).returncode == 0
-    add(copy / "gigabrain_zenoh" / where, f"\n{statement}\n")
-    done = imports_linted(copy)
-    assert done.returncode == 1
-    assert any(line.startswith(contract) and "BROKEN" in line for line in done.stdout.splitlines())
 
 
 def test_sizes_are_counted(tmp_path: Path) -> None:

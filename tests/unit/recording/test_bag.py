@@ -3,8 +3,6 @@
 import json
 import random
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import msgspec
@@ -21,7 +19,7 @@ from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.records import ZSTD_NAME
 from gigabrain_zenoh.recording.recover import recover, recover_all, unfinished
 from gigabrain_zenoh.recording.schema import flat_schema
-from tests import bag_rig
+from tests.unit.recording import bags
 
 
 def call(*arguments: str) -> object:
@@ -33,7 +31,7 @@ def call(*arguments: str) -> object:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("bag") / "whole.mcap"
-    assert bag_rig.write(path, bag_rig.drive(500)) == 600
+    assert bags.write(path, bags.drive(500)) == 600
     return path
 
 
@@ -41,10 +39,10 @@ def test_what_was_recorded_comes_out_byte_for_byte_with_its_key_encoding_and_sch
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.mcap"
-    told = [*bag_rig.drive(20), bag_rig.arrival(10**9, "strange/key", b"\xc1 no message")]
-    twist = bag_rig.arrival(10**9 + 1, "robot/teleop", b'{"linear_x": 0.2}')
+    told = [*bags.drive(20), bags.arrival(10**9, "strange/key", b"\xc1 no message")]
+    twist = bags.arrival(10**9 + 1, "robot/teleop", b'{"linear_x": 0.2}')
     told.append(twist._replace(encoding="application/json"))
-    bag_rig.write(path, iter(told))
+    bags.write(path, iter(told))
     read = list(Bag(path))
     assert [(s.log_ns, s.key, s.encoding, s.payload) for s in read] == [
         (a.log_ns, a.key, a.encoding, a.payload) for a in told
@@ -85,8 +83,8 @@ def test_missing_messages_are_counted_and_make_the_check_fail(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "gap.mcap"
-    kept = [a for a in bag_rig.drive(100) if not 30 <= a.header.seq <= 39]
-    bag_rig.write(path, iter(kept))
+    kept = [a for a in bags.drive(100) if not 30 <= a.header.seq <= 39]
+    bags.write(path, iter(kept))
     assert {key.key: key.missing for key in info(path).keys} == {"robot/scan": 0, "robot/state": 10}
     assert call("bag", "check", str(path)) == 1
     assert "robot/state: 10 messages are missing" in capsys.readouterr().out
@@ -159,7 +157,7 @@ def test_a_flipped_byte_costs_its_chunk_and_no_other(
     ]
     mended = tmp_path / "mended.mcap"
     assert recover(path, mended).messages == 588
-    assert bag_rig.seqs(mended) == bag_rig.seqs(path)
+    assert bags.seqs(mended) == bags.seqs(path)
     assert info(mended).finished
 
 
@@ -188,15 +186,15 @@ def test_flipped_bytes_anywhere_never_break_the_reader(whole: Path, tmp_path: Pa
 
 def test_cut_anywhere_all_that_is_earlier_can_be_read(tmp_path: Path) -> None:
     path, cut = tmp_path / "open.mcap", tmp_path / "cut.mcap"
-    bag_rig.write(path, bag_rig.drive(200), end=False)
+    bags.write(path, bags.drive(200), end=False)
     content = path.read_bytes()
-    everything = bag_rig.seqs(path)
+    everything = bags.seqs(path)
     assert everything == list(range(1, 201))
     ends = sorted({*range(len(content) - 300, len(content)), *range(9, len(content), 499)})
     before = 0
     for end in ends:
         cut.write_bytes(content[:end])
-        read = bag_rig.seqs(cut)
+        read = bags.seqs(cut)
         assert read == everything[: len(read)]
         assert len(read) >= before - 12, end  # a torn chunk gives what is whole of it
         before = max(before, len(read))
@@ -205,13 +203,13 @@ def test_cut_anywhere_all_that_is_earlier_can_be_read(tmp_path: Path) -> None:
 
 def test_a_cut_recording_is_recovered_into_one_with_an_index(tmp_path: Path) -> None:
     path = tmp_path / "open.mcap"
-    bag_rig.write(path, bag_rig.drive(200), end=False)
+    bags.write(path, bags.drive(200), end=False)
     path.write_bytes(path.read_bytes()[:-50])
-    left = bag_rig.seqs(path)
+    left = bags.seqs(path)
     assert unfinished(path)
     assert call("bag", "recover", str(path)) == 0
     mended = tmp_path / "open_recovered.mcap"
-    assert bag_rig.seqs(mended) == left
+    assert bags.seqs(mended) == left
     with mended.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert len(list(reader.iter_messages(topics="robot/state"))) == len(left) > 180
@@ -223,14 +221,14 @@ def test_the_next_start_mends_what_was_cut_off_and_leaves_the_rest_alone(
     whole: Path, tmp_path: Path
 ) -> None:
     cut, good, other = (tmp_path / name for name in ("cut.mcap", "good.mcap", "text.mcap"))
-    bag_rig.write(cut, bag_rig.drive(100), end=False)
+    bags.write(cut, bags.drive(100), end=False)
     shutil.copy(whole, good)
     other.write_text("no bag at all")
     busy = BagFile(tmp_path / "busy.mcap", viewers=False, notes={})
     before = {path: path.read_bytes() for path in (good, other, busy.path)}
     recover_all(tmp_path)
     assert info(cut).finished
-    assert bag_rig.seqs(cut) == list(range(1, 101))
+    assert bags.seqs(cut) == list(range(1, 101))
     assert {path: path.read_bytes() for path in before} == before
     assert len(list(tmp_path.iterdir())) == 4
     busy.close()
@@ -273,12 +271,6 @@ def test_a_plot_is_a_picture_and_an_unknown_field_names_the_nearest(
         call("bag", "plot", str(whole), "state.velocity.linear_z")
     with pytest.raises(ConfigError, match=r"no topic 'stat.pose.x'; did you mean 'state'\?"):
         call("bag", "plot", str(whole), "stat.pose.x")
-
-
-def test_the_light_commands_do_not_need_the_recorder() -> None:
-    code = "import sys, gigabrain_zenoh.cli.app; print([m for m in sys.modules if 'mcap' in m])"
-    told = subprocess.run((sys.executable, "-c", code), capture_output=True, text=True, check=True)
-    assert told.stdout == "[]\n"
 
 
 def test_settings_are_kept_for_a_replay(tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.drives import file_of
 from gigabrain_zenoh.recording.intake import Arrival
 from gigabrain_zenoh.recording.lerobot import columns, convert, episodes, frames
-from tests import bag_rig
 from tests.node.test_record_replay import RECORDINGS
+from tests.unit.recording import bags
 
 
 def enabled(states: range) -> Iterator[Arrival]:
@@ -25,15 +25,15 @@ def enabled(states: range) -> Iterator[Arrival]:
     for seq in states:
         at_ns = seq * 20_000_000
         command = codec.encode(CmdVel(linear_x=seq / 1000, source="control"))
-        yield bag_rig.arrival(at_ns - 2, "robot/cmd_vel", command)
-        state = msgspec.msgpack.decode(bag_rig.state(seq), type=RobotState)
+        yield bags.arrival(at_ns - 2, "robot/cmd_vel", command)
+        state = msgspec.msgpack.decode(bags.state(seq), type=RobotState)
         state = msgspec.structs.replace(state, gate=GateStatus(mode="enabled"))
-        yield bag_rig.arrival(at_ns, "robot/state", codec.encode(state))
+        yield bags.arrival(at_ns, "robot/state", codec.encode(state))
 
 
 def test_a_frame_is_every_fifth_state_with_the_command_of_then(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    bag_rig.write(path, enabled(range(1, 22)))
+    bags.write(path, enabled(range(1, 22)))
     found = list(frames(path))
     assert [frame.tick for frame in found] == [5, 10, 15, 20]
     assert found[1].state == pytest.approx([0.1, 0.0, 0.0, 0.1, 0.0, 0.0])
@@ -42,9 +42,9 @@ def test_a_frame_is_every_fifth_state_with_the_command_of_then(tmp_path: Path) -
 
 def test_an_episode_ends_where_the_states_break_off_or_the_gate_shuts(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    shut = (a for a in bag_rig.drive(80) if a.header.seq > 60)
+    shut = (a for a in bags.drive(80) if a.header.seq > 60)
     told = [*enabled(range(1, 22)), *enabled(range(31, 61)), *shut, *enabled(range(81, 86))]
-    bag_rig.write(path, iter(told))
+    bags.write(path, iter(told))
     assert [[frame.tick for frame in row] for row in episodes(path)] == [
         [5, 10, 15, 20],
         [35, 40, 45, 50, 55, 60],
@@ -78,6 +78,6 @@ def test_the_dataset_has_the_folders_of_the_format(tmp_path: Path) -> None:
 
 def test_a_recording_in_which_nobody_drives_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
-    bag_rig.write(path, bag_rig.drive(20))
+    bags.write(path, bags.drive(20))
     with pytest.raises(ConfigError, match="holds no time in which the gate was enabled"):
         episodes(path)

@@ -20,9 +20,10 @@ from gigabrain_zenoh.recording.intake import MOST_PLACES, OTHERS, Intake
 from gigabrain_zenoh.recording.node import chosen, listening, run
 from gigabrain_zenoh.recording.reading import Bag
 from gigabrain_zenoh.recording.recorder import Recorder
-from tests import bag_rig
-from tests.bag_rig import QUICK, kept
-from tests.bus_rig import Net, until
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.waiting import until
+from tests.unit.recording import bags
+from tests.unit.recording.bags import QUICK, kept
 
 
 async def test_what_comes_over_the_bus_is_in_the_file_as_it_came(tmp_path: Path) -> None:
@@ -89,9 +90,9 @@ def test_viewers_find_something_to_draw_of_every_kind(tmp_path: Path) -> None:
     file = BagFile(tmp_path / "v.mcap", viewers=True, notes={})
     for n, topic in enumerate(TOPICS):
         payload = codec.encode(EXAMPLES[topic.type.__name__])
-        file.add(bag_rig.arrival(n, topic.at("front"), payload))
+        file.add(bags.arrival(n, topic.at("front"), payload))
     jpeg = Image(frame_id="camera", encoding="jpeg", height=1, width=1, data=b"\xff\xd8")
-    file.add(bag_rig.arrival(99, "robot/image/rear", codec.encode(jpeg)))
+    file.add(bags.arrival(99, "robot/image/rear", codec.encode(jpeg)))
     file.finish()
     file.close()
     drawn = {
@@ -143,18 +144,18 @@ def test_messages_that_gathered_bear_the_times_of_their_own_stamps() -> None:
 def test_what_is_dropped_is_not_missing_nor_a_new_sender() -> None:
     intake = Intake(5000, lambda: 1)
     for seq in range(1, 6):  # of 1.5 kB each: three fit
-        intake.take("robot/scan", "", bag_rig.scan(seq))
+        intake.take("robot/scan", "", bags.scan(seq))
     assert (intake.counts(), len(intake.hand_over())) == ((5, 2, 0), 3)
     assert not intake.gaps.restarts
 
 
 def test_who_makes_up_keys_and_encodings_costs_a_bounded_number_of_them() -> None:
     intake = Intake(1 << 30, lambda: 1)
-    intake.take("robot/scan", "", bag_rig.scan(1))
+    intake.take("robot/scan", "", bags.scan(1))
     for n in range(10_000):
         intake.take(f"robot/{n}", "", b"x")
         intake.take("robot/state", f"text/{n}", b"x")
-    intake.take("robot/scan", "", bag_rig.scan(2))
+    intake.take("robot/scan", "", bags.scan(2))
     arrivals = intake.hand_over()
     assert len({(one.key, one.encoding) for one in arrivals}) == MOST_PLACES
     assert arrivals[-1].header.seq == 2
@@ -167,7 +168,7 @@ def test_viewers_get_every_second_state_and_each_thought_once(tmp_path: Path) ->
     for tick in range(50):  # one second
         for topic in (STATE, INTENT):
             said = replace(example(topic.type), seq=tick + 1, tick=tick, basis=tick // 5)
-            file.add(bag_rig.arrival(tick * 20_000_000, topic.key, codec.encode(said)))
+            file.add(bags.arrival(tick * 20_000_000, topic.key, codec.encode(said)))
     file.finish()
     file.close()
     drawn = Counter(channel.topic for channel, _, _ in Bag(file.path).messages())

@@ -24,7 +24,7 @@ from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.runtime.replay import Event, Node, record, replay
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.host import Host
-from tests.brain_rig import BOOT, DRIVING, TICK_NS, body, round_room, scan, state
+from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, body, round_room, scan, state
 
 SYSTEMS: dict[str, tuple[Node, str]] = {
     "perception": (functools.partial(perception.run, PerceptionConfig()), "robot/world"),

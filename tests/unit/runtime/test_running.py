@@ -3,8 +3,6 @@
 import contextlib
 import fcntl
 import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -48,17 +46,6 @@ def test_a_robot_is_found_for_as_long_as_its_supervisor_says(notes: Path) -> Non
         assert [path.name for path in notes.iterdir()] == [f"{os.getpid()}.json"]
     assert running() == []
     assert list(notes.iterdir()) == []
-
-
-def test_the_note_of_a_dead_supervisor_is_taken_away(notes: Path) -> None:
-    program = (
-        "import os\nfrom gigabrain_zenoh.runtime.running import announced, Endpoint\n"
-        "with announced('ghost', Endpoint(connect=('tcp/127.0.0.1:1',))): os.kill(os.getpid(), 9)"
-    )
-    subprocess.run((sys.executable, "-c", program), check=False)
-    (note,) = notes.iterdir()
-    assert running() == []
-    assert not note.exists()
 
 
 def test_a_note_whose_pid_is_used_again_is_that_of_a_dead_supervisor(notes: Path) -> None:

@@ -30,9 +30,10 @@ from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.stop_zone import brakes
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.step import Inputs, step
-from tests.brain_rig import Bench, body, open_space, scan, state
-from tests.gate_rig import driving
-from tests.safety_rig import BODY, Patrol
+from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.samples import body, open_space, scan, state
+from tests.unit.gate.rig import driving
+from tests.unit.safety.patrol import BODY, Patrol
 
 MONITORED = (
     BODY_TOPIC, STATE, SCAN, CMD_VEL, IMU, IMAGE, POSE, MAP, HEALTH, LOG, WORLD, INTENT,
@@ -42,7 +43,7 @@ AHEAD = Velocity(linear_x=0.2)
 
 async def test_a_it_judges_without_any_command() -> None:
     """There it runs only when a command comes: a dead commander leaves the body as it is."""
-    async with Bench(safety.run) as bench:
+    async with NodeBench(safety.run) as bench:
         bench.send(BODY_TOPIC, body())
         for tick in range(1, 41):
             bench.send(STATE, state(tick, v=0.2))
@@ -64,7 +65,7 @@ def test_b_a_command_that_is_not_a_number_is_zero_at_once() -> None:
 
 async def test_c_a_scan_stamped_in_the_future_goes_stale() -> None:
     """There it never does."""
-    async with Bench(safety.run) as bench:
+    async with NodeBench(safety.run) as bench:
         bench.send(BODY_TOPIC, body())
         for tick in range(1, 41):
             bench.send(STATE, state(tick))
@@ -131,7 +132,7 @@ def test_g_no_check_can_be_switched_off_by_a_zero(name: str) -> None:
 
 async def test_h_nobody_can_switch_it_off() -> None:
     """There a service toggles it, and another moves its zones, for any caller."""
-    async with Bench(safety.run) as bench:
+    async with NodeBench(safety.run) as bench:
         bench.send(BODY_TOPIC, body())
         stranger = bench.network.transport()
         answers = [

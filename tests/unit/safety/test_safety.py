@@ -11,8 +11,8 @@ from gigabrain_zenoh.gate.causes import BRAIN_SILENT
 from gigabrain_zenoh.geometry.ages import scan_limit_ns
 from gigabrain_zenoh.safety.step import Inputs, Memory, step
 from gigabrain_zenoh.safety.zones import Field
-from tests.brain_rig import DRIVING, LIDAR, WAFFLE, open_space, scan, state
-from tests.gate_rig import plain
+from gigabrain_zenoh.testing.samples import DRIVING, LIDAR, WAFFLE, open_space, scan, state
+from tests.unit.gate.rig import plain
 
 MS = 1_000_000
 BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.32, stop_margin=0.08))

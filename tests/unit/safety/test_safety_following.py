@@ -7,8 +7,8 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
-from tests.brain_rig import DRIVING, state
-from tests.safety_rig import Patrol
+from gigabrain_zenoh.testing.samples import DRIVING, state
+from tests.unit.safety.patrol import Patrol
 
 REST, AHEAD, TURN = Velocity(), Velocity(linear_x=0.2), Velocity(angular_z=1.0)
 IDLE, STOPPING = GateStatus(mode="idle"), GateStatus(mode="stopping", commander="control")

@@ -8,8 +8,8 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus, Thresholds
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
-from tests.brain_rig import DRIVING
-from tests.safety_rig import BODY, Patrol
+from gigabrain_zenoh.testing.samples import DRIVING
+from tests.unit.safety.patrol import BODY, Patrol
 
 REST = Velocity()
 STOPPING = GateStatus(mode="stopping", commander="control")

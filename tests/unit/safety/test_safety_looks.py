@@ -13,7 +13,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.pose_history import PoseHistory
 from gigabrain_zenoh.safety import looks, zones
 from gigabrain_zenoh.safety.zones import Field, Motion
-from tests.brain_rig import DRIVING, LIDAR, WAFFLE, scan, state
+from gigabrain_zenoh.testing.samples import DRIVING, LIDAR, WAFFLE, scan, state
 
 BEAMS = 271  # a degree apart, from right behind on the right to right behind on the left
 HALF = math.radians(135)

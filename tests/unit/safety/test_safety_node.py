@@ -10,7 +10,8 @@ from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, SCAN, STATE, WORLD
 from gigabrain_zenoh.safety import node as safety
-from tests.brain_rig import BOOT, DRIVING, TICK_NS, Bench, body, open_space, scan, state
+from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, body, open_space, scan, state
 
 ALL = ("perception", "decision", "control")
 SCRIPT = GateStatus(mode="enabled", commander="script", enables=1)
@@ -19,7 +20,7 @@ WORLD_NOW = WorldModel(scan_ok=True, obstacle_ahead=False)
 INTENT_NOW = Intent(twist=Velocity(), behaviour="avoid", reason="because")
 
 
-class Chain(Bench):
+class Chain(NodeBench):
     """Safety, with all that it listens to."""
 
     def __init__(self) -> None:

@@ -3,7 +3,7 @@
 import pytest
 
 from gigabrain_schemas.body import Battery, Joint
-from tests.safety_rig import Patrol
+from tests.unit.safety.patrol import Patrol
 
 
 def charge(percentage: float, voltage: float = 11.0) -> Battery:

@@ -13,7 +13,7 @@ from gigabrain_schemas.body import BodyDescription, RobotState, Thresholds
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.pose_history import PoseHistory
 from gigabrain_zenoh.safety.late import Late, look, slows, stops
-from tests.brain_rig import LIDAR, WAFFLE, scan, state
+from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, scan, state
 
 BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.25))
 SLOW_LIDAR = replace(WAFFLE, lidar=replace(LIDAR, rate_hz=5.0), thresholds=BODY.thresholds)

@@ -12,8 +12,8 @@ from msgspec.structs import replace
 from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh.safety.attitude import tilt_deg
 from gigabrain_zenoh.safety.host import Host, HostWatch, warnings
-from tests.safety_rig import BODY, Patrol, imu
-from tests.stack import until
+from gigabrain_zenoh.testing.waiting import until
+from tests.unit.safety.patrol import BODY, Patrol, imu
 
 Usage = namedtuple("Usage", "free")
 

@@ -8,8 +8,8 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Thresholds
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_zenoh.safety.unknown import SECTORS
-from tests.brain_rig import LIDAR, WAFFLE, open_space
-from tests.safety_rig import BODY, Patrol
+from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, open_space
+from tests.unit.safety.patrol import BODY, Patrol
 
 AHEAD = Velocity(linear_x=0.2)
 OMNI = replace(BODY, drive_type="omni", max_lateral_speed=0.2)

@@ -12,7 +12,7 @@ from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.export import export
 from gigabrain_schemas.topics import SERVICES, TOPICS, messages
 from gigabrain_zenoh.qa.faults.hostile import leaves
-from tests.wire_rig import as_map, codec, dotted, refuses
+from tests.unit.schemas.plain import as_map, codec, dotted, refuses
 
 HEADER = {"stamp_ns", "seq", "boot", "tick", "basis"}
 

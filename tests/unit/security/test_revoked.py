@@ -11,36 +11,12 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.security.authority import issue
 from gigabrain_zenoh.security.identity import read
 from gigabrain_zenoh.security.revoked import revoke
-from tests.keys_rig import site
-from tests.stack import Home
-from tests.unit.security.test_acl import answer, ask, asked_until_answered
-from tests.zenoh_rig import Ear, repeat
-
-HELLO = "red/robot/teleop"
 
 
 @pytest.fixture
 def own(fleet: Path, tmp_path: Path) -> Path:
     """A fleet's folder that a test may change."""
     return Path(shutil.copytree(fleet, tmp_path / "fleet"))
-
-
-async def test_who_was_called_back_can_do_nothing_and_the_next_of_that_role_all(own: Path) -> None:
-    revoke(own, "operator")
-    assert issue(own, "operator").name == "operator-2"
-    async with site(own) as net:
-        robot = await net.client("robot@red", "red")
-        robot.serve("robot/release", answer)
-        ear = Ear(robot, "robot/teleop")
-        old, new, of_red = (net.raw(name) for name in ("operator", "operator-2", "operator@red"))
-        await asked_until_answered(new, "red/robot/release")
-        assert await ask(old, "red/robot/release") == []
-        old.put(HELLO, b"old")
-        await repeat(lambda: new.put(HELLO, b"new"), lambda: ear.heard)
-        await repeat(
-            lambda: of_red.put(HELLO, b"red"), lambda: ("robot/teleop", b"red") in ear.heard
-        )
-        assert ("robot/teleop", b"old") not in ear.heard
 
 
 def test_without_the_list_the_router_knows_the_first_generation_with_it_the_newest(
@@ -83,14 +59,3 @@ def test_a_list_that_cannot_be_read_opens_no_door(own: Path, text: str) -> None:
     at = Endpoint(listen=("tls/127.0.0.1:7447",), keys=str(own / "router"), fleet=("red",))
     with pytest.raises(ConfigError, match="copy it from the fleet's folder again"):
         session_config(at)
-
-
-async def test_keys_are_called_back_by_command(own: Path, home: Home) -> None:
-    said = await home.run("keys", "revoke", "operator", "--robot", "red", "--dir", str(own))
-    assert f"{own}/router/generations.json: copy it into that identity's folder" in said.out
-    assert said.out.endswith(f"gigabrain keys issue operator --robot red --dir {own}\n")
-    listed = home.start("keys", "list", "--dir", str(own))
-    assert await listed.ended() == 1
-    assert "operator@red was revoked; delete it" in listed.out
-    router = await home.run("keys", "zenohd", "--robot", "red", "--dir", str(own))
-    assert '"operator@red~2"' in router.out

@@ -13,10 +13,10 @@ from websockets.exceptions import ConnectionClosed
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
+from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.foxglove.layout import topic_to_steer
 from gigabrain_zenoh.ui.foxglove.steering import velocity_of
-from tests.foxglove_bridge_rig import Bridge, bridged, hold
-from tests.stack import until
+from tests.unit.ui.foxglove_bridge import Bridge, bridged, hold
 
 LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
 

@@ -17,6 +17,8 @@ from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.runtime.deployment import Deployment
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page.access import Access, check, tokens
 from gigabrain_zenoh.ui.page.beside import free_port, with_page
 from gigabrain_zenoh.ui.page.operator import Operator
@@ -25,7 +27,6 @@ from gigabrain_zenoh.ui.page.server import run
 from gigabrain_zenoh.ui.page.viewer import Viewer
 from gigabrain_zenoh.ui.page.wire import Ask, GoalRequest
 from gigabrain_zenoh.ui.seat import Seat
-from tests.bus_rig import Net, settle
 
 
 def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:

@@ -9,13 +9,14 @@ import pytest
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gigabrain_zenoh.config.settings import PageConfig
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page import wire
 from gigabrain_zenoh.ui.page.access import Access, tokens
 from gigabrain_zenoh.ui.page.operator import Operator
 from gigabrain_zenoh.ui.page.scene import Scene
 from gigabrain_zenoh.ui.page.sessions import Sessions
 from gigabrain_zenoh.ui.seat import Seat
-from tests.bus_rig import Net, settle
 
 HOST = "127.0.0.1:8080"
 

@@ -20,10 +20,10 @@ from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.gate.causes import estop
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.gamepad import Gamepad, Pad
 from gigabrain_zenoh.ui.teleop_keys import HeldKeys, keys_of
 from gigabrain_zenoh.ui.teleop_station import Station, readout
-from tests.bus_rig import until
 
 WAFFLE = load_robot("turtlebot3_waffle")  # 0.26 m/s, 1.82 rad/s
 ALPHA = load_robot("alpha")  # goes sideways as well, 0.2 m/s

@@ -1,0 +1,175 @@
+"""A whole robot in memory: a mock body, its driver process and the brain, in fake time."""
+
+import asyncio
+import functools
+import math
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Self
+
+from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.driver.process import DriverProcess
+from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.topics import STATE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import Close, LocalNetwork, LocalTransport, OnSample
+from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.config.settings import DecisionConfig, DriverConfig, PerceptionConfig, Resume
+from gigabrain_zenoh.control import node as control
+from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.runtime.process import MakeBus
+from gigabrain_zenoh.runtime.replay import Node
+from gigabrain_zenoh.safety import node as safety
+from gigabrain_zenoh.testing.samples import TICK_NS
+
+BRAIN: dict[str, Node] = {
+    "perception": functools.partial(perception.run, PerceptionConfig()),
+    "decision": functools.partial(decision.run, DecisionConfig(linear_speed=0.26)),
+    "control": control.run,
+    "safety": safety.run,
+}
+
+
+class FreezableTransport(LocalTransport):
+    """A transport of a process that can be frozen; it receives what it missed when it goes on."""
+
+    def __init__(self, network: LocalNetwork) -> None:
+        super().__init__(network)
+        self.frozen = False
+        self._missed: list[Callable[[], object]] = []
+
+    def subscribe(self, key: str, on_sample: OnSample, depth: int) -> Close:
+        """Subscribe as any transport does."""
+
+        def receive(key: str, payload: bytes) -> None:
+            if self.frozen:
+                self._missed.append(functools.partial(on_sample, key, payload))
+            else:
+                on_sample(key, payload)
+
+        return super().subscribe(key, receive, depth)
+
+    def thaw(self) -> None:
+        """Deliver what was missed."""
+        self.frozen = False
+        while self._missed:
+            self._missed.pop(0)()
+
+
+class RecordedBody(MockBody):
+    """A mock body that records its speed in each tick."""
+
+    def __init__(self, robot: RobotFile, options: MockOptions, run: Run) -> None:
+        super().__init__(robot, options, run)
+        self.speeds: list[float] = []  # one per tick, as it was when the tick began
+
+    def _advance(self) -> None:
+        self.speeds.append(self._velocity.linear_x)
+        super()._advance()
+
+
+class RobotInMemory:
+    """A robot whose processes are tasks: `async with RobotInMemory(folder) as robot:`.
+
+    Time passes in `go` alone, in ticks of 20 ms.
+    """
+
+    def __init__(self, folder: Path, *, resume: Resume = "auto", button: bool = False) -> None:
+        self.network, self.clock = LocalNetwork(), FakeClock()
+        self._config = DriverConfig(
+            body="mock", resume=resume, state_dir=str(folder), button=button
+        )
+        self._running: dict[str, tuple[asyncio.Future[None], Bus]] = {}
+        self._ends: dict[str, FreezableTransport] = {}
+        self.state: RobotState | None = None
+
+    async def __aenter__(self) -> Self:
+        self.operator = Bus(self.network.transport(), self.clock)
+        self.operator.subscribe(STATE, self._see)
+        for name in BRAIN:
+            self.start(name)
+        await self.clock.advance(0)
+        self.start_driver()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for name in list(self._running):
+            await self.kill(name)
+        await self.operator.close()
+
+    def start(self, name: str, make_bus: MakeBus = Bus) -> None:
+        """Start one of the brain's processes."""
+        self._ends[name] = FreezableTransport(self.network)
+        bus = make_bus(self._ends[name], self.clock, name)
+        self._running[name] = asyncio.ensure_future(BRAIN[name](bus, lambda: None)), bus
+
+    def start_driver(self) -> None:
+        """Start the driver's process, with a body at rest."""
+        robot = load_robot("mock")
+        self.body = RecordedBody(robot, MockOptions(driver="mock"), Run(folder=Path()))
+        bus = Bus(self.network.transport(), self.clock, "driver")
+        process = DriverProcess(self._config, robot, self.body, bus)
+        self._running["driver"] = asyncio.ensure_future(process.run(lambda: None)), bus
+
+    async def kill(self, name: str) -> None:
+        """End one process at once."""
+        task, bus = self._running.pop(name)
+        assert not task.done(), task
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        await bus.close()
+
+    def freeze(self, name: str) -> None:
+        """Stop one of the brain's processes, as SIGSTOP does."""
+        self._ends[name].frozen = True
+
+    def thaw(self, name: str) -> None:
+        """Let it go on, as SIGCONT does; it receives all that was sent meanwhile."""
+        self._ends[name].thaw()
+
+    async def go(self, ticks: int) -> list[float]:
+        """Let `ticks` pass; return the body's speed in each of them [m/s]."""
+        before = len(self.body.speeds)
+        await self.clock.advance(ticks * TICK_NS)
+        for task, _ in self._running.values():
+            if task.done():
+                task.result()
+        return self.body.speeds[before:]
+
+    def bus(self, name: str) -> Bus:
+        """Return the bus of one of the processes."""
+        return self._running[name][1]
+
+    @property
+    def mode(self) -> str:
+        """The gate's mode."""
+        assert self.state
+        return self.state.gate.mode
+
+    @property
+    def causes(self) -> list[str]:
+        """The codes of the gate's causes."""
+        assert self.state
+        return [cause.code for cause in self.state.gate.causes]
+
+    @property
+    def counters(self) -> Counter[str]:
+        """The counters of the driver's bus."""
+        return self._running["driver"][1].counters
+
+    def _see(self, _key: str, now: RobotState) -> None:
+        self.state = now
+
+
+def ticks_until(speeds: list[float], reached: Callable[[float], bool]) -> int:
+    """Return the first tick in which the body's speed is as wanted, counted from 1."""
+    return next(i for i, speed in enumerate(speeds, 1) if reached(speed))
+
+
+def travelled(speeds: list[float]) -> float:
+    """Return the way driven with these speeds [m]."""
+    return math.fsum(speeds) * 0.02

@@ -1,0 +1,180 @@
+"""Robots of real processes, started by `gigabrain` commands in folders of their own."""
+
+import contextlib
+import itertools
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+import msgspec
+
+import gigabrain_drivers
+import gigabrain_schemas
+import gigabrain_zenoh
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.runtime.running import Running
+from gigabrain_zenoh.testing.waiting import PATIENCE_S, until
+
+PACKAGES = (gigabrain_zenoh, gigabrain_drivers, gigabrain_schemas)
+SOURCES = dict.fromkeys(str(Path(str(package.__file__)).parents[1]) for package in PACKAGES)
+AVOID = ("demo", "--behaviour", "avoid")  # the quickest demo to start
+GIGABRAIN = (sys.executable, "-P", "-c", "from gigabrain_zenoh.cli.app import main; main()")
+
+
+def free_port() -> int:
+    """Return a free TCP port of the loopback."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def listens(port: int) -> bool:
+    """Return whether a server accepts connections at a port of the loopback."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+class Command:
+    """A `gigabrain` command in a process of its own, with its output in files."""
+
+    def __init__(
+        self,
+        out: Path,
+        environment: dict[str, str],
+        arguments: tuple[str, ...],
+        stdout: int | None = None,
+        inside: tuple[str, ...] = (),
+    ) -> None:
+        self._paths = out.with_suffix(".out"), out.with_suffix(".err")
+        self._files: tuple[IO[bytes], ...] = tuple(path.open("wb") for path in self._paths)
+        self._process = subprocess.Popen(
+            (*inside, *GIGABRAIN, *arguments),
+            stdin=subprocess.DEVNULL,
+            stdout=self._files[0] if stdout is None else stdout,
+            stderr=self._files[1],
+            env=environment,
+            start_new_session=True,
+        )
+        self.pid = self._process.pid
+
+    @property
+    def out(self) -> str:
+        """Its standard output so far."""
+        return self._paths[0].read_text()
+
+    @property
+    def err(self) -> str:
+        """Its standard error so far."""
+        return self._paths[1].read_text()
+
+    @property
+    def running(self) -> bool:
+        """True until it has ended."""
+        return self._process.poll() is None
+
+    def send(self, number: signal.Signals) -> None:
+        """Send it a signal; Ctrl-C is SIGINT."""
+        self._process.send_signal(number)
+
+    async def ended(self, within_s: float = PATIENCE_S) -> int:
+        """Wait for its end, and return the exit code."""
+        await until(lambda: not self.running, f"the end of {self._process.args!r}", within_s)
+        return int(self._process.returncode)
+
+    def close(self) -> None:
+        """End it by SIGTERM, after 5 s by SIGKILL."""
+        if self.running:
+            self._process.terminate()
+            try:
+                self._process.wait(5.0)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+        self._process.wait(5.0)
+        for file in self._files:
+            file.close()
+
+
+class Home:
+    """A user's folders, and the processes that are started with them.
+
+    `inside` is a prefix that runs a command somewhere else, such as in a network namespace.
+    """
+
+    def __init__(self, folder: Path, inside: tuple[str, ...] = ()) -> None:
+        self.folder, self._inside = folder, inside
+        folder.mkdir(exist_ok=True)
+        self._commands: list[Command] = []
+        self._numbers = itertools.count(1)
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """The environment of processes that live in these folders."""
+        return os.environ | {
+            "PYTHONPATH": os.pathsep.join(SOURCES),
+            "XDG_STATE_HOME": str(self.folder / "state"),
+            "XDG_RUNTIME_DIR": str(self.folder / "run"),
+            "NO_COLOR": "1",
+            "COLUMNS": "100",
+        }
+
+    def start(self, *arguments: str, stdout: int | None = None) -> Command:
+        """Start a `gigabrain` command; its output goes to `stdout`, or into `Command.out`."""
+        out = self.folder / f"command-{next(self._numbers)}"
+        self._commands.append(Command(out, self.environment, arguments, stdout, self._inside))
+        return self._commands[-1]
+
+    async def run(self, *arguments: str) -> Command:
+        """Start a `gigabrain` command and wait for its end."""
+        command = self.start(*arguments)
+        await command.ended()
+        return command
+
+    def deployment(self, **values: object) -> Path:
+        """Write a deployment file; the router gets a free port unless `values` names one."""
+        path = self.folder / f"deployment-{next(self._numbers)}.yaml"
+        router = f"tcp/127.0.0.1:{free_port()}"
+        path.write_bytes(msgspec.json.encode({"router": router} | values))  # YAML as well
+        return path
+
+    def processes(self, name: str = "") -> list[int]:
+        """Return the pids of the supervised processes that live here, or of those of this name."""
+        mine = f'"run_dir":"{self.folder}', f'"name":"{name}"' if name else ""
+        return [pid for pid, told in _processes() if all(part in told for part in mine)]
+
+    def close(self) -> None:
+        """End all processes that are left."""
+        for command in self._commands:
+            command.close()
+        for pid in self.processes():
+            os.kill(pid, signal.SIGKILL)
+
+
+def _processes() -> Iterator[tuple[int, str]]:
+    """Yield the pid and the arguments of each process of this machine."""
+    if Path("/proc/self/cmdline").exists():
+        for folder in Path("/proc").glob("[0-9]*"):
+            with contextlib.suppress(OSError):  # it has just ended
+                yield int(folder.name), (folder / "cmdline").read_text(errors="replace")
+        return
+    listed = subprocess.run(("ps", "-ww", "-A", "-o", "pid=,args="), capture_output=True, text=True)
+    for line in listed.stdout.splitlines():
+        pid, _, arguments = line.strip().partition(" ")
+        yield int(pid), arguments
+
+
+def endpoint_of(deployment: Path) -> Endpoint:
+    """Return the endpoint of a deployment file that `Home.deployment` wrote."""
+    values = msgspec.json.decode(deployment.read_bytes())
+    return Endpoint(connect=(values["router"],), namespace=values.get("namespace", ""))
+
+
+async def robot_of(home: Home, command: Command) -> Endpoint:
+    """Wait until a command has announced its robot, and return the robot's endpoint."""
+    note = home.folder / "run" / "gigabrain" / f"{command.pid}.json"
+    await until(note.exists, "the robot is announced")
+    return msgspec.json.decode(note.read_bytes(), type=Running).endpoint

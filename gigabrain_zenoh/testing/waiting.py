@@ -1,0 +1,33 @@
+"""Waits for what other threads and processes do."""
+
+import asyncio
+import threading
+from collections.abc import Callable
+
+PATIENCE_S = 60.0  # far more than anything takes on a busy machine
+POLL_S = 0.002
+
+
+async def until(
+    condition: Callable[[], object], what: str = "", within_s: float = PATIENCE_S
+) -> None:
+    """Wait until `condition` holds. Raises TimeoutError that names `what` where it never does."""
+    loop = asyncio.get_running_loop()
+    end_s = loop.time() + within_s
+    while not condition():
+        if loop.time() >= end_s:
+            raise TimeoutError(f"not within {within_s:g} s: {what or condition}")
+        await asyncio.sleep(POLL_S)
+
+
+async def settle() -> None:
+    """Let the event loop run what is due, without time passing."""
+    for _ in range(5):
+        await asyncio.sleep(0)
+
+
+def in_thread(work: Callable[[], None]) -> threading.Thread:
+    """Return a thread that has just begun to `work`."""
+    thread = threading.Thread(target=work)
+    thread.start()
+    return thread

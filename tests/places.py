@@ -1,0 +1,5 @@
+"""Places of a checkout."""
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]

@@ -1,0 +1,72 @@
+"""Takes the docs' pictures of the operator page: python -m tests.qa.pictures FOLDER."""
+
+import asyncio
+import sys
+import tempfile
+from pathlib import Path
+
+from playwright.async_api import Page, async_playwright
+
+from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.testing.processes import Home
+from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.ui.watch import Watch
+from tests.system.page import CHROMIUM, FLAGS, OPERATOR, Robot
+
+READY_S = 600.0  # a machine without compiled kernels compiles them first
+MAPPED_M2, MAP_S = 45.0, 300.0  # so much of the house is to be seen, and how long that may take
+NAVIGATES = {
+    "perception": {"mapping": "slam"},
+    "decision": {"behaviour": "navigate", "begin": "roam"},
+    "speed": 2.0,  # in lock-step, so that a busy machine does not make it stop
+}
+SIZES = {"light": (1280, 800), "phone": (390, 844), "dark": (1280, 800)}
+
+
+async def take(folder: Path) -> None:
+    """A house, explored until there is something to see; the topics as well in the dark one."""
+    with tempfile.TemporaryDirectory() as place:
+        home = Home(Path(place) / "home")
+        try:
+            robot = Robot(home, world="house", seed=1, **NAVIGATES)
+            async with looking_on(robot.endpoint) as seen:
+                watch = Watch(seen.bus)
+                await robot.served()
+                await until(lambda: watch.task.current, "decision is ready", READY_S)
+                await until(lambda: watch.mapped_m2, "a map", READY_S)
+                async with async_playwright() as playwright:
+                    chromium = await playwright.chromium.launch(
+                        executable_path=CHROMIUM, args=FLAGS
+                    )
+                    page = await chromium.new_page()
+                    await page.goto(f"{robot.origin}/#{OPERATOR}")
+                    for name in SIZES:
+                        await dress(page, name)
+                        await until(lambda: worth_a_picture(watch), "a way in a map", MAP_S)
+                        await page.screenshot(path=folder / f"page_{name}.png")
+                    await chromium.close()
+        finally:
+            home.close()
+
+
+def worth_a_picture(watch: Watch) -> bool:
+    """Whether the map has grown, and the robot drives to somewhere not too near."""
+    task, state = watch.task.current, watch.state.fresh()
+    far = task is not None and (task.distance_remaining or 0.0) > 2.0
+    drives = state is not None and state.gate.mode == "enabled" and state.velocity.linear_x > 0.1
+    return far and drives and (watch.mapped_m2 or 0.0) > MAPPED_M2
+
+
+async def dress(page: Page, name: str) -> None:
+    """One page is dressed anew for each picture: several at a time would slow the robot."""
+    width, height = SIZES[name]
+    await page.set_viewport_size({"width": width, "height": height})
+    await page.emulate_media(color_scheme="dark" if name == "dark" else "light")
+    if name == "dark":
+        await page.click("#tab-topics")
+    await page.wait_for_selector("#link.live")
+    await page.wait_for_timeout(1200)  # the tables are drawn once a second
+
+
+if __name__ == "__main__":
+    asyncio.run(take(Path(sys.argv[1])))

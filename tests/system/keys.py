@@ -1,0 +1,88 @@
+"""Fleets of two robots, red and blue, and sessions of whoever has which keys."""
+
+import contextlib
+import json
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import zenoh
+
+from gigabrain_zenoh.bus.zenoh.config import session_config
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.security.authority import issue, new_fleet
+from gigabrain_zenoh.security.roles import Role
+from gigabrain_zenoh.testing.zenoh import free_endpoint
+
+OF_RED: tuple[Role, ...] = ("robot", "brain", "operator", "viewer")
+
+
+def make_fleet(folder: Path, name: str) -> Path:
+    """Everybody's keys."""
+    new_fleet(name, folder)
+    for role in OF_RED:
+        issue(folder, role, robot="red")
+    for robot in ("blue", "green"):  # of green nobody will have heard
+        issue(folder, "robot", robot=robot)
+    for role in ("operator", "router"):
+        issue(folder, role)
+    return folder
+
+
+class Site:
+    """A router of red and blue in this process, and those who come to it."""
+
+    def __init__(self, fleet: Path) -> None:
+        self.fleet, self.address = fleet, free_endpoint()
+        self._stack = contextlib.AsyncExitStack()
+
+    async def open(self) -> None:
+        """Start the router."""
+        at = Endpoint(
+            listen=(self.address,), keys=str(self.fleet / "router"), fleet=("red", "blue")
+        )
+        await self._join(at)
+
+    def as_(self, name: str, namespace: str = "") -> Endpoint:
+        """Where somebody finds the router."""
+        keys = str(self.fleet / name)
+        return Endpoint(connect=(self.address,), namespace=namespace, keys=keys)
+
+    async def client(self, name: str, namespace: str = "") -> ZenohTransport:
+        """One of our processes."""
+        return await self._join(self.as_(name, namespace))
+
+    def raw(self, name: str) -> zenoh.Session:
+        """Somebody who knows nothing of this project, but has keys."""
+        return self._stack.enter_context(raw(self.as_(name)))
+
+    async def _join(self, endpoint: Endpoint) -> ZenohTransport:
+        transport = await ZenohTransport.open(endpoint)
+        self._stack.push_async_callback(transport.close)
+        return transport
+
+    async def close(self) -> None:
+        """Everybody leaves."""
+        await self._stack.aclose()
+
+
+@contextlib.asynccontextmanager
+async def site(fleet: Path) -> AsyncIterator[Site]:
+    """A router that does not outlive the test."""
+    made = Site(fleet)
+    try:
+        await made.open()
+        yield made
+    finally:
+        await made.close()
+
+
+@contextlib.contextmanager
+def raw(endpoint: Endpoint) -> Iterator[zenoh.Session]:
+    """A bare Zenoh session. Raises ZError at once where the router does not let it in."""
+    config = zenoh.Config()
+    for key, value in session_config(endpoint).items():
+        config.insert_json5(key, json.dumps(value))
+    config.insert_json5("connect/timeout_ms", "0")
+    with zenoh.open(config) as session:
+        yield session

@@ -1,0 +1,178 @@
+"""What each role may say, ask and answer: on a real router, over TLS, key by key."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TOPICS
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.security.authority import issue
+from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.zenoh import Ear, repeat
+from tests.system.keys import Site, make_fleet, raw, site
+
+SAYS = {
+    "brain": "world pose map intent task granted heard/perception health/perception log estop",
+    "operator": "teleop cmd_vel joint_cmd button log estop",
+    "viewer": "",
+}
+ASKS = {
+    "brain": "estop describe/driver",
+    "operator": "estop release enable goal mission task_change map_save audit_log param/driver "
+    "describe/driver",
+    "viewer": "audit_log describe/driver",
+}
+SAID = [topic.at("perception") for topic in (*TOPICS, ESTOP_SAID)]
+ASKED = [service.at("driver") for service in SERVICES]
+
+
+@pytest.fixture
+async def net(fleet: Path) -> AsyncIterator[Site]:
+    async with site(fleet) as made:
+        yield made
+
+
+async def answer(_: bytes) -> tuple[bytes, str]:
+    return b"answered", ""
+
+
+async def ask(session: zenoh.Session, key: str, payload: bytes = b"") -> list[bytes]:
+    def get() -> list[bytes]:
+        replies = session.get(key, payload=payload, timeout=5.0)
+        return [reply.ok.payload.to_bytes() for reply in replies if reply.ok]
+
+    return await asyncio.to_thread(get)
+
+
+async def asked_until_answered(session: zenoh.Session, key: str) -> None:
+    async with asyncio.timeout(30):
+        while not await ask(session, key):
+            pass
+
+
+async def test_a_robot_hears_of_each_role_what_it_may_say_and_no_more(net: Site) -> None:
+    robot = await net.client("robot@red", "red")
+    robot.serve("robot/describe/driver", answer)
+    ear = Ear(robot, "robot/**")
+    for role, expected in SAYS.items():
+        session = net.raw(f"{role}@red")
+        may = {f"robot/{name}" for name in expected.split()}
+        ear.heard.clear()
+
+        def say_all(session: zenoh.Session = session) -> None:
+            for key in SAID:
+                session.put(f"red/{key}", b"x")
+
+        await asked_until_answered(session, "red/robot/describe/driver")
+        await repeat(say_all, lambda may=may: {key for key, _ in ear.heard} >= may)
+        say_all()
+        await asked_until_answered(session, "red/robot/describe/driver")  # after all it has said
+        await until(lambda may=may: {key for key, _ in ear.heard} == may)
+
+
+async def test_each_role_may_ask_its_own_questions_and_no_others(net: Site) -> None:
+    robot = await net.client("robot@red", "red")
+    for key in ASKED:
+        robot.serve(key, answer)
+    for role, expected in ASKS.items():
+        session = net.raw(f"{role}@red")
+        await asked_until_answered(session, "red/robot/describe/driver")  # declared last of all
+        answered = {key for key in ASKED if await ask(session, f"red/{key}")}
+        assert answered == {f"robot/{name}" for name in expected.split()}
+
+
+async def test_nobody_but_the_robot_answers_for_its_gate(net: Site) -> None:
+    for role in ("brain", "operator", "viewer"):
+        (await net.client(f"{role}@red", "red")).serve("robot/estop", answer)
+    brain = await net.client("brain@red", "red")
+    brain.serve("robot/goal", answer)
+    operator = net.raw("operator@red")
+    await asked_until_answered(operator, "red/robot/goal")  # the brain's own, declared last
+    assert await ask(operator, "red/robot/estop") == []
+
+
+async def test_everybody_sees_all_of_a_robot_and_nothing_of_its_neighbour(net: Site) -> None:
+    red, blue = await net.client("robot@red", "red"), await net.client("robot@blue", "blue")
+    heard: list[str] = []
+    viewer, fleet = net.raw("viewer@red"), net.raw("operator")
+    for key in ("red/robot/**", "blue/robot/**", "**"):
+        viewer.declare_subscriber(key, lambda sample: heard.append(str(sample.key_expr)))
+    of_all: list[str] = []
+    fleet.declare_subscriber("*/robot/scan", lambda sample: of_all.append(str(sample.key_expr)))
+    sends = [red.publish, blue.publish]
+
+    def send() -> None:
+        for publish in sends:
+            for topic in TOPICS:
+                publish(topic, topic.at("driver"), b"x", "")
+
+    wanted = {f"red/{topic.at('driver')}" for topic in TOPICS}
+    await repeat(send, lambda: set(heard) >= wanted and len(set(of_all)) == 2)
+    assert set(heard) == wanted
+    assert set(of_all) == {"red/robot/scan", "blue/robot/scan"}
+
+
+async def test_a_hostile_robot_with_keys_of_its_own_cannot_touch_its_neighbour(net: Site) -> None:
+    """10,000 commands, and forged states and scans; none arrives, what blue may do still works."""
+    red = await net.client("robot@red", "red")
+    red.serve("robot/estop", answer)
+    red.serve("robot/enable", answer)
+    red_ear, viewer_ear = (
+        Ear(red, "robot/**"),
+        Ear(await net.client("viewer@red", "red"), "robot/**"),
+    )
+    blue_ear = Ear(await net.client("robot@blue", "blue"), "robot/**")
+    blue = net.raw("robot@blue")
+    commands = [blue.declare_publisher(f"red/robot/{key}") for key in ("cmd_vel", "teleop")]
+    for i in range(5000):
+        for publisher in commands:
+            publisher.put(i.to_bytes(4, "big"), encoding="application/msgpack;gigabrain.CmdVel")
+        blue.put("red/robot/state", b"forged")
+        blue.put("*/robot/cmd_vel", b"wild")
+        if i % 500 == 0:
+            await asyncio.sleep(0)
+    assert await ask(blue, "red/robot/estop") == []
+    assert await ask(blue, "red/robot/enable") == []
+    assert await ask(blue, "*/robot/enable") == []
+    await repeat(lambda: blue.put("blue/robot/cmd_vel", b"own"), lambda: blue_ear.heard)
+    assert red_ear.heard == viewer_ear.heard == []
+
+
+async def test_who_is_unknown_hears_nothing_and_is_not_heard(net: Site) -> None:
+    red = await net.client("robot@red", "red")
+    red.serve("robot/describe/driver", answer)
+    ear, heard = Ear(await net.client("operator@red", "red"), "robot/**"), list[str]()
+    green = net.raw("robot@green")
+    green.declare_subscriber(
+        "**",
+        lambda sample: heard.append(str(sample.key_expr)),
+        allowed_origin=zenoh.Locality.REMOTE,  # it hears itself, as everybody does
+    )
+    green.put("red/robot/cmd_vel", b"x")
+    assert await ask(green, "red/robot/describe/driver") == []
+    green.put("green/robot/cmd_vel", b"x")
+    topic = TOPICS[0]
+    await repeat(lambda: red.publish(topic, "robot/scan", b"x", ""), lambda: ear.heard)
+    assert {key for key, _ in ear.heard} == {"robot/scan"}
+    assert heard == []
+
+
+async def test_the_admin_space_is_closed_to_all(net: Site) -> None:
+    for name in ("robot@red", "operator", "robot@green"):
+        session = net.raw(name)
+        router = str(session.info.routers_zid()[0])
+        told = await asyncio.to_thread(lambda s=session: list(s.get("@/**", timeout=5.0)))
+        keys = [str(reply.ok.key_expr) for reply in told if reply.ok]
+        assert not [key for key in keys if key.startswith(f"@/{router}/")]
+
+
+async def test_keys_of_another_fleet_and_no_keys_are_turned_away(net: Site, tmp_path: Path) -> None:
+    strangers = make_fleet(tmp_path / "other", "home")  # it may even have the same name
+    mixed = issue(strangers, "operator", name="mixed")  # with our authority's certificate
+    (mixed / "ca.crt").write_bytes((net.fleet / "ca.crt").read_bytes())
+    for keys in (str(strangers / "operator"), str(mixed), ""):
+        with pytest.raises(zenoh.ZError), raw(Endpoint(connect=(net.address,), keys=keys)):
+            pass

@@ -1,0 +1,155 @@
+"""Playing a recording: complete, in time, and harmless beside a robot."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from gigabrain_schemas.examples import example
+from gigabrain_schemas.requests import DescribeRequest, EnableRequest, ReleaseRequest
+from gigabrain_schemas.topics import CMD_VEL, DESCRIBE, ENABLE, MAP, RELEASE, TELEOP
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.cli.app import make_app
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.recording.bagfile import BagFile
+from gigabrain_zenoh.recording.play import Player, PlayOptions, check_nobody_drives
+from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.testing.brain import RobotInMemory
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.testing.zenoh import repeat, robot
+from tests.unit.recording import bags
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """2 s: a map at the start, states and scans."""
+    path = tmp_path_factory.mktemp("bag") / "drive.mcap"
+    grid = bags.arrival(1, "robot/map", codec.encode(example(MAP.type)))
+    assert bags.write(path, iter([grid, *bags.drive(100)])) == 121
+    return path
+
+
+@pytest.mark.parametrize("rate", [1.0, 2.0])
+async def test_nothing_is_dropped(drive: Path, rate: float) -> None:
+    async with robot() as network:
+        await network.router()
+        ear, mouth = await network.client(), await network.client()
+        heard: list[tuple[str, str, bytes]] = []
+        ear.tap("robot/**", lambda *sample: heard.append(sample))
+        await repeat(lambda: mouth.publish(TELEOP, TELEOP.key, b"", ""), lambda: heard)
+        player = Player(drive, PlayOptions(rate=rate), mouth)
+        await player.play()
+        await until(lambda: sum(key != TELEOP.key for key, _, _ in heard) == 121)
+    assert player.sent == 121
+    others = (TELEOP.key, "robot/map")
+    assert [(key, encoding, data) for key, encoding, data in heard if key not in others] == [
+        (s.key, s.encoding, s.payload) for s in Bag(drive) if s.key not in others
+    ]
+
+
+async def test_from_the_middle_the_map_comes_first_and_late_joiners_get_it(drive: Path) -> None:
+    network = LocalNetwork()
+    player = Player(drive, PlayOptions(rate=100.0, start_s=1.0), network.transport())
+    await player.play()
+    keys = [key for key, _ in network.sent]
+    assert sorted(keys[:2]) == ["robot/map", "robot/state"]  # the newest of what is kept
+    assert keys[2:].count("robot/state") == 50
+    assert keys.count("robot/scan") == 11
+    late = Bus(network.transport(), Clock())
+    assert await late.kept(MAP) == [codec.encode(example(MAP.type))]
+    await late.close()
+
+
+async def test_it_can_be_looped_chosen_from_and_sent_on_other_keys(drive: Path) -> None:
+    network = LocalNetwork()
+    remap = {"robot/scan": "old/scan"}
+    options = PlayOptions(rate=100.0, loop=True, topics=("scan",), remap=remap)
+    playing = asyncio.ensure_future(Player(drive, options, network.transport()).play())
+    await until(lambda: len(network.sent) > 45)
+    playing.cancel()
+    await asyncio.wait((playing,))
+    assert {key for key, _ in network.sent} == {"old/scan"}
+    assert network.sent[0] == network.sent[20]
+
+
+async def test_the_pace_is_that_of_the_recording(drive: Path) -> None:
+    network = LocalNetwork()
+    loop = asyncio.get_running_loop()
+    began_s = loop.time()
+    await Player(drive, PlayOptions(rate=4.0), network.transport()).play()
+    assert loop.time() - began_s >= 2.0 / 4.0
+
+
+async def test_where_a_driver_runs_playing_is_refused() -> None:
+    net = Net()
+    await check_nobody_drives(net.one)
+
+    async def describe(_: DescribeRequest) -> object:
+        return example(DESCRIBE.reply)
+
+    net.two.serve(DESCRIBE, describe, name="driver")  # type: ignore[arg-type]
+    with pytest.raises(Refused, match=r"a driver runs here \(pid 4710\); play with another"):
+        await check_nobody_drives(net.one)
+    await net.one.close()
+    await net.two.close()
+
+
+async def test_recorded_commands_do_not_move_a_living_robot(tmp_path: Path) -> None:
+    async with RobotInMemory(tmp_path / "state", resume="manual") as living:
+        await living.go(50)
+        assert living.state
+        path = tmp_path / "commands.mcap"
+        file = BagFile(path, viewers=False, notes={})
+        for seq in range(1, 101):  # of an earlier start: everything is right but the boot
+            command = CMD_VEL.type(
+                linear_x=0.2, source="script", seq=seq,
+                boot=living.state.boot ^ 1, tick=living.state.tick + seq // 2,
+                basis=living.state.tick + seq // 2,
+            )  # fmt: skip
+            file.add(bags.arrival(seq * 10_000_000, CMD_VEL.key, codec.encode(command)))
+        file.finish()
+        file.close()
+        generation = living.state.gate.estop_generation
+        await living.operator.ask(RELEASE, ReleaseRequest(estop_generation=generation))
+        (reply,) = await living.operator.ask(ENABLE, EnableRequest(source="script", take=True))
+        assert reply.ok
+        player = Player(path, PlayOptions(rate=100.0), living.network.transport())
+        playing = asyncio.ensure_future(player.play())
+        speeds: list[float] = []
+        while not playing.done():
+            await asyncio.sleep(0.001)
+            if player.sent:
+                speeds += await living.go(1)
+        assert player.sent == 100
+        assert max(map(abs, speeds)) == 0.0
+        assert living.counters["refused_boot"] == 100
+
+
+async def test_an_empty_bag_and_bad_options_are_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    bags.write(path, iter(()))
+    with pytest.raises(ConfigError, match="holds no message to play"):
+        await Player(path, PlayOptions(), LocalNetwork().transport()).play()
+
+
+@pytest.mark.parametrize(
+    ("option", "complaint"),
+    [
+        (("--rate", "0"), "--rate: expected a number from 0.01 to 100, got 0"),
+        (("--start", "nan"), "--start: expected seconds from 0 on, got nan"),
+        (("--remap", "a"), "--remap: expected old/key=new/key, got 'a'"),
+    ],
+)
+def test_options_are_checked_before_anything_is_sent(
+    drive: Path, option: tuple[str, str], complaint: str
+) -> None:
+    command = ("bag", "play", str(drive), *option)
+    with pytest.raises(ConfigError) as error:
+        make_app(command)(
+            command, exit_on_error=False, print_error=False, result_action="return_value"
+        )
+    assert str(error.value) == complaint

@@ -1,0 +1,93 @@
+"""The benches: what they make of figures, what they show, and the commands on a robot."""
+
+import json
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gigabrain_zenoh.qa.bench.stack import Process, StackResult
+from gigabrain_zenoh.qa.bench.with_tools import ToolsResult
+from gigabrain_zenoh.testing.processes import Home
+
+
+def stack(**changes: object) -> StackResult:
+    values = {
+        "body": "turtlebot3_waffle",
+        "world": "arena",
+        "seconds": 20.0,
+        "ready_s": 1.2,
+        "physics_cpu": 0.04,
+        "processes": (
+            Process(name="driver", cpu=0.125, rss_bytes=95_000_000),
+            Process(name="perception", cpu=0.025, rss_bytes=56_000_000),
+            Process(name="safety", cpu=0.0625, rss_bytes=58_500_000),
+        ),
+    }
+    return msgspec.convert(values | changes, StackResult)
+
+
+async def test_the_chain_is_timed_beside_a_bare_relay(home: Home, tmp_path: Path) -> None:
+    report = tmp_path / "chain.json"
+    options = ("--seconds", "1", "--rounds", "1", "--rates", "50", "--json", str(report))
+    command = await home.run("bench", "chain", *options)
+    assert await command.ended() == 0, command.err
+    result = json.loads(report.read_bytes())
+    (rate,) = result["rates"]
+    for runs in (rate["chain"], rate["relay"], [rate["peers"]]):
+        assert runs[0]["n"] >= 10
+        assert 0 < runs[0]["p50_ms"] <= runs[0]["p99_ms"]
+    assert [hop["name"] for hop in result["hops"]] == [
+        "scan → world", "world → intent", "intent → cmd_vel", "cmd_vel → driver",
+    ]  # fmt: skip
+    assert result["payload_bytes"][0] > 1440  # 360 beams
+    assert "ratio p50" in command.out
+
+
+async def test_a_whole_robot_is_measured(home: Home, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    pytest.importorskip("gtsam")
+    report = tmp_path / "stack.json"
+    command = home.start("bench", "stack", "--seconds", "2", "--goal", "--json", str(report))
+    assert await command.ended(600.0) == 0, command.err  # where nothing is kept yet, it compiles
+    result = json.loads(report.read_bytes())
+    names = [process["name"] for process in result["processes"]]
+    assert names == ["router", "driver", "perception", "decision", "control", "safety"]
+    assert all(process["rss_bytes"] > 1e7 for process in result["processes"])
+    assert result["ready_s"] > 0
+    assert result["physics_cpu"] > 0
+    goal = result["first_goal"]
+    assert goal["told"].startswith("goal-1: ")
+    assert 0 < goal["accepted_s"] < goal["drives_s"]
+    assert 0 < goal["accepted_cpu_s"] <= goal["drives_cpu_s"]
+    assert "physics and lidar" in command.out
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (("chain", "--rates", "51"), "--rates: expected above 0, at most 50, got 51"),
+        (("chain", "--seconds", "0"), "--seconds: expected a number above 0, got 0"),
+        (("stack", "--body", "turtlebot3_wafle"), "did you mean 'turtlebot3_waffle'?"),
+    ],
+)
+async def test_what_cannot_be_measured_is_refused(
+    home: Home, options: tuple[str, ...], complaint: str
+) -> None:
+    command = await home.run("bench", *options)
+    assert complaint in command.err
+    assert await command.ended() == 2
+
+
+async def test_the_chain_is_timed_with_all_tools_beside_it(home: Home) -> None:
+    result = home.folder / "tools.json"
+    ran = await home.run(
+        "bench", "chain", "--with", "tools", "--seconds", "2", "--rounds", "1", "--rates", "10",
+        "--json", str(result),
+    )  # fmt: skip
+    assert (await ran.ended(), result.exists()) == (0, True), ran.err
+    told = msgspec.json.decode(result.read_bytes(), type=ToolsResult)
+    assert [tool.name for tool in told.tools] == ["recorder", "page", "foxglove", "topic echo"]
+    assert all(0 < tool.cpu < 1 for tool in told.tools), told.tools
+    assert told.recorded_hz > 50
+    assert told.rates[0].tools[0].n > 10

@@ -1,0 +1,160 @@
+"""Compiling beforehand, in a process of its own."""
+
+import asyncio
+import os
+import subprocess
+import sys
+import types
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("numba")
+
+from gigabrain_zenoh.cli.warm import warm
+from gigabrain_zenoh.decision.navigating import DRIVE_KERNELS
+from gigabrain_zenoh.kernels import compiling, numba_alone
+from gigabrain_zenoh.kernels import kernel as kernels
+from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
+from gigabrain_zenoh.plugins import find
+
+CALLS = """
+import os
+def warm_up():
+    with open(os.environ["CALLS"], "a") as file:
+        print(os.getpid(), file=file)
+"""
+WARM_UP = "counted:warm_up"
+
+
+@pytest.fixture
+def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The file that gets a line with the process's number whenever all is called."""
+    (tmp_path / "counted.py").write_text(CALLS)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("CALLS", str(tmp_path / "calls"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "kept"))
+    monkeypatch.delitem(sys.modules, "counted", raising=False)
+    return tmp_path / "calls"
+
+
+def who(calls: Path) -> list[bool]:
+    """For each call, whether it was this process's."""
+    return [int(line) == os.getpid() for line in calls.read_text().split()]
+
+
+async def test_the_first_start_compiles_in_a_process_of_its_own(calls: Path) -> None:
+    await compiling.compiled(WARM_UP)
+    assert who(calls) == [False, True]
+    await compiling.compiled(WARM_UP)
+    assert who(calls) == [False, True, True]
+
+
+async def test_after_a_change_of_any_kernel_it_does_so_again(
+    calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await compiling.compiled(WARM_UP)
+    monkeypatch.setattr(kernels, "PACKAGE", tmp_path)
+    await compiling.compiled(WARM_UP)
+    assert who(calls) == [False, True, False, True]
+
+
+async def test_where_nothing_can_be_kept_it_compiles_here(
+    calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))
+    await compiling.compiled(WARM_UP)
+    assert who(calls) == [True]
+
+
+def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) -> None:
+    mark = kernels.mark_of(WARM_UP)
+    assert mark
+    assert not mark.exists()
+    compiling.compile_all(WARM_UP)
+    assert mark.exists()
+
+
+@pytest.mark.parametrize("warm_up", [MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS])
+def test_what_is_to_be_called_is_there(warm_up: str) -> None:
+    assert isinstance(find(warm_up), types.FunctionType)
+
+
+@pytest.mark.parametrize("code", [0, 1])
+def test_what_is_compiled_beforehand_is_what_each_process_calls(
+    code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tried, done = list[str](), list[str]()
+
+    async def in_child(warm_up: str) -> int:
+        tried.append(warm_up)
+        return code
+
+    monkeypatch.setattr(compiling, "in_child", in_child)
+    monkeypatch.setattr(compiling, "compile_all", done.append)
+    warm()
+    assert sorted(tried) == sorted((MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS))
+    assert done == (tried if code else [])  # what a child cannot do
+    assert capsys.readouterr().out.count(" s\n") == 2
+
+
+def test_a_child_that_fails_says_so(calls: Path) -> None:
+    assert asyncio.run(compiling.in_child(WARM_UP)) == 0
+    assert who(calls) == [False]
+    assert asyncio.run(compiling.in_child("counted:nothing")) == 1
+
+
+ALONE = """
+import importlib, sys
+from gigabrain_zenoh.kernels import kernel as kernels
+@kernels.kernel
+def double(x):
+    return 2 * x
+double(21)
+print(*(name for name in sys.argv[1:] if name in sys.modules))
+for name in sys.argv[1:]:
+    importlib.import_module(name)
+"""
+
+
+def test_numba_imports_nothing_that_we_do_not_use_and_hides_nothing_for_good() -> None:
+    there = [name for name in numba_alone.UNUSED if find_spec(name.partition(".")[0])]
+    assert "coverage" in there
+    command = (sys.executable, "-c", ALONE, *there)
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "\n"), done.stderr
+
+
+FINDING = """
+import sys
+import gigabrain_zenoh.perception.mapper
+from gigabrain_zenoh.mapping.warm import warm_up_finding
+warm_up_finding()
+print("gtsam" in sys.modules)
+"""
+
+
+def test_who_finds_its_way_in_a_saved_map_does_not_pay_for_making_one() -> None:
+    done = subprocess.run((sys.executable, "-c", FINDING), capture_output=True, text=True)
+    assert done.stdout == "False\n", done.stderr
+
+
+def test_the_child_imports_nothing_from_the_current_folder(
+    calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    for name in ("msgspec", "signal", "gigabrain_schemas"):
+        (here / f"{name}.py").write_text(f"open({str(here / 'was_run')!r}, 'w')\n")
+    monkeypatch.chdir(here)
+    assert asyncio.run(compiling.in_child(WARM_UP)) == 0
+    assert not (here / "was_run").exists()
+    assert who(calls) == [False]
+
+
+def test_why_the_child_failed_is_in_the_log(calls: Path, caplog: pytest.LogCaptureFixture) -> None:
+    assert asyncio.run(compiling.in_child("counted:nothing")) == 1
+    (said,) = (record.getMessage() for record in caplog.records if "compil" in record.getMessage())
+    assert said.endswith("AttributeError: module 'counted' has no attribute 'nothing'")

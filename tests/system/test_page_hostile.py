@@ -1,0 +1,176 @@
+"""What a WebSocket client may send to the page's server, and what becomes of it."""
+
+import asyncio
+import contextlib
+import re
+import signal
+import socket
+import struct
+import urllib.request
+from collections.abc import Iterator
+
+import pytest
+from websockets.asyncio.client import ClientConnection
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from gigabrain_schemas.topics import TELEOP
+from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.testing.processes import AVOID, Home
+from gigabrain_zenoh.testing.waiting import until
+from gigabrain_zenoh.ui.page import wire
+from tests.system.page import OPERATOR, VIEWER, Robot, client
+
+DRIVE = struct.pack("<4B3f", wire.DRIVE, 0, 0, 0, 0.1, 0.0, 0.0)
+REST = struct.pack("<4B3f", wire.DRIVE, 0, 0, 0, 0.0, 0.0, 0.0)
+ESTOP = wire.as_json(wire.ASK, {"id": 1, "what": "estop"})
+
+
+@pytest.fixture(scope="module")
+def robot(shared_home: Home) -> Iterator[Robot]:
+    made = Robot(shared_home)
+    yield made
+    made.command.close()
+
+
+async def kinds(robot: Robot, token: str = OPERATOR) -> int:
+    """The kind of the first frame that a newcomer gets."""
+    async with client(robot, token) as socket:
+        frame = await asyncio.wait_for(socket.recv(), 20)
+        assert isinstance(frame, bytes)
+        return frame[0]
+
+
+async def hear_on(socket: ClientConnection) -> None:
+    while True:
+        await asyncio.wait_for(socket.recv(), 20)
+
+
+async def pour(socket: ClientConnection) -> None:
+    while True:
+        await socket.send(REST)
+        await asyncio.sleep(0)
+
+
+@pytest.fixture
+async def served(robot: Robot) -> None:
+    await robot.served()
+
+
+@pytest.mark.usefixtures("served")
+@pytest.mark.parametrize(
+    ("token", "frame"),
+    [
+        (OPERATOR, b""),
+        (OPERATOR, b"\xff" * 100),
+        (OPERATOR, bytes((wire.ASK,)) + b"{not json"),
+        (OPERATOR, wire.as_json(wire.ASK, {"id": 1, "what": "explode"})),
+        (OPERATOR, wire.as_json(wire.ASK, {"id": 1, "what": "estop", "more": 1})),
+        (OPERATOR, struct.pack("<4B3f", wire.DRIVE, 0, 0, 0, float("nan"), 0.0, 0.0)),
+        (OPERATOR, DRIVE[:-1]),
+        (OPERATOR, b"x" * 5000),
+        (VIEWER, DRIVE),
+        (VIEWER, ESTOP),
+    ],
+    ids=["empty", "noise", "json", "unknown", "more", "nan", "short", "long", "looker", "stop"],
+)
+async def test_what_no_page_of_ours_sends_ends_the_connection_and_moves_nothing(
+    robot: Robot, token: str, frame: bytes
+) -> None:
+    async with looking_on(robot.endpoint) as seen:
+        steered: list[object] = []
+        seen.bus.subscribe(TELEOP, lambda _key, twist: steered.append(twist))
+        generation = seen.state.gate.estop_generation
+        async with client(robot, token) as socket:
+            await socket.send(frame)
+            with pytest.raises(ConnectionClosed):
+                await hear_on(socket)
+        await seen.ticks(10)
+        assert steered == []
+        assert seen.state.gate.estop_generation == generation
+    assert await kinds(robot) == wire.ABOUT
+
+
+@pytest.mark.usefixtures("served")
+async def test_a_flood_is_cut_off_and_others_go_on(robot: Robot) -> None:
+    async with client(robot, VIEWER) as other, client(robot) as flood:
+        with pytest.raises(ConnectionClosed):
+            await pour(flood)
+        assert await asyncio.wait_for(other.recv(), 20)
+
+
+@pytest.mark.usefixtures("served")
+@pytest.mark.parametrize("begun", [b"", b"GET / HTTP/1.1\r\nHost: "], ids=["silent", "half"])
+async def test_those_who_connect_and_ask_for_nothing_keep_nobody_out(
+    robot: Robot, begun: bytes
+) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(100):
+            silent = socket.create_connection(("127.0.0.1", robot.port), timeout=20)
+            stack.enter_context(silent).sendall(begun)
+        page = await asyncio.to_thread(urllib.request.urlopen, robot.origin, timeout=20)
+        assert page.status == 200
+        page.close()
+        silent.settimeout(30)
+        assert await asyncio.to_thread(silent.recv, 1) == b""  # the last one is hung up on as well
+
+
+@pytest.mark.usefixtures("served")
+async def test_only_its_own_pages_with_a_token_are_let_in(robot: Robot) -> None:
+    with pytest.raises(InvalidStatus):
+        async with client(robot, origin="http://evil.example"):
+            pass
+    with pytest.raises(ConnectionClosed) as closed:
+        await kinds(robot, "a guess")
+    assert closed.value.rcvd
+    assert closed.value.rcvd.code == 4401
+
+
+@pytest.mark.usefixtures("served")
+async def test_a_page_asked_for_by_another_name_is_not_given(robot: Robot) -> None:
+    """DNS rebinding: another site's name that leads to this address."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", robot.port)
+    writer.write(b"GET / HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n\r\n")
+    assert b" 421 " in await reader.readline()
+    writer.close()
+    await writer.wait_closed()
+
+
+@pytest.mark.usefixtures("served")
+async def test_a_viewer_who_never_reads_slows_neither_robot_nor_others(robot: Robot) -> None:
+    reader, writer = await asyncio.open_connection("127.0.0.1", robot.port, limit=1024)
+    head = (
+        f"GET /ws HTTP/1.1\r\nHost: 127.0.0.1:{robot.port}\r\nOrigin: {robot.origin}\r\n"
+        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+    )
+    login = wire.as_json(wire.LOGIN, wire.Login(token=VIEWER))
+    writer.write(head.encode())
+    assert b" 101 " in await reader.readline()
+    writer.write(bytes((0x82, 0x80 | len(login), 0, 0, 0, 0)) + login)  # masked by zeros
+    async with client(robot, VIEWER) as other, looking_on(robot.endpoint) as seen:
+        begin = seen.state.tick
+        moments = 0
+        while moments < 50:
+            frame = await asyncio.wait_for(other.recv(), 20)
+            moments += frame[0] == wire.MOMENT
+        assert seen.state.boot != 0
+        await until(lambda: seen.state.tick - begin >= 200, "the robot's time goes on as well")
+    writer.close()
+
+
+async def test_a_demo_says_where_its_page_is_and_steps_aside_from_a_taken_port(
+    home: Home,
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        demo = home.start(*AVOID, "--headless", "--page", "--port", str(port))
+        await until(lambda: "operator page: http://127.0.0.1:" in demo.err, "it says where")
+        said = re.search(r"http://127\.0\.0\.1:(\d+)\n", demo.err)
+        assert said
+        assert int(said[1]) != port
+        reader, writer = await asyncio.open_connection("127.0.0.1", int(said[1]))
+        writer.write(f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{said[1]}\r\n\r\n".encode())
+        assert b" 200 " in await reader.readline()
+        writer.close()
+        demo.send(signal.SIGINT)
+        assert await demo.ended() == 0

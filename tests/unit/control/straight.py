@@ -1,0 +1,59 @@
+"""Control's step with a body that does as it is told."""
+
+import math
+
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import BodyDescription, GateStatus
+from gigabrain_schemas.brain import CmdVel, Intent
+from gigabrain_schemas.safety import SpeedCaps
+from gigabrain_zenoh.control.node import Inputs, Memory, step
+from gigabrain_zenoh.testing.samples import DRIVING, WAFFLE, state
+
+SHUT = {
+    "latched": GateStatus(mode="latched", enables=1),
+    "idle": GateStatus(mode="idle", enables=1),
+    "stopping": GateStatus(mode="stopping", commander="control", enables=1),
+    "a script's": GateStatus(mode="enabled", commander="script", enables=1),
+}
+
+
+def want(v: float = 0.0, w: float = 0.0, *, basis: int = 1) -> Intent:
+    twist = Velocity(linear_x=v, angular_z=w)
+    return Intent(twist=twist, behaviour="avoid", reason="because", basis=basis)
+
+
+class Drive:
+    """Control, and a body that goes `gain` times as fast as it is told: late, and by and by."""
+
+    def __init__(
+        self, body: BodyDescription = WAFFLE, *, gain: float = 1.0, lag_s: float = 0.0
+    ) -> None:
+        self.body, self.memory, self.tick = body, Memory(), 0
+        self._gain, self._follows = gain, 1 - math.exp(-0.02 / lag_s) if lag_s else 1.0
+        self.v = self.w = 0.0
+        self._told = CmdVel(linear_x=0.0)
+
+    def go(
+        self,
+        intent: Intent | None = None,
+        *,
+        teleop: Velocity | None = None,
+        caps: SpeedCaps | None = None,
+        gate: GateStatus = DRIVING,
+        boot: int = 7,
+        ticks_passed: int = 1,
+    ) -> CmdVel:
+        """One tick."""
+        self.tick += ticks_passed
+        self.v += (self._gain * self._told.linear_x - self.v) * self._follows
+        self.w += (self._gain * self._told.angular_z - self.w) * self._follows
+        measured = state(self.tick, v=self.v, w=self.w, gate=gate, boot=boot)
+        inputs = Inputs(state=measured, intent=intent, teleop=teleop, caps=caps or SpeedCaps())
+        self.memory, self._told = step(self.body, self.memory, inputs)
+        return self._told
+
+    def speeds(
+        self, ticks: int, intent: Intent | None = None, *, caps: SpeedCaps | None = None
+    ) -> list[float]:
+        """The linear speeds commanded in so many ticks."""
+        return [self.go(intent, caps=caps).linear_x for _ in range(ticks)]

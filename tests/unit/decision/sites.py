@@ -1,0 +1,153 @@
+"""Who carries out tasks, in memory: the executive on time that the test counts, the service."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.brain import PoseInMap
+from gigabrain_schemas.tasks import (
+    Goal,
+    GoalReply,
+    GoalRequest,
+    MissionReply,
+    MissionRequest,
+    TaskReply,
+    TaskRequest,
+    TaskStatus,
+)
+from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, Topic
+from gigabrain_zenoh.decision.tasks import checks
+from gigabrain_zenoh.decision.tasks.executive import Executive, Saved
+from gigabrain_zenoh.decision.tasks.mission import Script
+from gigabrain_zenoh.decision.tasks.orders import Explore, GoTo, Order, Outcome
+from gigabrain_zenoh.decision.tasks.service import TaskService
+from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.samples import BOOT, state
+from gigabrain_zenoh.testing.waiting import settle
+
+PLACES = "places: {dock: [0, 0, 1.5], a: [1, 0], b: [2, 0], c: [3, 0]}\n"
+
+
+class Program:
+    """A program of the host that ends when the test says so."""
+
+    def __init__(self, script: Script) -> None:
+        self.script, self.stopped = script, False
+        self.result: tuple[bool, str] | None = None
+
+    def stop(self) -> None:
+        self.stopped = True
+
+
+class Robot:
+    """An executive, on time that the test counts, and somebody who drives."""
+
+    def __init__(self, saved: Saved | None = None) -> None:
+        self.charge, self.programs = 100.0, list[Program]()
+        self.pose: PoseInMap | None = None
+        self.tasks = Executive(self._read, self._start, saved or Saved())
+        self.order: Order | None = None
+        self.outcome: Outcome | None = None
+
+    def carry_out(self, text: str, how: Any = "replace") -> str:
+        return self.tasks.carry_out(checks.loads(PLACES + text, "m"), "m", how, "ann")
+
+    def step(self, seconds: float = 0.1) -> float | str | None:
+        """One step; where the robot is wanted: x of a goal, `explore`, or nowhere."""
+        self.order = self.tasks.step(seconds, self.outcome)
+        self.outcome = None
+        return _short(self.order)
+
+    def reached(self) -> float | str | None:
+        """What comes once it has got there."""
+        return self._became("done", "it is there")
+
+    def failed(self, why: str = "no way") -> float | str | None:
+        """What comes when it cannot get there."""
+        return self._became("failed", why)
+
+    @property
+    def status(self) -> TaskStatus:
+        return self.tasks.status
+
+    @property
+    def last(self) -> tuple[str, str]:
+        """How the last task ended."""
+        return self.status.done[0].state, self.status.done[0].reason
+
+    def _became(self, state: Any, reason: str) -> float | str | None:
+        assert self.order
+        self.outcome = Outcome(number=self.order.number, state=state, reason=reason)
+        return self.step()
+
+    def _read(self, topic: Topic[Any]) -> Message | None:
+        return state(1, battery=self.charge) if topic is STATE else self.pose
+
+    def _start(self, script: Script) -> Program:
+        self.programs.append(Program(script))
+        return self.programs[-1]
+
+
+def _short(order: Order | None) -> float | str | None:
+    if isinstance(order, GoTo):
+        return order.goal.x
+    return "explore" if isinstance(order, Explore) else None
+
+
+@contextmanager
+def one_robot() -> Iterator[Robot]:
+    """A robot none of whose programs outlives the test."""
+    made = Robot()
+    yield made
+    assert all(program.stopped for program in made.programs)
+
+
+class Site:
+    """A service of tasks, somebody who drives, and somebody who asks."""
+
+    def __init__(self, folder: Path, *, scripts: str = "") -> None:
+        self.net = Net()
+        self.wall, self.lost = "", ""
+        self.service = TaskService(self.net.one, self, folder=str(folder), scripts=scripts)
+        self.told: list[TaskStatus] = []
+        self.net.two.subscribe(TASK, lambda _key, status: self.told.append(status))
+        self.tick, self.order, self.outcome = 0, None, None
+        self.order: Order | None
+        self.outcome: Outcome | None
+
+    async def can_reach(self, goal: Goal) -> str:
+        await self.can_drive()
+        if self.wall:
+            raise Refused(self.wall)
+        return "on the way, 4.2 m"
+
+    async def can_drive(self) -> None:
+        if self.lost:
+            raise Refused(self.lost)
+
+    async def go(self, x: float, **how: str) -> GoalReply:
+        request = msgspec.convert({"x": x, "y": 0.0, "source": "ann"} | how, GoalRequest)
+        return (await self.net.two.ask(GOAL, request))[0]
+
+    async def carry_out(self, text: str) -> MissionReply:
+        request = MissionRequest(mission=text, source="ann", label="tea")
+        return (await self.net.two.ask(MISSION, request))[0]
+
+    async def change(self, do: str, task: str = "") -> TaskReply:
+        request = msgspec.convert({"do": do, "task": task, "source": "bob"}, TaskRequest)
+        return (await self.net.two.ask(TASK_CHANGE, request))[0]
+
+    async def step(self, ticks: int = 5, boot: int = BOOT) -> None:
+        self.tick += ticks
+        self.net.one.time.see(state(self.tick, boot=boot))
+        self.order = self.service.step(state(self.tick, boot=boot), self.outcome)
+        self.outcome = None
+        await settle()
+
+    async def end(self) -> None:
+        await self.service.close()

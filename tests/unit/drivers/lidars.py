@@ -1,0 +1,96 @@
+"""Lidars on real ptys, with the Waffle at rest in the arena behind them."""
+
+import functools
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.emulators.base import Device, EmulatedBody
+from gigabrain_drivers.emulators.physics import emulated_body
+from gigabrain_drivers.emulators.station import Station
+from gigabrain_drivers.lidars.serial_source import SerialSource
+from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.body import Lidar
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.testing.waiting import until
+
+LIDAR = Lidar(beams=360, rate_hz=10, range_min=0.12, range_max=3.5)
+
+
+class Wire:
+    """Collects what a device sends."""
+
+    def __init__(self) -> None:
+        self.sent: list[bytes] = []
+
+    def write(self, data: bytes) -> bool:
+        self.sent.append(data)
+        return True
+
+
+def waffle(world: str = "arena") -> EmulatedBody:
+    """Not started: its time stands still."""
+    return emulated_body("turtlebot3_waffle", Run(folder=Path(), world=world))
+
+
+@functools.cache
+def truth() -> NDArray[np.float32]:
+    """What the simulation's own lidar sees from where the body stands, (360,) [m]."""
+    return waffle().simulation.scan()
+
+
+def run_for(body: EmulatedBody, device: Device, seconds: float) -> None:
+    """Let simulated time go by, in steps of 10 ms, without waiting for it."""
+    for _ in range(round(seconds * 100)):
+        body._step()
+        device.step(body.snapshot.time_ns)
+
+
+@asynccontextmanager
+async def emulated(device: type[Device], options: Any) -> AsyncIterator[Station]:
+    """The device on its pty, in real time."""
+    body = waffle()
+    station = Station(functools.partial(device, body, options), device.port(options), Clock())
+    body.start()
+    station.start()
+    try:
+        yield station
+    finally:
+        await station.close()
+        await body.close()
+
+
+class Listener:
+    """The scans of a source, from its opening to its close."""
+
+    def __init__(self, source: SerialSource) -> None:
+        self.source, self.scans = source, list[LaserScan]()
+        source.emit = self.scans.append
+
+    async def __aenter__(self) -> "Listener":
+        self.source.open()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.source.close()
+
+    async def more(self, count: int) -> list[LaserScan]:
+        """The next `count` scans."""
+        start = len(self.scans)
+        await until(lambda: len(self.scans) >= start + count)
+        return self.scans[start : start + count]
+
+
+def agree(scan: LaserScan, expected: NDArray[np.float32], within: float = 0.06) -> float:
+    """The share of beams that agree; at edges, neighbours may see one side or the other."""
+    got, seen = (
+        np.nan_to_num(values, nan=-1.0, posinf=99.0) for values in (ranges(scan), expected)
+    )
+    near = [np.roll(seen, shift) for shift in (-1, 0, 1)]
+    return float(np.mean(np.any([np.abs(got - other) < within for other in near], axis=0)))

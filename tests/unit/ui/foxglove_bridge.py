@@ -1,0 +1,67 @@
+"""A Foxglove bridge in memory, beside a robot that says what a test wants."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+from websockets.asyncio.client import connect
+
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_schemas.body import Body
+from gigabrain_schemas.brain import Twist
+from gigabrain_schemas.topics import BODY, TELEOP
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.settings import FoxgloveConfig
+from gigabrain_zenoh.testing.processes import free_port
+from gigabrain_zenoh.testing.waiting import PATIENCE_S
+from gigabrain_zenoh.ui.foxglove.server import run
+from tests.unit.ui.foxglove_viewer import Viewer
+
+
+class Bridge:
+    """A robot that says what a test wants, and the bridge beside it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.config = FoxgloveConfig(port=free_port(), secret=str(folder / "secret"))
+        network = LocalNetwork()
+        self.robot = Bus(network.transport(), Clock(), "driver")
+        self.bus = Bus(network.transport(), Clock(), "foxglove")
+        self.steered: list[Twist] = []
+        self.robot.subscribe(TELEOP, lambda _key, twist: self.steered.append(twist))
+        body = load_robot("turtlebot3_waffle").description()
+        self.robot.publish(BODY, Body(description=body, link="sim"))
+
+    @property
+    def turns(self) -> list[float]:
+        return [twist.angular_z for twist in self.steered]
+
+    @contextlib.asynccontextmanager
+    async def viewer(self) -> AsyncIterator[Viewer]:
+        url = f"ws://127.0.0.1:{self.config.port}"
+        async with connect(url, subprotocols=["foxglove.sdk.v1"]) as made:  # type: ignore[list-item]
+            yield Viewer(made)
+
+
+@contextlib.asynccontextmanager
+async def bridged(folder: Path) -> AsyncIterator[Bridge]:
+    """A bridge that serves until the test is over."""
+    made, ready = Bridge(folder), asyncio.Event()
+    serving = asyncio.ensure_future(run(made.config, made.bus, ready.set))
+    await ready.wait()
+    yield made
+    serving.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await serving
+
+
+async def hold(viewer: Viewer, content: object, done: Callable[[], object]) -> None:
+    """Say it again and again, as the Teleop panel does while a button is held."""
+    async with asyncio.timeout(PATIENCE_S):
+        while True:
+            await viewer.publish(content)
+            await asyncio.sleep(0.04)
+            if done():
+                return
