@@ -24,8 +24,8 @@ def info(file: Path, *, json: bool = False) -> int:
     json
         For programs instead of people.
     """
-    from gigabrain_zenoh.recording.info import info as read
-    from gigabrain_zenoh.recording.tables import print_info
+    from gigabrain_zenoh.recording.bag_info import print_info
+    from gigabrain_zenoh.recording.bag_info import read_info as read
 
     found = read(file)
     if json:
@@ -47,8 +47,8 @@ def check(file: Path) -> int:
     file
         The recording.
     """
-    from gigabrain_zenoh.recording.info import faults
-    from gigabrain_zenoh.recording.info import info as read
+    from gigabrain_zenoh.recording.bag_info import faults
+    from gigabrain_zenoh.recording.bag_info import read_info as read
 
     found = read(file)
     wrong = faults(found)
@@ -73,14 +73,14 @@ def recover(file: Path, *, output: Annotated[Path | None, Parameter(alias="-o")]
     output
         The new file; without it, beside the old one with `_recovered` in its name.
     """
-    from gigabrain_zenoh.recording.recover import recover as mend
+    from gigabrain_zenoh.recording.bag_recovery import recover as mend
 
     done = mend(file, output or file.with_name(f"{file.stem}_recovered{file.suffix}"))
     for damage in done.damages:
-        print(f"{file}: byte {damage.offset}: {damage.what}")
+        print(f"{file}: byte {damage.offset}: {damage.text}")
     if not done.messages:
         done.path.unlink()
-        print(f"{file}: nothing could be saved")
+        print(f"{file}: nothing could be recovered")
         return 1
     print(f"{done.path}: {done.messages} messages")
     return 0
@@ -118,8 +118,8 @@ def play(
     beside_robot
         Even where a driver runs. Its gate refuses recorded commands; its brain is confused.
     """
-    from gigabrain_zenoh.recording.command import play as run
-    from gigabrain_zenoh.recording.play import PlayOptions
+    from gigabrain_zenoh.recording.player import PlayOptions
+    from gigabrain_zenoh.recording.player import play as run
 
     if not 0.01 <= rate <= 100:
         raise ConfigError(f"--rate: expected a number from 0.01 to 100, got {rate:g}")
@@ -159,7 +159,7 @@ def plot(
     output
         The file to write; without it, beside the recording.
     """
-    from gigabrain_zenoh.recording.plot import plot as draw
+    from gigabrain_zenoh.recording.message_tables import plot as draw
 
     print(draw(file, fields, output or file.with_suffix(".png")))
     return 0
@@ -180,7 +180,7 @@ def convert(file: Path, *, csv: Path | None = None, lerobot: Path | None = None)
         A new folder for the dataset.
     """
     from gigabrain_zenoh.recording.lerobot import convert as write_lerobot
-    from gigabrain_zenoh.recording.tables import write_csv
+    from gigabrain_zenoh.recording.message_tables import write_csv
 
     if csv is None and lerobot is None:
         raise ConfigError("say into what: --csv FOLDER or --lerobot FOLDER")

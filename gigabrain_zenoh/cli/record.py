@@ -45,8 +45,8 @@ def record(
     keep_free
         Stop writing while less than this is free on the disk [MB].
     """
-    from gigabrain_zenoh.recording.command import record as run
     from gigabrain_zenoh.recording.node import file_name
+    from gigabrain_zenoh.recording.node import record as run
 
     limits = {"seconds": seconds, "split-size": split_size, "split-time": split_time}
     for name, value in limits.items():

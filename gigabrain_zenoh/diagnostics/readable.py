@@ -12,7 +12,7 @@ from gigabrain_zenoh.diagnostics.arrays_in_words import Summary, array_of, plain
 from gigabrain_zenoh.diagnostics.names import topic_of
 from gigabrain_zenoh.errors import unknown
 from gigabrain_zenoh.host import log_text
-from gigabrain_zenoh.recording.gaps import is_json
+from gigabrain_zenoh.recording.headers import is_json
 
 LONG = 8  # numbers; more of them are summarised
 SHOWN = 64  # bytes of what nobody can read

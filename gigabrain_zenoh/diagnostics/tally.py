@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from msgspec import Struct
 
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.recording.gaps import Gaps, header_of
+from gigabrain_zenoh.recording.headers import SequenceGaps, header_of
 
 ROOM = 2000  # arrivals that are remembered per key
 MOST_KEYS = 1000  # that are listened to; anybody may make up another
@@ -96,7 +96,7 @@ class Tally:
         self._now_ns, self._unix_ns = now_ns, unix_ns
         self._lock = threading.Lock()
         self._streams: dict[str, Stream] = {}
-        self._gaps = Gaps()
+        self._gaps = SequenceGaps()
 
     def hear(self, key: str, encoding: str, payload: bytes) -> None:
         """Take one message."""

@@ -14,7 +14,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig, Re
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.launch.demo import Demo, DemoOptions
 from gigabrain_zenoh.launch.processes import node_of
-from gigabrain_zenoh.recording.process_replay import SAYS, replay_process, settings_for
+from gigabrain_zenoh.recording.process_replay import OUTPUTS, replay_process, settings_for
 from gigabrain_zenoh.runtime.deployment import ALL, Deployment
 
 AVOIDS = ("state", "body", "scan", "world", "intent", "cmd_vel", "safety")
@@ -71,7 +71,7 @@ def record(drive: Drive, to: Path) -> int:
 
 def repeats(path: Path) -> bool:
     """Whether every process does the same again: no tick was given up on a busy machine."""
-    replays = (replay_process(path, p, settings_for(path, p, None), node_of) for p in SAYS)
+    replays = (replay_process(path, p, settings_for(path, p, None), node_of) for p in OUTPUTS)
     return all(asyncio.run(replayed).same for replayed in replays)
 
 

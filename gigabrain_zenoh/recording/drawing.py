@@ -1,7 +1,7 @@
-"""What Foxglove, Lichtblick and Rerun draw of our messages: one conversion per message type.
+"""Converts messages into those that Foxglove, Lichtblick and Rerun draw.
 
-The recorder and the live bridge have this table in common. Frames by REP-105: map → odom →
-base_link → the lidar's own.
+The recorder and the live bridge share this table. Frames by REP-105: map → odom → base_link → the
+lidar's own frame.
 """
 
 import functools
@@ -17,18 +17,16 @@ from foxglove import messages as fox
 from gigabrain_schemas import arrays
 from gigabrain_schemas.base import Message, Pose
 from gigabrain_schemas.body import Body, RobotState
-from gigabrain_schemas.brain import Intent, OccupancyGrid, PoseInMap, WorldModel
+from gigabrain_schemas.brain import Intent, Obstacle, OccupancyGrid, PoseInMap, WorldModel
 from gigabrain_schemas.safety import LogRecord
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import CMD_VEL, INTENT, SAFETY, STATE, WORLD, Topic
-from gigabrain_zenoh.recording.schema import flat_schema
-from gigabrain_zenoh.recording.shapes import pose_of, stamp, things, turn
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
 LIDAR = "base_scan"  # as LaserScan has it
-GREY = [round(254 - 2.54 * cell) for cell in range(101)]  # by how sure it is that a cell is taken
-COLOURS = np.array(  # red, green, blue and alpha as one number; what is unknown is not drawn
+GREY = [round(254 - 2.54 * cell) for cell in range(101)]  # by probability of being occupied [%]
+CELL_COLOURS = np.array(  # red, green, blue and alpha as one number; unknown is transparent
     [
         *((grey, grey, grey, 255) for grey in GREY),
         *[(128, 128, 128, 255)] * 154,
@@ -36,21 +34,32 @@ COLOURS = np.array(  # red, green, blue and alpha as one number; what is unknown
     ],
     np.uint8,
 ).view("<u4")[:, 0]
-PATH_STEP = 2  # of the trajectory's points one is drawn: five a second of the way ahead
-LEVELS = {
+PATH_STEP = 2  # every second point of a trajectory is drawn: five for each second of it
+LOG_LEVELS = {
     "debug": fox.LogLevel.Debug,
     "info": fox.LogLevel.Info,
     "warning": fox.LogLevel.Warning,
     "error": fox.LogLevel.Error,
     "critical": fox.LogLevel.Fatal,
 }
+PLOTTED_KEYS = {topic.key for topic in (STATE, WORLD, INTENT, CMD_VEL, SAFETY)}
 
+AMBER = fox.Color(r=0.96, g=0.62, b=0.04, a=0.6)
+OBSTACLE_HEIGHT_M = 0.3
+LINE_WIDTH_M = 0.08
+ARROW_TIME_S = 1.0  # an arrow reaches to where an obstacle will be then
+MIN_ARROW_SPEED = 0.05  # [m/s]
+MIN_WALL_RADIUS_M = 0.3  # larger obstacles at rest are drawn as the points seen of them
+MAX_POINT_GAP_M = 0.25  # between two neighbouring points on one obstacle
+OBSTACLE_LIFETIME = fox.Duration(sec=1)
 
-PLOTTED = {topic.key for topic in (STATE, WORLD, INTENT, CMD_VEL, SAFETY)}
+MAX_SCHEMA_DEPTH = 12  # a Struct may contain itself
+SCALARS = {str: "string", bool: "boolean", int: "integer", float: "number"}
+BOUNDS = ("type", "minimum", "exclusiveMinimum")
 
 
 class Drawn(NamedTuple):
-    """One message for a viewer."""
+    """One encoded message for viewers."""
 
     topic: str
     encoding: str  # protobuf or json
@@ -58,13 +67,12 @@ class Drawn(NamedTuple):
     data: bytes
 
 
-def of(topic: str, message: Any) -> Drawn:
-    """A message of foxglove's, encoded."""
+def _drawn(topic: str, message: Any) -> Drawn:
     return Drawn(f"/viz/{topic}", "protobuf", type(message).get_schema, message.encode())
 
 
-def numbers(topic: Topic[Any], message: Message) -> Drawn:
-    """The numbers of a message, for plots; what is drawn anyway is left out."""
+def _numbers(topic: Topic[Any], message: Message) -> Drawn:
+    """Return the numbers of a message for plots, without what is drawn otherwise."""
     if isinstance(message, WorldModel):
         message = msgspec.structs.replace(message, hits=b"", obstacles=())
     elif isinstance(message, Intent):
@@ -74,17 +82,12 @@ def numbers(topic: Topic[Any], message: Message) -> Drawn:
     return Drawn(name, "json", schema, msgspec.json.encode(message))
 
 
-def json_schema(kind: type[Message]) -> Schema:
-    """The schema of one of our messages, as viewers accept it."""
-    return Schema(name=f"gigabrain.{kind.__name__}", encoding="jsonschema", data=flat_schema(kind))
-
-
 class Drawer:
-    """Converts message after message; remembers how the frames lie to one another."""
+    """Converts one message after another; keeps the newest odometry pose for the frames."""
 
     def __init__(self) -> None:
         self._odometry = Pose(x=0.0, y=0.0, yaw=0.0)
-        self._thought = (0, -1)  # boot and basis of the intent whose path was drawn last
+        self._last_intent = (0, -1)  # boot and basis of the last path drawn
         self._converters: dict[type[Message], Callable[[Any, str], Iterable[Drawn]]] = {
             LaserScan: self._scan,
             OccupancyGrid: self._map,
@@ -99,22 +102,22 @@ class Drawer:
         }
 
     def draws(self, topic: Topic[Any]) -> bool:
-        """Whether there is anything to see of a topic."""
-        return topic.key in PLOTTED or topic.type in self._converters
+        """Return whether viewers draw anything of a topic."""
+        return topic.key in PLOTTED_KEYS or topic.type in self._converters
 
     def draw(self, topic: Topic[Any], message: Message, name: str = "") -> Iterable[Drawn]:
-        """What viewers show of `message`; `name` is the camera's, where there are several."""
-        if isinstance(message, Intent) and not self._thought_again(message):
+        """Yield the messages that viewers draw of `message`; `name` is that of a camera."""
+        if isinstance(message, Intent) and not self._is_new(message):
             return
         if topic.type in self._converters:
             yield from self._converters[topic.type](message, name)
-        if topic.key in PLOTTED:
-            yield numbers(topic, message)
+        if topic.key in PLOTTED_KEYS:
+            yield _numbers(topic, message)
 
-    def _thought_again(self, intent: Intent) -> bool:
-        """Whether it is new: it is said again with every tick, and drawn once."""
-        before, self._thought = self._thought, (intent.boot, intent.basis)
-        return before != self._thought
+    def _is_new(self, intent: Intent) -> bool:
+        """Return whether an intent is new; it is repeated with every tick."""
+        before, self._last_intent = self._last_intent, (intent.boot, intent.basis)
+        return before != self._last_intent
 
     def _scan(self, scan: LaserScan, _: str) -> Iterable[Drawn]:
         ranges = arrays.ranges(scan)
@@ -126,7 +129,7 @@ class Drawer:
             end_angle=last,
             ranges=cast(list[float], ranges.astype(np.float64)),
         )
-        yield of("scan", drawn)
+        yield _drawn("scan", drawn)
 
     def _map(self, grid: OccupancyGrid, _: str) -> Iterable[Drawn]:
         cells = np.frombuffer(grid.cells, np.uint8)
@@ -141,13 +144,14 @@ class Drawer:
             row_stride=grid.width * 4,
             cell_stride=4,
             fields=[fox.PackedElementField(name=n, offset=i, type=byte) for i, n in names],
-            data=COLOURS[cells].tobytes(),
+            data=CELL_COLOURS[cells].tobytes(),
         )
-        yield of("map", drawn)
+        yield _drawn("map", drawn)
 
     def _pose(self, pose: PoseInMap, _: str) -> Iterable[Drawn]:
         here = pose_of(pose.x, pose.y, pose.yaw)
-        yield of("pose", fox.PoseInFrame(timestamp=stamp(pose), frame_id=MAP, pose=here))
+        in_map = fox.PoseInFrame(timestamp=stamp(pose), frame_id=MAP, pose=here)
+        yield _drawn("pose", in_map)
         odom = self._odometry
         yaw = pose.yaw - odom.yaw
         x = pose.x - odom.x * math.cos(yaw) + odom.y * math.sin(yaw)
@@ -157,19 +161,21 @@ class Drawer:
     def _path(self, intent: Intent, _: str) -> Iterable[Drawn]:
         shown = intent.trajectory[::PATH_STEP]
         poses = [pose_of(point.x, point.y, point.yaw) for point in shown]
-        yield of("path", fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses))
+        path = fox.PosesInFrame(timestamp=stamp(intent), frame_id=BASE, poses=poses)
+        yield _drawn("path", path)
 
     def _obstacles(self, world: WorldModel, _: str) -> Iterable[Drawn]:
-        entities = things(world, self._odometry, ODOM, BASE)
-        yield of("obstacles", fox.SceneUpdate(entities=entities))
+        entities = obstacle_entities(world, self._odometry)
+        yield _drawn("obstacles", fox.SceneUpdate(entities=entities))
 
     def _task(self, status: TaskStatus, _: str) -> Iterable[Drawn]:
-        """The way to the goal, and the goal at its end."""
-        way = [pose_of(x, y, 0.0) for x, y in status.path]
+        """Draw the path to the goal, with the goal at its end."""
+        poses = [pose_of(x, y, 0.0) for x, y in status.path]
         if status.goal:
             goal = status.goal
-            way.append(pose_of(goal.x, goal.y, goal.yaw or 0.0))
-        yield of("way", fox.PosesInFrame(timestamp=stamp(status), frame_id=MAP, poses=way))
+            poses.append(pose_of(goal.x, goal.y, goal.yaw or 0.0))
+        path = fox.PosesInFrame(timestamp=stamp(status), frame_id=MAP, poses=poses)
+        yield _drawn("way", path)
 
     def _image(self, image: Image, name: str) -> Iterable[Drawn]:
         when = stamp(image)
@@ -177,7 +183,7 @@ class Drawer:
             jpeg = fox.CompressedImage(
                 timestamp=when, frame_id=image.frame_id, data=image.data, format="jpeg"
             )
-            yield of(f"image/{name}", jpeg)
+            yield _drawn(f"image/{name}", jpeg)
             return
         raw = fox.RawImage(
             timestamp=when,
@@ -188,16 +194,16 @@ class Drawer:
             step=len(image.data) // max(image.height, 1),
             data=image.data,
         )
-        yield of(f"image/{name}", raw)
+        yield _drawn(f"image/{name}", raw)
 
     def _log(self, record: LogRecord, _: str) -> Iterable[Drawn]:
         drawn = fox.Log(
             timestamp=stamp(record),
-            level=LEVELS[record.level],
+            level=LOG_LEVELS[record.level],
             message=record.text,
             name=record.process,
         )
-        yield of("log", drawn)
+        yield _drawn("log", drawn)
 
     def _state(self, state: RobotState, _: str) -> Iterable[Drawn]:
         self._odometry = state.pose
@@ -216,6 +222,131 @@ class Drawer:
             parent_frame_id=parent,
             child_frame_id=child,
             translation=fox.Vector3(x=pose.x, y=pose.y),
-            rotation=turn(pose.yaw),
+            rotation=quaternion(pose.yaw),
         )
-        return of("tf", drawn)
+        return _drawn("tf", drawn)
+
+
+def stamp(message: Message) -> fox.Timestamp:
+    """Return the time of validity of `message`."""
+    return fox.Timestamp(message.stamp_ns // 1_000_000_000, message.stamp_ns % 1_000_000_000)
+
+
+def quaternion(yaw: float) -> fox.Quaternion:
+    """Return a heading [rad] as a quaternion."""
+    return fox.Quaternion(z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+
+
+def pose_of(x: float, y: float, yaw: float) -> fox.Pose:
+    """Return a planar pose [m, m, rad]."""
+    return fox.Pose(position=fox.Vector3(x=x, y=y), orientation=quaternion(yaw))
+
+
+def obstacle_entities(world: WorldModel, odometry: Pose) -> list[fox.SceneEntity]:
+    """Draw all obstacles: cylinders in `odom`, large ones at rest as points in `base_link`.
+
+    `odometry` is the pose of the robot when it saw them.
+    """
+    return [
+        _wall(world, one, odometry)
+        if one.radius > MIN_WALL_RADIUS_M and _speed(one) <= MIN_ARROW_SPEED and world.hits
+        else _cylinder(world, one)
+        for one in world.obstacles
+    ]
+
+
+def _speed(one: Obstacle) -> float:
+    return math.hypot(one.velocity_x, one.velocity_y)
+
+
+def _wall(world: WorldModel, one: Obstacle, odometry: Pose) -> fox.SceneEntity:
+    """Draw lines along the points that beams hit."""
+    hits = arrays.hits(world)
+    dx, dy = one.x - odometry.x, one.y - odometry.y
+    c, s = math.cos(odometry.yaw), math.sin(odometry.yaw)
+    off = np.hypot(hits[:, 0] - (c * dx + s * dy), hits[:, 1] - (c * dy - s * dx))
+    near = hits[off < one.radius + MAX_POINT_GAP_M]
+    joined = np.hypot(*np.diff(near, axis=0).T) < MAX_POINT_GAP_M
+    ends = np.hstack((near[:-1], near[1:]))[joined].reshape(-1, 2).tolist()
+    lines = fox.LinePrimitive(
+        type=fox.LinePrimitiveLineType.LineList,
+        points=[fox.Point3(x=x, y=y, z=OBSTACLE_HEIGHT_M / 2) for x, y in ends],
+        thickness=LINE_WIDTH_M, color=AMBER,
+    )  # fmt: skip
+    return fox.SceneEntity(
+        timestamp=stamp(world), frame_id=BASE, id=str(one.id), lifetime=OBSTACLE_LIFETIME,
+        lines=[lines],
+    )  # fmt: skip
+
+
+def _cylinder(world: WorldModel, one: Obstacle) -> fox.SceneEntity:
+    """Draw a cylinder, and an arrow to where it will be."""
+    here = pose_of(one.x, one.y, 0.0)
+    wide = 2 * max(one.radius, 0.01)
+    body = fox.CylinderPrimitive(
+        pose=here, size=fox.Vector3(x=wide, y=wide, z=OBSTACLE_HEIGHT_M), color=AMBER,
+        top_scale=1.0, bottom_scale=1.0,
+    )  # fmt: skip
+    speed = _speed(one)
+    arrow = fox.ArrowPrimitive(
+        pose=pose_of(one.x, one.y, math.atan2(one.velocity_y, one.velocity_x)),
+        shaft_length=ARROW_TIME_S * speed, shaft_diameter=0.03,
+        head_length=0.08, head_diameter=0.08, color=AMBER,
+    )  # fmt: skip
+    return fox.SceneEntity(
+        timestamp=stamp(world), frame_id=ODOM, id=str(one.id), lifetime=OBSTACLE_LIFETIME,
+        cylinders=[body], arrows=[arrow] if speed > MIN_ARROW_SPEED else [],
+    )  # fmt: skip
+
+
+def json_schema(kind: type[Message]) -> Schema:
+    """Return the schema of a message type in the form that viewers accept."""
+    return Schema(name=f"gigabrain.{kind.__name__}", encoding="jsonschema", data=flat_schema(kind))
+
+
+def flat_schema(message: type[msgspec.Struct]) -> bytes:
+    """Return the JSON Schema of `message` in the flat form that Foxglove and Lichtblick accept.
+
+    They refuse `$ref`, `$defs`, `anyOf`, an `enum` without `type`, and arrays of arrays. One such
+    property makes them ignore the whole channel, so it is left out of the schema.
+    """
+    whole = msgspec.json.schema(message)
+    parts = whole.pop("$defs", {})
+    flat = _flat(whole, parts, 0, item=False) or {"type": "object"}
+    return msgspec.json.encode({"title": message.__name__, **flat})
+
+
+def _flat(
+    part: dict[str, Any], parts: dict[str, Any], depth: int, *, item: bool
+) -> dict[str, Any] | None:
+    """Return one property; None if it has to be left out."""
+    if depth > MAX_SCHEMA_DEPTH:
+        return None
+    if "$ref" in part:
+        return _flat(parts[part["$ref"].rsplit("/", 1)[-1]], parts, depth + 1, item=item)
+    if "anyOf" in part:  # `X | None` becomes X
+        kinds = [kind for kind in part["anyOf"] if kind.get("type") != "null"]
+        return _flat(kinds[0], parts, depth + 1, item=item) if len(kinds) == 1 else None
+    kind = part.get("type")
+    if "enum" in part:
+        return {"type": kind or SCALARS[type(part["enum"][0])]}
+    if kind in SCALARS.values():
+        kept = BOUNDS if item else (*BOUNDS, "contentEncoding")
+        return {name: part[name] for name in kept if name in part}
+    if kind == "array" and not item:
+        return _array(part, parts, depth)
+    if kind == "object":
+        return _object(part, parts, depth)
+    return None
+
+
+def _array(part: dict[str, Any], parts: dict[str, Any], depth: int) -> dict[str, Any] | None:
+    items = part.get("items") or (part.get("prefixItems") or [None])[0]
+    inner = _flat(items, parts, depth + 1, item=True) if isinstance(items, dict) else None
+    return inner and {"type": "array", "items": inner}
+
+
+def _object(part: dict[str, Any], parts: dict[str, Any], depth: int) -> dict[str, Any]:
+    properties = part.get("properties", {}).items()
+    flat = {name: _flat(value, parts, depth + 1, item=False) for name, value in properties}
+    return {"type": "object", "properties": {name: value for name, value in flat.items() if value}}

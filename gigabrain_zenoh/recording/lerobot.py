@@ -1,11 +1,12 @@
-"""A recording as a LeRobot dataset, version 3.0 of its format, as lerobot 0.4 reads it.
+"""Converts a recording into a LeRobot dataset: format version 3.0, as lerobot 0.4 reads it.
 
-A frame per tenth of a second of the robot's own time, an episode for as long as the gate was
-enabled without a gap. Pictures are left out.
+A frame is a tenth of a second of the robot's time. An episode lasts while the gate is enabled
+without a gap. Images are left out.
 """
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,16 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.recording.fields import message_of
-from gigabrain_zenoh.recording.reading import Bag, samples
+from gigabrain_zenoh.recording.bag_reader import Bag, samples
+from gigabrain_zenoh.recording.message_tables import message_of
 
-FPS, TICKS = 10, 5  # frames a second, ticks a frame
+try:
+    import pyarrow as pa
+    from pyarrow import parquet
+except ModuleNotFoundError:
+    raise ConfigError("datasets need pyarrow: pip install 'gigabrain-zenoh[lerobot]'") from None
+
+FRAME_HZ, TICKS_PER_FRAME = 10, 5
 VERSION, TASK = "v3.0", "drive"
 STATE, SCAN, ACTION = "observation.state", "observation.environment_state", "action"
 STATE_NAMES = ("x", "y", "yaw", "linear_x", "linear_y", "angular_z")
@@ -31,18 +38,18 @@ FILE = "chunk-000/file-000.parquet"
 Floats = NDArray[np.float32]
 
 
-class Frame(Struct, frozen=True, kw_only=True):
-    """What the robot knew, and what it was told to do."""
+class LeRobotFrame(Struct, frozen=True, kw_only=True):
+    """Observation of the robot, and the command that it received."""
 
     boot: int
     tick: int
     state: Floats  # (6,)
-    scan: Floats  # (n,), [m]; as far as the lidar sees where nothing was hit, 0 where unknown
+    scan: Floats  # (n,), [m]; the lidar's range where nothing was hit, 0 where unknown
     action: Floats  # (3,), [m/s], [m/s], [rad/s]
 
 
-def frames(path: Path) -> Iterator[Frame]:
-    """Every fifth state while the gate was enabled, with the newest scan and command."""
+def frames(path: Path) -> Iterator[LeRobotFrame]:
+    """Iterate over every fifth state of an enabled gate, with the newest scan and command."""
     scan, action = np.empty(0, np.float32), np.zeros(3, np.float32)
     for sample in samples(path):
         message = message_of(sample)
@@ -50,23 +57,25 @@ def frames(path: Path) -> Iterator[Frame]:
             seen = np.minimum(ranges(message), np.float32(message.range_max))
             scan = np.nan_to_num(seen, nan=0.0)
         elif isinstance(message, CmdVel):
-            told = (message.linear_x, message.linear_y, message.angular_z)
-            action = np.array(told, np.float32)
+            speeds = (message.linear_x, message.linear_y, message.angular_z)
+            action = np.array(speeds, np.float32)
         elif isinstance(message, RobotState) and message.gate.mode == "enabled":
-            if message.tick % TICKS:
+            if message.tick % TICKS_PER_FRAME:
                 continue
             pose, speed = message.pose, message.velocity
             known = (pose.x, pose.y, pose.yaw, speed.linear_x, speed.linear_y, speed.angular_z)
             state = np.array(known, np.float32)
-            yield Frame(boot=message.boot, tick=message.tick, state=state, scan=scan, action=action)
+            yield LeRobotFrame(
+                boot=message.boot, tick=message.tick, state=state, scan=scan, action=action
+            )
 
 
-def episodes(path: Path) -> list[list[Frame]]:
-    """The frames in unbroken rows of two or more. Raises ConfigError where there are none."""
-    rows: list[list[Frame]] = []
+def episodes(path: Path) -> list[list[LeRobotFrame]]:
+    """Return the frames in unbroken rows of two or more. Raises ConfigError if there are none."""
+    rows: list[list[LeRobotFrame]] = []
     for frame in frames(path):
         last = rows[-1][-1] if rows else None
-        follows = last and (last.boot, last.tick + TICKS) == (frame.boot, frame.tick)
+        follows = last and (last.boot, last.tick + TICKS_PER_FRAME) == (frame.boot, frame.tick)
         if follows and last and last.scan.shape == frame.scan.shape:
             rows[-1].append(frame)
         else:
@@ -74,17 +83,17 @@ def episodes(path: Path) -> list[list[Frame]]:
     beams = max((len(row[0].scan) for row in rows), default=0)
     rows = [row for row in rows if len(row) > 1 and len(row[0].scan) == beams]
     if not rows:
-        raise ConfigError(f"{path} holds no time in which the gate was enabled")
+        raise ConfigError(f"{path} holds no drive: the gate was never enabled")
     return rows
 
 
-def columns(row: list[Frame], episode: int, first: int) -> dict[str, NDArray[Any]]:
-    """One episode as the format wants it; `first` is its first frame's number in the dataset."""
+def columns(row: list[LeRobotFrame], episode: int, first: int) -> dict[str, NDArray[Any]]:
+    """Return an episode's columns; `first` is the number of its first frame in the dataset."""
     count = np.arange(len(row), dtype=np.int64)
     found: dict[str, NDArray[Any]] = {
         STATE: np.stack([frame.state for frame in row]),
         ACTION: np.stack([frame.action for frame in row]),
-        "timestamp": (count / FPS).astype(np.float32),
+        "timestamp": (count / FRAME_HZ).astype(np.float32),
         "frame_index": count,
         "episode_index": np.full(len(row), episode, np.int64),
         "index": count + first,
@@ -96,7 +105,7 @@ def columns(row: list[Frame], episode: int, first: int) -> dict[str, NDArray[Any
 
 
 def features(beams: int) -> dict[str, dict[str, Any]]:
-    """The format's description of the columns."""
+    """Return the format's description of the columns."""
     found: dict[str, dict[str, Any]] = {
         STATE: {"dtype": "float32", "shape": [6], "names": list(STATE_NAMES)},
         ACTION: {"dtype": "float32", "shape": [3], "names": list(ACTION_NAMES)},
@@ -110,7 +119,7 @@ def features(beams: int) -> dict[str, dict[str, Any]]:
 
 
 def statistics(data: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[float]]]:
-    """Of each column over its frames."""
+    """Return the statistics of each column over its frames."""
     found = {}
     for name, values in data.items():
         table = values.reshape(len(values), -1).astype(np.float64)
@@ -125,11 +134,7 @@ def statistics(data: Mapping[str, NDArray[Any]]) -> dict[str, dict[str, list[flo
 
 
 def convert(path: Path, folder: Path) -> str:
-    """Write the dataset into a new folder; what came of it. Raises ConfigError."""
-    try:
-        from gigabrain_zenoh.recording import parquet
-    except ModuleNotFoundError:
-        raise ConfigError("datasets need pyarrow: pip install 'gigabrain-zenoh[lerobot]'") from None
+    """Write the dataset into a new folder; return a summary in words. Raises ConfigError."""
     rows, tables, first = episodes(path), [], 0
     for episode, row in enumerate(rows):
         tables.append(columns(row, episode, first))
@@ -145,7 +150,7 @@ def convert(path: Path, folder: Path) -> str:
         "chunks_size": 1000,
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
-        "fps": FPS,
+        "fps": FRAME_HZ,
         "splits": {"train": f"0:{len(rows)}"},
         "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
         "video_path": None,
@@ -153,11 +158,58 @@ def convert(path: Path, folder: Path) -> str:
     }
     try:
         folder.mkdir(parents=True)
-        parquet.write(whole, folder / "data" / FILE)
-        parquet.write_episodes([len(row) for row in rows], TASK, folder / "meta/episodes" / FILE)
-        parquet.write_task(TASK, folder / "meta/tasks.parquet")
+        _write_columns(whole, folder / "data" / FILE)
+        _write_episodes([len(row) for row in rows], TASK, folder / "meta/episodes" / FILE)
+        _write_task(TASK, folder / "meta/tasks.parquet")
         (folder / "meta/info.json").write_text(json.dumps(info, indent=4))
         (folder / "meta/stats.json").write_text(json.dumps(statistics(whole), indent=4))
     except OSError as error:
         raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
     return f"{folder}: {len(rows)} episodes, {first} frames"
+
+
+def _write_columns(columns: Mapping[str, NDArray[Any]], path: Path) -> None:
+    """Write one column per feature; vectors as lists of fixed length. Raises OSError."""
+    arrays = {}
+    for name, values in columns.items():
+        flat = pa.array(values.reshape(-1))
+        arrays[name] = (
+            flat if values.ndim == 1 else pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+        )
+    _write_table(pa.table(arrays), path)
+
+
+def _write_episodes(lengths: Sequence[int], task: str, path: Path) -> None:
+    """Write the range of rows of each episode in the data file. Raises OSError."""
+    ends, zeros = list(accumulate(lengths)), [0] * len(lengths)
+    table = {
+        "episode_index": list(range(len(lengths))),
+        "tasks": [[task]] * len(lengths),
+        "length": list(lengths),
+        "data/chunk_index": zeros,
+        "data/file_index": zeros,
+        "dataset_from_index": [0, *ends[:-1]],
+        "dataset_to_index": ends,
+        "meta/episodes/chunk_index": zeros,
+        "meta/episodes/file_index": zeros,
+    }
+    _write_table(pa.table(table), path)
+
+
+def _write_task(task: str, path: Path) -> None:
+    """Write the tasks: a table whose index, as pandas stores it, is the name. Raises OSError."""
+    index = "__index_level_0__"
+    table = pa.table({"task_index": pa.array([0], pa.int64()), index: [task]})
+    columns = [
+        {"name": "task_index", "field_name": "task_index", "pandas_type": "int64",
+         "numpy_type": "int64", "metadata": None},
+        {"name": None, "field_name": index, "pandas_type": "unicode",
+         "numpy_type": "object", "metadata": None},
+    ]  # fmt: skip
+    pandas = {"index_columns": [index], "column_indexes": [], "columns": columns}
+    _write_table(table.replace_schema_metadata({"pandas": json.dumps(pandas)}), path)
+
+
+def _write_table(table: pa.Table, path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    parquet.write_table(table, path)

@@ -1,9 +1,11 @@
-"""The recorder as a process, and what it has in common with `gigabrain record`."""
+"""The recorder as a process, and as the command `gigabrain record`."""
 
 import asyncio
+import contextlib
 import functools
 import itertools
 import logging
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -16,68 +18,71 @@ from gigabrain_schemas.topics import BODY, TOPICS
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import topic_named
 from gigabrain_zenoh.config.settings import RecorderConfig
+from gigabrain_zenoh.host.stop_signals import stop_signals
 from gigabrain_zenoh.logs import state_dir
-from gigabrain_zenoh.recording.recorder import Recorder
-from gigabrain_zenoh.recording.recover import recover_all
+from gigabrain_zenoh.recording.bag_recovery import recover_all
+from gigabrain_zenoh.recording.recorder import Recorder, Status
+from gigabrain_zenoh.runtime.joining import Where, joined
 
 log = logging.getLogger(__name__)
 
-ALL = "robot/**"
-COUNT_S = 0.5
+ALL_KEYS = "robot/**"
+HEALTH_INTERVAL_S = 0.5
+STATUS_INTERVAL_S = 0.5
+CLOSE_S = 10.0  # time that a slow disk has for the rest of a recording
 
 
-def patterns(names: tuple[str, ...]) -> list[str]:
-    """The key expressions to listen on: topics by name, or as given. Raises UnknownName."""
+def key_expressions(names: tuple[str, ...]) -> list[str]:
+    """Return the key expressions of topic names; others stay as given. Raises UnknownName."""
     if not names:
-        return [ALL]
+        return [ALL_KEYS]
     return [name if "*" in name else topic_named(name).at("**") for name in names]
 
 
-def chosen(names: tuple[str, ...]) -> Callable[[str], bool]:
-    """Whether a key is among those that `names` mean. Raises UnknownName."""
-    heard = [pattern.replace("**", "*") for pattern in patterns(names)] if names else ["*"]
+def key_filter(names: tuple[str, ...]) -> Callable[[str], bool]:
+    """Return a test for keys that `names` select; empty names select all. Raises UnknownName."""
+    patterns = [each.replace("**", "*") for each in key_expressions(names)] if names else ["*"]
 
     def wanted(key: str) -> bool:
-        return any(fnmatchcase(key, each) or f"{key}/*" == each for each in heard)
+        return any(fnmatchcase(key, each) or f"{key}/*" == each for each in patterns)
 
     return wanted
 
 
 def file_name(label: str = "") -> str:
-    """The name of a new recording: the time, and whose it is."""
+    """Return the name of a new recording: the time in UTC, and a label."""
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
     return f"{stamp}-{label}.mcap" if label else f"{stamp}.mcap"
 
 
 def path_of(config: RecorderConfig) -> Path:
-    """Where to record. Raises ConfigError where there is no home folder."""
+    """Return the path of a recording. Raises ConfigError if there is no home folder."""
     if config.file:
         return Path(config.file).absolute()
     folder = Path(config.folder).absolute() if config.folder else state_dir() / "recordings"
     return folder / file_name()
 
 
-def free(path: Path) -> Path:
-    """`path`, or where it exists the first numbered one beside it that does not."""
+def unused_path(path: Path) -> Path:
+    """Return `path`, or the first numbered variant of it that does not exist."""
     others = (path.with_name(f"{path.stem}_{n}{path.suffix}") for n in itertools.count(1))
     return path if not path.exists() else next(other for other in others if not other.exists())
 
 
 @contextmanager
 def listening(bus: Bus, recorder: Recorder, names: tuple[str, ...]) -> Iterator[None]:
-    """Whatever comes over the bus goes to the recorder, while the block runs."""
-    take = recorder.intake.take
-    heard = patterns(names)
-    taps = {pattern: bus.tap(pattern, take) for pattern in heard}
+    """Pass all messages of the topics `names` to the recorder while the block runs."""
+    take, expressions = recorder.intake.take, key_expressions(names)
+    taps = {each: bus.tap(each, take) for each in expressions}
 
     def see(_key: str, body: Body) -> None:
-        """A body may obey a key of its own, which is not below `robot`."""
+        """Record the key that a body obeys, which may lie outside `robot/`."""
         key = body.description.control_topic
         if not names and not key.startswith("robot/") and key not in taps:
             taps[key] = bus.tap(key, take)
 
     close = bus.subscribe(BODY, see)
-    fetching = asyncio.ensure_future(_fetch_kept(bus, recorder, heard))
+    fetching = asyncio.ensure_future(_fetch_kept(bus, recorder, expressions))
     try:
         yield
     finally:
@@ -87,25 +92,25 @@ def listening(bus: Bus, recorder: Recorder, names: tuple[str, ...]) -> Iterator[
             end()
 
 
-async def _fetch_kept(bus: Bus, recorder: Recorder, heard: list[str]) -> None:
-    """The map as it is, for a recording that begins after it was sent."""
+async def _fetch_kept(bus: Bus, recorder: Recorder, expressions: list[str]) -> None:
+    """Record messages kept for late subscribers, such as a map sent before the recording began."""
     for topic in TOPICS:
-        if topic.keep and (ALL in heard or topic.key in heard):
+        if topic.keep and (ALL_KEYS in expressions or topic.key in expressions):
             for payload in await bus.kept(topic):
                 if not recorder.intake.seen[topic.key]:
                     recorder.intake.take(topic.key, "", payload)
 
 
-def recover_others(folder: Path) -> None:
-    """Mend what earlier recordings have left unfinished, aside and in no hurry."""
+def _recover_in_background(folder: Path) -> None:
+    """Recover recordings that were interrupted earlier, in a thread."""
     threading.Thread(target=functools.partial(recover_all, folder), daemon=True).start()
 
 
 async def run(config: RecorderConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Record until the process ends."""
-    path = free(path_of(config))  # after a restart it goes on in another file
+    path = unused_path(path_of(config))  # after a restart it continues in another file
     recorder = Recorder(path, config)
-    recover_others(path.parent)
+    _recover_in_background(path.parent)
     with recorder, listening(bus, recorder, config.topics):
         ready()
         log.info("recording into %s", path)
@@ -122,14 +127,87 @@ async def run(config: RecorderConfig, bus: Bus, ready: Callable[[], None]) -> No
 
 
 async def _count(bus: Bus, recorder: Recorder) -> None:
-    """Show in the process's health how the recording is doing."""
-    async for _ in bus.clock.every(round(COUNT_S * 1e9)):
+    """Report the recording's progress in the health of the process."""
+    async for _ in bus.clock.every(round(HEALTH_INTERVAL_S * 1e9)):
         now = recorder.status()
-        bus.counters.update(
-            {
-                "recorded": now.written - bus.counters["recorded"],
-                "dropped": now.dropped - bus.counters["dropped"],
-                "missing": now.missing - bus.counters["missing"],
-                "bytes": now.size - bus.counters["bytes"],
-            }
-        )
+        totals = {
+            "recorded": now.written,
+            "dropped": now.dropped,
+            "missing": now.missing,
+            "bytes": now.size,
+        }
+        for name, total in totals.items():
+            bus.counters[name] = total
+
+
+async def record(config: RecorderConfig, where: Where, seconds: float | None) -> int:
+    """Record until Ctrl-C or for `seconds`; return the exit code. Raises GigabrainError."""
+    path = path_of(config)
+    async with joined(where, "record", looks_on=True) as (bus, _):
+        recorder = Recorder(path, config)
+        recorder.begin()
+        _recover_in_background(path.parent)
+        with stop_signals(CLOSE_S) as stop, recorder, listening(bus, recorder, config.topics):
+            print(f"recording into {path}; Ctrl-C ends it", flush=True)
+            await _show_status(recorder, stop, seconds)
+    end = recorder.status()
+    print(status_line(end))
+    for key in sorted(recorder.intake.seen):
+        print(_key_line(recorder, key))
+    return 1 if end.dropped else 0
+
+
+async def _show_status(recorder: Recorder, stop: asyncio.Event, seconds: float | None) -> None:
+    from rich.console import Console  # 0.3 s that the process does not need to start
+    from rich.live import Live
+    from rich.text import Text
+
+    with Live(console=Console(), auto_refresh=False, transient=True) as live:
+        loop = asyncio.get_running_loop()
+        end_s, before = loop.time() + (seconds or float("inf")), recorder.status()
+        while not stop.is_set() and loop.time() < end_s and not _has_failed(recorder):
+            with contextlib.suppress(TimeoutError):
+                left_s = max(0.0, end_s - loop.time())
+                await asyncio.wait_for(stop.wait(), min(STATUS_INTERVAL_S, left_s))
+            now = recorder.status()
+            if sys.stdout.isatty():
+                live.update(Text(f"{status_line(now)}  {_rates(before, now)}"), refresh=True)
+            before = now
+
+
+def _has_failed(recorder: Recorder) -> bool:
+    """Return whether the writer has ended early; raise its error if so."""
+    done = recorder.done
+    if done is None or not done.done():
+        return False
+    done.result()
+    return True
+
+
+def status_line(now: Status) -> str:
+    """Format the progress of a recording as one line."""
+    files = f" in {now.files} files" if now.files > 1 else ""
+    line = (
+        f"{now.path.name}  {now.seconds:.1f} s  {now.size / 1e6:.2f} MB{files}  "
+        f"{now.written} messages  missing {now.missing}  dropped {now.dropped}"
+    )
+    return f"{line}  ({now.fault})" if now.fault else line
+
+
+def _rates(before: Status, now: Status) -> str:
+    seconds = max(now.seconds - before.seconds, 1e-3)
+    messages, size = now.seen - before.seen, now.size - before.size
+    return f"{messages / seconds:.0f}/s  {size / seconds / 1e3:.0f} kB/s"
+
+
+def _key_line(recorder: Recorder, key: str) -> str:
+    intake = recorder.intake
+    line = f"  {key:<28} {intake.seen[key]:>7}"
+    for name, counts in (
+        ("missing", intake.gaps.missing),
+        ("dropped", intake.dropped),
+        ("restarts", intake.gaps.restarts),
+    ):
+        if counts[key]:
+            line += f"  {name} {counts[key]}"
+    return line

@@ -1,12 +1,12 @@
-"""Process replay: recorded input through the real node in fake time, its output against the record.
+"""Feeds recorded input to a node in fake time, and compares its output with the recording.
 
-What cannot be the same is left aside: when a message was sent (`stamp_ns`), its number (`seq`), and
-what safety says of its computer. Several messages that a node sends on one key for one tick and
-basis are one word, of which the last counts: which of two inputs within a tick was quicker decides
-how often it is repeated.
+Not compared are the time of sending (`stamp_ns`), the message number (`seq`), and warnings of
+safety about its computer. Of several messages on one key for one tick and basis only the last is
+compared: how often a node repeats it depends on which of two inputs within a tick came first.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,19 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_schemas.base import Message
+from gigabrain_schemas.heard import WAITED, Heard
 from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.tasks import Granted
 from gigabrain_schemas.topics import (
     CMD_VEL,
+    GRANTED,
+    HEARD,
     INTENT,
     JOINT_CMD,
     MAP,
     POSE,
     SAFETY,
+    STATE,
     WORLD,
     Topic,
 )
@@ -30,104 +35,115 @@ from gigabrain_zenoh.config.process_config import ProcessConfig
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.recording.fields import message_of, row
-from gigabrain_zenoh.recording.heard import hearing
-from gigabrain_zenoh.recording.placing import placed
-from gigabrain_zenoh.recording.reading import Bag, Sample, samples
+from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
+from gigabrain_zenoh.recording.headers import header_of
+from gigabrain_zenoh.recording.message_tables import message_of, row
 from gigabrain_zenoh.runtime.deployment import deployment_path, load_deployment
 from gigabrain_zenoh.runtime.process import Node
 from gigabrain_zenoh.runtime.replay import Event, replay
 from gigabrain_zenoh.safety import host
 
-SAYS: dict[str, tuple[Topic[Any], ...]] = {
+OUTPUTS: dict[str, tuple[Topic[Any], ...]] = {
     "perception": (WORLD, POSE, MAP),
     "decision": (INTENT,),
     "control": (CMD_VEL, JOINT_CMD),
     "safety": (SAFETY,),
 }
-ASIDE = ("stamp_ns", "seq")
-WITH_SETTINGS = ("perception", "decision")
-# a replay runs no programs, and remembers nothing
-NOWHERE = {"perception": {"state_dir": ""}, "decision": {"scripts": "", "state_dir": ""}}
-
-ELSEWHEN = 0.1  # share of words that may be said in one of the two alone
-# A process that is busy for a tick passes over a state; a replay has all the time in the world.
+NOT_COMPARED = ("stamp_ns", "seq")
+PROCESSES_WITH_SETTINGS = ("perception", "decision")
+# a replay runs no programs and saves nothing
+NO_SIDE_EFFECTS = {"perception": {"state_dir": ""}, "decision": {"scripts": "", "state_dir": ""}}
+# A process that is busy for a tick skips a state; a replay never is.
+MAX_UNMATCHED_SHARE = 0.1  # of outputs that only the recording or only the replay has
 
 NodeOf = Callable[[ProcessConfig], Node]
-Word = tuple[str, int, int, int]  # key, boot, tick, basis
+OutputId = tuple[str, int, int, int]  # key, boot, tick, basis
+
+_input_log = Codec(HEARD.type, HEARD.max_bytes)
+_granted = Codec(GRANTED.type, GRANTED.max_bytes)
 
 
 class Difference(Struct, frozen=True, kw_only=True):
-    """The first place where a process says something else than it did."""
+    """First output that differs from the recording."""
 
     key: str
     tick: int
     basis: int
     field: str  # dotted
     recorded: object
-    now: object
-    then_said: Message
-    now_said: Message
+    replayed: object
+    recorded_message: Message
+    replayed_message: Message
 
 
-class Outcome(Struct, frozen=True, kw_only=True):
-    """What a replay came to."""
+class ReplayResult(Struct, frozen=True, kw_only=True):
+    """Result of a replay."""
 
-    words: int  # compared
-    only_then: int  # recorded, and not said now
-    only_now: int
+    compared: int  # outputs
+    only_recorded: int  # outputs
+    only_replayed: int
     difference: Difference | None
-    begun_late: bool = False  # the process had spoken before the recording began
-    real_time: bool = False  # not in lock-step, and nobody has said in which order it heard
-    lost: int = 0  # messages that it went by, and the recording does not hold
+    begun_late: bool = False  # the process had sent messages before the recording began
+    real_time: bool = False  # neither in lock-step, nor with a log of inputs that gives their order
+    lost: int = 0  # inputs of the process that the recording does not hold
 
     @property
     def same(self) -> bool:
-        """Whether the process still does what it did."""
-        most = ELSEWHEN * (self.words + self.only_then)
-        return self.difference is None and max(self.only_then, self.only_now) <= most
+        """Return whether the process still does what it did."""
+        most = MAX_UNMATCHED_SHARE * (self.compared + self.only_recorded)
+        return self.difference is None and max(self.only_recorded, self.only_replayed) <= most
 
 
-class Past(Struct, frozen=True, kw_only=True):
-    """What a recording knows of a process."""
+class RecordedInputs(Struct, frozen=True, kw_only=True):
+    """Inputs of one life of a process, in its own order, as far as they were recorded."""
 
-    heard: list[Event]
-    said: dict[Word, Message]
-    exact: bool  # the process itself has said what it heard, and in which order
-    lost: int = 0  # of that, what the recording does not hold
-    begun_late: bool  # it had spoken before
+    events: list[Event]
+    start_ns: int  # Unix time of the first of them, by the clock of the process
+    end_ns: int  # Unix time of the process's last log of inputs
+    lost: int  # inputs that the recording does not hold
 
 
-def load(path: Path, process: str) -> Past:
-    """What the process heard, at which times [ns], and what it said. Raises ConfigError."""
-    heard: list[Sample] = []
-    said: list[tuple[str, Message]] = []
-    keys = {topic.key for topic in SAYS[process]}
+class RecordedRun(Struct, frozen=True, kw_only=True):
+    """Inputs and outputs of a process in a recording."""
+
+    inputs: list[Event]
+    outputs: dict[OutputId, Message]
+    exact: bool  # the process itself has logged its inputs and their order
+    lost: int = 0  # inputs that the recording does not hold
+    begun_late: bool  # the process had sent messages before
+
+
+def load_run(path: Path, process: str) -> RecordedRun:
+    """Read the inputs of a process, with their times [ns], and its outputs. Raises ConfigError."""
+    inputs: list[Sample] = []
+    outputs: list[tuple[str, Message]] = []
+    keys = {topic.key for topic in OUTPUTS[process]}
     for sample in samples(path):
         message = message_of(sample) if sample.key in keys else None
         if message and getattr(message, "source", BRAIN) == BRAIN:
-            said.append((sample.key, message))
+            outputs.append((sample.key, message))
         else:
-            heard.append(sample)
-    if not said:
-        raise ConfigError(f"{path} holds nothing that {process} has said")
-    own = hearing(heard, process)
+            inputs.append(sample)
+    if not outputs:
+        raise ConfigError(f"{path} holds no message from {process}")
+    own = logged_inputs(inputs, process)
     if own:
-        said = [one for one in said if own.began_ns <= one[1].stamp_ns <= own.until_ns]
+        outputs = [each for each in outputs if own.start_ns <= each[1].stamp_ns <= own.end_ns]
         events = own.events
     else:
-        events = placed([(e.log_ns - heard[0].log_ns, e.key, e.payload) for e in heard])
-    return Past(
-        heard=events,
-        said=_words(said),
+        first_ns = inputs[0].log_ns
+        events = with_requests([(s.log_ns - first_ns, s.key, s.payload) for s in inputs])
+    return RecordedRun(
+        inputs=events,
+        outputs=_by_id(outputs),
         exact=own is not None,
         lost=own.lost if own else 0,
-        begun_late=not said or said[0][1].seq > 1,
+        begun_late=not outputs or outputs[0][1].seq > 1,
     )
 
 
-def _words(said: Iterable[tuple[str, Message]]) -> dict[Word, Message]:
-    return {(key, m.boot, m.tick, m.basis): _without_computer(m) for key, m in said}
+def _by_id(outputs: Iterable[tuple[str, Message]]) -> dict[OutputId, Message]:
+    return {(key, m.boot, m.tick, m.basis): _without_computer(m) for key, m in outputs}
 
 
 def _without_computer(message: Message) -> Message:
@@ -137,52 +153,148 @@ def _without_computer(message: Message) -> Message:
     return msgspec.structs.replace(message, warnings=warnings)
 
 
-def compare(then: Mapping[Word, Message], now: Mapping[Word, Message]) -> Outcome:
-    """Word by word, in the order in which they were said then."""
-    both = [word for word in then if word in now]
-    found = (_differs(word, then[word], now[word]) for word in both)
-    return Outcome(
-        words=len(both),
-        only_then=len(then) - len(both),
-        only_now=len(now.keys() - then.keys()),
-        difference=next((each for each in found if each), None),
+def logged_inputs(recorded: Sequence[Sample], process: str) -> RecordedInputs | None:
+    """Return the inputs of the last life of `process`; None if it did not log them."""
+    key = HEARD.at(process)
+    logs = _last_life(_input_log.decode(one.payload) for one in recorded if one.key == key)
+    if not logs:
+        return None
+    by_number = _by_number(recorded, process)
+    events: list[Event] = []
+    lost = 0
+    for at_ns, name, seq in _entries(logs):
+        payload = bytes((seq > 0,)) if name == WAITED else _nearest(by_number[name, seq], at_ns)
+        if payload is None:
+            lost += 1
+        else:
+            events.append(_as_request(at_ns - logs[0].began_ns, name, payload))
+    return RecordedInputs(
+        events=events, start_ns=logs[0].began_ns, end_ns=logs[-1].stamp_ns, lost=lost
     )
 
 
-def _differs(word: Word, then: Message, now: Message) -> Difference | None:
-    before, after = row(then), row(now)
+def _last_life(logs: Iterable[Heard]) -> list[Heard]:
+    found: list[Heard] = []
+    for each in logs:
+        if found and each.seq <= found[-1].seq:  # the process has restarted
+            found = []
+        found.append(each)
+    return found
+
+
+def _entries(logs: Iterable[Heard]) -> Iterator[tuple[int, str, int]]:
+    """Yield Unix time [ns], which never decreases, key and number of each input."""
+    newest_ns = 0
+    for log in logs:
+        for entry in log.taken:
+            newest_ns = max(newest_ns, log.began_ns + entry.after_us * 1000)
+            yield newest_ns, log.keys[entry.key], entry.seq
+
+
+def _by_number(
+    recorded: Iterable[Sample], process: str
+) -> dict[tuple[str, int], list[tuple[int, bytes]]]:
+    """Return time and payload of messages by key and number, without other processes' requests."""
+    found: dict[tuple[str, int], list[tuple[int, bytes]]] = defaultdict(list)
+    for sample in recorded:
+        header = header_of(sample.payload)
+        if sample.key != GRANTED.key or header.process in ("", process):
+            found[sample.key, header.seq].append((sample.log_ns, sample.payload))
+    return found
+
+
+def _nearest(same_number: Sequence[tuple[int, bytes]], at_ns: int) -> bytes | None:
+    """Return the message nearest in time; a sender that restarts uses its numbers again."""
+    nearest = min(same_number, key=lambda one: abs(one[0] - at_ns), default=None)
+    return nearest[1] if nearest else None
+
+
+def _as_request(at_ns: int, key: str, payload: bytes) -> Event:
+    if key != GRANTED.key:
+        return at_ns, key, payload
+    granted: Granted = _granted.decode(payload)
+    return at_ns, granted.service, granted.request.encode()
+
+
+def with_requests(inputs: Sequence[Event]) -> list[Event]:
+    """Replace records of accepted requests by the requests, each where it took effect.
+
+    That is before the first message that its process had not received by then; on the wire the two
+    travel separately. For recordings in which the process did not log its inputs.
+    """
+    order = [((i, 1), event) for i, event in enumerate(inputs)]
+    for i, (_, key, payload) in enumerate(inputs):
+        if key != GRANTED.key:
+            continue
+        granted = _granted.decode(payload)
+        later = (j for j, event in enumerate(inputs) if _is_after(granted, event, default=j > i))
+        place = next(later, len(inputs) - 1)
+        order[i] = ((place, 0), _as_request(inputs[place][0], key, payload))
+    return [event for _, event in sorted(order, key=lambda one: one[0])]
+
+
+def _is_after(granted: Granted, event: Event, *, default: bool) -> bool:
+    """Return whether a request was accepted before `event` was received."""
+    _, key, payload = event
+    if key not in (STATE.key, WORLD.key):
+        return False
+    header = header_of(payload)
+    if header.boot != granted.boot:
+        return default
+    return header.tick > granted.tick if key == STATE.key else header.basis > granted.basis
+
+
+def compare(
+    recorded: Mapping[OutputId, Message], replayed: Mapping[OutputId, Message]
+) -> ReplayResult:
+    """Compare outputs in the recorded order."""
+    both = [each for each in recorded if each in replayed]
+    differences = (_difference(each[0], recorded[each], replayed[each]) for each in both)
+    return ReplayResult(
+        compared=len(both),
+        only_recorded=len(recorded) - len(both),
+        only_replayed=len(replayed.keys() - recorded.keys()),
+        difference=next((each for each in differences if each), None),
+    )
+
+
+def _difference(key: str, recorded: Message, replayed: Message) -> Difference | None:
+    before, after = row(recorded), row(replayed)
     for field in dict.fromkeys((*before, *after)):
-        if field not in ASIDE and before.get(field) != after.get(field):
+        if field not in NOT_COMPARED and before.get(field) != after.get(field):
             return Difference(
-                key=word[0],
-                tick=then.tick,
-                basis=then.basis,
+                key=key,
+                tick=recorded.tick,
+                basis=recorded.basis,
                 field=field,
                 recorded=before.get(field),
-                now=after.get(field),
-                then_said=then,
-                now_said=now,
+                replayed=after.get(field),
+                recorded_message=recorded,
+                replayed_message=replayed,
             )
     return None
 
 
 async def replay_process(
     path: Path, process: str, settings: dict[str, Any], node_of: NodeOf
-) -> Outcome:
-    """Feed a recording to a process as it is now. Raises ConfigError, and what ends the process."""
-    past = load(path, process)
+) -> ReplayResult:
+    """Replay a recording to a process. Raises ConfigError, and what the process raises."""
+    run = load_run(path, process)
     node = node_of(ProcessConfig(name=process, endpoint=Endpoint(), settings=settings))
-    kinds = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in SAYS[process]}
-    sent = await replay(node, past.heard, process)
-    now = _words((key, kinds[key](data)) for key, data in sent if key in kinds)
-    unsure = not past.exact and notes(path).get("speed", "1") == "1"
+    decoders = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in OUTPUTS[process]}
+    sent = await replay(node, run.inputs, process)
+    replayed = _by_id((key, decoders[key](data)) for key, data in sent if key in decoders)
+    real_time = not run.exact and notes_of(path).get("speed", "1") == "1"
     return msgspec.structs.replace(
-        compare(past.said, now), real_time=unsure, lost=past.lost, begun_late=past.begun_late
+        compare(run.outputs, replayed),
+        real_time=real_time,
+        lost=run.lost,
+        begun_late=run.begun_late,
     )
 
 
-def notes(path: Path) -> Mapping[str, str]:
-    """What a recording says of itself at its head."""
+def notes_of(path: Path) -> Mapping[str, str]:
+    """Return the notes at the head of a recording."""
     bag = Bag(path)
     for _ in bag:
         break
@@ -190,51 +302,54 @@ def notes(path: Path) -> Mapping[str, str]:
 
 
 def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, Any]:
-    """The settings of a process: of a deployment file, or those that the recording holds.
+    """Return the settings of a process, from a deployment file or from the recording.
 
-    Raises ConfigError where the process has settings and neither tells them.
+    Raises ConfigError if the process has settings and neither holds them.
     """
     if deployment:
         loaded = load_deployment(deployment_path(deployment))
-        told = {"perception": loaded.perception, "decision": loaded.decision}
-        settings = dict(msgspec.to_builtins(told.get(process, {})))
+        known = {"perception": loaded.perception, "decision": loaded.decision}
+        settings = dict(msgspec.to_builtins(known.get(process, {})))
     else:
-        held = notes(path)
-        if process in WITH_SETTINGS and process not in held:
+        notes = notes_of(path)
+        if process in PROCESSES_WITH_SETTINGS and process not in notes:
             raise ConfigError(
-                f"{path} does not hold the settings of {process}, as it was recorded from beside; "
+                f"{path} does not hold the settings of {process}: it was recorded by hand; "
                 "name the robot's deployment file: --deployment FILE"
             )
-        settings = dict(msgspec.json.decode(held.get(process, "{}")))
-    return settings | NOWHERE.get(process, {})
+        settings = dict(msgspec.json.decode(notes.get(process, "{}")))
+    return settings | NO_SIDE_EFFECTS.get(process, {})
 
 
 async def replay_file(path: Path, process: str, deployment: str | None, node_of: NodeOf) -> int:
-    """Replay and tell; 0 where the process does what it did, 1 where it does not."""
-    outcome = await replay_process(path, process, settings_for(path, process, deployment), node_of)
-    for line in in_words(path, process, outcome):
+    """Replay and print the result; return 0 if the process does what it did, else 1."""
+    result = await replay_process(path, process, settings_for(path, process, deployment), node_of)
+    for line in report_lines(path, process, result):
         print(line)
-    return 0 if outcome.same else 1
+    return 0 if result.same else 1
 
 
-def in_words(path: Path, process: str, outcome: Outcome) -> Iterator[str]:
-    """What a replay came to, for people."""
-    said = f"{outcome.words} messages compared"
-    if outcome.only_then or outcome.only_now:
-        said += f", {outcome.only_then} only in the recording, {outcome.only_now} only now"
-    if found := outcome.difference:
+def report_lines(path: Path, process: str, result: ReplayResult) -> Iterator[str]:
+    """Format the result of a replay for people."""
+    counts = f"{result.compared} messages compared"
+    if result.only_recorded or result.only_replayed:
+        counts += f", {result.only_recorded} only in the recording, "
+        counts += f"{result.only_replayed} only in the replay"
+    if found := result.difference:
         yield f"{path}: {process} does something else; the first difference:"
         yield f"{found.key} at tick {found.tick}, resting on tick {found.basis}: {found.field}"
-        yield f"  recorded {found.recorded!r}, now {found.now!r}"
-        yield f"  recorded {msgspec.json.encode(found.then_said).decode()}"
-        yield f"  now      {msgspec.json.encode(found.now_said).decode()}"
-    elif not outcome.same:
-        yield f"{path}: {process} speaks at other times: {said}"
+        yield f"  recorded {found.recorded!r}, now {found.replayed!r}"
+        yield f"  recorded {msgspec.json.encode(found.recorded_message).decode()}"
+        yield f"  now      {msgspec.json.encode(found.replayed_message).decode()}"
+    elif not result.same:
+        yield f"{path}: {process} sends at other times: {counts}"
     else:
-        yield f"{path}: {process} does what it did: {said}"
-    if not outcome.same and outcome.real_time:
+        yield f"{path}: {process} does what it did: {counts}"
+    if result.same:
+        return
+    if result.real_time:
         yield "it was recorded in real time: two messages within a tick may have changed places"
-    if outcome.lost and not outcome.same:
-        yield f"{outcome.lost} messages that it went by are not in the recording"
-    if not outcome.same and outcome.begun_late:
+    if result.lost:
+        yield f"the recording lacks {result.lost} messages that {process} received"
+    if result.begun_late:
         yield "the recording begins in the middle of a run, whose earlier part may be the reason"

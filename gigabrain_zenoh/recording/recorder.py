@@ -1,4 +1,4 @@
-"""Brings what the intake holds to the disk, in its own thread, and outlives the disk's faults."""
+"""Writes received messages to the disk in a thread of its own, and survives faults of the disk."""
 
 import logging
 import threading
@@ -10,80 +10,174 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from gigabrain_zenoh.bus.zenoh.unobtrusive import LONGEST_S
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.logs import Fault
-from gigabrain_zenoh.recording.bagfile import BagFile, topic_of
-from gigabrain_zenoh.recording.intake import Arrival, Intake
+from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage, topic_of
+from gigabrain_zenoh.recording.headers import SequenceGaps, header_of
 
 log = logging.getLogger(__name__)
 
 MB = 1_000_000
-LOOK_S = 0.3  # how often the queue is emptied, at least: every time costs cold caches
-RETRY_S = 1.0  # how often a full disk is tried again
-Open = Callable[[Path], BagFile]
+WRITE_INTERVAL_S = 0.3  # at most; shorter intervals cost more CPU time, for cold caches
+RETRY_S = 1.0  # between two attempts to write to a full disk
+MAX_CHANNELS = 1000  # pairs of key and encoding; any client may make up more
+OTHER_KEYS = "others"  # counts messages beyond those
+MAX_BATCH_NS = round(LONGEST_S * 1e9)  # within it a message's own stamp is its time of reception
+
+
+class Intake:
+    """Bounded queue from any thread to the writer. It never makes the bus wait.
+
+    Messages beyond its size, or on more channels than any robot has, are dropped and counted.
+    `hurry` is called when a quarter of it is full.
+    """
+
+    def __init__(
+        self, max_bytes: int, unix_ns: Callable[[], int], hurry: Callable[[], object] = int
+    ) -> None:
+        self._max_bytes, self._unix_ns, self._hurry = max_bytes, unix_ns, hurry
+        self._lock = threading.Lock()
+        self._waiting: list[tuple[int, str, str, bytes]] = []
+        self._parsed: list[ReceivedMessage] = []  # the oldest, with their headers
+        self._held_bytes = 0  # waiting, or being written
+        self._newest_ns = 0
+        self._channels: set[tuple[str, str]] = set()  # keys and encodings
+        self.gaps = SequenceGaps()
+        self.seen: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+
+    def take(self, key: str, encoding: str, payload: bytes) -> None:
+        """Queue one message, or drop it. May be called from any thread."""
+        now_ns, size = self._unix_ns(), len(payload)
+        with self._lock:
+            if not self._is_known(key, encoding):
+                self.seen[OTHER_KEYS] += 1
+                self.dropped[OTHER_KEYS] += 1
+                return
+            self.seen[key] += 1
+            if self._held_bytes + size > self._max_bytes:
+                self._parse()  # earlier messages are counted before this one
+                self.gaps.see(key, header_of(payload))
+                self.dropped[key] += 1
+                return
+            before, self._held_bytes = self._held_bytes, self._held_bytes + size
+            self._waiting.append((now_ns, key, encoding, payload))
+        if before < self._max_bytes // 4 <= before + size:
+            self._hurry()
+
+    def _is_known(self, key: str, encoding: str) -> bool:
+        """Return whether a key is recorded in an encoding; the first MAX_CHANNELS are."""
+        channel = key, encoding
+        if channel not in self._channels and len(self._channels) < MAX_CHANNELS:
+            self._channels.add(channel)
+        return channel in self._channels
+
+    def hand_over(self) -> list[ReceivedMessage]:
+        """Return all queued messages, oldest first; they count as held until `written`."""
+        with self._lock:
+            self._parse()
+            batch, self._parsed = self._parsed, []
+        return batch
+
+    def written(self, batch: list[ReceivedMessage]) -> None:
+        """Release the space of a batch that has been written."""
+        with self._lock:
+            self._held_bytes -= sum(len(message.payload) for message in batch)
+
+    def add_lost(self, lost: Counter[str]) -> None:
+        """Count messages that could not be written to the disk as dropped."""
+        with self._lock:
+            self.dropped += lost
+
+    def counts(self) -> tuple[int, int, int]:
+        """Return the number of messages seen, dropped, and never received."""
+        with self._lock:
+            return self.seen.total(), self.dropped.total(), self.gaps.missing.total()
+
+    def _parse(self) -> None:
+        """Read the headers of waiting messages; many in a row cost less than each alone."""
+        newest_ns, parsed, see = self._newest_ns, self._parsed, self.gaps.see
+        for taken_ns, key, encoding, payload in self._waiting:
+            header = header_of(payload)
+            see(key, header)
+            recent = 0 < taken_ns - header.stamp_ns < MAX_BATCH_NS
+            received_ns = header.stamp_ns if recent else taken_ns
+            newest_ns = received_ns if received_ns > newest_ns else newest_ns + 1
+            parsed.append(ReceivedMessage(newest_ns, key, encoding, payload, header))
+        self._newest_ns = newest_ns
+        self._waiting.clear()
 
 
 class Status(Struct, frozen=True, kw_only=True):
-    """How a recording is doing."""
+    """Progress of a recording."""
 
     path: Path
     seconds: float  # since its start
     size: int  # [bytes] on the disk, of all its files
     files: int
-    seen: int  # messages that came
+    seen: int  # messages received
     written: int  # of these, on the disk
-    dropped: int  # of these, lost here: the disk was too slow, or full
-    missing: int  # messages that never came, by their senders' count
-    fault: str  # what is wrong with the disk now
+    dropped: int  # of these, lost because the disk was too slow or full
+    missing: int  # messages never received, by their senders' count
+    fault: str  # present fault of the disk, or an empty text
 
 
 class Recorder:
-    """One recording, of one file or of several in a row. Used as a context manager."""
+    """One recording, of one file or several in a row. Used as a context manager."""
 
-    def __init__(self, path: Path, config: RecorderConfig, open_file: Open | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        config: RecorderConfig,
+        open_file: Callable[[Path], BagWriter] | None = None,
+    ) -> None:
         self._path, self._config = path, config
         self._open = open_file or self._default_open
-        began_unix, began = time.time_ns(), time.monotonic_ns()
-        room = round(config.queue_mb * MB)
+        start_unix_ns, start_ns = time.time_ns(), time.monotonic_ns()
         self._wake, self._ended = threading.Event(), False
-        self.intake = Intake(room, lambda: began_unix + time.monotonic_ns() - began, self._wake.set)
-        self._began_s = time.monotonic()
-        self._count = self._done_bytes = self._written = 0
-        self._file: BagFile | None = None
-        self._kept: dict[str, Arrival] = {}  # newest of what late joiners ask for
+        self.intake = Intake(
+            round(config.queue_mb * MB),
+            lambda: start_unix_ns + time.monotonic_ns() - start_ns,
+            self._wake.set,
+        )
+        self._start_s = time.monotonic()
+        self._files = self._closed_bytes = self._written = 0
+        self._file: BagWriter | None = None
+        self._kept: dict[str, ReceivedMessage] = {}  # newest of topics kept for late subscribers
         self._flushed_s, self._retry_s = time.monotonic(), 0.0
         self._fault_text, self._fault = "", Fault(log, logging.ERROR)
         self._pool = ThreadPoolExecutor(1, "recorder")
-        self.done: Future[None] | None = None  # settled early by a fault of ours alone
+        self.done: Future[None] | None = None  # ends early only by a programming error
 
     def begin(self) -> None:
-        """Make the file now, so that one that cannot be written is told at once.
+        """Create the file now, so that an error is raised at once.
 
-        Without this call it is made, or tried again every second, when there is something to write.
+        Without this call it is created with the first message, and retried every second.
         Raises ConfigError.
         """
-        self._file = self._next()
+        self._file = self._next_file()
 
     def __enter__(self) -> "Recorder":
         self.done = self._pool.submit(self._run)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Write what is left and finish the file."""
+        """Write remaining messages and finish the file."""
         self._ended = True
         self._wake.set()
         self._pool.shutdown()
 
     def status(self) -> Status:
-        """How it is doing now."""
+        """Return the present progress."""
         seen, dropped, missing = self.intake.counts()
         file = self._file
         return Status(
             path=file.path if file else self._path,
-            seconds=time.monotonic() - self._began_s,
-            size=self._done_bytes + (file.size if file else 0),
-            files=self._count,
+            seconds=time.monotonic() - self._start_s,
+            size=self._closed_bytes + (file.size if file else 0),
+            files=self._files,
             seen=seen,
             written=self._written + (file.written if file else 0),
             dropped=dropped,
@@ -91,55 +185,55 @@ class Recorder:
             fault=self._fault_text,
         )
 
-    def _default_open(self, path: Path) -> BagFile:
-        return BagFile(path, viewers=self._config.viewers, notes=self._config.notes)
+    def _default_open(self, path: Path) -> BagWriter:
+        return BagWriter(path, viewers=self._config.viewers, notes=self._config.notes)
 
-    def _next(self) -> BagFile:
-        """The next file of the row. Raises ConfigError where it cannot be made."""
+    def _next_file(self) -> BagWriter:
+        """Create the next file of the row. Raises ConfigError."""
         path = self._path
-        if self._count:
-            path = path.with_name(f"{path.stem}_{self._count}{path.suffix}")
+        if self._files:
+            path = path.with_name(f"{path.stem}_{self._files}{path.suffix}")
         file = self._open(path)
-        self._count += 1
+        self._files += 1
         return file
 
     def _run(self) -> None:
         while not self._ended:
-            self._wake.wait(LOOK_S)
+            self._wake.wait(WRITE_INTERVAL_S)
             self._wake.clear()
-            self._turn()
-        self._turn()
+            self._write_batch()
+        self._write_batch()
         self._finish()
 
-    def _turn(self) -> None:
+    def _write_batch(self) -> None:
         batch = self.intake.hand_over()
-        for arrival in batch:
-            self._write(arrival)
+        for message in batch:
+            self._write(message)
         self.intake.written(batch)
         if time.monotonic() - self._flushed_s >= self._config.flush_s:
             self._flush()
 
-    def _write(self, arrival: Arrival) -> None:
-        topic = topic_of(arrival.key)
+    def _write(self, message: ReceivedMessage) -> None:
+        topic = topic_of(message.key)
         if topic and topic.keep:
-            self._kept[arrival.key] = arrival
-        file = self._file or self._again(arrival)
+            self._kept[message.key] = message
+        file = self._file or self._reopen(message)
         if file is None:
-            self.intake.lose(Counter((arrival.key,)))
+            self.intake.add_lost(Counter((message.key,)))
             return
         try:
-            file.add(arrival)
+            file.add(message)
         except OSError as error:
-            self._broken(file, f"cannot write {file.path}: {error.strerror}")
+            self._abandon(file, f"cannot write {file.path}: {error.strerror}")
             return
-        if self._full(file, arrival):
+        if self._is_full(file, message):
             self._finish()
 
-    def _full(self, file: BagFile, arrival: Arrival) -> bool:
+    def _is_full(self, file: BagWriter, message: ReceivedMessage) -> bool:
         split_mb, split_s = self._config.split_mb, self._config.split_s
         too_big = split_mb is not None and file.size >= split_mb * MB
         return too_big or (
-            split_s is not None and arrival.log_ns - file.first_ns >= split_s * 1_000_000_000
+            split_s is not None and message.log_ns - file.first_ns >= split_s * 1_000_000_000
         )
 
     def _flush(self) -> None:
@@ -149,74 +243,74 @@ class Recorder:
             return
         try:
             file.flush()
-            if file.free_bytes() < self._config.keep_free_mb * MB:
+            if self._disk_is_low(file):
                 self._finish()
-                self._complain(self._low())
+                self._report(self._low_text())
         except OSError as error:
-            self._broken(file, f"cannot write {file.path}: {error.strerror}")
+            self._abandon(file, f"cannot write {file.path}: {error.strerror}")
 
     def _finish(self) -> None:
-        """End the present file well, or leave it to be recovered."""
+        """End the present file with its index; if that fails it is left to be recovered."""
         file = self._file
         if file is None:
             return
         try:
             file.flush()
-            file.note("gigabrain.recorded", self._counts())
+            now = self.status()
+            names = ("written", "dropped", "missing", "seen")
+            file.add_notes("gigabrain.recorded", {name: str(getattr(now, name)) for name in names})
             file.finish()
         except OSError as error:
-            self._broken(file, f"cannot finish {file.path}: {error.strerror}")
+            self._abandon(file, f"cannot finish {file.path}: {error.strerror}")
         else:
-            self._put_away(file)
+            self._close(file)
 
-    def _put_away(self, file: BagFile) -> None:
-        self._done_bytes += file.size
+    def _close(self, file: BagWriter) -> None:
+        self._closed_bytes += file.size
         self._written += file.written
         self._file = None
         file.close()
 
-    def _counts(self) -> dict[str, str]:
-        now = self.status()
-        counts = {name: getattr(now, name) for name in ("written", "dropped", "missing", "seen")}
-        return {name: str(count) for name, count in counts.items()}
-
-    def _broken(self, file: BagFile, text: str) -> None:
-        """What has not reached the disk is lost; what has is left as it is."""
-        self.intake.lose(file.pending)
-        self._put_away(file)
+    def _abandon(self, file: BagWriter, text: str) -> None:
+        """Count messages that have not reached the disk as lost; keep those that have."""
+        self.intake.add_lost(file.pending)
+        self._close(file)
         if not file.written:
             file.path.unlink(missing_ok=True)
-            self._count -= 1
-        self._complain(text)
+            self._files -= 1
+        self._report(text)
 
-    def _low(self) -> str:
+    def _disk_is_low(self, file: BagWriter) -> bool:
+        return file.free_bytes() < self._config.keep_free_mb * MB
+
+    def _low_text(self) -> str:
         least = f"{self._config.keep_free_mb:g} MB"
         return f"not recording: less than {least} are free on the disk of {self._path}"
 
-    def _complain(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         self._fault_text = text
         self._retry_s = time.monotonic() + RETRY_S
-        self._fault.begin(f"{text}; messages are lost until there is room")
+        self._fault.begin(f"{text}; messages are lost until there is space")
 
-    def _again(self, arrival: Arrival) -> BagFile | None:
-        """A new file, with what late joiners ask for at its head; None while the disk is full."""
+    def _reopen(self, message: ReceivedMessage) -> BagWriter | None:
+        """Begin a new file with the newest kept messages; None while the disk is full."""
         if time.monotonic() < self._retry_s:
             return None
         try:
-            file = self._file = self._next()
+            file = self._file = self._next_file()
         except ConfigError as error:
-            self._complain(str(error))
+            self._report(str(error))
             return None
         try:
             for kept in self._kept.values():
-                if kept is not arrival:
-                    file.add(kept._replace(log_ns=arrival.log_ns), again=True)
-            low = file.free_bytes() < self._config.keep_free_mb * MB
+                if kept is not message:
+                    file.add(kept._replace(log_ns=message.log_ns), repeated=True)
+            low = self._disk_is_low(file)
         except OSError as error:
-            self._broken(file, f"cannot write {file.path}: {error.strerror}")
+            self._abandon(file, f"cannot write {file.path}: {error.strerror}")
             return None
         if low:
-            self._broken(file, self._low())
+            self._abandon(file, self._low_text())
             return None
         self._fault_text = ""
         self._fault.end(f"recording again, into {file.path}")

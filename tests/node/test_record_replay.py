@@ -32,10 +32,14 @@ from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.processes import node_of
 from gigabrain_zenoh.qa.drives import DRIVES, file_of
-from gigabrain_zenoh.recording.fields import message_of
-from gigabrain_zenoh.recording.placing import placed
-from gigabrain_zenoh.recording.process_replay import SAYS, replay_process, settings_for
-from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.bag_reader import Bag
+from gigabrain_zenoh.recording.message_tables import message_of
+from gigabrain_zenoh.recording.process_replay import (
+    OUTPUTS,
+    replay_process,
+    settings_for,
+    with_requests,
+)
 from gigabrain_zenoh.recording.recorder import Recorder
 from gigabrain_zenoh.runtime.param_service import serve_params
 from gigabrain_zenoh.runtime.replay import ASKED, Event, record, replay
@@ -47,7 +51,7 @@ RECORDINGS = Path(__file__).parents[1] / "recordings"
 RENEW = "was the change meant? then: make recordings"
 
 
-@pytest.mark.parametrize("process", SAYS)
+@pytest.mark.parametrize("process", OUTPUTS)
 @pytest.mark.parametrize("name", DRIVES)
 async def test_every_process_does_what_it_did_on_the_recorded_drive(
     name: str, process: str
@@ -55,7 +59,7 @@ async def test_every_process_does_what_it_did_on_the_recorded_drive(
     path = file_of(RECORDINGS, name)
     outcome = await replay_process(path, process, settings_for(path, process, None), node_of)
     assert outcome.same, (outcome, RENEW)
-    assert outcome.words > 30
+    assert outcome.compared > 30
     assert not outcome.begun_late
 
 
@@ -107,14 +111,14 @@ def test_of_a_process_that_was_changed_the_first_difference_is_shown(
 def test_a_recording_without_the_process_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     bags.write(path, bags.drive(10))
-    with pytest.raises(ConfigError, match="holds nothing that safety has said"):
+    with pytest.raises(ConfigError, match="holds no message from safety"):
         call("replay", "--check", str(path), "--process", "safety")
 
 
 def test_without_its_settings_a_process_is_not_replayed_as_another(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     bags.write(path, bags.drive(10))
-    with pytest.raises(ConfigError, match=r"not hold the settings of decision, .* --deployment F"):
+    with pytest.raises(ConfigError, match=r"not hold the settings of decision: .* --deployment F"):
         call("replay", "--check", str(path), "--process", "decision")
 
 
@@ -137,7 +141,7 @@ def test_a_request_is_fed_where_it_counted_and_not_where_its_record_came() -> No
         (150, GRANTED.key, granted("robot/goal", tick=6, basis=0)),
         (151, GRANTED.key, granted("robot/mission", tick=6, basis=5)),
     ]
-    order = [(at, key) for at, key, _ in placed(heard)]
+    order = [(at, key) for at, key, _ in with_requests(heard)]
     assert order == [
         (1800, "robot/state"),
         (100, "robot/state"),
@@ -189,7 +193,7 @@ async def test_a_decision_that_was_sent_to_a_place_does_the_same_again() -> None
         await plane.go(1.5)
     own = (INTENT.key, TASK.key)
     then = [(key, data) for _, key, data in events if key in own]
-    heard = placed([event for event in events if event[1] not in own])
+    heard = with_requests([event for event in events if event[1] not in own])
     assert [key for _, key, _ in heard if key in ASKED] == [GOAL.key, *2 * (TASK_CHANGE.key,)]
     node = functools.partial(decision.run, DecisionConfig(behaviour="navigate"))
     now = [(key, data) for key, data in await replay(node, heard) if key in own]
@@ -210,7 +214,7 @@ async def test_a_parameter_that_was_changed_meanwhile_is_changed_again(tmp_path:
         speeds = await robot.go(100)
     assert (round(speeds[0], 2), round(speeds[-1], 2)) == (0.26, 0.1)
     then = [(key, data) for _, key, data in events if key == INTENT.key]
-    heard = placed([event for event in events if event[1] != INTENT.key])
+    heard = with_requests([event for event in events if event[1] != INTENT.key])
     assert [key for _, key, _ in heard if key.startswith(PARAM.key)] == [PARAM.at("decision")]
     now = [
         one for one in await replay(BRAIN["decision"], heard, "decision") if one[0] == INTENT.key

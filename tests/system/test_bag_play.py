@@ -14,14 +14,16 @@ from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.recording.bagfile import BagFile
-from gigabrain_zenoh.recording.play import Player, PlayOptions, check_nobody_drives
-from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.bag_reader import Bag
+from gigabrain_zenoh.recording.bag_writer import BagWriter
+from gigabrain_zenoh.recording.player import Player, PlayOptions, check_nobody_drives
 from gigabrain_zenoh.testing.brain import RobotInMemory
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.testing.zenoh import repeat, robot
 from tests.unit.recording import bags
+
+pytestmark = pytest.mark.system
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +105,7 @@ async def test_recorded_commands_do_not_move_a_living_robot(tmp_path: Path) -> N
         await living.go(50)
         assert living.state
         path = tmp_path / "commands.mcap"
-        file = BagFile(path, viewers=False, notes={})
+        file = BagWriter(path, viewers=False, notes={})
         for seq in range(1, 101):  # of an earlier start: everything is right but the boot
             command = CMD_VEL.type(
                 linear_x=0.2, source="script", seq=seq,

@@ -16,40 +16,41 @@ from gigabrain_schemas.examples import example
 from gigabrain_schemas.topics import MAP
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.config.settings import RecorderConfig
-from gigabrain_zenoh.recording import bagfile, tape
-from gigabrain_zenoh.recording.info import info
+from gigabrain_zenoh.recording import bag_writer
+from gigabrain_zenoh.recording.bag_info import read_info
+from gigabrain_zenoh.recording.bag_writer import AppendOnlyFile
 from gigabrain_zenoh.recording.recorder import Recorder
 from tests.unit.recording import bags
 from tests.unit.recording.bags import QUICK, kept, wait
 
 
-class SlowTape(tape.Tape):
+class SlowTape(AppendOnlyFile):
     """A disk that takes 1 MB a second."""
 
-    def write(self, data: bytes) -> int:
+    def append(self, data: bytes) -> None:
         time.sleep(len(data) / 1e6)
-        return super().write(data)
+        super().append(data)
 
 
-class FullTape(tape.Tape):
+class FullTape(AppendOnlyFile):
     """A disk that is full from time to time."""
 
     full = False
 
-    def write(self, data: bytes) -> int:
+    def append(self, data: bytes) -> None:
         if self.full:
-            super().write(data[: len(data) // 2])
+            super().append(data[: len(data) // 2])
             self.size -= len(data) // 2
             os.ftruncate(self._fd, self.size)
             os.lseek(self._fd, self.size, os.SEEK_SET)
             raise OSError(28, "No space left on device")
-        return super().write(data)
+        super().append(data)
 
 
 def test_on_a_slow_disk_what_is_written_and_what_was_dropped_is_what_came(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bagfile, "Tape", SlowTape)
+    monkeypatch.setattr(bag_writer, "AppendOnlyFile", SlowTape)
     path = tmp_path / "slow.mcap"
     config = RecorderConfig(viewers=False, flush_s=0.05, keep_free_mb=0, queue_mb=0.3)
     with Recorder(path, config) as recorder:
@@ -61,7 +62,7 @@ def test_on_a_slow_disk_what_is_written_and_what_was_dropped_is_what_came(
     assert status.seen == count
     assert status.written + status.dropped == count
     assert kept(path)["robot/scan"] == status.written
-    found = info(path)
+    found = read_info(path)
     assert found.keys[0].missing == bags.seqs(path, "robot/scan")[-1] - status.written
     assert found.notes["gigabrain.recorded"]["dropped"] == str(status.dropped)
 
@@ -71,14 +72,14 @@ def test_whoever_hands_messages_over_never_waits_for_the_disk(
 ) -> None:
     stood, gate = threading.Event(), threading.Event()
 
-    class StuckTape(tape.Tape):
-        def write(self, data: bytes) -> int:
+    class StuckTape(AppendOnlyFile):
+        def append(self, data: bytes) -> None:
             if self.size > 1000:
                 stood.set()
                 gate.wait()
-            return super().write(data)
+            super().append(data)
 
-    monkeypatch.setattr(bagfile, "Tape", StuckTape)
+    monkeypatch.setattr(bag_writer, "AppendOnlyFile", StuckTape)
     config = RecorderConfig(viewers=False, flush_s=0.01, keep_free_mb=0, queue_mb=0.1)
     with Recorder(tmp_path / "stuck.mcap", config) as recorder:
         first = 0
@@ -98,7 +99,7 @@ def test_whoever_hands_messages_over_never_waits_for_the_disk(
 def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(bagfile, "Tape", FullTape)
+    monkeypatch.setattr(bag_writer, "AppendOnlyFile", FullTape)
     monkeypatch.setattr("gigabrain_zenoh.recording.recorder.RETRY_S", 0.02)
     path = tmp_path / "full.mcap"
 
@@ -127,7 +128,7 @@ def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_f
     second = tmp_path / "full_1.mcap"
     assert bags.seqs(path) == list(range(1, 101))
     assert bags.seqs(second)[-100:] == list(range(201, 301))
-    assert info(second).finished
+    assert read_info(second).finished
 
 
 def test_what_must_stay_free_of_the_disk_stays_free(tmp_path: Path) -> None:
@@ -153,7 +154,7 @@ def test_a_recording_is_split_by_size_and_each_part_has_the_map(tmp_path: Path) 
     assert recorder.status().files >= 4
     assert recorder.status().written == 301
     for path in paths[: recorder.status().files]:
-        assert info(path).finished
+        assert read_info(path).finished
         assert kept(path)["robot/map"] == 1
     seqs = [seq for path in sorted(tmp_path.iterdir()) for seq in bags.seqs(path, "robot/scan")]
     assert sorted(seqs) == list(range(1, 301))
@@ -174,10 +175,10 @@ import sys, time
 from pathlib import Path
 from gigabrain_zenoh.recording.recorder import Recorder
 from gigabrain_zenoh.config.settings import RecorderConfig
-from tests import bag_rig
+from tests.unit.recording import bags
 with Recorder(Path(sys.argv[1]), RecorderConfig(viewers=False, keep_free_mb=0)) as recorder:
     for seq in range(1, 10_000):
-        recorder.intake.take("robot/state", "", bag_rig.state(seq))
+        recorder.intake.take("robot/state", "", bags.state(seq))
         print(seq, flush=True)
         time.sleep(0.005)
 """
@@ -209,14 +210,14 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, 60_000))
 from gigabrain_zenoh.recording import recorder as module
 from gigabrain_zenoh.recording.recorder import Recorder
 from gigabrain_zenoh.config.settings import RecorderConfig
-from tests import bag_rig
+from tests.unit.recording import bags
 module.RETRY_S = 1e9  # no second file
 config = RecorderConfig(viewers=False, keep_free_mb=0, flush_s=0)
 with Recorder(Path(sys.argv[1]), config) as recorder:
     for seq in range(1, 101):
-        recorder.intake.take("robot/scan", "", bag_rig.scan(seq))
+        recorder.intake.take("robot/scan", "", bags.scan(seq))
         if seq % 25 == 0:
-            bag_rig.wait(recorder, lambda now: now.written + now.dropped == seq)
+            bags.wait(recorder, lambda now: now.written + now.dropped == seq)
 now = recorder.status()
 print(now.seen, now.written, now.dropped)
 """

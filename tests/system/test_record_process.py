@@ -5,7 +5,7 @@ import signal
 from pathlib import Path
 
 from gigabrain_zenoh.qa.faults.onlooker import looking_on
-from gigabrain_zenoh.recording.info import faults, info
+from gigabrain_zenoh.recording.bag_info import faults, read_info
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 from gigabrain_zenoh.testing.waiting import until
 
@@ -33,7 +33,7 @@ async def test_a_recorder_that_is_killed_costs_the_robot_nothing_and_its_file_is
         before = robot.state
         os.kill(await robot.pid("recorder"), signal.SIGKILL)
         await until(lambda: len(sizes(folder)) == 2, "a second recording")
-        await until(lambda: info(folder / first).finished, "the first is mended")
+        await until(lambda: read_info(folder / first).finished, "the first is mended")
         assert robot.state.boot == before.boot
         assert "recorder ended with signal 9" in up.out
 
@@ -47,13 +47,13 @@ async def test_a_recorder_that_is_killed_costs_the_robot_nothing_and_its_file_is
         assert "missing 0  dropped 0" in by_hand.out
         up.send(signal.SIGINT)
         assert await up.ended() == 0
-    assert {key.key for key in info(home.folder / "hand.mcap").keys} == {
+    assert {key.key for key in read_info(home.folder / "hand.mcap").keys} == {
         "robot/scan",
         "robot/state",
     }
     for name in sizes(folder):
-        assert faults(info(folder / name)) == [], name
-    assert info(folder / first).notes["gigabrain"]["world"] == "arena"
+        assert faults(read_info(folder / name)) == [], name
+    assert read_info(folder / first).notes["gigabrain"]["world"] == "arena"
 
 
 async def test_what_cannot_be_recorded_is_said_in_one_line(home: Home) -> None:

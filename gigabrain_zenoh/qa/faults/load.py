@@ -19,7 +19,7 @@ from gigabrain_zenoh.qa.faults.helpers import helper, helpers, rss_mb
 from gigabrain_zenoh.qa.faults.rig import Rig
 from gigabrain_zenoh.qa.faults.stopping import Stop, stop_by
 from gigabrain_zenoh.qa.faults.subject import Subject
-from gigabrain_zenoh.recording.gaps import header_of
+from gigabrain_zenoh.recording.headers import header_of
 from gigabrain_zenoh.runtime.deployment import client_endpoint
 
 HOGS = 4  # for each core

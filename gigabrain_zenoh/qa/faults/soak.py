@@ -16,7 +16,7 @@ from gigabrain_zenoh.qa.faults.rig import Rig
 from gigabrain_zenoh.qa.faults.smooth import stops
 from gigabrain_zenoh.qa.faults.subject import Subject
 from gigabrain_zenoh.qa.faults.waiting import until
-from gigabrain_zenoh.recording.gaps import Gaps, header_of
+from gigabrain_zenoh.recording.headers import SequenceGaps, header_of
 from gigabrain_zenoh.runtime.deployment import client_endpoint
 
 QUIET_S = 20.0  # of driving that is judged, between two events of the long form
@@ -36,7 +36,7 @@ RECORD = (
 async def soak(rig: Rig) -> Measured:
     """It drives: for twenty seconds, or in the long form for 70 min in which things happen."""
     subject = await rig.robot("sim")
-    onlooker, gaps = subject.onlooker, Gaps()
+    onlooker, gaps = subject.onlooker, SequenceGaps()
     await subject.drive()
     await until(lambda: onlooker.state.tick >= WARM_TICKS, "it is warm")
     pids = {name: subject.pid(name) for name in subject.supervisor.statuses}

@@ -19,12 +19,10 @@ from gigabrain_zenoh.qa.faults.fault import Failed, Measured
 from gigabrain_zenoh.qa.faults.rig import Rig, deployment_of
 from gigabrain_zenoh.qa.faults.stopping import TICK_MS
 from gigabrain_zenoh.qa.faults.subject import Subject
-from gigabrain_zenoh.recording.bagfile import BagFile
-from gigabrain_zenoh.recording.gaps import header_of
-from gigabrain_zenoh.recording.intake import Arrival
-from gigabrain_zenoh.recording.reading import Bag, Sample
+from gigabrain_zenoh.recording.bag_reader import MAGIC, Bag, Sample
+from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
+from gigabrain_zenoh.recording.headers import header_of
 from gigabrain_zenoh.recording.recorder import Recorder
-from gigabrain_zenoh.recording.records import MAGIC
 
 ALL = ("router", "driver", "perception", "decision", "control", "safety", "recorder")
 KILLS, LONG_KILLS = 3, 50
@@ -137,18 +135,18 @@ def _cut(path: Path, cuts: int, chance: random.Random) -> int:
     return wrong
 
 
-class BadDisk(BagFile):
+class BadDisk(BagWriter):
     """A recording on a disk that takes 1 MB a second, or that is full now and then."""
 
     slow = full = False
     count = 0
 
-    def add(self, arrival: Arrival, *, again: bool = False) -> None:
+    def add(self, message: ReceivedMessage, *, repeated: bool = False) -> None:
         """Append one message, if the disk will have it."""
         if self.slow:
             time.sleep(SLOW_S)
         self.count += 1
-        super().add(arrival, again=again)
+        super().add(message, repeated=repeated)
         if self.full and self.count % TROUBLED_EVERY == 0:
             raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -169,7 +167,7 @@ def _unaccounted(folder: Path, disk: type[BadDisk]) -> int:
     """How many messages are neither on such a disk nor counted as dropped."""
     config = RecorderConfig(keep_free_mb=0, queue_mb=0.5, viewers=False, flush_s=0.05)
 
-    def make(path: Path) -> BagFile:
+    def make(path: Path) -> BagWriter:
         return disk(path, viewers=False, notes={})
 
     example, chance = EXAMPLES[LaserScan.__name__], random.Random(0)

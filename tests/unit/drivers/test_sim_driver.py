@@ -26,7 +26,7 @@ from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.recording.gaps import header_of
+from gigabrain_zenoh.recording.headers import header_of
 from gigabrain_zenoh.safety import node as safety
 
 WAFFLE = "turtlebot3_waffle"

@@ -2,6 +2,7 @@
 
 import io
 import os
+import struct
 import tracemalloc
 import zipfile
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zstandard
+from mcap.records import Message
 
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.driver.latch import UNREADABLE, LatchFile
@@ -28,8 +30,7 @@ from gigabrain_zenoh.mapping import arrays_file, map_file
 from gigabrain_zenoh.qa.bench import slam_logs
 from gigabrain_zenoh.qa.faults.rig import Options
 from gigabrain_zenoh.qa.faults.tries_file import TriesFile
-from gigabrain_zenoh.recording import records
-from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.bag_reader import MAGIC, Bag, BagDamage, read_records
 from gigabrain_zenoh.runtime import audit_file
 from gigabrain_zenoh.runtime.deployment import Deployment, load_deployment
 from gigabrain_zenoh.security import files, identity
@@ -247,41 +248,44 @@ def test_a_map_too_large_to_be_read_again_is_not_written() -> None:
 
 
 def record(opcode: int, content: bytes) -> bytes:
-    return records.HEAD.pack(opcode, len(content)) + content
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def message(data: bytes) -> bytes:
+    return record(5, struct.pack("<HIQQ", 1, 1, 7, 7) + data)
 
 
 def test_a_chunk_that_grows_without_end_is_damaged_and_what_follows_is_read(
     tmp_path: Path,
 ) -> None:
     bomb = zstandard.ZstdCompressor().compress(bytes(400_000_000))
-    chunk = records.CHUNK.pack(0, 0, 400_000_000, 0, 4) + b"zstd" + len(bomb).to_bytes(8, "little")
+    chunk = struct.pack("<QQQII4sQ", 0, 0, 400_000_000, 0, 4, b"zstd", len(bomb))
     path = tmp_path / "bomb.mcap"
-    message = record(5, records.MESSAGE.pack(1, 1, 7, 7) + b"after")
-    path.write_bytes(records.MAGIC + record(6, chunk + bomb) + message)
+    path.write_bytes(MAGIC + record(6, chunk + bomb) + message(b"after"))
     tracemalloc.start()
     try:
-        found = list(records.read(path))
+        found = list(read_records(path))
         assert tracemalloc.get_traced_memory()[1] < 150e6
     finally:
         tracemalloc.stop()
-    assert isinstance(found[0], records.Damage)
-    assert [one.data for one in found if isinstance(one, records.Message)] == [b"after"]
+    assert isinstance(found[0], BagDamage)
+    assert [one.data for one in found if isinstance(one, Message)] == [b"after"]
 
 
 def test_a_record_of_a_gigabyte_is_passed_over(tmp_path: Path) -> None:
     path = tmp_path / "long.mcap"
     with path.open("wb") as file:
-        file.write(records.MAGIC + records.HEAD.pack(5, 1 << 30))
+        file.write(MAGIC + struct.pack("<BQ", 5, 1 << 30))
         file.seek(1 << 30, os.SEEK_CUR)
-        file.write(record(5, records.MESSAGE.pack(1, 1, 7, 7) + b"after"))
+        file.write(message(b"after"))
     tracemalloc.start()
     try:
-        found = list(records.read(path))
+        found = list(read_records(path))
         assert tracemalloc.get_traced_memory()[1] < 10e6
     finally:
         tracemalloc.stop()
-    assert found[0] == records.Damage(8, "a record of 1074 MB is passed over")
-    assert [one.data for one in found if isinstance(one, records.Message)] == [b"after"]
+    assert found[0] == BagDamage(8, "a record of 1074 MB is skipped")
+    assert [one.data for one in found if isinstance(one, Message)] == [b"after"]
 
 
 @pytest.mark.parametrize("make", [device, fifo, endless])

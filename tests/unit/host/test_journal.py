@@ -16,8 +16,8 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.host.journal import Job, PastJournal, SaidJournal
-from gigabrain_zenoh.recording.heard import hearing
-from gigabrain_zenoh.recording.reading import Sample
+from gigabrain_zenoh.recording.bag_reader import Sample
+from gigabrain_zenoh.recording.process_replay import logged_inputs
 from gigabrain_zenoh.runtime.replay import replay
 
 MS = 1_000_000
@@ -155,7 +155,7 @@ def test_a_recording_is_put_into_the_order_of_the_process_without_what_it_passed
         life((SCAN.key, 1), (STATE.key, 3), (WAITED, 0), (BODY.key, 8), at_ms=45, seq=1),
         life((STATE.key, 2), at_ms=45, seq=1, process="control"),
     ]
-    own = hearing(samples, "decision")
+    own = logged_inputs(samples, "decision")
     assert own
     assert [(at, key) for at, key, _ in own.events] == [
         (0, "robot/scan"),
@@ -164,9 +164,9 @@ def test_a_recording_is_put_into_the_order_of_the_process_without_what_it_passed
     ]
     assert own.events[1][2] == state(3)
     assert own.lost == 1  # a body that nobody has recorded
-    assert own.began_ns == AT + 45 * MS
-    assert own.until_ns == AT + 49 * MS
-    assert hearing(samples, "perception") is None
+    assert own.start_ns == AT + 45 * MS
+    assert own.end_ns == AT + 49 * MS
+    assert logged_inputs(samples, "perception") is None
 
 
 def test_of_a_process_that_started_anew_the_last_life_is_taken() -> None:
@@ -176,16 +176,16 @@ def test_of_a_process_that_started_anew_the_last_life_is_taken() -> None:
         life((STATE.key, 1), at_ms=1, seq=4),
         life((STATE.key, 2), at_ms=501, seq=1),
     ]
-    own = hearing(samples, "decision")
+    own = logged_inputs(samples, "decision")
     assert own
     assert [payload for _, _, payload in own.events] == [state(2)]
-    assert own.began_ns == AT + 501 * MS
+    assert own.start_ns == AT + 501 * MS
 
 
 def test_of_two_messages_of_one_number_the_nearer_in_time_is_meant() -> None:
     early = codec.encode(replace(example(STATE.type), seq=1, tick=5))
     late = codec.encode(replace(example(STATE.type), seq=1, tick=900))
-    own = hearing(
+    own = logged_inputs(
         [
             sample(0, STATE.key, early),
             sample(9000, STATE.key, late),
@@ -200,7 +200,7 @@ def test_of_two_messages_of_one_number_the_nearer_in_time_is_meant() -> None:
 def test_what_was_granted_is_asked_again_where_the_process_had_granted_it() -> None:
     request = '{"x":1.0,"y":2.0}'
     granted = codec.encode(Granted(service=GOAL.key, request=request, seq=6))
-    own = hearing(
+    own = logged_inputs(
         [
             sample(0, STATE.key, state(1)),
             sample(1, GRANTED.key, granted),

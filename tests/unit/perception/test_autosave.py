@@ -18,7 +18,7 @@ from gigabrain_schemas.topics import MAP, POSE, SCAN, STATE, WORLD
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.mapping import autosave
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.recording.placing import placed
+from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
 from gigabrain_zenoh.testing.samples import state
 from tests.unit.perception.mapping_robot import Robot
@@ -207,7 +207,9 @@ async def test_a_replay_neither_reads_nor_writes(tmp_path: Path) -> None:
         robot.drive(60)
     then = [(key, data) for _, key, data in events if key in (WORLD.key, POSE.key)]
     before = [path.read_bytes() for path in files(tmp_path)]
-    heard = placed([event for event in events if event[1] in (STATE.key, SCAN.key, "robot/body")])
+    heard = with_requests(
+        [event for event in events if event[1] in (STATE.key, SCAN.key, "robot/body")]
+    )
     config = PerceptionConfig(mapping="slam", state_dir=str(tmp_path))
     now = await replay(functools.partial(perception.run, config), heard, "perception")
     assert [one for one in now if one[0] in (WORLD.key, POSE.key)] == then

@@ -14,7 +14,7 @@ from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.growing import Still
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.recording.placing import placed
+from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
 from tests.unit.perception.mapping_robot import SLAM, Robot
 
@@ -98,7 +98,7 @@ async def test_a_replay_of_a_drive_with_a_save_says_the_same_and_saves_nothing(
         robot.drive(20)
     (own_maps / "house.yaml").unlink()
     own = (WORLD.key, POSE.key, MAP.key)
-    heard = placed([event for event in events if event[1] not in own])
+    heard = with_requests([event for event in events if event[1] not in own])
     assert sum(key == MAP_SAVE.key for _, key, _ in heard) == 1
     now = await replay(functools.partial(perception.run, SLAM), heard, "perception")
     then = [(key, data) for _, key, data in events if key in own]

@@ -14,10 +14,9 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.config.settings import RecorderConfig
-from gigabrain_zenoh.recording.bagfile import BagFile, topic_of
-from gigabrain_zenoh.recording.gaps import header_of
-from gigabrain_zenoh.recording.intake import Arrival
-from gigabrain_zenoh.recording.reading import Bag
+from gigabrain_zenoh.recording.bag_reader import Bag
+from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage, topic_of
+from gigabrain_zenoh.recording.headers import header_of
 from gigabrain_zenoh.recording.recorder import Recorder, Status
 
 QUICK = RecorderConfig(viewers=False, flush_s=0.05, keep_free_mb=0)
@@ -49,15 +48,15 @@ def scan(seq: int) -> bytes:
     return msgspec.msgpack.encode(message)
 
 
-def arrival(at_ns: int, key: str, payload: bytes) -> Arrival:
+def arrival(at_ns: int, key: str, payload: bytes) -> ReceivedMessage:
     """What the recorder makes of a message."""
     topic = topic_of(key)
     kind = topic.type.__name__ if topic else ""
     encoding = f"application/msgpack;gigabrain.{kind}"
-    return Arrival(BEGIN_NS + at_ns, key, encoding, payload, header_of(payload))
+    return ReceivedMessage(BEGIN_NS + at_ns, key, encoding, payload, header_of(payload))
 
 
-def drive(states: int) -> Iterator[Arrival]:
+def drive(states: int) -> Iterator[ReceivedMessage]:
     """States at 50 Hz, with a scan after every fifth."""
     scans = itertools.count(1)
     for seq in range(1, states + 1):
@@ -67,10 +66,10 @@ def drive(states: int) -> Iterator[Arrival]:
 
 
 def write(
-    path: Path, arrivals: Iterator[Arrival], *, flush_every: int = 12, end: bool = True
+    path: Path, arrivals: Iterator[ReceivedMessage], *, flush_every: int = 12, end: bool = True
 ) -> int:
     """A recording of `arrivals`, flushed after so many, finished or not; how many are in it."""
-    file, count = BagFile(path, viewers=False, notes={}), 0
+    file, count = BagWriter(path, viewers=False, notes={}), 0
     for count, each in enumerate(arrivals, 1):
         file.add(each)
         if count % flush_every == 0:

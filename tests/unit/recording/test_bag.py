@@ -12,13 +12,12 @@ from mcap.reader import make_reader
 from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.recording.bagfile import BagFile
-from gigabrain_zenoh.recording.gaps import Gaps, Header, header_of
-from gigabrain_zenoh.recording.info import faults, info
-from gigabrain_zenoh.recording.reading import Bag
-from gigabrain_zenoh.recording.records import ZSTD_NAME
-from gigabrain_zenoh.recording.recover import recover, recover_all, unfinished
-from gigabrain_zenoh.recording.schema import flat_schema
+from gigabrain_zenoh.recording.bag_info import faults, read_info
+from gigabrain_zenoh.recording.bag_reader import ZSTD_NAME, Bag
+from gigabrain_zenoh.recording.bag_recovery import is_unfinished, recover, recover_all
+from gigabrain_zenoh.recording.bag_writer import BagWriter
+from gigabrain_zenoh.recording.drawing import flat_schema
+from gigabrain_zenoh.recording.headers import Header, SequenceGaps, header_of
 from tests.unit.recording import bags
 
 
@@ -66,7 +65,7 @@ def test_other_programs_read_it_by_its_index(whole: Path) -> None:
 
 
 def test_it_says_what_is_in_it(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    found = info(whole)
+    found = read_info(whole)
     assert (found.messages, found.seconds, found.finished) == (600, 9.981, True)
     scan, state = found.keys
     assert (scan.key, scan.message, scan.messages, scan.hz) == (
@@ -85,13 +84,16 @@ def test_missing_messages_are_counted_and_make_the_check_fail(
     path = tmp_path / "gap.mcap"
     kept = [a for a in bags.drive(100) if not 30 <= a.header.seq <= 39]
     bags.write(path, iter(kept))
-    assert {key.key: key.missing for key in info(path).keys} == {"robot/scan": 0, "robot/state": 10}
+    assert {key.key: key.missing for key in read_info(path).keys} == {
+        "robot/scan": 0,
+        "robot/state": 10,
+    }
     assert call("bag", "check", str(path)) == 1
     assert "robot/state: 10 messages are missing" in capsys.readouterr().out
 
 
 def test_a_sender_that_starts_anew_is_told_from_a_gap() -> None:
-    gaps = Gaps()
+    gaps = SequenceGaps()
     for seq, boot in ((5, 1), (6, 1), (9, 1), (2, 2), (3, 2), (9, 3)):
         gaps.see("robot/state", Header(seq=seq, boot=boot))
     assert gaps.missing["robot/state"] == 2 + 1 + 8
@@ -102,7 +104,7 @@ def test_a_sender_that_starts_anew_is_told_from_a_gap() -> None:
 
 
 def test_two_senders_on_one_key_have_a_count_each() -> None:
-    gaps = Gaps()
+    gaps = SequenceGaps()
     for seq, source in ((100, "control"), (1, "script"), (101, "control"), (2, "script")):
         gaps.see("robot/cmd_vel", Header(seq=seq, source=source))
     assert gaps.missing.total() == 0
@@ -145,7 +147,7 @@ def test_a_flipped_byte_costs_its_chunk_and_no_other(
     content = bytearray(whole.read_bytes())
     content[content.index(ZSTD_NAME, len(content) // 2) + 100] ^= 0x10  # in what is compressed
     path.write_bytes(content)
-    found = info(path)
+    found = read_info(path)
     assert found.messages == 600 - 12
     assert len(found.damages) == 1
     assert faults(found)
@@ -158,7 +160,7 @@ def test_a_flipped_byte_costs_its_chunk_and_no_other(
     mended = tmp_path / "mended.mcap"
     assert recover(path, mended).messages == 588
     assert bags.seqs(mended) == bags.seqs(path)
-    assert info(mended).finished
+    assert read_info(mended).finished
 
 
 def test_where_nothing_can_be_saved_that_is_said(
@@ -167,7 +169,7 @@ def test_where_nothing_can_be_saved_that_is_said(
     path = tmp_path / "stub.mcap"
     path.write_bytes(b"\x89MCAP0\r\n" + bytes(12))
     assert call("bag", "recover", str(path)) == 1
-    assert capsys.readouterr().out.endswith(f"{path}: nothing could be saved\n")
+    assert capsys.readouterr().out.endswith(f"{path}: nothing could be recovered\n")
     assert list(tmp_path.iterdir()) == [path]
     call("bag", "info", str(path))
     assert "\nempty\n" in capsys.readouterr().out
@@ -206,7 +208,7 @@ def test_a_cut_recording_is_recovered_into_one_with_an_index(tmp_path: Path) -> 
     bags.write(path, bags.drive(200), end=False)
     path.write_bytes(path.read_bytes()[:-50])
     left = bags.seqs(path)
-    assert unfinished(path)
+    assert is_unfinished(path)
     assert call("bag", "recover", str(path)) == 0
     mended = tmp_path / "open_recovered.mcap"
     assert bags.seqs(mended) == left
@@ -224,10 +226,10 @@ def test_the_next_start_mends_what_was_cut_off_and_leaves_the_rest_alone(
     bags.write(cut, bags.drive(100), end=False)
     shutil.copy(whole, good)
     other.write_text("no bag at all")
-    busy = BagFile(tmp_path / "busy.mcap", viewers=False, notes={})
+    busy = BagWriter(tmp_path / "busy.mcap", viewers=False, notes={})
     before = {path: path.read_bytes() for path in (good, other, busy.path)}
     recover_all(tmp_path)
-    assert info(cut).finished
+    assert read_info(cut).finished
     assert bags.seqs(cut) == list(range(1, 101))
     assert {path: path.read_bytes() for path in before} == before
     assert len(list(tmp_path.iterdir())) == 4
@@ -275,7 +277,7 @@ def test_a_plot_is_a_picture_and_an_unknown_field_names_the_nearest(
 
 def test_settings_are_kept_for_a_replay(tmp_path: Path) -> None:
     notes = {"decision": msgspec.json.encode({"turn": "left"}).decode()}
-    BagFile(tmp_path / "n.mcap", viewers=False, notes=notes).close()
+    BagWriter(tmp_path / "n.mcap", viewers=False, notes=notes).close()
     bag = Bag(tmp_path / "n.mcap")
     assert list(bag) == []
     assert bag.notes["gigabrain"] == notes

@@ -14,13 +14,13 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.drives import file_of
-from gigabrain_zenoh.recording.intake import Arrival
+from gigabrain_zenoh.recording.bag_writer import ReceivedMessage
 from gigabrain_zenoh.recording.lerobot import columns, convert, episodes, frames
 from tests.node.test_record_replay import RECORDINGS
 from tests.unit.recording import bags
 
 
-def enabled(states: range) -> Iterator[Arrival]:
+def enabled(states: range) -> Iterator[ReceivedMessage]:
     """States with the gate open, each after a command of a thousandth of its number."""
     for seq in states:
         at_ns = seq * 20_000_000
@@ -79,5 +79,5 @@ def test_the_dataset_has_the_folders_of_the_format(tmp_path: Path) -> None:
 def test_a_recording_in_which_nobody_drives_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     bags.write(path, bags.drive(20))
-    with pytest.raises(ConfigError, match="holds no time in which the gate was enabled"):
+    with pytest.raises(ConfigError, match="the gate was never enabled"):
         episodes(path)

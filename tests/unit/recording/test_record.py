@@ -14,12 +14,11 @@ from gigabrain_schemas.topics import IMAGE, INTENT, MAP, SCAN, STATE, TOPICS
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.recording.bagfile import BagFile
-from gigabrain_zenoh.recording.info import info
-from gigabrain_zenoh.recording.intake import MOST_PLACES, OTHERS, Intake
-from gigabrain_zenoh.recording.node import chosen, listening, run
-from gigabrain_zenoh.recording.reading import Bag
-from gigabrain_zenoh.recording.recorder import Recorder
+from gigabrain_zenoh.recording.bag_info import read_info
+from gigabrain_zenoh.recording.bag_reader import Bag
+from gigabrain_zenoh.recording.bag_writer import BagWriter
+from gigabrain_zenoh.recording.node import key_filter, listening, run
+from gigabrain_zenoh.recording.recorder import MAX_CHANNELS, OTHER_KEYS, Intake, Recorder
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.waiting import until
 from tests.unit.recording import bags
@@ -45,10 +44,10 @@ async def test_only_the_topics_that_were_asked_for_are_recorded(tmp_path: Path) 
         for topic in (SCAN, STATE, IMAGE):
             net.two.publish(topic, example(topic.type), name="front" if topic.many else "")
     assert kept(path) == {"robot/scan": 1, "robot/image/front": 1}
-    assert chosen(("robot/im*", "pose"))("robot/imu")
-    assert not chosen(("pose",))("robot/imu")
+    assert key_filter(("robot/im*", "pose"))("robot/imu")
+    assert not key_filter(("pose",))("robot/imu")
     with pytest.raises(ConfigError, match="no topic 'scam'; did you mean 'scan'"):
-        chosen(("scam",))
+        key_filter(("scam",))
     await net.one.close()
     await net.two.close()
 
@@ -80,14 +79,14 @@ async def test_the_process_records_and_tells_how_it_is_doing(tmp_path: Path) -> 
     process.cancel()
     await asyncio.wait((process,))
     (name,) = os.listdir(tmp_path)
-    assert info(tmp_path / name).finished
+    assert read_info(tmp_path / name).finished
     assert kept(tmp_path / name) == {"robot/state": 50}
     await net.one.close()
     await net.two.close()
 
 
 def test_viewers_find_something_to_draw_of_every_kind(tmp_path: Path) -> None:
-    file = BagFile(tmp_path / "v.mcap", viewers=True, notes={})
+    file = BagWriter(tmp_path / "v.mcap", viewers=True, notes={})
     for n, topic in enumerate(TOPICS):
         payload = codec.encode(EXAMPLES[topic.type.__name__])
         file.add(bags.arrival(n, topic.at("front"), payload))
@@ -157,14 +156,14 @@ def test_who_makes_up_keys_and_encodings_costs_a_bounded_number_of_them() -> Non
         intake.take("robot/state", f"text/{n}", b"x")
     intake.take("robot/scan", "", bags.scan(2))
     arrivals = intake.hand_over()
-    assert len({(one.key, one.encoding) for one in arrivals}) == MOST_PLACES
+    assert len({(one.key, one.encoding) for one in arrivals}) == MAX_CHANNELS
     assert arrivals[-1].header.seq == 2
-    assert len(intake.seen) <= MOST_PLACES + 1
-    assert intake.dropped == {OTHERS: 20_002 - len(arrivals)}
+    assert len(intake.seen) <= MAX_CHANNELS + 1
+    assert intake.dropped == {OTHER_KEYS: 20_002 - len(arrivals)}
 
 
 def test_viewers_get_every_second_state_and_each_thought_once(tmp_path: Path) -> None:
-    file = BagFile(tmp_path / "a.mcap", viewers=True, notes={})
+    file = BagWriter(tmp_path / "a.mcap", viewers=True, notes={})
     for tick in range(50):  # one second
         for topic in (STATE, INTENT):
             said = replace(example(topic.type), seq=tick + 1, tick=tick, basis=tick // 5)

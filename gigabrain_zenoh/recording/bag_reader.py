@@ -1,0 +1,277 @@
+"""Reads a bag from its first byte to its last, however it ended, and reports what is damaged.
+
+The library parses the records. Its readers end at the first damaged byte, return a message that was
+cut off as if it were whole, and allocate whatever size a chunk claims (400 MB for one of 13 kB).
+The walk from record to record, and the limits, are therefore ours.
+"""
+
+import contextlib
+import logging
+import mmap
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import lz4.frame
+import zstandard
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC
+
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.bounded_file import open_regular
+from gigabrain_zenoh.recording.headers import Header, header_of
+
+log = logging.getLogger(__name__)
+
+RAW = "raw"  # kind of a channel that holds recorded messages
+MAGIC = MCAP0_MAGIC
+HEAD = struct.Struct("<BQ")  # opcode and length of a record
+READ_OPCODES = {
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.MESSAGE,
+    Opcode.CHUNK,
+    Opcode.METADATA,
+}
+FOOTER_BYTES = HEAD.size + 20
+ZSTD_NAME = b"\x04\x00\x00\x00zstd"
+BYTES_BEFORE_NAME = HEAD.size + 28  # from a chunk's opcode to the name of its compression
+PIECE_BYTES = 1 << 16
+MAX_RECORD_BYTES = 48 << 20  # also of a decompressed chunk; writers use chunks of 1 MB
+MAX_WINDOW_BYTES = 1 << 25  # memory of a decompressor
+
+
+class BagDamage(NamedTuple):
+    """Part of a bag that cannot be read."""
+
+    offset: int  # [bytes] from the start of the file
+    text: str
+
+
+class BagEnd(NamedTuple):
+    """Regular end of a bag."""
+
+    index_ok: bool
+
+
+class Sample(NamedTuple):
+    """One recorded message."""
+
+    log_ns: int  # Unix time of reception
+    key: str
+    encoding: str  # Zenoh's
+    schema: str
+    payload: bytes
+
+    @property
+    def header(self) -> Header:
+        """Return the header of the message."""
+        return header_of(self.payload)
+
+
+class Bag:
+    """Recording on disk. Reading continues after damaged parts."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damages: list[BagDamage] = []  # these four are filled while the bag is read
+        self.finished = False
+        self.index_ok = False
+        self.notes: dict[str, Mapping[str, str]] = {}  # named tables of texts
+
+    def __iter__(self) -> Iterator[Sample]:
+        """Iterate over all messages from the bus. Raises ConfigError if the file is not a bag."""
+        for channel, schema, message in self.messages():
+            if channel.metadata.get("kind") == RAW:
+                yield Sample(
+                    message.log_time,
+                    channel.topic,
+                    channel.metadata.get("zenoh_encoding", ""),
+                    schema.name if schema else "",
+                    message.data,
+                )
+
+    def messages(self) -> Iterator[tuple[Channel, Schema | None, Message]]:
+        """Iterate over all messages, including those for viewers. Raises ConfigError."""
+        self.damages, self.finished, self.index_ok = [], False, False
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        for item in read_records(self.path):
+            if isinstance(item, Message):
+                if channel := channels.get(item.channel_id):
+                    yield channel, schemas.get(channel.schema_id), item
+            elif isinstance(item, Channel):
+                channels[item.id] = item
+            elif isinstance(item, Schema):
+                schemas[item.id] = item
+            elif isinstance(item, Metadata):
+                self.notes[item.name] = item.metadata
+            elif isinstance(item, BagDamage):
+                self.damages.append(item)
+            elif isinstance(item, BagEnd):
+                self.finished, self.index_ok = True, item.index_ok
+
+
+def samples(path: Path) -> Iterator[Sample]:
+    """Iterate over all messages from the bus; log a warning if the bag is damaged.
+
+    Raises ConfigError if the file is not a bag.
+    """
+    bag = Bag(path)
+    yield from bag
+    damage = bag.damages[0].text if bag.damages else "" if bag.finished else "the file is cut off"
+    if damage:
+        log.warning("%s: %s; mend it with: gigabrain bag recover %s", path, damage, path)
+
+
+def check_magic(path: Path) -> None:
+    """Raise ConfigError if the file is not a bag, and name what it is instead."""
+    try:
+        with open_regular(path) as file:
+            head = file.read(len(MAGIC))
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+    if not head:
+        raise ConfigError(f"{path} is empty")
+    if head[:5] == MAGIC[:5] and head[6:] == MAGIC[6:] and head != MAGIC:
+        version = head[5:6].decode("ascii", "replace")
+        raise ConfigError(f"{path} is MCAP of version {version}; version 0 can be read")
+    if head != MAGIC:
+        raise ConfigError(f"{path} is not a bag (MCAP)")
+
+
+def read_records(path: Path) -> Iterator[McapRecord | BagDamage | BagEnd]:
+    """Iterate over all records in order, chunks unpacked. Raises ConfigError."""
+    check_magic(path)
+    with open_regular(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        yield from _walk(data)
+
+
+def _walk(data: mmap.mmap) -> Iterator[McapRecord | BagDamage | BagEnd]:
+    at, end = len(MAGIC), len(data)
+    summary = _summary(data)
+    if summary:  # declares again what a damaged chunk may have declared
+        yield from (item for item in _parse(summary) if isinstance(item, Schema | Channel))
+    while at < end:
+        opcode, after = _head(data, at)
+        whole = opcode > 0 and after <= end
+        if whole and opcode == Opcode.DATA_END:
+            yield BagEnd(summary is not None)
+            return
+        if whole and after - at > MAX_RECORD_BYTES:
+            yield BagDamage(at, f"a record of {(after - at) / 1e6:.0f} MB is skipped")
+        elif whole and opcode not in READ_OPCODES:
+            pass
+        elif whole:
+            yield from _unpacked(data[at:after], at)
+        elif (chunk := _next_chunk(data, at + 1)) > 0:
+            yield BagDamage(at, "there is no valid record here")
+            after = chunk
+        else:
+            if opcode == Opcode.CHUNK:
+                yield from _torn_chunk(data[at : at + MAX_RECORD_BYTES])
+            break
+        at = after
+    yield BagDamage(at, "the file is cut off here")
+
+
+def _head(data: mmap.mmap, at: int) -> tuple[int, int]:
+    """Return opcode and end of the record at `at`; opcode 0 if there is none."""
+    if at + HEAD.size > len(data):
+        return 0, at
+    opcode, length = HEAD.unpack_from(data, at)
+    known = Opcode.HEADER <= opcode <= Opcode.DATA_END
+    return (opcode, at + HEAD.size + length) if known else (0, at)
+
+
+def _next_chunk(data: mmap.mmap, at: int) -> int:
+    """Return where the next chunk begins, found by its compression's name; -1 if there is none."""
+    name = data.find(ZSTD_NAME, at + BYTES_BEFORE_NAME)
+    while name > 0:
+        opcode, after = _head(data, name - BYTES_BEFORE_NAME)
+        if opcode == Opcode.CHUNK and after > name:
+            return name - BYTES_BEFORE_NAME
+        name = data.find(ZSTD_NAME, name + 1)
+    return -1
+
+
+def _summary(data: mmap.mmap) -> bytes | None:
+    """Return the part after the messages, or None if it is absent or damaged."""
+    at = len(data) - len(MAGIC) - FOOTER_BYTES
+    if at < len(MAGIC) or data[-len(MAGIC) :] != MAGIC:
+        return None
+    footer = next(_parse(data[at:]), None)
+    if not isinstance(footer, Footer) or not 0 < footer.summary_start <= at:
+        return None
+    if at - footer.summary_start > MAX_RECORD_BYTES:
+        return None
+    summary = data[footer.summary_start : len(data) - len(MAGIC) - 4]
+    ok = footer.summary_crc in (0, zlib.crc32(summary))
+    return data[footer.summary_start : at] if ok else None
+
+
+def _unpacked(record: bytes, at: int) -> Iterator[McapRecord | BagDamage]:
+    """Parse one record; of a chunk yield everything inside, or nothing if its checksum is wrong."""
+    for item in _parse(record):
+        if not isinstance(item, Chunk):
+            yield item
+            continue
+        records, complete = _decompressed(item)
+        crc = item.uncompressed_crc
+        if complete and (not crc or zlib.crc32(records) == crc):
+            yield from _parse(records)
+        else:
+            yield BagDamage(at, f"a chunk of {len(record) - HEAD.size} bytes is damaged")
+        return
+    if record[0] == Opcode.CHUNK:
+        yield BagDamage(at, f"a chunk of {len(record) - HEAD.size} bytes is damaged")
+
+
+def _torn_chunk(record: bytes) -> Iterator[McapRecord]:
+    """Parse the beginning of a chunk whose end was never written."""
+    with contextlib.suppress(McapError, struct.error, UnicodeDecodeError):
+        for item in StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records:
+            if isinstance(item, Chunk):
+                yield from _parse(_decompressed(item)[0])
+
+
+def _decompressed(chunk: Chunk) -> tuple[bytes, bool]:
+    """Return as much as can be decompressed within the limits, and whether that is all."""
+    if chunk.compression == "":
+        return chunk.data, True
+    records = bytearray()
+    try:
+        reader = _decompressor(chunk)
+        while len(records) < MAX_RECORD_BYTES and (piece := reader.read(PIECE_BYTES)):
+            records += piece
+    except (zstandard.ZstdError, RuntimeError, EOFError):
+        return bytes(records), False
+    return bytes(records), len(records) < MAX_RECORD_BYTES
+
+
+def _decompressor(chunk: Chunk) -> IO[bytes]:
+    if chunk.compression == "zstd":
+        decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES)
+        return decompressor.stream_reader(chunk.data)
+    if chunk.compression == "lz4":
+        return lz4.frame.open(BytesIO(chunk.data), "rb")  # type: ignore[no-any-return]
+    raise EOFError(f"unknown compression {chunk.compression!r}")
+
+
+def _parse(records: bytes) -> Iterator[McapRecord]:
+    """Parse all records that are whole, up to the first that is damaged."""
+    at = 0
+    while at + HEAD.size <= len(records):
+        after = at + HEAD.size + HEAD.unpack_from(records, at)[1]
+        if after > len(records):
+            break
+        at = after
+    reader = StreamReader(BytesIO(records[:at]), skip_magic=True, emit_chunks=True)
+    with contextlib.suppress(McapError, struct.error, UnicodeDecodeError):
+        yield from reader.records

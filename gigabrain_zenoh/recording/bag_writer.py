@@ -1,0 +1,266 @@
+"""Writes one MCAP file: every message byte for byte, and the messages that viewers draw."""
+
+import contextlib
+import fcntl
+import os
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from foxglove import Schema
+from mcap.well_known import MessageEncoding
+from mcap.writer import IndexType, Writer
+
+from gigabrain_schemas.topics import CMD_VEL, INTENT, STATE, TASK, TOPICS, Topic
+from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.bounded_file import open_regular
+from gigabrain_zenoh.recording.bag_reader import RAW
+from gigabrain_zenoh.recording.drawing import Drawer, Drawn, json_schema
+from gigabrain_zenoh.recording.headers import Header, is_json
+
+PROFILE, LIBRARY = "gigabrain", "gigabrain-zenoh"
+VIEW = "view"  # kind of a channel, in its metadata; that of recorded messages is RAW
+TOPIC_BY_KEY = {topic.key: topic for topic in TOPICS}
+MIN_DRAWN_INTERVAL_NS = {
+    STATE.key: 30_000_000,
+    CMD_VEL.key: 30_000_000,
+    TASK.key: 450_000_000,  # holds the whole path to the goal
+}
+_fdatasync = getattr(os, "fdatasync", os.fsync)  # macOS has no fdatasync
+
+
+class ReceivedMessage(NamedTuple):
+    """One message as it was received."""
+
+    log_ns: int  # Unix time of reception; strictly increasing
+    key: str
+    encoding: str  # Zenoh's
+    payload: bytes
+    header: Header
+
+
+def topic_of(key: str) -> Topic[Any] | None:
+    """Return the topic of a key, or None for a key that is not in the topic table."""
+    if key in TOPIC_BY_KEY:
+        return TOPIC_BY_KEY[key]
+    topic = TOPIC_BY_KEY.get(key.rpartition("/")[0])
+    return topic if topic and topic.many else None
+
+
+class AppendOnlyFile:
+    """New file, locked while it is open, that an interrupted append leaves as it was.
+
+    `write` only collects data, and `flush` appends all of it or nothing: a chunk that a full disk
+    cuts off would otherwise stay in the file. Raises ConfigError if the file exists.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.size = path, 0  # size on the disk [bytes]
+        self.pending = bytearray()
+        try:
+            if not path.parent.is_dir():
+                path.parent.mkdir(parents=True)
+            self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except FileExistsError as error:
+            raise ConfigError(f"{error.filename} exists; choose another file") from None
+        except OSError as error:
+            raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)  # keeps recovery off this file
+
+    def write(self, data: bytes) -> int:
+        """Collect data for the next `flush`."""
+        self.pending += data
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the size including collected data [bytes]."""
+        return self.size + len(self.pending)
+
+    def flush(self) -> None:
+        """Append all collected data. Raises OSError."""
+        data, self.pending = bytes(self.pending), bytearray()
+        if data:
+            self.append(data)
+
+    def append(self, data: bytes) -> None:
+        """Append all of `data`, or nothing and raise OSError."""
+        view = memoryview(data)
+        try:
+            while view:
+                view = view[os.write(self._fd, view) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, self.size)
+                os.lseek(self._fd, self.size, os.SEEK_SET)
+            raise
+        self.size += len(data)
+
+    def sync(self) -> None:
+        """Force appended data to the disk. Raises OSError."""
+        _fdatasync(self._fd)
+
+    def free_bytes(self) -> int:
+        """Return the free space on the disk [bytes]."""
+        disk = os.fstatvfs(self._fd)
+        return disk.f_bavail * disk.f_frsize
+
+    def close(self) -> None:
+        """Close and unlock the file."""
+        os.close(self._fd)
+
+
+def is_being_written(path: Path) -> bool:
+    """Return whether a recorder holds the lock on `path`."""
+    with open_regular(path) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+class _Channel(NamedTuple):
+    """Channel for messages of one key and encoding."""
+
+    id: int
+    drawn: Topic[Any] | None  # None if viewers draw nothing of this key
+
+
+class BagWriter:
+    """Recording in progress.
+
+    Raises ConfigError if the file cannot be created, OSError if the disk accepts no more.
+    """
+
+    def __init__(self, path: Path, *, viewers: bool, notes: Mapping[str, str]) -> None:
+        self._file, self._stored_bytes = AppendOnlyFile(path), 0
+        index = IndexType.ALL if viewers else IndexType.CHUNK | IndexType.METADATA
+        self._writer = Writer(self._file, index_types=index)  # type: ignore[arg-type]
+        try:
+            self._writer.start(PROFILE, LIBRARY)
+            self.add_notes("gigabrain", notes)
+            self._file.sync()
+        except OSError as error:
+            self._file.close()
+            path.unlink(missing_ok=True)
+            raise ConfigError(f"cannot write {path}: {error.strerror}") from None
+        self._viewers, self._drawer = viewers, Drawer()
+        self._decoders = {t.type: Codec(t.type, t.max_bytes).decode for t in TOPICS}
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str, bool], _Channel] = {}
+        self._view_channels: dict[tuple[str, str], int] = {}  # by topic and encoding
+        self._last_drawn_ns: dict[str, int] = {}  # by key
+        self._last_intent = (0, -1)  # boot and basis
+        self.pending: Counter[str] = Counter()  # messages per key that are not on the disk yet
+        self.written = 0  # messages on the disk
+        self.first_ns = 0
+
+    @property
+    def path(self) -> Path:
+        """Path of the file."""
+        return self._file.path
+
+    @property
+    def size(self) -> int:
+        """Size on the disk [bytes]."""
+        return self._file.size
+
+    def free_bytes(self) -> int:
+        """Return the free space on the disk [bytes]."""
+        return self._file.free_bytes()
+
+    def add(self, message: ReceivedMessage, *, repeated: bool = False) -> None:
+        """Append one message, and what viewers draw of it.
+
+        A `repeated` message is in an earlier file already, and is not counted again.
+        """
+        log_ns, key, encoding, payload, header = message
+        kind = key, encoding, is_json(payload)
+        channel = self._channels.get(kind) or self._add_channel(kind)
+        if not repeated:
+            self.pending[key] += 1
+        self.first_ns = self.first_ns or log_ns
+        stamp_ns = header.stamp_ns or log_ns
+        self._writer.add_message(channel.id, log_ns, payload, stamp_ns, header.seq & 0xFFFF_FFFF)
+        if channel.drawn and self._is_worth_drawing(message):
+            self._draw(channel.drawn, message)
+        self._store()
+
+    def flush(self) -> None:
+        """Bring all messages to the disk."""
+        self._writer.flush()
+        self._store()
+        self._file.sync()
+
+    def add_notes(self, name: str, values: Mapping[str, str]) -> None:
+        """Append a named table of texts."""
+        self._writer.add_metadata(name, dict(values))
+        self._file.flush()
+        self._stored_bytes = self._file.size
+
+    def finish(self) -> None:
+        """Write the index, without which most programs refuse to open the file."""
+        self._writer.finish()
+        self._store()
+        self._file.sync()
+
+    def close(self) -> None:
+        """Close the file, finished or not."""
+        self._file.close()
+
+    def _store(self) -> None:
+        """Append the chunk that the library has finished, if any: it holds all messages so far."""
+        self._file.flush()
+        if self._file.size != self._stored_bytes:
+            self._stored_bytes = self._file.size
+            self.written += self.pending.total()
+            self.pending = Counter()
+
+    def _add_channel(self, kind: tuple[str, str, bool]) -> _Channel:
+        key, encoding, json = kind
+        topic = topic_of(key)
+        form = MessageEncoding.JSON if json else "msgpack"
+        notes = {"kind": RAW, "zenoh_encoding": encoding}
+        schema = self._schema(json_schema(topic.type)) if topic else 0
+        number = self._writer.register_channel(key, form, schema, notes)
+        self._store()  # a large schema may finish the chunk before the message is in it
+        drawn = topic if topic and self._viewers and self._drawer.draws(topic) else None
+        self._channels[kind] = _Channel(number, drawn)
+        return self._channels[kind]
+
+    def _schema(self, of: Schema) -> int:
+        if of.name not in self._schemas:
+            self._schemas[of.name] = self._writer.register_schema(of.name, of.encoding, of.data)
+        return self._schemas[of.name]
+
+    def _draw(self, topic: Topic[Any], received: ReceivedMessage) -> None:
+        try:
+            message = self._decoders[topic.type](received.payload)
+        except ValueError:  # an invalid message is kept, but cannot be drawn
+            return
+        stamp_ns = received.header.stamp_ns or received.log_ns
+        for drawn in self._drawer.draw(topic, message, received.key.rpartition("/")[2]):
+            channel = self._view_channel(drawn)
+            self._writer.add_message(channel, received.log_ns, drawn.data, stamp_ns)
+
+    def _is_worth_drawing(self, message: ReceivedMessage) -> bool:
+        """Return whether it shows more than the one before; decided before it is decoded."""
+        key, header = message.key, message.header
+        if key == INTENT.key:  # repeated with every tick
+            before, self._last_intent = self._last_intent, (header.boot, header.basis)
+            return before != self._last_intent
+        interval_ns = MIN_DRAWN_INTERVAL_NS.get(key)
+        if interval_ns is not None:
+            if message.log_ns - self._last_drawn_ns.get(key, 0) < interval_ns:
+                return False
+            self._last_drawn_ns[key] = message.log_ns
+        return True
+
+    def _view_channel(self, drawn: Drawn) -> int:
+        kind = drawn.topic, drawn.encoding
+        if kind not in self._view_channels:
+            schema = self._schema(drawn.schema())
+            self._view_channels[kind] = self._writer.register_channel(*kind, schema, {"kind": VIEW})
+        return self._view_channels[kind]

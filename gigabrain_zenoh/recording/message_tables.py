@@ -1,0 +1,139 @@
+"""Messages as rows of named values: CSV tables, and plots over time."""
+
+import csv
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gigabrain_schemas import arrays
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import TOPICS
+from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
+
+Value = float | int | str | bool | None
+Series = tuple[list[float], list[float]]  # times since the first message [s], values
+DECODERS = {f"gigabrain.{t.type.__name__}": Codec(t.type, t.max_bytes).decode for t in TOPICS}
+
+
+def message_of(sample: Sample) -> Message | None:
+    """Decode a recorded message by its schema; None if it is not a valid message of ours."""
+    decode = DECODERS.get(sample.schema)
+    try:
+        return decode(sample.payload) if decode else None
+    except ValueError:
+        return None
+
+
+def row(message: Message) -> dict[str, Value]:
+    """Return all values by dotted name; of bytes only their number, except for a scan's ranges."""
+    values = dict(_flat("", msgspec.to_builtins(message, builtin_types=(bytes,))))
+    if isinstance(message, LaserScan):
+        del values["ranges"]
+        values |= {f"ranges.{i}": float(r) for i, r in enumerate(arrays.ranges(message))}
+    return values
+
+
+def _flat(name: str, value: Any) -> Iterator[tuple[str, Value]]:
+    if isinstance(value, bytes):
+        yield name, len(value)
+    elif isinstance(value, Mapping):
+        for key, inner in value.items():
+            yield from _flat(f"{name}.{key}" if name else str(key), inner)
+    elif isinstance(value, list | tuple):
+        for i, inner in enumerate(value):
+            yield from _flat(f"{name}.{i}", inner)
+    else:
+        yield name, value
+
+
+def write_csv(path: Path, folder: Path) -> list[Path]:
+    """Write one file per key with a row per message; return the files. Raises ConfigError."""
+    columns: dict[str, dict[str, None]] = {}  # in order of first appearance
+    for sample in samples(path):
+        if message := message_of(sample):
+            columns.setdefault(sample.key, {}).update(dict.fromkeys(row(message)))
+    if not columns:
+        raise ConfigError(f"{path} holds no message to convert")
+    paths = {key: folder / f"{key.replace('/', '_')}.csv" for key in sorted(columns)}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        files = {key: each.open("w", newline="") for key, each in paths.items()}
+    except OSError as error:
+        raise ConfigError(f"cannot write {folder}: {error.strerror}") from None
+    writers = {key: csv.DictWriter(file, ("time_s", *columns[key])) for key, file in files.items()}
+    for writer in writers.values():
+        writer.writeheader()
+    first_ns = 0
+    for sample in Bag(path):
+        first_ns = first_ns or sample.log_ns
+        if message := message_of(sample):
+            time_s = round((sample.log_ns - first_ns) / 1e9, 6)
+            writers[sample.key].writerow({"time_s": time_s, **row(message)})
+    for file in files.values():
+        file.close()
+    return list(paths.values())
+
+
+def read_series(path: Path, fields: Sequence[str]) -> dict[str, Series]:
+    """Return each field's values over time. Raises UnknownName for a field not in the bag."""
+    found: dict[str, Series] = {field: ([], []) for field in fields}
+    wanted = {field: _split(field) for field in fields}
+    known: set[str] = set()
+    first_ns = 0
+    for sample in samples(path):
+        first_ns = first_ns or sample.log_ns
+        topic = sample.key.removeprefix("robot/")
+        selected = [field for field, (name, _) in wanted.items() if name == topic]
+        if not selected and topic in known:
+            continue
+        message = message_of(sample)
+        if message is None:
+            continue
+        values = row(message)
+        if topic not in known:
+            known |= {topic, *(f"{topic}.{name}" for name in values)}
+        for field in selected:
+            value = values.get(wanted[field][1])
+            if isinstance(value, int | float):
+                found[field][0].append((sample.log_ns - first_ns) / 1e9)
+                found[field][1].append(float(value))
+    for field, (times, _) in found.items():
+        if not times:
+            numbers = {name for name in known if name.startswith(f"{wanted[field][0]}.")}
+            topics = {name for name in known if "." not in name}
+            raise unknown("number", field, numbers) if numbers else unknown("topic", field, topics)
+    return found
+
+
+def _split(field: str) -> tuple[str, str]:
+    topic, _, name = field.removeprefix("robot/").partition(".")
+    return topic, name
+
+
+def plot(path: Path, fields: Sequence[str], to: Path) -> Path:
+    """Draw `fields` over time into the PNG file `to`. Raises ConfigError."""
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        raise ConfigError("plots need matplotlib: pip install 'gigabrain-zenoh[record]'") from None
+    if not fields:
+        raise ConfigError("name what to draw, such as cmd_vel.linear_x")
+    drawn = read_series(path, fields)
+    figure = Figure(figsize=(10, 5), layout="constrained")
+    axes = figure.subplots()
+    for field, (times, values) in drawn.items():
+        axes.step(times, values, where="post", label=field, linewidth=1.2)
+    axes.set_xlabel("time [s]")
+    axes.set_title(path.name)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    try:
+        figure.savefig(to, format="png", dpi=110)
+    except OSError as error:
+        raise ConfigError(f"cannot write {to}: {error.strerror}") from None
+    return to

@@ -1,0 +1,140 @@
+"""Plays a recording over the bus, at its own rate or another."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from msgspec import Struct
+
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.requests import DescribeRequest
+from gigabrain_schemas.topics import DESCRIBE, Topic
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import Transport
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.recording.bag_reader import Bag, Sample, check_magic
+from gigabrain_zenoh.recording.bag_writer import topic_of
+from gigabrain_zenoh.recording.node import key_filter
+from gigabrain_zenoh.runtime.joining import Where, joined
+
+DISCOVERY_S = 0.5  # until all subscribers are known, before the first message is sent
+ASK_S = 0.3
+
+
+class PlayOptions(Struct, frozen=True, kw_only=True):
+    """Selection of what is played, and how."""
+
+    rate: float = 1.0  # times the recorded rate
+    start_s: float = 0.0  # from the first message
+    loop: bool = False
+    topics: tuple[str, ...] = ()  # names or key expressions; empty for all
+    remap: Mapping[str, str] = {}  # recorded key: key to publish on instead
+
+
+class Player:
+    """Publishes the messages of a bag. It drops none: a slow subscriber slows it down."""
+
+    def __init__(self, path: Path, options: PlayOptions, transport: Transport) -> None:
+        self._path, self._options, self._transport = path, options, transport
+        self._topics: dict[str, Topic[Message]] = {}
+        self._kept: dict[str, Sample] = {}  # newest of topics kept for late subscribers
+        self.sent = 0
+        self.late_s = 0.0  # greatest delay of a message
+
+    async def play(self) -> None:
+        """Play to the end, or for ever with `loop`. Raises ConfigError if it is not a bag."""
+        self._declare()
+        await asyncio.sleep(DISCOVERY_S)
+        await self._play_once()
+        while self._options.loop:
+            await self._play_once()
+
+    def _samples(self) -> Iterable[Sample]:
+        wanted = key_filter(self._options.topics)
+        return (sample for sample in Bag(self._path) if wanted(sample.key))
+
+    def _declare(self) -> None:
+        """Declare all publishers before the first message."""
+        keys = {sample.key: None for sample in self._samples()}
+        if not keys:
+            raise ConfigError(f"{self._path} holds no message to play")
+        for key in keys:
+            known = topic_of(key)
+            topic = known or Topic(key, Message, 1.0)
+            self._topics[key] = replace(topic, congestion="block")
+            if known and known.keep:
+                self._serve(key)
+
+    def _serve(self, key: str) -> None:
+        async def answer(_: bytes) -> tuple[bytes, str]:
+            if key not in self._kept:
+                raise Refused("it has not been played yet")
+            return self._kept[key].payload, self._kept[key].encoding
+
+        self._transport.serve(self._target(key), answer)
+
+    def _target(self, key: str) -> str:
+        return self._options.remap.get(key, key)
+
+    async def _play_once(self) -> None:
+        async for sample in self._due_samples():
+            topic, key = self._topics[sample.key], self._target(sample.key)
+            self._transport.publish(topic, key, sample.payload, sample.encoding)
+            self.sent += 1
+
+    async def _due_samples(self) -> AsyncIterator[Sample]:
+        """Yield every message when it is due; first the kept ones of the part that is skipped."""
+        start_s, first_ns, started = 0.0, 0, False
+        for sample in self._samples():
+            first_ns = first_ns or sample.log_ns
+            at_s = (sample.log_ns - first_ns) / 1e9 - self._options.start_s
+            if sample.key in self._topics and self._topics[sample.key].keep:
+                self._kept[sample.key] = sample
+            if at_s < 0:
+                continue
+            if not started:
+                started, start_s = True, time.monotonic()
+                for kept in self._kept.values():
+                    if kept is not sample:
+                        yield kept
+            await self._until(start_s + at_s / self._options.rate)
+            yield sample
+
+    async def _until(self, due_s: float) -> None:
+        now_s = time.monotonic()
+        if now_s < due_s:
+            await asyncio.sleep(due_s - now_s)
+        elif self.sent % 64 == 0:
+            await asyncio.sleep(0)  # queries are answered however late the player is
+        self.late_s = max(self.late_s, now_s - due_s)
+
+
+async def check_nobody_drives(bus: Bus) -> None:
+    """Raise Refused if a driver runs on this bus: its robot would receive every message twice."""
+    replies = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=ASK_S, name="driver")
+    if replies:
+        raise Refused(
+            f"a driver runs here (pid {replies[0].pid}); play with another --namespace, "
+            "or with --beside-robot"
+        )
+
+
+async def play(path: Path, options: PlayOptions, where: Where, *, beside_robot: bool) -> int:
+    """Play to the end or until Ctrl-C; return the exit code. Raises GigabrainError."""
+    check_magic(path)
+    async with joined(where, "play") as (bus, transport):
+        if not beside_robot:
+            await check_nobody_drives(bus)
+        player = Player(path, options, transport)
+        with stop_signals() as stop:
+            playing = asyncio.ensure_future(player.play())
+            stopped = asyncio.ensure_future(stop.wait())
+            await asyncio.wait((playing, stopped), return_when=asyncio.FIRST_COMPLETED)
+            stopped.cancel()
+            if not playing.cancel():
+                playing.result()
+    print(f"{player.sent} messages sent, at most {player.late_s * 1e3:.0f} ms late")
+    return 0
