@@ -2,26 +2,105 @@
 
 import asyncio
 import contextlib
-import itertools
 import logging
 import os
 import queue
-import re
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
 from logging.handlers import QueueHandler, QueueListener, RotatingFileHandler
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
+
+import msgspec
 
 from gigabrain_schemas.safety import LogRecord
 from gigabrain_zenoh import errors
-from gigabrain_zenoh.errors import ConfigError, GigabrainError
-from gigabrain_zenoh.host import log_text, run_folders
+from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.host.run_folders import unwritable
+from gigabrain_zenoh.host.terminal import printable
 
+LEVELS: Final = ("debug", "info", "warning", "error", "critical")
+_SHOWN_APART = frozenset({"t", "level", "process", "event", "text", "traceback"})
+_COLOURS = {"debug": "2", "warning": "33", "error": "31", "critical": "1;31"}
+_FORMATTER = logging.Formatter()
+
+
+def level_of(record: logging.LogRecord) -> str:
+    """The name of the nearest of LEVELS that is not above the record's own level."""
+    return LEVELS[min(max(record.levelno // 10 - 1, 0), len(LEVELS) - 1)]
+
+
+def fields(record: logging.LogRecord, process: str) -> dict[str, Any]:
+    """`{"t": unix_ns, "level", "process", "event", "text"}` and the record's own `data`.
+
+    `data` comes in by `extra={"data": {...}}`; it names the event, and cannot overwrite the rest.
+    """
+    data = getattr(record, "data", {})
+    known: dict[str, Any] = {
+        "t": int(record.created * 1e9),
+        "level": level_of(record),
+        "process": process,
+        "event": str(data.get("event", "log")),
+        "text": _text_of(record),
+    }
+    if record.exc_info:
+        known["traceback"] = _FORMATTER.formatException(record.exc_info)
+    return known | {str(k): v for k, v in data.items() if k not in known}
+
+
+def _text_of(record: logging.LogRecord) -> str:
+    try:
+        return record.getMessage()
+    except (TypeError, ValueError, KeyError):  # a library's arguments do not fit its own format
+        return f"{record.msg} {record.args}"
+
+
+def encode(record: Mapping[str, Any]) -> bytes:
+    """One line of JSON without its newline, whatever the values are; NaN becomes null."""
+    try:
+        return _ENCODER.encode(record)
+    except (TypeError, ValueError, OverflowError, RecursionError):
+        # a cycle, a lone surrogate or an odd key: the line matters more than its looks
+        return _ENCODER.encode({ascii(key)[1:-1]: _safe(value) for key, value in record.items()})
+
+
+def readable(record: Mapping[str, Any], *, colour: bool = False) -> str:
+    """`12:03:44 driver     warning  text key=value`, in local time, without its newline."""
+    clock = time.strftime("%H:%M:%S", time.localtime(record["t"] / 1e9))
+    level, text = str(record["level"]), printable(record.get("text") or record["event"])
+    data = [
+        f"{printable(key)}={printable(_value(value))}"
+        for key, value in record.items()
+        if key not in _SHOWN_APART
+    ]
+    shown = f"\033[{_COLOURS[level]}m{level:<8}\033[0m" if colour and level in _COLOURS else level
+    line = f"{clock} {printable(record['process']):<10} {shown:<8} {' '.join([text, *data])}"
+    rest = str(record.get("traceback", "")).splitlines()
+    return "\n".join([line, *("    " + printable(more) for more in rest)])
+
+
+def _plain(value: object) -> object:
+    """What msgspec does not know: numpy scalars and arrays as numbers, all else as its repr."""
+    to_list = getattr(value, "tolist", None)
+    return to_list() if callable(to_list) else str(value)
+
+
+def _safe(value: object) -> object:
+    return value if isinstance(value, int) else ascii(value)
+
+
+def _value(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, str) and value and " " not in value:
+        return value
+    return encode({"": value})[4:-1].decode()
+
+
+_ENCODER = msgspec.json.Encoder(enc_hook=_plain)
 log = logging.getLogger(__name__)
-
 QUEUED_RECORDS = 1000  # for each of file and console; more are dropped and counted
 LAST_WORDS_S = 0.5  # how long the end of a process waits until they are written
 FILE_BYTES = 10_000_000  # of one log file; then the next is begun
@@ -89,7 +168,7 @@ class BusHandler(logging.Handler):
 
 def _message(record: logging.LogRecord, process: str) -> LogRecord:
     """The record within the bounds of its message: the bus carries the gist, the file the whole."""
-    known = log_text.fields(record, process)
+    known = fields(record, process)
     text = str(known.pop("text"))
     event, level = str(known.pop("event")), known.pop("level")
     data = {k: str(v) for k, v in known.items() if k not in ("t", "process", "traceback")}
@@ -115,7 +194,7 @@ class _JsonFormatter(logging.Formatter):
         self._process = process
 
     def format(self, record: logging.LogRecord) -> str:
-        return log_text.encode(log_text.fields(record, self._process)).decode()
+        return encode(fields(record, self._process)).decode()
 
 
 class _ReadableFormatter(logging.Formatter):
@@ -124,8 +203,7 @@ class _ReadableFormatter(logging.Formatter):
         self._process, self._colour = process, colour
 
     def format(self, record: logging.LogRecord) -> str:
-        fields = log_text.fields(record, self._process)
-        return log_text.readable(fields, colour=self._colour)
+        return readable(fields(record, self._process), colour=self._colour)
 
 
 class _File(RotatingFileHandler):
@@ -146,7 +224,7 @@ class _File(RotatingFileHandler):
         self._fault.begin(f"cannot write {self.baseFilename}: {sys.exc_info()[1]}")
 
 
-class Background(QueueHandler):
+class QueuedHandler(QueueHandler):
     """Formats records where they are logged, and has `sink` write them in a thread of its own.
 
     So a full disk, or a console that nobody reads, holds up neither the event loop nor the end of
@@ -201,11 +279,11 @@ def setup(process: str, run_dir: Path | None, *, json_console: bool, level: str 
 
     Raises ConfigError when the folder cannot be written, UnknownName for a level that is none.
     """
-    if level not in log_text.LEVELS:
-        raise errors.unknown("log level", level, log_text.LEVELS)
+    if level not in LEVELS:
+        raise errors.unknown("log level", level, LEVELS)
     sinks = [] if run_dir is None else [_file(process, run_dir)]
     console = _JsonFormatter(process) if json_console else _ReadableFormatter(process, _colour())
-    sinks.append(Background(logging.StreamHandler(sys.stderr), console, "console"))
+    sinks.append(QueuedHandler(logging.StreamHandler(sys.stderr), console, "console"))
     root = logging.getLogger()
     for old in _sinks():
         root.removeHandler(old)
@@ -221,58 +299,19 @@ def flush() -> None:
         sink.flush()
 
 
-def _sinks() -> list[Background]:
-    return [one for one in logging.getLogger().handlers if isinstance(one, Background)]
+def _sinks() -> list[QueuedHandler]:
+    return [one for one in logging.getLogger().handlers if isinstance(one, QueuedHandler)]
 
 
-def _file(process: str, run_dir: Path) -> Background:
+def _file(process: str, run_dir: Path) -> QueuedHandler:
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         file = _File(run_dir / f"{process}.jsonl")
     except OSError as error:
-        raise _unwritable(run_dir, error) from None
-    return Background(file, _JsonFormatter(process), "log file")
+        raise unwritable(run_dir, error) from None
+    return QueuedHandler(file, _JsonFormatter(process), "log file")
 
 
 def _colour() -> bool:
     plain = os.environ.get("NO_COLOR") or os.environ.get("TERM") == "dumb"
     return not plain and sys.stderr.isatty()
-
-
-def new_run_dir(base: Path | None, label: str) -> Path:
-    """Create `<base>/<UTC stamp>-<label>-<pid>`; `base` None is the user's state folder (XDG).
-
-    Old run folders are removed first (see `run_folders`), and this one is marked as in use. Raises
-    ConfigError when it cannot be created.
-    """
-    base = base or state_dir() / "runs"
-    stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-    name = f"{stamp}-{re.sub(r'[^A-Za-z0-9._-]+', '-', label)}-{os.getpid()}"
-    try:
-        with run_folders.tidied(base):
-            for n in itertools.count(1):
-                path = base / (name if n == 1 else f"{name}-{n}")
-                if not path.exists():  # by an earlier run of this process in this second
-                    break
-            path.mkdir()
-            run_folders.hold(path)
-            return path
-    except OSError as error:
-        raise _unwritable(base, error) from None
-
-
-def state_dir() -> Path:
-    """Return the folder in which runs and robots keep their state. Raises ConfigError."""
-    from platformdirs import user_state_path  # 10 ms, of which not every command has need
-
-    try:
-        return user_state_path("gigabrain")
-    except RuntimeError:
-        raise ConfigError("there is no home folder; set XDG_STATE_HOME to a folder") from None
-
-
-def _unwritable(folder: Path, error: OSError) -> ConfigError:
-    return ConfigError(
-        f"cannot write the run folder {folder}: {error.strerror}; "
-        "make it writable, or set XDG_STATE_HOME to a folder that is"
-    )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from gigabrain_drivers.echo_loop import EchoLoop
 from gigabrain_drivers.links.serial_link import SerialLink
-from gigabrain_schemas.button import ButtonState
+from gigabrain_schemas.safety import ButtonState
 from gigabrain_schemas.topics import BUTTON, STATE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.estop import press

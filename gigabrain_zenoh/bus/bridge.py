@@ -1,8 +1,4 @@
-"""From any thread onto the event loop: a deque, and one byte that says there is something in it.
-
-Cheaper than `call_soon_threadsafe` per message: while the loop is busy, any number of arrivals cost
-a single write.
-"""
+"""Hand-over from any thread to the event loop: bridge, mailbox, and queue of queries."""
 
 import asyncio
 import contextlib
@@ -10,8 +6,10 @@ import os
 import socket
 import threading
 from collections import deque
-from collections.abc import Callable
-from typing import Any, Protocol
+from collections.abc import Awaitable, Callable
+from typing import Any, Generic, Protocol, TypeVar
+
+from gigabrain_zenoh.bus.transport import Close
 
 
 class Waker(Protocol):
@@ -135,4 +133,143 @@ class Bridge:
                 function(argument)
         finally:
             if self._queue and not self._signalled:  # one of them raised: the others still go
+                self._wake()
+
+
+T = TypeVar("T")
+SPARE = 8  # samples kept at depth 1, of which the newest readable one is delivered
+
+
+class Mailbox(Generic[T]):
+    """Queue of at most `depth` samples for a busy event loop; new samples replace the oldest.
+
+    With `depth` 1, only the newest readable sample is delivered. A sample is unreadable if
+    `on_sample` returns False. The mailbox keeps a few spares, so that invalid samples do not
+    displace a valid one.
+    """
+
+    def __init__(self, bridge: Bridge, on_sample: Callable[[T], bool | None], depth: int) -> None:
+        self._bridge, self._on_sample = bridge, on_sample
+        self._newest_only = depth == 1
+        self._samples: deque[T] = deque(maxlen=SPARE if self._newest_only else depth)
+        self._posted = False
+
+    def put(self, sample: T) -> None:
+        """Store a sample and wake the event loop. Never blocks; may be called from any thread."""
+        self._samples.append(sample)
+        if not self._posted:
+            self._posted = True
+            self._bridge.post(Mailbox._deliver, self)
+
+    def _deliver(self) -> None:
+        self._posted = False  # before emptying, so that samples arriving from now on post again
+        if self._newest_only:
+            self._deliver_newest()
+            return
+        for _ in range(len(self._samples)):
+            self._on_sample(self._samples.popleft())
+
+    def _deliver_newest(self) -> None:
+        waiting = [self._samples.popleft() for _ in range(len(self._samples))]
+        for sample in reversed(waiting):
+            if self._on_sample(sample) is not False:
+                break
+
+
+WAITING = 32  # queries of a key that may wait; beyond that the oldest are refused
+ANSWERING = 32  # queries of a key that are answered concurrently, unless urgent
+SLICE = 4  # queries started in one turn of the loop
+
+
+class _QueriedKey(Generic[T]):
+    """Waiting queries of one key."""
+
+    def __init__(self, answer: Callable[[T], Awaitable[None]], urgent: bool) -> None:
+        self.answer, self.urgent = answer, urgent
+        self.waiting: deque[T] = deque()
+        self.answering = 0
+
+    @property
+    def ready(self) -> bool:
+        """Return whether a waiting query may start.
+
+        Urgent queries are not limited, as their answers may wait for a disk.
+        """
+        return bool(self.waiting) and (self.urgent or self.answering < ANSWERING)
+
+
+class QueryQueue(Generic[T]):
+    """All queries of a process; `refuse` is called for dropped queries, from any thread."""
+
+    def __init__(self, bridge: Bridge, refuse: Callable[[T], None]) -> None:
+        self._bridge, self._refuse = bridge, refuse
+        self._urgent: deque[_QueriedKey[T]] = deque()
+        self._others: deque[_QueriedKey[T]] = deque()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._posted = False
+
+    def serve(
+        self, answer: Callable[[T], Awaitable[None]], *, urgent: bool
+    ) -> tuple[Callable[[T], None], Close]:
+        """Register a key; return a function that adds a query, and one that closes the key.
+
+        Queries may be added from any thread.
+        """
+        key = _QueriedKey(answer, urgent)
+        keys = self._urgent if urgent else self._others
+        keys.append(key)
+
+        def put(query: T) -> None:
+            key.waiting.append(query)
+            while len(key.waiting) > WAITING:
+                self._refuse(key.waiting.popleft())
+            self._wake()
+
+        def close() -> None:
+            if key in keys:
+                keys.remove(key)
+            while key.waiting:
+                self._refuse(key.waiting.popleft())
+
+        return put, close
+
+    def close(self) -> None:
+        """Cancel running answers and start no more."""
+        self._urgent.clear()
+        self._others.clear()
+        for task in self._tasks:
+            task.cancel()
+
+    def _wake(self) -> None:
+        if not self._posted:
+            self._posted = True
+            self._bridge.post(QueryQueue._begin, self)
+
+    def _begin(self) -> None:
+        """Start up to SLICE queries; the others wait for the next turn of the loop."""
+        self._posted = False  # before reading, so that new queries wake the loop again
+        for _ in range(SLICE):
+            if not (key := self._next()):
+                return
+            key.answering += 1
+            task = asyncio.get_running_loop().create_task(self._answer(key, key.waiting.popleft()))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+        self._wake()
+
+    def _next(self) -> _QueriedKey[T] | None:
+        """Return the next key with a query to start: urgent keys first, then round-robin."""
+        for keys in (self._urgent, self._others):
+            for _ in range(len(keys)):
+                keys.rotate(-1)
+                if keys[-1].ready:
+                    return keys[-1]
+        return None
+
+    async def _answer(self, key: _QueriedKey[T], query: T) -> None:
+        try:
+            await key.answer(query)
+        finally:
+            key.answering -= 1
+            if key.waiting:
                 self._wake()

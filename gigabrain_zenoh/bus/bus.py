@@ -1,6 +1,7 @@
 """Typed publish, subscribe and ask. The bus speaks messages; a transport speaks bytes."""
 
 import asyncio
+import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeVar
@@ -11,20 +12,51 @@ from gigabrain_schemas.base import Cause, Message
 from gigabrain_schemas.topics import STATE, Service, Topic
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.freshness import CLOCK_KEYS, Latest, RobotTime
+from gigabrain_zenoh.bus.input_log import InputLogger
 from gigabrain_zenoh.bus.params import Params
-from gigabrain_zenoh.bus.rejections import Rejections
 from gigabrain_zenoh.bus.transport import Close, OnLink, OnRaw, OnSample, Transport
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ClockLost, GigabrainError, Refused
-from gigabrain_zenoh.host.journal import Journal
+from gigabrain_zenoh.logs import Fault
+
+log = logging.getLogger(__name__)
+QUIET_NS = 1_000_000_000  # a fault ends after this long without an invalid message
+
+
+class Rejections:
+    """Counts and faults of dropped messages, by key."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._faults: dict[str, tuple[Fault, int]] = {}  # and the time of the last invalid message
+        self.counts: Counter[str] = Counter()
+
+    def reject(self, key: str, error: ValueError) -> None:
+        """Count an invalid message on `key`, and log the fault if it is new."""
+        self.counts[key] += 1
+        fault, _ = self._faults.get(key, (Fault(log), 0))
+        self._faults[key] = fault, self._clock.now_ns()
+        about = {"event": "rejected", "key": key}
+        fault.begin(f"dropped a message on {key}: {error}", about)
+
+    def accept(self, key: str) -> None:
+        """End the fault on `key` after a valid message, if no invalid one came within QUIET_NS.
+
+        While a valid and an invalid sender share the key, the fault stays.
+        """
+        if key not in self._faults:
+            return
+        fault, last_ns = self._faults[key]
+        if self._clock.now_ns() - last_ns >= QUIET_NS:
+            del self._faults[key]
+            fault.end(f"{key} is valid again")
+
 
 __all__ = ["Bus", "Latest", "RobotTime"]
-
 M = TypeVar("M", bound=Message)
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
-
 LOST_NS = 3_000_000_000  # without a state that can be believed, while others come
 PAUSE_NS = 1_000_000_000  # between two of them, and the count begins again
 FETCH_S = 1.0  # how long the one who keeps a value may take to hand it over
@@ -46,7 +78,7 @@ class Bus:
         self.problems: tuple[Cause, ...] = ()  # what a node cannot do now, for its health
         self.latency_ms: dict[str, float] = {}  # what a node measures, for its health
         self.report: Callable[[], Mapping[str, float | int | str | None]] = dict
-        self.journal = Journal()  # of what the node goes by
+        self.input_log = InputLogger()  # of what the node goes by
         self.params = Params()  # what may be changed while the process runs
         self.arrived: dict[str, tuple[int, int]] = {}  # boot and tick of the newest, by key
         # whether work was done since the last call; a loop that turns, where a node says no more
@@ -112,7 +144,7 @@ class Bus:
                 return False
             self._rejections.accept(pattern)
             self.arrived[pattern] = message.boot, message.tick
-            self.journal.note(key, message.seq)
+            self.input_log.note(key, message.seq)
             if moves_time and not self._in_time(topic, message):
                 return False
             on_message(key, message)

@@ -1,4 +1,4 @@
-"""How old a message is, by the robot's clock, and whether it still counts."""
+"""The age of messages by the robot's clock, and whether they still count."""
 
 from typing import Generic, TypeVar
 
@@ -7,7 +7,6 @@ from gigabrain_schemas.topics import SCAN, STATE, Topic
 from gigabrain_zenoh.clock import Clock
 
 M = TypeVar("M", bound=Message)
-
 LEAD_TICKS = 5  # how far behind the robot a process may be with reading its states
 CLOCK_KEYS = (STATE.key, SCAN.key)  # what the driver sends on these moves the robot's clock
 JUMP_TICKS = 50  # a message that is farther off, or of another boot, has to be confirmed
@@ -130,3 +129,28 @@ class Latest(Generic[M]):
         limit = self._topic.stale_after_ns if within_ns is None else within_ns
         in_time = self._echo_ns(message) <= max(limit, self._topic.echo_ns)
         return message if in_time and self._silent_ns(message) <= limit else None
+
+
+class PreviousTick(Generic[M]):
+    """The newest message of an earlier tick."""
+
+    def __init__(self) -> None:
+        self._newest: M | None = None
+        self._before: M | None = None
+
+    def receive(self, message: M) -> None:
+        """Take one message."""
+        newest = self._newest
+        same_start = newest and newest.boot == message.boot
+        if newest and not (same_start and newest.tick >= message.tick):
+            self._before = newest  # what claims to be of the future never comes before anything
+        self._newest = message
+
+    def at(self, boot: int, tick: int, within_ns: int) -> M | None:
+        """The newest of before `tick`, of this boot and no older than `within_ns`."""
+        for message in (self._newest, self._before):
+            if message is None or message.boot != boot:
+                continue
+            if 0 < (tick - message.tick) * TICK_NS <= within_ns:
+                return message
+        return None

@@ -133,9 +133,9 @@ def make_app(chosen: "Sequence[str]" = ()) -> "App":
 
 
 def _version() -> str:
-    from gigabrain_zenoh.version import __version__  # takes a while: only when asked for
+    from gigabrain_zenoh.plugins import package_version  # takes a while: only when asked for
 
-    return __version__
+    return package_version()
 
 
 def main() -> None:
@@ -143,7 +143,7 @@ def main() -> None:
     try:
         from contextlib import suppress
 
-        from gigabrain_zenoh.host.interrupts import interrupts
+        from gigabrain_zenoh.host.signals import interrupts
 
         interrupts.install()
     except KeyboardInterrupt:
@@ -169,7 +169,7 @@ def _call(words: "Sequence[str]") -> object:
 
     from gigabrain_zenoh.config.renames import renamed_arguments
     from gigabrain_zenoh.errors import ConfigError, GigabrainError
-    from gigabrain_zenoh.host.interrupts import interrupts
+    from gigabrain_zenoh.host.signals import interrupts
 
     words = renamed_arguments(words)
     try:

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.audit import AuditRecord
@@ -41,15 +41,15 @@ def audit(
         One JSON object per line.
     """
 
-    from gigabrain_zenoh.runtime import audit_file, audit_text
+    from gigabrain_zenoh.runtime import audit
 
     if not 0 < newest <= 1000:
         raise ConfigError(f"--newest: expected 1 to 1000, got {newest}")
-    show = audit_text.as_json if json else audit_text.readable
+    show = audit.as_json if json else audit.readable
     if robot:
         if follow or at.connect:
             raise ConfigError("leave out the name of a robot that runs")
-        _print(map(show, audit_file.read(_folder(robot), newest)))
+        _print(map(show, audit.read_audit(_folder(robot), newest)))
     else:
         run_async(_ask(at, newest, follow, show))
     return 0
@@ -72,8 +72,8 @@ async def _ask(at: Which, newest: int, follow: bool, show: "Callable[[AuditRecor
 def _folder(robot: str) -> Path:
     """Where a robot has left its log. Raises ConfigError, and UnknownName."""
     from gigabrain_zenoh.errors import unknown
-    from gigabrain_zenoh.logs import state_dir
-    from gigabrain_zenoh.runtime.audit_file import FOLDER
+    from gigabrain_zenoh.host.run_folders import state_dir
+    from gigabrain_zenoh.runtime.audit import FOLDER
 
     known = {path.parent.name: path.parent for path in (state_dir() / "robots").glob(f"*/{FOLDER}")}
     if robot in known:

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 
 def info(file: Path, *, json: bool = False) -> int:

@@ -11,8 +11,8 @@ from rich.console import Console, RenderableType
 
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host import results
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host import files
+from gigabrain_zenoh.host.signals import run_async
 
 FASTEST_HZ = 50.0  # one scan per tick of the robot's clock
 
@@ -45,7 +45,7 @@ def chain(
     """
     from gigabrain_zenoh.qa.bench.chain import measure_chain
 
-    results.check_place(json)
+    files.check_result_path(json)
     above_zero("seconds", seconds)
     above_zero("rounds", rounds)
     for rate in rates:
@@ -100,7 +100,7 @@ def stack(
     from gigabrain_zenoh.qa.bench.stack import measure_stack
     from gigabrain_zenoh.qa.bench.tables import stack_page
 
-    results.check_place(json)
+    files.check_result_path(json)
     above_zero("seconds", seconds)
     result = run_async(measure_stack(body, world, seconds, _progress, goal=goal))
     _finish(stack_page(result), result, json)
@@ -132,7 +132,7 @@ def estop(
     from gigabrain_zenoh.qa.bench.estop import measure_estop
     from gigabrain_zenoh.qa.bench.tables import estop_page
 
-    results.check_place(json)
+    files.check_result_path(json)
     above_zero("driving", driving)
     above_zero("latched", latched)
     result = run_async(measure_estop(body, driving, latched, _progress))
@@ -146,4 +146,4 @@ def _progress(text: str) -> None:
 
 def _finish(page: RenderableType, result: msgspec.Struct, json: Path | None) -> None:
     Console().print(page)
-    results.write(result, json)
+    files.write_result(result, json)

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host import results
+from gigabrain_zenoh.host import files
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -75,11 +75,11 @@ def barn(*, of: Trials, json: Path | None = None) -> int:
     from gigabrain_zenoh.qa.bench.barn_worlds import choose, read_worlds
 
     of.check()
-    results.check_place(json)
+    files.check_result_path(json)
     chosen, nodes = choose(read_worlds(of.worlds, of.dynamic), of.only), of.nodes and not of.dynamic
     result = measure_barn(chosen, of.trials, of.plant, of.samples, of.jobs, _progress, nodes=nodes)
     Console().print(_table(result, of.worlds.name, of.plant))
-    results.write(result, json)
+    files.write_result(result, json)
     return 0
 
 

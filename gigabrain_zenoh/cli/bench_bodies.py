@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from gigabrain_zenoh.cli.checked import above_zero
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 from gigabrain_zenoh.runtime.deployment import Deployment
 
 if TYPE_CHECKING:
@@ -46,11 +46,11 @@ def bodies(
     from rich.console import Console
 
     from gigabrain_drivers.driver.catalog import simulated
-    from gigabrain_zenoh.host import results
+    from gigabrain_zenoh.host import files
     from gigabrain_zenoh.qa.bench.bodies import measure_bodies
 
     above_zero("seconds", seconds)
-    results.check_place(json)
+    files.check_result_path(json)
     chosen = names or simulated(link)
     deployment = Deployment(
         link=link, world=world, seed=seed, resume="auto", router="tcp/127.0.0.1:0"
@@ -60,7 +60,7 @@ def bodies(
         measuring = measure_bodies(chosen, deployment, seconds, Path(folder), status.update)
         result = run_async(measuring)
     console.print(_table(result))
-    results.write(result, json)
+    files.write_result(result, json)
     return 0 if result.ok else 1
 
 

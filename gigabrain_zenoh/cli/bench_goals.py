@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.checked import above_zero
-from gigabrain_zenoh.host import results
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host import files
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -70,7 +70,7 @@ def goals(*, of: Runs = RUNS, json: Path | None = None, logs: Path | None = None
 
     above_zero("goals", of.goals)
     above_zero("speed", of.speed)
-    results.check_place(json)
+    files.check_result_path(json)
     course = Course(
         goals=of.goals,
         meetings=of.meetings,
@@ -81,7 +81,7 @@ def goals(*, of: Runs = RUNS, json: Path | None = None, logs: Path | None = None
     )
     result = run_async(measure_goals(of.bodies, of.worlds, course, _progress))
     _show(result)
-    results.write(result, json)
+    files.write_result(result, json)
     return 0 if result.ok else 1
 
 

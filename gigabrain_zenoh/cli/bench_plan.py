@@ -53,16 +53,16 @@ def plan(
     """
     from rich.console import Console
 
-    from gigabrain_zenoh.host import results
+    from gigabrain_zenoh.host import files
     from gigabrain_zenoh.qa.bench.plan import measure_plan
 
     above_zero("queries", queries)
     if any(one < LEAST for one in size):
         raise ConfigError(f"--size: expected at least {LEAST}, got {min(size)}")
-    results.check_place(json)
+    files.check_result_path(json)
     result = measure_plan(size, queries, seed, png, lambda text: print(text, file=sys.stderr))
     Console().print(_table(result))
-    results.write(result, json)
+    files.write_result(result, json)
     return 0 if result.ok else 1
 
 

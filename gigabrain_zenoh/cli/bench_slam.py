@@ -67,12 +67,12 @@ def _slam_logs(paths: tuple[Path, ...], png: Path | None, json: Path | None) -> 
     """Map what was recorded, and show how far the maps are from the reference."""
     from rich.console import Console
 
-    from gigabrain_zenoh.host import results
+    from gigabrain_zenoh.host import files
     from gigabrain_zenoh.qa.bench.slam import judged, total
     from gigabrain_zenoh.qa.bench.slam_logs import load, relations
     from gigabrain_zenoh.qa.bench.slam_picture import draw
 
-    results.check_place(json)
+    files.check_result_path(json)
     logs = [load(path) for path in paths]
     for one in logs:
         relations(one)  # or it says at once what is wrong
@@ -80,7 +80,7 @@ def _slam_logs(paths: tuple[Path, ...], png: Path | None, json: Path | None) -> 
     result = total([judged(one, driven) for one, driven in drives])
     if png:
         draw(drives, png)
-    results.write(result, json)
+    files.write_result(result, json)
     Console().print(_table(result))
     return 0
 

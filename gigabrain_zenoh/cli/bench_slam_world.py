@@ -21,12 +21,12 @@ def slam_world(
     from rich.console import Console
     from rich.progress import Progress
 
-    from gigabrain_zenoh.host import results
+    from gigabrain_zenoh.host import files
     from gigabrain_zenoh.qa.bench.slam_world import WorldsResult, tour
     from gigabrain_zenoh.qa.bench.slam_world_picture import draw
 
     above_zero("minutes", minutes)
-    results.check_place(json)
+    files.check_result_path(json)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         tasks = [progress.add_task(world, total=minutes) for world in worlds]
         toured = [
@@ -36,7 +36,7 @@ def slam_world(
     result = WorldsResult(worlds=tuple(one.result for one in toured))
     if png:
         draw(toured, png)
-    results.write(result, json)
+    files.write_result(result, json)
     Console().print(_table(result.worlds))
     return 0
 

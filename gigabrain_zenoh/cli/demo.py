@@ -10,7 +10,7 @@ from gigabrain_zenoh.cli.checked import above_zero, checked
 from gigabrain_zenoh.config.settings import LinkName, Resume
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 from gigabrain_zenoh.runtime.deployment import Deployment, recorded
 
 

@@ -1,7 +1,7 @@
 """`gigabrain doctor`: what is wrong here, and the cure."""
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 MARKS = {"ok": "ok  ", "hint": "hint", "bad": "BAD "}
 

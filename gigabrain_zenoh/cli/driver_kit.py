@@ -13,7 +13,7 @@ from cyclopts.validators import Number
 
 from gigabrain_zenoh.cli.checked import above_zero, finite
 from gigabrain_zenoh.config.settings import LinkName
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 COLOURS = {"pass": "green", "fail": "bold red", "n/a": "dim"}
 

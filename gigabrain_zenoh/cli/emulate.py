@@ -4,7 +4,7 @@ from pathlib import Path
 
 from gigabrain_zenoh.cli.checked import checked
 from gigabrain_zenoh.config.settings import EmulatorConfig
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 
 def emulate(name: str, *, world: str = "arena", seed: int = 0, ports: Path | None = None) -> int:

@@ -12,8 +12,8 @@ from cyclopts.validators import Number
 
 from gigabrain_zenoh.cli.where import show
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host import results
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host import files
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -107,11 +107,11 @@ def faults(
         show(_plan(chosen))
         return 0
     robot.check()
-    results.check_place(json)
-    results.check_place(into)
+    files.check_result_path(json)
+    files.check_result_path(into)
     judged = _run(chosen, robot.options(), repeat, into)
     show(_table(judged, chosen))
-    results.write(judged, json)
+    files.write_result(judged, json)
     return 1 if failed(judged) else 0
 
 
@@ -160,18 +160,18 @@ def _plan(chosen: "Sequence[Fault]") -> "Table":
     return table
 
 
-def _table(results: "Sequence[Result]", chosen: "Sequence[Fault]") -> "Table":
+def _table(files: "Sequence[Result]", chosen: "Sequence[Fault]") -> "Table":
     from rich.markup import escape
     from rich.table import Table
 
     from gigabrain_zenoh.qa.faults.fault import in_words
 
     rows = {fault.number: fault for fault in chosen}
-    passed = sum(result.verdict == "passed" for result in results)
-    table = Table(title=f"{passed} of {len(results)} passed")
+    passed = sum(result.verdict == "passed" for result in files)
+    table = Table(title=f"{passed} of {len(files)} passed")
     for name in ("no.", "fault", "criterion", "worst", "tries", "waited", "verdict"):
         table.add_column(name, overflow="fold", no_wrap=name == "fault")
-    for result in results:
+    for result in files:
         told = f"[{COLOURS[result.verdict]}]{result.verdict}[/]"
         if result.reason:
             told += f": {escape(result.reason)}"

@@ -31,8 +31,7 @@ def foxglove(
     import msgspec
 
     from gigabrain_zenoh.cli.checked import checked
-    from gigabrain_zenoh.config.process_config import ProcessConfig
-    from gigabrain_zenoh.config.settings import FoxgloveConfig
+    from gigabrain_zenoh.config.settings import FoxgloveConfig, ProcessConfig
     from gigabrain_zenoh.launch.processes import run_process
     from gigabrain_zenoh.runtime.running import find_endpoint
     from gigabrain_zenoh.ui.foxglove.layout import write_layout

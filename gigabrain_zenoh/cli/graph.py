@@ -6,7 +6,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 
 def graph(
@@ -38,7 +38,7 @@ def graph(
     from gigabrain_zenoh.diagnostics.nodes import Nodes, census
     from gigabrain_zenoh.diagnostics.roll_call import flows
     from gigabrain_zenoh.errors import ConfigError
-    from gigabrain_zenoh.runtime.joining import joined
+    from gigabrain_zenoh.runtime.connect import joined
 
     if dot + mermaid + (png is not None) > 1:
         raise ConfigError("choose one of --dot, --mermaid and --png")

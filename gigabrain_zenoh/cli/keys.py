@@ -7,10 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
-from gigabrain_zenoh.security.checks import INSTALL
-from gigabrain_zenoh.security.files import CA_KEY, CERTIFICATE
-from gigabrain_zenoh.security.list_file import generations_in
-from gigabrain_zenoh.security.roles import Role, common_name
+from gigabrain_zenoh.security.acl import Role, common_name
+from gigabrain_zenoh.security.identity_files import CA_KEY, CERTIFICATE, INSTALL, generations_in
 
 SOON_DAYS = 30
 
@@ -90,10 +88,10 @@ def revoke(role: Role, *, robot: str = "", dir: Path | None = None) -> None:
         The fleet's folder; without it, the only one here.
     """
     with _importing():
-        from gigabrain_zenoh.security import revoked
+        from gigabrain_zenoh.security import authority
 
     folder = _fleet(dir)
-    lists = revoked.revoke(folder, role, robot)
+    lists = authority.revoke(folder, role, robot)
     for path in lists:
         print(
             f"{path}: copy it into that identity's folder on its host, and start its router again"
@@ -145,7 +143,7 @@ def zenohd(
         The fleet's folder, where some of its identities were revoked.
     """
     with _importing():
-        from gigabrain_zenoh.runtime.zenohd import configuration
+        from gigabrain_zenoh.bus.zenoh.config import configuration
 
     generations = generations_in(_fleet(dir)) if dir else {}
     print(configuration(robot or ("",), str(keys), listen, generations), end="")

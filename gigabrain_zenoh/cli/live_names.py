@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.requests import Description
@@ -27,7 +27,7 @@ def processes(_: object) -> list[str]:
 
 def _there() -> list["Description"]:
     from gigabrain_zenoh.diagnostics.roll_call import roll_call
-    from gigabrain_zenoh.runtime.joining import Where, joined
+    from gigabrain_zenoh.runtime.connect import Where, joined
 
     async def ask() -> list["Description"]:
         async with joined(Where(), "completion") as (bus, _):

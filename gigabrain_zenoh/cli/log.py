@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from gigabrain_zenoh import logs
 from gigabrain_zenoh.cli.live_names import processes
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host import log_text
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -79,11 +79,11 @@ def _wanted(process: str, level: str, since: str) -> "Wanted":
 
 
 def _tell(line: "Line") -> None:
-    say(log_text.readable(line))
+    say(logs.readable(line))
 
 
 def _tell_json(line: "Line") -> None:
-    say(log_text.encode(line).decode())
+    say(logs.encode(line).decode())
 
 
 async def _follow(at: Which, wanted: "Wanted", tell: "Callable[[Line], None]") -> None:
@@ -91,8 +91,8 @@ async def _follow(at: Which, wanted: "Wanted", tell: "Callable[[Line], None]") -
     from gigabrain_zenoh.diagnostics.hearing import NAME
     from gigabrain_zenoh.diagnostics.log_reading import as_line
     from gigabrain_zenoh.diagnostics.reader import ended_with_reader
-    from gigabrain_zenoh.host.stop_signals import stop_signals
-    from gigabrain_zenoh.runtime.joining import joined
+    from gigabrain_zenoh.host.signals import stop_signals
+    from gigabrain_zenoh.runtime.connect import joined
 
     async with joined(at.where(), NAME) as (bus, _):
 

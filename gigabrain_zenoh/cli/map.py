@@ -2,7 +2,7 @@
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 PATIENCE_S = 20.0  # a large map takes a while to write
 
@@ -28,7 +28,7 @@ def save(name: str, /, *, at: Which = HERE, replace: bool = False) -> int:
     from gigabrain_schemas.requests import MapRequest
     from gigabrain_schemas.topics import MAP_SAVE
     from gigabrain_zenoh.diagnostics.hearing import NAME
-    from gigabrain_zenoh.runtime.joining import joined
+    from gigabrain_zenoh.runtime.connect import joined
 
     try:
         fields = {"name": name, "replace": replace, "source": getpass.getuser()}

@@ -6,7 +6,7 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.live_names import processes
 from gigabrain_zenoh.cli.where import HERE, Which, say, show
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.diagnostics.nodes import Nodes
@@ -56,7 +56,7 @@ def info(process: Annotated[str, Parameter(completer=processes)], /, *, at: Whic
 def _census(at: Which) -> "Nodes":
     from gigabrain_zenoh.diagnostics.hearing import NAME
     from gigabrain_zenoh.diagnostics.nodes import census
-    from gigabrain_zenoh.runtime.joining import joined
+    from gigabrain_zenoh.runtime.connect import joined
 
     async def look() -> "Nodes":
         async with joined(at.where(), NAME) as (bus, _):

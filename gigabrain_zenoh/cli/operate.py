@@ -11,7 +11,7 @@ from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.client.robot import connect as connect_robot
 from gigabrain_zenoh.errors import GigabrainError, NotConfirmed
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 
 def estop(*, at: Which = HERE, reason: str = "") -> int:

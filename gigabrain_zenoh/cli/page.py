@@ -60,7 +60,7 @@ def page(*, served: Served = LOCALLY, at: Which = HERE) -> int:
     """
     import msgspec
 
-    from gigabrain_zenoh.config.process_config import ProcessConfig
+    from gigabrain_zenoh.config.settings import ProcessConfig
     from gigabrain_zenoh.errors import ConfigError
     from gigabrain_zenoh.launch.processes import run_process
     from gigabrain_zenoh.runtime.running import find_endpoint

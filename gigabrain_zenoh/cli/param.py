@@ -8,7 +8,7 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.live_names import processes
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import BodyLost, Refused, unknown
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.requests import Param, ParamReply
@@ -85,7 +85,7 @@ async def _ask(at: Which, process: str, name: str, value: str) -> "dict[str, Par
     from gigabrain_schemas.topics import PARAM
     from gigabrain_zenoh.diagnostics.hearing import NAME
     from gigabrain_zenoh.diagnostics.roll_call import roll_call
-    from gigabrain_zenoh.runtime.joining import joined
+    from gigabrain_zenoh.runtime.connect import joined
 
     request = ParamRequest(name=name, value=value, source=getpass.getuser())
     async with joined(at.where(), NAME) as (bus, _):

@@ -10,22 +10,22 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.bus.zenoh.config import router_config, secured
 from gigabrain_zenoh.cli.checked import checked
-from gigabrain_zenoh.config.addresses import exposed, reached_at
-from gigabrain_zenoh.config.process_config import ProcessConfig
 from gigabrain_zenoh.config.settings import (
     ButtonConfig,
     DecisionConfig,
     DriverConfig,
     Endpoint,
     LinkName,
+    ProcessConfig,
     Resume,
 )
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.network import exposed, reached_at
+from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.launch.processes import run_process
-from gigabrain_zenoh.logs import state_dir
 from gigabrain_zenoh.runtime.running import announced, find_endpoint
-from gigabrain_zenoh.security.checks import identity_in
+from gigabrain_zenoh.security.identity_files import identity_in
 
 ROUTER = "tcp/127.0.0.1:7447"
 

@@ -8,10 +8,10 @@ from typing import Protocol
 
 import msgspec
 
-from gigabrain_zenoh.config.addresses import is_loopback
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.stdin_lines import typed_lines
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.network import is_loopback
+from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.host.terminal import typed_lines
 from gigabrain_zenoh.qa.proxy.call import Address
 from gigabrain_zenoh.qa.proxy.chaos import CALM, WAYS, Chaos, Told, Way, told
 from gigabrain_zenoh.qa.proxy.damage import Figures

@@ -8,7 +8,7 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.checked import above_zero, checked
 from gigabrain_zenoh.cli.where import HERE, Which
 from gigabrain_zenoh.config.settings import RecorderConfig
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 
 def record(

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 
 def replay(

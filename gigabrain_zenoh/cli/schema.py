@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gigabrain_schemas.export import export as write
+from gigabrain_schemas.golden import export as write
 from gigabrain_zenoh.errors import ConfigError
 
 

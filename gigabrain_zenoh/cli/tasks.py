@@ -9,7 +9,7 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.tasks import Task
@@ -168,7 +168,7 @@ def _with(at: Which, do: "Callable[[Tasks], Awaitable[None]]") -> int:
     import getpass
 
     from gigabrain_zenoh.client.tasks import Tasks
-    from gigabrain_zenoh.runtime.joining import joined
+    from gigabrain_zenoh.runtime.connect import joined
 
     async def run() -> None:
         async with joined(at.where(), f"{getpass.getuser()}-cli") as (bus, _):

@@ -1,7 +1,7 @@
 """`gigabrain teleop`: drive by keys or by a gamepad."""
 
 from gigabrain_zenoh.cli.where import HERE, Which
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 
 def teleop(

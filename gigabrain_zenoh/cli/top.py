@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from gigabrain_zenoh.cli.where import HERE, Which, show
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.stop_signals import run_async, stop_signals
+from gigabrain_zenoh.host.signals import run_async, stop_signals
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.diagnostics.top_feed import Feed
@@ -29,7 +29,7 @@ def top(*, at: Which = HERE, once: bool = False) -> int:
     from gigabrain_zenoh.diagnostics.hearing import NAME, everything
     from gigabrain_zenoh.diagnostics.tally import tallied
     from gigabrain_zenoh.diagnostics.top_feed import BusFeed
-    from gigabrain_zenoh.runtime.joining import joined
+    from gigabrain_zenoh.runtime.connect import joined
 
     async def run() -> None:
         where = at.where()

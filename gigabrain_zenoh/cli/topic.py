@@ -7,7 +7,7 @@ from cyclopts import Parameter
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.cli.live_names import topics
 from gigabrain_zenoh.cli.where import HERE, Which, say, show
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_schemas.base import Message
@@ -33,7 +33,7 @@ def list_(*, at: Which = HERE, all_topics: bool = False, json: bool = False) -> 
 
     from gigabrain_zenoh.diagnostics import topic_table
     from gigabrain_zenoh.diagnostics.hearing import NAME, everything, look
-    from gigabrain_zenoh.runtime.joining import joined
+    from gigabrain_zenoh.runtime.connect import joined
 
     async def run() -> None:
         where = at.where()
@@ -233,7 +233,7 @@ async def _send(
 ) -> None:
     """Send a message, of the process `of` where each has its own topic, and say how often."""
     from gigabrain_zenoh.diagnostics.publishing import send
-    from gigabrain_zenoh.runtime.joining import joined
+    from gigabrain_zenoh.runtime.connect import joined
 
     async with joined(at.where(), "pub") as (bus, _):
         say(f"sent {await send(bus, topic, message, rate, count, of)}")

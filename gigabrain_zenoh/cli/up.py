@@ -6,10 +6,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.config.places import located
+from gigabrain_zenoh.config.loading import located
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.display import LINES, Display, writer
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.host.terminal import LINES, Display, writer
 from gigabrain_zenoh.runtime.deployment import deployment_path, host_of, load_deployment
 
 

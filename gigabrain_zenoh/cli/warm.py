@@ -3,7 +3,7 @@
 import asyncio
 import time
 
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 
 def warm() -> None:

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.runtime.joining import Where
+    from gigabrain_zenoh.runtime.connect import Where
 
 
 @Parameter(name="*")
@@ -34,7 +34,7 @@ class Which:
 
     def where(self) -> "Where":
         """As the tools take it."""
-        from gigabrain_zenoh.runtime.joining import Where
+        from gigabrain_zenoh.runtime.connect import Where
 
         return Where(connect=self.connect, namespace=self.namespace, keys=self.folder)
 

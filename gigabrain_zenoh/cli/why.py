@@ -1,7 +1,7 @@
 """`gigabrain why`: why does it not move?"""
 
 from gigabrain_zenoh.cli.where import HERE, Which, say
-from gigabrain_zenoh.host.stop_signals import run_async
+from gigabrain_zenoh.host.signals import run_async
 
 
 def why(*, at: Which = HERE, json: bool = False) -> int:
@@ -26,7 +26,7 @@ def why(*, at: Which = HERE, json: bool = False) -> int:
     from gigabrain_zenoh.diagnostics.why import judge
     from gigabrain_zenoh.diagnostics.why_facts import Facts, Watcher
     from gigabrain_zenoh.errors import Ambiguous, BusError
-    from gigabrain_zenoh.runtime.joining import joined
+    from gigabrain_zenoh.runtime.connect import joined
 
     async def look() -> Facts:
         try:

@@ -8,8 +8,8 @@ from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.topics import AUDIT_LOG, Service
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, Refused
-from gigabrain_zenoh.runtime.audit_file import in_order
-from gigabrain_zenoh.security.checks import may_not_ask
+from gigabrain_zenoh.runtime.audit import in_order
+from gigabrain_zenoh.security.identity_files import may_not_ask
 
 Q = TypeVar("Q", bound=Message)
 

@@ -33,7 +33,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, Unsupported
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
 from gigabrain_zenoh.runtime.running import find_endpoint
-from gigabrain_zenoh.security.checks import may_not_ask, no_router
+from gigabrain_zenoh.security.identity_files import may_not_ask, no_router
 
 M = TypeVar("M", bound=Message)
 

@@ -18,7 +18,7 @@ from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Service
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.asking import ANSWER_S
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
-from gigabrain_zenoh.security.checks import may_not_ask
+from gigabrain_zenoh.security.identity_files import may_not_ask
 
 LARGEST = 1e9  # limit of coordinates on the bus
 PLAN_S = 5.0  # how long path planning in a large map may take

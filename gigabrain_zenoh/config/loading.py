@@ -1,20 +1,271 @@
-"""Configuration: a YAML file becomes a frozen msgspec Struct, or one line says why not."""
+"""Configuration: a YAML file becomes a frozen msgspec Struct, or one line says why not.
+
+msgspec says what is wrong, but under a dict it does not say where, and an unknown field it puts
+on the parent's line. This walks the document beside the type and finds the very line.
+"""
 
 import difflib
-from collections.abc import Sequence
+import re
+import types
+import typing
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import msgspec
+from msgspec import inspect as mi
 
-from gigabrain_zenoh.config import faults as config_faults
-from gigabrain_zenoh.config import yaml_text as config_yaml
+from gigabrain_zenoh.config import yaml_text
 from gigabrain_zenoh.config.renames import renamed_fields
+from gigabrain_zenoh.config.yaml_text import Entry, Node
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.bounded_file import read_bounded
+from gigabrain_zenoh.host.files import read_bounded
+
+_LONGEST = 60  # characters of a value that are shown
+_NAMES: tuple[tuple[tuple[type, ...], str], ...] = (
+    ((mi.IntType,), "a whole number"),
+    ((mi.FloatType,), "a number"),
+    ((mi.StrType,), "a string"),
+    ((mi.BoolType,), "true or false"),
+    ((mi.NoneType,), "null"),
+    ((mi.ListType, mi.VarTupleType, mi.SetType, mi.FrozenSetType), "a list"),
+    ((mi.StructType, mi.DictType), "a mapping"),
+)
+_LIMITS = {
+    "ge": ">=",
+    "gt": ">",
+    "le": "<=",
+    "lt": "<",
+    "multiple_of": "a multiple of",
+    "min_length": "of length >=",
+    "max_length": "of length <=",
+    "pattern": "matching",
+}
+
+
+def expected(type_: Any) -> str:
+    """What a value of `type_` looks like, with its limits."""
+    return _words(mi.type_info(type_))
+
+
+def _words(info: mi.Type) -> str:
+    if isinstance(info, mi.Metadata):
+        return _words(info.type)
+    if isinstance(info, mi.UnionType):
+        words = dict.fromkeys(_words(t) for t in info.types if not isinstance(t, mi.NoneType))
+        return " or ".join([*words, *(["null"] if info.includes_none else [])])
+    if choices := _choices(info):
+        return one_of(choices)
+    if isinstance(info, mi.TupleType):
+        return f"a list of {len(info.item_types)}"
+    for kinds, name in _NAMES:
+        if isinstance(info, kinds):
+            return name + _limits(info)
+    return type(info).__name__.removesuffix("Type").lower()
+
+
+def _limits(info: mi.Type) -> str:
+    given = [(words, getattr(info, name, None)) for name, words in _LIMITS.items()]
+    said = [f"{words} {limit}" for words, limit in given if limit is not None]
+    return " " + " and ".join(said) if said else ""
+
+
+def choices(type_: Any) -> list[Any]:
+    """The values that a Literal or an Enum (also inside a Union) allows; empty for other types."""
+    return _choices(mi.type_info(type_))
+
+
+def _choices(info: mi.Type) -> list[Any]:
+    if isinstance(info, mi.UnionType):
+        return [value for member in info.types for value in _choices(member)]
+    if isinstance(info, mi.LiteralType):
+        return list(info.values)
+    return [member.value for member in info.cls] if isinstance(info, mi.EnumType) else []
+
+
+def one_of(values: Sequence[Any]) -> str:
+    """`one of 'left', 'right'`, or the only value there is."""
+    return "one of " + ", ".join(map(repr, values)) if len(values) > 1 else repr(values[0])
+
+
+def got(node: Node) -> str:
+    """What the file holds, as it is written there."""
+    if node.entries is not None:
+        return "a mapping"
+    if node.items is not None:
+        return f"a list of {len(node.items)}"
+    if node.value is None:
+        return node.text or "nothing"
+    text = node.text if len(node.text) <= _LONGEST else node.text[: _LONGEST - 3] + "..."
+    return repr(text) if isinstance(node.value, str) else text
+
+
+def nearest(name: object, known: Iterable[Any]) -> str:
+    """`; did you mean 'turn'?` where something known is near, or nothing."""
+    names = [k for k in known if isinstance(k, str)]
+    close = difflib.get_close_matches(name, names, 1, 0.6) if isinstance(name, str) else []
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+@dataclass(frozen=True)
+class FieldFault:
+    """One line for people about one line of a file (from 1)."""
+
+    line: int
+    text: str
+
+
+def find_fault(root: Node, type_: Any) -> FieldFault | None:
+    """The first place, in the order of the file, where `root` cannot be a `type_`."""
+    return _find(root, type_, "", root.line)
+
+
+def _find(node: Node, type_: Any, path: str, key_line: int) -> FieldFault | None:
+    structs = _structs(type_) if node.entries is not None else []
+    if fault := _wrong_tag(node, structs, path, key_line):
+        return fault
+    for fault in _inside(node, _meant(type_, node), path, key_line):
+        return fault
+    try:
+        msgspec.convert(node.value, type_)
+    except msgspec.ValidationError as error:
+        line = key_line if node.entries or node.items else node.line
+        if structs:  # its fields are right, so its own __post_init__ said no
+            return _own_fault(node, path, line, re.sub(r" - at `[^`]*`$", "", str(error)))
+        hint = nearest(node.value, choices(type_))
+        return FieldFault(line, _at(path, f"expected {expected(type_)}, got {got(node)}{hint}"))
+    return None
+
+
+def _own_fault(node: Node, path: str, line: int, text: str) -> FieldFault:
+    """What a Struct says of itself; `FIELD: ...` or `FIELD[2]: ...` is about that very line.
+
+    Else it is about the first field that it names and that stands in the file.
+    """
+    match = re.match(r"(\w+)(?:\[(\d+)\])?: ", text)
+    for entry in node.entries or ():
+        if match and entry.key == match[1]:
+            items = entry.node.items or ()
+            number = int(match[2]) if match[2] else len(items)
+            at = items[number].line if number < len(items) else entry.line
+            return FieldFault(at, _join(path, text))
+    lines = {entry.key: entry.line for entry in node.entries or ()}
+    named = (lines[word] for word in re.findall(r"\w+", text) if word in lines)
+    return FieldFault(next(named, line), _at(path, text))
+
+
+def _wrong_tag(node: Node, structs: list[Any], path: str, key_line: int) -> FieldFault | None:
+    """A union's Structs are told apart by a tag field; without a good one nothing else is said."""
+    tags = [s.__struct_config__.tag for s in structs if s.__struct_config__.tag is not None]
+    name = structs[0].__struct_config__.tag_field if tags else ""
+    for entry in node.entries or ():
+        if tags and entry.key == name and entry.node.value not in tags:
+            hint = nearest(entry.node.value, tags)
+            text = f"expected {one_of(tags)}, got {got(entry.node)}{hint}"
+            return FieldFault(entry.line, _at(_join(path, name), text))
+    if len(tags) > 1 and name not in node.value:
+        return FieldFault(key_line, _at(path, f"missing field {name!r}; expected {one_of(tags)}"))
+    return None
+
+
+def _inside(node: Node, type_: Any, path: str, key_line: int) -> Iterator[FieldFault]:
+    if node.entries is not None and _is_struct(type_):
+        yield from _in_struct(node, node.entries, type_, path, key_line)
+    elif node.entries is not None and _is_mapping(type_):
+        for entry in node.entries:
+            yield from _in_entry(entry, typing.get_args(type_), path)
+    elif node.items is not None and _is_list(type_):
+        for i, (item, of) in enumerate(zip(node.items, _item_types(type_, node), strict=False)):
+            if fault := _find(item, of, f"{path}[{i}]", item.line):
+                yield fault
+
+
+def _in_struct(
+    node: Node, entries: tuple[Entry, ...], type_: Any, path: str, key_line: int
+) -> Iterator[FieldFault]:
+    fields = {f.encode_name: f for f in msgspec.structs.fields(type_)}
+    config = type_.__struct_config__
+    known = sorted([*fields, config.tag_field] if config.tag is not None else fields)
+    among = ", ".join(known) or "none"
+    for entry in entries:
+        if field := fields.get(entry.key):
+            if fault := _find(entry.node, field.type, _join(path, entry.key), entry.line):
+                yield fault
+        elif entry.key not in known and config.forbid_unknown_fields:
+            hint = nearest(entry.key, known) or ";"
+            yield FieldFault(entry.line, f"unknown field {entry.key!r}{hint} known: {among}")
+    for name, field in fields.items():
+        if field.required and name not in node.value:
+            text = f"missing field {name!r}; expected {expected(field.type)}"
+            yield FieldFault(key_line, _at(path, text))
+
+
+def _in_entry(entry: Entry, types_: tuple[Any, ...], path: str) -> Iterator[FieldFault]:
+    key_type, value_type = types_ or (str, Any)
+    if _find(Node(entry.line, entry.key, entry.key), key_type, "", entry.line):
+        text = f"expected {expected(key_type)} as the name, got {entry.key!r}"
+        yield FieldFault(entry.line, _at(path, text))
+    if fault := _find(entry.node, value_type, _join(path, entry.key), entry.line):
+        yield fault
+
+
+def _item_types(type_: Any, node: Node) -> list[Any]:
+    arguments = typing.get_args(type_) or (Any,)
+    if typing.get_origin(type_) is tuple and arguments[-1] is not ...:
+        return list(arguments)
+    return [arguments[0]] * len(node.value)
+
+
+def _meant(type_: Any, node: Node) -> Any:
+    """The member of an Annotated, Optional or Union type that a value like `node` is meant for."""
+    members = _members(type_)
+    if node.entries is not None and (structs := _structs(type_)):
+        name = structs[0].__struct_config__.tag_field
+        tag = node.value.get(name) if len(structs) > 1 else structs[0].__struct_config__.tag
+        return next(s for s in structs if s.__struct_config__.tag == tag)
+    fits = _is_list if node.entries is None else _is_mapping
+    return next((member for member in members if fits(member)), None)
+
+
+def _members(type_: Any) -> list[Any]:
+    if typing.get_origin(type_) is typing.Annotated:
+        return _members(typing.get_args(type_)[0])
+    if typing.get_origin(type_) in (typing.Union, types.UnionType):
+        return [part for member in typing.get_args(type_) for part in _members(member)]
+    return [type_]
+
+
+def _structs(type_: Any) -> list[Any]:
+    return [member for member in _members(type_) if _is_struct(member)]
+
+
+def _is_struct(type_: Any) -> bool:
+    return isinstance(type_, type) and issubclass(type_, msgspec.Struct)
+
+
+def _is_mapping(type_: Any) -> bool:
+    return _is_a(type_, Mapping)
+
+
+def _is_list(type_: Any) -> bool:
+    return _is_a(type_, Collection) and not _is_a(type_, (Mapping, str, bytes))
+
+
+def _is_a(type_: Any, families: type | tuple[type, ...]) -> bool:
+    origin = typing.get_origin(type_) or type_
+    return isinstance(origin, type) and issubclass(origin, families)
+
+
+def _join(path: str, key: str) -> str:
+    return f"{path}.{key}" if path else key
+
+
+def _at(path: str, text: str) -> str:
+    return f"{path}: {text}" if path else text
+
 
 T = TypeVar("T")
-
 MOST_BYTES = 256 * 1024  # a hundred times what a large robot's file holds
 
 
@@ -47,15 +298,15 @@ def loads(text: str, type: type[T], source: str, at: Sequence[str] = ()) -> T:
     With `at`, such as ("decision", "settings"), only that section is read; missing ones are empty.
     """
     try:
-        root = renamed_fields(config_yaml.read(text), source)
+        root = renamed_fields(yaml_text.read(text), source)
         for name in at:
             found = (entry.node for entry in root.entries or () if entry.key == name)
-            root = next(found, config_yaml.Node(root.line, {}, entries=()))
+            root = next(found, yaml_text.Node(root.line, {}, entries=()))
         return msgspec.convert(root.value, type)
-    except config_yaml.YamlFault as fault:
+    except yaml_text.YamlFault as fault:
         raise _error(source, fault.line, str(fault)) from None
     except msgspec.ValidationError as error:
-        where = config_faults.find(root, type) or config_faults.Fault(root.line, str(error))
+        where = find_fault(root, type) or FieldFault(root.line, str(error))
         raise _error(source, where.line, where.text) from None
 
 
@@ -67,3 +318,20 @@ def _nearest(path: Path) -> str:
     names = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
     close = difflib.get_close_matches(path.name, names, 1)
     return f"; did you mean '{path.with_name(close[0])}'?" if close else "; expected a YAML file"
+
+
+def located(path: Path, error: ConfigError) -> ConfigError:
+    """What a process says of a name that it was given, with that name's line in the file."""
+    if named := re.match(r"no \w+ ('.*?');", str(error)):
+        for node in _scalars(yaml_text.read(read(path))):
+            if repr(node.value) == named[1]:
+                return type(error)(f"{path}:{node.line}: {error}")
+    return error
+
+
+def _scalars(node: yaml_text.Node) -> Iterator[yaml_text.Node]:
+    children = [entry.node for entry in node.entries or ()] + list(node.items or ())
+    if not children:
+        yield node
+    for child in children:
+        yield from _scalars(child)

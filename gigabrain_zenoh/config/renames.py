@@ -20,8 +20,8 @@ class Rename:
 
     In YAML, `old` ends with the field and the mappings around it (`decision.begin`), and `new` is
     relative to the same mapping (`start`, or `avoid.turn` for a field that moved one level down).
-    With `when`, the row holds only where it returns True for the mapping that has the field. An empty
-    `new` drops a field that has no effect there.
+    With `when`, the row holds only where it returns True for the mapping that has the field. An
+    empty `new` drops a field that has no effect there.
 
     On the command line, `old` is a command (`warm`, `task list`), an option of a command
     (`goto --how`) or an option of every command (`--remember`); `new` is the new words.

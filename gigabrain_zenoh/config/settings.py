@@ -1,9 +1,9 @@
 """Settings of the processes. Kept separate, so that reading a deployment file needs no numpy."""
 
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 from gigabrain_schemas.base import NonNegative, Positive
 
@@ -143,3 +143,14 @@ class RecorderConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     queue_mb: Annotated[float, Meta(gt=0)] = 32  # queue for a slow disk [MB]; then messages drop
     keep_free_mb: Annotated[float, Meta(ge=0)] = 200  # disk space left for other uses [MB]
     notes: dict[str, str] = {}  # stored in the file, for replay
+
+
+class ProcessConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Complete configuration of one process."""
+
+    name: str
+    endpoint: Endpoint
+    settings: dict[str, Any] = field(default_factory=dict)
+    run_dir: str | None = None  # folder of its log file; without it there is no log file
+    json_console: bool = False  # JSON log lines on the console, for a supervisor to read
+    level: str = "info"

@@ -12,13 +12,13 @@ from gigabrain_schemas.brain import CmdVel, Intent
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, TELEOP, command_topic
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.earlier import Earlier
-from gigabrain_zenoh.bus.heartbeat import Progress
+from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.control.teleop import Teleop
 from gigabrain_zenoh.control.tracking import LONGEST_DELAY_TICKS, undone, wanted
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, clamp, limits_of, ramp
 from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 
@@ -200,7 +200,7 @@ class EarlierCaps:
     """
 
     def __init__(self) -> None:
-        self._verdicts: Earlier[SafetyState] = Earlier()
+        self._verdicts: PreviousTick[SafetyState] = PreviousTick()
 
     def receive(self, verdict: SafetyState) -> None:
         """Take one verdict."""

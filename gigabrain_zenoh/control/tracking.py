@@ -9,7 +9,7 @@ from bisect import bisect_right
 
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_schemas.brain import Intent, Response, TrajectoryPoint
+from gigabrain_schemas.brain import ActuationModel, Intent, TrajectoryPoint
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.planar import between, compose, relative
 
@@ -61,7 +61,7 @@ def undone(turn_gain: float) -> float:
 
 
 def predicted(
-    here: Pose, velocity: Velocity, told: tuple[Velocity, ...], ticks: int, response: Response
+    here: Pose, velocity: Velocity, told: tuple[Velocity, ...], ticks: int, response: ActuationModel
 ) -> Pose:
     """Predict the body's pose after `ticks` ticks, from the commands already sent (`told`)."""
     follows = 1.0 - math.exp(-TICK_S / _lag(response))
@@ -77,7 +77,7 @@ def predicted(
     return pose
 
 
-def _lag(response: Response) -> float:
+def _lag(response: ActuationModel) -> float:
     return max(SHORTEST_LAG_S, min(LONGEST_LAG_S, response.lag))
 
 
@@ -90,7 +90,9 @@ def _share(before: TrajectoryPoint, after: TrajectoryPoint, t: float) -> float:
     return max(0.0, min(1.0, (t - before.t) / length)) if length > 0 else 1.0
 
 
-def _without_lag(before: TrajectoryPoint, after: TrajectoryPoint, response: Response) -> Velocity:
+def _without_lag(
+    before: TrajectoryPoint, after: TrajectoryPoint, response: ActuationModel
+) -> Velocity:
     """Return the steady command that takes a body with this lag from one velocity to the next."""
     left = math.exp(-max(after.t - before.t, TICK_S) / _lag(response))
     return Velocity(

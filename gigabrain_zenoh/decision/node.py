@@ -9,12 +9,12 @@ from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, WORLD
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.earlier import Earlier
-from gigabrain_zenoh.bus.heartbeat import Progress
+from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision.behaviours import Plain, Senses
 from gigabrain_zenoh.geometry.ages import scan_limit_ns
+from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ def _think(config: DecisionConfig, bus: Bus, senses: Senses) -> None:
     thinker, said, too_old = Thinker(config, senses), "", 0
     for name, expected in thinker.params.items():
         bus.params.add_field(name, expected, lambda: thinker.config, thinker.configure)
-    verdicts: Earlier[SafetyState] = Earlier()
+    verdicts: PreviousTick[SafetyState] = PreviousTick()
 
     def newest_world() -> WorldModel | None:
         body = bodies.current

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.base import TICK_NS, Velocity
 from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.brain import CmdVel, Response
+from gigabrain_schemas.brain import ActuationModel, CmdVel
 from gigabrain_zenoh.bus.freshness import LEAD_TICKS
 from gigabrain_zenoh.gate.state import BRAIN
 
 Floats = NDArray[np.float64]
 
 TICK_S = TICK_NS / 1e9
-PRIOR = Response(delay=0.04, lag=0.06)  # used until enough has been learnt
+PRIOR = ActuationModel(delay=0.04, lag=0.06)  # used until enough has been learnt
 DELAYS = 16  # candidates, a tick apart: 0 to 0.3 s
 DELAYS_S = TICK_S * np.arange(DELAYS)
 LAGS_S = 0.02 * np.arange(26)  # candidates: 0 to 0.5 s
@@ -87,12 +87,12 @@ class Axis:
 class ResponseEstimator:
     """Estimates a body's response from its commands and states."""
 
-    def __init__(self, prior: Response = PRIOR) -> None:
+    def __init__(self, prior: ActuationModel = PRIOR) -> None:
         self._prior, self._newest = prior, 0  # tick of the newest state
         self._begin(0)
 
     @property
-    def response(self) -> Response:
+    def response(self) -> ActuationModel:
         """Return the current estimate; the prior until enough has been learnt."""
         return self._response
 
@@ -188,7 +188,7 @@ class ResponseEstimator:
         likely = np.exp(cost.min() - cost)
         likely /= likely.sum()
         known = z.weight >= ENOUGH_TICKS
-        self._response = Response(
+        self._response = ActuationModel(
             delay=float((likely * DELAYS_S[:, None]).sum()),
             lag=float((likely * LAGS_S).sum()),
             turn_gain=float((likely * z.gains()).sum()) if known else self._prior.turn_gain,

@@ -17,7 +17,7 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.topics import BODY, MAP, POSE, STATE, command_topic
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.earlier import Earlier
+from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision.behaviours import Behaviour, Situation, must_charge
 from gigabrain_zenoh.decision.behaviours.bearings import Bearings, Driven, Route
@@ -31,7 +31,7 @@ from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
 from gigabrain_zenoh.geometry.planar import compose, inverse
 from gigabrain_zenoh.geometry.pose_history import PoseHistory
-from gigabrain_zenoh.host.background import Background, Take
+from gigabrain_zenoh.host.threads import ScheduledWorker, Take
 from gigabrain_zenoh.navigation import local, planner
 from gigabrain_zenoh.navigation.moment import Sent
 
@@ -62,7 +62,7 @@ class Steering:
         self._response, self._history = ResponseEstimator(), PoseHistory()
         self._states: deque[RobotState] = deque(maxlen=SENT_TICKS)
         self._lateness = Lateness()
-        self._places: Earlier[PoseInMap] = Earlier()
+        self._places: PreviousTick[PoseInMap] = PreviousTick()
         self._maps: deque[OccupancyGrid] = deque(maxlen=2)
         self._bodies = bus.latest(BODY)
         bus.latest(POSE, self._places.receive)
@@ -70,10 +70,10 @@ class Steering:
         self._hears_commands = False
         self._guide = Guide(config.unknown)
         self._route: Route | None = None
-        self._beside = Background(PATIENCE_S, bus.journal.in_time)
+        self._beside = ScheduledWorker(PATIENCE_S, bus.input_log.in_time)
         self._thought: tuple[int, OccupancyGrid] | None = None  # tick and map of the last plan
         self._driven: Driven | None = None
-        self._commands: Earlier[CmdVel] = Earlier()
+        self._commands: PreviousTick[CmdVel] = PreviousTick()
         self._stands = False  # the behaviour did not follow its route in the last step
         self._counted = (0, 0)  # boot and tick until which `_held_ticks` has counted
         self._held_ticks = 0  # since the last route was requested

@@ -23,10 +23,10 @@ from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.diagnostics.hearing import NAME
 from gigabrain_zenoh.diagnostics.roll_call import roll_call
 from gigabrain_zenoh.errors import BusError, ConfigError
-from gigabrain_zenoh.logs import state_dir
+from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime import running
-from gigabrain_zenoh.runtime.joining import Where, joined
-from gigabrain_zenoh.security.checks import identity_in
+from gigabrain_zenoh.runtime.connect import Where, joined
+from gigabrain_zenoh.security.identity_files import identity_in
 
 LOOK_S = 2.5  # so that every process has reported its health twice
 LIBRARIES = (

@@ -12,7 +12,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.diagnostics.names import Target, not_found, target
 from gigabrain_zenoh.diagnostics.roll_call import roll_call
 from gigabrain_zenoh.diagnostics.tally import Tally, tallied
-from gigabrain_zenoh.runtime.joining import Where, joined
+from gigabrain_zenoh.runtime.connect import Where, joined
 from gigabrain_zenoh.runtime.running import find_endpoint
 
 LOOK_S = 1.2  # so that what is sent once a second is heard

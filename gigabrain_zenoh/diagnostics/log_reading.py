@@ -11,9 +11,9 @@ import msgspec
 from gigabrain_schemas.safety import LogRecord
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError, unknown
-from gigabrain_zenoh.host.bounded_file import open_regular
-from gigabrain_zenoh.host.log_text import LEVELS
-from gigabrain_zenoh.logs import FILE_BYTES, state_dir
+from gigabrain_zenoh.host.files import open_regular
+from gigabrain_zenoh.host.run_folders import state_dir
+from gigabrain_zenoh.logs import FILE_BYTES, LEVELS
 
 LOGS = "*.jsonl*"  # driver.jsonl, and driver.jsonl.1 before it
 UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}

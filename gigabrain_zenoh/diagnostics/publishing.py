@@ -16,8 +16,8 @@ from gigabrain_zenoh.client.robot import Robot, connect
 from gigabrain_zenoh.diagnostics.names import OURS, not_found, short
 from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.host.stop_signals import stop_signals
-from gigabrain_zenoh.runtime.joining import Where
+from gigabrain_zenoh.host.signals import stop_signals
+from gigabrain_zenoh.runtime.connect import Where
 
 M = TypeVar("M", bound=Message)
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")

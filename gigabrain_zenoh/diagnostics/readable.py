@@ -11,7 +11,7 @@ from gigabrain_zenoh.codec import DECODE_ERRORS, Codec
 from gigabrain_zenoh.diagnostics.arrays_in_words import Summary, array_of, plain, summary
 from gigabrain_zenoh.diagnostics.names import topic_of
 from gigabrain_zenoh.errors import unknown
-from gigabrain_zenoh.host import log_text
+from gigabrain_zenoh.host import terminal
 from gigabrain_zenoh.recording.headers import is_json
 
 LONG = 8  # numbers; more of them are summarised
@@ -78,7 +78,7 @@ def lines(value: Any, indent: int = 0) -> Iterator[str]:
     """A tree as lines in the manner of YAML."""
     pad = "  " * indent
     for name, inner in value.items():
-        shown = log_text.printable(name)
+        shown = terminal.printable(name)
         if isinstance(inner, Mapping) and inner:
             yield f"{pad}{shown}:"
             yield from lines(inner, indent + 1)
@@ -111,7 +111,7 @@ def in_a_line(value: Any) -> str:
         return "-"
     if isinstance(value, bool):
         return str(value).lower()
-    return log_text.printable(value) if value != "" else '""'
+    return terminal.printable(value) if value != "" else '""'
 
 
 def pick(value: Mapping[str, Any], fields: Sequence[str]) -> dict[str, Any]:

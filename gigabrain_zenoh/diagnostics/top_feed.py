@@ -14,7 +14,7 @@ from gigabrain_zenoh.diagnostics.top_rows import (
     topic_cells,
     topic_row,
 )
-from gigabrain_zenoh.host.bounded import put
+from gigabrain_zenoh.host.bounded import put_newest
 
 Rows = dict[str, tuple[Cell, ...]]
 MOST_PROCESSES = 64
@@ -39,7 +39,7 @@ class BusFeed:
         bus.subscribe(HEALTH, self._hear)
 
     def _hear(self, _key: str, told: Health) -> None:
-        put(self._health, told.process, (told, self._bus.clock.now_ns()), MOST_PROCESSES)
+        put_newest(self._health, told.process, (told, self._bus.clock.now_ns()), MOST_PROCESSES)
         self._past.add(told.process, max(told.latency_ms.values(), default=None))
 
     def refresh(self) -> tuple[Rows, Rows]:

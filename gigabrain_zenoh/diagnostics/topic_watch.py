@@ -16,7 +16,7 @@ from gigabrain_zenoh.diagnostics.reader import ended_with_reader
 from gigabrain_zenoh.diagnostics.roll_call import receivers, roll_call, senders
 from gigabrain_zenoh.diagnostics.tally import Figures, tallied
 from gigabrain_zenoh.errors import BodyLost
-from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.host.signals import stop_signals
 
 QUIET_S = 2.0  # without a message, and somebody is told
 REPORT_S = 1.0

@@ -12,10 +12,9 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import TICK_NS, Cause, Velocity
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.gate import causes as why
-from gigabrain_zenoh.gate.checks import ISSUED_TICKS, against, age_ns, at_rest, is_finite, refusal
-from gigabrain_zenoh.gate.requests import estop, no, release
 from gigabrain_zenoh.gate.state import (
     BRAIN,
+    ISSUED_TICKS,
     Command,
     Enable,
     Estop,
@@ -27,9 +26,57 @@ from gigabrain_zenoh.gate.state import (
     Release,
     Safety,
     Tick,
+    age_ns,
+    at_rest,
+    is_finite,
+    refusal,
     status,
+    stop_reasons,
 )
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, ramp, slowed
+
+STILL_TICKS = 25  # 0.5 s at rest before a release
+
+
+def estop(state: GateState, event: Estop) -> tuple[GateState, Outcome]:
+    """Zero at once and latched, whatever the gate was doing."""
+    generation = state.estop_generation + 1
+    state = replace(
+        state,
+        mode="latched",
+        causes=why.merge(why.latching(state.causes), (why.estop(event.source),)),
+        estop_generation=generation,
+        commander="",
+        before=ZERO,
+    )
+    return state, Outcome(text=f"stopped and latched; e-stop number {generation}")
+
+
+def release(state: GateState, event: Release) -> tuple[GateState, Outcome]:
+    """Idle, where the body rests and nothing latches it any more."""
+    if state.mode == "stopping":
+        return rejected(state, "still stopping; try again when the body is at rest")
+    if state.mode != "latched":
+        return state, Outcome(text="not latched, nothing to release")
+    if event.estop_generation != state.estop_generation:
+        newest = state.estop_generation
+        return rejected(
+            state, f"e-stop number {newest} is the newest; look at it before you release"
+        )
+    if state.still_ticks < STILL_TICKS:
+        return rejected(state, "the body is not at rest yet; wait half a second")
+    held = why.latching(state.faults + (state.safety.causes if state.safety else ()))
+    if held:
+        return rejected(state, f"what latched it still holds: {why.in_words(held)}")
+    by_hand = bool(why.latching(state.causes))
+    state = replace(state, mode="idle", causes=(), by_hand=by_hand)
+    return state, Outcome(text="released; enable it to move")
+
+
+def rejected(state: GateState, text: str) -> tuple[GateState, Outcome]:
+    """A refusal, and why."""
+    return state, Outcome(ok=False, text=text)
+
 
 __all__ = [
     "BRAIN",
@@ -48,7 +95,6 @@ __all__ = [
     "status",
     "step",
 ]
-
 TICK_S = TICK_NS / 1e9
 STOPPING_TICKS = 15  # 300 ms, then idle
 CALM_TICKS = 5  # 100 ms at zero after an enable, however hard somebody holds a joystick
@@ -63,7 +109,7 @@ def step(config: GateConfig, state: GateState, event: Event) -> tuple[GateState,
     if taken is state:
         return state, outcome
     if taken.mode == "enabled":
-        found = against(config, taken, taken.commander)
+        found = stop_reasons(config, taken, taken.commander)
         taken = _stop(taken, found) if found else taken
     return replace(taken, output=_output(config, taken)), outcome
 
@@ -99,7 +145,7 @@ def _tick(config: GateConfig, state: GateState, event: Tick) -> GateState:
     )
     if state.mode == "enabled":
         return state
-    now = against(config, state, BRAIN)
+    now = stop_reasons(config, state, BRAIN)
     state = replace(state, healthy_ticks=0 if now else state.healthy_ticks + 1)
     if state.mode == "stopping":
         return _stopping(state, now)
@@ -209,19 +255,19 @@ def _safety(state: GateState, said: SafetyState) -> GateState:
 
 def _enable(config: GateConfig, state: GateState, event: Enable) -> tuple[GateState, Outcome]:
     if not event.source:
-        return no(state, "say who asks: the source must not be empty")
+        return rejected(state, "say who asks: the source must not be empty")
     if state.mode == "latched":
-        return no(state, f"latched: {why.in_words(state.causes)}; release it first")
+        return rejected(state, f"latched: {why.in_words(state.causes)}; release it first")
     if state.mode == "stopping":
-        return no(state, "still stopping; try again when it is idle")
+        return rejected(state, "still stopping; try again when it is idle")
     if state.commander not in ("", event.source):
         if not event.take:
-            return no(state, f"{state.commander} drives; take it over with take=true")
+            return rejected(state, f"{state.commander} drives; take it over with take=true")
         if event.source == BRAIN and event.by in ("", BRAIN):
-            return no(state, f"{state.commander} drives; only a person hands it to the brain")
-    found = against(config, state, event.source)
+            return rejected(state, f"{state.commander} drives; only a person hands it to the brain")
+    found = stop_reasons(config, state, event.source)
     if found:
-        return no(state, f"not now: {why.in_words(found)}")
+        return rejected(state, f"not now: {why.in_words(found)}")
     granted = Outcome(text=f"{event.source} drives")
     if state.commander == event.source:  # it goes on: a second enable is no command
         return replace(state, enables=state.enables + 1), granted

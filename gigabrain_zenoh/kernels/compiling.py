@@ -12,8 +12,8 @@ import sys
 from collections.abc import Awaitable
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host import lifeline
-from gigabrain_zenoh.host.scheduling import join_in
+from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.host.this_process import join_in
 from gigabrain_zenoh.plugins import find
 
 log = logging.getLogger(__name__)
@@ -101,5 +101,5 @@ def compile_all(warm_up: str) -> None:
 
 
 if __name__ == "__main__":
-    lifeline.die_with_parent(int(sys.argv[2]))
+    this_process.die_with_parent(int(sys.argv[2]))
     compile_all(sys.argv[1])

@@ -15,18 +15,65 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError
-from gigabrain_zenoh.host import results
-from gigabrain_zenoh.host.capacity import Capacity
-from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.host import files
+from gigabrain_zenoh.host.run_folders import new_run_dir
+from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.launch.up import LIMIT_S, STOP_S
-from gigabrain_zenoh.logs import new_run_dir
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.ui.live_view import HeadlessView, LiveView, View
 from gigabrain_zenoh.ui.report import Observed, Report, last_told, make_report, summary
 from gigabrain_zenoh.ui.watch import Watch
+
+CAPACITY_LOOK_S = 1.0
+SHORT_LOOKS = 5  # so many in a row, for a pause of the machine passes
+KEPT = 0.95  # share of real time that a simulation keeps on a machine that can carry it
+
+
+class Capacity:
+    """Judges a run in real time by the robot's clock, and by why it stands."""
+
+    def __init__(self) -> None:
+        self.problem = ""  # for people; stays once it is there
+        self._began: tuple[float, float] | None = None  # of a row of bad looks: wall, robot [s]
+        self._last: tuple[float, float] | None = None
+        self._short, self._held = 0, False
+
+    def restart(self) -> None:
+        """Count from the next look on: a process is starting, and time may wait for it."""
+        self._last, self._short, self._held = None, 0, False
+
+    def look(self, now_s: float, robot_s: float, *, held: bool) -> None:
+        """Compare the wall clock with the robot's.
+
+        `held` says that the brain is held back while the processors have no time to spare.
+        """
+        if self._last is None:
+            self._last = self._began = now_s, robot_s
+        self._held |= held
+        passed_s, gained_s = now_s - self._last[0], robot_s - self._last[1]
+        if passed_s < CAPACITY_LOOK_S:
+            return
+        lost = 0.0 < gained_s < KEPT * passed_s  # a clock that stands still is another fault
+        if not (lost or self._held):
+            self._began, self._short = (now_s, robot_s), 0
+        else:
+            self._short += 1
+        self._last, self._held = (now_s, robot_s), False
+        if self._short >= SHORT_LOOKS and not self.problem:
+            self.problem = self._in_words(now_s, robot_s)
+
+    def _in_words(self, now_s: float, robot_s: float) -> str:
+        assert self._began
+        share = (robot_s - self._began[1]) / (now_s - self._began[0])
+        what = f"its time runs at {share:.0%} of real time" if share < KEPT else "the brain is late"
+        return (
+            f"this machine is too small for the robot, or too busy: {what}; "
+            "run fewer robots on it, or end what else needs its processors"
+        )
+
 
 SYSTEMS = ("perception", "decision", "control")
 LOOK_S = 0.1  # how often the run is looked at
@@ -53,7 +100,7 @@ class Demo:
 
     def __init__(self, deployment: Deployment, options: DemoOptions) -> None:
         self._deployment, self._options = with_free_port(deployment), options
-        results.check_place(options.report)
+        files.check_result_path(options.report)
         self._run_dir = new_run_dir(None, "demo")
         specs = process_specs(
             self._deployment,
@@ -225,7 +272,7 @@ class Demo:
         if self._capacity.problem and self._live:
             print(self._capacity.problem, file=sys.stderr)
         if report:
-            results.write(report, self._options.report)
+            files.write_result(report, self._options.report)
             print(summary(report))
         if stopped and report is None:
             print("ended; the driver did not answer, so there is no report", file=sys.stderr)

@@ -10,10 +10,10 @@ import sys
 import msgspec
 
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.config.process_config import ProcessConfig
 from gigabrain_zenoh.config.renames import renamed_settings
-from gigabrain_zenoh.host import heap, lifeline
-from gigabrain_zenoh.host.interrupts import interrupts
+from gigabrain_zenoh.config.settings import ProcessConfig
+from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.host.signals import interrupts
 from gigabrain_zenoh.runtime import process
 from gigabrain_zenoh.runtime.process import MakeBus, Node, ProcessType
 
@@ -24,7 +24,7 @@ PROCESSES = {
         stops=True,
     ),
     "relay": ProcessType(
-        "gigabrain_zenoh.runtime.relay:run",
+        "gigabrain_zenoh.runtime.router:run_relay",
         "gigabrain_zenoh.config.settings:RelayConfig",
         stops=True,
     ),
@@ -83,8 +83,8 @@ def run_process(config: ProcessConfig, make_bus: MakeBus = Bus) -> int:
 
 def main() -> None:
     """Run a supervised process, configured by its first argument, and exit."""
-    lifeline.die_with_supervisor()
-    heap.map_large_blocks()
+    this_process.die_with_supervisor()
+    this_process.map_large_blocks()
     interrupts.install()
     code = run_process(msgspec.json.decode(sys.argv[1], type=ProcessConfig))
     sys.stdout.flush()

@@ -8,11 +8,26 @@ from typing import Any
 import msgspec
 
 from gigabrain_zenoh.bus.zenoh.config import router_config
-from gigabrain_zenoh.config.process_config import ProcessConfig
-from gigabrain_zenoh.config.settings import DriverConfig, EmulatorConfig, Endpoint, RecorderConfig
-from gigabrain_zenoh.runtime.deployment import ALL, BUTTON, EMULATOR, Deployment, local_endpoint
-from gigabrain_zenoh.runtime.keeper import ProcessSpec
-from gigabrain_zenoh.runtime.relay_place import RELAY, behind, between, has_relay, relay_config
+from gigabrain_zenoh.config.settings import (
+    DriverConfig,
+    EmulatorConfig,
+    Endpoint,
+    ProcessConfig,
+    RecorderConfig,
+)
+from gigabrain_zenoh.runtime.deployment import (
+    ALL,
+    BUTTON,
+    EMULATOR,
+    RELAY,
+    Deployment,
+    behind,
+    between,
+    has_relay,
+    local_endpoint,
+    relay_config,
+)
+from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 
 # -P: a package in the current folder must not shadow an installed one
 COMMAND = (sys.executable, "-P", "-m", "gigabrain_zenoh.launch.processes")

@@ -3,26 +3,90 @@
 import asyncio
 import contextlib
 import os
+import socket
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
+from gigabrain_zenoh import logs
 from gigabrain_zenoh.decision.tasks.scripts import check_folder
 from gigabrain_zenoh.errors import BusError, ConfigError
-from gigabrain_zenoh.host import log_text
-from gigabrain_zenoh.host.sd_notify import Notifier
-from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.host.run_folders import new_run_dir, state_dir
+from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.launch.specs import process_specs
-from gigabrain_zenoh.logs import new_run_dir, state_dir
 from gigabrain_zenoh.runtime.deployment import (
+    RELAY,
     Deployment,
     check_keys,
     local_endpoint,
     with_free_port,
 )
-from gigabrain_zenoh.runtime.relay_place import RELAY
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.supervisor import Supervisor
+
+SHARE = 0.4  # fraction of the watchdog's timeout between two keep-alives
+
+
+class Notifier:
+    """Sends one service's state to its manager. Errors are ignored: the robot continues."""
+
+    def __init__(
+        self,
+        address: str = "",
+        watchdog_s: float | None = None,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._address = "\0" + address[1:] if address.startswith("@") else address
+        self._watchdog_s, self._now_s = watchdog_s, now_s
+        self._fed_s: float | None = None
+        self._status, self._ready = "", False
+
+    @classmethod
+    def from_environment(cls) -> Self:
+        """Create a notifier from the service manager's variables, and unset them."""
+        address = os.environ.pop("NOTIFY_SOCKET", "")
+        microseconds = os.environ.pop("WATCHDOG_USEC", "")
+        meant = os.environ.pop("WATCHDOG_PID", "") or str(os.getpid())
+        fed = microseconds.isdecimal() and meant == str(os.getpid())
+        return cls(address, int(microseconds) / 1e6 if fed else None)
+
+    def ready(self) -> None:
+        """Report that the service is ready; sent only once."""
+        if not self._ready:
+            self._ready = True
+            self._tell("READY=1")
+
+    def status(self, text: str) -> None:
+        """Send a status line for people; sent only when it changes."""
+        if text != self._status:
+            self._status = text
+            self._tell(f"STATUS={text}")
+
+    def alive(self) -> None:
+        """Feed the watchdog, if one is configured and it is due.
+
+        Call this while all processes make progress. Otherwise the service manager restarts the
+        service.
+        """
+        now_s = self._now_s()
+        if self._watchdog_s is None:
+            return
+        if self._fed_s is None or now_s - self._fed_s >= SHARE * self._watchdog_s:
+            self._fed_s = now_s
+            self._tell("WATCHDOG=1")
+
+    def stopping(self) -> None:
+        """Report that the service is stopping on request."""
+        self._tell("STOPPING=1")
+
+    def _tell(self, line: str) -> None:
+        if not self._address:
+            return
+        with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
+            out.setblocking(False)
+            out.sendto(line.encode(), self._address)
+
 
 STOP_S = 1.5  # until processes that do not end are killed
 LIMIT_S = STOP_S + 2.0  # until the supervisor itself is ended by force
@@ -62,7 +126,7 @@ async def up(
             before, refusal = refusal, str(record.get("text", ""))
             if refusal == before:  # told already, when it was tried the first time
                 return
-        say(log_text.readable(record, colour=False))
+        say(logs.readable(record, colour=False))
 
     say(f"{deployment.body} on {host}: {', '.join(spec.name for spec in specs)}; logs in {run_dir}")
     with (

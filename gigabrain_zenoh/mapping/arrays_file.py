@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.bounded_file import open_regular
+from gigabrain_zenoh.host.files import open_regular
 
 Arrays = Mapping[str, NDArray[Any]]
 

@@ -20,7 +20,7 @@ from gigabrain_schemas.base import Cause, Count, Finite
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.se2 import Floats
-from gigabrain_zenoh.host.atomic_write import make_folder, replacing
+from gigabrain_zenoh.host.files import make_folder, replacing
 from gigabrain_zenoh.mapping import arrays_file
 from gigabrain_zenoh.mapping.arrays_file import Arrays
 

@@ -1,7 +1,7 @@
 """A localizer whose searches of the whole map run beside the scans."""
 
 from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, compose
-from gigabrain_zenoh.host.background import Background, Take
+from gigabrain_zenoh.host.threads import ScheduledWorker, Take
 from gigabrain_zenoh.mapping.field import Field
 from gigabrain_zenoh.mapping.localizer import Localizer, Place, View
 from gigabrain_zenoh.mapping.relocalize import search
@@ -13,7 +13,7 @@ class Finder:
     """Where the robot is in a map that does not change."""
 
     def __init__(
-        self, field: Field, why: str, background: Background, last: Floats | None = None
+        self, field: Field, why: str, background: ScheduledWorker, last: Floats | None = None
     ) -> None:
         self._localizer = Localizer(field, why)
         self._background = background

@@ -10,8 +10,7 @@ from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose, wrap
-from gigabrain_zenoh.host.background import PATIENCE_S, Background, InTime, Take
-from gigabrain_zenoh.host.journal import done
+from gigabrain_zenoh.host.threads import PATIENCE_S, InTime, ScheduledWorker, Take, done
 from gigabrain_zenoh.mapping.arrays_file import Arrays
 from gigabrain_zenoh.mapping.doubt import Doubt
 from gigabrain_zenoh.mapping.drift import Rates
@@ -83,7 +82,7 @@ class GrowingMap:
     """See Chart in known.py."""
 
     def __init__(self, patience_s: float = PATIENCE_S, in_time: InTime = done) -> None:
-        self._background = Background(patience_s, in_time)
+        self._background = ScheduledWorker(patience_s, in_time)
         self._slam, self._sweeps, self._grid = Slam(rates=RATES), Sweeps(), Grid()
         self._drawn: list[Floats] = []  # poses of keyframes, as they are in the grid
         self._waiting: list[Sweep] = []  # to be drawn

@@ -6,8 +6,7 @@ from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.geometry.se2 import Floats
-from gigabrain_zenoh.host.background import PATIENCE_S, Background, InTime
-from gigabrain_zenoh.host.journal import done
+from gigabrain_zenoh.host.threads import PATIENCE_S, InTime, ScheduledWorker, done
 from gigabrain_zenoh.mapping.field import field_of
 from gigabrain_zenoh.mapping.finder import Finder
 from gigabrain_zenoh.mapping.localizer import Place, View
@@ -57,7 +56,7 @@ class KnownMap:
     def __init__(
         self, saved: SavedMap, patience_s: float = PATIENCE_S, in_time: InTime = done
     ) -> None:
-        self._saved, self._background = saved, Background(patience_s, in_time)
+        self._saved, self._background = saved, ScheduledWorker(patience_s, in_time)
         field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
         self._finder = Finder(field, "looking for the robot in the map", self._background)
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import Finite, Fraction
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.host.atomic_write import make_folder, sync_folder, write_synced
-from gigabrain_zenoh.logs import state_dir
+from gigabrain_zenoh.host.files import make_folder, sync_folder, write_synced
+from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.mapping import arrays_file, pgm
 from gigabrain_zenoh.mapping.arrays_file import Arrays
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.bounded_file import read_bounded
+from gigabrain_zenoh.host.files import read_bounded
 
 MOST_CELLS = 8_000_000  # what a message may carry
 MOST_HEADER = 100_000  # bytes, with all its comments

@@ -8,7 +8,7 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from gigabrain_schemas.base import Pose, Positive, Velocity
-from gigabrain_schemas.brain import Obstacle, Response, TrajectoryPoint
+from gigabrain_schemas.brain import ActuationModel, Obstacle, TrajectoryPoint
 
 Floats = NDArray[np.float64]
 Kind = Literal["going", "going round", "waiting", "backing out", "turning in place", "arrived"]
@@ -60,7 +60,7 @@ class Moment:
     path: Floats | None = None  # (k, 2) [m], to the goal; without one it looks for its own
     known: Floats = field(default_factory=no_points)  # (m, 2) [m], obstacles of the map near by
     obstacles: tuple[Obstacle, ...] = ()
-    response: Response = field(default_factory=Response)
+    response: ActuationModel = field(default_factory=ActuationModel)
     sent: tuple[Sent, ...] = ()  # oldest first; those of the last 0.5 s are enough
     delayed: float = 0.0  # [s], how much later than usual what is planned will be obeyed
     may_back: bool = True  # else something is behind it, or it cannot see there

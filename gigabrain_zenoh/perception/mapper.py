@@ -18,14 +18,13 @@ from gigabrain_schemas.requests import MapReply, MapRequest
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE
 from gigabrain_zenoh.bus.bus import Bus, Latest
-from gigabrain_zenoh.bus.granting import grant
+from gigabrain_zenoh.bus.input_log import log_accepted
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.scan import beams, hits
 from gigabrain_zenoh.geometry.se2 import Floats
-from gigabrain_zenoh.host.background import InTime
-from gigabrain_zenoh.host.journal import done
-from gigabrain_zenoh.host.percentile import Newest
+from gigabrain_zenoh.host.bounded import NewestValues
+from gigabrain_zenoh.host.threads import InTime, done
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.autosave import Autosave, refuse
 from gigabrain_zenoh.mapping.fusion import Fusion, Moment, way
@@ -81,19 +80,19 @@ class Mapper:
 
     def __init__(self, config: PerceptionConfig, bus: Bus, bodies: Latest[Body]) -> None:
         self._config, self._bus, self._bodies = config, bus, bodies
-        self._chart = chart_of(config, bus.journal.in_time)
+        self._chart = chart_of(config, bus.input_log.in_time)
         self._fusion, self._boot = Fusion(), 0
         self._last: Moment | None = None  # at the last scan that was processed
         self._blank = not config.map  # the map is still empty
         self._mapped = False  # this process has processed a scan, or restored a map
         self._shown: OccupancyGrid | None = None
         self._shown_tick = self._said_tick = 0
-        saves = config.mapping == "slam" and config.state_dir and bus.journal.live
+        saves = config.mapping == "slam" and config.state_dir and bus.input_log.live
         self._autosave = Autosave(Path(config.state_dir)) if saves else None
         self._before: Moment | None = None  # at the last scan in a restored map
         self._said, self._left_out = "", ""
         self._early = False  # the first scan arrived without its odometry
-        self._took_ms = Newest(TIMED)
+        self._took_ms = NewestValues(TIMED)
         self._saving = asyncio.Lock()  # concurrent saves would write to the same files
         bus.serve(MAP_SAVE, self._save)
         bus.report = self._report
@@ -150,7 +149,7 @@ class Mapper:
         for head, arrays in autosave.found(boot):
             last = None if head.place is None else np.array(head.place)
             try:
-                chart = GrowingMap.thaw(arrays, in_time=self._bus.journal.in_time, last=last)
+                chart = GrowingMap.thaw(arrays, in_time=self._bus.input_log.in_time, last=last)
             except ConfigError as error:
                 refuse(str(error))
                 continue
@@ -250,7 +249,7 @@ class Mapper:
             log.warning("a scan is left out of the map: %s", why, extra={"data": {"event": "scan"}})
 
     async def _save(self, request: MapRequest) -> MapReply:
-        grant(self._bus, MAP_SAVE.key, request, self._last.tick if self._last else 0)
+        log_accepted(self._bus, MAP_SAVE.key, request, self._last.tick if self._last else 0)
         path = map_file.saved_as(request.name)
         same = bool(self._config.map) and path == map_file.path_of(self._config.map)
         try:
@@ -268,7 +267,7 @@ class Mapper:
                 break
             await self._bus.clock.sleep_ns(SETTLE_NS)
         saved, graph = await asyncio.to_thread(self._chart.still().to_save)
-        if self._bus.journal.live:
+        if self._bus.input_log.live:
             await asyncio.to_thread(map_file.save, path, saved, graph, replace=replace)
         return f"saved {path}: {map_file.in_words(saved)}"
 

@@ -16,12 +16,12 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
 from gigabrain_zenoh.bus.bus import Bus, Latest
-from gigabrain_zenoh.bus.heartbeat import Progress
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.geometry.placed_scans import PlacedScans
 from gigabrain_zenoh.geometry.scan import EDGE, Floats, blind_ahead, hits, scan_problem
 from gigabrain_zenoh.kernels.compiling import compiled
 from gigabrain_zenoh.perception.obstacles.surroundings import Surroundings
+from gigabrain_zenoh.runtime.heartbeat import Progress
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.perception.mapper import Mapper

@@ -23,8 +23,9 @@ from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, 
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
+from gigabrain_schemas.topics import current_key
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.bounded_file import open_regular
+from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.recording.headers import Header, header_of
 
 log = logging.getLogger(__name__)
@@ -91,7 +92,7 @@ class Bag:
             if channel.metadata.get("kind") == RAW:
                 yield Sample(
                     message.log_time,
-                    channel.topic,
+                    current_key(channel.topic),
                     channel.metadata.get("zenoh_encoding", ""),
                     schema.name if schema else "",
                     message.data,

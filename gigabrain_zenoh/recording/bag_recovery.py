@@ -9,7 +9,7 @@ from mcap.writer import Writer
 from msgspec import Struct
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.bounded_file import open_regular
+from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.recording.bag_reader import MAGIC, Bag, BagDamage, check_magic
 from gigabrain_zenoh.recording.bag_writer import (
     LIBRARY,

@@ -15,7 +15,7 @@ from mcap.writer import IndexType, Writer
 from gigabrain_schemas.topics import CMD_VEL, INTENT, STATE, TASK, TOPICS, Topic
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.bounded_file import open_regular
+from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.recording.bag_reader import RAW
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn, json_schema
 from gigabrain_zenoh.recording.headers import Header, is_json

@@ -6,7 +6,7 @@ from typing import Any
 import msgspec
 
 from gigabrain_schemas.topics import BODY, IMAGE, IMU, SCAN, STATE
-from gigabrain_zenoh.host.bounded import put
+from gigabrain_zenoh.host.bounded import put_newest
 
 DRIVER_KEYS = (STATE.key, SCAN.key, IMU.key, BODY.key, IMAGE.key)  # with the driver's boot
 MAX_COUNT = 2**63 - 1
@@ -63,7 +63,7 @@ class SequenceGaps:
         name = header.process or header.source
         sender = key, str(name)[:64] if name else ""
         last = self._last.get(sender)
-        put(self._last, sender, header, MAX_SENDERS)
+        put_newest(self._last, sender, header, MAX_SENDERS)
         if last is None:
             return 0
         if header.seq == last.seq + 1 and header.boot == last.boot:  # the usual case

@@ -18,11 +18,11 @@ from gigabrain_schemas.topics import BODY, TOPICS
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import topic_named
 from gigabrain_zenoh.config.settings import RecorderConfig
-from gigabrain_zenoh.host.stop_signals import stop_signals
-from gigabrain_zenoh.logs import state_dir
+from gigabrain_zenoh.host.run_folders import state_dir
+from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.recording.bag_recovery import recover_all
 from gigabrain_zenoh.recording.recorder import Recorder, Status
-from gigabrain_zenoh.runtime.joining import Where, joined
+from gigabrain_zenoh.runtime.connect import Where, joined
 
 log = logging.getLogger(__name__)
 

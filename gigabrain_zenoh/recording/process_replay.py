@@ -14,25 +14,24 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_schemas.base import Message
-from gigabrain_schemas.heard import WAITED, Heard
+from gigabrain_schemas.input_log import WAITED, AcceptedRequest, InputLog
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.tasks import Granted
 from gigabrain_schemas.topics import (
     CMD_VEL,
-    GRANTED,
-    HEARD,
+    INPUT_LOG,
     INTENT,
     JOINT_CMD,
     MAP,
     POSE,
+    REQUEST_LOG,
     SAFETY,
     STATE,
     WORLD,
     Topic,
+    current_key,
 )
 from gigabrain_zenoh.codec import Codec
-from gigabrain_zenoh.config.process_config import ProcessConfig
-from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
@@ -59,8 +58,8 @@ MAX_UNMATCHED_SHARE = 0.1  # of outputs that only the recording or only the repl
 NodeOf = Callable[[ProcessConfig], Node]
 OutputId = tuple[str, int, int, int]  # key, boot, tick, basis
 
-_input_log = Codec(HEARD.type, HEARD.max_bytes)
-_granted = Codec(GRANTED.type, GRANTED.max_bytes)
+_input_log = Codec(INPUT_LOG.type, INPUT_LOG.max_bytes)
+_granted = Codec(REQUEST_LOG.type, REQUEST_LOG.max_bytes)
 
 
 class Difference(Struct, frozen=True, kw_only=True):
@@ -155,7 +154,7 @@ def _without_computer(message: Message) -> Message:
 
 def logged_inputs(recorded: Sequence[Sample], process: str) -> RecordedInputs | None:
     """Return the inputs of the last life of `process`; None if it did not log them."""
-    key = HEARD.at(process)
+    key = INPUT_LOG.at(process)
     logs = _last_life(_input_log.decode(one.payload) for one in recorded if one.key == key)
     if not logs:
         return None
@@ -173,8 +172,8 @@ def logged_inputs(recorded: Sequence[Sample], process: str) -> RecordedInputs | 
     )
 
 
-def _last_life(logs: Iterable[Heard]) -> list[Heard]:
-    found: list[Heard] = []
+def _last_life(logs: Iterable[InputLog]) -> list[InputLog]:
+    found: list[InputLog] = []
     for each in logs:
         if found and each.seq <= found[-1].seq:  # the process has restarted
             found = []
@@ -182,13 +181,13 @@ def _last_life(logs: Iterable[Heard]) -> list[Heard]:
     return found
 
 
-def _entries(logs: Iterable[Heard]) -> Iterator[tuple[int, str, int]]:
+def _entries(logs: Iterable[InputLog]) -> Iterator[tuple[int, str, int]]:
     """Yield Unix time [ns], which never decreases, key and number of each input."""
     newest_ns = 0
     for log in logs:
         for entry in log.taken:
             newest_ns = max(newest_ns, log.began_ns + entry.after_us * 1000)
-            yield newest_ns, log.keys[entry.key], entry.seq
+            yield newest_ns, current_key(log.keys[entry.key]), entry.seq
 
 
 def _by_number(
@@ -198,7 +197,7 @@ def _by_number(
     found: dict[tuple[str, int], list[tuple[int, bytes]]] = defaultdict(list)
     for sample in recorded:
         header = header_of(sample.payload)
-        if sample.key != GRANTED.key or header.process in ("", process):
+        if sample.key != REQUEST_LOG.key or header.process in ("", process):
             found[sample.key, header.seq].append((sample.log_ns, sample.payload))
     return found
 
@@ -210,9 +209,9 @@ def _nearest(same_number: Sequence[tuple[int, bytes]], at_ns: int) -> bytes | No
 
 
 def _as_request(at_ns: int, key: str, payload: bytes) -> Event:
-    if key != GRANTED.key:
+    if key != REQUEST_LOG.key:
         return at_ns, key, payload
-    granted: Granted = _granted.decode(payload)
+    granted: AcceptedRequest = _granted.decode(payload)
     return at_ns, granted.service, granted.request.encode()
 
 
@@ -224,7 +223,7 @@ def with_requests(inputs: Sequence[Event]) -> list[Event]:
     """
     order = [((i, 1), event) for i, event in enumerate(inputs)]
     for i, (_, key, payload) in enumerate(inputs):
-        if key != GRANTED.key:
+        if key != REQUEST_LOG.key:
             continue
         granted = _granted.decode(payload)
         later = (j for j, event in enumerate(inputs) if _is_after(granted, event, default=j > i))
@@ -233,7 +232,7 @@ def with_requests(inputs: Sequence[Event]) -> list[Event]:
     return [event for _, event in sorted(order, key=lambda one: one[0])]
 
 
-def _is_after(granted: Granted, event: Event, *, default: bool) -> bool:
+def _is_after(granted: AcceptedRequest, event: Event, *, default: bool) -> bool:
     """Return whether a request was accepted before `event` was received."""
     _, key, payload = event
     if key not in (STATE.key, WORLD.key):

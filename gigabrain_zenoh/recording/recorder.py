@@ -10,7 +10,7 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from gigabrain_zenoh.bus.zenoh.unobtrusive import LONGEST_S
+from gigabrain_zenoh.bus.zenoh.workarounds import LONGEST_S
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.logs import Fault

@@ -1,16 +1,17 @@
 """A deployment file: which body on which link, and which process runs on which host."""
 
+import sys
 from collections import Counter
+from collections.abc import Collection
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, structs
 
 from gigabrain_zenoh.bus.zenoh.config import secured
 from gigabrain_zenoh.config import loading as config
-from gigabrain_zenoh.config.addresses import exposed, host_and_port
 from gigabrain_zenoh.config.settings import (
     ButtonConfig,
     DecisionConfig,
@@ -21,15 +22,15 @@ from gigabrain_zenoh.config.settings import (
     PageConfig,
     PerceptionConfig,
     RecorderConfig,
+    RelayConfig,
     Resume,
     Seed,
     Speed,
 )
 from gigabrain_zenoh.errors import ConfigError, unknown
-from gigabrain_zenoh.host.free_port import reserve_port
+from gigabrain_zenoh.host.network import exposed, host_and_port, reserve_port
 from gigabrain_zenoh.runtime.running import local_socket
-from gigabrain_zenoh.security.checks import check_identity
-from gigabrain_zenoh.security.files import identity_folder
+from gigabrain_zenoh.security.identity_files import check_identity, identity_folder
 
 MOST_HOSTS = 64
 EMULATOR = "emulator"  # runs beside the driver where the link is `emulated`; not in `hosts`
@@ -203,3 +204,32 @@ def recorded(path: Path) -> dict[str, Any]:
     """What makes a deployment record itself into one file, raw, for a replay."""
     recorder = {"file": str(path.absolute()), "viewers": False}
     return {"hosts": {"robot": (*ROBOT, "recorder")}, "recorder": recorder}
+
+
+RELAY = "relay"
+MEET = {"perception", "decision"}  # each runs once per robot, so there is one relay at most
+AT_THE_ROBOT = {"router", "driver"}  # no relay between them: a body without its router must stop
+
+
+def has_relay(processes: Collection[str]) -> bool:
+    """Return whether a host with these processes runs a relay; never on Windows.
+
+    A relay needs Unix sockets.
+    """
+    here = set(processes)
+    return sys.platform != "win32" and here >= MEET and not here & AT_THE_ROBOT
+
+
+def behind(endpoint: Endpoint) -> Endpoint:
+    """Return the endpoint of the host's processes: a Unix socket that only this user can open."""
+    return structs.replace(endpoint, connect=(local_socket(),), keys="")
+
+
+def between(endpoint: Endpoint) -> Endpoint:
+    """Return the relay's endpoint: it listens on the socket, and connects to the robot's router."""
+    return structs.replace(endpoint, listen=(local_socket(),))
+
+
+def relay_config(endpoint: Endpoint) -> RelayConfig:
+    """Build the relay's settings, which name the router it connects to."""
+    return RelayConfig(router=endpoint.connect[-1], keys=endpoint.keys)

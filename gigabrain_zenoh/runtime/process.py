@@ -13,25 +13,22 @@ from typing import Any
 
 import msgspec
 
-from gigabrain_schemas.topics import HEARD, LOG
+from gigabrain_schemas.topics import INPUT_LOG, LOG
 from gigabrain_zenoh import logs
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.heartbeat import STDOUT, beat
+from gigabrain_zenoh.bus.input_log import PublishedInputLogger
 from gigabrain_zenoh.bus.transport import Transport
 from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME
-from gigabrain_zenoh.bus.zenoh.unobtrusive import NAP_S
+from gigabrain_zenoh.bus.zenoh.workarounds import NAP_S
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.config.process_config import ProcessConfig
+from gigabrain_zenoh.config.settings import ProcessConfig
 from gigabrain_zenoh.errors import GigabrainError, unknown
-from gigabrain_zenoh.host.interrupts import interrupts
-from gigabrain_zenoh.host.journal import SaidJournal
-from gigabrain_zenoh.host.scheduling import go_first, join_in, start_first, step_aside
-from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.host.signals import interrupts, stop_signals
+from gigabrain_zenoh.host.this_process import go_first, join_in, start_first, step_aside
 from gigabrain_zenoh.plugins import find
-from gigabrain_zenoh.runtime.health import publish_health
-from gigabrain_zenoh.runtime.meeting import join
-from gigabrain_zenoh.runtime.name_claim import NameClaim
-from gigabrain_zenoh.runtime.param_service import serve_params
+from gigabrain_zenoh.runtime.connect import join
+from gigabrain_zenoh.runtime.heartbeat import STDOUT, beat
+from gigabrain_zenoh.runtime.services import NameClaim, publish_health, serve_params
 
 log = logging.getLogger("gigabrain")
 
@@ -132,8 +129,8 @@ async def _work(
     handler = logs.BusHandler(functools.partial(bus.publish, LOG), config.name)
     logging.getLogger().addHandler(handler)
     if process_type.repeats:
-        say = functools.partial(bus.publish, HEARD, name=config.name)
-        bus.journal = SaidJournal(say, bus.clock.unix_ns)
+        say = functools.partial(bus.publish, INPUT_LOG, name=config.name)
+        bus.input_log = PublishedInputLogger(say, bus.clock.unix_ns)
     try:
         claim = NameClaim(bus)
         await claim.take()
@@ -150,7 +147,7 @@ async def _work(
         raise group.exceptions[0] from None
     finally:
         logging.getLogger().removeHandler(handler)
-        bus.journal.flush()
+        bus.input_log.flush()
         await bus.close()
 
 

@@ -5,14 +5,14 @@ import contextlib
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Sequence
 
-from gigabrain_schemas.heard import WAITED
+from gigabrain_schemas.input_log import WAITED
 from gigabrain_schemas.topics import MAP_SAVE, SERVICES
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.input_log import ReplayedInputLogger
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.host.journal import PastJournal
-from gigabrain_zenoh.runtime.param_service import serve_params
+from gigabrain_zenoh.runtime.services import serve_params
 
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 Event = tuple[int, str, bytes]  # time since the start [ns], key, payload
@@ -42,7 +42,7 @@ async def replay(
     clock, network = FakeClock(), LocalNetwork()
     bus = Bus(network.transport(), clock, process)
     serve_params(bus)
-    bus.journal = past = PastJournal()
+    bus.input_log = past = ReplayedInputLogger()
     ready, asked = asyncio.Event(), list[asyncio.Future[None]]()
     running = asyncio.ensure_future(node(bus, ready.set))
     try:

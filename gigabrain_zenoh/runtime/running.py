@@ -16,7 +16,7 @@ from gigabrain_zenoh.bus.zenoh.config import secured
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
-from gigabrain_zenoh.host.bounded_file import open_regular
+from gigabrain_zenoh.host.files import open_regular
 
 SOCKET = "unixsock-stream"
 NOTE_BYTES = 65536  # maximum size of a note

@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from typing import Self
 
 from gigabrain_zenoh import errors
-from gigabrain_zenoh.bus import heartbeat
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.backoff import Backoff
-from gigabrain_zenoh.runtime.keeper import (
-    Keeper,
+from gigabrain_zenoh.runtime import heartbeat
+from gigabrain_zenoh.runtime.managed_process import (
+    Backoff,
+    ManagedProcess,
     OnRecord,
     ProcessSpec,
     ProcessStatus,
@@ -40,7 +40,7 @@ class Supervisor:
     ) -> None:
         _check(specs)
         self._shared = Shared(on_record, backoff or Backoff(), keep_stuck)
-        self._keepers = {spec.name: Keeper(spec, self._shared) for spec in specs}
+        self._keepers = {spec.name: ManagedProcess(spec, self._shared) for spec in specs}
         self.statuses: Mapping[str, ProcessStatus] = {
             name: keeper.status for name, keeper in self._keepers.items()
         }
@@ -137,7 +137,7 @@ class Supervisor:
             if keeper.child:
                 keeper.child.abandon()
 
-    async def _end(self, keepers: Sequence[Keeper], kill_s: float, leave_s: float) -> None:
+    async def _end(self, keepers: Sequence[ManagedProcess], kill_s: float, leave_s: float) -> None:
         """Request the end, kill at `kill_s`, and stop waiting at `leave_s` (both loop times)."""
         for keeper in keepers:
             keeper.ask_to_end()
@@ -146,7 +146,7 @@ class Supervisor:
             keeper.force_to_end()
         await self._wait_for(keepers, leave_s)
 
-    async def _wait_for(self, keepers: Sequence[Keeper], until_s: float) -> None:
+    async def _wait_for(self, keepers: Sequence[ManagedProcess], until_s: float) -> None:
         tasks = [self._tasks[keeper.spec.name] for keeper in keepers]
         if tasks:
             left_s = until_s - asyncio.get_running_loop().time()

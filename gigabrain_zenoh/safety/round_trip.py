@@ -5,7 +5,7 @@ import msgspec
 from gigabrain_schemas.base import TICK_NS, Cause
 from gigabrain_schemas.body import BodyDescription, Thresholds
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.host.percentile import percentile
+from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.safety.sustain import held, ticks_of
 from gigabrain_zenoh.safety.words import say
 

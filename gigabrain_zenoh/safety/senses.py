@@ -25,8 +25,7 @@ from gigabrain_schemas.topics import (
     command_topic,
 )
 from gigabrain_zenoh.bus.bus import Bus, Latest
-from gigabrain_zenoh.bus.earlier import Earlier
-from gigabrain_zenoh.bus.freshness import LEAD_TICKS
+from gigabrain_zenoh.bus.freshness import LEAD_TICKS, PreviousTick
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.ages import scan_limit_ns
 from gigabrain_zenoh.safety.attitude import horizontal
@@ -45,7 +44,7 @@ class Senses:
 
     def __init__(self, bus: Bus, on_new: Callable[[Message], None], look: Look) -> None:
         self._bus, self._look = bus, look
-        self._by_commander: dict[str, Earlier[CmdVel]] = {}
+        self._by_commander: dict[str, PreviousTick[CmdVel]] = {}
         # age [ticks] and source; tick, and horizontal acceleration [m/s2]
         self._echoes: deque[tuple[int, str]] = deque(maxlen=MOST)
         self._shocks: deque[tuple[int, float]] = deque(maxlen=MOST)
@@ -121,7 +120,7 @@ class Senses:
         state = self._states.current
         if state and command.source == state.gate.commander:
             if command.source not in self._by_commander:  # who has driven before drives no more
-                self._by_commander = {command.source: Earlier()}
+                self._by_commander = {command.source: PreviousTick()}
             self._by_commander[command.source].receive(command)
         if command.boot == self._bus.time.boot:
             self._echoes.append((max(0, self._bus.time.tick - command.tick), command.source))

@@ -1,12 +1,13 @@
-"""What each role may do, in one table, and the router's rules that follow from it.
+"""The roles, what each may do, and the router's rules that follow from it.
 
-What a role may *say* is decided where it enters the router. To hear and see all of its own robot
-is everybody's right who has an identity; somebody without one does not even get a session.
+What a role may publish is decided where it enters the router. Everybody with an identity may listen
+to all of its own robot; without one there is no session.
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 from gigabrain_schemas.topics import (
     AUDIT_LOG,
@@ -17,9 +18,8 @@ from gigabrain_schemas.topics import (
     ESTOP,
     ESTOP_SAID,
     GOAL,
-    GRANTED,
     HEALTH,
-    HEARD,
+    INPUT_LOG,
     INTENT,
     JOINT_CMD,
     LOG,
@@ -29,6 +29,7 @@ from gigabrain_schemas.topics import (
     PARAM,
     POSE,
     RELEASE,
+    REQUEST_LOG,
     TASK,
     TASK_CHANGE,
     TELEOP,
@@ -37,9 +38,53 @@ from gigabrain_schemas.topics import (
     Service,
     Topic,
 )
-from gigabrain_zenoh.security.roles import Role, common_name, of_generation
+from gigabrain_zenoh.errors import ConfigError, unknown
 
-ALL = "robot/**"  # all that there is of one robot
+Role = Literal["robot", "brain", "operator", "viewer", "router"]
+ROLES: tuple[Role, ...] = get_args(Role)
+SERVERS: tuple[Role, ...] = ("robot", "router")  # only they may be a router
+MAX_NAME_LENGTH = 64  # characters of a common name (RFC 5280, ub-common-name)
+NAMESPACE = re.compile(r"[\w.-]+(/[\w.-]+)*", re.ASCII)
+
+
+def common_name(role: Role, robot: str = "", generation: int = 1) -> str:
+    """What the certificate says, and all that the router goes by.
+
+    Raises ConfigError for a robot that cannot be one.
+    """
+    if not robot:
+        return of_generation(role, generation)
+    name = of_generation(f"{role}@{robot}", generation)
+    if not NAMESPACE.fullmatch(robot) or len(name) > MAX_NAME_LENGTH:
+        most = MAX_NAME_LENGTH - len(name) + len(robot)
+        raise ConfigError(
+            f"robot {robot!r}: expected its namespace, letters, digits, '_', '-' and '.', "
+            f"of at most {most} characters"
+        )
+    return name
+
+
+def of_generation(name: str, generation: int) -> str:
+    """A common name of the first generation as it is in another."""
+    return name if generation == 1 else f"{name}~{generation}"
+
+
+def parse(name: str) -> tuple[Role, str, int]:
+    """Role, robot and generation in a common name. Raises UnknownName for a role that is none."""
+    name, _, generation = name.partition("~")
+    role, _, robot = name.partition("@")
+    return role_named(role), robot, int(generation) if generation.isdecimal() else 1
+
+
+def role_named(role: str) -> Role:
+    """The role of that name. Raises UnknownName."""
+    for one in ROLES:
+        if one == role:
+            return one
+    raise unknown("role", role, ROLES)
+
+
+EVERYTHING = "robot/**"  # all that there is of one robot
 TO_LISTENERS = ("put", "query", "reply", "declare_queryable")
 FIRST: Mapping[str, int] = {}  # nobody has been called back
 LOCAL = "local"  # who comes by the router's Unix socket, which only this user can open
@@ -56,7 +101,7 @@ class Rights:
 
 
 BRAIN = Rights(
-    says=(WORLD, POSE, MAP, INTENT, TASK, GRANTED, HEARD, HEALTH, LOG, ESTOP_SAID),
+    says=(WORLD, POSE, MAP, INTENT, TASK, REQUEST_LOG, INPUT_LOG, HEALTH, LOG, ESTOP_SAID),
     asks=(DESCRIBE, ESTOP),
     answers=(GOAL, MISSION, TASK_CHANGE, MAP_SAVE, PARAM, DESCRIBE),
     names=("perception", "decision", "relay"),
@@ -145,8 +190,8 @@ def _known(robots: Sequence[str]) -> Iterator[tuple[str, tuple[str, ...]]]:
 
 def _rules(role: Role, robot: str) -> Iterator[Rule]:
     """One role's rules for one robot."""
-    rights, who, everything = RIGHTS[role], common_name(role, robot), under(robot, [ALL])
-    says, asks, answers = _keys(rights) if rights else ([ALL], [ALL], [ALL])
+    rights, who, everything = RIGHTS[role], common_name(role, robot), under(robot, [EVERYTHING])
+    says, asks, answers = _keys(rights) if rights else ([EVERYTHING], [EVERYTHING], [EVERYTHING])
     yield _rule(f"{who} hears", "egress", TO_LISTENERS, everything)
     # that somebody listens is no secret: a fleet's operator may listen to `**`
     yield _rule(f"{who} is heard", "egress", ["declare_subscriber"], ["**"])

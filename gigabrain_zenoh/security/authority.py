@@ -1,6 +1,7 @@
-"""A fleet's own certificate authority: it makes itself, and identities for the hosts.
+"""A fleet's own certificate authority: it makes itself, issues identities, and revokes them.
 
-Certificates are X.509 v3 with EC P-256 keys (RFC 5280); the common name is who somebody is.
+Certificates are X.509 v3 with EC P-256 keys (RFC 5280); the common name names a role and a robot.
+Routers read revocations from their identity's folder, as Zenoh has none for certificates.
 """
 
 import datetime
@@ -11,19 +12,25 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from gigabrain_zenoh.config.addresses import host_and_port, is_host, is_ip
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.atomic_write import sync_folder, write_synced
-from gigabrain_zenoh.security.files import CA, CA_KEY, CERTIFICATE, KEY
-from gigabrain_zenoh.security.identity import read_certificate, read_key
-from gigabrain_zenoh.security.list_file import generations_in
-from gigabrain_zenoh.security.revoked import write_list
-from gigabrain_zenoh.security.roles import LONGEST, SERVERS, Role, common_name
+from gigabrain_zenoh.host.files import replace_file, sync_folder, write_synced
+from gigabrain_zenoh.host.network import host_and_port, is_host, is_ip
+from gigabrain_zenoh.security.acl import MAX_NAME_LENGTH, SERVERS, Role, common_name
+from gigabrain_zenoh.security.identity import read, read_certificate, read_key
+from gigabrain_zenoh.security.identity_files import (
+    CA,
+    CA_KEY,
+    CERTIFICATE,
+    KEY,
+    LIST,
+    generations_in,
+)
 
 CA_DAYS, DAYS = 3650, 365
 EARLY = datetime.timedelta(days=1)  # clocks of hosts differ
@@ -32,8 +39,8 @@ LOCAL = ("localhost", "127.0.0.1", "::1")
 
 def new_fleet(fleet: str, folder: Path) -> None:
     """Make a fleet's authority in `folder`. Raises ConfigError where there is something already."""
-    if not fleet.strip() or len(fleet) > LONGEST:
-        raise ConfigError(f"fleet {fleet!r}: expected a name of 1 to {LONGEST} characters")
+    if not fleet.strip() or len(fleet) > MAX_NAME_LENGTH:
+        raise ConfigError(f"fleet {fleet!r}: expected a name of 1 to {MAX_NAME_LENGTH} characters")
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name(
         [
@@ -193,3 +200,31 @@ def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
     for name, data in contents.items():
         mode = 0o600 if name in (KEY, CA_KEY) else 0o644
         write_synced(folder / name, data, mode)
+
+
+def revoke(fleet_folder: Path, role: Role, robot: str = "") -> tuple[Path, ...]:
+    """Call back all identities issued so far under a common name; the lists that routers want.
+
+    Raises ConfigError for roles that may be a router: they are believed without a router.
+    """
+    if role in SERVERS:
+        raise ConfigError(
+            f"keys of a {role} can also pass for a router, which no list prevents; "
+            "make a new fleet with `gigabrain keys new`"
+        )
+    name, known = common_name(role, robot), generations_in(fleet_folder)
+    generations = {**known, name: known.get(name, 1) + 1}
+    places = [place.parent for place in sorted(fleet_folder.glob(f"*/{CERTIFICATE}"))]
+    routers = [place for place in places if read(place)[0].role in SERVERS]
+    for folder in (fleet_folder, *routers):
+        write_list(folder, generations)
+    return tuple(folder / LIST for folder in routers)
+
+
+def write_list(folder: Path, generations: Mapping[str, int]) -> None:
+    """Replace the list in a folder. Raises ConfigError."""
+    content = msgspec.json.format(msgspec.json.encode(generations)) + b"\n"
+    try:
+        replace_file(folder / LIST, content)
+    except OSError as error:
+        raise ConfigError(f"cannot write {folder / LIST}: {error.strerror}") from None

@@ -11,8 +11,9 @@ from cryptography.x509.oid import NameOID
 from msgspec import Struct
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.bounded_file import read_bounded
-from gigabrain_zenoh.security.files import (
+from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.security.acl import Role, parse
+from gigabrain_zenoh.security.identity_files import (
     CA,
     CERTIFICATE,
     KEY,
@@ -21,7 +22,6 @@ from gigabrain_zenoh.security.files import (
     check_private,
     unreadable,
 )
-from gigabrain_zenoh.security.roles import Role, parse
 
 MOST_BYTES = 100_000  # of a key or a certificate
 

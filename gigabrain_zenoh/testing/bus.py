@@ -10,16 +10,17 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.input_log import InputLogger
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.host.journal import Job, Journal, done
+from gigabrain_zenoh.host.threads import Job, done
 from gigabrain_zenoh.testing.waiting import PATIENCE_S
 
 M = TypeVar("M", bound=Message)
 Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 
 
-class PatientJournal(Journal):
+class PatientJournal(InputLogger):
     """Waits for a node's background work, however slow the machine is.
 
     For tests that compare results.
@@ -52,7 +53,7 @@ class NodeBench:
 
     async def __aenter__(self) -> Self:
         self.bus = Bus(self.network.transport(), self.clock, "node")
-        self.bus.journal = PatientJournal()
+        self.bus.input_log = PatientJournal()
         self._running = asyncio.ensure_future(self._node(self.bus, self._ready.set))
         await self.clock.advance(0)
         return self

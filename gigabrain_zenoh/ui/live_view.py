@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gigabrain_zenoh.gate.causes import in_words
-from gigabrain_zenoh.host.display import LINES, Display, writer
+from gigabrain_zenoh.host.terminal import LINES, Display, writer
 from gigabrain_zenoh.runtime.deployment import Deployment
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.ui.watch import Watch

@@ -20,7 +20,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.causes import LATE
-from gigabrain_zenoh.host.bounded import put
+from gigabrain_zenoh.host.bounded import put_newest
 
 UNKNOWN = b"\xff"  # an unknown cell
 PROCESSES = 64  # at most, whose health is kept
@@ -91,7 +91,7 @@ class Watch:
         return None
 
     def _healthy(self, _key: str, health: Health) -> None:
-        put(self.health, health.process, health, PROCESSES)
+        put_newest(self.health, health.process, health, PROCESSES)
 
     def _moved(self, state: RobotState) -> None:
         last, self._last = self._last, state

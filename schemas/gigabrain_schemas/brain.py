@@ -105,7 +105,7 @@ class TrajectoryPoint(msgspec.Struct, frozen=True, array_like=True, forbid_unkno
     angular_z: AngularSpeed = 0.0  # [rad/s]
 
 
-class Response(Record, frozen=True, kw_only=True):
+class ActuationModel(Record, frozen=True, kw_only=True):
     """How a body answers a commanded velocity: nothing at first, then as a first-order lag."""
 
     delay: Delay = 0.0  # [s]
@@ -129,7 +129,7 @@ class Intent(Message, frozen=True, kw_only=True):
     joints: Annotated[tuple[JointTarget, ...], Meta(max_length=MOST_JOINTS)] = ()
     trajectory: Annotated[tuple[TrajectoryPoint, ...], Meta(max_length=256)] = ()
     follow: bool = False  # control keeps to the trajectory; without, it gives the body the twist
-    response: Response = Response()  # what the trajectory counts on
+    response: ActuationModel = ActuationModel()  # what the trajectory counts on
     progress: Fraction = 0.0  # how far the present step has come, as expected against as measured
     behaviour: Name
     reason: Text  # in words, for people

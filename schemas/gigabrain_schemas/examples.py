@@ -18,6 +18,7 @@ from gigabrain_schemas.body import (
     Thresholds,
 )
 from gigabrain_schemas.brain import (
+    ActuationModel,
     CmdVel,
     Intent,
     JointCommand,
@@ -25,13 +26,11 @@ from gigabrain_schemas.brain import (
     Obstacle,
     OccupancyGrid,
     PoseInMap,
-    Response,
     TrajectoryPoint,
     Twist,
     WorldModel,
 )
-from gigabrain_schemas.button import ButtonState
-from gigabrain_schemas.heard import WAITED, Heard, Taken
+from gigabrain_schemas.input_log import WAITED, AcceptedRequest, ConsumedInput, InputLog
 from gigabrain_schemas.requests import (
     DescribeRequest,
     Description,
@@ -45,13 +44,12 @@ from gigabrain_schemas.requests import (
     ParamRequest,
     ReleaseRequest,
 )
-from gigabrain_schemas.safety import Health, LogRecord, SafetyState, SpeedCaps
+from gigabrain_schemas.safety import ButtonState, Health, LogRecord, SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import Image, Imu, ImuData, LaserScan
 from gigabrain_schemas.tasks import (
     Goal,
     GoalReply,
     GoalRequest,
-    Granted,
     MissionReply,
     MissionRequest,
     Task,
@@ -199,7 +197,7 @@ BRAIN: tuple[Message, ...] = (
             TrajectoryPoint(t=1.0, x=0.0, y=0.0, yaw=-0.5, angular_z=-0.5),
         ),
         follow=True,
-        response=Response(delay=0.04, lag=0.1),
+        response=ActuationModel(delay=0.04, lag=0.1),
         progress=0.4,
         behaviour="avoid",
         reason="turning right: obstacle 0.83 m ahead",
@@ -314,7 +312,7 @@ TASKS: tuple[Message, ...] = (
     MissionReply(ok=False, text="mission:2: do[0].goto: no place 'kitchen'"),
     TaskRequest(stamp_ns=STAMP_NS, seq=1, do="cancel", task="goal-7", source="ann"),
     TaskReply(ok=True, text="goal-7 is cancelled", task="goal-7"),
-    Granted(
+    AcceptedRequest(
         stamp_ns=STAMP_NS, seq=3, boot=BOOT, tick=205, basis=200,
         process="decision", service="robot/goal",
         request='{"x":3.0,"y":1.5,"how":"preempt","source":"ann"}',
@@ -344,10 +342,13 @@ TASKS: tuple[Message, ...] = (
 )  # fmt: skip
 
 HEARD: tuple[Message, ...] = (
-    Heard(
+    InputLog(
         stamp_ns=STAMP_NS, seq=4, boot=BOOT, tick=206, basis=0, began_ns=STAMP_NS - 500_000_000,
         keys=("robot/state", "robot/scan", WAITED),
-        taken=(Taken(0, 205, 0), Taken(1, 41, 1250), Taken(2, 1, 2100), Taken(0, 206, 20_020)),
+        taken=(
+            ConsumedInput(0, 205, 0), ConsumedInput(1, 41, 1250), ConsumedInput(2, 1, 2100),
+            ConsumedInput(0, 206, 20_020),
+        ),
     ),
 )  # fmt: skip
 

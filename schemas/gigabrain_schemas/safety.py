@@ -1,4 +1,4 @@
-"""What safety says, how processes are doing, and what they log."""
+"""The state of safety, of an e-stop button, of each process, and its log."""
 
 from typing import Annotated, Literal
 
@@ -68,3 +68,10 @@ class LogRecord(Message, frozen=True, kw_only=True):
     event: Name
     text: Text
     data: Annotated[dict[Key, Data], Meta(max_length=64)] = field(default_factory=dict)
+
+
+class ButtonState(Message, frozen=True, kw_only=True):
+    """What an e-stop button says. Whoever counts on one takes its silence for a press."""
+
+    pressed: bool  # also when nothing is known of the contact
+    text: Text = ""  # why it counts as pressed

@@ -19,7 +19,7 @@ from gigabrain_schemas.base import (
 How = Literal["replace", "queue", "preempt"]
 # in place of all that there is to do; after it; or before it, which goes on afterwards
 TaskState = Literal["queued", "active", "paused", "succeeded", "failed", "cancelled"]
-LONGEST = 96 * 1024  # of a request as text: a mission of the longest, quoted
+MAX_REQUEST_BYTES = 96 * 1024  # of a request as text: a mission of the longest, quoted
 MOST_POINTS = 256  # of a path that is only drawn
 
 
@@ -52,7 +52,7 @@ class GoalReply(Message, frozen=True, kw_only=True):
 class MissionRequest(Message, frozen=True, kw_only=True):
     """Carry out a mission."""
 
-    mission: Annotated[str, Meta(max_length=LONGEST)]  # the YAML text
+    mission: Annotated[str, Meta(max_length=MAX_REQUEST_BYTES)]  # the YAML text
     how: How = "replace"
     source: Name = "anonymous"
     label: Name = "mission"  # what people call it; stands for the file's name in errors
@@ -80,17 +80,6 @@ class TaskReply(Message, frozen=True, kw_only=True):
     ok: bool
     text: Text
     task: Name = ""
-
-
-class Granted(Message, frozen=True, kw_only=True):
-    """What somebody asked for, at the moment from which it counts: an input like any message.
-
-    `tick` and `basis` are the newest that had been heard and thought about before it.
-    """
-
-    process: Name = ""  # who was asked
-    service: Name  # the key that it was asked on, such as robot/goal
-    request: Annotated[str, Meta(max_length=LONGEST)]  # JSON, with who asked
 
 
 class Task(Record, frozen=True, kw_only=True):

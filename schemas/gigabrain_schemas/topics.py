@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeVar
 
-from gigabrain_schemas import audit, body, brain, button, heard, requests, safety, sensors, tasks
+from gigabrain_schemas import audit, body, brain, input_log, requests, safety, sensors, tasks
 from gigabrain_schemas.base import Message
 
 M = TypeVar("M", bound=Message)
@@ -84,13 +84,21 @@ HEALTH = Topic(
 LOG = Topic("robot/log", safety.LogRecord, 10, priority="background", depth=256, max_bytes=16 * KB)
 # real_time is for what stops the robot, and for nothing that anybody could send by the thousand
 BUTTON = Topic(
-    "robot/button", button.ButtonState, 20, missed=4, priority="real_time", express=True,
+    "robot/button", safety.ButtonState, 20, missed=4, priority="real_time", express=True,
     max_bytes=KB,
 )  # fmt: skip
 TASK = Topic("robot/task", tasks.TaskStatus, 5, keep=True, max_bytes=64 * KB)
-GRANTED = Topic("robot/granted", tasks.Granted, 10, depth=256, max_bytes=128 * KB)
-HEARD = Topic(
-    "robot/heard", heard.Heard, 2, priority="background", many=True, depth=32, max_bytes=64 * KB
+REQUEST_LOG = Topic(
+    "robot/request_log", input_log.AcceptedRequest, 10, depth=256, max_bytes=128 * KB
+)
+INPUT_LOG = Topic(
+    "robot/input_log",
+    input_log.InputLog,
+    2,
+    priority="background",
+    many=True,
+    depth=32,
+    max_bytes=64 * KB,
 )
 AUDIT = Topic("robot/audit", audit.AuditRecord, 10, depth=256)
 
@@ -102,8 +110,18 @@ def command_topic(of: body.BodyDescription) -> Topic[brain.CmdVel]:
 
 TOPICS: tuple[Topic[Any], ...] = (
     SCAN, IMU, STATE, BODY, IMAGE, WORLD, POSE, MAP, INTENT, TELEOP, CMD_VEL, JOINT_CMD, SAFETY,
-    BUTTON, HEALTH, LOG, TASK, GRANTED, HEARD, AUDIT,
+    BUTTON, HEALTH, LOG, TASK, REQUEST_LOG, INPUT_LOG, AUDIT,
 )  # fmt: skip
+
+OLD_KEYS = {"robot/heard": INPUT_LOG.key, "robot/granted": REQUEST_LOG.key}  # until release 0.3
+
+
+def current_key(key: str) -> str:
+    """Return the present key for one that a recording of an older release holds."""
+    start, _, rest = key.removeprefix("robot/").partition("/")
+    new = OLD_KEYS.get(f"robot/{start}")
+    return f"{new}/{rest}" if new and rest else new or key
+
 
 ESTOP = Service("robot/estop", requests.EstopRequest, requests.GateReply, priority="real_time")
 # for clients that can say, but not ask: it stops just the same, and nothing is confirmed

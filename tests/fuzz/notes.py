@@ -18,8 +18,9 @@ from gigabrain_schemas.body import GateStatus
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import limits_of
-from gigabrain_zenoh.host.child import Lines, as_record
+from gigabrain_zenoh.host.terminal import LineSplitter
 from gigabrain_zenoh.qa.proxy.chaos import told
+from gigabrain_zenoh.runtime.managed_process import as_record
 from gigabrain_zenoh.runtime.running import folder, running
 from tests.fuzz.harness import split
 
@@ -52,7 +53,7 @@ def note(data: bytes) -> None:
 
 def record(data: bytes) -> None:
     """A line of a child's output becomes a log record that can be written as JSON."""
-    lines = Lines()
+    lines = LineSplitter()
     for line in [*lines.feed(data), lines.end()]:
         made = as_record(line, "child")
         assert isinstance(made["event"], str)

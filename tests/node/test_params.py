@@ -19,7 +19,7 @@ from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.decision.behaviours import BEHAVIOURS
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.navigation.local import Goal, LocalPlanner
-from gigabrain_zenoh.runtime.param_service import LOG_LEVEL, serve_params
+from gigabrain_zenoh.runtime.services import LOG_LEVEL, serve_params
 from gigabrain_zenoh.testing.bus import NodeBench
 from gigabrain_zenoh.testing.samples import state
 from tests.node.plane import Plane, drawn

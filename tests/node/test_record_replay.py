@@ -11,13 +11,14 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.examples import example
+from gigabrain_schemas.input_log import AcceptedRequest
 from gigabrain_schemas.requests import ParamRequest
-from gigabrain_schemas.tasks import GoalReply, GoalRequest, Granted, TaskRequest
+from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskRequest
 from gigabrain_schemas.topics import (
     GOAL,
-    GRANTED,
     INTENT,
     PARAM,
+    REQUEST_LOG,
     STATE,
     TASK,
     TASK_CHANGE,
@@ -41,8 +42,8 @@ from gigabrain_zenoh.recording.process_replay import (
     with_requests,
 )
 from gigabrain_zenoh.recording.recorder import Recorder
-from gigabrain_zenoh.runtime.param_service import serve_params
 from gigabrain_zenoh.runtime.replay import ASKED, Event, record, replay
+from gigabrain_zenoh.runtime.services import serve_params
 from gigabrain_zenoh.testing.brain import BRAIN, RobotInMemory
 from tests.node.plane import ROOM, Plane, drawn
 from tests.unit.recording import bags
@@ -123,7 +124,9 @@ def test_without_its_settings_a_process_is_not_replayed_as_another(tmp_path: Pat
 
 
 def granted(service: str, tick: int, basis: int) -> bytes:
-    return codec.encode(Granted(service=service, request="{}", boot=7, tick=tick, basis=basis))
+    return codec.encode(
+        AcceptedRequest(service=service, request="{}", boot=7, tick=tick, basis=basis)
+    )
 
 
 def said(topic: Topic[Any], tick: int, boot: int = 7) -> Event:
@@ -138,8 +141,8 @@ def test_a_request_is_fed_where_it_counted_and_not_where_its_record_came() -> No
         said(WORLD, 5),
         said(STATE, 6),
         said(STATE, 7),
-        (150, GRANTED.key, granted("robot/goal", tick=6, basis=0)),
-        (151, GRANTED.key, granted("robot/mission", tick=6, basis=5)),
+        (150, REQUEST_LOG.key, granted("robot/goal", tick=6, basis=0)),
+        (151, REQUEST_LOG.key, granted("robot/mission", tick=6, basis=5)),
     ]
     order = [(at, key) for at, key, _ in with_requests(heard)]
     assert order == [

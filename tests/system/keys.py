@@ -10,8 +10,8 @@ import zenoh
 from gigabrain_zenoh.bus.zenoh.config import session_config
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.authority import issue, new_fleet
-from gigabrain_zenoh.security.roles import Role
 from gigabrain_zenoh.testing.zenoh import free_endpoint
 
 OF_RED: tuple[Role, ...] = ("robot", "brain", "operator", "viewer")

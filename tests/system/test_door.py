@@ -16,7 +16,7 @@ from gigabrain_schemas.audit import AuditRecord
 from gigabrain_zenoh.client.robot import connect
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import NotConfirmed
-from gigabrain_zenoh.runtime import audit_file
+from gigabrain_zenoh.runtime import audit
 from gigabrain_zenoh.testing.processes import Command, Home, free_port, robot_of
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.keys import make_fleet, raw
@@ -43,7 +43,7 @@ class Gate:
 
     @property
     def audited(self) -> dict[tuple[str, str, str], AuditRecord]:
-        records = audit_file.read(self._robot, 1000)
+        records = audit.read_audit(self._robot, 1000)
         return {(record.what, record.source, record.code): record for record in records}
 
 

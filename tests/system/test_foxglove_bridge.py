@@ -21,7 +21,7 @@ from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.topics import IMAGE, LOG, MAP, POSE, SCAN, STATE, TASK, WORLD
 from gigabrain_zenoh.config.settings import FoxgloveConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.runtime.name_claim import NameClaim
+from gigabrain_zenoh.runtime.services import NameClaim
 from gigabrain_zenoh.testing.processes import Home, free_port, listens
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.foxglove.layout import topic_to_steer, write_layout

@@ -8,8 +8,8 @@ import pytest
 
 BEGIN = """
 import asyncio, os, signal, sys, threading, time
-from gigabrain_zenoh.host.interrupts import interrupts
-from gigabrain_zenoh.host.stop_signals import run_async, stop_signals
+from gigabrain_zenoh.host.signals import interrupts
+from gigabrain_zenoh.host.signals import run_async, stop_signals
 interrupts.install()
 interrupts.limit_s = 0.3
 

@@ -42,7 +42,9 @@ def test_a_console_that_nobody_reads_holds_up_neither_the_program_nor_its_log_fi
     monkeypatch.setattr(logs, "LAST_WORDS_S", 60.0)
     with unread() as pipe:
         logs.setup("driver", tmp_path, json_console=True)
-        file, console = (h for h in logging.getLogger().handlers if isinstance(h, logs.Background))
+        file, console = (
+            h for h in logging.getLogger().handlers if isinstance(h, logs.QueuedHandler)
+        )
         for i in range(1500):
             log.info("line %d", i)
             if i % 100 == 99:

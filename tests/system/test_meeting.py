@@ -9,8 +9,8 @@ import pytest
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.runtime import meeting
-from gigabrain_zenoh.runtime.meeting import join, unknown_host
+from gigabrain_zenoh.runtime import connect
+from gigabrain_zenoh.runtime.connect import join, unknown_host
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.testing.zenoh import free_endpoint, under_way
 
@@ -36,8 +36,8 @@ def resolver(monkeypatch: pytest.MonkeyPatch) -> Resolver:
     """No name leaves this machine."""
     made = Resolver()
     monkeypatch.setattr(socket, "getaddrinfo", made)
-    monkeypatch.setattr(meeting, "AGAIN_S", 0.01)
-    monkeypatch.setattr(meeting, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(connect, "AGAIN_S", 0.01)
+    monkeypatch.setattr(connect, "PATIENCE_S", 0.01)
     return made
 
 

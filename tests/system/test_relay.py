@@ -9,11 +9,10 @@ import pytest
 
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE
-from gigabrain_zenoh.config.process_config import ProcessConfig
-from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.qa.faults.onlooker import Onlooker, at_rest, looking_on
-from gigabrain_zenoh.runtime import audit_file
+from gigabrain_zenoh.runtime import audit
 from gigabrain_zenoh.runtime.deployment import Deployment, ProcessName
 from gigabrain_zenoh.security.authority import issue, new_fleet
 from gigabrain_zenoh.testing.processes import Home, free_port
@@ -121,7 +120,7 @@ async def test_a_robot_whose_brain_loses_its_relay_stops_and_drives_again_and_no
             await robot.ticks(75)  # the router's audit is on the disk by then
         folder = robots.folder / "state" / "gigabrain" / "robots"
         folder /= namespace or "turtlebot3_waffle"
-        audited = {record.what for record in audit_file.read(folder, 1000)}
+        audited = {record.what for record in audit.read_audit(folder, 1000)}
         assert "estop" in audited
         assert not audited & {"refused", "stranger"}
     finally:

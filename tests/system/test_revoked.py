@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh.security.authority import issue
-from gigabrain_zenoh.security.revoked import revoke
+from gigabrain_zenoh.security.authority import issue, revoke
 from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.zenoh import Ear, repeat
 from tests.system.keys import site

@@ -5,7 +5,7 @@ import sys
 
 ENDS = """
 import asyncio, os, signal
-from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.host.signals import stop_signals
 
 # a shell's `&` starts the tests with SIGINT ignored
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -12,8 +12,8 @@ import jsonschema
 import pytest
 import yaml
 
-from gigabrain_zenoh.config.addresses import exposed
 from gigabrain_zenoh.config.loading import loads
+from gigabrain_zenoh.host.network import exposed
 from gigabrain_zenoh.qa.faults.onlooker import looking_on
 from gigabrain_zenoh.runtime.deployment import Deployment, load_deployment
 from gigabrain_zenoh.testing.processes import Home, endpoint_of

@@ -20,8 +20,8 @@ from gigabrain_schemas.topics import (
     STATE,
     TELEOP,
 )
+from gigabrain_zenoh.bus.bridge import Mailbox
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.mailbox import Mailbox
 from gigabrain_zenoh.bus.zenoh import transport as zenoh_transport
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 from gigabrain_schemas.base import Cause
-from gigabrain_schemas.button import ButtonState
+from gigabrain_schemas.safety import ButtonState
 from gigabrain_schemas.topics import BUTTON
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.gate import causes as why

@@ -17,10 +17,10 @@ from gigabrain_drivers.driver.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_drivers.lidars.base import check_turns, source_class
 from gigabrain_drivers.links.port_name import AUTO
 from gigabrain_zenoh.config import loading as config
-from gigabrain_zenoh.config.places import located
+from gigabrain_zenoh.config.loading import located
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
-from gigabrain_zenoh.logs import state_dir
+from gigabrain_zenoh.host.run_folders import state_dir
 
 EMULATOR = "{emulator}"  # in a robot's file: the folder of the emulator's ports
 Options = TypeVar("Options", bound=Struct)

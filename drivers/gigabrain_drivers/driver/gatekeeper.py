@@ -16,7 +16,7 @@ from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, RELEASE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
-from gigabrain_zenoh.host.scribe import Scribe
+from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.runtime.audit import AuditTrail
 
@@ -45,7 +45,9 @@ class Gatekeeper:
         self._output_changed = changed
         file = LatchFile(folder)
         latched = file.read()
-        self._scribe: Scribe[Latched] = Scribe(lambda newest: file.keep(newest[-1]), room=1)
+        self._scribe: BackgroundWriter[Latched] = BackgroundWriter(
+            lambda newest: file.keep(newest[-1]), room=1
+        )
         self._latched, self._on_disk = latched, self._scribe.put(latched)
         self._on_time_ns = -STEP_NS  # when the newest tick came that was not late
         self._forgetful = Fault(log, logging.ERROR)

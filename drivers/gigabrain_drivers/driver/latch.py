@@ -9,8 +9,7 @@ from msgspec import Meta
 from gigabrain_schemas.base import Cause
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.atomic_write import make_folder, replace_file
-from gigabrain_zenoh.host.bounded_file import read_bounded
+from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
 
 MOST_BYTES = 65_536
 UNREADABLE = Cause(

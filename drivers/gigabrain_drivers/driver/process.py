@@ -33,13 +33,13 @@ from gigabrain_schemas.topics import (
     command_topic,
 )
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.heartbeat import Progress
 from gigabrain_zenoh.config.settings import DriverConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.ages import scan_limit_ns
 from gigabrain_zenoh.geometry.limits import ZERO, limits_of
+from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 

@@ -3,7 +3,7 @@
 from collections import deque
 from collections.abc import Mapping
 
-from gigabrain_zenoh.host.percentile import Newest
+from gigabrain_zenoh.host.bounded import NewestValues
 
 MOST = 20_000  # newest times that the figures are drawn from
 WAITING = 1_000  # scans that may be unanswered; a brain that is away answers none
@@ -18,7 +18,7 @@ class RoundTrip:
     def __init__(self) -> None:
         self.scan_tick = 0  # newest tick that carried a scan
         self._waiting: deque[tuple[int, int]] = deque(maxlen=WAITING)  # tick, sent at [ns]
-        self._times_ms = Newest(MOST)
+        self._times_ms = NewestValues(MOST)
 
     def sent(self, tick: int, now_ns: int) -> None:
         """The scan of `tick` is on its way."""

@@ -11,11 +11,11 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.faults import Faults
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.heartbeat import Progress
 from gigabrain_zenoh.config.settings import EmulatorConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError
-from gigabrain_zenoh.host.stdin_lines import typed_lines
-from gigabrain_zenoh.host.stop_signals import stop_signals
+from gigabrain_zenoh.host.signals import stop_signals
+from gigabrain_zenoh.host.terminal import typed_lines
+from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from gigabrain_drivers.links.link import LinkProblem
 from gigabrain_drivers.links.tcp_link import TcpLink
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.bounded_file import read_bounded
+from gigabrain_zenoh.host.files import read_bounded
 
 MOST_BYTES = 256  # of a file that says where to call
 

@@ -16,7 +16,7 @@ from gigabrain_drivers.sim.body import (
 )
 from gigabrain_schemas.base import NonNegative, Percentage, Positive
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.bounded_file import read_bounded
+from gigabrain_zenoh.host.files import read_bounded
 
 SIMULATED = ("differential", "quadruped")  # drive types
 MOST_MODEL_BYTES = 10_000_000

@@ -1,24 +1,74 @@
 """Configuration of Zenoh sessions, and explanations of their errors. Does not import Zenoh."""
 
+import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from msgspec import structs
 
-from gigabrain_zenoh.bus.zenoh.bounds import bounds
-from gigabrain_zenoh.config.addresses import LOCAL_ENDPOINT, host_and_port
+from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TOPICS, Priority, Service, Topic
 from gigabrain_zenoh.config.settings import Endpoint, RouterConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.security.acl import access_control, known_names
-from gigabrain_zenoh.security.files import CA, CERTIFICATE, KEY, check_files
-from gigabrain_zenoh.security.list_file import generations_in
+from gigabrain_zenoh.host.network import LOCAL_ENDPOINT, host_and_port
+from gigabrain_zenoh.security.acl import FIRST, access_control, known_names
+from gigabrain_zenoh.security.identity_files import (
+    CA,
+    CERTIFICATE,
+    KEY,
+    check_files,
+    generations_in,
+)
+
+FAR_TOO_LARGE = 4  # times the size that a reader accepts
+SAID: tuple[Topic[Any], ...] = (*TOPICS, ESTOP_SAID)
+Rule = dict[str, Any]
+
+
+def bounds() -> dict[str, Any]:
+    """Return the settings of a router's session that limit messages from others."""
+    return {
+        "low_pass_filter": [*_small("put", SAID), *_small("query", SERVICES)],
+        "qos/network": [*_urgent("put", SAID), *_urgent("query", SERVICES)],
+    }
+
+
+def _small(message: str, of: Iterable[Topic[Any] | Service[Any, Any]]) -> list[Rule]:
+    """Return rules of Zenoh's low-pass filter that drop far too large messages at the router."""
+    sizes = {each.key: each.max_bytes for each in of}
+    return [
+        _at_ingress(f"a {message} of at most {size // 1024} KB", message, _keys(sizes, size))
+        | {"size_limit": FAR_TOO_LARGE * size}
+        for size in sorted(set(sizes.values()))
+    ]
+
+
+def _urgent(message: str, of: Iterable[Topic[Any] | Service[Any, Any]]) -> list[Rule]:
+    """Return rules that set each message's priority to its topic's, whatever its sender requested.
+
+    Otherwise a flood of messages sent at the highest priority would fill the e-stop's queue.
+    Messages that may not be dropped would block all others for as long as one reader does not read.
+    """
+    urgency: dict[str, Priority] = {each.key: each.priority for each in of}
+    return [
+        _at_ingress(f"a {message} at {priority}", message, _keys(urgency, priority))
+        | {"overwrite": {"priority": priority, "congestion_control": "drop", "express": False}}
+        for priority in sorted(set(urgency.values()))
+    ]
+
+
+def _keys(by_key: dict[str, Any], wanted: object) -> list[str]:
+    return [f"**/{key}/**" for key, value in by_key.items() if value == wanted]
+
+
+def _at_ingress(name: str, message: str, keys: list[str]) -> Rule:
+    return {"id": name, "messages": [message], "flows": ["ingress"], "key_exprs": keys}
+
 
 # Runs Zenoh in one thread, except for sending: a message then wakes half as many threads. The
 # variable is documented by Zenoh (zenoh_runtime::ZRuntime); a value set by the user wins.
 ZENOH_RUNTIME = "(rx: (handover: app), acc: (handover: app), net: (handover: app))"
-
 SECURE, PLAIN = "tls/", "tcp/"
 ROOMY = ("real_time", "interactive_high", "data_high", "data")
 PENDING = 4000  # links that may wait to be accepted; silent ones are dropped after a second
@@ -155,3 +205,32 @@ def _check(text: str) -> None:
         host_and_port(text)
     except ValueError as error:
         raise ConfigError(str(error)) from None
+
+
+HEADER = """\
+// A router for several robots on a host of its own. Written by:
+//   gigabrain keys zenohd{options}
+// Start: zenohd --config zenohd.json5
+"""
+
+
+def configuration(
+    robots: Sequence[str], keys: str, listen: str, generations: Mapping[str, int] = FIRST
+) -> str:
+    """A file for `zenohd --config`; `keys` is the folder of its identity on its own host."""
+    endpoint = secured(Endpoint(listen=(listen,), keys=keys, fleet=tuple(robots)))
+    settings = session_settings(endpoint) | security(endpoint, generations)
+    options = "".join(f" --robot {robot}" for robot in robots if robot)
+    return HEADER.format(options=options) + json.dumps(_nested(settings), indent=2) + "\n"
+
+
+def _nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """`{"a/b": 1}` as `{"a": {"b": 1}}`."""
+    root: dict[str, Any] = {}
+    for path, value in settings.items():
+        *parents, name = path.split("/")
+        place = root
+        for parent in parents:
+            place = place.setdefault(parent, {})
+        place[name] = value
+    return root

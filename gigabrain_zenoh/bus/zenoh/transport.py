@@ -9,14 +9,10 @@ import zenoh
 from zenoh.handlers import Callback
 
 from gigabrain_schemas.topics import Priority, Topic
-from gigabrain_zenoh.bus.bridge import Bridge
-from gigabrain_zenoh.bus.mailbox import Mailbox
-from gigabrain_zenoh.bus.questions import Questions
+from gigabrain_zenoh.bus.bridge import Bridge, Mailbox, QueryQueue
 from gigabrain_zenoh.bus.transport import Answer, Close, Link, OnLink, OnRaw, OnSample
-from gigabrain_zenoh.bus.zenoh.line import Lines
-from gigabrain_zenoh.bus.zenoh.session import open_session
-from gigabrain_zenoh.bus.zenoh.staying import stay
-from gigabrain_zenoh.bus.zenoh.unobtrusive import Nap
+from gigabrain_zenoh.bus.zenoh.session import ReconnectingSession, open_session
+from gigabrain_zenoh.bus.zenoh.workarounds import ReceiveThrottle, keep_thread_state
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import GigabrainError
 
@@ -36,14 +32,14 @@ class ZenohTransport:
     """Transport of a process, over one Zenoh session at a time."""
 
     def __init__(self, session: zenoh.Session, endpoint: Endpoint) -> None:
-        self._nap = Nap(endpoint.nap_s) if endpoint.nap_s else None
+        self._nap = ReceiveThrottle(endpoint.nap_s) if endpoint.nap_s else None
         self._bridge = Bridge()
         self._loop = asyncio.get_running_loop()
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._questions: Questions[zenoh.Query] = Questions(self._bridge, _refuse)
+        self._questions: QueryQueue[zenoh.Query] = QueryQueue(self._bridge, _refuse)
         self._asking: set[asyncio.Future[None]] = set()
         self._closed = False
-        self._lines = Lines(session, endpoint, self._bridge, self._lost)
+        self._lines = ReconnectingSession(session, endpoint, self._bridge, self._lost)
 
     @classmethod
     async def open(cls, endpoint: Endpoint) -> "ZenohTransport":
@@ -85,7 +81,7 @@ class ZenohTransport:
         """
 
         def deliver(sample: zenoh.Sample) -> None:
-            stay()
+            keep_thread_state()
             on_raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes())
 
         take = self._nap.after_each(deliver) if self._nap else deliver

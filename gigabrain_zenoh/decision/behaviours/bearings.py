@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_schemas.brain import Response
+from gigabrain_schemas.brain import ActuationModel
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.tasks.orders import Order
 from gigabrain_zenoh.navigation.moment import Sent
@@ -41,7 +41,7 @@ class Bearings:
     body: BodyDescription | None
     map_from_odom: Pose | None  # None while it is not known where in the map the robot is
     lost: str  # why not, in words
-    response: Response
+    response: ActuationModel
     sent: tuple[Sent, ...]
     order: Order | None
     route: Route | None  # for that order, once there is one

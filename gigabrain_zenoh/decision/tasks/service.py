@@ -19,7 +19,7 @@ from gigabrain_schemas.tasks import (
 )
 from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Service
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.granting import grant
+from gigabrain_zenoh.bus.input_log import log_accepted
 from gigabrain_zenoh.decision.tasks import checks
 from gigabrain_zenoh.decision.tasks.executive import Executive, Saved
 from gigabrain_zenoh.decision.tasks.mission import Mission
@@ -28,7 +28,7 @@ from gigabrain_zenoh.decision.tasks.scripts import Scripts
 from gigabrain_zenoh.decision.tasks.store import TaskFile
 from gigabrain_zenoh.decision.tasks.watching import Watched
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.host.scribe import Scribe
+from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ class TaskService:
         if problem:
             log.warning("%s", problem, extra={"data": {"event": "tasks"}})
         self._tasks = Executive(self._watched.read, self._scripts.start, saved)
-        self._scribe: Scribe[Saved] = Scribe(file.write, 1)
+        self._scribe: BackgroundWriter[Saved] = BackgroundWriter(file.write, 1)
         self._written, self._unwritable = saved, Fault(log)
         self._boot = self._tick = self._told_tick = self._basis = 0
         self._said: dict[str, str] = {}
@@ -183,7 +183,7 @@ class TaskService:
         self, of: Service[Any, Any], request: GoalRequest | MissionRequest | TaskRequest
     ) -> None:
         """Tell from when on a request counts, so that a recording holds all that we go by."""
-        grant(self._bus, of.key, request, self._basis)
+        log_accepted(self._bus, of.key, request, self._basis)
         self._tell()
 
     def _refuse(self, what: str, source: str, error: GigabrainError) -> None:

@@ -8,8 +8,7 @@ import msgspec
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.decision.tasks.executive import Saved
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.atomic_write import make_folder, replace_file
-from gigabrain_zenoh.host.bounded_file import read_bounded
+from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
 
 MOST_BYTES = 1_000_000
 

@@ -6,7 +6,7 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.topics import STATE, Topic
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.earlier import Earlier
+from gigabrain_zenoh.bus.freshness import PreviousTick
 
 
 class Watched:
@@ -14,7 +14,7 @@ class Watched:
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
-        self._heard: dict[str, Earlier[Any]] = {}
+        self._heard: dict[str, PreviousTick[Any]] = {}
         self._state: RobotState | None = None
 
     def see(self, state: RobotState) -> None:
@@ -27,7 +27,7 @@ class Watched:
         if state is None or topic.key == STATE.key:
             return state
         if topic.key not in self._heard:
-            earlier: Earlier[Any] = Earlier()
+            earlier: PreviousTick[Any] = PreviousTick()
             self._heard[topic.key] = earlier
             self._bus.subscribe(topic, lambda _key, message: earlier.receive(message))
         found: Message | None = self._heard[topic.key].at(

@@ -8,7 +8,7 @@ from multiprocessing import get_context
 
 from msgspec import Struct
 
-from gigabrain_zenoh.host.percentile import percentile
+from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.navigation import local
 from gigabrain_zenoh.qa.bench import barn_drive, barn_nodes
 from gigabrain_zenoh.qa.bench.barn_worlds import World

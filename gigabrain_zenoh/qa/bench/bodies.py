@@ -17,7 +17,7 @@ from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.qa.bench.bodies_onlooker import Onlooker
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
-from gigabrain_zenoh.runtime.keeper import ProcessSpec
+from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.ui.watch import Watch
 

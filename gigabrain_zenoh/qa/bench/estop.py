@@ -20,12 +20,12 @@ from gigabrain_zenoh.client.estop import press
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.host.percentile import percentile
+from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.qa.bench.group import Group, client, running
 from gigabrain_zenoh.qa.bench.runs import LOOPBACK
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
-from gigabrain_zenoh.runtime.keeper import ProcessSpec
+from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 
 SPEED = 0.26  # [m/s]
 FAST = 0.9  # share of it, from which on the robot counts as driving

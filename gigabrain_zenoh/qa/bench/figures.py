@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from msgspec import Struct
 
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.host.percentile import percentile
+from gigabrain_zenoh.host.bounded import percentile
 
 
 class Figures(Struct, frozen=True, kw_only=True):

@@ -14,7 +14,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.sensors import Image
 from gigabrain_schemas.topics import CMD_VEL, IMAGE
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.host import lifeline
+from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.qa.bench.group import client
 
 RATE_HZ = 100.0
@@ -37,7 +37,7 @@ async def flood(endpoint: Endpoint, ready: Callable[[], None]) -> None:
 
 def main() -> None:
     """Entry of the process."""
-    lifeline.die_with_supervisor()
+    this_process.die_with_supervisor()
     endpoint = msgspec.json.decode(sys.argv[1], type=Endpoint)
     asyncio.run(flood(endpoint, lambda: print('{"event": "ready"}', flush=True)))
     os._exit(0)  # Zenoh's threads must not keep it alive

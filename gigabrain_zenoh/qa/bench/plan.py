@@ -12,7 +12,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.percentile import percentile
+from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.navigation.costmap import Costmap, Costs, Inflation, costmap
 from gigabrain_zenoh.navigation.planner import Path, Planner, Point, warm_up
 from gigabrain_zenoh.navigation.search import Ints, Search

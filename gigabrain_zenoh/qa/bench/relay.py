@@ -22,8 +22,8 @@ from msgspec import Struct
 
 from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME, session_config
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.host import lifeline
-from gigabrain_zenoh.host.scheduling import go_first
+from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.host.this_process import go_first
 from gigabrain_zenoh.qa.bench.figures import figures
 
 STAMP_BYTES = 8
@@ -116,7 +116,7 @@ def say(record: Mapping[str, Any]) -> None:
 
 def main() -> None:
     """Entry of a process of the relay."""
-    lifeline.die_with_supervisor()
+    this_process.die_with_supervisor()
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDS)  # before Zenoh's threads inherit the mask
     role = msgspec.json.decode(sys.argv[1], type=Role)
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)

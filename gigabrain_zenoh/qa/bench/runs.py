@@ -18,7 +18,7 @@ from gigabrain_zenoh.qa.bench.figures import Figures
 from gigabrain_zenoh.qa.bench.group import Group, client, driver_report, running
 from gigabrain_zenoh.qa.bench.relay import Role
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
-from gigabrain_zenoh.runtime.keeper import ProcessSpec
+from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 
 LOOPBACK = "tcp/127.0.0.1:0"
 SETTLE_S = 1.0  # of the relay; the chain counts from when the gate opens

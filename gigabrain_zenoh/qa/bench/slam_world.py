@@ -20,7 +20,7 @@ from gigabrain_zenoh.mapping.growing import GrowingMap
 from gigabrain_zenoh.perception.mapper import view_of
 from gigabrain_zenoh.qa.bench.figures import Figures, figures
 from gigabrain_zenoh.qa.bench.growth import Growth, Watch
-from gigabrain_zenoh.runtime.health import rss_bytes
+from gigabrain_zenoh.runtime.services import rss_bytes
 
 PATIENCE_S = 60.0  # so that a slow machine makes the same map
 COLD = 20  # scans before anything is timed

@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.host import run_queue
+from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.qa.conformance import direct, line_faults, stops, timing
 from gigabrain_zenoh.qa.conformance.result import Failed, Finding, NotApplicable, Result, summary
 from gigabrain_zenoh.qa.conformance.rig import Rig
@@ -165,9 +165,9 @@ async def _found(call: Callable[[], Awaitable[Finding]]) -> Finding:
     Raises NotApplicable where that is so each time.
     """
     for _ in range(ATTEMPTS):
-        waited_ms = run_queue.waited_ms()
+        waited_ms = this_process.waited_ms()
         finding = await _tried(call)
-        waited_ms = run_queue.waited_ms() - waited_ms
+        waited_ms = this_process.waited_ms() - waited_ms
         if finding.ok or not 0 < finding.late_ms <= waited_ms:
             return finding
     raise NotApplicable(

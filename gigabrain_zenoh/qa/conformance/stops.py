@@ -36,7 +36,7 @@ async def not_a_number(rig: Rig) -> Finding:
     last, calls = rig.last, len(rig.tap.calls)
     if last is None:
         raise Failed("nothing was commanded")
-    with _unsaid("gigabrain_zenoh.bus.rejections"):
+    with _unsaid("gigabrain_zenoh.bus.bus"):
         rig.deliver({**msgspec.structs.asdict(last), "linear_x": math.nan, "seq": last.seq + 1})
         told = await rig.until(lambda: rig.tap.calls[calls:], AT_ONCE)
     zero = told is not None and rig.tap.calls[calls].asked == ZERO

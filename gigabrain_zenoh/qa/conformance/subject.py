@@ -13,7 +13,7 @@ from gigabrain_drivers.links.link import Link
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.gate.checks import at_rest
+from gigabrain_zenoh.gate.state import at_rest
 from gigabrain_zenoh.qa.conformance.result import NotApplicable
 
 REST_SPEED = 0.02  # [m/s], of the true body, below which it stands

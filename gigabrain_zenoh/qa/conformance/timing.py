@@ -4,7 +4,7 @@ import asyncio
 
 from gigabrain_schemas.base import TICK_NS, Velocity
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.host import run_queue
+from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.qa.conformance.result import Failed, Finding
 from gigabrain_zenoh.qa.conformance.rig import Rig
 from gigabrain_zenoh.qa.conformance.subject import link_of
@@ -64,7 +64,7 @@ async def latency(rig: Rig) -> Finding:
         nonlocal asked_ns
         if way == "tx" and rig.tap.speaking and asked_ns:
             took_ms = (clock.now_ns() - asked_ns) / 1e6
-            times.append(took_ms - (run_queue.own_waited_ms() - waited_ms))
+            times.append(took_ms - (this_process.own_waited_ms() - waited_ms))
             asked_ns = 0
 
     wanted = await rig.drive()
@@ -74,7 +74,7 @@ async def latency(rig: Rig) -> Finding:
         for i in range(SAMPLES):
             await rig.go_on(1)
             await asyncio.sleep(MID_TICK_S)
-            waited_ms = run_queue.own_waited_ms()
+            waited_ms = this_process.own_waited_ms()
             asked_ns = clock.now_ns()
             rig.command(Velocity(linear_x=wanted.linear_x - (i % 2) * step))
     finally:

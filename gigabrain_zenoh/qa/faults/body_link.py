@@ -15,7 +15,7 @@ from gigabrain_zenoh.qa.faults.waiting import until
 from gigabrain_zenoh.qa.line_proxy import in_front_of
 from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
-from gigabrain_zenoh.runtime.keeper import ProcessSpec
+from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 from gigabrain_zenoh.safety.following import WINDOW_TICKS
 
 CHECK = "*{crc16}"  # at the end of a command; what it costs to have none: docs/firmware_line.md

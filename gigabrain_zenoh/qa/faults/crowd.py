@@ -17,7 +17,7 @@ from gigabrain_schemas.topics import CMD_VEL, IMAGE, INTENT, SAFETY, SCAN, STATE
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.client.robot import connect
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.host.percentile import percentile
+from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.qa.faults.fault import Failed, Measured
 from gigabrain_zenoh.qa.faults.forger import forging
 from gigabrain_zenoh.qa.faults.rig import Rig

@@ -11,7 +11,6 @@ from gigabrain_schemas.requests import EnableRequest
 from gigabrain_schemas.topics import CMD_VEL, ENABLE
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.host.backoff import Backoff
 from gigabrain_zenoh.qa.faults.fault import Failed, Measured
 from gigabrain_zenoh.qa.faults.forger import forging
 from gigabrain_zenoh.qa.faults.rig import Rig, deployment_of
@@ -19,6 +18,7 @@ from gigabrain_zenoh.qa.faults.stopping import TICK_MS
 from gigabrain_zenoh.qa.faults.subject import Subject
 from gigabrain_zenoh.qa.faults.waiting import until
 from gigabrain_zenoh.runtime.deployment import client_endpoint
+from gigabrain_zenoh.runtime.managed_process import Backoff
 
 VICTIMS = ("router", "driver", "perception", "decision", "control", "safety")
 ORDERS = 60  # sampled, in the long form

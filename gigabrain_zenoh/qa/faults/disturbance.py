@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Callable, Iterable
 
-from gigabrain_zenoh.host import run_queue
+from gigabrain_zenoh.host import this_process
 
 LOOK_S = 0.1
 DISTURBED_MS = 30.0  # of 100: a tick and a half in which a part of the robot could not run
@@ -36,9 +36,12 @@ class RunQueueWatch:
         now = {
             (process, thread): waited_ns
             for process in self._processes()
-            for thread, waited_ns in run_queue.by_thread(process).items()
+            for thread, waited_ns in this_process.waited_ns_by_thread(process).items()
         }
-        now |= {("host", core): stolen_ns for core, stolen_ns in run_queue.stolen().items()}
+        now |= {
+            ("host", core): stolen_ns
+            for core, stolen_ns in this_process.stolen_ns_by_core().items()
+        }
         waits = (waited - self._before.get(thread, waited) for thread, waited in now.items())
         self.longest_ms = max(self.longest_ms, max(waits, default=0) / 1e6)
         self._before = now

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from gigabrain_zenoh.host.bounded_file import read_bounded
+from gigabrain_zenoh.host.files import read_bounded
 from gigabrain_zenoh.qa.faults.errand import waiting_robot
 from gigabrain_zenoh.qa.faults.extremes import Case, cases
 from gigabrain_zenoh.qa.faults.one_message import Outcome, sending

@@ -19,7 +19,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.host import lifeline
+from gigabrain_zenoh.host import this_process
 
 NAME = "flooder"
 URGENT = replace(CMD_VEL, priority="real_time", express=True)
@@ -56,7 +56,7 @@ async def flood(rate_hz: int, large: bytes, endpoint: Endpoint) -> None:
 
 def main() -> None:
     """Entry of the process."""
-    lifeline.die_with_supervisor()
+    this_process.die_with_supervisor()
     os.nice(19)  # it stands for somebody on another machine: its work is not to cost the robot's
     rate_hz, large_bytes, endpoint = sys.argv[1:]
     where = msgspec.json.decode(endpoint, type=Endpoint)

@@ -3,11 +3,11 @@
 import asyncio
 
 from gigabrain_schemas.body import RobotState
-from gigabrain_zenoh.host.backoff import Backoff
 from gigabrain_zenoh.qa.faults.fault import Measured, Stage
 from gigabrain_zenoh.qa.faults.rig import Rig, deployment_of
 from gigabrain_zenoh.qa.faults.subject import Subject
 from gigabrain_zenoh.qa.faults.waiting import until
+from gigabrain_zenoh.runtime.managed_process import Backoff
 
 VICTIMS: dict[Stage, tuple[str, ...]] = {
     "auto": ("perception", "decision", "control", "safety"),

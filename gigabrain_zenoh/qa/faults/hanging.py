@@ -18,8 +18,8 @@ from gigabrain_schemas.topics import SCAN, STATE, WORLD, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Close, Transport
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.config.process_config import ProcessConfig
-from gigabrain_zenoh.host import lifeline
+from gigabrain_zenoh.config.settings import ProcessConfig
+from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.launch.processes import run_process
 
 M = TypeVar("M", bound=Message)
@@ -64,7 +64,7 @@ class HangingBus(Bus):
 
 def main() -> None:
     """Entry of the process."""
-    lifeline.die_with_supervisor()
+    this_process.die_with_supervisor()
     config = msgspec.json.decode(sys.argv[1], type=ProcessConfig)
     hangs = threading.Event()
     signal.signal(signal.SIGUSR1, lambda _number, _frame: hangs.set())

@@ -9,7 +9,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 
 import psutil
 
-from gigabrain_zenoh.host import lifeline
+from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.qa.faults.fault import Failed
 from gigabrain_zenoh.qa.faults.tampered import MODULES
 
@@ -20,7 +20,7 @@ async def helper(module: str, *words: str) -> AsyncIterator[asyncio.subprocess.P
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-P", "-m", MODULES + module, *words),
         stdout=asyncio.subprocess.PIPE,
-        env=os.environ | {lifeline.VARIABLE: str(os.getpid())},
+        env=os.environ | {this_process.SUPERVISOR_VARIABLE: str(os.getpid())},
     )
     try:
         yield process

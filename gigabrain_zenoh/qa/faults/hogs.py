@@ -8,7 +8,7 @@ import json
 import sys
 from collections.abc import Callable
 
-from gigabrain_zenoh.host import lifeline
+from gigabrain_zenoh.host import this_process
 
 MEMORY_MB = 256
 OBJECTS = 1_000_000
@@ -49,7 +49,7 @@ KINDS: dict[str, Callable[[], None]] = {
 
 def main() -> None:
     """Entry of the process."""
-    lifeline.die_with_supervisor()
+    this_process.die_with_supervisor()
     KINDS[sys.argv[1]]()
 
 

@@ -11,7 +11,7 @@ from gigabrain_schemas.audit import AuditRequest
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.topics import AUDIT_LOG, STATE
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.host.percentile import percentile
+from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.qa.faults.estop import Presses
 from gigabrain_zenoh.qa.faults.fault import Failed, Measured
 from gigabrain_zenoh.qa.faults.flooder import NAME

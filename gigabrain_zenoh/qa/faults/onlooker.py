@@ -32,7 +32,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.host.percentile import percentile
+from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.qa.faults.fault import Failed
 from gigabrain_zenoh.qa.faults.waiting import PATIENCE_S, until
 

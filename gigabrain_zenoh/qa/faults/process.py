@@ -14,7 +14,7 @@ from gigabrain_zenoh.qa.faults.rig import Rig, deployment_of
 from gigabrain_zenoh.qa.faults.stopping import TICK_MS, Stop, creep, stop_by
 from gigabrain_zenoh.qa.faults.subject import Subject
 from gigabrain_zenoh.qa.faults.waiting import until
-from gigabrain_zenoh.runtime.keeper import ProcessSpec
+from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 
 RESTED_TICKS = 50  # how long a robot has to stand after all is well again
 FROZEN_TICKS, FROZEN_LONG_TICKS = 250, 3000  # 5 s, 60 s

@@ -7,10 +7,10 @@ from typing import Literal, Self
 
 from gigabrain_drivers.emulators.emulator import wire_of
 from gigabrain_zenoh.config.settings import DecisionConfig, LinkName, PerceptionConfig, Resume
-from gigabrain_zenoh.host.backoff import Backoff
 from gigabrain_zenoh.qa.faults.fault import Skipped, Stage
 from gigabrain_zenoh.qa.faults.subject import TIRELESS, Change, Subject
 from gigabrain_zenoh.runtime.deployment import Deployment
+from gigabrain_zenoh.runtime.managed_process import Backoff
 
 SPEED = 0.26  # [m/s], of all tests that do not say otherwise
 BODIES: dict[Stage, str] = {

@@ -13,8 +13,8 @@ from unittest import mock
 
 import msgspec
 
-from gigabrain_zenoh.config.process_config import ProcessConfig
-from gigabrain_zenoh.host import lifeline
+from gigabrain_zenoh.config.settings import ProcessConfig
+from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.launch.processes import run_process
 
 HOUR_NS, YEAR_NS = 3_600_000_000_000, 31_557_600_000_000_000
@@ -48,7 +48,7 @@ RATES: dict[str, Shift] = {"jumps": lambda since_ns: 0, "other-host": drift}
 
 def main() -> None:
     """Entry of the process."""
-    lifeline.die_with_supervisor()
+    this_process.die_with_supervisor()
     config = msgspec.json.decode(sys.argv[2], type=ProcessConfig)
     with clocks(WALLS[sys.argv[1]], RATES[sys.argv[1]]):
         code = run_process(config)

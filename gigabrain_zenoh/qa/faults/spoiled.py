@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import msgspec
 
-from gigabrain_zenoh.config.process_config import ProcessConfig
-from gigabrain_zenoh.config.settings import Endpoint, Resume
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig, Resume
 from gigabrain_zenoh.qa.faults.rig import Rig, deployment_of
 from gigabrain_zenoh.qa.faults.subject import Subject
 from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
 from gigabrain_zenoh.runtime.deployment import client_endpoint, with_free_port
-from gigabrain_zenoh.runtime.keeper import ProcessSpec
+from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 
 HOLE = Chaos(hole=True)
 

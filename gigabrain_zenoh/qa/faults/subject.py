@@ -13,15 +13,14 @@ from typing import Any, Self
 import msgspec
 
 from gigabrain_zenoh.client.robot import Robot
-from gigabrain_zenoh.config.process_config import ProcessConfig
+from gigabrain_zenoh.config.settings import ProcessConfig
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.host.backoff import Backoff
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.qa.faults.fault import Failed
 from gigabrain_zenoh.qa.faults.onlooker import Onlooker, looking_on
 from gigabrain_zenoh.qa.faults.waiting import until
 from gigabrain_zenoh.runtime.deployment import EMULATOR, Deployment, client_endpoint, with_free_port
-from gigabrain_zenoh.runtime.keeper import ProcessSpec
+from gigabrain_zenoh.runtime.managed_process import Backoff, ProcessSpec
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 
 Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]

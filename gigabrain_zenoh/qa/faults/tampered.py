@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from gigabrain_zenoh.qa.faults.rig import Rig, deployment_of
 from gigabrain_zenoh.qa.faults.subject import Change, Subject
-from gigabrain_zenoh.runtime.keeper import ProcessSpec
+from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 
 MODULES = "gigabrain_zenoh.qa.faults."
 

@@ -26,8 +26,8 @@ from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Transport
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.config.process_config import ProcessConfig
-from gigabrain_zenoh.host import lifeline
+from gigabrain_zenoh.config.settings import ProcessConfig
+from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.launch.processes import run_process
 
 Ranges = NDArray[np.float32]
@@ -139,7 +139,7 @@ def tampering_bus(steps: Steps, transport: Transport, clock: Clock, name: str) -
 
 def main() -> None:
     """Entry of the process."""
-    lifeline.die_with_supervisor()
+    this_process.die_with_supervisor()
     config = msgspec.json.decode(sys.argv[2], type=ProcessConfig)
     steps = Steps(sys.argv[1])
 

@@ -7,7 +7,7 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host.bounded_file import read_bounded
+from gigabrain_zenoh.host.files import read_bounded
 from gigabrain_zenoh.qa.faults.fault import Fault, Try
 from gigabrain_zenoh.qa.faults.rig import Options
 

@@ -19,8 +19,8 @@ from gigabrain_zenoh.qa.faults.waiting import PATIENCE_S
 from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
 from gigabrain_zenoh.runtime.deployment import Deployment, with_free_port
+from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.authority import issue, new_fleet
-from gigabrain_zenoh.security.roles import Role
 
 ROLES: tuple[Role, ...] = ("robot", "brain", "operator", "viewer")
 FLIPS = (1e-4, 1e-3)  # of each byte

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Collection
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.host import heap
+from gigabrain_zenoh.host import this_process
 
 log = logging.getLogger(__name__)
 
@@ -149,7 +149,7 @@ class Front:
                 await asyncio.gather(*ways, return_exceptions=True)
         finally:
             self._viewers -= 1
-            asyncio.get_running_loop().call_later(GONE_S, heap.trim)
+            asyncio.get_running_loop().call_later(GONE_S, this_process.trim_heap)
 
 
 async def _pour(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from gigabrain_zenoh.config.settings import FoxgloveConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.logs import state_dir
-from gigabrain_zenoh.security.files import made_once
+from gigabrain_zenoh.host.run_folders import state_dir
+from gigabrain_zenoh.security.identity_files import made_once
 
 SECRET_BYTES = 24
 PLACE = "TOPIC_TO_STEER"  # in the package's file, where the topic belongs

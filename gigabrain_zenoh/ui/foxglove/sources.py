@@ -28,7 +28,7 @@ from gigabrain_schemas.topics import (
     Topic,
 )
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.sampled import Sampled
+from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn
 
 SAMPLED: tuple[Topic[Any], ...] = (STATE, SCAN, WORLD, INTENT, POSE, SAFETY, CMD_VEL)

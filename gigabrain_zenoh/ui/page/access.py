@@ -12,11 +12,11 @@ import msgspec
 from msgspec import Struct
 
 from gigabrain_zenoh.codec import DECODE_ERRORS
-from gigabrain_zenoh.config.addresses import is_ip, is_loopback
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.logs import state_dir
-from gigabrain_zenoh.security.files import made_once
+from gigabrain_zenoh.host.network import is_ip, is_loopback
+from gigabrain_zenoh.host.run_folders import state_dir
+from gigabrain_zenoh.security.identity_files import made_once
 
 Role = Literal["operator", "viewer"]
 LOOPBACK_NAMES = ("127.0.0.1", "localhost", "::1")

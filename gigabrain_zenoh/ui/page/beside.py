@@ -5,7 +5,7 @@ import contextlib
 from msgspec.structs import replace
 
 from gigabrain_zenoh.config.settings import PageConfig
-from gigabrain_zenoh.host.free_port import reserve_port
+from gigabrain_zenoh.host.network import reserve_port
 from gigabrain_zenoh.runtime.deployment import Deployment
 from gigabrain_zenoh.ui.page.access import token_file, tokens
 from gigabrain_zenoh.ui.page.node import INSTALL, installed

@@ -27,8 +27,8 @@ from gigabrain_schemas.topics import (
     WORLD,
 )
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.sampled import Sampled
-from gigabrain_zenoh.host.bounded import put
+from gigabrain_zenoh.bus.listening import Sampled
+from gigabrain_zenoh.host.bounded import put_newest
 from gigabrain_zenoh.ui.page import wire
 
 PROCESSES = 64  # whose health is shown
@@ -115,7 +115,7 @@ class Scene:
 
     def _hear_health(self, _key: str, health: Health) -> None:
         frame = wire.as_json(wire.HEALTH, health)
-        put(self._health, health.process, frame, PROCESSES)
+        put_newest(self._health, health.process, frame, PROCESSES)
         self._tell(f"health/{health.process}", frame)
 
     def _hear_line(self, _key: str, line: LogRecord) -> None:

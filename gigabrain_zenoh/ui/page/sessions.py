@@ -7,13 +7,13 @@ import logging
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from gigabrain_zenoh.plugins import package_version
 from gigabrain_zenoh.ui.page import wire
 from gigabrain_zenoh.ui.page.access import Access, Role
 from gigabrain_zenoh.ui.page.operator import Operator
 from gigabrain_zenoh.ui.page.scene import Scene
 from gigabrain_zenoh.ui.page.viewer import Viewer
 from gigabrain_zenoh.ui.seat import Seat
-from gigabrain_zenoh.version import __version__
 
 log = logging.getLogger(__name__)
 
@@ -134,7 +134,7 @@ class Sessions:
         about = wire.About(
             role=viewer.role,
             viewer=viewer.number,
-            version=__version__,
+            version=package_version(),
             body=body.description if body else None,
             link=body.link if body else "",
         )

@@ -3,8 +3,7 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from gigabrain_zenoh.bus.bridge import Bridge
-from gigabrain_zenoh.bus.mailbox import Mailbox
+from gigabrain_zenoh.bus.bridge import Bridge, Mailbox
 from gigabrain_zenoh.testing.waiting import in_thread, until
 
 

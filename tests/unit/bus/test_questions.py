@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 
 from gigabrain_schemas.topics import ESTOP, SERVICES
-from gigabrain_zenoh.bus.bridge import Bridge
+from gigabrain_zenoh.bus.bridge import Bridge, QueryQueue
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.questions import Questions
 from gigabrain_zenoh.bus.transport import LocalNetwork, LocalTransport
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.testing.waiting import in_thread, until
@@ -24,7 +23,7 @@ class Rig:
         self.at_turn: dict[str, int] = {}
         self.goes_on = asyncio.Event()
         self.goes_on.set()
-        self.questions: Questions[str] = Questions(self.bridge, self.refused.append)
+        self.questions: QueryQueue[str] = QueryQueue(self.bridge, self.refused.append)
         self.describe, self.close_describe = self.questions.serve(self._answer, urgent=False)
         self.goal, _ = self.questions.serve(self._answer, urgent=False)
         self.estop, _ = self.questions.serve(self._answer, urgent=True)

@@ -9,9 +9,8 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.topics import STATE
 from gigabrain_zenoh import codec
-from gigabrain_zenoh.bus.earlier import Earlier
-from gigabrain_zenoh.bus.freshness import RobotTime
-from gigabrain_zenoh.bus.sampled import Sampled
+from gigabrain_zenoh.bus.freshness import PreviousTick, RobotTime
+from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.errors import ClockLost
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.samples import BOOT, open_space, scan, state
@@ -97,7 +96,7 @@ def test_time_does_not_go_back(time: RobotTime) -> None:
 
 
 def test_what_came_before_is_still_known_after_a_message_of_the_future() -> None:
-    places: Earlier[PoseInMap] = Earlier()
+    places: PreviousTick[PoseInMap] = PreviousTick()
 
     def place(tick: int) -> PoseInMap:
         return PoseInMap(x=0.0, y=0.0, yaw=0.0, covariance=(0.0,) * 9, boot=BOOT, tick=tick)

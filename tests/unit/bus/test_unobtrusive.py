@@ -1,6 +1,6 @@
 """Those who only look on wake seldom."""
 
-from gigabrain_zenoh.bus.zenoh.unobtrusive import Nap
+from gigabrain_zenoh.bus.zenoh.workarounds import ReceiveThrottle
 
 
 class Thread:
@@ -8,7 +8,7 @@ class Thread:
 
     def __init__(self) -> None:
         self.now_s, self.slept_s, self.got = 100.0, list[float](), list[str]()
-        nap = Nap(0.04, lambda: self.now_s, self._sleep)
+        nap = ReceiveThrottle(0.04, lambda: self.now_s, self._sleep)
         self._take = nap.after_each(self.got.append)
 
     def _sleep(self, seconds: float) -> None:

@@ -8,8 +8,8 @@ import pytest
 import zenoh
 
 from gigabrain_zenoh.bus.bridge import Bridge
-from gigabrain_zenoh.bus.zenoh import line as zenoh_line
-from gigabrain_zenoh.bus.zenoh.line import Lines
+from gigabrain_zenoh.bus.zenoh import session as zenoh_line
+from gigabrain_zenoh.bus.zenoh.session import ReconnectingSession
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.testing.waiting import until
 
@@ -66,7 +66,9 @@ class World:
         monkeypatch.setattr(zenoh_line, "close_session", self._close)
         monkeypatch.setattr(zenoh_line, "AGAIN_S", 0.0)
         first: Any = sessions[0]
-        self.lines = Lines(first, Endpoint(connect=("tcp/127.0.0.1:1",)), Bridge(), self._count)
+        self.lines = ReconnectingSession(
+            first, Endpoint(connect=("tcp/127.0.0.1:1",)), Bridge(), self._count
+        )
         for name in ("scan", "state"):
             self.lines.declare(lambda line, name=name: line.session.declare(name))
 

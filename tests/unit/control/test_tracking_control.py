@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_schemas.brain import Response
+from gigabrain_schemas.brain import ActuationModel
 from tests.unit.control.tracking import AGILE, SLOW, Course, Path, Plant, errors, ess
 
 SIDEWAYS = replace(AGILE, drive_type="omni", max_lateral_speed=1.0)
@@ -72,15 +72,18 @@ def test_a_body_that_slips_as_it_turns_is_told_to_turn_more(slip: float) -> None
 
 
 @pytest.mark.parametrize(
-    "believed", [Response(delay=0.04, lag=0.15), Response(delay=0.1, lag=0.06), Response()]
+    "believed",
+    [ActuationModel(delay=0.04, lag=0.15), ActuationModel(delay=0.1, lag=0.06), ActuationModel()],
 )
 def test_with_a_response_that_is_not_the_bodys_it_is_still_better_than_the_twist(
-    believed: Response,
+    believed: ActuationModel,
 ) -> None:
     assert max(errors(Course(ess, 11.0), Plant(), 8.0, response=believed)) < 0.1
 
 
-@pytest.mark.parametrize("response", [Response(), Response(delay=0.3, lag=0.0), Response(lag=0.5)])
-def test_bodies_without_delay_or_lag_and_slow_ones_are_driven_too(response: Response) -> None:
+@pytest.mark.parametrize(
+    "response", [ActuationModel(), ActuationModel(delay=0.3, lag=0.0), ActuationModel(lag=0.5)]
+)
+def test_bodies_without_delay_or_lag_and_slow_ones_are_driven_too(response: ActuationModel) -> None:
     plant = Plant(response=response)
     assert max(errors(Course(ess, 11.0), plant, 8.0, response=response)[150:]) < 0.04

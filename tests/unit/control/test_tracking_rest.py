@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose, Velocity
-from gigabrain_schemas.brain import Response, TrajectoryPoint
+from gigabrain_schemas.brain import ActuationModel, TrajectoryPoint
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, STATE
 from gigabrain_zenoh.control import node as control
@@ -83,7 +83,7 @@ async def test_the_process_brakes_and_says_so_once_when_it_is_too_far_off(
             now = state(tick, v=speeds[-1] if speeds else 0.0, pose=(x, 0.0, 0.0))
             bench.send(STATE, now)
             basis = max(1, 10 * ((tick - 1) // 10))  # of the jump decision does not know yet
-            bench.send(INTENT, replace(course.intent(basis, Response()), tick=tick))
+            bench.send(INTENT, replace(course.intent(basis, ActuationModel()), tick=tick))
             speeds += [command.linear_x for command in bench.sent(CMD_VEL)][-1:]
     assert [record.message for record in caplog.records] == [
         "braking: too far off the trajectory",
@@ -131,7 +131,7 @@ def test_asked_again_within_a_tick_it_answers_the_same() -> None:
 def test_a_response_beyond_reason_makes_no_command_beyond_reason() -> None:
     plant, course = Plant(), Course(ess, 11.0)
     errors(course, plant, 2.0)
-    mad = Response(delay=1e9, lag=1e9, turn_gain=1e-310)
+    mad = ActuationModel(delay=1e9, lag=1e9, turn_gain=1e-310)
     still = replace(course.intent(plant.tick, mad), trajectory=(TrajectoryPoint(60.0, 0, 0, 0),))
     assert max(abs(plant.go(still).linear_x) for _ in range(5)) <= 0.52
     assert all(math.isfinite(plant.go(still).angular_z) for _ in range(5))

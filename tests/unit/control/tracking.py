@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_schemas.brain import CmdVel, Intent, Response, TrajectoryPoint
+from gigabrain_schemas.brain import ActuationModel, CmdVel, Intent, TrajectoryPoint
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_zenoh.control.node import Inputs, Memory, step
 from gigabrain_zenoh.geometry.planar import compose, relative
@@ -17,7 +17,7 @@ from gigabrain_zenoh.testing.samples import WAFFLE, state
 AGILE = replace(
     WAFFLE, max_linear_speed=1.0, max_linear_acceleration=2.0, max_angular_acceleration=6
 )
-SLOW = Response(delay=0.1, lag=0.15)
+SLOW = ActuationModel(delay=0.1, lag=0.15)
 
 Motion = tuple[Pose, Velocity]
 Path = Callable[[float], Velocity]  # velocity in the body's frame at a time [s]
@@ -37,7 +37,7 @@ class Course:
     def at(self, t: float) -> Motion:
         return self.poses[min(round(t * 1000), len(self.poses) - 1)], self._velocity(t)
 
-    def intent(self, tick: int, response: Response, *, follow: bool = True) -> Intent:
+    def intent(self, tick: int, response: ActuationModel, *, follow: bool = True) -> Intent:
         """What decision would say in this tick: the next 2 s, as seen from where it should be."""
         here, now = self.at(tick * 0.02)
         points = []
@@ -68,7 +68,7 @@ class Plant:
     def __init__(
         self,
         body: BodyDescription = AGILE,
-        response: Response = SLOW,
+        response: ActuationModel = SLOW,
         *,
         gain: float = 1.0,
         slip: float = 1.0,
@@ -107,7 +107,7 @@ def errors(
     seconds: float,
     *,
     follow: bool = True,
-    response: Response = SLOW,
+    response: ActuationModel = SLOW,
     late: int = 1,
 ) -> list[float]:
     """How far the body is from where it should be, tick by tick [m]; ten intents a second.

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.body import GateStatus
-from gigabrain_schemas.brain import CmdVel, Response
+from gigabrain_schemas.brain import ActuationModel, CmdVel
 from gigabrain_zenoh.decision.response import PRIOR, ResponseEstimator
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, state
 
@@ -36,7 +36,7 @@ class Plant:
 
     def drive(
         self, v: float, w: float, ticks: int, *, gate: GateStatus = DRIVING, source: str = "control"
-    ) -> Response:
+    ) -> ActuationModel:
         """So many ticks on the way to a speed, with ramps as control makes them."""
         for _ in range(ticks):
             self.tick += 1
@@ -54,7 +54,7 @@ class Plant:
                 self.w += (self._gain[1] * now_w - self.w) * self._follows
         return self.estimator.response
 
-    def wander(self, legs: int) -> Response:
+    def wander(self, legs: int) -> ActuationModel:
         """Another speed every half a second."""
         wishes = itertools.cycle([(0.4, 0.0), (0.1, 0.9), (0.5, -0.5), (0.0, -0.9), (0.3, 0.4)])
         for v, w in itertools.islice(wishes, legs):

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest, Granted
-from gigabrain_schemas.topics import GRANTED
+from gigabrain_schemas.input_log import AcceptedRequest
+from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest
+from gigabrain_schemas.topics import REQUEST_LOG
 from gigabrain_zenoh.decision.tasks import checks, service
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.tasks.orders import GoTo, Outcome
@@ -189,8 +190,8 @@ async def test_a_disk_that_cannot_be_written_is_told_and_the_robot_goes_on(
 async def test_what_was_granted_is_told_with_the_tick_and_the_world_from_which_it_counts(
     site: Site,
 ) -> None:
-    told: list[Granted] = []
-    site.net.two.subscribe(GRANTED, lambda _key, granted: told.append(granted))
+    told: list[AcceptedRequest] = []
+    site.net.two.subscribe(REQUEST_LOG, lambda _key, granted: told.append(granted))
     await site.step()
     site.service.step(state(7), None, basis=5)
     site.net.one.time.see(state(7))

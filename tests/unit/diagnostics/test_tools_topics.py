@@ -29,8 +29,7 @@ from gigabrain_zenoh.diagnostics.tally import Tally
 from gigabrain_zenoh.diagnostics.topic_table import about, rows
 from gigabrain_zenoh.diagnostics.topic_watch import Shown, echo, in_words, shown
 from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName
-from gigabrain_zenoh.runtime.health import publish_health
-from gigabrain_zenoh.runtime.name_claim import NameClaim
+from gigabrain_zenoh.runtime.services import NameClaim, publish_health
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.waiting import settle
 

@@ -42,7 +42,7 @@ from gigabrain_zenoh.diagnostics.top_rows import (
     topic_row,
 )
 from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
-from gigabrain_zenoh.runtime.param_service import serve_params
+from gigabrain_zenoh.runtime.services import serve_params
 from gigabrain_zenoh.testing.bus import Net
 
 FLOWS = [

@@ -20,8 +20,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.diagnostics.why import LINKS, Verdict, judge
 from gigabrain_zenoh.diagnostics.why_facts import Facts, Watcher
 from gigabrain_zenoh.gate.causes import estop
-from gigabrain_zenoh.runtime.health import publish_health
-from gigabrain_zenoh.runtime.name_claim import NameClaim
+from gigabrain_zenoh.runtime.services import NameClaim, publish_health
 from gigabrain_zenoh.testing.brain import RobotInMemory
 
 Break = Callable[[RobotInMemory], Awaitable[None]]

@@ -13,8 +13,8 @@ from gigabrain_drivers.driver.button_watch import ButtonWatch
 from gigabrain_drivers.echo_loop import EchoLoop
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_schemas.body import GateStatus
-from gigabrain_schemas.button import ButtonState
 from gigabrain_schemas.requests import EstopRequest, GateReply
+from gigabrain_schemas.safety import ButtonState
 from gigabrain_schemas.topics import BUTTON, ESTOP
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork

@@ -13,7 +13,7 @@ from gigabrain_schemas.audit import AuditRecord
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, ESTOP_SAID, RELEASE
-from gigabrain_zenoh.runtime.audit_file import read
+from gigabrain_zenoh.runtime.audit import read_audit
 from gigabrain_zenoh.testing.brain import RobotInMemory
 from gigabrain_zenoh.testing.samples import TICK_NS
 
@@ -112,7 +112,7 @@ async def test_an_e_stop_is_on_disk_when_it_is_confirmed(tmp_path: Path) -> None
         on_disk = LatchFile(tmp_path).read()
         assert (on_disk.estop_generation, on_disk.causes[0].code) == (1, "estop")
         assert await robot.go(1) == [0.0]
-    entries = read(tmp_path, 1000)
+    entries = read_audit(tmp_path, 1000)
     assert [(e.what, e.source, e.text) for e in entries if e.what == "estop"] == [
         ("estop", "ann", "stopped and latched; e-stop number 1, a child")
     ]

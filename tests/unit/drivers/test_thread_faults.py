@@ -17,8 +17,7 @@ from gigabrain_schemas.topics import CMD_VEL
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork, LocalTransport
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.config.process_config import ProcessConfig
-from gigabrain_zenoh.config.settings import DriverConfig, Endpoint
+from gigabrain_zenoh.config.settings import DriverConfig, Endpoint, ProcessConfig
 from gigabrain_zenoh.runtime import process
 from gigabrain_zenoh.testing.waiting import until
 

@@ -5,7 +5,7 @@ import pytest
 
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.se2 import between, compose
-from gigabrain_zenoh.host.background import Background
+from gigabrain_zenoh.host.threads import ScheduledWorker
 from gigabrain_zenoh.mapping.growing import GrowingMap
 from tests.unit.mapping.houses import HALL, HOUSE, PATIENCE_S, Rooms, Walker, at, error, grown
 
@@ -151,7 +151,7 @@ def test_the_same_drive_gives_the_same_map_bit_for_bit() -> None:
 
 
 def test_work_beside_counts_at_the_scan_that_was_fixed_for_it() -> None:
-    background, taken = Background(PATIENCE_S), []
+    background, taken = ScheduledWorker(PATIENCE_S), []
     background.start(lambda: lambda: taken.append("now"), 3)
     for scan in range(1, 5):
         background.at_scan()
@@ -161,7 +161,7 @@ def test_work_beside_counts_at_the_scan_that_was_fixed_for_it() -> None:
 
 
 def test_work_that_failed_is_raised_at_its_scan() -> None:
-    background = Background(PATIENCE_S)
+    background = ScheduledWorker(PATIENCE_S)
 
     def fail() -> None:
         raise ValueError("broken")

@@ -12,11 +12,11 @@ from gigabrain_drivers.driver.latch import Latched, LatchFile
 from gigabrain_zenoh.decision.tasks.executive import Saved
 from gigabrain_zenoh.decision.tasks.store import TaskFile
 from gigabrain_zenoh.gate.causes import estop
-from gigabrain_zenoh.host import atomic_write
+from gigabrain_zenoh.host import files
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.security.list_file import LIST
-from gigabrain_zenoh.security.revoked import write_list
+from gigabrain_zenoh.security.authority import write_list
+from gigabrain_zenoh.security.identity_files import LIST
 
 
 class Disk:
@@ -61,36 +61,36 @@ def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Disk:
 def test_what_replace_file_has_written_survives_a_power_cut(tmp_path: Path, disk: Disk) -> None:
     path = tmp_path / "note"
     for content in (b"one", b"two"):
-        atomic_write.replace_file(path, content)
+        files.replace_file(path, content)
         assert disk.left(path) == content
     assert [file.name for file in tmp_path.iterdir()] == ["note"]
 
 
 def test_on_a_full_disk_the_old_content_stays_and_no_draft(tmp_path: Path, disk: Disk) -> None:
     path = tmp_path / "note"
-    atomic_write.replace_file(path, b"one")
+    files.replace_file(path, b"one")
     disk.full = True
     with pytest.raises(OSError, match="No space left"):
-        atomic_write.replace_file(path, b"two")
+        files.replace_file(path, b"two")
     assert path.read_bytes() == b"one"
     assert [file.name for file in tmp_path.iterdir()] == ["note"]
 
 
 def test_a_file_is_created_once_whole_and_private(tmp_path: Path, disk: Disk) -> None:
     path = tmp_path / "tokens"
-    atomic_write.create_file(path, b"secret", 0o600)
+    files.create_file(path, b"secret", 0o600)
     assert disk.left(path) == b"secret"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     with pytest.raises(FileExistsError):
-        atomic_write.create_file(path, b"other", 0o600)
+        files.create_file(path, b"other", 0o600)
     assert path.read_bytes() == b"secret"
     assert [file.name for file in tmp_path.iterdir()] == ["tokens"]
 
 
 def test_a_new_folder_survives_with_all_its_parents(tmp_path: Path, disk: Disk) -> None:
     path = tmp_path / "a" / "b" / "note"
-    atomic_write.make_folder(path.parent)
-    atomic_write.replace_file(path, b"one")
+    files.make_folder(path.parent)
+    files.replace_file(path, b"one")
     assert disk.left(path) == b"one"
 
 

@@ -5,8 +5,8 @@ from msgspec.structs import replace
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import BODY, HEALTH
-from gigabrain_zenoh.host.bounded import put
-from gigabrain_zenoh.host.journal import MOST_KEYS, SaidJournal
+from gigabrain_zenoh.bus.input_log import MOST_KEYS, PublishedInputLogger
+from gigabrain_zenoh.host.bounded import put_newest
 from gigabrain_zenoh.safety.host import Host
 from gigabrain_zenoh.safety.senses import Senses
 from gigabrain_zenoh.testing.bus import Net
@@ -25,15 +25,15 @@ def health(name: str) -> Health:
 def test_the_oldest_gives_way() -> None:
     held: dict[str, int] = {}
     for n, key in enumerate("abcad"):
-        put(held, key, n, 3)
+        put_newest(held, key, n, 3)
     assert held == {"c": 2, "a": 3, "d": 4}
 
 
-def test_a_journal_keeps_the_newest_number_of_so_many_keys() -> None:
-    journal = SaidJournal(lambda _: None, lambda: 0)
+def test_an_input_log_keeps_the_newest_number_of_so_many_keys() -> None:
+    input_log = PublishedInputLogger(lambda _: None, lambda: 0)
     for n in range(10_000):
-        journal.note(f"robot/health/{n}", 1)
-    assert len(journal._last) == MOST_KEYS == 512
+        input_log.note(f"robot/health/{n}", 1)
+    assert len(input_log._last) == MOST_KEYS == 512
 
 
 async def test_who_watches_keeps_the_health_of_64_processes() -> None:

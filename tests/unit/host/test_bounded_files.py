@@ -20,7 +20,7 @@ from gigabrain_drivers.links.address import written
 from gigabrain_drivers.links.link import LinkProblem
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_zenoh.config import loading as config
-from gigabrain_zenoh.config.places import located
+from gigabrain_zenoh.config.loading import located
 from gigabrain_zenoh.decision.tasks import checks
 from gigabrain_zenoh.decision.tasks.executive import Saved
 from gigabrain_zenoh.decision.tasks.store import TaskFile
@@ -31,10 +31,10 @@ from gigabrain_zenoh.qa.bench import slam_logs
 from gigabrain_zenoh.qa.faults.rig import Options
 from gigabrain_zenoh.qa.faults.tries_file import TriesFile
 from gigabrain_zenoh.recording.bag_reader import MAGIC, Bag, BagDamage, read_records
-from gigabrain_zenoh.runtime import audit_file
+from gigabrain_zenoh.runtime import audit
 from gigabrain_zenoh.runtime.deployment import Deployment, load_deployment
-from gigabrain_zenoh.security import files, identity
-from gigabrain_zenoh.security.list_file import LIST, generations_in
+from gigabrain_zenoh.security import identity, identity_files
+from gigabrain_zenoh.security.identity_files import LIST, generations_in
 
 YAML = "image: x\nresolution: 0.05\norigin: [0, 0, 0]\n"
 
@@ -96,7 +96,7 @@ def read_run(path: Path) -> object:
 def read_audit(path: Path) -> object:
     (path.parent / "audit").mkdir()
     path.rename(path.parent / "audit" / "gate-000001.jsonl")
-    return audit_file.read(path.parent, 10)
+    return audit.read_audit(path.parent, 10)
 
 
 def read_tries(path: Path) -> object:
@@ -104,7 +104,7 @@ def read_tries(path: Path) -> object:
 
 
 def read_secret(path: Path) -> object:
-    return files.made_once(path, b"secret")
+    return identity_files.made_once(path, b"secret")
 
 
 READERS: tuple[Callable[[Path], object], ...] = (

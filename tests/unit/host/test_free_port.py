@@ -6,7 +6,7 @@ import sys
 import pytest
 import zenoh
 
-from gigabrain_zenoh.host.free_port import reserve_port
+from gigabrain_zenoh.host.network import reserve_port
 
 HOST = "127.0.0.1"
 ASKED = 20_000  # times, of some 28,000 ports that there are to give

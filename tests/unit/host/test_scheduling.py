@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from gigabrain_zenoh.host.scheduling import step_aside
+from gigabrain_zenoh.host.this_process import step_aside
 from gigabrain_zenoh.launch.processes import PROCESSES
 from gigabrain_zenoh.testing.waiting import in_thread
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from gigabrain_zenoh.host.scribe import Scribe
+from gigabrain_zenoh.host.threads import BackgroundWriter
 
 
 async def test_who_waits_hears_of_any_exception_and_the_next_is_written() -> None:
@@ -14,7 +14,7 @@ async def test_who_waits_hears_of_any_exception_and_the_next_is_written() -> Non
         written.append(items)
         return ""
 
-    scribe = Scribe(write, room=4)
+    scribe = BackgroundWriter(write, room=4)
     assert await scribe.put(1) == "ValueError: cannot encode that"
     assert await scribe.put(2) == ""
     assert written == [(2,)]

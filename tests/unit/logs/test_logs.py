@@ -16,6 +16,7 @@ import pytest
 
 from gigabrain_zenoh import logs
 from gigabrain_zenoh.errors import ConfigError, UnknownName
+from gigabrain_zenoh.host import run_folders
 
 log = logging.getLogger("a.module")
 
@@ -182,7 +183,7 @@ def test_a_run_folder_that_cannot_be_written_is_refused_in_one_line(tmp_path: Pa
     with pytest.raises(ConfigError, match=said):
         logs.setup("control", tmp_path / "file" / "run", json_console=True)
     with pytest.raises(ConfigError, match="Not a directory"):
-        logs.new_run_dir(tmp_path / "file", "demo")
+        run_folders.new_run_dir(tmp_path / "file", "demo")
     (tmp_path / "control.jsonl").mkdir()
     with pytest.raises(ConfigError, match="Is a directory"):
         logs.setup("control", tmp_path, json_console=True)
@@ -207,7 +208,7 @@ def test_a_run_folder_is_named_by_time_label_and_pid(
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     monkeypatch.setattr("os.getpid", lambda: 42)
-    first, second = (logs.new_run_dir(None, "demo random:7") for _ in range(2))
+    first, second = (run_folders.new_run_dir(None, "demo random:7") for _ in range(2))
     assert first.parent == tmp_path / "gigabrain" / "runs"
     assert re.fullmatch(r"\d{8}T\d{6}Z-demo-random-7-42", first.name)
     assert first.is_dir()
@@ -221,7 +222,7 @@ def test_without_a_usable_state_folder_the_home_holds_the_runs(
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", given)
     monkeypatch.setenv("HOME", str(tmp_path))
-    made = logs.new_run_dir(None, "up")
+    made = run_folders.new_run_dir(None, "up")
     assert made.parent == tmp_path / ".local" / "state" / "gigabrain" / "runs"
 
 
@@ -232,7 +233,7 @@ def test_without_a_home_it_says_what_to_set(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setenv("XDG_STATE_HOME", "")
     monkeypatch.setattr(os.path, "expanduser", no_home)
     with pytest.raises(ConfigError, match="set XDG_STATE_HOME"):
-        logs.new_run_dir(None, "up")
+        run_folders.new_run_dir(None, "up")
 
 
 def test_a_fault_is_logged_once_when_it_begins_and_once_when_it_ends(stderr: Said) -> None:

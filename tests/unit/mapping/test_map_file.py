@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.requests import MapRequest
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.host import atomic_write
+from gigabrain_zenoh.host import files
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.map_file import SavedMap
 
@@ -209,7 +209,7 @@ def test_a_save_that_fails_half_way_leaves_the_old_map(
     def full(_fd: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(atomic_write.os, "fsync", full)
+    monkeypatch.setattr(files.os, "fsync", full)
     with pytest.raises(Refused, match="No space left on device"):
         map_file.save(path, room(), GRAPH, replace=True)
     monkeypatch.undo()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Lidar
-from gigabrain_schemas.brain import Obstacle, Response
+from gigabrain_schemas.brain import ActuationModel, Obstacle
 from gigabrain_zenoh.geometry.sweep import depth, edges
 from gigabrain_zenoh.navigation.local import (
     Goal,
@@ -55,7 +55,7 @@ OMNI = BodyDescription(
     max_angular_acceleration=3.0,
     lidar=Lidar(beams=360, rate_hz=10, range_min=0.12, range_max=8.0),
 )
-AT_ONCE = Response()
+AT_ONCE = ActuationModel()
 QUICK = LocalSettings(samples=300, window=5.0)
 
 
@@ -75,7 +75,7 @@ class Drive:
         walls: Floats,
         *,
         settings: LocalSettings = QUICK,
-        response: Response = AT_ONCE,
+        response: ActuationModel = AT_ONCE,
         someone: Callable[[float], tuple[Obstacle, ...]] = lambda _: (),
     ) -> None:
         self.body, self.goal, self.walls, self.someone = body, goal, walls, someone

@@ -8,12 +8,12 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_schemas.brain import Obstacle, Response
+from gigabrain_schemas.brain import ActuationModel, Obstacle
 from gigabrain_zenoh.navigation.local import Goal, LocalPlanner, Moment, Sent
 from tests.unit.navigation.drives import CAR, OMNI, QUICK, WAFFLE, Drive, wall
 
 NOTHING = np.empty((0, 2))
-LATE = Response(delay=0.1, lag=0.15)
+LATE = ActuationModel(delay=0.1, lag=0.15)
 TRIKE = replace(CAR, drive_type="differential", robot_type="trike")
 DOOR = np.concatenate(
     [wall((0.8, 0.225), (0.8, 1.5)), wall((0.8, -0.225), (0.8, -1.5))]

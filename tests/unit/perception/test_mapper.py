@@ -16,7 +16,7 @@ from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapping import grid, map_file
 from gigabrain_zenoh.perception.mapper import chart_of
-from gigabrain_zenoh.runtime.health import publish_health
+from gigabrain_zenoh.runtime.services import publish_health
 from gigabrain_zenoh.testing.samples import scan, state
 from tests.unit.mapping.houses import HOUSE, Rooms, at, drawn
 from tests.unit.perception.mapping_robot import Robot

@@ -10,7 +10,7 @@ from gigabrain_schemas.topics import CMD_VEL, SCAN
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.diagnostics.rates import Heard, median_ms
 from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.host.percentile import Newest, percentile
+from gigabrain_zenoh.host.bounded import NewestValues, percentile
 from gigabrain_zenoh.qa.bench.costs import Hop, Timed
 from gigabrain_zenoh.qa.bench.figures import figures, over_rounds
 from gigabrain_zenoh.qa.bench.runs import relay_roles
@@ -31,11 +31,11 @@ def test_a_percentile_is_a_value_that_was_measured(
 
 def test_nothing_has_no_percentile() -> None:
     assert percentile([], 0.5) is None
-    assert Newest(3).percentile(0.5) is None
+    assert NewestValues(3).percentile(0.5) is None
 
 
 def test_the_oldest_value_gives_way() -> None:
-    newest = Newest(3)
+    newest = NewestValues(3)
     for value in (5.0, 1.0, 9.0, 2.0):
         newest.add(value)
     assert len(newest) == 3
@@ -46,7 +46,7 @@ def test_the_oldest_value_gives_way() -> None:
 def test_the_newest_values_are_those_that_came_last(
     values: list[float], most: int, share: float
 ) -> None:
-    newest = Newest(most)
+    newest = NewestValues(most)
     for value in values:
         newest.add(value)
     assert newest.percentile(share) == percentile(sorted(values[-most:]), share)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh.host import run_queue
+from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.qa.conformance import kit
 from gigabrain_zenoh.qa.conformance.result import Failed, Finding, NotApplicable
 
@@ -15,7 +15,7 @@ from gigabrain_zenoh.qa.conformance.result import Failed, Finding, NotApplicable
 def waiting(monkeypatch: pytest.MonkeyPatch, each_ms: float) -> None:
     """A machine that has the kit wait so long between two looks."""
     steps = itertools.count()
-    monkeypatch.setattr(run_queue, "waited_ms", lambda: each_ms * next(steps))
+    monkeypatch.setattr(this_process, "waited_ms", lambda: each_ms * next(steps))
 
 
 def finds(*findings: Finding) -> Callable[[], Awaitable[Finding]]:
@@ -80,18 +80,18 @@ def test_waiting_for_a_core_is_summed_over_all_threads(
         folder = tmp_path / "self" / "task" / thread
         folder.mkdir(parents=True)
         (folder / "schedstat").write_text(text)
-    monkeypatch.setattr(run_queue, "PROC", tmp_path)
-    assert run_queue.waited_ms() == 2.5
-    assert run_queue.by_thread("self") == {"7": 2_000_000, "8": 500_000}
+    monkeypatch.setattr(this_process, "PROC", tmp_path)
+    assert this_process.waited_ms() == 2.5
+    assert this_process.waited_ns_by_thread("self") == {"7": 2_000_000, "8": 500_000}
 
 
 def test_where_the_system_does_not_say_nothing_was_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_queue, "PROC", tmp_path / "none")
-    monkeypatch.setattr(run_queue, "OWN", tmp_path / "none")
-    assert (run_queue.waited_ms(), run_queue.own_waited_ms()) == (0.0, 0.0)
-    assert run_queue.stolen() == {}
+    monkeypatch.setattr(this_process, "PROC", tmp_path / "none")
+    monkeypatch.setattr(this_process, "OWN_SCHEDSTAT", tmp_path / "none")
+    assert (this_process.waited_ms(), this_process.own_waited_ms()) == (0.0, 0.0)
+    assert this_process.stolen_ns_by_core() == {}
 
 
 def test_what_a_host_keeps_from_a_virtual_machine_is_told_by_core(
@@ -99,6 +99,6 @@ def test_what_a_host_keeps_from_a_virtual_machine_is_told_by_core(
 ) -> None:
     lines = ("cpu  9 9 9 9 9 9 9 7 0 0", "cpu0 1 2 3 4 5 6 7 5 9 9", "cpu1 1 2 3 4 5 6 7 2 9 9")
     (tmp_path / "stat").write_text("\n".join((*lines, "intr 1 2 3", "")))
-    monkeypatch.setattr(run_queue, "PROC", tmp_path)
+    monkeypatch.setattr(this_process, "PROC", tmp_path)
     tick_ns = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
-    assert run_queue.stolen() == {"cpu0": 5 * tick_ns, "cpu1": 2 * tick_ns}
+    assert this_process.stolen_ns_by_core() == {"cpu0": 5 * tick_ns, "cpu1": 2 * tick_ns}

@@ -16,7 +16,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.errors import ConfigError, UnknownName
-from gigabrain_zenoh.host import run_queue
+from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.qa.faults import suite
 from gigabrain_zenoh.qa.faults.disturbance import LOOK_S, RunQueueWatch
@@ -278,8 +278,8 @@ async def test_the_longest_wait_of_one_thread_between_two_looks_is_told(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks = iter([{"1": 5_000_000, "2": 0}, {"1": 6_000_000, "2": 31_000_000, "3": 90_000_000}])
-    monkeypatch.setattr(run_queue, "by_thread", lambda process: next(looks))
-    monkeypatch.setattr(run_queue, "stolen", dict)
+    monkeypatch.setattr(this_process, "waited_ns_by_thread", lambda process: next(looks))
+    monkeypatch.setattr(this_process, "stolen_ns_by_core", dict)
     watch = RunQueueWatch(lambda: [7])
     watch.look()
     watch.look()
@@ -300,7 +300,7 @@ async def test_a_core_that_the_host_gave_to_others_was_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     looks = iter([{"cpu0": 900_000_000, "cpu1": 0}, {"cpu0": 940_000_000, "cpu1": 10_000_000}])
-    monkeypatch.setattr(run_queue, "stolen", lambda: next(looks))
+    monkeypatch.setattr(this_process, "stolen_ns_by_core", lambda: next(looks))
     watch = RunQueueWatch(list)
     watch.look()
     watch.look()

@@ -12,9 +12,8 @@ from gigabrain_schemas.topics import AUDIT, AUDIT_LOG
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.host.scribe import Scribe
-from gigabrain_zenoh.runtime.audit import AuditTrail
-from gigabrain_zenoh.runtime.audit_file import AuditFile, in_order, read
+from gigabrain_zenoh.host.threads import BackgroundWriter
+from gigabrain_zenoh.runtime.audit import AuditFile, AuditTrail, in_order, read_audit
 
 
 def entry(number: int, stamp_ns: int = 0) -> AuditRecord:
@@ -46,9 +45,9 @@ class Rig:
 def test_entries_survive_a_restart_and_are_appended_to(tmp_path: Path) -> None:
     assert AuditFile(tmp_path, "driver").append([entry(1), entry(2)]) == ""
     assert AuditFile(tmp_path, "driver").append([entry(3)]) == ""
-    assert texts(read(tmp_path, 10)) == ["1", "2", "3"]
+    assert texts(read_audit(tmp_path, 10)) == ["1", "2", "3"]
     assert texts(AuditFile(tmp_path, "driver").newest(2)) == ["2", "3"]
-    assert read(tmp_path / "nowhere", 10) == ()
+    assert read_audit(tmp_path / "nowhere", 10) == ()
 
 
 def test_a_full_file_is_followed_by_another_and_only_the_oldest_goes(tmp_path: Path) -> None:
@@ -58,7 +57,7 @@ def test_a_full_file_is_followed_by_another_and_only_the_oldest_goes(tmp_path: P
     names = sorted(path.name for path in (tmp_path / "audit").iterdir())
     assert len(names) == 3
     assert all(path.stat().st_size <= 1000 for path in (tmp_path / "audit").iterdir())
-    found = texts(read(tmp_path, 1000))
+    found = texts(read_audit(tmp_path, 1000))
     assert found == [str(number) for number in range(41 - len(found), 41)]
     assert len(found) >= 10
 
@@ -69,14 +68,14 @@ def test_a_torn_line_costs_no_other(tmp_path: Path) -> None:
     path = tmp_path / "audit" / "driver-000001.jsonl"
     path.write_bytes(path.read_bytes() + msgspec.json.encode(entry(2))[:20])
     file.append([entry(3)])
-    assert texts(read(tmp_path, 10)) == ["1", "3"]
+    assert texts(read_audit(tmp_path, 10)) == ["1", "3"]
 
 
 def test_logs_of_several_processes_become_one_and_keep_their_own_order(tmp_path: Path) -> None:
     AuditFile(tmp_path, "driver").append([entry(1, 100), entry(2, 300)])
     AuditFile(tmp_path, "router").append([entry(3, 200)])
-    assert texts(read(tmp_path, 10)) == ["1", "3", "2"]
-    assert texts(read(tmp_path, 1)) == ["2"]
+    assert texts(read_audit(tmp_path, 10)) == ["1", "3", "2"]
+    assert texts(read_audit(tmp_path, 1)) == ["2"]
     assert texts(in_order([[entry(1, 300), entry(2, 100)], [entry(3, 400)]])) == ["1", "2", "3"]
 
 
@@ -98,7 +97,7 @@ async def test_an_entry_is_told_at_once_written_and_can_be_asked_for(tmp_path: P
         )
     ]  # fmt: skip
     await rig.trail.close()
-    assert read(tmp_path, 10) == tuple(rig.heard)
+    assert read_audit(tmp_path, 10) == tuple(rig.heard)
     assert await rig.other.ask(AUDIT_LOG, AuditRequest()) == [AuditPage(records=tuple(rig.heard))]
 
 
@@ -159,7 +158,7 @@ async def test_refusals_and_events_push_no_act_of_a_person_out_of_the_log(tmp_pa
         refused = msgspec.structs.replace(entry(number), what="refused", ok=False)
         raised = msgspec.structs.replace(entry(number), what="raised")
         file.append([refused, raised, msgspec.structs.replace(entry(number), ok=False)])
-    assert texts(read(tmp_path, 1000))[0] == "1"
+    assert texts(read_audit(tmp_path, 1000))[0] == "1"
     assert texts(file.newest(1000))[0] == "1"
     assert len(list((tmp_path / "audit").iterdir())) == 4
 
@@ -172,7 +171,7 @@ async def test_a_disk_that_hangs_holds_nobody_up_and_the_oldest_give_way() -> No
         batches.append(items)
         return "the disk is full" if 5 in items else ""
 
-    scribe = Scribe(write, room=3)
+    scribe = BackgroundWriter(write, room=3)
     first = scribe.put(1)
     await asyncio.sleep(0)  # the first batch is on its way
     others = [scribe.put(number) for number in (2, 3, 4, 5)]

@@ -7,10 +7,9 @@ from gigabrain_schemas.topics import AUDIT
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Link, LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.runtime import audit_file
+from gigabrain_zenoh.runtime import audit
+from gigabrain_zenoh.runtime.access_audit import AccessAudit, Denied, TurnedAway, ZenohLog
 from gigabrain_zenoh.runtime.audit import AuditTrail
-from gigabrain_zenoh.runtime.door import Door
-from gigabrain_zenoh.runtime.zenoh_log import Denied, TurnedAway, ZenohLog
 
 ZID = "4869ee9928fa158cf819ad0d7cad9dc4"
 ACCESS = "2026-11-21T03:07:13.9Z TRACE  rx-0 ThreadId(11) zenoh::net::routing::interceptor"
@@ -54,7 +53,7 @@ class Rig:
         other = Bus(network.transport(), self.clock, "other")
         other.subscribe(AUDIT, lambda _key, record: self.heard.append(record))
         self.trail = AuditTrail(self.bus, folder)
-        self.door = Door(self.trail, {"viewer@red"})
+        self.door = AccessAudit(self.trail, {"viewer@red"})
         self.door.link(Link(ZID, "viewer@red", "tls/127.0.0.1:5", there=True))
 
 
@@ -75,7 +74,7 @@ async def test_40000_denials_are_one_record_a_minute_and_push_out_no_estop(tmp_p
     ]
     assert len(rig.trail._recent[False]) == 1
     await rig.trail.close()
-    assert [(r.what, r.text[:16]) for r in audit_file.read(tmp_path, 10)][:4] == [
+    assert [(r.what, r.text[:16]) for r in audit.read_audit(tmp_path, 10)][:4] == [
         ("boot", "before the flood"),
         ("estop", "before the flood"),
         ("release", "before the flood"),

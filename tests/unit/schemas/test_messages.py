@@ -9,7 +9,7 @@ from gigabrain_schemas.brain import (
     CmdVel,
 )
 from gigabrain_schemas.examples import EXAMPLES
-from gigabrain_schemas.export import export
+from gigabrain_schemas.golden import export
 from gigabrain_schemas.topics import SERVICES, TOPICS, messages
 from gigabrain_zenoh.qa.faults.hostile import leaves
 from tests.unit.schemas.plain import as_map, codec, dotted, refuses
@@ -52,8 +52,8 @@ REQUIRED: dict[str, set[str]] = {
     "MapReply": {"ok", "text"},
     "TaskRequest": {"do"},
     "TaskReply": {"ok", "text"},
-    "Granted": {"service", "request"},
-    "Heard": {"began_ns", "keys", "taken"},
+    "AcceptedRequest": {"service", "request"},
+    "InputLog": {"began_ns", "keys", "taken"},
     "TaskStatus": set(),
     "ParamRequest": set(),
     "ParamReply": {"ok", "text"},
@@ -83,8 +83,8 @@ def test_the_table_holds_the_keys_and_rates_of_the_design() -> None:
         "robot/button": ("ButtonState", 20),
         "robot/log": ("LogRecord", 10),
         "robot/task": ("TaskStatus", 5),
-        "robot/granted": ("Granted", 10),
-        "robot/heard/*": ("Heard", 2),
+        "robot/request_log": ("AcceptedRequest", 10),
+        "robot/input_log/*": ("InputLog", 2),
         "robot/audit": ("AuditRecord", 10),
     }
     assert [service.at("*") for service in SERVICES] == [
@@ -113,8 +113,8 @@ def test_a_value_stops_counting_after_so_many_missed_periods() -> None:
         "robot/button": 200_000_000,
         "robot/log": 500_000_000,
         "robot/task": 1_000_000_000,
-        "robot/granted": 500_000_000,
-        "robot/heard": 2_500_000_000,
+        "robot/request_log": 500_000_000,
+        "robot/input_log": 2_500_000_000,
         "robot/audit": 500_000_000,
     }
 

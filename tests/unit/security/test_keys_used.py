@@ -99,7 +99,7 @@ def test_the_router_listens_where_it_is_told_and_on_a_socket_of_its_user(
 
 
 def test_the_committed_router_of_a_larger_site_is_what_the_command_prints() -> None:
-    from gigabrain_zenoh.runtime.zenohd import configuration
+    from gigabrain_zenoh.bus.zenoh.config import configuration
 
     committed = (ROOT / "deploy" / "zenohd" / "zenohd.json5").read_text()
     made = configuration(("red", "blue"), "/etc/gigabrain/keys", "tls/0.0.0.0:7447")

@@ -1,0 +1,144 @@
+"""Files: written durably, read with a bounded size, and results of long runs."""
+
+import errno
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+import msgspec
+
+from gigabrain_zenoh.errors import ConfigError
+
+KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a FIFO"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def open_regular(path: Path, most_bytes: int | None = None) -> BinaryIO:
+    """Open a file to be read. Raises OSError, and ConfigError for anything but a regular file.
+
+    Also for one of more than `most_bytes`.
+    """
+    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a FIFO opens at once so
+    try:
+        about = os.fstat(fd)
+        for is_kind, name in KINDS:
+            if is_kind(about.st_mode):
+                raise ConfigError(f"{path}: is {name}; expected a file")
+        if most_bytes is not None and about.st_size > most_bytes:
+            raise ConfigError(too_large(path, about.st_size, most_bytes))
+        return open(fd, "rb")
+    except BaseException:
+        os.close(fd)
+        raise
+
+
+def read_bounded(path: Path, most_bytes: int) -> bytes:
+    """The content of a regular file. Raises OSError, and ConfigError as `open_regular` does."""
+    with open_regular(path, most_bytes) as file:
+        data = file.read(most_bytes + 1)  # a file of /proc has no size, and another may grow
+    if len(data) > most_bytes:
+        raise ConfigError(too_large(path, len(data), most_bytes))
+    return data
+
+
+def too_large(path: Path, there: int, most_bytes: int) -> str:
+    """What to say of a file that is."""
+    return f"{path}: {there / 1e6:.1f} MB; expected at most {most_bytes / 1e6:g} MB"
+
+
+NOT_SYNCED = (errno.EINVAL, errno.ENOTSUP)  # from file systems that cannot sync a folder
+
+
+def replace_file(path: Path, data: bytes, mode: int = 0o644) -> None:
+    """Write `data` to `path`, durably. One writer at a time. Raises OSError."""
+    with replacing(path, mode) as file:
+        file.write(data)
+
+
+@contextmanager
+def replacing(path: Path, mode: int = 0o644) -> Iterator[BinaryIO]:
+    """A file to write what is to replace `path`, durably, when the block ends. Raises OSError."""
+    draft = path.with_name(f".{path.name}.new")
+    try:
+        with _synced(draft, mode) as file:
+            yield file
+        draft.replace(path)
+    except BaseException:
+        draft.unlink(missing_ok=True)  # a full disk would stay full
+        raise
+    sync_folder(path.parent)
+
+
+def create_file(path: Path, data: bytes, mode: int = 0o644) -> None:
+    """Write the new file `path`, durably; of several writers one wins, nobody sees half a file.
+
+    Raises FileExistsError where it exists, and OSError.
+    """
+    draft = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        write_synced(draft, data, mode)
+        os.link(draft, path)
+    finally:
+        draft.unlink(missing_ok=True)
+    sync_folder(path.parent)
+
+
+def write_synced(path: Path, data: bytes, mode: int = 0o644) -> None:
+    """Write a file's content to disk; its name is there once the folder is synced."""
+    with _synced(path, mode) as file:
+        file.write(data)
+
+
+@contextmanager
+def _synced(path: Path, mode: int) -> Iterator[BinaryIO]:
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
+        yield file
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def make_folder(path: Path) -> None:
+    """Create a folder and its parents, durably. Raises OSError."""
+    if path.exists():
+        return
+    make_folder(path.parent)
+    path.mkdir(exist_ok=True)
+    sync_folder(path.parent)
+
+
+def sync_folder(path: Path) -> None:
+    """Bring the names in a folder to disk. Raises OSError."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    except OSError as error:
+        if error.errno not in NOT_SYNCED:
+            raise
+    finally:
+        os.close(fd)
+
+
+def check_result_path(path: Path | None) -> None:
+    """Raise ConfigError where `path` cannot be written; call this before a long run."""
+    if path and not path.parent.is_dir():
+        raise ConfigError(f"cannot write {path}: no such folder")
+    if path and path.is_dir():
+        raise ConfigError(f"cannot write {path}: it is a folder")
+
+
+def write_result(results: object, path: Path | None) -> None:
+    """Write `results` as JSON, if a path is given. Raises ConfigError if that fails."""
+    if path is None:
+        return
+    try:
+        path.write_bytes(msgspec.json.format(msgspec.json.encode(results)) + b"\n")
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from None

@@ -1,0 +1,191 @@
+"""SIGINT, SIGTERM and SIGHUP of a command: none is lost, from its first line to its last.
+
+An entry point calls `interrupts.install` first, so this module imports nothing heavy. The effect of
+a signal depends on the command's progress (see `reacting`). Only the first one counts.
+"""
+
+import asyncio
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, TypeVar
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+LIMIT_S = 1.8  # from the first signal to the end by force
+RESEND_S = 0.05
+React = Callable[[], object]
+
+
+class Interrupts:
+    """The signals of this process. There is one of these, `interrupts`."""
+
+    def __init__(self) -> None:
+        self.received = 0  # the number of the first signal
+        self.limit_s = LIMIT_S
+        self._pending = False  # received, and nothing has reacted to it
+        self._react: React | None = self._exit
+        self._installed = False
+        self._wake_fd = -1
+
+    @property
+    def exit_code(self) -> int:
+        """The exit code of a command that a signal has ended, as shells have it."""
+        return 128 + self.received
+
+    def install(self) -> None:
+        """Handle the signals until the process ends; before `reacting` they end it at once.
+
+        SIGHUP stays ignored where it is (nohup). SIGINT does not: a shell without job control
+        starts `command &` with SIGINT ignored, and `kill -INT` has to end it nevertheless.
+        """
+        self._installed = True
+        self._set_handlers()
+        read_fd, self._wake_fd = os.pipe()
+        os.set_blocking(self._wake_fd, False)
+        signal.set_wakeup_fd(self._wake_fd, warn_on_full_buffer=False)
+        sys.unraisablehook = self._unraisable
+        threading.Thread(target=self._watch, args=(read_fd,), name="signals", daemon=True).start()
+
+    @contextlib.contextmanager
+    def installed(self) -> Iterator[None]:
+        """Handle the signals while the block runs, where `install` was not called.
+
+        After a signal they stay handled: what is left to do is not cut short by another one.
+        """
+        if self._installed:
+            yield
+            return
+        before = self._set_handlers()
+        self._installed = True
+        try:
+            yield
+        finally:
+            self._installed = False
+            if not self.received:
+                for number, handler in before.items():
+                    signal.signal(number, handler)
+
+    @contextlib.contextmanager
+    def reacting(self, react: React | None) -> Iterator[None]:
+        """Have the first signal call `react`, in the main thread between any two bytecodes.
+
+        None leaves it to whatever reacts next: inside the block, or after it.
+        """
+        before, self._react = self._react, react
+        try:
+            self._settle()
+            yield
+        finally:
+            self._react = before
+            self._settle()
+
+    def raising(self) -> contextlib.AbstractContextManager[None]:
+        """Have the first signal raise KeyboardInterrupt, for code that has to clean up."""
+        return self.reacting(_raise)
+
+    def _set_handlers(self) -> dict[signal.Signals, Any]:
+        return {
+            number: signal.signal(number, self._take)
+            for number in SIGNALS
+            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
+        }
+
+    def _take(self, number: int, _frame: FrameType | None) -> None:
+        if not self.received:
+            self.received, self._pending = number, True
+            if self._wake_fd >= 0:  # an event loop may have replaced the wakeup descriptor
+                with contextlib.suppress(BlockingIOError):
+                    os.write(self._wake_fd, bytes([number]))
+        self._settle()
+
+    def _settle(self) -> None:
+        if self._pending and self._react:
+            self._pending = False
+            self._react()
+
+    def _exit(self) -> None:
+        os._exit(self.exit_code)
+
+    def _watch(self, read_fd: int) -> None:
+        """Bring the signal before the main thread; end the process when its time is over.
+
+        A signal that came just before a system call, or to another thread, does not interrupt the
+        call: it is sent again until the main thread has run its handler.
+        """
+        number = 0
+        while number not in SIGNALS:  # others may be handled as well, such as SIGWINCH
+            number = os.read(read_fd, 1)[0]
+        began_s = time.monotonic()
+        while time.monotonic() - began_s < self.limit_s:
+            if self._pending or not self.received:
+                _send_to_main_thread(number)
+            time.sleep(RESEND_S)
+        os._exit(128 + number)
+
+    def _unraisable(self, args: "sys.UnraisableHookArgs") -> None:
+        """A KeyboardInterrupt raised where nobody can catch it, such as `__del__`, comes again."""
+        if not (self.received and isinstance(args.exc_value, KeyboardInterrupt)):
+            sys.__unraisablehook__(args)
+            return
+        self._pending = True  # so that the thread above sends it again
+
+
+def _send_to_main_thread(number: int) -> None:
+    signal.pthread_kill(threading.main_thread().ident or 0, number)
+
+
+def _raise() -> None:
+    raise KeyboardInterrupt
+
+
+interrupts = Interrupts()
+T = TypeVar("T")
+
+
+@contextmanager
+def stop_signals(limit_s: float = LIMIT_S) -> Iterator[asyncio.Event]:
+    """Yield an event that the first SIGINT, SIGTERM or SIGHUP sets; further signals do nothing.
+
+    A command that has not ended `limit_s` after the signal is terminated by force.
+    """
+    stop, loop = asyncio.Event(), asyncio.get_running_loop()
+
+    def react() -> None:
+        loop.call_soon_threadsafe(stop.set)
+
+    interrupts.limit_s = limit_s
+    with interrupts.installed(), interrupts.reacting(react):
+        yield stop
+
+
+def run_async(work: Coroutine[Any, Any, T]) -> T:
+    """Run a command's coroutine until it ends; the first signal cancels it.
+
+    Raises KeyboardInterrupt if a signal ended it. Unlike `asyncio.run`, it also does so for SIGTERM
+    and SIGHUP, and never interrupts asyncio's own code. It also receives SIGINT where a shell has
+    set it to be ignored.
+    """
+
+    async def cancelled_by_signal() -> T:
+        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+        assert task
+
+        def react() -> None:
+            loop.call_soon_threadsafe(task.cancel)
+
+        with interrupts.reacting(react):
+            return await work
+
+    with interrupts.reacting(None):
+        try:
+            return asyncio.run(cancelled_by_signal())
+        except asyncio.CancelledError:
+            if not interrupts.received:
+                raise
+            raise KeyboardInterrupt from None

@@ -1,0 +1,176 @@
+"""This process in its operating system: its parent, priority, heap and waits for a core.
+
+A supervised process calls `die_with_supervisor` first, so this module imports nothing heavy.
+"""
+
+import contextlib
+import ctypes
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+SUPERVISOR_VARIABLE = "GIGABRAIN_SUPERVISOR"  # the supervisor puts its pid there
+_PR_SET_PDEATHSIG = 1  # prctl(2)
+
+
+def die_with_supervisor() -> None:
+    """Die with the supervisor whose pid is in the environment; nothing if this has none.
+
+    The variable is taken out, so that what this process starts is not bound to its grandparent.
+    """
+    pid = os.environ.pop(SUPERVISOR_VARIABLE, "")
+    if pid.isdecimal():
+        die_with_parent(int(pid))
+
+
+def die_with_parent(parent_pid: int) -> None:
+    """Have this process killed when its parent ends, also while it is stopped (Linux).
+
+    On Linux the kernel does it when the parent's thread that started this process ends; elsewhere
+    a daemon thread watches. If the parent is gone already, this process ends here.
+    """
+    if sys.platform != "linux" or not _kill_on_parent_death():
+        watch_parent(parent_pid)
+    if os.getppid() != parent_pid:  # it died before we asked
+        _die()
+
+
+def watch_parent(parent_pid: int, period_s: float = 0.2) -> threading.Thread:
+    """Watch from a daemon thread whether the parent is still the parent."""
+
+    def watch() -> None:
+        while os.getppid() == parent_pid:
+            time.sleep(period_s)
+        _die()
+
+    thread = threading.Thread(target=watch, name="lifeline", daemon=True)
+    thread.start()
+    return thread
+
+
+def _kill_on_parent_death() -> bool:
+    import ctypes  # costs 3 ms, which only a supervised process pays
+
+    libc = ctypes.CDLL(None)
+    zero = ctypes.c_ulong(0)
+    return bool(
+        libc.prctl(_PR_SET_PDEATHSIG, ctypes.c_ulong(signal.SIGKILL), zero, zero, zero) == 0
+    )
+
+
+def _die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+FIRST_NICE = -10  # nice value, see nice(1): nine times the weight of a program at nice 0
+AUTOGROUP = Path("/proc/self/autogroup")
+
+
+def go_first() -> None:
+    """Raise the priority of this process permanently, as root or with a sufficient RLIMIT_NICE.
+
+    Linux first shares the CPU among sessions; niceness counts only within one ("The autogroup
+    feature", sched(7)). The session's priority is therefore set too. The supervisor gives each
+    process its own session.
+    """
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, 0, FIRST_NICE)
+    _session(FIRST_NICE)
+
+
+def start_first() -> None:
+    """Raise the priority of this process's session until `join_in`, where permitted.
+
+    The robot is at rest until a crashed part of its brain has restarted, so start-up comes first.
+    """
+    _session(FIRST_NICE)
+
+
+def join_in() -> None:
+    """Return this process's session to normal priority."""
+    _session(0)
+
+
+def _session(nice: int) -> None:
+    if os.getsid(0) == os.getpid():
+        with contextlib.suppress(OSError):  # no permission, or no autogroups here
+            AUTOGROUP.write_text(str(nice))
+
+
+def step_aside() -> None:
+    """Make this thread, and threads it starts, wait rather than preempt others on waking.
+
+    Linux's SCHED_BATCH needs no permission and does not reduce the process's share of the CPU. A
+    thread that wakes up does not interrupt a running one (sched(7)).
+    """
+    if hasattr(os, "SCHED_BATCH"):
+        with contextlib.suppress(OSError):  # a container may forbid it
+            os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+
+
+PROC = Path("/proc")
+OWN_SCHEDSTAT = PROC / "thread-self/schedstat"
+STOLEN_FIELD = 8  # field of a core's line in /proc/stat (proc_stat(5))
+
+
+def waited_ms() -> float:
+    """Return how long the threads of this process have waited in total [ms]."""
+    return sum(waited_ns_by_thread("self").values()) / 1e6
+
+
+def own_waited_ms() -> float:
+    """Return how long the calling thread has waited in total [ms]."""
+    return _waited_ns(OWN_SCHEDSTAT) / 1e6
+
+
+def waited_ns_by_thread(process: int | str) -> dict[str, int]:
+    """Return how long each thread of `process` has waited in total [ns], by thread id."""
+    files = (PROC / str(process) / "task").glob("*/schedstat")
+    return {file.parent.name: _waited_ns(file) for file in files}
+
+
+def stolen_ns_by_core() -> dict[str, int]:
+    """Return how long the host of a virtual machine has withheld each core in total [ns], by core.
+
+    The kernel usually counts in ticks of 10 ms.
+    """
+    try:
+        lines = (PROC / "stat").read_text().splitlines()
+    except OSError:
+        return {}
+    tick_ns = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+    cores = (line.split() for line in lines if line.startswith("cpu") and line[3].isdigit())
+    return {
+        core[0]: int(core[STOLEN_FIELD]) * tick_ns for core in cores if len(core) > STOLEN_FIELD
+    }
+
+
+def _waited_ns(schedstat: Path) -> int:
+    """Return a schedstat file's second number (kernel, Documentation/scheduler/sched-stats.rst)."""
+    try:
+        return int(schedstat.read_text().split()[1])
+    except OSError:  # the thread has just ended, or the system has no statistics
+        return 0
+
+
+M_MMAP_THRESHOLD = -3  # mallopt(3)
+LARGE_BYTES = 4 << 20  # the costs of a map of 50 x 50 m, and less, stay in the heap
+
+
+def map_large_blocks() -> None:
+    """Have blocks of LARGE_BYTES and more go back to the system as soon as they are free.
+
+    By itself glibc raises that limit to 32 MiB as blocks are freed, and then keeps those of each
+    thread: 119 MB after planning in a few maps of 140 x 140 m, and 1 MB with this.
+    """
+    with contextlib.suppress(AttributeError, OSError):
+        ctypes.CDLL(None).mallopt(M_MMAP_THRESHOLD, LARGE_BYTES)
+
+
+def trim_heap() -> None:
+    """Return what is free to the system. It may take some milliseconds."""
+    with contextlib.suppress(AttributeError, OSError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -1,0 +1,121 @@
+"""Work in threads beside the event loop: results due at a fixed scan, and writes to slow disks."""
+
+import asyncio
+import concurrent.futures
+import logging
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Generic, TypeVar
+
+Job = Future[Any]
+PATIENCE_S = 0.1  # how long a scan waits for a result that is due
+Take = Callable[[], None]  # makes the result count, in the scans' own thread
+Work = Callable[[], Take]
+InTime = Callable[[Future[Any], float], bool]  # whether work is done after so long [s]
+
+
+def done(job: Job, patience_s: float | None) -> bool:
+    """Whether `job` is done after that long at most."""
+    finished, _ = concurrent.futures.wait((job,), patience_s)
+    return bool(finished)
+
+
+class ScheduledWorker:
+    """One thread, and at most one piece of work at a time."""
+
+    def __init__(self, patience_s: float = PATIENCE_S, in_time: InTime = done) -> None:
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="mapping")
+        self._job: Future[Take] | None = None
+        self._left = 0  # scans until the result is due
+        self._patience_s, self._in_time = patience_s, in_time
+        self.late = 0  # how often a result was not there when it was due
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is under way."""
+        return self._job is None
+
+    @property
+    def overdue(self) -> int:
+        """For how many scans a result has been due and not there."""
+        return max(0, -self._left) if self._job else 0
+
+    def start(self, work: Work, scans: int) -> None:
+        """Begin; the result is due in so many scans."""
+        self._job, self._left = self._pool.submit(work), scans
+
+    def hasten(self, scans: int) -> None:
+        """Make the result due in `scans` at most, if there is work under way."""
+        self._left = min(self._left, scans)
+
+    def at_scan(self) -> None:
+        """Take the result, when it is due at this scan and there. Raises what the work raised."""
+        if self._job is None:
+            return
+        self._left -= 1
+        if self._left > 0:
+            return
+        if not self._in_time(self._job, self._patience_s):
+            self.late += 1
+            return
+        job, self._job = self._job, None
+        job.result()()
+
+    def finish(self) -> None:
+        """Take the result of what is under way, however long that takes."""
+        job, self._job = self._job, None
+        if job:
+            job.result()()
+
+    def close(self) -> None:
+        """End the thread, after what is under way."""
+        self._pool.shutdown()
+
+
+log = logging.getLogger(__name__)
+T = TypeVar("T")
+
+
+class BackgroundWriter(Generic[T]):
+    """Queue whose items are passed to `write` in a worker thread, in order and in batches.
+
+    The function `write` returns a problem in one line, or an empty text once all is on disk. When
+    more than `room` items wait, the oldest are dropped.
+    """
+
+    def __init__(self, write: Callable[[Sequence[T]], str], room: int) -> None:
+        self._write = write
+        self._items: deque[T] = deque(maxlen=room)
+        self._waiting: list[asyncio.Future[str]] = []
+        self._task: asyncio.Task[None] | None = None
+        self.lost = 0  # number of dropped items
+
+    def put(self, item: T) -> asyncio.Future[str]:
+        """Queue `item` for writing; the future resolves to the problem, or to an empty text."""
+        self.lost += len(self._items) == self._items.maxlen
+        self._items.append(item)
+        done: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._waiting.append(done)
+        if self._task is None or self._task.done():
+            self._task = asyncio.create_task(self._work(), name="scribe")
+        return done
+
+    async def close(self) -> None:
+        """Wait until all items are written."""
+        if self._task:
+            await self._task
+
+    async def _work(self) -> None:
+        while self._waiting:
+            items, self._items = tuple(self._items), deque(maxlen=self._items.maxlen)
+            waiting, self._waiting = self._waiting, []
+            try:
+                problem = await asyncio.to_thread(self._write, items)
+            except Exception as error:
+                # any error must reach the waiting futures, and later items must still be written
+                log.exception("writing failed")
+                problem = f"{type(error).__name__}: {error}"
+            for done in waiting:
+                if not done.done():
+                    done.set_result(problem)

@@ -1,0 +1,153 @@
+"""The way onto a robot's bus: of its processes, and of tools that come and go."""
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+import threading
+from collections.abc import AsyncIterator, Iterable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from msgspec import Struct, structs
+
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME, session_config
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.bus.zenoh.workarounds import NAP_S
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.host.network import host_and_port, is_ip
+from gigabrain_zenoh.host.this_process import step_aside
+from gigabrain_zenoh.runtime.running import find_endpoint
+from gigabrain_zenoh.security.identity_files import identity_in, no_router
+
+log = logging.getLogger("gigabrain")
+PATIENCE_S = 1.0  # how long the router may be missing before a warning is logged
+AGAIN_S = 1.0  # between attempts to resolve a host name
+
+
+async def join(endpoint: Endpoint) -> ZenohTransport:
+    """Open the session. Log a warning once if the router is missing for longer than PATIENCE_S.
+
+    Raises BusError when a router cannot listen. Raises ConfigError for errors that waiting cannot
+    mend, such as invalid keys of this process.
+    """
+    session_config(endpoint)
+    await _know(endpoint.listen)
+    opening = asyncio.ensure_future(ZenohTransport.open(endpoint))
+    try:
+        done, _ = await asyncio.wait((opening,), timeout=PATIENCE_S)
+        if not done:
+            if endpoint.keys:  # a router rejects invalid keys without an error
+                await asyncio.to_thread(identity_in, Path(endpoint.keys))
+            await _explain(endpoint, opening)
+        return await opening
+    finally:
+        opening.cancel()
+
+
+async def unknown_host(endpoints: Iterable[str]) -> str:
+    """Return the first host in these endpoints whose name cannot be resolved, or an empty text.
+
+    Resolves in a daemon thread: a resolver may take many seconds, and must not delay the process's
+    exit.
+    """
+    hosts = [host for host, _ in map(host_and_port, endpoints) if host and not is_ip(host)]
+    if not hosts:
+        return ""
+    loop = asyncio.get_running_loop()
+    told: asyncio.Future[str] = loop.create_future()
+
+    def settle(unknown: str) -> None:
+        if not told.done():
+            told.set_result(unknown)
+
+    def work() -> None:
+        unknown = next((host for host in hosts if not _known(host)), "")
+        with contextlib.suppress(RuntimeError):  # the loop is closed
+            loop.call_soon_threadsafe(settle, unknown)
+
+    threading.Thread(target=work, name="resolver", daemon=True).start()
+    return await told
+
+
+def _known(host: str) -> bool:
+    try:
+        socket.getaddrinfo(host, None)
+    except (OSError, UnicodeError):
+        return False
+    return True
+
+
+async def _know(listen: Iterable[str]) -> None:
+    """Wait until the router's own listen addresses resolve.
+
+    At boot, name resolution may start later than the router.
+    """
+    said = ""
+    while host := await unknown_host(listen):
+        if host != said:
+            _tell(_nobody(host))
+        said = host
+        await asyncio.sleep(AGAIN_S)
+
+
+async def _explain(endpoint: Endpoint, opening: asyncio.Future[ZenohTransport]) -> None:
+    """Log what the session waits for, unless it opens while the host name is being resolved."""
+    naming = asyncio.ensure_future(unknown_host(endpoint.connect))
+    try:
+        await asyncio.wait((opening, naming), return_when=asyncio.FIRST_COMPLETED)
+        if not opening.done():
+            _tell(_nobody(naming.result()) if naming.result() else _no_router(endpoint))
+    finally:
+        naming.cancel()
+
+
+def _nobody(host: str) -> str:
+    return f"nobody here knows a host {host!r}; waiting for its name (is it spelt right?)"
+
+
+def _no_router(endpoint: Endpoint) -> str:
+    where = ", ".join(endpoint.connect) or ", ".join(endpoint.listen)
+    return f"no router at {where} yet; waiting for it (start one with: gigabrain router)"
+
+
+def _tell(text: str) -> None:
+    log.warning("%s", text, extra={"data": {"event": "waiting"}})
+
+
+ROUTER_S = 3.0  # how long a router may take to answer
+
+
+class Where(Struct, frozen=True, kw_only=True):
+    """Which robot, as people say it."""
+
+    connect: str | None = None  # its router; without it, the only robot that runs here
+    namespace: str = ""
+    keys: str = ""  # the folder of an identity
+
+
+@asynccontextmanager
+async def joined(
+    where: Where, name: str, *, looks_on: bool = False
+) -> AsyncIterator[tuple[Bus, ZenohTransport]]:
+    """A bus of a robot, and the transport below it. Raises BusError where there is none.
+
+    Who `looks_on` lets what he listens to gather, and the robot's own processes go first.
+    """
+    endpoint = find_endpoint(where.connect, where.namespace, where.keys)
+    if looks_on:
+        step_aside()
+        endpoint = structs.replace(endpoint, nap_s=NAP_S)
+    os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
+    try:
+        transport = await asyncio.wait_for(ZenohTransport.open(endpoint), ROUTER_S)
+    except TimeoutError:
+        raise no_router(endpoint) from None
+    bus = Bus(transport, Clock(), name)
+    try:
+        yield bus, transport
+    finally:
+        await bus.close()

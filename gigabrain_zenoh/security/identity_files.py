@@ -1,0 +1,177 @@
+"""Files of an identity, checked without reading certificates, and what a host may run with it."""
+
+import fcntl
+import logging
+import os
+import stat
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.host.files import open_regular, read_bounded
+from gigabrain_zenoh.host.network import host_and_port
+from gigabrain_zenoh.security.acl import Role, common_name
+
+log = logging.getLogger(__name__)
+CA, CA_KEY = "ca.crt", "ca.key"
+CERTIFICATE, KEY = "identity.crt", "identity.key"
+MAX_SECRET_BYTES = 65_536  # of a file that `made_once` makes
+REMEDY = "copy the whole folder that `gigabrain keys issue` made"
+
+
+def check_files(folder: Path) -> None:
+    """Whether all files of an identity are there, and its key is private. Raises ConfigError."""
+    if not folder.is_dir():
+        raise ConfigError(
+            f"{folder}: no folder with keys; make an identity with `gigabrain keys issue ROLE` "
+            "and copy its folder here"
+        )
+    for name in (CA, CERTIFICATE, KEY):
+        path = folder / name
+        try:
+            if not path.is_file():
+                raise ConfigError(f"{folder}: {name} is missing; {REMEDY}")
+        except PermissionError:
+            raise unreadable(path) from None
+        if not os.access(path, os.R_OK):
+            raise unreadable(path)
+    check_private(folder / KEY)
+
+
+def check_private(path: Path) -> None:
+    """Whether a key is its owner's alone. Raises ConfigError."""
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if os.name == "posix" and mode & 0o077:
+        raise ConfigError(f"{path} is open to others (mode {mode:04o}); chmod 600 {path}")
+
+
+def made_once(path: Path, content: bytes) -> tuple[bytes, bool]:
+    """What a private file holds, and whether it had to be made, with `content`. Raises ConfigError.
+
+    Of several who make it at once one wins, and nobody sees it unfinished. An empty one, as a
+    crash may leave it, is made anew.
+    """
+    try:
+        if path.exists() and (found := read_bounded(path, MAX_SECRET_BYTES)):
+            check_private(path)
+            return found, False
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}-") as new:  # 0600
+            new.write(content)
+            new.flush()
+            os.fsync(new.fileno())
+            try:
+                os.link(new.name, path)
+                return content, True
+            except FileExistsError:
+                check_private(path)
+            with open_regular(path, MAX_SECRET_BYTES) as old:
+                fcntl.flock(old, fcntl.LOCK_EX)  # of several who heal it one does
+                found = read_bounded(path, MAX_SECRET_BYTES)
+                if not found:
+                    log.warning("%s was empty; it is made anew", path)
+                    os.link(new.name, f"{new.name}-whole")
+                    os.replace(f"{new.name}-whole", path)
+                return found or content, not found
+    except OSError as error:
+        raise ConfigError(f"cannot read or write {path}: {error.strerror}") from None
+
+
+def unreadable(path: Path) -> ConfigError:
+    """The error for a file that this user may not read."""
+    return ConfigError(f"{path} cannot be read by this user; run as its owner, or chown it")
+
+
+def identity_folder(keys: str, host: str = "") -> Path:
+    """The identity in the folder `keys`, or in its part for `host` where it holds several."""
+    folder = Path(keys).expanduser()
+    of_host = folder / host
+    if host and not (folder / CERTIFICATE).exists() and of_host.is_dir():
+        return of_host
+    return folder
+
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.security.identity import Identity
+INSTALL = "keys need more: pip install 'gigabrain-zenoh[keys]'"
+NEEDS: Mapping[str, tuple[Role, ...]] = {
+    "router": ("robot", "router"),
+    "driver": ("robot",),
+    "control": ("robot",),
+    "safety": ("robot",),
+    "perception": ("robot", "brain"),
+    "decision": ("robot", "brain"),
+}
+OTHERS: tuple[Role, ...] = ("robot", "operator")  # for what a person looks at
+
+
+def identity_in(folder: Path) -> "Identity":
+    """The identity in a folder. Raises ConfigError where it cannot be used."""
+    try:  # 150 ms, which only those pay who look at certificates
+        from gigabrain_zenoh.security.identity import load
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{error}; {INSTALL}") from None
+    return load(folder)
+
+
+def check_identity(folder: Path, processes: Iterable[str], namespace: str, router: str) -> None:
+    """Whether a host with this identity may run `processes` of the robot `namespace`.
+
+    Raises ConfigError, which names the identity that it takes.
+    """
+    identity, processes = identity_in(folder), tuple(processes)
+    for process in processes:
+        roles = NEEDS.get(process, OTHERS)
+        if identity.role not in roles:
+            wanted = " or ".join(common_name(role, namespace) for role in roles)
+            raise ConfigError(f"{folder} is the identity of {identity.name}; {process} "
+                              f"needs that of {wanted}")  # fmt: skip
+    if identity.robot != namespace and (identity.robot or identity.role in ("robot", "brain")):
+        wanted = common_name(identity.role, namespace)
+        raise ConfigError(f"{folder} is the identity of {identity.name}; expected {wanted}")
+    host, _ = host_and_port(router)
+    if "router" in processes and host and host not in identity.hosts:
+        raise ConfigError(
+            f"{folder} is for a router at {', '.join(identity.hosts)}, not at {host}; "
+            f"issue one with --host {host}"
+        )
+
+
+def no_router(endpoint: Endpoint) -> BusError:
+    """Why no router lets us in. Raises ConfigError where our own keys are at fault."""
+    where, doubt = endpoint.connect[-1], "is the robot running, and without keys?"
+    if endpoint.keys:
+        identity = identity_in(Path(endpoint.keys))
+        doubt = f"is the robot running, with keys of the fleet {identity.fleet!r}?"
+    return BusError(f"no router answers at {where}; {doubt}")
+
+
+def may_not_ask(keys: str) -> str:
+    """What else may be the reason for silence: a router does not say what it denies."""
+    return f"; or {identity_in(Path(keys)).name} may not ask for it" if keys else ""
+
+
+LIST = "generations.json"
+MAX_GENERATION = 10_000
+MAX_LIST_BYTES = 1_000_000
+
+
+def generations_in(folder: Path) -> dict[str, int]:
+    """By common name; empty where no list is. Raises ConfigError for one that cannot be read."""
+    path = folder / LIST
+    try:
+        return msgspec.json.decode(
+            read_bounded(path, MAX_LIST_BYTES),
+            type=dict[str, Annotated[int, msgspec.Meta(ge=1, le=MAX_GENERATION)]],
+        )
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: {error}; copy it from the fleet's folder again") from None
