@@ -1,7 +1,6 @@
 """Folders of past runs: limits their number and size, and marks those in use."""
 
 import contextlib
-import fcntl
 import itertools
 import logging
 import os
@@ -12,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.posix import fcntl
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, TypeVar
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+HANGUP = getattr(signal, "SIGHUP", None)  # Windows has none
+SIGNALS = (signal.SIGINT, signal.SIGTERM, *([HANGUP] if HANGUP else ()))
 LIMIT_S = 1.8  # from the first signal to the end by force
 RESEND_S = 0.05
 React = Callable[[], object]
@@ -93,7 +94,7 @@ class Interrupts:
         return {
             number: signal.signal(number, self._take)
             for number in SIGNALS
-            if number != signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
+            if number != HANGUP or signal.getsignal(number) is not signal.SIG_IGN
         }
 
     def _take(self, number: int, _frame: FrameType | None) -> None:

@@ -1,7 +1,6 @@
 """Writes one MCAP file: every message byte for byte, and the messages that viewers draw."""
 
 import contextlib
-import fcntl
 import os
 from collections import Counter
 from collections.abc import Mapping
@@ -16,6 +15,7 @@ from gigabrain_schemas.topics import CMD_VEL, INTENT, STATE, TASK, TOPICS, Topic
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import open_regular
+from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.recording.bag_reader import RAW
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn, json_schema
 from gigabrain_zenoh.recording.headers import Header, is_json

@@ -5,7 +5,6 @@ one thread, of which the second makes the first count (zenoh 1.10, net/routing/i
 """
 
 import contextlib
-import fcntl
 import logging
 import os
 import re
@@ -18,6 +17,7 @@ from gigabrain_schemas.topics import SERVICES, TOPICS
 from gigabrain_zenoh.bus.bridge import Bridge, Mailbox
 from gigabrain_zenoh.bus.transport import Link
 from gigabrain_zenoh.bus.zenoh.session import log_to_stdout
+from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.runtime.audit import AuditTrail
 
 DIRECTIVES = "zenoh::net::routing::interceptor=trace,zenoh_link_tls=warn"

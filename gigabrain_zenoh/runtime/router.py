@@ -7,13 +7,13 @@ robot's router checks messages against the host's certificate, as if processes c
 import asyncio
 import contextlib
 import logging
-import resource
 from collections.abc import Callable
 from pathlib import Path
 
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import Link
 from gigabrain_zenoh.config.settings import RelayConfig, RouterConfig
+from gigabrain_zenoh.host.posix import resource
 from gigabrain_zenoh.runtime.access_audit import AccessAudit, zenoh_log
 from gigabrain_zenoh.runtime.audit import AuditTrail
 from gigabrain_zenoh.runtime.running import SOCKET

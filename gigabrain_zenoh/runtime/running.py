@@ -1,7 +1,6 @@
 """Registry of the robots that run on this machine, so that tools and scripts can find them."""
 
 import contextlib
-import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
@@ -17,6 +16,7 @@ from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
 from gigabrain_zenoh.host.files import open_regular
+from gigabrain_zenoh.host.posix import fcntl
 
 SOCKET = "unixsock-stream"
 NOTE_BYTES = 65536  # maximum size of a note
@@ -86,8 +86,9 @@ def _check_private(place: Path) -> None:
     """Raise ConfigError where another user could put notes into the folder, or replace it."""
     for one in (place, place.parent):
         with contextlib.suppress(FileNotFoundError):
-            about = one.stat()
-            if about.st_uid != os.getuid() or about.st_mode & 0o022:
+            # a link that somebody else planted leads to a folder that may well be ours
+            owners = {one.lstat().st_uid, one.stat().st_uid}
+            if owners != {os.getuid()} or one.stat().st_mode & 0o022:
                 raise ConfigError(
                     f"{one} belongs to another user, or others may write it, so it cannot say "
                     "which robots run; set XDG_RUNTIME_DIR to a folder of your own, of mode 0700"

@@ -1,6 +1,5 @@
 """Files of an identity, checked without reading certificates, and what a host may run with it."""
 
-import fcntl
 import logging
 import os
 import stat
@@ -15,6 +14,7 @@ from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.host.files import open_regular, read_bounded
 from gigabrain_zenoh.host.network import host_and_port
+from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.security.acl import Role, common_name
 
 log = logging.getLogger(__name__)

@@ -7,7 +7,6 @@ import asyncio
 import contextlib
 import os
 import sys
-import termios
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -20,6 +19,7 @@ from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.host.posix import termios
 from gigabrain_zenoh.ui.gamepad import Gamepad
 from gigabrain_zenoh.ui.teleop_keys import HeldKeys, keys_of
 

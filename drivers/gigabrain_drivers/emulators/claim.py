@@ -1,12 +1,12 @@
 """A folder of ports belongs to one emulator at a time."""
 
 import contextlib
-import fcntl
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.posix import fcntl
 
 
 @contextlib.contextmanager

@@ -4,9 +4,10 @@ import asyncio
 import contextlib
 import errno
 import os
-import tty
 from collections.abc import Callable
 from pathlib import Path
+
+from gigabrain_zenoh.host.posix import tty
 
 READ_BYTES = 4096
 BITS_PER_BYTE = 10  # 8N1: start, eight, stop

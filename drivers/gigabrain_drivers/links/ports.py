@@ -2,12 +2,12 @@
 
 import errno
 import os
-import termios
 from pathlib import Path
 
 from serial.tools import list_ports
 
 from gigabrain_drivers.links.port_name import AUTO, USB, usb_id
+from gigabrain_zenoh.host.posix import termios
 
 NO_PORT = (errno.ENOTTY, errno.EINVAL, errno.EISDIR)  # a file, a folder, another device
 

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import errno
 import os
-import termios
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from gigabrain_drivers.links import ports
 from gigabrain_drivers.links.link import Link, LinkProblem
 from gigabrain_drivers.links.port_name import AUTO
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.host.posix import termios
 
 Probe = Callable[[serial.Serial], bool]
 

@@ -1,6 +1,5 @@
 """SLAM over recorded logs: how good the maps are, and what they cost."""
 
-import resource
 import sys
 import time
 from collections.abc import Callable
@@ -10,6 +9,7 @@ import numpy as np
 from msgspec import Struct
 
 from gigabrain_zenoh.geometry.se2 import Floats, between, compose
+from gigabrain_zenoh.host.posix import resource
 from gigabrain_zenoh.mapping.slam import Estimate, Slam
 from gigabrain_zenoh.qa.bench.figures import Figures, figures
 from gigabrain_zenoh.qa.bench.slam_crispness import crispness

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import os
-import resource
 import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -22,6 +21,7 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.client.robot import connect
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.host.posix import resource
 from gigabrain_zenoh.qa.faults.fault import Measured, Skipped
 from gigabrain_zenoh.qa.faults.intruders import unauthorised_publisher
 from gigabrain_zenoh.qa.faults.rig import Rig

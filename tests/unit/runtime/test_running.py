@@ -104,3 +104,27 @@ def test_a_folder_that_cannot_be_written_is_named(
     with pytest.raises(ConfigError, match=r"cannot write .*; set XDG_RUNTIME_DIR$"):  # noqa: SIM117
         with announced("waffle", HERE):
             pass
+
+
+def test_a_link_that_another_user_planted_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "runtime"
+    (tmp_path / "mine").mkdir(mode=0o700)
+    place.symlink_to(tmp_path / "mine")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
+    with announced("waffle", Endpoint(connect=("tcp/127.0.0.1:1",))):
+        assert [robot.label for robot in running()] == ["waffle"]  # a link of one's own is good
+        real = Path.lstat
+
+        def lstat(path: Path) -> os.stat_result:
+            about = real(path)
+            return (
+                os.stat_result((*about[:4], os.getuid() + 1, *about[5:]))
+                if path == place
+                else about
+            )
+
+        monkeypatch.setattr(Path, "lstat", lstat)
+        with pytest.raises(ConfigError, match="belongs to another user"):
+            running()
