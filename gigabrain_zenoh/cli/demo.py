@@ -100,7 +100,7 @@ def demo(*, drive: Drive = DRIVE, shown: Shown = SHOWN) -> int:
     Ends with 1 after any contact, without motion, or when a process has died.
     """
     from gigabrain_zenoh.launch.demo import Demo, DemoOptions
-    from gigabrain_zenoh.ui.page.beside import with_page
+    from gigabrain_zenoh.ui.page.node import with_page
 
     drive.check()
     if shown.record and shown.record.exists():

@@ -34,7 +34,7 @@ def foxglove(
     from gigabrain_zenoh.config.settings import FoxgloveConfig, ProcessConfig
     from gigabrain_zenoh.launch.processes import run_process
     from gigabrain_zenoh.runtime.running import find_endpoint
-    from gigabrain_zenoh.ui.foxglove.layout import write_layout
+    from gigabrain_zenoh.ui.foxglove.access import write_layout
 
     config = checked({"port": port, "origins": origin}, FoxgloveConfig)
     if layout:

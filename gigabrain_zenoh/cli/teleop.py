@@ -26,8 +26,7 @@ def teleop(
 
     from gigabrain_zenoh.client.robot import connect as connect_robot
     from gigabrain_zenoh.errors import ConfigError
-    from gigabrain_zenoh.ui.gamepad import Gamepad
-    from gigabrain_zenoh.ui.teleop_station import Station
+    from gigabrain_zenoh.ui.teleop_station import Gamepad, TeleopStation
 
     async def run() -> None:
         pad = Gamepad()
@@ -38,7 +37,7 @@ def teleop(
             async with connect_robot(
                 at.connect, namespace=at.namespace, keys=at.folder, source=source
             ) as robot:
-                await Station(robot, pad).drive(take)
+                await TeleopStation(robot, pad).drive(take)
         finally:
             pad.close()
 

@@ -24,8 +24,14 @@ from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.ui.live_view import HeadlessView, LiveView, View
-from gigabrain_zenoh.ui.report import Observed, Report, last_told, make_report, summary
-from gigabrain_zenoh.ui.watch import Watch
+from gigabrain_zenoh.ui.run_report import (
+    Observed,
+    Report,
+    RunMonitor,
+    make_report,
+    summary,
+    truth_in_health,
+)
 
 CAPACITY_LOOK_S = 1.0
 SHORT_LOOKS = 5  # so many in a row, for a pause of the machine passes
@@ -130,7 +136,7 @@ class Demo:
                 running = asyncio.ensure_future(self._supervisor.run())
                 bus = await self._join(stop)
                 try:
-                    report = await self._watch(Watch(bus), stop) if bus else None
+                    report = await self._watch(RunMonitor(bus), stop) if bus else None
                 finally:
                     closing = asyncio.ensure_future(bus.close()) if bus else None
                     await self._supervisor.stop(STOP_S)
@@ -149,7 +155,7 @@ class Demo:
             return None
         return Bus(opening.result(), Clock(), "demo")
 
-    async def _watch(self, watch: Watch, stop: asyncio.Event) -> Report | None:
+    async def _watch(self, watch: RunMonitor, stop: asyncio.Event) -> Report | None:
         """Look on until the end, then ask the driver for the truth."""
         view = self._view(watch)
         loop = asyncio.get_running_loop()
@@ -172,7 +178,7 @@ class Demo:
         self._last_fault = newest_fault(text for _, text in self._faults)
         return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)
 
-    def _look_at_capacity(self, watch: Watch, view: View) -> None:
+    def _look_at_capacity(self, watch: RunMonitor, view: View) -> None:
         """Say once that this machine is too small; in lock-step time may wait for the brain."""
         capacity, known = self._capacity, self._capacity.problem
         if self._starting or self._deployment.speed != 1.0:
@@ -203,7 +209,7 @@ class Demo:
         status = self._supervisor.statuses.get("page")
         return self._options.page if status is None or status.state == "ready" else ""
 
-    def _over(self, watch: Watch) -> bool:
+    def _over(self, watch: RunMonitor) -> bool:
         seconds = self._options.seconds
         return seconds is not None and watch.seconds >= seconds - 1e-6
 
@@ -212,7 +218,7 @@ class Demo:
         """Whether there is a page in the terminal."""
         return not self._options.headless and sys.stdout.isatty()
 
-    def _view(self, watch: Watch) -> View:
+    def _view(self, watch: RunMonitor) -> View:
         seconds, page = self._options.seconds, self._options.page
         if not self._live:
             return HeadlessView(watch, seconds, self._served, self._starting_up)
@@ -221,7 +227,7 @@ class Demo:
             watch, self._supervisor, self._deployment, faults, seconds, page, self._starting_up
         )
 
-    async def _ask_for_truth(self, watch: Watch, within_s: float) -> Report | None:
+    async def _ask_for_truth(self, watch: RunMonitor, within_s: float) -> Report | None:
         statuses = self._supervisor.statuses
         names = [name for name, status in statuses.items() if status.state == "ready"]
         told = await asyncio.gather(*(watch.describe(name, within_s) for name in names))
@@ -229,7 +235,7 @@ class Demo:
         state = watch.state.newest
         if "driver" not in answers and state is None:
             return None
-        told_of_all = last_told(watch.health.get("driver"))
+        told_of_all = truth_in_health(watch.health.get("driver"))
         for answer in answers.values():
             told_of_all |= answer
         seen = Observed(
@@ -241,6 +247,7 @@ class Demo:
             seconds=watch.seconds,
             distance_m=watch.distance_m,
             decisions=tuple(self._decisions),
+            turns=watch.turns,
             deaths=self._supervisor.deaths,
             restarts=sum(status.restarts for status in statuses.values()),
             mapped_m2=watch.mapped_m2,

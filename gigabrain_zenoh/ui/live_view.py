@@ -15,7 +15,7 @@ from gigabrain_zenoh.gate.causes import in_words
 from gigabrain_zenoh.host.terminal import LINES, Display, writer
 from gigabrain_zenoh.runtime.deployment import Deployment
 from gigabrain_zenoh.runtime.supervisor import Supervisor
-from gigabrain_zenoh.ui.watch import Watch
+from gigabrain_zenoh.ui.run_report import RunMonitor
 
 FRAMES_HZ = 4
 FAULT_S = 30.0  # how long a fault stays on the page
@@ -46,7 +46,7 @@ class HeadlessView:
 
     def __init__(
         self,
-        watch: Watch,
+        watch: RunMonitor,
         seconds: float | None,
         page: Where = str,
         starting: Starting = str,
@@ -93,7 +93,7 @@ class LiveView:
 
     def __init__(
         self,
-        watch: Watch,
+        watch: RunMonitor,
         supervisor: Supervisor,
         deployment: Deployment,
         faults: Sequence[tuple[float, str]],
@@ -198,7 +198,7 @@ def _line(text: str, style: str, justify: Literal["left", "center"] = "left") ->
     return Text(text, style=style, justify=justify, no_wrap=True, overflow="ellipsis")
 
 
-def doing(watch: Watch, starting: str = "") -> str:
+def doing(watch: RunMonitor, starting: str = "") -> str:
     """What the robot is doing, in words; `starting` says who is not there yet."""
     state, intent = watch.state.fresh(), watch.intent.fresh()
     if state is None:
@@ -215,7 +215,7 @@ def doing(watch: Watch, starting: str = "") -> str:
     return intent.reason if intent else "decision is silent"
 
 
-def _activity(name: str, watch: Watch) -> str:
+def _activity(name: str, watch: RunMonitor) -> str:
     """One process's work, as its messages show it."""
     health = watch.health.get(name)
     sent = health.sent_hz if health else {}
@@ -246,7 +246,7 @@ def _activity(name: str, watch: Watch) -> str:
     return f"{verdict.verdict}: {causes}" if causes else verdict.verdict
 
 
-def _seen(watch: Watch) -> str:
+def _seen(watch: RunMonitor) -> str:
     world = watch.world.fresh()
     if world is None:
         return "silent"

@@ -1,14 +1,18 @@
-"""Operator's station in a terminal: keys and a gamepad publish `robot/teleop`.
+"""Drives a robot from a terminal, by keys and a gamepad, and shows its state.
 
-It also displays the robot's state.
+The gamepad is read by the kernel's joystick interface: Documentation/input/joydev/joystick-api.rst.
 """
 
 import asyncio
 import contextlib
 import os
+import re
+import struct
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
 
 from rich.live import Live
 from rich.text import Text
@@ -20,20 +24,176 @@ from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.host.posix import termios
-from gigabrain_zenoh.ui.gamepad import Gamepad
-from gigabrain_zenoh.ui.teleop_keys import HeldKeys, keys_of
 
 PERIOD_S = 0.05
-KEYS = "WASD or arrows drive · Q E sideways · + - speed · SPACE e-stop · R release · G go · X quit"
-PAD = "gamepad: hold a shoulder button to drive, B stops"
+KEYS_HELP = (
+    "WASD or arrows drive · Q E sideways · + - speed · SPACE e-stop · R release · G go · X quit"
+)
+PAD_HELP = "gamepad: hold a shoulder button to drive, B stops"
+
+# A terminal repeats a held key first after 0.25 to 0.6 s, then every 30 to 50 ms.
+TAP_S = 0.4  # how long a first press counts as held
+HELD_S = 0.15  # the same for a repeated press: after release, the robot brakes this late
+SPEED_SHARES = (0.25, 0.5, 0.75, 1.0)  # speed steps, as fractions of the body's limits
+
+Axes = tuple[int, int, int]  # ahead, left, counter-clockwise: -1, 0 or 1
+MOVES: Final[dict[str, Axes]] = {
+    "w": (1, 0, 0), "up": (1, 0, 0),
+    "s": (-1, 0, 0), "down": (-1, 0, 0),
+    "a": (0, 0, 1), "left": (0, 0, 1),
+    "d": (0, 0, -1), "right": (0, 0, -1),
+    "q": (0, 1, 0), "e": (0, -1, 0),
+}  # fmt: skip
+ARROW_KEYS = {"A": "up", "B": "down", "C": "right", "D": "left"}
+KEY_PATTERN = re.compile(r"\x1b[\[O](?:\d+(?:;\d+)*)?([A-Za-z~])|(.)", re.DOTALL)
+
+EVENT = struct.Struct("<IhBB")  # milliseconds, value, type, number
+BUTTON, AXIS, INITIAL = 0x01, 0x02, 0x80  # types of events
+DEAD_MAN_BUTTONS = (4, 5)  # the shoulder buttons: nothing moves unless one of them is held
+STOP_BUTTON = 1  # the button at the right (B, circle)
+AHEAD_AXIS, TURN_AXIS, SIDEWAYS_AXIS = 1, 3, 0  # left stick up and down, right stick, left stick
+AXIS_RANGE = 32767.0
+DEAD_ZONE = 0.1  # share of a stick's range in which it counts as released
 
 
-class Station:
+def keys_of(typed: str) -> list[str]:
+    """Return the keys in a terminal's input; arrows by name, other escape sequences are dropped."""
+    found = []
+    for sequence, plain in KEY_PATTERN.findall(typed):
+        name = ARROW_KEYS.get(sequence, "") if sequence else plain.lower()
+        if name and name != "\x1b":
+            found.append(name)
+    return found
+
+
+class HeldKeys:
+    """Keys that count as held, and the speed that the operator has chosen."""
+
+    def __init__(self) -> None:
+        self._until_s: dict[str, float] = {}
+        self._share = 0
+
+    @property
+    def share(self) -> float:
+        """Return the chosen fraction of the body's limits."""
+        return SPEED_SHARES[self._share]
+
+    def press(self, key: str, now_s: float) -> bool:
+        """Process a key press; return whether the key is one of those for driving."""
+        if key in ("+", "-"):
+            step = 1 if key == "+" else -1
+            self._share = max(0, min(len(SPEED_SHARES) - 1, self._share + step))
+        elif key in MOVES:
+            repeated = now_s < self._until_s.get(key, now_s)
+            held_s = HELD_S if repeated else TAP_S
+            self._until_s[key] = now_s + held_s
+        else:
+            return False
+        return True
+
+    def release_all(self) -> None:
+        """Count all keys as released."""
+        self._until_s.clear()
+
+    def velocity(self, body: BodyDescription, now_s: float) -> Velocity:
+        """Return the velocity for the keys that are held now."""
+        held = [MOVES[key] for key, until_s in self._until_s.items() if now_s < until_s]
+        if not held:
+            return ZERO
+        x, y, z = (max(-1, min(1, sum(axis))) for axis in zip(*held, strict=True))
+        return Velocity(
+            linear_x=x * self.share * body.max_linear_speed,
+            linear_y=y * self.share * body.max_lateral_speed,
+            angular_z=z * self.share * body.max_angular_speed,
+        )
+
+
+class PadState:
+    """State of buttons and sticks after the events received. Pure."""
+
+    def __init__(self) -> None:
+        self._buttons: dict[int, bool] = {}
+        self._axes: dict[int, float] = {}
+        self._rest = b""
+
+    def feed(self, data: bytes) -> bool:
+        """Process events; return whether one of them is a press of the stop button."""
+        data = self._rest + data
+        whole = len(data) - len(data) % EVENT.size
+        self._rest, stop = data[whole:], False
+        for _, value, kind, number in EVENT.iter_unpack(data[:whole]):
+            if kind & BUTTON:
+                self._buttons[number] = bool(value)
+                stop = stop or (number == STOP_BUTTON and bool(value) and not kind & INITIAL)
+            elif kind & AXIS:
+                self._axes[number] = value / AXIS_RANGE
+        return stop
+
+    @property
+    def held(self) -> bool:
+        """Return whether a dead-man button is held."""
+        return any(self._buttons.get(button) for button in DEAD_MAN_BUTTONS)
+
+    def velocity(self, body: BodyDescription, share: float) -> Velocity:
+        """Return the velocity that the sticks ask for, at most `share` of the body's limits."""
+        if not self.held:
+            return ZERO
+        ahead, turn, left = (
+            -self._pushed(axis) * share for axis in (AHEAD_AXIS, TURN_AXIS, SIDEWAYS_AXIS)
+        )
+        return Velocity(
+            linear_x=ahead * body.max_linear_speed,
+            linear_y=left * body.max_lateral_speed,
+            angular_z=turn * body.max_angular_speed,
+        )
+
+    def _pushed(self, axis: int) -> float:
+        value = max(-1.0, min(1.0, self._axes.get(axis, 0.0)))
+        return value if abs(value) > DEAD_ZONE else 0.0
+
+
+class Gamepad:
+    """First gamepad of this machine, while it is plugged in."""
+
+    def __init__(self, folder: Path = Path("/dev/input")) -> None:
+        self.pad: PadState | None = None
+        self.stop = asyncio.Event()  # set by the stop button
+        self._fd: int | None = None
+        for path in sorted(folder.glob("js*")):
+            with contextlib.suppress(OSError):
+                self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+                self.pad = PadState()
+                asyncio.get_running_loop().add_reader(self._fd, self._read)
+                return
+
+    def close(self) -> None:
+        """Close the device."""
+        fd, self._fd, self.pad = self._fd, None, None
+        if fd is not None:
+            asyncio.get_running_loop().remove_reader(fd)
+            os.close(fd)
+
+    def _read(self) -> None:
+        if self._fd is None or self.pad is None:
+            return
+        try:
+            data = os.read(self._fd, 64 * EVENT.size)
+        except BlockingIOError:
+            return
+        except OSError:  # unplugged: no dead-man button is held
+            data = b""
+        if not data:
+            self.close()
+        elif self.pad.feed(data):
+            self.stop.set()
+
+
+class TeleopStation:
     """Publishes the operator's velocity 20 times a second, zero included."""
 
     def __init__(self, robot: Robot, pad: Gamepad) -> None:
         self._robot, self._pad = robot, pad
-        self._keys, self._said = HeldKeys(), ""
+        self._keys, self._reply = HeldKeys(), ""
         self._quit = False
         self._asking: set[asyncio.Task[None]] = set()
 
@@ -79,7 +239,7 @@ class Station:
 
     def _ask(self, what: str) -> None:
         """Release all keys, then send a request to the gate."""
-        self._keys.let_go()
+        self._keys.release_all()
         self._robot.steer(ZERO)
         task = asyncio.create_task(self._answer(what))
         self._asking.add(task)
@@ -89,16 +249,16 @@ class Station:
         try:
             if what == "stop":
                 reply = await self._robot.estop("teleop")
-                self._said = f"CONFIRMED by {reply.robot_type}: {reply.text}"
+                self._reply = f"CONFIRMED by {reply.robot_type}: {reply.text}"
             elif what == "release":
-                self._said = (await self._robot.release()).text
+                self._reply = (await self._robot.release()).text
             else:
                 await self._enable(take=True)
         except GigabrainError as error:
-            self._said = str(error)
+            self._reply = str(error)
 
     async def _enable(self, take: bool) -> None:
-        self._said = (await self._robot.enable(BRAIN, take=take)).text
+        self._reply = (await self._robot.enable(BRAIN, take=take)).text
 
     async def _hand_back(self) -> None:
         """Stop the body; enable the brain again only if this station still had the body."""
@@ -116,18 +276,23 @@ class Station:
     def _lines(self, wanted: Velocity) -> list[str]:
         state = self._robot.state
         if state is None:
-            return ["the robot is silent; is the driver running?", self._said, KEYS]
-        return [*readout(state, wanted, self._keys.share), self._said, KEYS, *self._pad_line()]
+            return ["no messages from the robot; is its driver running?", self._reply, KEYS_HELP]
+        return [
+            *readout(state, wanted, self._keys.share),
+            self._reply,
+            KEYS_HELP,
+            *self._pad_line(),
+        ]
 
     def _pad_line(self) -> list[str]:
-        return [PAD] if self._pad.pad else []
+        return [PAD_HELP] if self._pad.pad else []
 
 
 def readout(state: RobotState, wanted: Velocity, share: float) -> list[str]:
     """Return lines with the gate, its commander, the speed, and causes with their remedies."""
     now, gate = state.velocity, state.gate
     lines = [
-        f"{state.robot_type}: {gate.mode}, driven by {gate.commander or 'nobody'}",
+        f"{state.robot_type}: {gate.mode}, commander {gate.commander or 'none'}",
         f"speed {now.linear_x:+.2f} m/s {now.angular_z:+.2f} rad/s, "
         f"wanted {wanted.linear_x:+.2f} {wanted.angular_z:+.2f} ({share:.0%} of its limits)",
     ]

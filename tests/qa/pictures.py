@@ -10,7 +10,7 @@ from playwright.async_api import Page, async_playwright
 from gigabrain_zenoh.qa.faults.onlooker import looking_on
 from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.ui.watch import Watch
+from gigabrain_zenoh.ui.run_report import RunMonitor
 from tests.system.page import CHROMIUM, FLAGS, OPERATOR, Robot
 
 READY_S = 600.0  # a machine without compiled kernels compiles them first
@@ -30,7 +30,7 @@ async def take(folder: Path) -> None:
         try:
             robot = Robot(home, world="house", seed=1, **NAVIGATES)
             async with looking_on(robot.endpoint) as seen:
-                watch = Watch(seen.bus)
+                watch = RunMonitor(seen.bus)
                 await robot.served()
                 await until(lambda: watch.task.current, "decision is ready", READY_S)
                 await until(lambda: watch.mapped_m2, "a map", READY_S)
@@ -49,7 +49,7 @@ async def take(folder: Path) -> None:
             home.close()
 
 
-def worth_a_picture(watch: Watch) -> bool:
+def worth_a_picture(watch: RunMonitor) -> bool:
     """Whether the map has grown, and the robot drives to somewhere not too near."""
     task, state = watch.task.current, watch.state.fresh()
     far = task is not None and (task.distance_remaining or 0.0) > 2.0

@@ -14,7 +14,7 @@ from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.runtime.deployment import ROBOT
 from gigabrain_zenoh.testing.processes import Command, Home, endpoint_of, free_port, listens
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.ui.page import wire
+from gigabrain_zenoh.ui.page import frames
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 # the first four as its sandbox, GPU and network are none of ours; the rest keep it from the network
@@ -113,5 +113,5 @@ async def client(
     """A WebSocket of no browser."""
     url = f"ws://127.0.0.1:{robot.port}/ws"
     async with connect(url, origin=origin or robot.origin, max_queue=None) as socket:  # type: ignore[arg-type]
-        await socket.send(wire.as_json(wire.LOGIN, wire.Login(token=token)))
+        await socket.send(frames.as_json(frames.LOGIN, frames.Login(token=token)))
         yield socket

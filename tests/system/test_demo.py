@@ -24,8 +24,13 @@ from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.processes import AVOID, Command, Home, robot_of
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.live_view import doing
-from gigabrain_zenoh.ui.report import Observed, last_told, make_report, summary
-from gigabrain_zenoh.ui.watch import Watch
+from gigabrain_zenoh.ui.run_report import (
+    Observed,
+    RunMonitor,
+    make_report,
+    summary,
+    truth_in_health,
+)
 from tests.places import ROOT
 
 BODIES = ROOT / "drivers" / "gigabrain_drivers" / "bodies"
@@ -236,20 +241,20 @@ def test_a_run_whose_driver_did_not_answer_in_the_end_is_told_as_far_as_it_is_kn
         decisions=((1.0, "exploring: going"),), deaths=0, restarts=0, rejected=0,
         mapped_m2=33.61, answered=False,
     )  # fmt: skip
-    report = make_report(last_told(health), seen)
+    report = make_report(truth_in_health(health), seen)
     assert (report.ok, report.contacts, report.stale_commands_executed) == (False, None, 0)
     assert (report.sim_seconds, report.distance_m) == (31.0, 2.5)
     assert summary(report) == (
         "the driver did not answer in the end: 2.50 m in 31 s, 34 m² mapped, "
         "scan to command 30.0 ms (p99 148.0)"
     )
-    unknown = make_report(last_told(None), seen)
+    unknown = make_report(truth_in_health(None), seen)
     assert (unknown.stale_commands_executed, unknown.lockstep_timeouts) == (None, None)
 
 
 async def test_the_mapped_area_is_that_of_cells_known_to_be_free_or_taken() -> None:
     net = Net()
-    watch = Watch(net.one)
+    watch = RunMonitor(net.one)
     assert watch.mapped_m2 is None
     grid = OccupancyGrid(
         width=3, height=2, resolution=0.5, origin_x=0.0, origin_y=0.0, cells=b"\x00\x64\xff" * 2
@@ -259,7 +264,7 @@ async def test_the_mapped_area_is_that_of_cells_known_to_be_free_or_taken() -> N
 
 
 async def test_a_process_on_its_way_is_named_until_the_gate_is_open() -> None:
-    watch = Watch(Net().one)
+    watch = RunMonitor(Net().one)
     assert doing(watch) == "starting"
     late = "decision is getting ready, compiling, once per installation"
     assert doing(watch, late) == late
@@ -287,7 +292,7 @@ async def test_a_clock_that_stands_still_ends_the_demo_but_not_while_a_process_i
     statuses = demo._supervisor.statuses
     for name, status in statuses.items():
         status.state = "starting" if name == "decision" else "ready"
-    watching = asyncio.ensure_future(demo._watch(Watch(net.one), stop))
+    watching = asyncio.ensure_future(demo._watch(RunMonitor(net.one), stop))
     await asyncio.sleep(2.0)
     assert not watching.done()
     statuses["decision"].state = "ready"
@@ -303,7 +308,7 @@ async def test_where_the_page_is_is_said_once_and_not_before_it_is_there(
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     net = Net()
-    watch = Watch(net.one)
+    watch = RunMonitor(net.one)
     net.two.publish(STATE, EXAMPLES["RobotState"])
     hosts = {"robot": (*ROBOT, "page")}
     where = DemoOptions(headless=True, page="http://127.0.0.1:8080")

@@ -24,7 +24,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime.services import NameClaim
 from gigabrain_zenoh.testing.processes import Home, free_port, listens
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.ui.foxglove.layout import topic_to_steer, write_layout
+from gigabrain_zenoh.ui.foxglove.access import topic_to_steer, write_layout
 from gigabrain_zenoh.ui.page.access import token_file, tokens
 from tests.unit.ui.foxglove_bridge import Bridge, bridged, hold
 from tests.unit.ui.foxglove_viewer import Viewer, fields

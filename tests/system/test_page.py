@@ -128,7 +128,7 @@ async def test_the_e_stop_stops_a_driving_robot_and_names_who_confirmed_it(
 async def test_a_goal_that_nobody_serves_is_refused_in_words(chromium: Browser) -> None:
     page = await chromium.open()
     await page.click("#map", position={"x": 300, "y": 200})
-    await told(page, "goal", "nobody serves goals")
+    await told(page, "goal", "no process serves goals")
 
 
 async def test_tables_and_log_show_every_process(chromium: Browser) -> None:
@@ -150,7 +150,7 @@ async def test_of_two_viewers_one_steers_and_both_see_it(chromium: Browser, seen
     await turning(seen)
     await told(two, "doing", "steered by viewer")
     await two.keyboard.down("d")
-    await told(two, "said", "somebody else steers")
+    await told(two, "said", "another page steers")
     await seen.ticks(25)
     assert seen.state.velocity.angular_z > 0.3
     await two.keyboard.up("d")

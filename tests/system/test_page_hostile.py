@@ -17,12 +17,12 @@ from gigabrain_schemas.topics import TELEOP
 from gigabrain_zenoh.qa.faults.onlooker import looking_on
 from gigabrain_zenoh.testing.processes import AVOID, Home
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.ui.page import wire
+from gigabrain_zenoh.ui.page import frames
 from tests.system.page import OPERATOR, VIEWER, Robot, client
 
-DRIVE = struct.pack("<4B3f", wire.DRIVE, 0, 0, 0, 0.1, 0.0, 0.0)
-REST = struct.pack("<4B3f", wire.DRIVE, 0, 0, 0, 0.0, 0.0, 0.0)
-ESTOP = wire.as_json(wire.ASK, {"id": 1, "what": "estop"})
+DRIVE = struct.pack("<4B3f", frames.DRIVE, 0, 0, 0, 0.1, 0.0, 0.0)
+REST = struct.pack("<4B3f", frames.DRIVE, 0, 0, 0, 0.0, 0.0, 0.0)
+ESTOP = frames.as_json(frames.ASK, {"id": 1, "what": "estop"})
 
 
 @pytest.fixture(scope="module")
@@ -62,10 +62,10 @@ async def served(robot: Robot) -> None:
     [
         (OPERATOR, b""),
         (OPERATOR, b"\xff" * 100),
-        (OPERATOR, bytes((wire.ASK,)) + b"{not json"),
-        (OPERATOR, wire.as_json(wire.ASK, {"id": 1, "what": "explode"})),
-        (OPERATOR, wire.as_json(wire.ASK, {"id": 1, "what": "estop", "more": 1})),
-        (OPERATOR, struct.pack("<4B3f", wire.DRIVE, 0, 0, 0, float("nan"), 0.0, 0.0)),
+        (OPERATOR, bytes((frames.ASK,)) + b"{not json"),
+        (OPERATOR, frames.as_json(frames.ASK, {"id": 1, "what": "explode"})),
+        (OPERATOR, frames.as_json(frames.ASK, {"id": 1, "what": "estop", "more": 1})),
+        (OPERATOR, struct.pack("<4B3f", frames.DRIVE, 0, 0, 0, float("nan"), 0.0, 0.0)),
         (OPERATOR, DRIVE[:-1]),
         (OPERATOR, b"x" * 5000),
         (VIEWER, DRIVE),
@@ -87,7 +87,7 @@ async def test_what_no_page_of_ours_sends_ends_the_connection_and_moves_nothing(
         await seen.ticks(10)
         assert steered == []
         assert seen.state.gate.estop_generation == generation
-    assert await kinds(robot) == wire.ABOUT
+    assert await kinds(robot) == frames.ABOUT
 
 
 @pytest.mark.usefixtures("served")
@@ -143,7 +143,7 @@ async def test_a_viewer_who_never_reads_slows_neither_robot_nor_others(robot: Ro
         "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
         "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
     )
-    login = wire.as_json(wire.LOGIN, wire.Login(token=VIEWER))
+    login = frames.as_json(frames.LOGIN, frames.Login(token=VIEWER))
     writer.write(head.encode())
     assert b" 101 " in await reader.readline()
     writer.write(bytes((0x82, 0x80 | len(login), 0, 0, 0, 0)) + login)  # masked by zeros
@@ -152,7 +152,7 @@ async def test_a_viewer_who_never_reads_slows_neither_robot_nor_others(robot: Ro
         moments = 0
         while moments < 50:
             frame = await asyncio.wait_for(other.recv(), 20)
-            moments += frame[0] == wire.MOMENT
+            moments += frame[0] == frames.MOMENT
         assert seen.state.boot != 0
         await until(lambda: seen.state.tick - begin >= 200, "the robot's time goes on as well")
     writer.close()

@@ -19,7 +19,7 @@ from gigabrain_zenoh.qa.bench.bodies_onlooker import Onlooker
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 from gigabrain_zenoh.runtime.supervisor import Supervisor
-from gigabrain_zenoh.ui.watch import Watch
+from gigabrain_zenoh.ui.run_report import RunMonitor
 
 BODY = ("emulator", "driver")  # what is exchanged; all else stays
 LOOK_S = 0.05
@@ -114,7 +114,7 @@ async def _drive(
     ]
     bus = Bus(await ZenohTransport.open(client_endpoint(deployment)), Clock(), "bench")
     try:
-        onlooker, watch = Onlooker(bus), Watch(bus)
+        onlooker, watch = Onlooker(bus), RunMonitor(bus)
         async with Supervisor(specs, lambda name, record: None) as supervisor:
             running = asyncio.create_task(supervisor.run())
             await _until_driven(onlooker, seconds, supervisor, brain)
@@ -156,7 +156,7 @@ async def _until_driven(
             raise BodyLost(f"nothing goes on; gate: {gate}")
 
 
-async def _truth(watch: Watch, supervisor: Supervisor) -> dict[str, float | int | str | None]:
+async def _truth(watch: RunMonitor, supervisor: Supervisor) -> dict[str, float | int | str | None]:
     told = await asyncio.gather(*(watch.describe(name, 1.0) for name in supervisor.statuses))
     return {key: value for answer in told if answer for key, value in answer.report.items()}
 

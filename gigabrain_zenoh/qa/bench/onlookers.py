@@ -12,8 +12,8 @@ from websockets.asyncio.client import connect
 from websockets.typing import Origin, Subprotocol
 
 from gigabrain_zenoh.qa.bench.group import cpu_s
-from gigabrain_zenoh.ui.page import wire
-from gigabrain_zenoh.ui.page.beside import HOST, free_port
+from gigabrain_zenoh.ui.page import frames
+from gigabrain_zenoh.ui.page.node import HOST, free_port
 
 ECHO = "topic echo"
 ECHOED = "state"  # 50 a second
@@ -77,7 +77,7 @@ async def looking_on(ports: Ports) -> AsyncIterator[Echo]:
 async def _view_page(port: int) -> None:
     place = f"{HOST}:{port}"
     async with connect(f"ws://{place}/ws", origin=Origin(f"http://{place}")) as socket:
-        await socket.send(wire.as_json(wire.LOGIN, wire.Login()))
+        await socket.send(frames.as_json(frames.LOGIN, frames.Login()))
         async for _ in socket:
             pass
 

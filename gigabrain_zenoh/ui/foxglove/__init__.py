@@ -1,1 +1,1 @@
-"""A live bridge to viewers that speak the protocol of Foxglove, such as Lichtblick."""
+"""Bridge to viewers of Foxglove's protocol, such as Lichtblick."""

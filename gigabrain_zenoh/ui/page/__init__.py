@@ -1,1 +1,1 @@
-"""The operator page: a robot in a browser, seen and steered."""
+"""The operator page: shows a robot in a browser, and steers it."""

@@ -1,4 +1,4 @@
-"""Who may open the page, and what for: tokens, and the names under which it is asked for."""
+"""Access to the page: tokens for operators and viewers, and the names of its host."""
 
 import hmac
 import ipaddress
@@ -25,29 +25,29 @@ TOKEN_BYTES = 24
 
 
 class Tokens(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One secret for those who drive, one for those who look."""
+    """Secrets of operators and of viewers."""
 
     operator: str
     viewer: str
 
     def __post_init__(self) -> None:
         if min(len(self.operator), len(self.viewer)) < 16 or self.operator == self.viewer:
-            raise ValueError("two tokens of 16 characters or more are expected")
+            raise ValueError("expected two different tokens of 16 characters or more")
 
 
 def wants_login(config: PageConfig) -> bool:
-    """Whether somebody who opens the page has to have a token."""
+    """Return whether the page asks for a token."""
     return config.login or not is_loopback(config.listen)
 
 
 def check(config: PageConfig) -> None:
-    """Raises ConfigError for a page that others can reach without TLS."""
+    """Raise ConfigError for a page that other machines can reach without TLS."""
     if bool(config.certificate) != bool(config.certificate_key):
-        raise ConfigError("page: a certificate and its key belong together")
+        raise ConfigError("page: set both certificate and certificate_key, or neither")
     if not is_loopback(config.listen) and not config.certificate:
         raise ConfigError(
-            f"page: {config.listen} can be reached from the network; name a certificate and its "
-            "key (PEM files), or leave it on 127.0.0.1 and use an SSH tunnel"
+            f"page: {config.listen} can be reached from the network; set certificate and "
+            "certificate_key (PEM files), or listen on 127.0.0.1 and use an SSH tunnel"
         )
     for file in filter(None, (config.certificate, config.certificate_key)):
         if not os.access(file, os.R_OK):
@@ -55,15 +55,12 @@ def check(config: PageConfig) -> None:
 
 
 def token_file(named: str) -> Path:
-    """Where the tokens are kept; in the file that is `named`, where one is."""
+    """Return the path of the token file: `named`, or the default if that is empty."""
     return Path(named) if named else state_dir() / "page" / "tokens.json"
 
 
 def tokens(path: Path) -> tuple[Tokens, bool]:
-    """The tokens in a file that only its owner can read, and whether it had to be made.
-
-    Raises ConfigError where it cannot be used.
-    """
+    """Return the tokens in a private file, and whether it was made now. Raises ConfigError."""
     fresh = Tokens(
         operator=secrets.token_urlsafe(TOKEN_BYTES), viewer=secrets.token_urlsafe(TOKEN_BYTES)
     )
@@ -71,11 +68,11 @@ def tokens(path: Path) -> tuple[Tokens, bool]:
     try:
         return msgspec.json.decode(held, type=Tokens), made
     except DECODE_ERRORS as error:
-        raise ConfigError(f"{path}: {error}; remove it, and new tokens are made") from None
+        raise ConfigError(f"{path}: {error}; remove it to have new tokens made") from None
 
 
 class Access:
-    """Decides who is let in."""
+    """Decides which requests and tokens are accepted."""
 
     def __init__(self, config: PageConfig, port: int) -> None:
         self._tokens, self.made = None, False
@@ -86,16 +83,16 @@ class Access:
         names = {_in_header(name) for name in (config.listen, *local, *config.names)}
         self._hosts = {f"{name}:{port}" for name in names}
         if port == PORTS[self._scheme]:
-            self._hosts |= names  # browsers leave out the port that goes without saying
+            self._hosts |= names  # browsers leave out the default port
 
-    def told(self) -> str:
-        """The tokens, for whoever has just had them made; else nothing."""
+    def new_tokens_text(self) -> str:
+        """Return the tokens in words if they were made now, else an empty text."""
         if self._tokens is None or not self.made:
             return ""
         return f"to drive: {self._tokens.operator}\nto look:  {self._tokens.viewer}"
 
     def role(self, token: str) -> Role | None:
-        """What a token allows; None for a stranger's."""
+        """Return the role of a token; None if it is unknown."""
         if self._tokens is None:
             return "operator"
         if _same(token, self._tokens.operator):
@@ -103,17 +100,17 @@ class Access:
         return "viewer" if _same(token, self._tokens.viewer) else None
 
     def named(self, headers: Mapping[str, str]) -> bool:
-        """Whether the page was asked for by a name of its own (DNS rebinding, RFC 9110 7.2)."""
+        """Return whether the Host is a name of this page (DNS rebinding, RFC 9110 7.2)."""
         return headers.get("host", "").lower() in self._hosts
 
     def own_page(self, headers: Mapping[str, str]) -> bool:
-        """Whether it is this page that opens a WebSocket, and no other site's."""
+        """Return whether a WebSocket is opened by this page, and not by another site."""
         origin = headers.get("origin", "").lower()
         return self.named(headers) and origin == f"{self._scheme}://{headers['host'].lower()}"
 
 
 def _in_header(name: str) -> str:
-    """A name or an address as browsers put it into `Host` and `Origin` (RFC 3986, 3.2.2)."""
+    """Return a name or address as browsers write it in Host and Origin (RFC 3986, 3.2.2)."""
     name = name.strip("[]").lower()
     return f"[{ipaddress.ip_address(name)}]" if ":" in name and is_ip(name) else name
 

@@ -1,25 +1,56 @@
-"""The page as a process; its libraries are looked for only when it is started."""
+"""The page as a process, and beside a demo; its libraries are imported only when it starts."""
 
+import contextlib
 from collections.abc import Callable
 from importlib.util import find_spec
+
+from msgspec.structs import replace
 
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.network import reserve_port
+from gigabrain_zenoh.runtime.deployment import Deployment
+from gigabrain_zenoh.ui.page.access import token_file, tokens
 
-NEEDS = ("starlette", "uvicorn", "websockets")
-INSTALL = "the operator page needs more: pip install 'gigabrain-zenoh[page]'"
+LIBRARIES = ("starlette", "uvicorn", "websockets")
+INSTALL = "the operator page needs more packages: pip install 'gigabrain-zenoh[page]'"
+HOST = "127.0.0.1"
 
 
 def installed() -> bool:
-    """Whether everything is there that the page needs."""
-    return all(find_spec(name) for name in NEEDS)
+    """Return whether the page's libraries are installed."""
+    return all(find_spec(name) for name in LIBRARIES)
 
 
 async def run(config: PageConfig, bus: Bus, ready: Callable[[], None]) -> None:
-    """Serve the page until the process ends. Raises ConfigError where it cannot be served."""
+    """Serve the page until the process ends. Raises ConfigError if that is impossible."""
     if not installed():
         raise ConfigError(INSTALL)
     from gigabrain_zenoh.ui.page.server import run as serve
 
     await serve(config, bus, ready)
+
+
+def with_page(deployment: Deployment, port: int, *, login: bool = False) -> tuple[Deployment, str]:
+    """Return the deployment with a page on its first host, and the page's address.
+
+    Without the page's libraries return the deployment as it is, and how to install them. With
+    `login` the address contains the operator's token. Raises ConfigError.
+    """
+    if not installed():
+        return deployment, INSTALL
+    port = free_port(port)
+    (host, names), *others = deployment.hosts.items()
+    hosts = {host: (*names, "page"), **dict(others)}
+    served = replace(deployment, hosts=hosts, page=PageConfig(port=port, login=login))
+    key = f"/#{tokens(token_file(''))[0].operator}" if login else ""
+    return served, f"http://{HOST}:{port}{key}"
+
+
+def free_port(port: int) -> int:
+    """Return `port` if it is free, else any free port."""
+    for wanted in (port, 0):
+        with contextlib.suppress(OSError):
+            return reserve_port(HOST, wanted)
+    return port

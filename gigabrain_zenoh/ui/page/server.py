@@ -1,4 +1,4 @@
-"""The page's server: a process of its own, which the robot never waits for."""
+"""The page's web server: a process of its own that the robot never waits for."""
 
 import asyncio
 import contextlib
@@ -15,22 +15,23 @@ from starlette.responses import PlainTextResponse
 from starlette.routing import Mount, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.ui.page.access import Access, check, token_file, wants_login
-from gigabrain_zenoh.ui.page.operator import Operator
-from gigabrain_zenoh.ui.page.patience import Impatient
-from gigabrain_zenoh.ui.page.scene import Scene
-from gigabrain_zenoh.ui.page.sessions import Sessions
-from gigabrain_zenoh.ui.seat import Seat
+from gigabrain_zenoh.ui.page.frames import PageView
+from gigabrain_zenoh.ui.page.sessions import Operator, Sessions
+from gigabrain_zenoh.ui.robot_view import TeleopArbiter
 
 log = logging.getLogger(__name__)
 
 STATIC = Path(__file__).parent / "static"
-MOST = 512  # connections of all kinds
-FRAME_NS = 100_000_000  # viewers see ten moments a second
+MAX_CONNECTIONS = 512  # of all kinds
+MAX_SILENT = 64  # connections without a request; the oldest gives way to the newest
+REQUEST_TIMEOUT_S = 5.0
+FRAME_INTERVAL_NS = 100_000_000
 HEADERS = {
     b"content-security-policy": b"default-src 'self'; connect-src 'self'; img-src 'self' blob: "
     b"data:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
@@ -40,16 +41,48 @@ HEADERS = {
 }
 
 
-class Guarded:
-    """Answers only those who ask for the page by its own name, and says what it may load."""
+class ImpatientProtocol(H11Protocol):
+    """HTTP that closes connections without a request, so that they keep no browser out."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Watch a new connection; close the oldest silent one if there are too many."""
+        super().connection_made(transport)
+        self._since_s = self.loop.time()
+        self._timer = self.loop.call_later(REQUEST_TIMEOUT_S, self._check)
+        silent = [c for c in self.connections if isinstance(c, ImpatientProtocol) and c.silent]
+        if len(silent) > MAX_SILENT:
+            min(silent, key=lambda connection: connection._since_s).transport.close()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Stop watching."""
+        self._timer.cancel()
+        super().connection_lost(exc)
+
+    @property
+    def silent(self) -> bool:
+        """Return whether no request is under way."""
+        return not self.transport.is_closing() and (
+            self.cycle is None or self.cycle.response_complete
+        )
+
+    def _check(self) -> None:
+        if self.transport.get_protocol() is not self:
+            return  # a WebSocket by now, whose login has a timeout of its own
+        if self.silent:
+            self.transport.close()
+        self._timer = self.loop.call_later(REQUEST_TIMEOUT_S, self._check)
+
+
+class GuardedApp:
+    """Answers only requests for the page's own names, and adds security headers."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app, self._access = app, access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Answer one request."""
         if scope["type"] == "http" and not self._access.named(Headers(scope=scope)):
-            response = PlainTextResponse("this page goes by another name\n", 421)
+            response = PlainTextResponse("this page has another name\n", 421)
             await response(scope, receive, send)
             return
 
@@ -62,7 +95,7 @@ class Guarded:
 
 
 class _Server(uvicorn.Server):
-    """Uvicorn without signals of its own: the process around it has them."""
+    """Uvicorn without signal handlers: the process has its own."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -70,7 +103,7 @@ class _Server(uvicorn.Server):
 
 
 def listen(config: PageConfig) -> socket.socket:
-    """The socket of the page. Raises ConfigError where it cannot be had."""
+    """Open the page's socket. Raises ConfigError."""
     family = socket.AF_INET6 if ":" in config.listen else socket.AF_INET
     try:
         return socket.create_server((config.listen, config.port), family=family)
@@ -84,34 +117,37 @@ def listen(config: PageConfig) -> socket.socket:
 async def run(config: PageConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Serve the page until the process ends. Raises ConfigError."""
     check(config)
-    with listen(config) as door:
-        port = door.getsockname()[1]
-        access = Access(config, port)
+    with listen(config) as listener:
+        access = Access(config, listener.getsockname()[1])
         sessions = Sessions(access)
-        scene = Scene(bus, sessions.tell)
-        sessions.serve(scene, Seat(scene), Operator(bus))
+        view = PageView(bus, sessions.send)
+        sessions.serve(view, TeleopArbiter(view), Operator(bus))
         server = _server(config, access, sessions)
-        serving = asyncio.ensure_future(server.serve(sockets=[door]))
-        showing = asyncio.ensure_future(_show(bus, scene, sessions))
-        scheme = "https" if config.certificate else "http"
-        host = f"[{config.listen}]" if ":" in config.listen else config.listen
-        log.info("operator page at %s://%s:%d", scheme, host, port)
-        if wants_login(config):
-            log.info("it wants a token of %s", token_file(config.tokens))
-        if config.tell_tokens and access.made:
-            print(access.told(), flush=True)
+        serving = asyncio.ensure_future(server.serve(sockets=[listener]))
+        sending = asyncio.ensure_future(_send_frames(bus, sessions))
+        _announce(config, access, listener.getsockname()[1])
         ready()
         try:
-            ends = (serving, showing, bus.failed)
+            ends = (serving, sending, bus.failed)
             await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            showing.cancel()
+            sending.cancel()
             sessions.close()
             server.should_exit = True
             await serving
-        for end in (showing, bus.failed):
+        for end in (sending, bus.failed):
             if end.done() and not end.cancelled():
                 end.result()
+
+
+def _announce(config: PageConfig, access: Access, port: int) -> None:
+    scheme = "https" if config.certificate else "http"
+    host = f"[{config.listen}]" if ":" in config.listen else config.listen
+    log.info("operator page at %s://%s:%d", scheme, host, port)
+    if wants_login(config):
+        log.info("its tokens are in %s", token_file(config.tokens))
+    if config.tell_tokens and access.made:
+        print(access.new_tokens_text(), flush=True)
 
 
 def _server(config: PageConfig, access: Access, sessions: Sessions) -> _Server:
@@ -119,17 +155,17 @@ def _server(config: PageConfig, access: Access, sessions: Sessions) -> _Server:
     routes = [WebSocketRoute("/ws", sessions.talk), Mount("/", files)]
     return _Server(
         uvicorn.Config(
-            Guarded(Starlette(routes=routes), access),
+            GuardedApp(Starlette(routes=routes), access),
             log_config=None,
             log_level="warning",
             access_log=False,
             lifespan="off",
-            http=Impatient,
+            http=ImpatientProtocol,
             ws="websockets-sansio",
             ws_max_size=4096,
             ws_per_message_deflate=False,
             timeout_graceful_shutdown=1,
-            limit_concurrency=MOST,
+            limit_concurrency=MAX_CONNECTIONS,
             server_header=False,
             ssl_certfile=config.certificate or None,
             ssl_keyfile=config.certificate_key or None,
@@ -137,12 +173,9 @@ def _server(config: PageConfig, access: Access, sessions: Sessions) -> _Server:
     )
 
 
-async def _show(bus: Bus, scene: Scene, sessions: Sessions) -> None:
-    """Ten times a second, to whoever looks."""
+async def _send_frames(bus: Bus, sessions: Sessions) -> None:
     numbers = itertools.count()
-    async for _ in bus.clock.every(FRAME_NS):
+    async for _ in bus.clock.every(FRAME_INTERVAL_NS):
         bus.counters["frames"] = next(numbers)
         if sessions.viewers:
-            sessions.tell("moment", sessions.moment())
-            for slot, frame in scene.news():
-                sessions.tell(slot, frame)
+            sessions.send_news()

@@ -1,30 +1,137 @@
-"""The browsers that are connected: login, what they are sent, what they say."""
+"""Browsers that are connected: their login, the frames sent to them, and their requests."""
 
 import asyncio
 import contextlib
 import itertools
 import logging
+import time
+from collections.abc import Sequence
 
+from msgspec.structs import replace
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
+from gigabrain_schemas.topics import ENABLE, GOAL, RELEASE, TASK_CHANGE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.client.asking import ANSWER_S, ask, granted
+from gigabrain_zenoh.client.estop import press
+from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
+from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.plugins import package_version
-from gigabrain_zenoh.ui.page import wire
+from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, Role
-from gigabrain_zenoh.ui.page.operator import Operator
-from gigabrain_zenoh.ui.page.scene import Scene
-from gigabrain_zenoh.ui.page.viewer import Viewer
-from gigabrain_zenoh.ui.seat import Seat
+from gigabrain_zenoh.ui.page.frames import Ask, PageView, Reply
+from gigabrain_zenoh.ui.robot_view import TeleopArbiter
 
 log = logging.getLogger(__name__)
 
-LOGIN_S = 5.0  # until a browser has to have said who it is
-WRONG_S = 0.5  # how long a wrong token waits for its answer
-MOST = 16  # browsers at a time; who only looks gives way to an operator
-MOST_OPERATORS = 64  # of whom each can stop the robot, so nobody else's number keeps one out
-ARRIVING = 64  # browsers that have not said who they are; the oldest gives way to the newest
-WAITING = 8  # requests of one viewer that are under way; e-stops do not count
-LONGEST = 120  # bytes of a reason for closing
-BAD, STRANGER, FULL = 1008, 4401, 4429  # why a WebSocket is closed (RFC 6455 7.4)
+LOGIN_TIMEOUT_S = 5.0
+WRONG_TOKEN_DELAY_S = 0.5  # before the answer to a wrong token
+MAX_VIEWERS = 16  # browsers at a time; a viewer gives way to an operator
+MAX_OPERATORS = 64  # each of them can stop the robot, so the number of viewers keeps none out
+MAX_LOGINS = 64  # browsers that have not logged in; the oldest gives way to the newest
+MAX_PENDING = 8  # requests of one viewer under way; e-stops do not count
+MAX_REASON_BYTES = 120  # of a reason for closing
+MAX_WAITING_FRAMES = 64  # for a slow browser
+MAX_RECEIVED_HZ = 120  # frames that a browser may send; held keys take 25
+BAD_FRAME, STRANGER, FULL = 1008, 4401, 4429  # codes for closing a WebSocket (RFC 6455 7.4)
+OTHER_STEERS = "another page steers the robot"
+
+
+class Viewer:
+    """Frames that wait for one browser: the newest of each slot; the oldest go if too many."""
+
+    def __init__(self, number: int, role: Role) -> None:
+        self.number, self.role = number, role
+        self.gives_way = asyncio.Event()
+        self._slots: dict[str, bytes] = {}
+        self._filled = asyncio.Event()
+        self._second_s, self._received = 0.0, 0
+
+    def put(self, slot: str, frame: bytes) -> None:
+        """Send `frame` instead of what still waits in its slot. Never waits."""
+        self._slots[slot] = frame
+        while len(self._slots) > MAX_WAITING_FRAMES:
+            del self._slots[next(iter(self._slots))]
+        self._filled.set()
+
+    async def next(self) -> bytes:
+        """Wait for the next frame to send."""
+        await self._filled.wait()
+        frame = self._slots.pop(next(iter(self._slots)))
+        if not self._slots:
+            self._filled.clear()
+        return frame
+
+    def floods(self, now_s: float) -> bool:
+        """Count a received frame; return whether there are too many in this second."""
+        if now_s - self._second_s >= 1.0:
+            self._second_s, self._received = now_s, 0
+        self._received += 1
+        return self._received > MAX_RECEIVED_HZ
+
+
+class Operator:
+    """Carries out requests."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+
+    async def answer(self, asked: Ask) -> Reply:
+        """Carry out a request. Errors are part of the reply."""
+        start_s = time.perf_counter()
+        try:
+            text, robot = await self._do(asked)
+            ok = True
+        except GigabrainError as error:
+            text, robot, ok = str(error), "", False
+        took_ms = round((time.perf_counter() - start_s) * 1e3, 1)
+        return Reply(
+            id=asked.id, what=asked.what, ok=ok, text=text[:500], robot=robot, took_ms=took_ms
+        )
+
+    async def _do(self, asked: Ask) -> tuple[str, str]:
+        if asked.what == "goal":
+            return await self._goal(asked), ""
+        if asked.what == "cancel":
+            return await self._cancel(), ""
+        if asked.what == "estop":
+            reply = await press(self._bus, "operator page")
+        elif asked.what == "release":
+            reply = await self._release(asked.estop_generation)
+        else:
+            reply = await self._enable(take=asked.what == "take")
+        return reply.text, reply.robot_type
+
+    async def _release(self, generation: int) -> GateReply:
+        request = ReleaseRequest(estop_generation=generation, source=self._bus.process)
+        return granted(await ask(self._bus, RELEASE, request))
+
+    async def _enable(self, *, take: bool) -> GateReply:
+        request = EnableRequest(source=BRAIN, take=take, by=self._bus.process)
+        return granted(await ask(self._bus, ENABLE, request))
+
+    async def _cancel(self) -> str:
+        request = TaskRequest(do="cancel", source=self._bus.process)
+        replies = await self._bus.ask(TASK_CHANGE, request, timeout_s=ANSWER_S)
+        return _text_of(replies)
+
+    async def _goal(self, asked: Ask) -> str:
+        if asked.goal is None:
+            raise Refused("a goal needs a place")
+        goal = replace(asked.goal, source=self._bus.process)
+        replies = await self._bus.ask(GOAL, goal, timeout_s=ANSWER_S)
+        return _text_of(replies)
+
+
+def _text_of(replies: Sequence[GoalReply | TaskReply]) -> str:
+    """Return the text of the first reply. Raises BodyLost without a reply, and Refused."""
+    if not replies:
+        raise BodyLost("no process serves goals: this robot runs no navigation")
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    return replies[0].text
 
 
 class Sessions:
@@ -33,121 +140,125 @@ class Sessions:
     def __init__(self, access: Access) -> None:
         self._access = access
         self._numbers = itertools.count(1)
-        self._asking: dict[asyncio.Task[None], Viewer] = {}
-        self._arriving: list[asyncio.Task[Role | None]] = []
+        self._pending: dict[asyncio.Task[None], Viewer] = {}
+        self._logins: list[asyncio.Task[Role | None]] = []
         self._loop = asyncio.get_running_loop()
         self.viewers: list[Viewer] = []
 
-    def serve(self, scene: Scene, seat: Seat, operator: Operator) -> None:
-        """What they are to see, and whom to ask."""
-        self._scene, self._seat, self._operator = scene, seat, operator
-        scene.on_body = self._introduce
+    def serve(self, view: PageView, arbiter: TeleopArbiter, operator: Operator) -> None:
+        """Set the sources of frames, and the recipients of commands and requests."""
+        self._view, self._arbiter, self._operator = view, arbiter, operator
+        view.on_body = self._introduce_all
 
-    def tell(self, slot: str, frame: bytes) -> None:
-        """Send a frame to all; nobody is waited for."""
+    def send(self, slot: str, frame: bytes) -> None:
+        """Send a frame to all viewers without waiting."""
         for viewer in self.viewers:
             viewer.put(slot, frame)
 
-    def moment(self) -> bytes:
-        """How the robot is now."""
-        return self._scene.moment(self._seat.driving(self._loop.time()), len(self.viewers))
+    def send_news(self) -> None:
+        """Send the present state, scan and images to all viewers."""
+        driving = self._arbiter.driving(self._loop.time())
+        self.send("moment", self._view.state_frame(driving, len(self.viewers)))
+        for slot, frame in self._view.new_frames():
+            self.send(slot, frame)
 
     def close(self) -> None:
-        """Nobody steers from here any more."""
-        self._seat.clear()
-        for task in self._asking:
+        """End steering and requests."""
+        self._arbiter.clear()
+        for task in self._pending:
             task.cancel()
 
     async def talk(self, socket: WebSocket) -> None:
-        """One browser, from its login to its end."""
+        """Serve one browser from its login to its end."""
         if not self._access.own_page(socket.headers):
-            log.warning("a page of another origin was refused")
-            await socket.close(BAD, "this page is not of this server")
+            log.warning("refused a page of another origin")
+            await socket.close(BAD_FRAME, "this page is not of this server")
             return
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect):
-            role = await self._arrive(socket)
-            if role is None or not self._has_room(role):
+            role = await self._admit(socket)
+            if role is None or not self._has_place(role):
                 await socket.close(FULL if role else STRANGER)
                 return
             viewer = Viewer(next(self._numbers), role)
-            await self._look_on(socket, viewer)
+            await self._serve_viewer(socket, viewer)
             if viewer.gives_way.is_set():
                 await socket.close(FULL, "an operator has taken this place")
 
-    def _has_room(self, role: Role) -> bool:
-        """Whether one more gets in; makes room for an operator."""
-        looking = [each for each in self.viewers if each.role != "operator"]
+    def _has_place(self, role: Role) -> bool:
+        """Return whether one more is admitted; for an operator a viewer gives way."""
         if role != "operator":
-            return len(self.viewers) < MOST
-        if len(self.viewers) >= MOST and looking:
+            return len(self.viewers) < MAX_VIEWERS
+        looking = [each for each in self.viewers if each.role != "operator"]
+        if len(self.viewers) >= MAX_VIEWERS and looking:
             looking[0].gives_way.set()
             self.viewers.remove(looking[0])
-        return len(self.viewers) < MOST_OPERATORS
+        return len(self.viewers) < MAX_OPERATORS
 
-    async def _arrive(self, socket: WebSocket) -> Role | None:
+    async def _admit(self, socket: WebSocket) -> Role | None:
         login = self._loop.create_task(self._login(socket))
-        self._arriving.append(login)
-        if len(self._arriving) > ARRIVING:
-            self._arriving.pop(0).cancel()
+        self._logins.append(login)
+        if len(self._logins) > MAX_LOGINS:
+            self._logins.pop(0).cancel()
         try:
             await asyncio.wait((login,))
         finally:
             login.cancel()
-            if login in self._arriving:
-                self._arriving.remove(login)
+            if login in self._logins:
+                self._logins.remove(login)
         return None if login.cancelled() else login.result()
 
     async def _login(self, socket: WebSocket) -> Role | None:
         try:
-            message = await asyncio.wait_for(socket.receive(), LOGIN_S)
+            message = await asyncio.wait_for(socket.receive(), LOGIN_TIMEOUT_S)
             frame = message.get("bytes") or b""
-            if frame[:1] != bytes((wire.LOGIN,)):
+            if frame[:1] != bytes((frames.LOGIN,)):
                 return None
-            role = self._access.role(wire.login_of(frame[1:]).token)
+            role = self._access.role(frames.decoded(frame[1:], frames.Login).token)
         except (TimeoutError, ValueError):
             return None
         if role is None:
-            log.warning("somebody with a wrong token was turned away")
-            await asyncio.sleep(WRONG_S)
+            log.warning("refused a browser with a wrong token")
+            await asyncio.sleep(WRONG_TOKEN_DELAY_S)
         return role
 
-    async def _look_on(self, socket: WebSocket, viewer: Viewer) -> None:
-        self._greet(viewer)
+    async def _serve_viewer(self, socket: WebSocket, viewer: Viewer) -> None:
+        self._introduce(viewer)
         self.viewers.append(viewer)
-        sending = asyncio.ensure_future(_send(socket, viewer))
-        hearing = asyncio.ensure_future(self._hear(socket, viewer))
-        leaving = asyncio.ensure_future(viewer.gives_way.wait())
-        tasks = (sending, hearing, leaving)
+        tasks = (
+            asyncio.ensure_future(_send_frames(socket, viewer)),
+            asyncio.ensure_future(self._receive(socket, viewer)),
+            asyncio.ensure_future(viewer.gives_way.wait()),
+        )
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             if viewer in self.viewers:
                 self.viewers.remove(viewer)
-            self._seat.leave(viewer.number)
+            self._arbiter.leave(viewer.number)
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    def _greet(self, viewer: Viewer) -> None:
-        body = self._scene.body
-        about = wire.About(
+    def _introduce(self, viewer: Viewer) -> None:
+        body = self._view.body
+        about = frames.About(
             role=viewer.role,
             viewer=viewer.number,
             version=package_version(),
             body=body.description if body else None,
             link=body.link if body else "",
         )
-        viewer.put("about", wire.as_json(wire.ABOUT, about))
-        for slot, frame in self._scene.before():
+        viewer.put("about", frames.as_json(frames.ABOUT, about))
+        for slot, frame in self._view.kept_frames():
             viewer.put(slot, frame)
 
-    def _introduce(self) -> None:
+    def _introduce_all(self) -> None:
         for viewer in self.viewers:
-            self._greet(viewer)
+            self._introduce(viewer)
 
-    async def _hear(self, socket: WebSocket, viewer: Viewer) -> None:
-        """Until the browser leaves, or says what it may not."""
+    async def _receive(self, socket: WebSocket, viewer: Viewer) -> None:
+        """Process frames until the browser leaves or sends one that is not allowed."""
         while True:
             message = await socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -155,48 +266,45 @@ class Sessions:
             try:
                 self._take(viewer, message.get("bytes") or b"")
             except ValueError as error:
-                log.warning("viewer %d was cut off: %s", viewer.number, str(error)[:200])
-                await socket.close(BAD, str(error).encode()[:LONGEST].decode(errors="ignore"))
+                log.warning("disconnected viewer %d: %s", viewer.number, str(error)[:200])
+                reason = str(error).encode()[:MAX_REASON_BYTES].decode(errors="ignore")
+                await socket.close(BAD_FRAME, reason)
                 return
 
     def _take(self, viewer: Viewer, frame: bytes) -> None:
-        """One frame. Raises ValueError for one that no page of ours sends."""
+        """Process one frame. Raises ValueError for one that our page never sends."""
         now_s = self._loop.time()
         if viewer.floods(now_s):
             raise ValueError("too many frames")
         kind, content = frame[:1], frame[1:]
         if viewer.role != "operator":
             raise ValueError("a viewer may look and not drive")
-        if kind == bytes((wire.DRIVE,)):
-            if not self._seat.drive(viewer.number, wire.drive_of(content), now_s):
-                self._reply(viewer, wire.Reply(id=0, what="drive", ok=False, text=SEATED))
-        elif kind == bytes((wire.ASK,)):
-            self._ask(viewer, wire.ask_of(content))
+        if kind == bytes((frames.DRIVE,)):
+            if not self._arbiter.drive(viewer.number, frames.drive_of(content), now_s):
+                self._reply(viewer, Reply(id=0, what="drive", ok=False, text=OTHER_STEERS))
+        elif kind == bytes((frames.ASK,)):
+            self._ask(viewer, frames.decoded(content, Ask))
         else:
             raise ValueError("an unknown frame")
 
-    def _ask(self, viewer: Viewer, asked: wire.Ask) -> None:
-        under_way = list(self._asking.values()).count(viewer)
+    def _ask(self, viewer: Viewer, asked: Ask) -> None:
         if asked.what == "estop":
-            self._seat.clear()
-        elif under_way >= WAITING:
+            self._arbiter.clear()
+        elif list(self._pending.values()).count(viewer) >= MAX_PENDING:
             text = "too many requests are still under way"
-            self._reply(viewer, wire.Reply(id=asked.id, what=asked.what, ok=False, text=text))
+            self._reply(viewer, Reply(id=asked.id, what=asked.what, ok=False, text=text))
             return
         task = self._loop.create_task(self._answer(viewer, asked))
-        self._asking[task] = viewer
-        task.add_done_callback(self._asking.pop)
+        self._pending[task] = viewer
+        task.add_done_callback(self._pending.pop)
 
-    async def _answer(self, viewer: Viewer, asked: wire.Ask) -> None:
+    async def _answer(self, viewer: Viewer, asked: Ask) -> None:
         self._reply(viewer, await self._operator.answer(asked))
 
-    def _reply(self, viewer: Viewer, reply: wire.Reply) -> None:
-        viewer.put(f"reply/{reply.id}", wire.as_json(wire.REPLY, reply))
+    def _reply(self, viewer: Viewer, reply: Reply) -> None:
+        viewer.put(f"reply/{reply.id}", frames.as_json(frames.REPLY, reply))
 
 
-SEATED = "somebody else steers from another page"
-
-
-async def _send(socket: WebSocket, viewer: Viewer) -> None:
+async def _send_frames(socket: WebSocket, viewer: Viewer) -> None:
     while True:
         await socket.send_bytes(await viewer.next())

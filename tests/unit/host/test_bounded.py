@@ -12,8 +12,8 @@ from gigabrain_zenoh.safety.senses import Senses
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.samples import WAFFLE, body
 from gigabrain_zenoh.testing.waiting import settle
-from gigabrain_zenoh.ui.page.scene import Scene
-from gigabrain_zenoh.ui.watch import Watch
+from gigabrain_zenoh.ui.page.frames import PageView
+from gigabrain_zenoh.ui.run_report import RunMonitor
 
 
 def health(name: str) -> Health:
@@ -38,14 +38,14 @@ def test_an_input_log_keeps_the_newest_number_of_so_many_keys() -> None:
 
 async def test_who_watches_keeps_the_health_of_64_processes() -> None:
     net, told = Net(), list[str]()
-    watch, scene = Watch(net.one), Scene(net.one, lambda slot, _frame: told.append(slot))
+    watch, scene = RunMonitor(net.one), PageView(net.one, lambda slot, _frame: told.append(slot))
     for n in range(500):
         net.two.publish(HEALTH, health(f"stranger-{n}"), name=f"stranger-{n}")
     net.two.publish(HEALTH, health("driver"), name="driver")
     await settle()
     assert len(watch.health) == 64
     assert "driver" in watch.health
-    assert len([slot for slot, _ in scene.before() if slot.startswith("health/")]) == 64
+    assert len([slot for slot, _ in scene.kept_frames() if slot.startswith("health/")]) == 64
 
 
 async def test_safety_listens_to_one_other_control_topic_at_a_time() -> None:

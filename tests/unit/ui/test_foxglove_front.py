@@ -9,8 +9,8 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from gigabrain_zenoh.ui.foxglove import front
-from gigabrain_zenoh.ui.foxglove.front import Front, hidden_host
+from gigabrain_zenoh.ui.foxglove import access
+from gigabrain_zenoh.ui.foxglove.access import Front, hidden_host
 from tests.unit.ui.foxglove_bridge import Bridge, bridged
 
 HEAD = "GET / HTTP/1.1\r\nHost: 127.0.0.1:8765\r\nUpgrade: websocket\r\n{}\r\n\r\n"
@@ -92,7 +92,7 @@ async def talker() -> AsyncIterator[tuple[Talker, int, Front]]:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(front, "STALL_S", 1.0)
+    monkeypatch.setattr(access, "STALL_TIMEOUT_S", 1.0)
 
 
 async def first(port: int) -> tuple[bytes, asyncio.StreamWriter]:

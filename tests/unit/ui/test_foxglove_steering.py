@@ -14,7 +14,7 @@ from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.ui.foxglove.layout import topic_to_steer
+from gigabrain_zenoh.ui.foxglove.access import topic_to_steer
 from gigabrain_zenoh.ui.foxglove.steering import velocity_of
 from tests.unit.ui.foxglove_bridge import Bridge, bridged, hold
 

@@ -20,13 +20,11 @@ from gigabrain_zenoh.runtime.deployment import Deployment
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page.access import Access, check, tokens
-from gigabrain_zenoh.ui.page.beside import free_port, with_page
-from gigabrain_zenoh.ui.page.operator import Operator
-from gigabrain_zenoh.ui.page.scene import Scene
+from gigabrain_zenoh.ui.page.frames import Ask, GoalRequest, PageView
+from gigabrain_zenoh.ui.page.node import free_port, with_page
 from gigabrain_zenoh.ui.page.server import run
-from gigabrain_zenoh.ui.page.viewer import Viewer
-from gigabrain_zenoh.ui.page.wire import Ask, GoalRequest
-from gigabrain_zenoh.ui.seat import Seat
+from gigabrain_zenoh.ui.page.sessions import Operator, Viewer
+from gigabrain_zenoh.ui.robot_view import TeleopArbiter
 
 
 def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
@@ -40,7 +38,7 @@ def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
         tokens(path)
     path.chmod(0o600)
     path.write_text('{"operator": "short", "viewer": "short"}')
-    with pytest.raises(ConfigError, match="two tokens of 16 characters"):
+    with pytest.raises(ConfigError, match="tokens of 16 characters"):
         tokens(path)
 
 
@@ -103,9 +101,9 @@ def test_tokens_are_told_to_whoever_had_them_made(tmp_path: Path) -> None:
     config = PageConfig(login=True, tokens=str(tmp_path / "tokens.json"))
     first, second = Access(config, 8080), Access(config, 8080)
     made, _ = tokens(tmp_path / "tokens.json")
-    assert first.told() == f"to drive: {made.operator}\nto look:  {made.viewer}"
-    assert second.told() == ""
-    assert Access(PageConfig(), 8080).told() == ""
+    assert first.new_tokens_text() == f"to drive: {made.operator}\nto look:  {made.viewer}"
+    assert second.new_tokens_text() == ""
+    assert Access(PageConfig(), 8080).new_tokens_text() == ""
 
 
 def test_beyond_loopback_it_wants_tls_and_a_token(tmp_path: Path) -> None:
@@ -113,7 +111,7 @@ def test_beyond_loopback_it_wants_tls_and_a_token(tmp_path: Path) -> None:
     for listen in ("0.0.0.0", "192.168.1.10", "::"):
         with pytest.raises(ConfigError, match="can be reached from the network"):
             check(PageConfig(listen=listen))
-    with pytest.raises(ConfigError, match="belong together"):
+    with pytest.raises(ConfigError, match="certificate_key, or neither"):
         check(PageConfig(certificate="cert.pem"))
     with pytest.raises(ConfigError, match="cannot read"):
         check(PageConfig(certificate="none.pem", certificate_key="none.key"))
@@ -192,12 +190,12 @@ class Seated:
 
     def __init__(self, tell: Callable[[str, bytes], None] = lambda _slot, _frame: None) -> None:
         self.net, self.steered = Net(), list[Twist]()
-        self.scene = Scene(self.net.one, tell)
+        self.scene = PageView(self.net.one, tell)
         self.net.two.subscribe(TELEOP, lambda _key, twist: self.steered.append(twist))
         self.net.two.publish(
             BODY, Body(description=load_robot("turtlebot3_waffle").description(), link="sim")
         )
-        self.seat = Seat(self.scene)
+        self.seat = TeleopArbiter(self.scene)
         self.one, self.two = 1, 2
 
     @property
@@ -244,7 +242,7 @@ async def test_a_goal_that_nobody_serves_is_said_to_be_so() -> None:
     goal = Ask(id=7, what="goal", goal=GoalRequest(x=1.0, y=2.0))
     reply = await Operator(page.net.one).answer(goal)
     assert (reply.id, reply.ok) == (7, False)
-    assert reply.text == "nobody serves goals: this robot has no navigation running"
+    assert reply.text == "no process serves goals: this robot runs no navigation"
 
 
 def test_a_demo_on_a_shared_machine_prints_an_address_that_logs_in(

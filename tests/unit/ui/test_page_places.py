@@ -11,12 +11,11 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.waiting import settle
-from gigabrain_zenoh.ui.page import wire
+from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, tokens
-from gigabrain_zenoh.ui.page.operator import Operator
-from gigabrain_zenoh.ui.page.scene import Scene
-from gigabrain_zenoh.ui.page.sessions import Sessions
-from gigabrain_zenoh.ui.seat import Seat
+from gigabrain_zenoh.ui.page.frames import PageView
+from gigabrain_zenoh.ui.page.sessions import Operator, Sessions
+from gigabrain_zenoh.ui.robot_view import TeleopArbiter
 
 HOST = "127.0.0.1:8080"
 
@@ -56,15 +55,15 @@ class Page:
         self.tokens, _ = tokens(folder / "tokens.json")
         self.sessions = Sessions(Access(config, 8080))
         self.net = Net()
-        scene = Scene(self.net.one, self.sessions.tell)
-        self.sessions.serve(scene, Seat(scene), Operator(self.net.one))
+        scene = PageView(self.net.one, self.sessions.send)
+        self.sessions.serve(scene, TeleopArbiter(scene), Operator(self.net.one))
         self._talks: list[asyncio.Task[None]] = []
 
     async def comes(self, token: str = "") -> Socket:
         """A browser that says who it is, or nothing."""
         socket = Socket()
         if token:
-            socket.said.put_nowait(wire.as_json(wire.LOGIN, wire.Login(token=token)))
+            socket.said.put_nowait(frames.as_json(frames.LOGIN, frames.Login(token=token)))
         self._talks.append(asyncio.ensure_future(self.sessions.talk(socket)))
         for _ in range(3):
             await settle()

@@ -21,9 +21,14 @@ from gigabrain_zenoh.gate.causes import estop
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.ui.gamepad import Gamepad, Pad
-from gigabrain_zenoh.ui.teleop_keys import HeldKeys, keys_of
-from gigabrain_zenoh.ui.teleop_station import Station, readout
+from gigabrain_zenoh.ui.teleop_station import (
+    Gamepad,
+    HeldKeys,
+    PadState,
+    TeleopStation,
+    keys_of,
+    readout,
+)
 
 WAFFLE = load_robot("turtlebot3_waffle")  # 0.26 m/s, 1.82 rad/s
 ALPHA = load_robot("alpha")  # goes sideways as well, 0.2 m/s
@@ -54,7 +59,7 @@ def test_several_keys_add_up_and_opposite_ones_cancel() -> None:
     assert keys.velocity(WAFFLE, 0.1) == Velocity(linear_x=0.065, angular_z=0.455)
     keys.press("s", 0.0)
     assert keys.velocity(WAFFLE, 0.1) == Velocity(angular_z=0.455)
-    keys.let_go()
+    keys.release_all()
     assert keys.velocity(WAFFLE, 0.1) == ZERO
 
 
@@ -76,7 +81,7 @@ def event(value: int, kind: int, number: int) -> bytes:
 
 
 def test_a_gamepad_moves_nothing_unless_a_dead_man_button_is_held() -> None:
-    pad = Pad()
+    pad = PadState()
     pad.feed(event(-32767, 2, 1) + event(-32767, 2, 3))
     assert pad.velocity(WAFFLE, 1.0) == ZERO
     pad.feed(event(1, 1, 5))
@@ -86,7 +91,7 @@ def test_a_gamepad_moves_nothing_unless_a_dead_man_button_is_held() -> None:
 
 
 def test_events_may_come_in_pieces_and_a_stick_near_its_middle_is_let_go() -> None:
-    pad = Pad()
+    pad = PadState()
     data = event(1, 1, 4) + event(-3200, 2, 1) + event(-16384, 2, 3)
     for at in range(0, len(data), 3):
         pad.feed(data[at : at + 3])
@@ -94,7 +99,7 @@ def test_events_may_come_in_pieces_and_a_stick_near_its_middle_is_let_go() -> No
 
 
 def test_its_stop_button_counts_when_it_is_pressed_and_not_as_it_was_found() -> None:
-    pad = Pad()
+    pad = PadState()
     assert not pad.feed(event(1, 1 | 0x80, 1))
     assert not pad.feed(event(0, 1, 1))
     assert pad.feed(event(1, 1, 1))
@@ -118,7 +123,7 @@ def test_the_display_says_who_drives_and_what_to_do_about_what_holds_it_back() -
     state = example(RobotState)
     state = type(state)(robot_type="mock", pose=state.pose, velocity=state.velocity, gate=gate)
     assert readout(state, Velocity(linear_x=0.1), 0.25) == [
-        "mock: latched, driven by nobody",
+        "mock: latched, commander none",
         "speed +0.20 m/s -0.50 rad/s, wanted +0.10 +0.00 (25% of its limits)",
         "  e-stop pressed by ann: find out why it was pressed",
     ]
@@ -150,7 +155,7 @@ class Held:
 
 
 async def cancelled_while_driving(robot: Held, folder: Path) -> None:
-    station = Station(cast(Robot, robot), Gamepad(folder))
+    station = TeleopStation(cast(Robot, robot), Gamepad(folder))
     driving = asyncio.create_task(station.drive(take=True))
     await until(lambda: len(robot.steered) > 1)
     driving.cancel()  # as a signal does

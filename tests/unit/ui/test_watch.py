@@ -10,7 +10,7 @@ from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import DESCRIBE, SAFETY, STATE
 from gigabrain_zenoh.testing.bus import Net
-from gigabrain_zenoh.ui.watch import Watch
+from gigabrain_zenoh.ui.run_report import RunMonitor
 
 
 async def answer(_: DescribeRequest) -> Description:
@@ -19,7 +19,7 @@ async def answer(_: DescribeRequest) -> Description:
 
 async def test_a_process_that_comes_back_in_time_is_heard() -> None:
     net = Net()
-    asking = asyncio.ensure_future(Watch(net.one).describe("driver", 20.0))
+    asking = asyncio.ensure_future(RunMonitor(net.one).describe("driver", 20.0))
     await asyncio.sleep(0.15)
     net.two.serve(DESCRIBE, answer, name="driver")
     told = await asking
@@ -28,7 +28,7 @@ async def test_a_process_that_comes_back_in_time_is_heard() -> None:
 
 
 async def test_who_never_answers_is_none() -> None:
-    assert await Watch(Net().one).describe("driver", 0.15) is None
+    assert await RunMonitor(Net().one).describe("driver", 0.15) is None
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ async def test_a_brain_that_is_late_on_a_busy_machine_is_held_by_its_load(
     mode: GateMode, cause: str, warning: str, held: bool
 ) -> None:
     net = Net()
-    watch, said = Watch(net.one), Cause(code=cause, text="why")
+    watch, said = RunMonitor(net.one), Cause(code=cause, text="why")
     gate = GateStatus(mode=mode, causes=(said,), enables=1)
     pose = Pose(x=0.0, y=0.0, yaw=0.0)
     net.two.publish(STATE, RobotState(robot_type="any", pose=pose, velocity=Velocity(), gate=gate))

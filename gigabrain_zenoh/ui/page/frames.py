@@ -1,0 +1,210 @@
+"""Frames between the page's server and a browser: a byte for their kind, then JSON or arrays."""
+
+import itertools
+import struct
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Count, Finite, Message, Pose, Text, Velocity
+from gigabrain_schemas.body import Body, BodyDescription, RobotState
+from gigabrain_schemas.brain import Intent, OccupancyGrid, WorldModel
+from gigabrain_schemas.safety import Health, LogRecord, SafetyState
+from gigabrain_schemas.sensors import Image, LaserScan
+from gigabrain_schemas.tasks import GoalRequest
+from gigabrain_schemas.topics import Topic
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.host.bounded import put_newest
+from gigabrain_zenoh.ui.robot_view import RobotView
+
+ABOUT, MOMENT, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
+LOGIN, DRIVE, ASK = range(1, 4)  # from the browser
+MAX_PROCESSES = 64  # whose health is shown
+MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
+
+T = TypeVar("T")
+
+
+class About(Struct, frozen=True, kw_only=True):
+    """Facts about the robot and the viewer; sent at the start and when the body changes."""
+
+    role: str
+    viewer: int  # number of this viewer
+    version: str
+    body: BodyDescription | None = None
+    link: str = ""
+
+
+class StateFrame(Struct, frozen=True, kw_only=True):
+    """Present state of the robot; None for what is not fresh."""
+
+    state: RobotState | None
+    pose: Pose | None  # in the map if there is one, else by odometry
+    frame: Literal["map", "odom"]
+    intent: Intent | None
+    safety: SafetyState | None
+    world: WorldModel | None
+    driving: int = 0  # number of the viewer that steers
+    viewers: int = 1
+
+
+class Login(Struct, frozen=True, forbid_unknown_fields=True):
+    """First frame of a browser."""
+
+    token: Annotated[str, Meta(max_length=128)] = ""
+
+
+class Ask(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Request to the robot."""
+
+    id: Annotated[int, Meta(ge=0, le=2**31)]
+    what: Literal["estop", "release", "enable", "take", "goal", "cancel"]
+    estop_generation: Count = 0  # as the page shows it: a newer e-stop is not released unseen
+    goal: GoalRequest | None = None
+
+
+class Reply(Struct, frozen=True, kw_only=True):
+    """Result of a request."""
+
+    id: int
+    what: str
+    ok: bool
+    text: Text
+    robot: str = ""  # type of the robot that confirmed it
+    took_ms: float = 0.0
+
+
+def as_json(kind: int, content: Any) -> bytes:
+    """Return a frame of JSON."""
+    return bytes((kind,)) + msgspec.json.encode(content)
+
+
+def scan_frame(scan: LaserScan, body: BodyDescription, pose: Pose) -> bytes:
+    """Return a scan and the robot's pose: 4 + 9 · 4 bytes, then the ranges as float32.
+
+    x, y, yaw of the robot, x, y, yaw of the lidar on it, first angle, increment, greatest range.
+    """
+    lidar = body.lidar
+    mount = (lidar.x, lidar.y, lidar.yaw) if lidar else (0.0, 0.0, 0.0)
+    head = struct.pack(
+        "<4B9f", SCAN, 0, 0, 0, pose.x, pose.y, pose.yaw, *mount,
+        scan.angle_min, scan.angle_increment, scan.range_max,
+    )  # fmt: skip
+    return head + scan.ranges
+
+
+def map_frame(grid: OccupancyGrid) -> bytes:
+    """Return a map: 4 bytes, resolution, origin, width and height, then the cells."""
+    origin = grid.origin_x, grid.origin_y
+    head = struct.pack("<4B3f2I", MAP, 0, 0, 0, grid.resolution, *origin, grid.width, grid.height)
+    return head + grid.cells
+
+
+def image_frame(camera: str, image: Image) -> bytes:
+    """Return an image: 4 bytes, width, height, camera (64 bytes), encoding (16), then the data."""
+    texts = camera.encode()[:64], image.encoding.encode()
+    head = struct.pack("<4B2I64s16s", IMAGE, 0, 0, 0, image.width, image.height, *texts)
+    return head + image.data
+
+
+class _Drive(Struct, frozen=True, array_like=True):
+    x: Finite
+    y: Finite
+    z: Finite
+
+
+def drive_of(content: bytes) -> Velocity:
+    """Return the velocity in a DRIVE frame: three float32 after 3 bytes. Raises ValueError."""
+    try:
+        values = msgspec.convert(struct.unpack("<3x3f", content), _Drive)
+    except (struct.error, msgspec.ValidationError) as error:
+        raise ValueError(f"not a velocity: {error}") from None
+    return Velocity(linear_x=values.x, linear_y=values.y, angular_z=values.z)
+
+
+def decoded(content: bytes, kind: type[T]) -> T:
+    """Return the Login or Ask in a frame. Raises ValueError."""
+    try:
+        return msgspec.json.decode(content, type=kind)
+    except DECODE_ERRORS as error:
+        raise ValueError(str(error)) from None
+
+
+class PageView(RobotView):
+    """Newest messages of a robot as frames. `send` passes a frame and its slot to all viewers."""
+
+    def __init__(self, bus: Bus, send: Callable[[str, bytes], None]) -> None:
+        self._send = send
+        self._kept: dict[str, bytes] = {}  # map and task, by slot
+        self._health: dict[str, bytes] = {}
+        self._lines: list[bytes] = []
+        self._numbers = itertools.count()
+        self.on_body: Callable[[], None] = lambda: None
+        super().__init__(bus)
+
+    def state_frame(self, driving: int, viewers: int) -> bytes:
+        """Return the present state of the robot."""
+        state = self.state.fresh()
+        pose, in_map = self._newest_pose(state)
+        world = self.world.fresh()
+        content = StateFrame(
+            state=state,
+            pose=pose,
+            frame="map" if in_map else "odom",
+            intent=self.intent.fresh(),
+            safety=self.safety.fresh(),
+            world=world and replace(world, hits=b""),  # the page draws the scan itself
+            driving=driving,
+            viewers=viewers,
+        )
+        return as_json(MOMENT, content)
+
+    def new_frames(self) -> Iterator[tuple[str, bytes]]:
+        """Yield scan and images received since the last call, with their slots."""
+        pose, _ = self._newest_pose(self.state.fresh())
+        scan = self.scan.look()
+        if scan and pose and self.body:
+            yield "scan", scan_frame(scan, self.body.description, pose)
+        for camera, sampled in list(self.images.items()):
+            if image := sampled.look():
+                yield f"image/{camera}", image_frame(camera, image)
+
+    def kept_frames(self) -> Iterator[tuple[str, bytes]]:
+        """Yield the frames for a new viewer: map, task, health and log."""
+        yield from self._kept.items()
+        yield from ((f"health/{name}", frame) for name, frame in self._health.items())
+        yield from ((f"log/{next(self._numbers)}", frame) for frame in self._lines)
+
+    def show(self, topic: Topic[Any], message: Message) -> None:
+        """Send a rare message at once, and keep it for later viewers."""
+        if isinstance(message, Body):
+            before, self.body = self.body, message
+            if before is None or before.description != message.description:
+                self.on_body()
+        elif isinstance(message, Health):
+            frame = as_json(HEALTH, message)
+            put_newest(self._health, message.process, frame, MAX_PROCESSES)
+            self._send(f"health/{message.process}", frame)
+        elif isinstance(message, LogRecord):
+            frame = as_json(LOG, message)
+            self._lines = [*self._lines[1 - MAX_KEPT_LINES :], frame]
+            self._send(f"log/{next(self._numbers)}", frame)
+        elif isinstance(message, OccupancyGrid):
+            self._keep("map", map_frame(message))
+        else:
+            self._keep("task", as_json(TASK, message))
+
+    def _keep(self, slot: str, frame: bytes) -> None:
+        self._kept[slot] = frame
+        self._send(slot, frame)
+
+    def _newest_pose(self, state: RobotState | None) -> tuple[Pose | None, bool]:
+        """Return the robot's pose, and whether it is in the map."""
+        place = self.pose.fresh()
+        if place and place.localized:
+            return Pose(x=place.x, y=place.y, yaw=place.yaw), True
+        return (state.pose if state else None), False
