@@ -172,9 +172,9 @@ async def test_a_driver_that_hangs_at_the_end_costs_its_truth_and_not_the_report
         demo.send(signal.SIGINT)
         assert await demo.ended() == 0
     told = json.loads(path.read_bytes())
-    assert told["verdict"].endswith("the driver did not answer in the end")
+    assert told["verdict"].endswith("the driver did not answer at the end")
     assert (told["contacts"], told["stale_commands_executed"]) == (None, 0)
-    assert "the driver did not answer in the end: " in demo.out
+    assert "the driver did not answer at the end: " in demo.out
 
 
 async def test_two_demos_side_by_side_do_not_meet(home: Home) -> None:
@@ -199,7 +199,7 @@ def test_a_run_is_judged_by_contacts_motion_and_deaths() -> None:
     }  # fmt: skip
     seen = Observed(
         body="waffle", world="arena", seed=1, speed=1.0, seconds=9.02, distance_m=0.06,
-        decisions=((1.0, "turning left: obstacle"), (2.0, "forward 0.20 m/s")), deaths=1,
+        decisions=((1.0, "turning left: obstacle"), (2.0, "forward 0.20 m/s")), turns=1, deaths=1,
         restarts=1, rejected=3,
     )  # fmt: skip
     report = make_report(told, seen)
@@ -220,7 +220,7 @@ def test_of_a_robot_that_maps_the_area_and_its_tasks_are_told_instead_of_turns()
     status = TaskStatus(done=(task, replace(task, id="goal-2", state="failed")))
     seen = Observed(
         body="waffle", world="house", seed=1, speed=1.0, seconds=20.0, distance_m=4.0,
-        decisions=((1.0, "exploring: going"),), deaths=0, restarts=0, rejected=0,
+        decisions=((1.0, "exploring: going"),), turns=0, deaths=0, restarts=0, rejected=0,
         mapped_m2=33.61, tasks=status,
     )  # fmt: skip
     report = make_report(told, seen)
@@ -238,14 +238,14 @@ def test_a_run_whose_driver_did_not_answer_in_the_end_is_told_as_far_as_it_is_kn
     health = replace(DRIVER_HEALTH, latency_ms=figures, counters={"others": 3})
     seen = Observed(
         body="waffle", world="house", seed=1, speed=1.0, seconds=31.0, distance_m=2.5,
-        decisions=((1.0, "exploring: going"),), deaths=0, restarts=0, rejected=0,
+        decisions=((1.0, "exploring: going"),), turns=0, deaths=0, restarts=0, rejected=0,
         mapped_m2=33.61, answered=False,
     )  # fmt: skip
     report = make_report(truth_in_health(health), seen)
     assert (report.ok, report.contacts, report.stale_commands_executed) == (False, None, 0)
     assert (report.sim_seconds, report.distance_m) == (31.0, 2.5)
     assert summary(report) == (
-        "the driver did not answer in the end: 2.50 m in 31 s, 34 m² mapped, "
+        "the driver did not answer at the end: 2.50 m in 31 s, 34 m² mapped, "
         "scan to command 30.0 ms (p99 148.0)"
     )
     unknown = make_report(truth_in_health(None), seen)
