@@ -1,4 +1,4 @@
-"""What a person sees of a running demo: one calm page in the terminal, or a line now and then."""
+"""Views of a running demo: one page in the terminal, or a progress line."""
 
 import sys
 import time
@@ -18,13 +18,13 @@ from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.ui.run_report import RunMonitor
 
 FRAMES_HZ = 4
-FAULT_S = 30.0  # how long a fault stays on the page
-LINE_S = 10.0  # of the robot's time between two lines without a terminal
+FAULT_SHOWN_S = 30.0
+LINE_INTERVAL_S = 10.0  # of the robot's time, without a terminal
 GATE_COLOURS = {"enabled": "green", "idle": "yellow", "stopping": "yellow", "latched": "red"}
 
 
-Starting = Callable[[], str]  # who is not ready yet, in words; an empty text where all are
-Where = Callable[[], str]  # where the operator page is, once it is there
+Starting = Callable[[], str]  # processes that are not ready yet, in words; empty if all are
+Where = Callable[[], str]  # address of the operator page, once it is served
 
 
 class View(Protocol):
@@ -35,10 +35,10 @@ class View(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
     def show(self) -> None:
-        """Bring it up to date."""
+        """Update the view."""
 
     def say(self, fault: str) -> None:
-        """Show a fault, if it is not shown anyhow."""
+        """Show a fault."""
 
 
 class HeadlessView:
@@ -52,7 +52,7 @@ class HeadlessView:
         starting: Starting = str,
     ) -> None:
         self._watch, self._seconds, self._page, self._starting = watch, seconds, page, starting
-        self._next, self._told = LINE_S, False
+        self._next, self._page_shown = LINE_INTERVAL_S, False
         self._in_place = sys.stderr.isatty()
         self._display = Display(writer(sys.stderr), LINES)
 
@@ -71,14 +71,14 @@ class HeadlessView:
         self._display.put(f"{below}{fault}\n")
 
     def show(self) -> None:
-        """Bring it up to date."""
+        """Print the progress, if it is due."""
         watch = self._watch
-        if not self._told and watch.state.newest and (page := self._page()):
+        if not self._page_shown and watch.state.newest and (page := self._page()):
             self._display.put(f"operator page: {page}\n")
-            self._told = True
+            self._page_shown = True
         if not self._in_place and watch.seconds < self._next:
             return
-        self._next = watch.seconds + LINE_S
+        self._next = watch.seconds + LINE_INTERVAL_S
         of = f"/{self._seconds:.0f}" if self._seconds else ""
         does = doing(watch, self._starting())
         line = f"{watch.seconds:6.1f}{of} s  {watch.distance_m:6.2f} m  {does}"
@@ -105,7 +105,7 @@ class LiveView:
         self._subtitle = f"{page} · Ctrl-C ends it" if page else "Ctrl-C ends it"
         self._watch, self._supervisor, self._deployment = watch, supervisor, deployment
         self._faults, self._seconds = faults, seconds
-        # made on the loop's thread, from one moment's values; its own screen survives resizing
+        # drawn on the loop's thread, so that all values are of one time
         self._live = Live(self._page(), screen=True, auto_refresh=False)
         self._display = Display[Panel](lambda page: self._live.update(page, refresh=True), room=1)
         self._next_s = 0.0
@@ -121,14 +121,14 @@ class LiveView:
         self._live.console.print(self._page())
 
     def show(self) -> None:
-        """Draw it anew, a few times a second."""
+        """Redraw the page, a few times a second."""
         now_s = time.monotonic()
         if now_s >= self._next_s:
             self._next_s = now_s + 1 / FRAMES_HZ
             self._display.put(self._page())
 
     def say(self, fault: str) -> None:
-        """Do nothing: the page has it."""
+        """Do nothing: the page shows faults anyway."""
 
     def _page(self) -> Panel:
         deployment, watch = self._deployment, self._watch
@@ -144,7 +144,9 @@ class LiveView:
             self._processes(),
         ]
         now_s = time.monotonic()
-        parts += [_line(text, "yellow") for at_s, text in self._faults if now_s - at_s < FAULT_S]
+        parts += [
+            _line(text, "yellow") for at_s, text in self._faults if now_s - at_s < FAULT_SHOWN_S
+        ]
         return Panel(Group(*parts), title=title, subtitle=self._subtitle, padding=(1, 2))
 
     def _figures(self) -> Table:
@@ -194,12 +196,12 @@ class LiveView:
 
 
 def _line(text: str, style: str, justify: Literal["left", "center"] = "left") -> Text:
-    """A line that ends in an ellipsis where there is no room for all of it."""
+    """Return a line that ends in an ellipsis if it is too long."""
     return Text(text, style=style, justify=justify, no_wrap=True, overflow="ellipsis")
 
 
 def doing(watch: RunMonitor, starting: str = "") -> str:
-    """What the robot is doing, in words; `starting` says who is not there yet."""
+    """Describe what the robot does; `starting` names processes that are not ready yet."""
     state, intent = watch.state.fresh(), watch.intent.fresh()
     if state is None:
         return starting or "starting" if watch.state.newest is None else "the driver is silent"
@@ -216,13 +218,13 @@ def doing(watch: RunMonitor, starting: str = "") -> str:
 
 
 def _activity(name: str, watch: RunMonitor) -> str:
-    """One process's work, as its messages show it."""
+    """Describe the work of a process by its messages."""
     health = watch.health.get(name)
     sent = health.sent_hz if health else {}
     if name in ("router", "relay"):
-        return "joins the others"
+        return "connects the processes"
     if name == "page":
-        return "shows it in a browser"
+        return "shows the robot in a browser"
     if name == "recorder":
         return f"recorded {health.counters.get('recorded', 0) if health else 0} messages"
     if name == "driver":
@@ -233,7 +235,9 @@ def _activity(name: str, watch: RunMonitor) -> str:
         intent = watch.intent.fresh()
         if intent is None:
             return "silent"
-        return f"{intent.reason.partition(':')[0]} · {intent.progress:.0%}"
+        task = watch.task.current
+        work = task.doing if task and task.doing else intent.reason
+        return f"{intent.progress:.0%} · {work}"
     if name == "control":
         command = watch.command.fresh()
         if command is None:

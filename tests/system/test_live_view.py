@@ -27,7 +27,7 @@ TOLD = [
         rf"│  {name} +ready +\d+ +\d+\.\d % +\d+ MB  \S"
         for name in ("router", "driver", "perception", "decision", "control", "safety")
     ),
-    r"decision .* (forward|turning right) · \d+%",
+    r"decision .* \d+% · (forward|turning right)",
     r"control .* [+-]\d\.\d\d m/s  [+-]\d\.\d\d rad/s",
 ]
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]")

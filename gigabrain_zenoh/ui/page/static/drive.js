@@ -1,4 +1,4 @@
-// Joystick, keys and gamepad. Commands go out only while something is held, and one zero at the end.
+// Joystick, keys and gamepad. Sends commands only while something is held, and one zero at the end.
 const PERIOD_MS = 40
 const KEYS = {
   KeyW: [1, 0, 0], ArrowUp: [1, 0, 0], KeyS: [-1, 0, 0], ArrowDown: [-1, 0, 0],
@@ -14,7 +14,7 @@ export class Drive {
   #sending = false
   #padStopped = false
 
-  /** `limits()` are the greatest speeds, `send(x, y, z)` passes them on, `stop()` is the e-stop. */
+  /** `limits()` returns the greatest speeds, `send(x, y, z)` sends a velocity, `stop()` is the e-stop. */
   constructor({ stick, share, limits, send, stop, allowed, show }) {
     Object.assign(this, { stick, share, limits, send, stop, allowed, show })
     this.#listenToKeys()

@@ -1,9 +1,9 @@
-// What is drawn in the robot's own frame. Each takes the pen and the map view.
+// Layers drawn in the robot's frame. Each function takes the canvas context and the map view.
 const TAU = 2 * Math.PI
 const AHEAD_S = 1, SLOW = 0.05 // how far ahead of a moving thing its line reaches; below [m/s] there is none
 const LARGE = 0.3, GAP = 0.25 // [m] radius of what is drawn as it was seen; between beams on one thing
 
-/** The nearest thing in each sector, as perception sees it. */
+/** Free space up to the nearest obstacle in each sector. */
 function paintFree(pen, view) {
   const sectors = view.moment.world?.sectors ?? []
   pen.beginPath()

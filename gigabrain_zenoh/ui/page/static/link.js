@@ -1,4 +1,4 @@
-// The WebSocket: frames of one byte of kind and their content. Nothing is kept for later while it is down.
+// The WebSocket. Frames are a byte for their kind, then their content. Nothing is queued while it is down.
 const ABOUT = 1, MOMENT = 2, SCAN = 3, MAP = 4, HEALTH = 5, LOG = 6, REPLY = 7, IMAGE = 8, TASK = 9
 const LOGIN = 1, DRIVE = 2, ASK = 3
 const SILENT_MS = 1000, AGAIN_MS = [300, 600, 1200, 2500]
@@ -11,7 +11,7 @@ export class Link {
   #tries = 0
   #ids = 0
   #waiting = new Map()
-  #heard = 0
+  #received = 0
 
   /** `on` has about, moment, scan, map, task, health, log, image, state(word) and login(). */
   constructor(on, token) {
@@ -31,7 +31,7 @@ export class Link {
     this.#socket = socket
   }
 
-  get live() { return performance.now() - this.#heard < SILENT_MS }
+  get live() { return performance.now() - this.#received < SILENT_MS }
 
   drive(x, y, z) {
     if (this.#socket.readyState !== WebSocket.OPEN) return
@@ -41,7 +41,7 @@ export class Link {
     this.#socket.send(frame.buffer)
   }
 
-  /** The robot's answer, or why there is none; never rejects. */
+  /** Resolves to the robot's reply, or to the reason why there is none; never rejects. */
   ask(what, more = {}, within = 3000) {
     if (this.#socket.readyState !== WebSocket.OPEN) {
       return Promise.resolve({ ok: false, text: 'this page has no connection' })
@@ -66,7 +66,7 @@ export class Link {
   #take(data) {
     const kind = new Uint8Array(data, 0, 1)[0]
     const json = () => JSON.parse(text.decode(new Uint8Array(data, 1)))
-    if (kind === MOMENT) { this.#heard = performance.now(); this.#tries = 0; this.on.state('live'); this.on.moment(json()) }
+    if (kind === MOMENT) { this.#received = performance.now(); this.#tries = 0; this.on.state('live'); this.on.moment(json()) }
     else if (kind === SCAN) this.on.scan(new Float32Array(data, 4, 9), new Float32Array(data, 40))
     else if (kind === MAP) this.on.map(new DataView(data, 4, 20), new Int8Array(data, 24))
     else if (kind === TASK) this.on.task(json())
@@ -85,7 +85,7 @@ export class Link {
 
   #closed(code) {
     for (const end of [...this.#waiting.values()]) end({ ok: false, text: 'the connection was lost' })
-    this.#heard = 0
+    this.#received = 0
     this.on.state('offline')
     if (code === STRANGER) return this.on.login()
     const wait = code === FULL ? 5000 : AGAIN_MS[Math.min(this.#tries++, AGAIN_MS.length - 1)]
@@ -93,6 +93,6 @@ export class Link {
   }
 
   #watch() {
-    if (this.#heard && !this.live) this.on.state('silent')
+    if (this.#received && !this.live) this.on.state('silent')
   }
 }

@@ -1,8 +1,8 @@
-// Puts the page together: what comes over the link is shown, what a person does goes back.
+// Connects the page: shows what the link receives, and sends what a person does.
 import { Drive } from './drive.js'
 import { Link } from './link.js'
 import { MapView } from './map.js'
-import { $, hearHealth, hearLine, put, showFigures, showGate, showImage, showSafety, showTables, showTask } from './panels.js'
+import { $, showHealth, showLogLine, put, showFigures, showGate, showImage, showSafety, showTables, showTask } from './panels.js'
 
 const STOP_MS = 2500 // the server gives up after two seconds
 const HANDS = 'press the hardware e-stop or cut the power'
@@ -23,11 +23,11 @@ const link = new Link({
     put($('robot'), told.body ? `${told.body.robot_type} · ${told.link}` : 'gigabrain')
     document.title = `${told.body?.robot_type ?? 'gigabrain'}${looking() ? ' (view only)' : ''}`
     $('estop').disabled = looking()
-    $('estop').querySelector('small').textContent = looking() ? 'view only: this token may not stop the robot' : 'space bar'
+    $('estop').querySelector('small').textContent = looking() ? 'view only: this token cannot stop the robot' : 'space bar'
   },
   moment(now) {
     moment = now
-    if (now.state?.gate.mode === 'latched') drive.letGo() // what a person has to release is not started by a held key
+    if (now.state?.gate.mode === 'latched') drive.letGo() // a held key must not move the robot right after the release
     map.setMoment(now)
     showGate(now.state, looking())
     showFigures(now.state, now)
@@ -40,8 +40,8 @@ const link = new Link({
     map.setTask(status)
     showTask(status, looking())
   },
-  health: hearHealth,
-  log: hearLine,
+  health: showHealth,
+  log: showLogLine,
   image: showImage,
   told: (reply) => say(reply),
   state(word) {
@@ -55,7 +55,7 @@ const link = new Link({
       showGate(null, looking())
       showFigures(null, {})
       showSafety(null, about.body)
-      put($('doing'), word === 'offline' ? 'no connection to the page’s server; trying again' : 'the page’s server is silent')
+      put($('doing'), word === 'offline' ? 'no connection to the page’s server; retrying' : 'no messages from the page’s server')
     }
   },
   login() { $('login').showModal() },
@@ -69,7 +69,7 @@ const drive = new Drive({
   stop: () => stop(),
   allowed: mayDrive,
   show(wanted) {
-    put($('wanted'), wanted ? `${wanted[0].toFixed(2)} m/s  ${wanted[2].toFixed(2)} rad/s` : 'let go')
+    put($('wanted'), wanted ? `${wanted[0].toFixed(2)} m/s  ${wanted[2].toFixed(2)} rad/s` : 'released')
   },
 })
 

@@ -1,8 +1,8 @@
-// The map: what is known of the place, the robot in it, and where it means to go. Drawn when there is news.
+// The map with the robot, its path and its goal. Redrawn when something has changed.
 import { ON_ROBOT } from './layers.js'
 
-const CELL_M = 0.05, SIDE = 1200 // of what the scan has left behind, where there is no map
-const HEADING_M = 0.1 // a shorter drag gives a place and no heading
+const CELL_M = 0.05, SIDE = 1200 // of the trace of scans, shown without a map
+const HEADING_M = 0.1 // a shorter drag sets no heading
 const TAU = 2 * Math.PI
 const COLOURS = ['floor', 'grid', 'wall', 'scan', 'plan', 'zone', 'trail', 'seen', 'robot', 'thing', 'ink']
 
@@ -73,7 +73,7 @@ export class MapView {
     this.draw()
   }
 
-  /** What the robot is at: its way and its goal, in the map. */
+  /** Path and goal of the present task, in the map. */
   setTask(task) {
     this.task = task
     this.goal = task.goal

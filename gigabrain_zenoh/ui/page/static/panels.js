@@ -1,4 +1,4 @@
-// What stands beside the map: gate, safety, processes, topics, log, pictures. Text only, never HTML of others.
+// Panels next to the map: gate, safety, processes, topics, log, images. Messages are shown as text, never as HTML.
 export const $ = (id) => document.getElementById(id)
 const MODES = { enabled: 'driving allowed', idle: 'idle', stopping: 'stopping', latched: 'latched' }
 const LINES = 200, LATE_MS = 3000
@@ -19,7 +19,7 @@ export function make(tag, text = '', kind = '') {
   return element
 }
 
-/** Replaces the children only when their text has changed, so that nothing is read aloud twice. */
+/** Replaces the children only when their text has changed, so that a screen reader reads nothing twice. */
 function replace(parent, key, children) {
   if (parent.dataset.key === key) return
   parent.dataset.key = key
@@ -39,8 +39,8 @@ export function showGate(state, looking) {
   $('gate').dataset.mode = gate?.mode ?? 'silent'
   put($('mode'), gate ? MODES[gate.mode] : 'silent')
   const who = gate?.commander === 'control' ? 'the brain' : gate?.commander
-  put($('who'), gate ? `driven by ${who || 'nobody'}` : '')
-  const silent = { text: 'the robot says nothing', remedy: 'see that its driver runs, and the network', latching: true }
+  put($('who'), gate ? `commander: ${who || 'none'}` : '')
+  const silent = { text: 'no messages from the robot', remedy: 'check its driver and the network', latching: true }
   listCauses($('causes'), gate ? gate.causes : [silent])
   $('release').disabled = gate?.mode !== 'latched'
   $('enable').disabled = !gate || gate.mode === 'latched' || gate.mode === 'stopping'
@@ -60,13 +60,13 @@ export function showFigures(state, moment) {
 }
 
 function doing(state, moment) {
-  if (!state) return 'the robot is silent'
+  if (!state) return 'no messages from the robot'
   const { mode, commander } = state.gate
-  if (mode !== 'enabled' && compiling.size) return `getting ready: ${[...compiling].join(' and ')} is compiling, once per installation`
+  if (mode !== 'enabled' && compiling.size) return `starting up: ${[...compiling].join(' and ')} compiling (once per installation)`
   if (mode !== 'enabled') return mode === 'idle' ? 'at rest, waiting to be enabled' : mode
   if (commander !== 'control') return `${commander} drives`
   if (moment.driving) return `steered by viewer ${moment.driving}`
-  return moment.intent?.reason ?? 'decision is silent'
+  return moment.intent?.reason ?? 'no messages from decision'
 }
 
 export function showSafety(safety, body) {
@@ -86,7 +86,7 @@ export function showSafety(safety, body) {
   }))
 }
 
-/** What the robot was sent to do, how far it is, and what became of the last one. */
+/** Shows the present task and its progress, or the result of the last one. */
 export function showTask(status, looking) {
   const { current } = status
   $('cancel').hidden = looking || !current
@@ -108,9 +108,9 @@ function lastTask(task) {
 }
 
 const healths = new Map() // process -> [health, when]
-const compiling = new Set() // processes that have said so, and not yet that they are ready
+const compiling = new Set() // processes that are compiling
 
-export function hearHealth(health) {
+export function showHealth(health) {
   healths.set(health.process, [health, performance.now()])
   showTables()
 }
@@ -170,7 +170,7 @@ function since(seconds) {
   return seconds < 5400 ? `${(seconds / 60).toFixed(0)} min` : `${(seconds / 3600).toFixed(1)} h`
 }
 
-export function hearLine(line) {
+export function showLogLine(line) {
   if (line.event === 'compiling') compiling.add(line.process)
   if (line.event === 'ready') compiling.delete(line.process)
   const list = $('log').firstElementChild, item = make('li', '', line.level)
