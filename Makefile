@@ -56,7 +56,7 @@ system: setup
 # before a release, on a machine with nothing else to do: hours, and continued where it was stopped
 qa: setup
 	$(BIN)/python -m tests.qa.dockerfile_steps
-	$(BIN)/python -m gigabrain_zenoh.qa.faults.extremes_run .qa/extremes.jsonl
+	$(BIN)/python -m gigabrain_zenoh.qa.faults.rows.extreme_messages .qa/extremes.jsonl
 
 bench: setup
 	$(BIN)/gigabrain bench chain

@@ -1,9 +1,8 @@
 """`gigabrain bench chain`, `stack` and `estop`: what this machine makes of it."""
 
 import sys
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 from cyclopts import Parameter
@@ -22,13 +21,11 @@ def chain(
     seconds: float = 10.0,
     rounds: int = 3,
     rates: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (10.0, 50.0),
-    beside: Annotated[Literal["relay", "tools"], Parameter(name="--with")] = "relay",
     json: Path | None = None,
 ) -> int:
-    """Time the way from a scan to its command, in turns with something to compare it with.
+    """Time the way from a scan to its command, in turns with a bare Zenoh relay.
 
     Example: gigabrain bench chain --seconds 10 --rounds 3 --rates 10 50
-    Example: gigabrain bench chain --with tools --rates 10
 
     Parameters
     ----------
@@ -38,12 +35,10 @@ def chain(
         How often the chain and the relay take turns.
     rates
         How many scans a second [Hz].
-    beside
-        A bare Zenoh relay, or the same chain with recorder, page, bridge and echo beside it.
     json
         Write all figures into this file.
     """
-    from gigabrain_zenoh.qa.bench.chain import measure_chain
+    from gigabrain_zenoh.qa.bench.chain import chain_page, measure_chain
 
     files.check_result_path(json)
     above_zero("seconds", seconds)
@@ -51,24 +46,9 @@ def chain(
     for rate in rates:
         if not 0 < rate <= FASTEST_HZ:
             raise ConfigError(f"--rates: expected above 0, at most {FASTEST_HZ:g}, got {rate:g}")
-    if beside == "tools":
-        return _with_tools(seconds, rounds, rates, json)
-    from gigabrain_zenoh.qa.bench.tables import chain_page
 
     result = run_async(measure_chain(seconds, rounds, rates, _progress))
     _finish(chain_page(result), result, json)
-    return 0
-
-
-def _with_tools(seconds: float, rounds: int, rates: tuple[float, ...], json: Path | None) -> int:
-    for name, extra in (("websockets", "page"), ("starlette", "page"), ("foxglove", "record")):
-        if not find_spec(name):
-            raise ConfigError(f"this needs more: pip install 'gigabrain-zenoh[{extra}]'")
-    from gigabrain_zenoh.qa.bench.tables import tools_page
-    from gigabrain_zenoh.qa.bench.with_tools import measure_with_tools
-
-    result = run_async(measure_with_tools(seconds, rounds, rates, _progress))
-    _finish(tools_page(result), result, json)
     return 0
 
 
@@ -97,8 +77,7 @@ def stack(
     json
         Write all figures into this file.
     """
-    from gigabrain_zenoh.qa.bench.stack import measure_stack
-    from gigabrain_zenoh.qa.bench.tables import stack_page
+    from gigabrain_zenoh.qa.bench.stack import measure_stack, stack_page
 
     files.check_result_path(json)
     above_zero("seconds", seconds)
@@ -129,8 +108,7 @@ def estop(
     json
         Write all figures into this file.
     """
-    from gigabrain_zenoh.qa.bench.estop import measure_estop
-    from gigabrain_zenoh.qa.bench.tables import estop_page
+    from gigabrain_zenoh.qa.bench.estop import estop_page, measure_estop
 
     files.check_result_path(json)
     above_zero("driving", driving)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from gigabrain_zenoh.qa.bench.barn import BarnResult
-    from gigabrain_zenoh.qa.bench.course import Trial
+    from gigabrain_zenoh.qa.bench.barn_course import BarnTrial
 
 
 @Parameter(name="*")
@@ -72,18 +72,21 @@ def barn(*, of: Trials, json: Path | None = None) -> int:
     from rich.console import Console
 
     from gigabrain_zenoh.qa.bench.barn import measure_barn
-    from gigabrain_zenoh.qa.bench.barn_worlds import choose, read_worlds
+    from gigabrain_zenoh.qa.bench.barn_course import choose_worlds, read_worlds
 
     of.check()
     files.check_result_path(json)
-    chosen, nodes = choose(read_worlds(of.worlds, of.dynamic), of.only), of.nodes and not of.dynamic
+    chosen, nodes = (
+        choose_worlds(read_worlds(of.worlds, of.dynamic), of.only),
+        of.nodes and not of.dynamic,
+    )
     result = measure_barn(chosen, of.trials, of.plant, of.samples, of.jobs, _progress, nodes=nodes)
     Console().print(_table(result, of.worlds.name, of.plant))
     files.write_result(result, json)
     return 0
 
 
-def _progress(trial: "Trial") -> None:
+def _progress(trial: "BarnTrial") -> None:
     text = f"world {trial.world} trial {trial.trial}: {trial.result} after {trial.seconds:.2f} s"
     text += f", least clearance {trial.least_clearance:.3f} m"
     print(text, file=sys.stderr, flush=True)

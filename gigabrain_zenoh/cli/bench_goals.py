@@ -66,12 +66,12 @@ def goals(*, of: Runs = RUNS, json: Path | None = None, logs: Path | None = None
     logs
         Keep the logs of all processes in this folder.
     """
-    from gigabrain_zenoh.qa.bench.goals import Course, measure_goals
+    from gigabrain_zenoh.qa.bench.goals import GoalCourse, measure_goals
 
     above_zero("goals", of.goals)
     above_zero("speed", of.speed)
     files.check_result_path(json)
-    course = Course(
+    course = GoalCourse(
         goals=of.goals,
         meetings=of.meetings,
         hours=of.hours,

@@ -7,12 +7,12 @@ from cyclopts import Parameter
 
 from gigabrain_zenoh.cli.side_by_side import side_by_side
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host import files
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.qa.bench.slam import Drive, SlamResult
-    from gigabrain_zenoh.qa.bench.slam_logs import Log
+    from gigabrain_zenoh.qa.bench.slam_logs import LaserLog, MappedLog, SlamResult
 
 
 def slam(
@@ -67,32 +67,29 @@ def _slam_logs(paths: tuple[Path, ...], png: Path | None, json: Path | None) -> 
     """Map what was recorded, and show how far the maps are from the reference."""
     from rich.console import Console
 
-    from gigabrain_zenoh.host import files
-    from gigabrain_zenoh.qa.bench.slam import judged, total
-    from gigabrain_zenoh.qa.bench.slam_logs import load, relations
-    from gigabrain_zenoh.qa.bench.slam_picture import draw
+    from gigabrain_zenoh.qa.bench.slam_logs import draw_logs, judge_log, load, relations, total
 
     files.check_result_path(json)
     logs = [load(path) for path in paths]
     for one in logs:
         relations(one)  # or it says at once what is wrong
     drives = _driven(logs)
-    result = total([judged(one, driven) for one, driven in drives])
+    result = total([judge_log(one, driven) for one, driven in drives])
     if png:
-        draw(drives, png)
+        draw_logs(drives, png)
     files.write_result(result, json)
     Console().print(_table(result))
     return 0
 
 
-def _driven(logs: "list[Log]") -> "list[tuple[Log, Drive]]":
+def _driven(logs: "list[LaserLog]") -> "list[tuple[LaserLog, MappedLog]]":
     from functools import partial
 
     from rich.console import Console
     from rich.progress import Progress
 
     from gigabrain_zenoh.mapping.warm import warm_up
-    from gigabrain_zenoh.qa.bench.slam import drive
+    from gigabrain_zenoh.qa.bench.slam_logs import map_log
 
     with Progress(console=Console(stderr=True), transient=True) as progress:
         compiling = progress.add_task("compiling", total=None)
@@ -100,7 +97,7 @@ def _driven(logs: "list[Log]") -> "list[tuple[Log, Drive]]":
         progress.remove_task(compiling)
         tasks = [progress.add_task(one.name, total=len(one.ranges)) for one in logs]
         return [
-            (one, drive(one, partial(progress.advance, task)))
+            (one, map_log(one, partial(progress.advance, task)))
             for one, task in zip(logs, tasks, strict=True)
         ]
 

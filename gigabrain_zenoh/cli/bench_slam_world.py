@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 from gigabrain_zenoh.cli.checked import above_zero
 from gigabrain_zenoh.cli.side_by_side import side_by_side
+from gigabrain_zenoh.host import files
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.qa.bench.slam_world import Off, WorldResult
+    from gigabrain_zenoh.qa.bench.slam_world import PoseErrors, WorldResult
 
 
 def slam_world(
@@ -21,21 +22,19 @@ def slam_world(
     from rich.console import Console
     from rich.progress import Progress
 
-    from gigabrain_zenoh.host import files
-    from gigabrain_zenoh.qa.bench.slam_world import WorldsResult, tour
-    from gigabrain_zenoh.qa.bench.slam_world_picture import draw
+    from gigabrain_zenoh.qa.bench.slam_world import WorldsResult, draw_worlds, map_world
 
     above_zero("minutes", minutes)
     files.check_result_path(json)
     with Progress(console=Console(stderr=True), transient=True) as progress:
         tasks = [progress.add_task(world, total=minutes) for world in worlds]
         toured = [
-            tour(body, world, seed, minutes, partial(progress.advance, task))
+            map_world(body, world, seed, minutes, partial(progress.advance, task))
             for world, task in zip(worlds, tasks, strict=True)
         ]
     result = WorldsResult(worlds=tuple(one.result for one in toured))
     if png:
-        draw(toured, png)
+        draw_worlds(toured, png)
     files.write_result(result, json)
     Console().print(_table(result.worlds))
     return 0
@@ -65,5 +64,5 @@ def _table(worlds: "Sequence[WorldResult]") -> "Table":
     )
 
 
-def _off(off: "Off") -> str:
+def _off(off: "PoseErrors") -> str:
     return f"{off.mean_m:.3f}, {off.max_m:.3f} m; {off.mean_deg:.2f}, {off.max_deg:.2f}°"

@@ -15,8 +15,6 @@ from gigabrain_zenoh.cli.checked import above_zero, finite
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.host.signals import run_async
 
-COLOURS = {"pass": "green", "fail": "bold red", "n/a": "dim"}
-
 
 class _Said(logging.Handler):
     """Gathers the warnings of whatever is tried, instead of a line for each. Used as `with`."""
@@ -52,7 +50,7 @@ def test(
 
     Example: gigabrain driver test mycustombot --link emulated
 
-    A check that says nothing about a link is shown as n/a with the reason, not as passed.
+    A check that does not apply to a link is shown as skipped with the reason, not as passed.
 
     Parameters
     ----------
@@ -69,6 +67,7 @@ def test(
 
     from gigabrain_drivers.driver.catalog import links_of, load_robot
     from gigabrain_zenoh.qa.conformance import kit
+    from gigabrain_zenoh.qa.judging import COLOURS
 
     links = links_of(load_robot(name))
     chosen: LinkName = link or ("emulated" if "emulated" in links else "sim")
@@ -88,7 +87,7 @@ def test(
             f"what was broken on purpose, in its own words: {said}", markup=False, soft_wrap=True
         )
     console.print(table)
-    return int(any(result.verdict == "fail" for result in results))
+    return int(any(result.verdict == "FAILED" for result in results))
 
 
 def trace(
@@ -141,10 +140,10 @@ def trace(
 def _traced(name: str, link: LinkName, part: str, seconds: float, speeds: dict[str, float]) -> bool:
     """Print the bytes; whether any came from the body, or whoever was reading has seen enough."""
     from gigabrain_schemas.base import Velocity
-    from gigabrain_zenoh.qa import trace
+    from gigabrain_zenoh.qa.conformance import authoring
 
     with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
-        tracing = trace.run(
+        tracing = authoring.trace_line(
             name,
             link,
             Path(folder),
@@ -174,8 +173,8 @@ def new(name: str, *, folder: Path = Path()) -> int:
     folder
         Where the package's folder is made.
     """
-    from gigabrain_zenoh.qa.conformance.new import write
+    from gigabrain_zenoh.qa.conformance.authoring import write_package
 
-    path = write(name, folder)
+    path = write_package(name, folder)
     print(f"{path}: edit robot.yaml and driver.py; README.md says how to go on")
     return 0

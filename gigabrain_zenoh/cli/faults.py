@@ -18,10 +18,8 @@ from gigabrain_zenoh.host.signals import run_async
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.qa.faults.fault import Fault, Result, Try
-    from gigabrain_zenoh.qa.faults.rig import Options
-
-COLOURS = {"passed": "green", "FAILED": "bold red", "skipped": "yellow"}
+    from gigabrain_zenoh.qa.faults.fault import FaultResult, FaultRow, FaultRun
+    from gigabrain_zenoh.qa.faults.rig.rig import Options
 
 
 @Parameter(name="*")
@@ -58,7 +56,7 @@ class Robot:
 
     def options(self) -> "Options":
         """As the suite takes it."""
-        from gigabrain_zenoh.qa.faults.rig import Options
+        from gigabrain_zenoh.qa.faults.rig.rig import Options
 
         return Options(self.body, self.world, self.behaviour, self.long)
 
@@ -98,8 +96,7 @@ def faults(
     json
         Write all results into this file.
     """
-    from gigabrain_zenoh.qa.faults.suite import failed
-    from gigabrain_zenoh.qa.faults.table import choose
+    from gigabrain_zenoh.qa.faults.suite import choose, failed
 
     left_out = choose(skip) if skip else ()
     chosen = tuple(fault for fault in choose(only) if fault not in left_out)
@@ -116,24 +113,23 @@ def faults(
 
 
 def _run(
-    chosen: "Sequence[Fault]", options: "Options", repeat: int, into: Path | None
-) -> "list[Result]":
+    chosen: "Sequence[FaultRow]", options: "Options", repeat: int, into: Path | None
+) -> "list[FaultResult]":
     """Run them, with a line for each run that has ended."""
     from rich.console import Console
 
-    from gigabrain_zenoh.qa.faults.suite import run_suite
-    from gigabrain_zenoh.qa.faults.tries_file import TriesFile
+    from gigabrain_zenoh.qa.faults.suite import RunsFile, run_suite
 
     # the suite hears what it forges itself; nobody has to read that
     logging.getLogger("gigabrain_zenoh").addHandler(logging.NullHandler())
-    console, file = Console(), TriesFile(into, options) if into else None
+    console, file = Console(), RunsFile(into, options) if into else None
     earlier = file.read() if file else {}
     with tempfile.TemporaryDirectory(prefix="gb-") as folder, console.status("") as status:
 
-        def begun(fault: "Fault") -> None:
+        def begun(fault: "FaultRow") -> None:
             status.update(f"{chosen.index(fault) + 1} of {len(chosen)}: {fault.name}")
 
-        def ended(fault: "Fault", run: "Try") -> None:
+        def ended(fault: "FaultRow", run: "FaultRun") -> None:
             console.print(_line(fault, run))
             if file:
                 file.append(fault, run)
@@ -142,13 +138,13 @@ def _run(
         return run_async(suite)
 
 
-def _line(fault: "Fault", run: "Try") -> str:
+def _line(fault: "FaultRow", run: "FaultRun") -> str:
     why = f": {run.reason}" if run.reason else ""
     disturbed = f", disturbed: waited {run.waited_ms:g} ms for a core" if run.disturbed else ""
     return f"{fault.number:>2} {fault.name}: {run.verdict}{why} ({run.seconds:g} s{disturbed})"
 
 
-def _plan(chosen: "Sequence[Fault]") -> "Table":
+def _plan(chosen: "Sequence[FaultRow]") -> "Table":
     from rich.table import Table
 
     table = Table(title="fault tests")
@@ -160,18 +156,19 @@ def _plan(chosen: "Sequence[Fault]") -> "Table":
     return table
 
 
-def _table(files: "Sequence[Result]", chosen: "Sequence[Fault]") -> "Table":
+def _table(results: "Sequence[FaultResult]", chosen: "Sequence[FaultRow]") -> "Table":
     from rich.markup import escape
     from rich.table import Table
 
     from gigabrain_zenoh.qa.faults.fault import in_words
+    from gigabrain_zenoh.qa.judging import COLOURS
 
     rows = {fault.number: fault for fault in chosen}
-    passed = sum(result.verdict == "passed" for result in files)
-    table = Table(title=f"{passed} of {len(files)} passed")
+    passed = sum(result.verdict == "passed" for result in results)
+    table = Table(title=f"{passed} of {len(results)} passed")
     for name in ("no.", "fault", "criterion", "worst", "tries", "waited", "verdict"):
         table.add_column(name, overflow="fold", no_wrap=name == "fault")
-    for result in files:
+    for result in results:
         told = f"[{COLOURS[result.verdict]}]{result.verdict}[/]"
         if result.reason:
             told += f": {escape(result.reason)}"
@@ -182,7 +179,7 @@ def _table(files: "Sequence[Result]", chosen: "Sequence[Fault]") -> "Table":
     return table
 
 
-def _tries(tries: "Sequence[Try]") -> str:
+def _tries(tries: "Sequence[FaultRun]") -> str:
     """Say what came of all runs: `9 of 10, disturbed: 1 of 2`."""
     counted = [one.verdict == "passed" for one in tries if not one.disturbed]
     disturbed = [one.verdict == "passed" for one in tries if one.disturbed]

@@ -12,10 +12,16 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.network import is_loopback
 from gigabrain_zenoh.host.signals import run_async
 from gigabrain_zenoh.host.terminal import typed_lines
-from gigabrain_zenoh.qa.proxy.call import Address
-from gigabrain_zenoh.qa.proxy.chaos import CALM, WAYS, Chaos, Told, Way, told
-from gigabrain_zenoh.qa.proxy.damage import Figures
-from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
+from gigabrain_zenoh.qa.proxy.chaos import (
+    CALM,
+    WAYS,
+    Chaos,
+    ProxyCommand,
+    Way,
+    WayCounters,
+    parse_command,
+)
+from gigabrain_zenoh.qa.proxy.tcp import Address, TcpProxy
 
 ENDPOINT = re.compile(r"(?:(?:tcp|tls|ws)/)?(?P<host>\[[^\]]+\]|[^/:\[\]]+):(?P<port>\d+)")
 
@@ -53,9 +59,9 @@ def proxy(
     insecure
         Let others on the network reach it too, and through it what is behind.
     """
-    begin = told(chaos)
+    begin = parse_command(chaos)
     if to.startswith("/"):
-        from gigabrain_zenoh.qa.line_proxy import LineProxy
+        from gigabrain_zenoh.qa.proxy.serial import LineProxy
 
         made: Spoiled = LineProxy(to, _path(listen), baud=baud, seed=seed)
     else:
@@ -67,7 +73,7 @@ def proxy(
 class Spoiled(AbstractAsyncContextManager[object], Protocol):
     """A proxy for any kind of line."""
 
-    figures: dict[Way, Figures]
+    figures: dict[Way, WayCounters]
 
     def set(self, chaos: Chaos = CALM, *ways: Way) -> None:
         """Have this go wrong."""
@@ -82,7 +88,7 @@ class Spoiled(AbstractAsyncContextManager[object], Protocol):
         """Be gone."""
 
 
-async def _stand(proxy: Spoiled, begin: Told, to: str) -> None:
+async def _stand(proxy: Spoiled, begin: ProxyCommand, to: str) -> None:
     async with proxy:
         await obey(proxy, begin)
         _say(f"{proxy} leads to {to}, and spoils it as it is told")
@@ -92,12 +98,12 @@ async def _stand(proxy: Spoiled, begin: Told, to: str) -> None:
         with typed_lines(wishes.put_nowait):
             while True:
                 try:
-                    await obey(proxy, told(await wishes.get()))
+                    await obey(proxy, parse_command(await wishes.get()))
                 except ConfigError as error:
                     _say(str(error))
 
 
-async def obey(proxy: Spoiled, wish: Told) -> None:
+async def obey(proxy: Spoiled, wish: ProxyCommand) -> None:
     """Do what a typed line asks for."""
     if wish.cut:
         proxy.cut(reset=wish.cut == "rst")

@@ -19,7 +19,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import limits_of
 from gigabrain_zenoh.host.terminal import LineSplitter
-from gigabrain_zenoh.qa.proxy.chaos import told
+from gigabrain_zenoh.qa.proxy.chaos import parse_command
 from gigabrain_zenoh.runtime.managed_process import as_record
 from gigabrain_zenoh.runtime.running import folder, running
 from tests.fuzz.harness import split
@@ -70,7 +70,7 @@ def typed(data: bytes) -> None:
 
 
 CONFIG = gate.GateConfig(limits=limits_of(load_robot("mock")))
-PARSERS: tuple[Callable[[str], object], ...] = (told, address, port_name.usb_id)
+PARSERS: tuple[Callable[[str], object], ...] = (parse_command, address, port_name.usb_id)
 CHECKS = {"latch": latch, "note": note, "record": record, "typed": typed}
 
 

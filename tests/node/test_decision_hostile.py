@@ -10,7 +10,7 @@ from gigabrain_schemas.topics import BODY, CMD_VEL, GOAL
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision.steering import Steering
-from gigabrain_zenoh.qa.faults.extremes import fixed
+from gigabrain_zenoh.qa.faults.rig.extremes import chosen_extremes
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.samples import body, state
 from gigabrain_zenoh.testing.waiting import settle
@@ -55,7 +55,7 @@ async def test_no_extreme_stops_decision_and_it_reaches_its_goal_afterwards() ->
     async with Plane(drawn(ROOM)) as plane:
         await plane.go(0.2)
         await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
-        for case in (one for one in fixed() if one.to in heard):
+        for case in (one for one in chosen_extremes() if one.to in heard):
             own = said(plane, case.to)
             base = msgspec.msgpack.decode(codec.encode(own)) if own else None
             header = {"boot": plane.boot, "tick": plane.tick, "basis": plane.tick}

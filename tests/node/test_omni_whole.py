@@ -21,8 +21,7 @@ from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.sweep import depth, edges
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.qa.bench.in_memory import InMemory
-from gigabrain_zenoh.qa.planted import node_of
+from gigabrain_zenoh.qa.in_memory_robot import InMemoryRobot, node_of
 from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.host import Host
@@ -112,7 +111,7 @@ async def test_it_goes_sideways_through_a_gap_that_it_would_not_fit_through_ahea
     tmp_path: Path,
 ) -> None:
     body = Body()
-    async with InMemory(nodes(body, tmp_path)) as robot:
+    async with InMemoryRobot(nodes(body, tmp_path)) as robot:
         states = robot.operator.latest(STATE)
         told: list[TaskStatus] = []
         robot.operator.subscribe(TASK, lambda _, status: told.append(status))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from playwright.async_api import Page, async_playwright
 
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.run_report import RunMonitor
@@ -29,7 +29,7 @@ async def take(folder: Path) -> None:
         home = Home(Path(place) / "home")
         try:
             robot = Robot(home, world="house", seed=1, **NAVIGATES)
-            async with looking_on(robot.endpoint) as seen:
+            async with probing(robot.endpoint) as seen:
                 watch = RunMonitor(seen.bus)
                 await robot.served()
                 await until(lambda: watch.task.current, "decision is ready", READY_S)

@@ -6,8 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gigabrain_zenoh.qa.bench.stack import Process, StackResult
-from gigabrain_zenoh.qa.bench.with_tools import ToolsResult
+from gigabrain_zenoh.qa.bench.stack import ProcessCost, StackResult
 from gigabrain_zenoh.testing.processes import Home
 
 
@@ -19,9 +18,9 @@ def stack(**changes: object) -> StackResult:
         "ready_s": 1.2,
         "physics_cpu": 0.04,
         "processes": (
-            Process(name="driver", cpu=0.125, rss_bytes=95_000_000),
-            Process(name="perception", cpu=0.025, rss_bytes=56_000_000),
-            Process(name="safety", cpu=0.0625, rss_bytes=58_500_000),
+            ProcessCost(name="driver", cpu=0.125, rss_bytes=95_000_000),
+            ProcessCost(name="perception", cpu=0.025, rss_bytes=56_000_000),
+            ProcessCost(name="safety", cpu=0.0625, rss_bytes=58_500_000),
         ),
     }
     return msgspec.convert(values | changes, StackResult)
@@ -77,17 +76,3 @@ async def test_what_cannot_be_measured_is_refused(
     command = await home.run("bench", *options)
     assert complaint in command.err
     assert await command.ended() == 2
-
-
-async def test_the_chain_is_timed_with_all_tools_beside_it(home: Home) -> None:
-    result = home.folder / "tools.json"
-    ran = await home.run(
-        "bench", "chain", "--with", "tools", "--seconds", "2", "--rounds", "1", "--rates", "10",
-        "--json", str(result),
-    )  # fmt: skip
-    assert (await ran.ended(), result.exists()) == (0, True), ran.err
-    told = msgspec.json.decode(result.read_bytes(), type=ToolsResult)
-    assert [tool.name for tool in told.tools] == ["recorder", "page", "foxglove", "topic echo"]
-    assert all(0 < tool.cpu < 1 for tool in told.tools), told.tools
-    assert told.recorded_hz > 50
-    assert told.rates[0].tools[0].n > 10

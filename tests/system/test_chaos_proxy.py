@@ -11,7 +11,7 @@ from gigabrain_schemas.topics import TELEOP
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
-from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
+from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.testing.zenoh import Ear, repeat, robot
 from tests.system.server import Server, serving

@@ -21,7 +21,7 @@ from gigabrain_zenoh.errors import (
     UnknownName,
     Unsupported,
 )
-from gigabrain_zenoh.qa.faults.onlooker import Onlooker, looking_on
+from gigabrain_zenoh.qa.probe import Probe, probing
 from gigabrain_zenoh.testing.processes import AVOID, Command, Home, free_port, robot_of
 from gigabrain_zenoh.testing.waiting import until
 
@@ -34,10 +34,10 @@ def demo(shared_home: Home) -> Command:
 @pytest.fixture
 async def robot(
     shared_home: Home, demo: Command, monkeypatch: pytest.MonkeyPatch
-) -> AsyncIterator[Onlooker]:
+) -> AsyncIterator[Probe]:
     """The robot of the demo, driving itself; scripts find it without being told where it is."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(shared_home.folder / "run"))
-    async with looking_on(await robot_of(shared_home, demo)) as onlooker:
+    async with probing(await robot_of(shared_home, demo)) as onlooker:
         await until(lambda: onlooker.state.gate.mode == "enabled", "driving")
         yield onlooker
 
@@ -48,18 +48,18 @@ async def square(script: Robot) -> None:
         await script.drive(angular_z=1.0, seconds=math.pi / 2)
 
 
-async def test_a_script_drives_a_square_and_the_brain_goes_on_afterwards(robot: Onlooker) -> None:
+async def test_a_script_drives_a_square_and_the_brain_goes_on_afterwards(robot: Probe) -> None:
     async with gigabrain_zenoh.connect(take=True, source="square") as script:
         for _ in range(4):  # where a busy machine holds up the script or the gate, once more
             try:
                 await script.set_base_velocity(0.0)
-                await robot.still()
+                await robot.at_rest()
                 start = robot.state
                 await square(script)
             except Refused:  # the machine held up safety, and the gate lets nobody in meanwhile
                 await robot.ticks(50)
                 continue
-            moved = robot.moved(start)
+            moved = robot.distance_from(start)
             turned = abs(math.remainder(robot.state.pose.yaw - start.pose.yaw, math.tau))
             if robot.state.gate.enables == start.gate.enables and moved < 0.05 and turned < 0.15:
                 break
@@ -68,10 +68,10 @@ async def test_a_script_drives_a_square_and_the_brain_goes_on_afterwards(robot: 
         x = [state.pose.x for state in robot.states if state.tick > start.tick]
         assert max(x) - min(x) > 0.25
     await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
-    await robot.straight(speed=0.15, room=0.0)
+    await robot.driving_straight(speed=0.15, room=0.0)
 
 
-async def test_a_script_keeps_the_body_while_it_thinks(robot: Onlooker) -> None:
+async def test_a_script_keeps_the_body_while_it_thinks(robot: Probe) -> None:
     async with connect(take=True, source="thinker") as script:
         await script.drive(angular_z=0.5, seconds=0.4)
         await robot.ticks(75)
@@ -81,7 +81,7 @@ async def test_a_script_keeps_the_body_while_it_thinks(robot: Onlooker) -> None:
     await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
 
 
-async def test_without_take_it_is_refused_and_told_who_drives(robot: Onlooker) -> None:
+async def test_without_take_it_is_refused_and_told_who_drives(robot: Probe) -> None:
     async with connect() as script:
         with pytest.raises(Refused) as refused:
             await script.set_base_velocity(0.1)
@@ -89,7 +89,7 @@ async def test_without_take_it_is_refused_and_told_who_drives(robot: Onlooker) -
     assert robot.state.gate.commander == "control"
 
 
-async def test_a_script_that_was_taken_over_does_not_take_the_body_back(robot: Onlooker) -> None:
+async def test_a_script_that_was_taken_over_does_not_take_the_body_back(robot: Probe) -> None:
     async with connect(take=True, source="script") as script, connect(source="person") as person:
         await script.set_base_velocity(0.1)
         await person.enable(take=True)
@@ -105,7 +105,7 @@ async def test_a_script_that_was_taken_over_does_not_take_the_body_back(robot: O
 
 
 async def test_a_velocity_lasts_one_second_and_is_cut_to_what_the_body_can(
-    robot: Onlooker,
+    robot: Probe,
 ) -> None:
     async with connect(take=True) as script:
         for _ in range(4):  # once more where a busy machine holds up the script or the gate
@@ -113,7 +113,7 @@ async def test_a_velocity_lasts_one_second_and_is_cut_to_what_the_body_can(
             asked = await script.set_base_velocity(0.0, 0.5, -9.0)
             assert (asked.linear_x, asked.linear_y, asked.angular_z) == (0.0, 0.0, -1.82)
             await until(lambda: robot.state.velocity.angular_z < -1.0, "turning")
-            await robot.still()
+            await robot.at_rest()
             new = [state for state in robot.states if state.tick > start.tick]
             turned = [state.tick for state in new if state.velocity.angular_z < -1.0]
             if min(state.velocity.angular_z for state in new) < -1.6:
@@ -122,7 +122,7 @@ async def test_a_velocity_lasts_one_second_and_is_cut_to_what_the_body_can(
     await until(lambda: robot.state.gate.commander == "control", "the brain goes on")
 
 
-async def test_what_the_robot_says_can_be_listened_to(robot: Onlooker) -> None:
+async def test_what_the_robot_says_can_be_listened_to(robot: Probe) -> None:
     async with connect() as script:
         scans: list[LaserScan] = []
         async with asyncio.timeout(60):
@@ -141,7 +141,7 @@ async def test_what_the_robot_says_can_be_listened_to(robot: Onlooker) -> None:
         ]
 
 
-async def test_what_there_is_not_is_said_in_words(robot: Onlooker) -> None:
+async def test_what_there_is_not_is_said_in_words(robot: Probe) -> None:
     async with connect() as script:
         with pytest.raises(UnknownName, match=r"no topic 'scna'; did you mean 'scan'\? known: "):
             script.topic("scna")
@@ -152,7 +152,7 @@ async def test_what_there_is_not_is_said_in_words(robot: Onlooker) -> None:
 
 
 async def test_several_robots_are_listed(
-    robot: Onlooker, shared_home: Home, demo: Command, home: Home
+    robot: Probe, shared_home: Home, demo: Command, home: Home
 ) -> None:
     second = shared_home.start(*AVOID, "--headless", "--world", "house")
     first_at, second_at = await robot_of(shared_home, demo), await robot_of(shared_home, second)
@@ -189,10 +189,10 @@ async def test_no_robot_no_router_and_no_driver_are_told_apart(
             await script.estop()
 
 
-async def test_the_release_goes_by_what_is_known_of_the_e_stop(robot: Onlooker) -> None:
+async def test_the_release_goes_by_what_is_known_of_the_e_stop(robot: Probe) -> None:
     async with connect() as script:
         assert isinstance(script, Robot)
         await script.estop("test")
-        await robot.still(ticks=30)
+        await robot.at_rest(ticks=30)
         assert (await script.release()).text == "released; enable it to move"
-        await robot.hand_to_brain()
+        await robot.enable_brain()

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from gigabrain_zenoh.qa.conformance import kit
-from gigabrain_zenoh.qa.conformance.result import Finding, summary
-from gigabrain_zenoh.qa.conformance.subject import Subject
+from gigabrain_zenoh.qa.conformance.robot import CheckedRobot
+from gigabrain_zenoh.qa.judging import Finding, summary
 
 
 def test_the_worst_and_the_median_of_each_time_are_told() -> None:
@@ -56,5 +56,5 @@ async def test_only_the_stops_are_repeated(tmp_path: Path) -> None:
 async def test_a_body_is_judged_by_what_its_firmware_promises(
     name: str, promise: str, tmp_path: Path
 ) -> None:
-    async with Subject(name, "emulated", tmp_path) as subject:
+    async with CheckedRobot(name, "emulated", tmp_path) as subject:
         assert subject.promise == promise

@@ -18,7 +18,7 @@ from gigabrain_schemas.tasks import Task, TaskStatus
 from gigabrain_schemas.topics import MAP, STATE
 from gigabrain_zenoh.launch import demo as demo_module
 from gigabrain_zenoh.launch.demo import Demo, DemoOptions, newest_fault
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.runtime.deployment import ROBOT, Deployment
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.processes import AVOID, Command, Home, robot_of
@@ -129,7 +129,7 @@ async def test_a_process_that_dies_fails_the_run_but_does_not_end_it(home: Home)
     report = home.folder / "report.json"
     options = ("--seconds", "30", "--speed", "4", "--headless", "--report", str(report))
     demo = home.start(*AVOID, *options)
-    async with looking_on(await robot_of(home, demo)) as robot:
+    async with probing(await robot_of(home, demo)) as robot:
         await until(lambda: robot.state.gate.mode == "enabled", "driving")
         os.kill(await robot.pid("perception"), signal.SIGKILL)
     assert await demo.ended() == 1
@@ -149,7 +149,7 @@ async def test_a_body_without_a_truth_of_its_own_is_judged_by_its_odometry(home:
 @pytest.mark.parametrize("frozen", ["none", "router", "driver", "decision"])
 async def test_ctrl_c_ends_all_of_it_also_when_one_hangs(home: Home, frozen: str) -> None:
     demo = home.start(*AVOID, "--headless")
-    async with looking_on(await robot_of(home, demo)) as robot:
+    async with probing(await robot_of(home, demo)) as robot:
         await until(lambda: robot.state.gate.mode == "enabled", "driving")
         assert len(home.processes()) == 6
         if frozen != "none":
@@ -165,9 +165,9 @@ async def test_a_driver_that_hangs_at_the_end_costs_its_truth_and_not_the_report
 ) -> None:
     path = home.folder / "report.json"
     demo = home.start(*AVOID, "--headless", "--keep-stuck", "--report", str(path))
-    async with looking_on(await robot_of(home, demo)) as robot:
+    async with probing(await robot_of(home, demo)) as robot:
         await until(lambda: robot.health.get("driver"), "the driver's health")
-        await robot.straight(0.15, room=0.0)
+        await robot.driving_straight(0.15, room=0.0)
         os.kill(await robot.pid("driver"), signal.SIGSTOP)
         demo.send(signal.SIGINT)
         assert await demo.ended() == 0
@@ -181,7 +181,7 @@ async def test_two_demos_side_by_side_do_not_meet(home: Home) -> None:
     demos = [home.start(*AVOID, "--headless", "--seed", seed) for seed in ("1", "2")]
     boots = []
     for demo in demos:
-        async with looking_on(await robot_of(home, demo)) as robot:
+        async with probing(await robot_of(home, demo)) as robot:
             await robot.ticks(25)
             boots.append({state.boot for state in robot.states})
     assert [len(boots[0]), len(boots[1])] == [1, 1]

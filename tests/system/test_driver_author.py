@@ -8,8 +8,8 @@ import pytest
 from gigabrain_drivers import links
 from gigabrain_drivers.driver import catalog
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.qa.conformance import direct, kit, new
-from gigabrain_zenoh.qa.conformance.subject import Subject
+from gigabrain_zenoh.qa.conformance import authoring, driver_checks, kit
+from gigabrain_zenoh.qa.conformance.robot import CheckedRobot
 
 
 def installed(folder: Path, site: Path) -> Path:
@@ -30,7 +30,7 @@ def installed(folder: Path, site: Path) -> Path:
 
 
 async def test_a_new_driver_passes_the_kit_by_its_name(tmp_path: Path, site: Path) -> None:
-    folder = new.write("kit_probe", tmp_path)
+    folder = authoring.write_package("kit_probe", tmp_path)
     assert folder == tmp_path / "gigabrain-kit-probe"
     package = installed(folder, site)
     assert catalog.robot_files()["kit_probe"] == package / "robot.yaml"
@@ -53,48 +53,48 @@ def test_what_the_docs_name_can_be_imported() -> None:
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    folder = new.write("kit_twice", tmp_path)
+    folder = authoring.write_package("kit_twice", tmp_path)
     (folder / "README.md").write_text("mine")
     with pytest.raises(ConfigError, match="exists; nothing was written"):
-        new.write("kit_twice", tmp_path)
+        authoring.write_package("kit_twice", tmp_path)
     assert (folder / "README.md").read_text() == "mine"
 
 
 @pytest.mark.parametrize("name", ["My Robot", "class", "1st", "a", "../x", "robot_"])
 def test_a_name_that_no_module_can_have_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="expected lower-case letters"):
-        new.write(name, tmp_path)
+        authoring.write_package(name, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["mock", "turtlebot3_waffle", "line"])
 def test_a_name_that_is_taken_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="already"):
-        new.write(name, tmp_path)
+        authoring.write_package(name, tmp_path)
 
 
-def broken(name: str, folder: Path, site: Path, old: str, by: str) -> Subject:
+def broken(name: str, folder: Path, site: Path, old: str, by: str) -> CheckedRobot:
     """A new driver with one mistake in it."""
-    path = installed(new.write(name, folder), site) / "driver.py"
+    path = installed(authoring.write_package(name, folder), site) / "driver.py"
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, by))
-    return Subject(name, "sim", folder)
+    return CheckedRobot(name, "sim", folder)
 
 
 async def test_a_driver_that_ignores_its_limits_fails(tmp_path: Path, site: Path) -> None:
     plain = "Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)"
     bounded = "self.bounded(linear_x, linear_y, angular_z)"
     async with broken("kit_fast", tmp_path, site, bounded, plain) as subject:
-        found = await direct.limits(subject)
+        found = await driver_checks.limits(subject)
         assert (found.ok, found.measured) == (False, "at most 10.00 of max speed")
-        assert not (await direct.refuses_nan(subject)).ok
+        assert not (await driver_checks.refuses_nan(subject)).ok
 
 
 async def test_a_driver_whose_stop_raises_fails(tmp_path: Path, site: Path) -> None:
     stop = '"""Bring the body to rest."""'
     async with broken("kit_loud", tmp_path, site, stop, 'raise OSError("gone")') as subject:
-        found = await direct.never_raises(subject)
+        found = await driver_checks.never_raises(subject)
         assert (found.ok, found.measured) == (False, "stop, never opened: OSError('gone')")
 
 
@@ -102,7 +102,7 @@ async def test_a_driver_that_returns_what_it_did_not_send_fails(tmp_path: Path, 
     honest = "return self._velocity\n"
     lying = "return self.bounded(linear_x / 2, linear_y, angular_z)\n"
     async with broken("kit_lies", tmp_path, site, honest, lying) as subject:
-        assert not (await direct.returns(subject)).ok
+        assert not (await driver_checks.returns(subject)).ok
 
 
 async def test_a_driver_that_raises_something_else_fails_and_the_kit_goes_on(
@@ -121,4 +121,4 @@ async def test_a_driver_that_raises_something_else_fails_and_the_kit_goes_on(
 
 def test_the_kit_moves_no_real_body(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="for the links sim and emulated"):
-        Subject("mycustombot", "real", tmp_path)
+        CheckedRobot("mycustombot", "real", tmp_path)

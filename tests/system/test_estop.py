@@ -12,7 +12,7 @@ from gigabrain_schemas.requests import ReleaseRequest
 from gigabrain_schemas.topics import RELEASE
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.qa.faults.onlooker import Onlooker, looking_on
+from gigabrain_zenoh.qa.probe import Probe, probing
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 from gigabrain_zenoh.testing.waiting import until
 
@@ -26,26 +26,26 @@ def deployment(shared_home: Home) -> Path:
 
 
 @pytest.fixture
-async def robot(deployment: Path) -> AsyncIterator[Onlooker]:
+async def robot(deployment: Path) -> AsyncIterator[Probe]:
     """The robot, driving straight on."""
-    async with looking_on(endpoint_of(deployment), "operator") as onlooker:
+    async with probing(endpoint_of(deployment), "operator") as onlooker:
         if onlooker.state.gate.mode == "latched" and onlooker.state.gate.estop_generation:
             await go_on(onlooker)
-        await onlooker.straight()
+        await onlooker.driving_straight()
         yield onlooker
 
 
-async def go_on(robot: Onlooker) -> None:
+async def go_on(robot: Probe) -> None:
     """A person releases the latch and lets the brain drive."""
     person = Robot(robot.bus)
-    await robot.still(ticks=30)
+    await robot.at_rest(ticks=30)
     assert (await person.release()).text == "released; enable it to move"
     await robot.ticks(40)
     assert robot.state.gate.mode == "idle"  # also where it resumes by itself: a person stopped it
-    await robot.hand_to_brain()
+    await robot.enable_brain()
 
 
-async def test_it_stops_the_body_and_keeps_it_stopped(robot: Onlooker) -> None:
+async def test_it_stops_the_body_and_keeps_it_stopped(robot: Probe) -> None:
     generation, start = robot.state.gate.estop_generation, robot.state
     reply = await Robot(robot.bus).estop("a chair is in the way")
     assert (reply.ok, reply.gate.mode) == (True, "latched")
@@ -53,18 +53,18 @@ async def test_it_stops_the_body_and_keeps_it_stopped(robot: Onlooker) -> None:
     assert reply.text == f"stopped and latched; e-stop number {generation + 1}"
     await robot.ticks(100)
     assert robot.travel_until_rest(start) <= 0.06
-    assert robot.moved(start) <= 0.06
+    assert robot.distance_from(start) <= 0.06
     assert robot.state.gate.mode == "latched"
     assert robot.state.gate.causes[0].text == "e-stop pressed by operator"
     await until(lambda: "a chair is in the way" in " ".join(r.text for r in robot.logs), "its log")
     with pytest.raises(Refused, match=r"latched: e-stop pressed by operator .*; release it first"):
         await Robot(robot.bus, take=True).set_base_velocity(0.2)
     await go_on(robot)
-    await robot.straight(room=0.0)
+    await robot.driving_straight(room=0.0)
 
 
 async def test_the_command_says_who_has_confirmed_it(
-    robot: Onlooker, shared_home: Home, deployment: Path
+    robot: Probe, shared_home: Home, deployment: Path
 ) -> None:
     start = robot.state
     where = endpoint_of(deployment).connect[0]
@@ -74,7 +74,7 @@ async def test_the_command_says_who_has_confirmed_it(
         r"CONFIRMED by turtlebot3_waffle: stopped and latched; e-stop number \d+ \(\d+ ms\)\n",
         stop.out,
     )
-    await robot.still()
+    await robot.at_rest()
     assert robot.state.gate.mode == "latched"
     enable = await shared_home.run("enable")
     assert await enable.ended() == 1
@@ -82,15 +82,15 @@ async def test_the_command_says_who_has_confirmed_it(
         r"gigabrain: turtlebot3_waffle: latched: e-stop pressed by \S+-cli .*; release it first\n",
         enable.err,
     )
-    await robot.still(ticks=30)
+    await robot.at_rest(ticks=30)
     release = await shared_home.run("release")
     assert "released; enable it to move" in release.out
     assert "control drives" in (await shared_home.run("enable")).out
-    await robot.straight()
+    await robot.driving_straight()
     assert robot.state.gate.enables > start.gate.enables
 
 
-async def test_it_survives_the_death_of_the_driver(robot: Onlooker) -> None:
+async def test_it_survives_the_death_of_the_driver(robot: Probe) -> None:
     generation = (await Robot(robot.bus).estop()).gate.estop_generation
     before = robot.state
     os.kill(await robot.pid("driver"), signal.SIGKILL)
@@ -101,14 +101,14 @@ async def test_it_survives_the_death_of_the_driver(robot: Onlooker) -> None:
     assert robot.state.gate.estop_generation == generation
     assert (robot.state.pose.x, robot.state.pose.y) == (0.0, 0.0)
     await go_on(robot)
-    await robot.straight(room=0.0)
+    await robot.driving_straight(room=0.0)
 
 
-async def test_only_who_knows_of_the_newest_e_stop_can_release_it(robot: Onlooker) -> None:
+async def test_only_who_knows_of_the_newest_e_stop_can_release_it(robot: Probe) -> None:
     person = Robot(robot.bus)
     first = (await person.estop()).gate.estop_generation
     await person.estop()
-    await robot.still(ticks=30)
+    await robot.at_rest(ticks=30)
     replies = await robot.bus.ask(RELEASE, ReleaseRequest(estop_generation=first))
     assert not replies[0].ok
     assert replies[0].text == (
@@ -116,4 +116,4 @@ async def test_only_who_knows_of_the_newest_e_stop_can_release_it(robot: Onlooke
     )
     assert robot.state.gate.mode == "latched"
     await go_on(robot)
-    await robot.straight(room=0.0)
+    await robot.driving_straight(room=0.0)

@@ -9,8 +9,7 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import device_class
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import UnknownName
-from gigabrain_zenoh.qa.conformance.session import Session
-from gigabrain_zenoh.qa.conformance.subject import Subject
+from gigabrain_zenoh.qa.conformance.robot import CheckedRobot, DriverSession
 
 NAME = "foreign_base"
 DRIVER = '''"""Somebody's driver, and the board that it talks to."""
@@ -54,9 +53,9 @@ def package(site: Path) -> Path:
 
 
 async def test_a_packages_driver_drives_the_packages_emulator(package: Path) -> None:
-    async with Subject(NAME, "emulated", package / "run") as subject:
+    async with CheckedRobot(NAME, "emulated", package / "run") as subject:
         assert subject.promise == "80 ms (its data sheet)"
-        async with Session(subject) as session:
+        async with DriverSession(subject) as session:
             await session.connected()
             session.wanted = Velocity(linear_x=0.2)
             assert await session.until(lambda: subject.told(None)[0] == 0.2, 100) is not None

@@ -184,7 +184,7 @@ def _panels(place: object) -> list[str]:
 async def test_a_robot_turns_as_a_viewer_tells_it_and_a_second_bridge_says_what_to_do(
     home: Home,
 ) -> None:
-    from gigabrain_zenoh.qa.faults.onlooker import looking_on
+    from gigabrain_zenoh.qa.probe import probing
     from gigabrain_zenoh.runtime.deployment import ROBOT
     from gigabrain_zenoh.testing.processes import endpoint_of
 
@@ -196,15 +196,15 @@ async def test_a_robot_turns_as_a_viewer_tells_it_and_a_second_bridge_says_what_
     hosts = {"robot": [*ROBOT, "foxglove"]}
     file = home.deployment(body="mock", resume="auto", hosts=hosts, foxglove={"port": port})
     home.start("up", str(file))
-    async with looking_on(endpoint_of(file)) as seen:
+    async with probing(endpoint_of(file)) as seen:
         await until(lambda: listens(port), "the bridge is there")
-        await seen.hand_to_brain()
+        await seen.enable_brain()
         async with connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"]) as made:  # type: ignore[list-item]
             viewer = Viewer(made)
             await viewer.publish_on(topic)
 
             await hold(viewer, LEFT, lambda: seen.state.velocity.angular_z > 0.3)
-        await seen.still()
+        await seen.at_rest()
         second = await home.run(
             "foxglove", "--port", str(port), "--namespace", "other",
             "--connect", endpoint_of(file).connect[0],

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.testing.processes import Home, robot_of
 from gigabrain_zenoh.testing.waiting import until
 
@@ -18,7 +18,7 @@ async def home_of_robot(home: Home) -> AsyncIterator[Home]:
     """A robot that makes a map of the arena; in lock-step, on any machine."""
     demo = home.start("demo", "--headless", "--speed", "3", "--seconds", "3000")
     endpoint = await robot_of(home, demo)
-    async with looking_on(endpoint) as robot:
+    async with probing(endpoint) as robot:
         await until(lambda: robot.state.gate.mode == "enabled", "driving", COMPILING_S)
         yield home
 

@@ -28,8 +28,8 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.qa.faults.hostile import replaced
-from gigabrain_zenoh.qa.faults.onlooker import SYSTEMS, Onlooker, looking_on
+from gigabrain_zenoh.qa.faults.rig.hostile import replaced
+from gigabrain_zenoh.qa.probe import NODES, Probe, probing
 from gigabrain_zenoh.testing.processes import AVOID, Home, endpoint_of, robot_of
 from gigabrain_zenoh.testing.waiting import until
 from tests.unit.schemas.plain import as_map, numbers, refuses
@@ -85,7 +85,7 @@ async def test_a_flood_on_every_key_is_dropped_and_counted_and_the_robot_drives_
     options = ("--headless", "--speed", "2", "--seconds", "30", "--report", str(path))
     demo = home.start(*AVOID, *options)
     endpoint = await robot_of(home, demo)
-    async with looking_on(endpoint) as robot, stranger_at(endpoint) as (transport, _):
+    async with probing(endpoint) as robot, stranger_at(endpoint) as (transport, _):
         await until(lambda: robot.state.gate.mode == "enabled", "driving")
         pids, enables = await robot.pids(), robot.state.gate.enables
         for topic in TOPICS:
@@ -120,9 +120,9 @@ def deployment(shared_home: Home) -> Path:
 
 
 @pytest.fixture
-async def robot(deployment: Path) -> AsyncIterator[Onlooker]:
+async def robot(deployment: Path) -> AsyncIterator[Probe]:
     """The robot, driving by itself."""
-    async with looking_on(endpoint_of(deployment)) as onlooker:
+    async with probing(endpoint_of(deployment)) as onlooker:
         await until(lambda: onlooker.state.gate.mode == "enabled", "driving")
         yield onlooker
 
@@ -134,7 +134,7 @@ async def robot(deployment: Path) -> AsyncIterator[Onlooker]:
     ids=["no MessagePack", "half JSON", "a number for a boolean", "NaN", "70 kB"],
 )
 async def test_a_request_that_is_none_is_refused_in_words(
-    robot: Onlooker, deployment: Path, service: Service[Any, Any], payload: bytes
+    robot: Probe, deployment: Path, service: Service[Any, Any], payload: bytes
 ) -> None:
     async with stranger_at(endpoint_of(deployment)) as (transport, _):
         replies = await transport.query(service.key, payload, "", 5.0, service.priority)
@@ -147,7 +147,7 @@ async def test_a_request_that_is_none_is_refused_in_words(
 
 
 async def test_nobody_else_can_drive_a_body_that_has_a_commander(
-    robot: Onlooker, deployment: Path
+    robot: Probe, deployment: Path
 ) -> None:
     before = (await robot.truth())["ticks"]
     async with stranger_at(endpoint_of(deployment)) as (_, bus):
@@ -159,4 +159,4 @@ async def test_nobody_else_can_drive_a_body_that_has_a_commander(
     refused = "refused_commander"
     await until(lambda: robot.health["driver"].counters.get(refused, 0) >= 40, "the count")
     assert robot.state.gate.commander == "control"
-    assert all(name in robot.health for name in SYSTEMS)
+    assert all(name in robot.health for name in NODES)

@@ -18,9 +18,9 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.qa.faults.onlooker import Onlooker, at_rest, looking_on
+from gigabrain_zenoh.qa.probe import Probe, at_rest, probing
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
-from gigabrain_zenoh.qa.proxy.proxy import TcpProxy
+from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
 from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
@@ -62,7 +62,7 @@ class Site:
 class Ears:
     """What control says to the gate, and what of decision's it rests on."""
 
-    def __init__(self, robot: Onlooker) -> None:
+    def __init__(self, robot: Probe) -> None:
         self.commands: deque[CmdVel] = deque(maxlen=10_000)
         robot.bus.subscribe(CMD_VEL, lambda _key, command: self.commands.append(command))
 
@@ -89,12 +89,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
 
 
 @pytest.fixture
-async def robot(site: Site) -> AsyncIterator[Onlooker]:
-    async with looking_on(site.endpoint) as onlooker:
+async def robot(site: Site) -> AsyncIterator[Probe]:
+    async with probing(site.endpoint) as onlooker:
         yield onlooker
 
 
-async def drives_again(robot: Onlooker, since: int) -> None:
+async def drives_again(robot: Probe, since: int) -> None:
     """Soon after the tick `since`, wherever to: it may just have a wall before it."""
     await until(
         lambda: robot.state.gate.mode == "enabled" and not at_rest(robot.state), "it drives again"
@@ -102,17 +102,17 @@ async def drives_again(robot: Onlooker, since: int) -> None:
     assert robot.state.tick - since <= RETURN_TICKS
 
 
-async def nothing_stale_or_touched(robot: Onlooker) -> None:
+async def nothing_stale_or_touched(robot: Probe) -> None:
     truth = await robot.truth()
     assert (truth["stale_commands_executed"], truth["contacts"]) == (0, 0)
 
 
 @pytest.mark.parametrize("seconds", [0.1, 0.3, 1.0, 3.0])
 async def test_a_brain_that_is_cut_off_stops_the_robot_and_holds_up_nobody_else(
-    site: Site, robot: Onlooker, seconds: float
+    site: Site, robot: Probe, seconds: float
 ) -> None:
     ears = Ears(robot)
-    await robot.straight(0.19)
+    await robot.driving_straight(0.19)
     start = robot.state.tick
     site.net.cut("brain")
     await asyncio.sleep(seconds)
@@ -129,22 +129,22 @@ async def test_a_brain_that_is_cut_off_stops_the_robot_and_holds_up_nobody_else(
     await nothing_stale_or_touched(robot)
 
 
-async def killed_router(site: Site, robot: Onlooker) -> int:
+async def killed_router(site: Site, robot: Probe) -> int:
     """Kill it while the robot drives; the tick at which the robot is heard through it again."""
     pid = await robot.pid("router")
-    await robot.straight(0.19)
+    await robot.driving_straight(0.19)
     start = robot.state
     os.kill(pid, signal.SIGKILL)
     await until(lambda: len(site.records("router", "ready")) == 2, "the router is back")
     await until(lambda: robot.state.tick > start.tick + 10, "the robot is heard again")
     stopped = [r["tick"] for r in site.records("driver", "gate") if r["mode"] == "stopping"]
     assert stopped[-1] - start.tick <= STOP_TICKS + 1  # one for the news of the first tick
-    assert robot.moved(start) <= 0.10
+    assert robot.distance_from(start) <= 0.10
     return next(state.tick for state in robot.states if state.tick > start.tick + 10)
 
 
 async def test_a_killed_router_stops_the_robot_which_drives_again_soon_after_its_return(
-    site: Site, robot: Onlooker
+    site: Site, robot: Probe
 ) -> None:
     await drives_again(robot, await killed_router(site, robot))
     await nothing_stale_or_touched(robot)
@@ -155,12 +155,12 @@ async def test_with_manual_resume_no_fault_of_the_network_ends_in_motion(tmp_pat
         site = Site(stack, net, tmp_path, "manual")
         site.up("robot")
         site.up("brain")
-        async with looking_on(site.endpoint) as robot:
+        async with probing(site.endpoint) as robot:
             await robot.ticks(50)
             assert robot.state.gate.mode == "latched"
             person = Robot(robot.bus)
             await person.release()
-            await robot.straight(0.15, by_hand=True)
+            await robot.driving_straight(0.15, by_hand=True)
             net.cut("brain")
             await asyncio.sleep(1.0)  # the router has noticed, and is heard nevertheless
             assert (await person.estop()).gate.mode == "latched"
@@ -169,20 +169,20 @@ async def test_with_manual_resume_no_fault_of_the_network_ends_in_motion(tmp_pat
             await robot.ticks(10)
             await person.release()
             await stands_until_enabled(robot)
-            await robot.straight(0.15, by_hand=True)
+            await robot.driving_straight(0.15, by_hand=True)
             await killed_router(site, robot)
             await stands_until_enabled(robot)
             await nothing_stale_or_touched(robot)
 
 
-async def stands_until_enabled(robot: Onlooker) -> None:
+async def stands_until_enabled(robot: Probe) -> None:
     """Nothing speaks against driving any more, and still it does not."""
     await until(lambda: robot.state.gate.mode == "idle", "the gate shuts")
     await until(lambda: not robot.state.gate.causes, "all is well again")
     start = robot.state
     await robot.ticks(LOOK_TICKS)
     assert (robot.state.gate.mode, robot.state.gate.enables) == ("idle", start.gate.enables)
-    assert robot.moved(start) <= 0.001
+    assert robot.distance_from(start) <= 0.001
 
 
 # what is wrong with the brain's link, and whether the robot drives nevertheless; None where that
@@ -206,8 +206,8 @@ async def test_over_a_bad_link_the_robot_drives_or_stands_and_does_not_stutter(
         site.up("robot")
         async with TcpProxy((net.address["robot"], 7447), (net.ours, 0)) as proxy:
             site.up("brain", proxy.endpoint)
-            async with looking_on(site.endpoint) as robot:
-                await robot.straight(0.15, room=0.0)
+            async with probing(site.endpoint) as robot:
+                await robot.driving_straight(0.15, room=0.0)
                 for name, link, drives in LINKS:
                     proxy.set(link)
                     await robot.ticks(REST_TICKS)
@@ -219,7 +219,7 @@ async def test_over_a_bad_link_the_robot_drives_or_stands_and_does_not_stutter(
                 await nothing_stale_or_touched(robot)
 
 
-async def judge(robot: Onlooker, name: str, drives: bool | None) -> None:
+async def judge(robot: Probe, name: str, drives: bool | None) -> None:
     """It starts at most once a second, and mostly drives or always stands where that is known.
 
     Where it drives, this machine may hold up for a while what the link does not.

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.security.authority import issue, new_fleet
 from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
@@ -41,11 +41,11 @@ async def test_three_hosts_with_keys_drive_and_each_may_do_what_it_is_there_for(
                 homes[name].start("up", str(file), "--host", name)
             router, keys = f"tls/{address}:7447", str(tmp_path / "home" / "operator")
             where = ("--connect", router, "--keys")
-            async with looking_on(Endpoint(connect=(router,), keys=keys)) as robot:
+            async with probing(Endpoint(connect=(router,), keys=keys)) as robot:
                 await robot.ticks(50)
                 assert robot.state.gate.mode == "latched"
                 await Robot(robot.bus).release()
-                await robot.straight(0.15, by_hand=True)
+                await robot.driving_straight(0.15, by_hand=True)
                 viewer = await homes["operator"].run(
                     "estop", *where, str(tmp_path / "home" / "viewer")
                 )
@@ -58,11 +58,11 @@ async def test_three_hosts_with_keys_drive_and_each_may_do_what_it_is_there_for(
                     "release", *where, str(tmp_path / "home" / "brain")
                 )
                 assert await brain.ended() != 0
-                await robot.still(30)
+                await robot.at_rest(30)
                 assert robot.state.gate.mode == "latched"
                 released = await homes["operator"].run("release", *where, keys)
                 assert await released.ended() == 0
-                await robot.straight(0.15, by_hand=True)
+                await robot.driving_straight(0.15, by_hand=True)
         finally:
             for home in homes.values():
                 home.close()
@@ -80,7 +80,7 @@ async def test_a_stranger_on_the_network_gets_nothing_and_is_written_down(tmp_pa
             homes["robot"].start("up", str(file), "--host", "robot")
             keys = str(tmp_path / "home" / "operator")
             endpoint = Endpoint(connect=(f"tls/{address}:7447",), keys=keys)
-            async with looking_on(endpoint) as robot:
+            async with probing(endpoint) as robot:
                 for line in (
                     ("--connect", f"tcp/{address}:7447"),
                     (

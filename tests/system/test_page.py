@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from playwright.async_api import Page
 
-from gigabrain_zenoh.qa.faults.onlooker import Onlooker, at_rest, looking_on
+from gigabrain_zenoh.qa.probe import Probe, at_rest, probing
 from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.page import VIEWER, Browser, Robot, browser, needs_browser
@@ -27,8 +27,8 @@ def robot(shared_home: Home) -> Iterator[Robot]:
 
 
 @pytest.fixture
-async def seen(robot: Robot) -> AsyncIterator[Onlooker]:
-    async with looking_on(robot.endpoint) as onlooker:
+async def seen(robot: Robot) -> AsyncIterator[Probe]:
+    async with probing(robot.endpoint) as onlooker:
         yield onlooker
 
 
@@ -59,7 +59,7 @@ async def ready_to_drive(page: Page) -> None:
     await page.wait_for_selector(ENABLED)
 
 
-async def turning(seen: Onlooker) -> None:
+async def turning(seen: Probe) -> None:
     """Turning left, which this robot's own brain never does."""
     await until(lambda: seen.state.velocity.angular_z > 0.3, "turning as told")
 
@@ -74,32 +74,32 @@ async def hold_left(page: Page) -> None:
     await page.mouse.move(box["x"], box["y"] + box["height"] / 2)
 
 
-async def test_a_held_key_drives_and_letting_go_stops(chromium: Browser, seen: Onlooker) -> None:
+async def test_a_held_key_drives_and_letting_go_stops(chromium: Browser, seen: Probe) -> None:
     page = await chromium.open()
     await ready_to_drive(page)
     await page.keyboard.down("a")
     await turning(seen)
     await told(page, "wanted", "0.00 m/s  0.91 rad/s")
     await page.keyboard.up("a")
-    await seen.still()
+    await seen.at_rest()
     assert (seen.state.gate.mode, seen.state.gate.commander) == ("enabled", "control")
     assert "viewer" not in await text(page, "doing")
 
 
 async def test_a_window_that_loses_the_focus_lets_all_keys_go(
-    chromium: Browser, seen: Onlooker
+    chromium: Browser, seen: Probe
 ) -> None:
     page = await chromium.open()
     await ready_to_drive(page)
     await page.keyboard.down("a")
     await turning(seen)
     await page.evaluate("window.dispatchEvent(new Event('blur'))")
-    await seen.still()
+    await seen.at_rest()
     await page.keyboard.up("a")
 
 
 async def test_the_e_stop_stops_a_driving_robot_and_names_who_confirmed_it(
-    chromium: Browser, seen: Onlooker
+    chromium: Browser, seen: Probe
 ) -> None:
     page = await chromium.open()
     await ready_to_drive(page)
@@ -112,7 +112,7 @@ async def test_the_e_stop_stops_a_driving_robot_and_names_who_confirmed_it(
         r"in \d+ ms: stopped and latched; e-stop number \d+", await text(page, "confirmed")
     )
     await until(lambda: seen.state.gate.mode == "latched", "latched")
-    await seen.still()
+    await seen.at_rest()
     assert seen.state.gate.estop_generation == before + 1
     assert [cause.text for cause in seen.state.gate.causes] == ["e-stop pressed by page"]
     await told(page, "causes", "find out why it was pressed")
@@ -142,7 +142,7 @@ async def test_tables_and_log_show_every_process(chromium: Browser) -> None:
     assert await page.get_attribute("#tab-log", "aria-selected") == "true"
 
 
-async def test_of_two_viewers_one_steers_and_both_see_it(chromium: Browser, seen: Onlooker) -> None:
+async def test_of_two_viewers_one_steers_and_both_see_it(chromium: Browser, seen: Probe) -> None:
     one, two = await chromium.open(), await chromium.open()
     await told(two, "link", "2 viewers")
     await ready_to_drive(one)
@@ -155,10 +155,10 @@ async def test_of_two_viewers_one_steers_and_both_see_it(chromium: Browser, seen
     assert seen.state.velocity.angular_z > 0.3
     await two.keyboard.up("d")
     await one.keyboard.up("a")
-    await seen.still()
+    await seen.at_rest()
 
 
-async def test_a_viewers_token_looks_and_does_not_drive(chromium: Browser, seen: Onlooker) -> None:
+async def test_a_viewers_token_looks_and_does_not_drive(chromium: Browser, seen: Probe) -> None:
     page = await chromium.open(VIEWER)
     assert await page.is_disabled("#estop")
     assert not await page.is_visible("#stick")
@@ -172,7 +172,7 @@ async def test_a_viewers_token_looks_and_does_not_drive(chromium: Browser, seen:
 
 
 async def test_on_a_phone_nothing_is_cut_off_and_the_joystick_drives(
-    chromium: Browser, seen: Onlooker
+    chromium: Browser, seen: Probe
 ) -> None:
     page = await chromium.open(width=390, height=844)
     assert await page.evaluate("document.documentElement.scrollWidth") == 390
@@ -186,11 +186,11 @@ async def test_on_a_phone_nothing_is_cut_off_and_the_joystick_drives(
     await hold_left(page)
     await turning(seen)
     await page.mouse.up()
-    await seen.still()
+    await seen.at_rest()
 
 
 async def test_a_joystick_pressed_while_the_robot_stops_for_a_moment_steers_when_it_goes_on(
-    chromium: Browser, seen: Onlooker
+    chromium: Browser, seen: Probe
 ) -> None:
     page = await chromium.open()
     await ready_to_drive(page)
@@ -203,11 +203,11 @@ async def test_a_joystick_pressed_while_the_robot_stops_for_a_moment_steers_when
         os.kill(pid, signal.SIGCONT)
     await turning(seen)
     await page.mouse.up()
-    await seen.still()
+    await seen.at_rest()
 
 
 async def test_what_was_held_when_the_robot_was_latched_has_to_be_pressed_anew(
-    chromium: Browser, seen: Onlooker
+    chromium: Browser, seen: Probe
 ) -> None:
     page, other = await chromium.open(), await chromium.open()
     await ready_to_drive(other)
@@ -232,11 +232,11 @@ async def test_what_was_held_when_the_robot_was_latched_has_to_be_pressed_anew(
     await hold_left(page)
     await turning(seen)
     await page.mouse.up()
-    await seen.still()
+    await seen.at_rest()
 
 
 async def test_the_page_comes_back_by_itself_after_its_server_and_drives_again(
-    chromium: Browser, seen: Onlooker
+    chromium: Browser, seen: Probe
 ) -> None:
     page = await chromium.open()
     await ready_to_drive(page)
@@ -245,7 +245,7 @@ async def test_the_page_comes_back_by_itself_after_its_server_and_drives_again(
     os.kill(await seen.pid("page"), signal.SIGKILL)
     await page.wait_for_selector("#link:not(.live)")
     assert await page.inner_text("#mode") == "Silent"
-    await seen.still()
+    await seen.at_rest()
     await page.keyboard.press("Space")
     await told(page, "confirmed", "NOT CONFIRMED: ")
     await page.wait_for_selector(LIVE)
@@ -254,4 +254,4 @@ async def test_the_page_comes_back_by_itself_after_its_server_and_drives_again(
     await page.keyboard.down("a")
     await turning(seen)
     await page.keyboard.up("a")
-    await seen.still()
+    await seen.at_rest()

@@ -14,7 +14,7 @@ from websockets.asyncio.client import ClientConnection
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from gigabrain_schemas.topics import TELEOP
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.testing.processes import AVOID, Home
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.page import frames
@@ -76,7 +76,7 @@ async def served(robot: Robot) -> None:
 async def test_what_no_page_of_ours_sends_ends_the_connection_and_moves_nothing(
     robot: Robot, token: str, frame: bytes
 ) -> None:
-    async with looking_on(robot.endpoint) as seen:
+    async with probing(robot.endpoint) as seen:
         steered: list[object] = []
         seen.bus.subscribe(TELEOP, lambda _key, twist: steered.append(twist))
         generation = seen.state.gate.estop_generation
@@ -147,7 +147,7 @@ async def test_a_viewer_who_never_reads_slows_neither_robot_nor_others(robot: Ro
     writer.write(head.encode())
     assert b" 101 " in await reader.readline()
     writer.write(bytes((0x82, 0x80 | len(login), 0, 0, 0, 0)) + login)  # masked by zeros
-    async with client(robot, VIEWER) as other, looking_on(robot.endpoint) as seen:
+    async with client(robot, VIEWER) as other, probing(robot.endpoint) as seen:
         begin = seen.state.tick
         moments = 0
         while moments < 50:

@@ -4,7 +4,7 @@ import os
 import signal
 from pathlib import Path
 
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.recording.bag_info import faults, read_info
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 from gigabrain_zenoh.testing.waiting import until
@@ -26,8 +26,8 @@ async def test_a_recorder_that_is_killed_costs_the_robot_nothing_and_its_file_is
         recorder={"folder": str(folder), "keep_free_mb": 0},
     )
     up = home.start("up", str(file))
-    async with looking_on(endpoint_of(file)) as robot:
-        await robot.straight(speed=0.15)
+    async with probing(endpoint_of(file)) as robot:
+        await robot.driving_straight(speed=0.15)
         await until(lambda: max(sizes(folder).values(), default=0) > 50_000, "a recording grows")
         (first,) = sizes(folder)
         before = robot.state

@@ -11,7 +11,7 @@ from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.launch.specs import process_specs
-from gigabrain_zenoh.qa.faults.onlooker import Onlooker, at_rest, looking_on
+from gigabrain_zenoh.qa.probe import Probe, at_rest, probing
 from gigabrain_zenoh.runtime import audit
 from gigabrain_zenoh.runtime.deployment import Deployment, ProcessName
 from gigabrain_zenoh.security.authority import issue, new_fleet
@@ -62,17 +62,17 @@ def test_its_processes_meet_at_a_socket_and_it_alone_connects_to_the_router(
     assert list(made) == ["relay", "perception", "decision"]
 
 
-async def relay_lost(robot: Onlooker, *, killed: bool) -> None:
+async def relay_lost(robot: Probe, *, killed: bool) -> None:
     """With it the brain is lost, which stops the robot; and it comes back by itself."""
     (told,) = await robot.bus.ask(DESCRIBE, DescribeRequest(), name="relay", timeout_s=20)
     ears = Ears(robot)
-    await robot.straight(0.19)
+    await robot.driving_straight(0.19)
     start = robot.state
     os.kill(told.pid, signal.SIGKILL if killed else signal.SIGSTOP)
     await robot.ticks(REST_TICKS)
     if not killed:
         os.kill(told.pid, signal.SIGCONT)
-    await robot.straight(0.15, room=0.0)
+    await robot.driving_straight(0.15, room=0.0)
     last, first = ears.silence(start.tick)
     assert first - last > STOP_TICKS
     late = [c.linear_x for c in ears.commands if last + STOP_TICKS <= c.tick < first]
@@ -108,7 +108,7 @@ async def test_a_robot_whose_brain_loses_its_relay_stops_and_drives_again_and_no
         await until(lambda: "waiting for it" in brain.out, "it says what it waits for")
         robots.start("up", file, "--host", "robot")
         where = Endpoint(connect=(str(values["router"]),), keys=operator, namespace=namespace)
-        async with looking_on(where) as robot:
+        async with probing(where) as robot:
             await relay_lost(robot, killed=False)
             await relay_lost(robot, killed=True)
             for name in ("relay", *BRAIN):

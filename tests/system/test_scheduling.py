@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from gigabrain_zenoh.host.this_process import FIRST_NICE
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 
 NOBODY = 65534
@@ -82,7 +82,7 @@ def test_without_the_rights_it_goes_on_as_it_is() -> None:
 async def test_of_a_robot_what_stops_it_goes_first(home: Home) -> None:
     file = home.deployment()
     home.start("up", str(file))
-    async with looking_on(endpoint_of(file)) as seen:
+    async with probing(endpoint_of(file)) as seen:
         found = {
             name: os.getpriority(os.PRIO_PROCESS, await seen.pid(name))
             for name in ("driver", "perception", "decision", "control", "safety")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 from gigabrain_zenoh.testing.waiting import until
 
@@ -62,7 +62,7 @@ async def test_up_tells_its_service_manager_how_all_are_doing(
     assert [word for word in manager.heard if word.startswith("STATUS")][-1] == ALL_READY
     assert manager.heard[0].startswith("STATUS=not ready: router, driver")
     await until(lambda: manager.heard[-1] == "WATCHDOG=1", "the watchdog is fed")
-    async with looking_on(endpoint_of(file)) as robot:
+    async with probing(endpoint_of(file)) as robot:
         pid = await robot.pid("decision")
         assert not knows_of_the_manager(pid)
         os.kill(pid, signal.SIGSTOP)

@@ -5,7 +5,7 @@ import signal
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.testing.processes import Home, free_port
 from gigabrain_zenoh.testing.waiting import until
 
@@ -70,7 +70,7 @@ async def test_of_two_drivers_that_start_together_exactly_one_stays(home: Home) 
     (stays,) = [driver for driver in both if driver.running]
     assert await left.ended() == 2
     assert f"a driver is already running here (pid {stays.pid} on " in left.err
-    async with looking_on(Endpoint(connect=(where,))) as robot:
+    async with probing(Endpoint(connect=(where,))) as robot:
         await robot.ticks(250)  # until the one that stays has settled
         replies = await robot.bus.ask(DESCRIBE, DescribeRequest(), name="driver", timeout_s=20)
         assert [(one.pid, one.claim) for one in replies] == [(stays.pid, "settled")]

@@ -14,7 +14,7 @@ import yaml
 
 from gigabrain_zenoh.config.loading import loads
 from gigabrain_zenoh.host.network import exposed
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.runtime.deployment import Deployment, load_deployment
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 from gigabrain_zenoh.testing.waiting import until
@@ -75,8 +75,8 @@ def bare(tmp_path: Path) -> Iterator[Home]:
 async def test_it_runs_without_capabilities_on_a_read_only_system(bare: Home) -> None:
     file = bare.deployment(resume="auto")
     up = bare.start("up", str(file))
-    async with looking_on(endpoint_of(file)) as robot:
-        await robot.straight(0.15, room=0.0)
+    async with probing(endpoint_of(file)) as robot:
+        await robot.driving_straight(0.15, room=0.0)
     (note,) = bare.folder.glob("run/gigabrain/*.json")
     before = note.stat().st_mtime_ns
     await until(lambda: note.stat().st_mtime_ns > before, "the note of a robot that is well")

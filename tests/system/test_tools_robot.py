@@ -15,7 +15,7 @@ import yaml
 from gigabrain_drivers.driver.catalog import robot_path
 from gigabrain_zenoh.diagnostics.graph import ORDER
 from gigabrain_zenoh.gate.state import BRAIN
-from gigabrain_zenoh.qa.faults.onlooker import Onlooker, looking_on
+from gigabrain_zenoh.qa.probe import Probe, probing
 from gigabrain_zenoh.runtime.running import Running
 from gigabrain_zenoh.testing.processes import AVOID, Home, free_port, robot_of
 from gigabrain_zenoh.testing.waiting import until
@@ -39,11 +39,11 @@ async def demo(shared_home: Home) -> Home:
 
 
 @contextlib.asynccontextmanager
-async def looking(home: Home) -> AsyncIterator[Onlooker]:
+async def looking(home: Home) -> AsyncIterator[Probe]:
     """Somebody at the robot of this home."""
     (note,) = (home.folder / "run" / "gigabrain").glob("*.json")
     endpoint = msgspec.json.decode(note.read_bytes(), type=Running).endpoint
-    async with looking_on(endpoint) as seen:
+    async with probing(endpoint) as seen:
         yield seen
 
 
@@ -52,7 +52,7 @@ async def until_driving(home: Home) -> None:
     async with looking(home) as seen:
         while (seen.state.gate.mode, seen.state.gate.commander) != ("enabled", BRAIN):
             if seen.state.gate.mode == "idle":
-                await seen.hand_to_brain()
+                await seen.enable_brain()
             await seen.ticks(5)
 
 
@@ -192,7 +192,7 @@ async def test_an_e_stop_is_named_with_the_way_out(demo: Home) -> None:
     told = json.loads(latched.out)
     assert "latched" in {one["link"]: one["text"] for one in told["findings"]}["gate"]
     async with looking(demo) as seen:
-        await seen.still(30)
+        await seen.at_rest(30)
     assert await (await demo.run("release")).ended() == 0
     idle = await demo.run("why")
     assert await idle.ended() == 18

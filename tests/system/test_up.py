@@ -14,7 +14,7 @@ import pytest
 
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.qa.faults.onlooker import looking_on
+from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.testing.processes import AVOID, Command, Home, endpoint_of, free_port, robot_of
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
@@ -40,7 +40,7 @@ async def test_it_starts_in_readiness_order_restarts_what_dies_and_ends_cleanly(
     assert ready(up)[0] == "router"
     assert sorted(ready(up)) == sorted(ALL)
     assert len(home.processes()) == 6
-    async with looking_on(endpoint_of(file)) as robot:
+    async with probing(endpoint_of(file)) as robot:
         os.kill(await robot.pid("safety"), signal.SIGKILL)
         await until(lambda: ready(up)[6:] == ["safety"], "safety is ready again")
         assert "safety ended with signal 9 (Killed); next start in 0.2 s" in up.out
@@ -54,7 +54,7 @@ async def test_after_five_deaths_within_a_minute_a_process_is_given_up_in_one_li
     home: Home,
 ) -> None:
     up = home.start("up", str(home.deployment()))
-    async with looking_on(await robot_of(home, up)) as robot:
+    async with probing(await robot_of(home, up)) as robot:
         killed = {await robot.pid("decision")}
         os.kill(*killed, signal.SIGKILL)
         while len(killed) < 5:  # each at once: on a busy machine five starts may take a minute
@@ -76,7 +76,7 @@ async def test_it_goes_on_when_nobody_reads_what_it_says(home: Home) -> None:
     os.close(reader)
     up = home.start("up", str(home.deployment()), stdout=writer)
     os.close(writer)
-    async with looking_on(await robot_of(home, up)) as robot:
+    async with probing(await robot_of(home, up)) as robot:
         await robot.pids()
         await robot.ticks(25)
         up.send(signal.SIGINT)
@@ -95,7 +95,7 @@ async def test_a_terminal_that_stands_still_holds_up_neither_restarts_nor_the_en
     os.set_blocking(writer, True)
     up = home.start("up", str(home.deployment()), stdout=writer)
     os.close(writer)
-    async with looking_on(await robot_of(home, up)) as robot:
+    async with probing(await robot_of(home, up)) as robot:
         pid = (await robot.pids())["decision"]
         os.kill(pid, signal.SIGKILL)
         for _ in range(500):
@@ -118,7 +118,7 @@ async def test_it_ends_cleanly_when_asked_or_when_its_terminal_has_gone(
     up = home.start("up", str(home.deployment()), stdout=side)
     signal.signal(signal.SIGHUP, inherited)
     os.close(side)
-    async with looking_on(await robot_of(home, up)) as robot:
+    async with probing(await robot_of(home, up)) as robot:
         await robot.pids()
     os.close(terminal)  # what it says from now on meets an error
     up.send(number)
@@ -152,8 +152,8 @@ def small_disk(tmp_path: Path) -> Iterator[Home]:
 async def test_a_full_disk_is_told_once_and_stops_nobody(small_disk: Home) -> None:
     file = small_disk.deployment(resume="auto")
     up = small_disk.start("up", str(file), "--level", "debug")
-    async with looking_on(endpoint_of(file)) as robot:
-        await robot.straight(0.15, room=0.0)
+    async with probing(endpoint_of(file)) as robot:
+        await robot.driving_straight(0.15, room=0.0)
         full = re.compile(
             r"^\S+ driver +warning +cannot write \S+/driver.jsonl: .*No space left.*$", re.M
         )
@@ -169,7 +169,7 @@ async def test_a_full_disk_is_told_once_and_stops_nobody(small_disk: Home) -> No
 async def test_nothing_survives_its_death_not_even_what_is_frozen(home: Home) -> None:
     file = home.deployment()
     up = home.start("up", str(file))
-    async with looking_on(endpoint_of(file)) as robot:
+    async with probing(endpoint_of(file)) as robot:
         os.kill(await robot.pid("control"), signal.SIGSTOP)
         assert len(home.processes()) == 6
         up.send(signal.SIGKILL)
@@ -184,15 +184,15 @@ async def test_the_hosts_of_a_deployment_make_one_robot(home: Home) -> None:
     file.write_text(re.sub(r"keys: .*", "", here))  # it is on loopback
     brain = home.start("up", str(file), "--host", "brain")
     body = home.start("up", str(file), "--host", "robot")
-    async with looking_on(Endpoint(connect=(where,))) as robot:
+    async with probing(Endpoint(connect=(where,))) as robot:
         await until(lambda: len(ready(brain)) == 3 and len(ready(body)) == 4, "all are ready")
         assert sorted(ready(brain)) == ["decision", "perception", "relay"]
         person = Robot(robot.bus)
         await robot.ticks(30)
         await person.release()
-        await robot.straight(speed=0.15, room=0.0, by_hand=True)
+        await robot.driving_straight(speed=0.15, room=0.0, by_hand=True)
         os.kill(brain.pid, signal.SIGKILL)  # the whole host
-        await robot.still()
+        await robot.at_rest()
         assert robot.state.gate.mode in ("stopping", "idle")
 
 

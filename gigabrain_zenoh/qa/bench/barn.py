@@ -1,19 +1,45 @@
-"""BARN and DynaBARN: many worlds, many trials, and what they come to."""
+"""`gigabrain bench barn`: drives a Jackal through the worlds of BARN and DynaBARN."""
 
+import asyncio
+import functools
 import gc
 import statistics
+import tempfile
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
+import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
+from gigabrain_schemas.arrays import hits
+from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_schemas.body import GateStatus, RobotState
+from gigabrain_schemas.brain import CmdVel, Intent, PoseInMap, WorldModel
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.tasks import GoalRequest
+from gigabrain_schemas.topics import GOAL, MAP, POSE, STATE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.control import node as control
+from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.decision.response import ResponseEstimator
+from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.gate.gate import BRAIN
+from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of, ramp
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.navigation import local
-from gigabrain_zenoh.qa.bench import barn_drive, barn_nodes
-from gigabrain_zenoh.qa.bench.barn_worlds import World
-from gigabrain_zenoh.qa.bench.course import Trial
-from gigabrain_zenoh.qa.bench.plant import HARD, IDEAL, JACKAL, MUJOCO, Conditions
+from gigabrain_zenoh.navigation.local import Goal, LocalPlanner, LocalSettings, Moment, Sent
+from gigabrain_zenoh.perception import node as perception
+from gigabrain_zenoh.perception.obstacles.surroundings import Surroundings
+from gigabrain_zenoh.qa.bench.barn_course import BarnCourse, BarnTrial, BarnWorld
+from gigabrain_zenoh.qa.bench.plant import HARD, IDEAL, JACKAL, LIDAR, MUJOCO, Conditions
+from gigabrain_zenoh.qa.in_memory_robot import InMemoryRobot, node_of
+from gigabrain_zenoh.runtime.replay import Node
+from gigabrain_zenoh.safety import node as safety
+from gigabrain_zenoh.safety.host import Host
 
 PLANTS = {"hard": HARD, "ideal": IDEAL, "mujoco": MUJOCO}
 
@@ -23,7 +49,7 @@ class BarnResult(Struct, frozen=True, kw_only=True):
 
     plant: Conditions
     samples: int  # plans per cycle
-    trials: tuple[Trial, ...]
+    trials: tuple[BarnTrial, ...]
 
     def share(self, result: str) -> float:
         """Of the trials, how many ended so."""
@@ -52,12 +78,12 @@ class BarnResult(Struct, frozen=True, kw_only=True):
 
 
 def measure_barn(
-    worlds: Iterable[World],
+    worlds: Iterable[BarnWorld],
     trials: int,
     plant: str,
     samples: int,
     jobs: int,
-    progress: Callable[[Trial], None],
+    progress: Callable[[BarnTrial], None],
     *,
     nodes: bool,
 ) -> BarnResult:
@@ -65,7 +91,7 @@ def measure_barn(
 
     With the robot's own `nodes`, or with the functions that they call.
     """
-    drive = barn_nodes.drive if nodes else barn_drive.drive
+    drive = drive_nodes if nodes else drive_functions
     done = []
     with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_get_ready) as pool:
         waiting = [
@@ -85,3 +111,155 @@ def _get_ready() -> None:
     local.warm_up(JACKAL)
     gc.collect()
     gc.freeze()
+
+
+WAKING_TICKS = 500  # until the gate is open and the robot knows where it is
+
+
+class WatchedCourse:
+    """A course, looked at in each tick. It stands still once the trial is over."""
+
+    def __init__(self, course: BarnCourse) -> None:
+        self._course = course
+
+    def advance(self, velocity: Velocity) -> None:
+        """See Plant in gigabrain_zenoh.qa.in_memory_robot."""
+        if not self._course.result:
+            self._course.advance(velocity)
+            self._course.look()
+
+    def state(self) -> RobotState:
+        """See Plant."""
+        return self._course.state()
+
+    def scan(self) -> LaserScan | None:
+        """See Plant."""
+        return self._course.scan()
+
+
+def drive_nodes(world: BarnWorld, trial: int, conditions: Conditions, samples: int) -> BarnTrial:
+    """One trial in one world; the same arguments give the same result."""
+    with tempfile.TemporaryDirectory(prefix="barn-") as folder:
+        return asyncio.run(_drive(BarnCourse(world, trial, conditions), samples, folder))
+
+
+async def _drive(course: BarnCourse, samples: int, folder: str) -> BarnTrial:
+    async with InMemoryRobot(_nodes(WatchedCourse(course), samples, folder)) as robot:
+        await _awake(robot)
+        goal = GoalRequest(x=course.goal.x, y=course.goal.y, source="bench")
+        (reply,) = await robot.ask(GOAL, goal)
+        if not reply.ok:
+            raise Refused(f"the goal is refused: {reply.text}")
+        while not course.result:
+            await robot.tick()
+    return course.ended()
+
+
+def _nodes(plant: WatchedCourse, samples: int, folder: str) -> dict[str, Node]:
+    """With the settings of a robot that drives where nobody has been."""
+    anywhere = DecisionConfig(behaviour="navigate", unknown="allow", samples=samples)
+    return {
+        "perception": functools.partial(perception.run, PerceptionConfig(mapping="slam")),
+        "decision": functools.partial(decision.run, anywhere),
+        "control": control.run,
+        "safety": _safety,
+        "driver": node_of(JACKAL, plant, folder),
+    }
+
+
+async def _safety(bus: Bus, ready: Callable[[], None]) -> None:
+    """No outcome may depend on how busy this computer is."""
+    await safety.run(bus, ready, lambda _now_ns: Host())
+
+
+async def _awake(robot: InMemoryRobot) -> None:
+    """Let time pass until it can be sent. Raises Refused when it never can."""
+    states, places = robot.operator.latest(STATE), robot.operator.latest(POSE)
+    maps = robot.operator.latest(MAP)
+    for _ in range(WAKING_TICKS):
+        await robot.tick()
+        state, place = states.current, places.current
+        if state and state.gate.mode == "enabled" and _known(place) and maps.current:
+            return
+    raise Refused("the robot has not woken up")
+
+
+def _known(place: PoseInMap | None) -> bool:
+    return place is not None and place.localized
+
+
+TICK_S = TICK_NS / 1e9
+BOOT = 1
+SENT_TICKS = 30  # of commands, that planning looks back on
+DRIVING = GateStatus(mode="enabled", commander=BRAIN, enables=1)
+
+
+class BarnBrain:
+    """The robot's nodes in one piece."""
+
+    def __init__(self, goal: Goal, settings: LocalSettings) -> None:
+        self._goal = goal
+        self._planner = LocalPlanner(JACKAL, settings)
+        self._surroundings = Surroundings()
+        self._response = ResponseEstimator()
+        self._memory = control.Memory()
+        self._intent: Intent | None = None
+        self._perception = PerceptionConfig(mapping="slam")
+        self.cycles_ms: list[float] = []
+
+    def tick(self, state: RobotState, scan: LaserScan | None) -> CmdVel:
+        """The command of one tick."""
+        self._response.state(state)
+        if scan is not None:
+            world = perception.step(self._perception, JACKAL, scan)
+            world = self._surroundings.add(world, LIDAR, scan, state.pose)
+            self._intent = self._decide(state, world)
+        inputs = control.Inputs(state=state, intent=self._intent)
+        self._memory, command = control.step(JACKAL, self._memory, inputs)
+        command = replace(command, boot=BOOT, tick=state.tick)
+        self._response.command(command)
+        return command
+
+    def _decide(self, state: RobotState, world: WorldModel) -> Intent:
+        began = time.thread_time()
+        sent = self._response.sent(state.tick - SENT_TICKS, state.tick - 1)
+        moment = Moment(
+            tick=state.tick,
+            pose=state.pose,
+            velocity=state.velocity,
+            goal=self._goal,
+            hits=hits(world).astype(np.float64),
+            obstacles=world.obstacles,
+            response=self._response.response,
+            sent=tuple(Sent(tick, velocity) for tick, velocity in sent),
+        )
+        plan = self._planner.plan(moment)
+        self.cycles_ms.append((time.thread_time() - began) * 1e3)
+        return Intent(
+            twist=plan.twist,
+            trajectory=plan.trajectory,
+            follow=bool(plan.trajectory),
+            response=moment.response,
+            behaviour="navigate",
+            reason=plan.reason,
+            basis=state.tick,
+        )
+
+
+def drive_functions(
+    world: BarnWorld, trial: int, conditions: Conditions, samples: int
+) -> BarnTrial:
+    """One trial in one world; the same arguments give the same result."""
+    course = BarnCourse(world, trial, conditions)
+    brain = BarnBrain(course.goal, LocalSettings(samples=samples))
+    limits, output = limits_of(JACKAL), ZERO
+    while True:
+        course.look()
+        if course.result:
+            return course.ended(tuple(brain.cycles_ms))
+        scan, tick = course.scan(), course.tick
+        state = replace(course.state(), gate=DRIVING, boot=BOOT, tick=tick)
+        command = brain.tick(state, scan and replace(scan, boot=BOOT, tick=tick, basis=tick))
+        asked = Velocity(linear_x=command.linear_x, angular_z=command.angular_z)
+        output = ramp(output, clamp(asked, limits), limits, TICK_S)
+        course.advance(output)

@@ -1,4 +1,4 @@
-"""One brain, all bodies in turn: the brain's processes are not restarted and not told which."""
+"""`gigabrain bench bodies`: one brain, not restarted or reconfigured, drives all bodies in turn."""
 
 import asyncio
 import dataclasses
@@ -9,28 +9,30 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
+from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import CMD_VEL, HEALTH, STATE
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
-from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.launch.specs import process_specs
-from gigabrain_zenoh.qa.bench.bodies_onlooker import Onlooker
+from gigabrain_zenoh.qa.robot_under_test import ProcessGroup, client
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
-from gigabrain_zenoh.runtime.supervisor import Supervisor
 from gigabrain_zenoh.ui.run_report import RunMonitor
 
-BODY = ("emulator", "driver")  # what is exchanged; all else stays
-LOOK_S = 0.05
+BODY = ("emulator", "driver")  # the processes that are exchanged; the others stay
+POLL_S = 0.05
 START_S = 60.0  # until a body is enabled, on a busy machine
 STALL_S = 20.0
-STOP_S = 1.5
-TICK_S = 0.02
+TICK_S = TICK_NS / 1e9
+MOTION = (("linear_x", 0.05), ("angular_z", 0.2))  # least speed that counts as motion
 
 
 class BodyFigures(Struct, frozen=True, kw_only=True):
-    """How one body fared with the brain."""
+    """The figures of one body with the brain."""
 
     body: str
     seconds: float  # of the robot's time, while enabled
@@ -40,10 +42,10 @@ class BodyFigures(Struct, frozen=True, kw_only=True):
     commanded: float  # [m/s], mean of the speed forward
     measured: float  # [m/s]
     latency_ticks: float | None  # median from a command of motion to the motion measured
-    motions: int  # that this median is of
+    motions: int  # over which this median is taken
     reconnects: int
     stops: int  # how often the gate was shut meanwhile
-    driver_cpu: float | None  # [%] of a core; a body that the driver simulates is part of it
+    driver_cpu: float | None  # [%] of a core; includes a body that the driver simulates
 
 
 class BodiesResult(Struct, frozen=True, kw_only=True):
@@ -58,7 +60,7 @@ class BodiesResult(Struct, frozen=True, kw_only=True):
 
     @property
     def ok(self) -> bool:
-        """Whether nobody touched anything, and nothing of the brain was started anew."""
+        """Whether there was no contact, and no process of the brain was restarted."""
         return self.brain_restarts == 0 and all(body.contacts == 0 for body in self.bodies)
 
 
@@ -69,30 +71,24 @@ async def measure_bodies(
     folder: Path,
     say: Callable[[str], None],
 ) -> BodiesResult:
-    """Drive each body for so many seconds of its time. Raises GigabrainError.
+    """Drive each body for `seconds` of its time. Raises GigabrainError.
 
     `deployment` says all but the body.
     """
     deployment = with_free_port(deployment)
-    brain = [
-        spec
-        for spec in process_specs(deployment, "robot", folder / "brain", folder / "state")
-        if spec.name not in BODY
-    ]
-    async with Supervisor(brain, lambda name, record: None) as supervisor:
-        running = asyncio.create_task(supervisor.run())
-        await _all_ready(supervisor, running)
-        pids = {name: status.pid or 0 for name, status in supervisor.statuses.items()}
+    specs = process_specs(deployment, "robot", folder / "brain", folder / "state")
+    brain_specs = [spec for spec in specs if spec.name not in BODY]
+    async with ProcessGroup(brain_specs, strict=False) as brain:
+        await brain.until_ready(START_S)
+        pids = brain.pids
         figures = []
         for name in names:
             say(name)
-            where = folder / Path(name).stem
             one = msgspec.structs.replace(deployment, body=name)
-            figures.append(await _drive(one, seconds, where, supervisor))
-        restarts = supervisor.deaths + sum(s.restarts for s in supervisor.statuses.values())
-        same = all(s.pid == pids[name] for name, s in supervisor.statuses.items())
-        await supervisor.stop(STOP_S)
-        await running
+            figures.append(await _drive(one, seconds, folder / Path(name).stem, brain))
+        statuses = brain.supervisor.statuses
+        restarts = brain.supervisor.deaths + sum(s.restarts for s in statuses.values())
+        same = brain.pids == pids
     return BodiesResult(
         link=deployment.link,
         world=deployment.world,
@@ -104,82 +100,122 @@ async def measure_bodies(
 
 
 async def _drive(
-    deployment: Deployment, seconds: float, folder: Path, brain: Supervisor
+    deployment: Deployment, seconds: float, folder: Path, brain: ProcessGroup
 ) -> BodyFigures:
-    """One body, from its driver's start to its end."""
+    """Drive one body, from its driver's start to its end."""
     specs = [
-        _alone(spec)
+        _independent(spec)
         for spec in process_specs(deployment, "robot", folder, folder / "state")
         if spec.name in BODY
     ]
-    bus = Bus(await ZenohTransport.open(client_endpoint(deployment)), Clock(), "bench")
-    try:
-        onlooker, watch = Onlooker(bus), RunMonitor(bus)
-        async with Supervisor(specs, lambda name, record: None) as supervisor:
-            running = asyncio.create_task(supervisor.run())
-            await _until_driven(onlooker, seconds, supervisor, brain)
-            truth = await _truth(watch, supervisor)
-            await supervisor.stop(STOP_S)
-            await running
-    finally:
-        await bus.close()
-    return _figures(deployment.body, onlooker, truth)
+    async with client(client_endpoint(deployment)) as bus:
+        motion, watch = MotionProbe(bus), RunMonitor(bus)
+        async with ProcessGroup(specs, strict=False) as body:
+            await _until_driven(motion, seconds, body, brain)
+            answers = await asyncio.gather(
+                *(watch.describe(name, 1.0) for name in body.supervisor.statuses)
+            )
+    truth = {key: value for one in answers if one for key, value in one.report.items()}
+    return _figures(deployment.body, motion, truth)
 
 
-def _alone(spec: ProcessSpec) -> ProcessSpec:
-    """The same, waiting for nobody of another supervisor."""
+def _independent(spec: ProcessSpec) -> ProcessSpec:
+    """Return the same process, without waiting for those of another supervisor."""
     return dataclasses.replace(spec, after=tuple(name for name in spec.after if name in BODY))
 
 
-async def _all_ready(supervisor: Supervisor, running: "asyncio.Task[None]") -> None:
-    async with asyncio.timeout(START_S):
-        while any(status.state != "ready" for status in supervisor.statuses.values()):
-            if supervisor.given_up or running.done():
-                raise BodyLost(f"{', '.join(supervisor.given_up)} cannot be started")
-            await asyncio.sleep(LOOK_S)
-
-
 async def _until_driven(
-    onlooker: Onlooker, seconds: float, body: Supervisor, brain: Supervisor
+    motion: "MotionProbe", seconds: float, body: ProcessGroup, brain: ProcessGroup
 ) -> None:
-    """Look on until the gate has been open for so long. Raises BodyLost when nothing goes on."""
+    """Wait until the gate has been open for `seconds`. Raises BodyLost when nothing goes on."""
     loop = asyncio.get_running_loop()
-    seen, seen_s = onlooker.enabled_ticks, loop.time()
-    while onlooker.enabled_ticks * TICK_S < seconds:
-        await asyncio.sleep(LOOK_S)
-        if body.given_up or brain.given_up:
-            raise BodyLost(f"{', '.join(body.given_up or brain.given_up)} does not run")
-        if onlooker.enabled_ticks != seen:
-            seen, seen_s = onlooker.enabled_ticks, loop.time()
+    seen, seen_s = motion.enabled_ticks, loop.time()
+    while motion.enabled_ticks * TICK_S < seconds:
+        await asyncio.sleep(POLL_S)
+        if given_up := body.supervisor.given_up or brain.supervisor.given_up:
+            raise BodyLost(f"{', '.join(given_up)} does not run")
+        if motion.enabled_ticks != seen:
+            seen, seen_s = motion.enabled_ticks, loop.time()
         elif loop.time() - seen_s > (STALL_S if seen else START_S):
-            gate = onlooker.state.gate if onlooker.state else None
+            gate = motion.state.gate if motion.state else None
             raise BodyLost(f"nothing goes on; gate: {gate}")
 
 
-async def _truth(watch: RunMonitor, supervisor: Supervisor) -> dict[str, float | int | str | None]:
-    told = await asyncio.gather(*(watch.describe(name, 1.0) for name in supervisor.statuses))
-    return {key: value for answer in told if answer for key, value in answer.report.items()}
-
-
 def _figures(
-    body: str, onlooker: Onlooker, truth: dict[str, float | int | str | None]
+    body: str, motion: "MotionProbe", truth: dict[str, float | int | str | None]
 ) -> BodyFigures:
     def number(name: str) -> float | None:
         value = truth.get(name)
         return float(value) if isinstance(value, int | float) else None
 
-    contacts, late, cpu = number("contacts"), onlooker.latencies, onlooker.driver_cpu
+    contacts, late, cpu = number("contacts"), motion.latencies, motion.driver_cpu
     return BodyFigures(
         body=Path(body).stem if body.endswith((".yaml", ".yml")) else body,
-        seconds=round(onlooker.enabled_ticks * TICK_S, 2),
+        seconds=round(motion.enabled_ticks * TICK_S, 2),
         contacts=None if contacts is None else int(contacts),
         distance_m=number("distance_m"),
         min_clearance_m=number("min_clearance_m"),
-        commanded=round(onlooker.commanded, 4),
-        measured=round(onlooker.measured, 4),
+        commanded=round(_mean(motion.commanded), 4),
+        measured=round(_mean(motion.measured), 4),
         latency_ticks=statistics.median(late) if late else None,
         motions=len(late),
-        reconnects=onlooker.state.link.reconnects if onlooker.state else 0,
-        stops=onlooker.stops,
+        reconnects=motion.state.link.reconnects if motion.state else 0,
+        stops=motion.stops,
         driver_cpu=round(100 * statistics.fmean(cpu), 1) if cpu else None,
     )
+
+
+def _mean(speeds: Sequence[float]) -> float:
+    return statistics.fmean(speeds) if speeds else 0.0
+
+
+class MotionProbe:
+    """Compares commands and motion, tick by tick, while the gate is open."""
+
+    def __init__(self, bus: Bus) -> None:
+        self.enabled_ticks = self.stops = 0
+        self.state: RobotState | None = None
+        self.latencies: list[int] = []
+        self.driver_cpu: list[float] = []  # of a core, each second
+        self.commanded: list[float] = []  # [m/s], forward
+        self.measured: list[float] = []
+        self._command: CmdVel | None = None
+        self._begun: dict[str, int | None] = {}  # tick of a command of motion not yet followed
+        self._was_moving: dict[str, bool] = {}
+        self._open = False
+        bus.subscribe(STATE, self._on_state)
+        bus.subscribe(CMD_VEL, self._on_command)
+        bus.subscribe(HEALTH, self._on_health)
+
+    def _on_health(self, _key: str, health: Health) -> None:
+        if self._open and health.process == "driver":
+            self.driver_cpu.append(health.cpu)
+
+    def _on_command(self, _key: str, command: CmdVel) -> None:
+        self._command = command
+        for axis, level in MOTION:
+            moves = abs(getattr(command, axis)) >= level
+            if moves and not self._was_moving.get(axis, False):
+                self._begun[axis] = None if self._moves(axis, level) else command.tick
+            elif not moves:
+                self._begun[axis] = None
+            self._was_moving[axis] = moves
+
+    def _on_state(self, _key: str, state: RobotState) -> None:
+        self.state = state
+        opened = state.gate.mode == "enabled"
+        self.stops += self._open and not opened
+        self._open = opened
+        if not opened or self._command is None or self._command.boot != state.boot:
+            return
+        self.enabled_ticks += 1
+        self.commanded.append(self._command.linear_x)
+        self.measured.append(state.velocity.linear_x)
+        for axis, level in MOTION:
+            begun = self._begun.get(axis)
+            if begun is not None and self._moves(axis, level):
+                self.latencies.append(state.tick - begun)
+                self._begun[axis] = None
+
+    def _moves(self, axis: str, level: float) -> bool:
+        return self.state is not None and abs(getattr(self.state.velocity, axis)) >= level

@@ -1,13 +1,11 @@
-"""`gigabrain bench estop`: from the press to the gate's zero, and how far the body goes on."""
+"""`gigabrain bench estop`: from the press to the gate's zero, and how far the body still moves."""
 
 import asyncio
 import contextlib
 import math
-import sys
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 from msgspec import Struct
@@ -21,89 +19,83 @@ from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.bounded import percentile
-from gigabrain_zenoh.launch.specs import process_specs
-from gigabrain_zenoh.qa.bench.group import Group, client, running
-from gigabrain_zenoh.qa.bench.runs import LOOPBACK
+from gigabrain_zenoh.qa.faults.rig.cpu_load import PROGRAM
+from gigabrain_zenoh.qa.judging import limited, table_of
+from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, ProcessGroup, measured_robot
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 
+if TYPE_CHECKING:
+    from rich.console import Group
+
+Say = Callable[[str], None]
 SPEED = 0.26  # [m/s]
-FAST = 0.9  # share of it, from which on the robot counts as driving
+FAST = 0.9  # share of it, from which the robot counts as driving
 STILL = 0.005  # [m/s]
-P99_MS, MAX_MS, TRAVEL_M = 50.0, 100.0, 0.06  # targets
-FLOOD = (sys.executable, "-P", "-m", "gigabrain_zenoh.qa.bench.flood")
+MAX_P99_MS, MAX_MS, MAX_TRAVEL_M = 50.0, 100.0, 0.06  # targets
 APART_S = 0.02  # between two presses while it is latched
 
 
-class Presses(Struct, frozen=True, kw_only=True):
-    """What came of some presses."""
+class PressTimes(Struct, frozen=True, kw_only=True):
+    """Times and travel of some presses."""
 
     name: str
-    ms: tuple[float, ...]  # from the press until the answer was there
-    travel_m: tuple[float, ...]  # from the press to rest, of those that were pressed while driving
+    ms: tuple[float, ...]  # from the press to its answer
+    travel_m: tuple[float, ...]  # from the press to rest, of those pressed while driving
 
     def p(self, share: float) -> float:
-        """A percentile of the times [ms]."""
+        """Return a percentile of the times [ms]."""
         return percentile(sorted(self.ms), share) or 0.0
 
 
 class EstopResult(Struct, frozen=True, kw_only=True):
-    """Idle and under flood."""
+    """Presses on an idle and on a flooded network."""
 
     body: str
-    rounds: tuple[Presses, ...]
+    rounds: tuple[PressTimes, ...]
 
 
-async def measure_estop(
-    body: str, driving: int, latched: int, say: Callable[[str], None]
-) -> EstopResult:
-    """Press while it drives, and while it is latched; idle, and while others flood the network."""
+async def measure_estop(body: str, driving: int, latched: int, say: Say) -> EstopResult:
+    """Press while it drives and while it is latched, on an idle and on a flooded network."""
+    decision = DecisionConfig(linear_speed=SPEED)
     deployment = with_free_port(
-        Deployment(
-            body=body, resume="manual", router=LOOPBACK, decision=DecisionConfig(linear_speed=SPEED)
-        )
+        Deployment(body=body, resume="manual", router=LOOPBACK, decision=decision)
     )
-    endpoint = client_endpoint(deployment)
-    with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as name:
-        specs = process_specs(deployment, "robot", Path(name), Path(name) / "state")
-        say(f"starting {body}")
-        async with running(specs) as group, client(endpoint) as bus:
-            person = _Person(bus, group)
-            idle = await person.presses("idle", driving, latched, say)
-            flood = ProcessSpec("flood", (*FLOOD, msgspec.json.encode(endpoint).decode()))
-            async with running([flood]):
-                flooded = await person.presses("flooded", driving, latched, say)
+    endpoint = msgspec.json.encode(client_endpoint(deployment)).decode()
+    say(f"starting {body}")
+    async with measured_robot(deployment) as (group, bus):
+        operator = _Operator(bus, group)
+        idle = await operator.presses("idle", driving, latched, say)
+        async with ProcessGroup([ProcessSpec("flood", (*PROGRAM, "pictures", endpoint))]) as flood:
+            await flood.until_ready()
+            flooded = await operator.presses("flooded", driving, latched, say)
     return EstopResult(body=body, rounds=(idle, flooded))
 
 
-class _Person:
-    """Presses, lets go, enables, and watches the body."""
+class _Operator:
+    """Presses, releases, enables, and observes the body."""
 
-    def __init__(self, bus: Bus, group: Group) -> None:
+    def __init__(self, bus: Bus, group: ProcessGroup) -> None:
         self._bus, self._group = bus, group
         self._trail: list[RobotState] = []
-        self._asked = False  # whether somebody is about to set it going
+        self._enabling = False  # whether a request to enable is under way
         self._state = bus.latest(STATE, self._trail.append)
 
-    async def presses(
-        self, name: str, driving: int, latched: int, say: Callable[[str], None]
-    ) -> Presses:
-        """So many while it drives, and so many while it is latched."""
+    async def presses(self, name: str, driving: int, latched: int, say: Say) -> PressTimes:
+        """Press `driving` times while it drives, and `latched` times while it is latched."""
         times, travels = [], []
         for count in range(driving):
             say(f"{name}: press {count + 1} of {driving} while it drives")
-            await self._group.until(self._fast)
+            await self._group.until(self._fast, "the robot drives")
             start = self._trail[-1]
             self._trail.clear()
             times.append(await self._press())
-            await self._group.until(lambda: any(map(_rests, self._trail)))
+            await self._group.until(lambda: any(map(_rests, self._trail)), "the body rests")
             travels.append(_travel(start, self._trail))
-            if count == driving - 1:
-                break
         for _ in range(latched):
             times.append(await self._press())
             await asyncio.sleep(APART_S)
-        return Presses(name=name, ms=tuple(times), travel_m=tuple(travels))
+        return PressTimes(name=name, ms=tuple(times), travel_m=tuple(travels))
 
     async def _press(self) -> float:
         began = time.perf_counter()
@@ -111,21 +103,21 @@ class _Person:
         return (time.perf_counter() - began) * 1e3
 
     def _fast(self) -> bool:
-        """Whether it drives; sets it going where it does not."""
+        """Return whether it drives; enables it where the gate is shut."""
         state = self._state.fresh()
         if state is None:
             return False
-        if state.gate.mode != "enabled" and not self._asked:
-            self._asked = True
-            asyncio.get_running_loop().create_task(self._set_going(state.gate.estop_generation))
+        if state.gate.mode != "enabled" and not self._enabling:
+            self._enabling = True
+            asyncio.get_running_loop().create_task(self._enable(state.gate.estop_generation))
         return state.velocity.linear_x > FAST * SPEED
 
-    async def _set_going(self, generation: int) -> None:
-        """As a person does: release, then enable; refused until it rests, and tried again."""
+    async def _enable(self, generation: int) -> None:
+        """Release, then enable; refused until the body rests, and tried again."""
         with contextlib.suppress(Refused):
             await self._bus.ask(RELEASE, ReleaseRequest(estop_generation=generation))
             await self._bus.ask(ENABLE, EnableRequest(source=BRAIN))
-        self._asked = False
+        self._enabling = False
 
 
 def _rests(state: RobotState) -> bool:
@@ -133,7 +125,7 @@ def _rests(state: RobotState) -> bool:
 
 
 def _travel(start: RobotState, trail: list[RobotState]) -> float:
-    """The path [m] by odometry until the body first rested."""
+    """Return the path by odometry until the body first rested [m]."""
     path, before = 0.0, start
     for state in trail:
         path += math.hypot(state.pose.x - before.pose.x, state.pose.y - before.pose.y)
@@ -141,3 +133,26 @@ def _travel(start: RobotState, trail: list[RobotState]) -> float:
         if _rests(state):
             break
     return path
+
+
+def estop_page(result: EstopResult) -> "Group":
+    """Return what `gigabrain bench estop` prints."""
+    from rich.console import Group
+    from rich.text import Text
+
+    table = table_of("network", "presses", "p50 [ms]", "p99 [ms]", "max [ms]", "travel [m]")
+    for one in result.rounds:
+        table.add_row(
+            one.name,
+            f"{len(one.ms)}",
+            f"{one.p(0.5):.1f}",
+            limited(one.p(0.99), MAX_P99_MS, 1),
+            limited(max(one.ms), MAX_MS, 1),
+            limited(max(one.travel_m, default=0.0), MAX_TRAVEL_M, 3),
+        )
+    title = f"\nE-stop of {result.body}: from the press to the answer that the gate is at zero"
+    note = (
+        "flooded: a hundred pictures of 1 MB and a thousand commands a second. Travel is by "
+        "odometry, of the presses at 0.26 m/s; half of it is braking."
+    )
+    return Group(Text(title, style="bold"), table, Text(note, style="dim"))

@@ -10,10 +10,10 @@ from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.mapping.field import OCCUPIED
 
 WARM_UP = 0.25  # share of the time that the slope leaves out: six hours of eight are judged
-HOUR = 60  # minutes
+MINUTES_PER_HOUR = 60  # minutes
 
 
-class Growth(Struct, frozen=True, kw_only=True):
+class MapGrowth(Struct, frozen=True, kw_only=True):
     """One process that makes a map."""
 
     memory_mb: tuple[float, ...]  # each minute of the robot's time
@@ -26,7 +26,7 @@ class Growth(Struct, frozen=True, kw_only=True):
         return max(self.memory_mb, default=0.0)
 
 
-class Watch:
+class GrowthSampler:
     """Takes the samples."""
 
     def __init__(self) -> None:
@@ -38,17 +38,17 @@ class Watch:
         """How many minutes were sampled."""
         return len(self._memory)
 
-    def minute(self, rss_bytes: int, grid: OccupancyGrid) -> None:
+    def minute(self, rss_mb: float, grid: OccupancyGrid) -> None:
         """Add a minute of the robot's time."""
-        self._memory.append(rss_bytes / 1e6)
-        if self.minutes % HOUR == 0:
+        self._memory.append(rss_mb)
+        if self.minutes % MINUTES_PER_HOUR == 0:
             self._walls.append(occupied(grid))
 
-    def growth(self, grid: OccupancyGrid) -> Growth:
+    def growth(self, grid: OccupancyGrid) -> MapGrowth:
         """Return what the samples come to, the map being `grid` in the end."""
-        return Growth(
+        return MapGrowth(
             memory_mb=tuple(round(one, 1) for one in self._memory),
-            mb_an_hour=slope(self._memory[int(len(self._memory) * WARM_UP) :]) * HOUR,
+            mb_an_hour=slope(self._memory[int(len(self._memory) * WARM_UP) :]) * MINUTES_PER_HOUR,
             walls=(*self._walls, occupied(grid)),
         )
 

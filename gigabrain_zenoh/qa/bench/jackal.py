@@ -1,8 +1,7 @@
 """The BARN bench's Jackal in MuJoCo: four wheels that skid in every turn, among solid posts.
 
-It stands in for `gigabrain_zenoh.qa.bench.plant.Plant`: the same delay, the same lag of its motors'
-controller, the same errors of odometry and lidar. What slips, and how fast it can speed up, is the
-physics' own.
+It replaces `plant.KinematicJackal`, with the same delay, lag, and errors of odometry and lidar.
+Slip and acceleration are the physics' own.
 """
 
 import math
@@ -22,21 +21,21 @@ from gigabrain_drivers.sim.world import World
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
 from gigabrain_schemas.body import Lidar as LidarDescription
 from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.qa.bench.plant import FIELD_OF_VIEW, Conditions, clearance
+from gigabrain_zenoh.qa.bench.plant import FIELD_OF_VIEW_RAD, Conditions, clearance
 
 Floats = NDArray[np.float64]
 
 TICK_S = TICK_NS / 1e9
 SUBSTEPS = 4  # of a tick: as often the motors are told something new
 PHYSICS_STEPS = 4  # in 10 ms: two for each time that the motors are told
-WHEEL_RADIUS, TRACK = 0.098, 0.37559  # [m]
+WHEEL_RADIUS_M, TRACK_M = 0.098, 0.37559  # [m]
 TRACK_FACTOR = 1.5  # its maker's: by so much it has to turn its wheels more than if they rolled
-POST_HEIGHT, FAR = 1.0, 50.0  # [m], of the posts, and to the walls that every world has
+POST_HEIGHT_M, WALLS_M = 1.0, 50.0  # [m], of the posts, and to the walls that every world has
 LEFT = (f"{ROBOT}front_left", f"{ROBOT}rear_left")
 RIGHT = (f"{ROBOT}front_right", f"{ROBOT}rear_right")
 
 
-class Jackal:
+class MujocoJackal:
     """One trial's body. It knows the truth, which the robot never hears of."""
 
     def __init__(
@@ -66,7 +65,7 @@ class Jackal:
     @property
     def velocity(self) -> Velocity:
         """By the wheels and the gyro."""
-        v = WHEEL_RADIUS * float(self._data.qvel[self._wheels].mean())
+        v = WHEEL_RADIUS_M * float(self._data.qvel[self._wheels].mean())
         w = float(self._data.sensordata[self._gyro])
         return Velocity(linear_x=v * self._way, angular_z=w * self._turn)
 
@@ -85,9 +84,9 @@ class Jackal:
         v, w = self._told
         v, w = v + share * (command.linear_x - v), w + share * (command.angular_z - w)
         self._told = v, w
-        across = w * TRACK_FACTOR * TRACK / 2
-        self._data.ctrl[self._left] = (v - across) / WHEEL_RADIUS
-        self._data.ctrl[self._right] = (v + across) / WHEEL_RADIUS
+        across = w * TRACK_FACTOR * TRACK_M / 2
+        self._data.ctrl[self._left] = (v - across) / WHEEL_RADIUS_M
+        self._data.ctrl[self._right] = (v + across) / WHEEL_RADIUS_M
         mujoco.mj_step(self._model, self._data, nstep=round(dt / self._model.opt.timestep))
         seen, measured = self.odometry, self.velocity
         middle = seen.yaw + 0.5 * measured.angular_z * dt
@@ -107,7 +106,7 @@ class Jackal:
                 noise_m=self._conditions.noise,
             )
             self._lidar = Lidar(config, self._model, f"{ROBOT}lidar", self._random)
-        angles = np.linspace(-FIELD_OF_VIEW / 2, FIELD_OF_VIEW / 2, lidar.beams)
+        angles = np.linspace(-FIELD_OF_VIEW_RAD / 2, FIELD_OF_VIEW_RAD / 2, lidar.beams)
         ways = np.stack((np.cos(angles), np.sin(angles), np.zeros_like(angles)), axis=1)
         ranges = self._lidar.cast(self._data, ways)
         ranges[self._random.random(lidar.beams) < self._conditions.dropouts] = np.inf
@@ -122,8 +121,8 @@ def _world(start: tuple[float, float, float], posts: Floats) -> World:
     return World(
         name="barn",
         description="posts",
-        half_x=FAR,
-        half_y=FAR,
-        shapes=tuple(Cylinder(x, y, radius, POST_HEIGHT) for x, y, radius in posts.tolist()),
+        half_x=WALLS_M,
+        half_y=WALLS_M,
+        shapes=tuple(Cylinder(x, y, radius, POST_HEIGHT_M) for x, y, radius in posts.tolist()),
         start=Place(*start),
     )

@@ -21,18 +21,18 @@ Floats = NDArray[np.float64]
 TICK_S = TICK_NS / 1e9
 SUBSTEPS = 4  # of a tick
 ACCELERATION, ANGULAR_ACCELERATION = 5.0, 20.0  # [m/s2], [rad/s2], what the floor takes
-LENGTH, WIDTH = 0.458, 0.416  # [m], of chassis and wheels
-FIELD_OF_VIEW = math.radians(270.0)
+LENGTH_M, WIDTH_M = 0.458, 0.416  # [m], of chassis and wheels
+FIELD_OF_VIEW_RAD = math.radians(270.0)
 
 LIDAR = Lidar(beams=720, rate_hz=25, range_min=0.1, range_max=10.0, x=0.055)
 JACKAL = BodyDescription(
     robot_type="jackal",
     drive_type="differential",
     footprint=(
-        (LENGTH / 2, WIDTH / 2),
-        (-LENGTH / 2, WIDTH / 2),
-        (-LENGTH / 2, -WIDTH / 2),
-        (LENGTH / 2, -WIDTH / 2),
+        (LENGTH_M / 2, WIDTH_M / 2),
+        (-LENGTH_M / 2, WIDTH_M / 2),
+        (-LENGTH_M / 2, -WIDTH_M / 2),
+        (LENGTH_M / 2, -WIDTH_M / 2),
     ),
     max_linear_speed=2.0,
     max_angular_speed=3.0,
@@ -64,7 +64,7 @@ MUJOCO = Conditions(slip=1.0, physics=True)
 IDEAL = Conditions(delay=0.0, lag=0.0, slip=1.0, drift=0.0, noise=0.01, dropouts=0.0)
 
 
-class Body(Protocol):
+class JackalBody(Protocol):
     """One trial's body, in whatever world."""
 
     x: float  # [m], the truth
@@ -90,7 +90,7 @@ class Body(Protocol):
         ...
 
 
-class Plant:
+class KinematicJackal:
     """One trial's body, by kinematics alone."""
 
     def __init__(
@@ -143,7 +143,7 @@ class Plant:
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         eye = self.x + cosine * lidar.x, self.y + sine * lidar.x
         ranges = np.full(lidar.beams, np.inf)
-        _cast(eye, self.yaw, FIELD_OF_VIEW, discs, ranges)
+        _cast(eye, self.yaw, FIELD_OF_VIEW_RAD, discs, ranges)
         ranges += self._random.normal(0.0, self._conditions.noise, lidar.beams)
         lost = self._random.random(lidar.beams) < self._conditions.dropouts
         ranges[lost | (ranges > lidar.range_max)] = np.inf
@@ -155,7 +155,7 @@ class Plant:
         return clearance(self, discs)
 
 
-def clearance(body: Body, discs: Floats) -> float:
+def clearance(body: JackalBody, discs: Floats) -> float:
     """How far a body is from the nearest of `discs`, exactly [m]; 0 or less in contact."""
     dx, dy = discs[:, 0] - body.x, discs[:, 1] - body.y
     cosine, sine = math.cos(body.yaw), math.sin(body.yaw)

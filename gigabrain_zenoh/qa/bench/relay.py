@@ -1,10 +1,10 @@
-"""The bare relay: four plain Zenoh processes that only put what they get. The chain's yardstick.
+"""The bare relay: four plain Zenoh processes that pass on what they get. The chain's yardstick.
 
     source ──scan──► first ──world──► second ──intent──► third ──cmd──► source
 
-A callback puts straight away: no asyncio, no decoding, no work. Each has the Zenoh threads and the
-niceness of the process that it stands for. Started as
-`python -m gigabrain_zenoh.qa.bench.relay ROLE`, with a Role in JSON.
+A callback puts at once: no asyncio, no decoding, no work. Each has the Zenoh threads and the
+niceness of the process that it stands for. Started as `python -m gigabrain_zenoh.qa.bench.relay
+ROLE`, with a RelayRole in JSON.
 """
 
 import json
@@ -24,28 +24,28 @@ from gigabrain_zenoh.bus.zenoh.config import ZENOH_RUNTIME, session_config
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.this_process import go_first
-from gigabrain_zenoh.qa.bench.figures import figures
+from gigabrain_zenoh.qa.judging import latencies
 
 STAMP_BYTES = 8
 LOST_S = 0.3  # what has not come back by then never will
 ENDS = {signal.SIGTERM, signal.SIGINT}
 
 
-class Role(Struct, frozen=True, kw_only=True):
-    """What one process of the relay does."""
+class RelayRole(Struct, frozen=True, kw_only=True):
+    """The role of one process of the relay."""
 
     gets: str  # key
     puts: str  # key
     size: int  # bytes of what it puts
-    endpoint: Endpoint  # its router; or where it is met and whom it meets, as a peer
-    first: bool = False  # it goes before others where it may, as driver and control do
+    endpoint: Endpoint  # its router; or, of a peer, where it listens and connects
+    first: bool = False  # it gets a higher priority where allowed, as driver and control do
     rate_hz: float = 0.0  # of the source; 0 for the others
     settle_s: float = 0.0  # of the source: for how long it does not measure
     seconds: float = 0.0  # of the source: for how long it does
 
 
 def open_session(endpoint: Endpoint) -> zenoh.Session:
-    """A session configured as all of ours are; one that listens is a peer here, not a router."""
+    """Open a session configured like ours; one that listens is a peer here, not a router."""
     settings = session_config(endpoint)
     if endpoint.listen:
         settings["mode"] = "peer"
@@ -56,14 +56,14 @@ def open_session(endpoint: Endpoint) -> zenoh.Session:
 
 
 def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
-    """As the bus declares one for a stream."""
+    """Declare a publisher as the bus does for a stream."""
     return session.declare_publisher(
         key, priority=zenoh.Priority.DATA, congestion_control=zenoh.CongestionControl.DROP
     )
 
 
-def pass_on(session: zenoh.Session, role: Role) -> None:
-    """Put what comes, cut or filled up to this hop's size, until told to end."""
+def pass_on(session: zenoh.Session, role: RelayRole) -> None:
+    """Put what arrives, cut or filled up to this hop's size, until a signal ends the process."""
     put, filler = publisher(session, role.puts).put, bytes(role.size)
 
     def relay(sample: zenoh.Sample) -> None:
@@ -76,8 +76,8 @@ def pass_on(session: zenoh.Session, role: Role) -> None:
     subscriber.undeclare()
 
 
-def measure(session: zenoh.Session, role: Role) -> None:
-    """Send at a steady rate, and tell how long each message took to come round."""
+def measure(session: zenoh.Session, role: RelayRole) -> None:
+    """Send at a steady rate, and report how long each message took to come round."""
     put, filler = publisher(session, role.puts).put, bytes(role.size - STAMP_BYTES)
     times_ms: list[float] = []
     settled = threading.Event()
@@ -96,7 +96,7 @@ def measure(session: zenoh.Session, role: Role) -> None:
     settled.set()
     paced(role.rate_hz, role.seconds, send)
     time.sleep(LOST_S)
-    say({"event": "figures", "figures": msgspec.to_builtins(figures(times_ms))})
+    say({"event": "figures", "figures": msgspec.to_builtins(latencies(times_ms))})
     signal.sigwait(ENDS)
     subscriber.undeclare()
 
@@ -110,15 +110,15 @@ def paced(rate_hz: float, seconds: float, act: Callable[[], None]) -> None:
 
 
 def say(record: Mapping[str, Any]) -> None:
-    """A line that the supervisor understands."""
+    """Print a line that the supervisor reads."""
     print(msgspec.json.encode(record).decode(), flush=True)
 
 
 def main() -> None:
-    """Entry of a process of the relay."""
+    """Run one process of the relay."""
     this_process.die_with_supervisor()
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDS)  # before Zenoh's threads inherit the mask
-    role = msgspec.json.decode(sys.argv[1], type=Role)
+    role = msgspec.json.decode(sys.argv[1], type=RelayRole)
     os.environ.setdefault("ZENOH_RUNTIME", ZENOH_RUNTIME)
     if role.first:  # before there are threads, which inherit it
         go_first()

@@ -1,32 +1,40 @@
-"""Recorded laser logs, and what a map of theirs is worth.
+"""`gigabrain bench slam --log`: maps recorded laser logs, and compares them with reference poses.
 
 R. Kümmerle et al., On measuring the accuracy of SLAM algorithms, Autonomous Robots 2009: a map is
-judged by how poses that are near one another lie to each other, not by where they are.
-"""
+judged by how poses that are near one another lie to each other, not by where they are. The
+reference of some logs is wrong in places, so crispness judges a map by its own scans: a wall that
+is drawn twice fills twice as many cells."""
 
+import sys
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.geometry.se2 import Floats, between, compose, inverse
+from gigabrain_zenoh.geometry.se2 import Floats, between, compose, inverse, transform
+from gigabrain_zenoh.host.posix import resource
 from gigabrain_zenoh.mapping import arrays_file
 from gigabrain_zenoh.mapping.points import Scan, from_beams
+from gigabrain_zenoh.mapping.slam import Estimate, Slam
+from gigabrain_zenoh.qa.judging import Latencies, latencies
 
 RANGE_MIN, RANGE_MAX = 0.1, 25.0  # [m], beyond them a beam says nothing
-NEAR = 3.0  # [m], poses of a relation
-DENSE = 0.3  # [m], a median step below it makes a dense log
+NEAR_M = 3.0  # [m], poses of a relation
+DENSE_M = 0.3  # [m], a median step below it makes a dense log
 GAP, DENSE_GAP = 30, 300  # scans between the poses of a relation
-RELATIONS = 2000
+MAX_RELATIONS = 2000
 SEED = 0
 FIELDS = ("ranges", "ref", "odom")
 
 
 @dataclass(frozen=True, slots=True)
-class Log:
+class LaserLog:
     """Scans and odometry in the order of recording, and poses that somebody corrected."""
 
     name: str
@@ -41,7 +49,7 @@ class Log:
         return from_beams(angles, self.ranges[at], RANGE_MIN, RANGE_MAX)
 
 
-class Errors(Struct, frozen=True, kw_only=True):
+class RelationErrors(Struct, frozen=True, kw_only=True):
     """How far relations are from the reference."""
 
     mean_m: float
@@ -50,7 +58,7 @@ class Errors(Struct, frozen=True, kw_only=True):
     std_deg: float
 
 
-def load(path: Path) -> Log:
+def load(path: Path) -> LaserLog:
     """The log in an .npz file: `ranges` [cm], `ref` and `odom`. Raises ConfigError."""
     arrays = arrays_file.read(path, "no laser log")
     if missing := set(FIELDS) - arrays.keys():
@@ -62,14 +70,14 @@ def load(path: Path) -> Log:
     for name, poses in (("ref", reference), ("odom", odometry)):
         if poses.shape != (count, 3) or not np.issubdtype(poses.dtype, np.floating):
             raise ConfigError(f"{path}: {name}: expected poses of shape ({count}, 3)")
-    return Log(path.stem, ranges / 100.0, reference.astype(float), odometry.astype(float))
+    return LaserLog(path.stem, ranges / 100.0, reference.astype(float), odometry.astype(float))
 
 
-def relations(log: Log, seed: int = SEED) -> NDArray[np.intp]:
+def relations(log: LaserLog, seed: int = SEED) -> NDArray[np.intp]:
     """Pairs of scans (k, 2) at places that were passed twice. Raises ConfigError without any."""
     places = log.reference[:, :2]
     step = float(np.median(np.hypot(*np.diff(places, axis=0).T)))
-    gap = DENSE_GAP if step < DENSE else GAP
+    gap = DENSE_GAP if step < DENSE_M else GAP
     pairs = [
         np.column_stack((np.full_like(later, first), later))
         for first in range(len(places) - gap - 1)
@@ -78,23 +86,23 @@ def relations(log: Log, seed: int = SEED) -> NDArray[np.intp]:
     if not pairs:
         raise ConfigError(f"{log.name}: no place is passed twice, so there is nothing to compare")
     every = np.concatenate(pairs)
-    if len(every) <= RELATIONS:
+    if len(every) <= MAX_RELATIONS:
         return every
-    return every[np.random.default_rng(seed).choice(len(every), RELATIONS, replace=False)]
+    return every[np.random.default_rng(seed).choice(len(every), MAX_RELATIONS, replace=False)]
 
 
 def _near(places: Floats, first: int, start: int) -> NDArray[np.intp]:
     away = np.hypot(*(places[start:] - places[first]).T)
-    return np.flatnonzero(away < NEAR) + start
+    return np.flatnonzero(away < NEAR_M) + start
 
 
-def errors(log: Log, poses: Floats, pairs: NDArray[np.intp]) -> Errors:
+def errors(log: LaserLog, poses: Floats, pairs: NDArray[np.intp]) -> RelationErrors:
     """How `poses` (n, 3) compare with the reference over `pairs`."""
     first, second = pairs.T
     wanted = between(log.reference[first], log.reference[second])
     off = between(wanted, between(poses[first], poses[second]))
     away, turn = np.hypot(off[:, 0], off[:, 1]), np.degrees(np.abs(off[:, 2]))
-    return Errors(
+    return RelationErrors(
         mean_m=float(away.mean()),
         std_m=float(away.std()),
         mean_deg=float(turn.mean()),
@@ -109,3 +117,207 @@ def laid_onto(poses: Floats, reference: Floats) -> Floats:
     turn = float(np.arctan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1]))
     about = np.array((*one.mean(axis=0), 0.0))
     return compose(np.array((*other.mean(axis=0), turn)), compose(inverse(about), poses))
+
+
+CELL_M = 0.1  # [m]
+NEAREST, FARTHEST = 0.3, 15.0  # [m], of the hits that count
+GRID_TURNS = 8  # spread over a right angle: one turn alone may be off by 3 %
+KEY = 1 << 20  # cells along a row, 100 km
+
+
+def crispness(log: LaserLog, poses: Floats) -> float:
+    """Return the cells filled at `poses` (n, 3) per cell filled at the log's reference poses.
+
+    `poses` are laid onto the reference by one rigid fit first. Below 1 is crisper than the
+    reference. The ratio is the mean over turns of the grid.
+    """
+    bodies = [hits(log, at) for at in range(len(log.ranges))]
+    turns: Floats = np.linspace(0, np.pi / 2, GRID_TURNS, endpoint=False)
+    ours = cells_filled(bodies, laid_onto(poses, log.reference), turns)
+    reference = cells_filled(bodies, log.reference, turns)
+    return float(np.mean(ours / reference))
+
+
+def hits(log: LaserLog, at: int) -> NDArray[np.float64]:
+    """Return the hits of one scan (n, 2) in the body's frame [m], of the ranges that count."""
+    points = log.scan(at).points.astype(np.float64)
+    away = np.hypot(*points.T)
+    return np.asarray(points[(away > NEAREST) & (away < FARTHEST)])
+
+
+def cells_filled(
+    bodies: list[NDArray[np.float64]], poses: Floats, turns: Floats
+) -> NDArray[np.float64]:
+    """Return how many cells the scans fill at `poses` (n, 3), for each turn [rad] of the grid."""
+    return np.array([_filled(bodies, compose(np.array((0, 0, turn)), poses)) for turn in turns])
+
+
+def _filled(bodies: list[NDArray[np.float64]], poses: Floats) -> float:
+    each = np.array([len(body) for body in bodies])
+    points = np.concatenate(bodies)
+    x, y, yaw = np.repeat(poses, each, axis=0).T
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    columns = np.floor((x + cos * points[:, 0] - sin * points[:, 1]) / CELL_M).astype(np.int64)
+    rows = np.floor((y + sin * points[:, 0] + cos * points[:, 1]) / CELL_M).astype(np.int64)
+    return float(len(np.unique(rows * KEY + columns)))
+
+
+COLD = 20  # scans before anything is timed
+
+Progress = Callable[[], None]  # called after each scan
+
+
+class LogResult(Struct, frozen=True, kw_only=True):
+    """One log. Times are of the CPU, which is what a free core would take."""
+
+    log: str
+    scans: int
+    beams: int
+    keyframes: int
+    loops: int
+    relations: int
+    odometry: RelationErrors
+    front_end: RelationErrors
+    graph: RelationErrors
+    crispness: float  # cells filled, per cell that the reference fills
+    unmatched: int  # scans that were put where odometry or a search had them
+    breaks: int  # in the sequence
+    scan: Latencies
+    loop: Latencies
+    loop_max_ms: float
+
+
+class SlamResult(Struct, frozen=True, kw_only=True):
+    """All logs."""
+
+    logs: tuple[LogResult, ...]
+    mean_m: float  # of the graphs' errors, over the logs
+    peak_mb: float  # of this process, with everything that it has imported
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MappedLog:
+    """A log mapped."""
+
+    slam: Slam
+    estimates: list[Estimate]
+    smooth: Floats  # (n, 3), where the front end alone puts the scans
+    scan_ms: list[float]
+    loop_ms: list[float]
+    loops: int
+
+    def poses(self) -> Floats:
+        """Where the graph has put all scans in the end, (n, 3)."""
+        keyframes = self.slam.poses[[estimate.keyframe for estimate in self.estimates]]
+        return compose(keyframes, np.array([estimate.relative for estimate in self.estimates]))
+
+
+def map_log(log: LaserLog, progress: Progress) -> MappedLog:
+    """Map the log, loops being searched after each scan."""
+    steps = between(log.odometry[:-1], log.odometry[1:])
+    steps = np.concatenate((np.zeros((1, 3)), steps))
+    slam, loops = Slam(), 0
+    estimates: list[Estimate] = []
+    smooth: list[Floats] = []
+    scan_ms: list[float] = []
+    loop_ms: list[float] = []
+    for at, step in enumerate(steps):
+        began = time.thread_time()
+        estimates.append(slam.add(log.scan(at), step))
+        scan_ms.append((time.thread_time() - began) * 1e3)
+        smooth.append(slam.smooth)
+        while slam.behind:
+            began = time.thread_time()
+            correction = slam.close_loops()
+            loop_ms.append((time.thread_time() - began) * 1e3)
+            if correction:
+                slam.apply(correction)
+                loops += len(correction.loops)
+        progress()
+    return MappedLog(
+        slam=slam,
+        estimates=estimates,
+        smooth=np.array(smooth),
+        scan_ms=scan_ms,
+        loop_ms=loop_ms,
+        loops=loops,
+    )
+
+
+def judge_log(log: LaserLog, driven: MappedLog) -> LogResult:
+    """What the map_log is worth. Raises ConfigError for a log that passes no place twice."""
+    pairs, poses = relations(log), driven.poses()
+    kinds = [estimate.kind for estimate in driven.estimates]
+    return LogResult(
+        log=log.name,
+        scans=len(log.ranges),
+        beams=log.ranges.shape[1],
+        keyframes=len(driven.slam.keyframes),
+        loops=driven.loops,
+        relations=len(pairs),
+        odometry=errors(log, log.odometry, pairs),
+        front_end=errors(log, driven.smooth, pairs),
+        graph=errors(log, poses, pairs),
+        crispness=crispness(log, poses),
+        unmatched=sum(kind in ("odometry", "searched") for kind in kinds),
+        breaks=kinds.count("broken"),
+        scan=latencies(driven.scan_ms[COLD:]),
+        loop=latencies(driven.loop_ms[COLD:]),
+        loop_max_ms=max(driven.loop_ms[COLD:], default=0.0),
+    )
+
+
+def total(logs: list[LogResult]) -> SlamResult:
+    """The logs together."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return SlamResult(
+        logs=tuple(logs),
+        mean_m=float(np.mean([log.graph.mean_m for log in logs])),
+        peak_mb=peak / (1e6 if sys.platform == "darwin" else 1e3),
+    )
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SIDE_INCHES = 7.0  # [inch] of each map
+DOTS_PER_INCH = 130  # per inch
+WALLS, DRIVEN, REFERENCE = "#1d2733", "#d9480f", "#1c7ed6"
+
+
+def draw_logs(drives: Sequence[tuple[LaserLog, MappedLog]], to: Path) -> None:
+    """Draw each map with the way that was driven, side by side. Raises ConfigError."""
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        raise ConfigError(
+            "pictures need matplotlib: pip install 'gigabrain-zenoh[record]'"
+        ) from None
+    columns = min(len(drives), 2)
+    rows = -(-len(drives) // columns)
+    figure = Figure(figsize=(SIDE_INCHES * columns, SIDE_INCHES * rows), layout="constrained")
+    cells = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for axes in cells:
+        axes.set_axis_off()
+    for axes, (log, driven) in zip(cells, drives, strict=False):
+        _draw_log(axes, log, driven)
+    try:
+        figure.savefig(to, format="png", dpi=DOTS_PER_INCH)
+    except OSError as error:
+        raise ConfigError(f"cannot write {to}: {error.strerror}") from None
+
+
+def _draw_log(axes: "Axes", log: LaserLog, driven: MappedLog) -> None:
+    keyframes = zip(driven.slam.poses, driven.slam.keyframes, strict=True)
+    walls = np.concatenate([transform(pose, keyframe.points) for pose, keyframe in keyframes])
+    poses = driven.poses()
+    reference = laid_onto(log.reference, poses)
+    axes.set_axis_on()
+    axes.plot(*walls.T, ",", color=WALLS, alpha=0.3)
+    axes.plot(*reference[:, :2].T, color=REFERENCE, linewidth=1.2, label="reference")
+    axes.plot(*poses[:, :2].T, color=DRIVEN, linewidth=0.8, label="as mapped")
+    axes.set_title(log.name)
+    axes.set_aspect("equal")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]")
+    axes.legend(loc="best")

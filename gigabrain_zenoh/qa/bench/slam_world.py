@@ -1,13 +1,15 @@
-"""SLAM in a simulated world against the physics' truth, on what perception itself calls."""
+"""`gigabrain bench slam --world`: maps simulated worlds, and compares poses with the truth."""
 
 import time
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from msgspec import Struct
 
+from gigabrain_schemas.arrays import cells
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import OccupancyGrid
@@ -18,18 +20,19 @@ from gigabrain_zenoh.geometry.se2 import Floats, between, compose, inverse
 from gigabrain_zenoh.mapping.fusion import Fusion, Moment, way
 from gigabrain_zenoh.mapping.growing import GrowingMap
 from gigabrain_zenoh.perception.mapper import view_of
-from gigabrain_zenoh.qa.bench.figures import Figures, figures
-from gigabrain_zenoh.qa.bench.growth import Growth, Watch
+from gigabrain_zenoh.qa.bench.growth import GrowthSampler, MapGrowth
+from gigabrain_zenoh.qa.bench.slam_logs import DOTS_PER_INCH, DRIVEN, REFERENCE, SIDE_INCHES
+from gigabrain_zenoh.qa.judging import Latencies, latencies
 from gigabrain_zenoh.runtime.services import rss_bytes
 
-PATIENCE_S = 60.0  # so that a slow machine makes the same map
+CLOSE_LOOPS_S = 60.0  # so that a slow machine makes the same map
 COLD = 20  # scans before anything is timed
 TICKS_A_MINUTE = round(60e9 / TICK_NS)
 
 Progress = Callable[[], None]  # called after each minute
 
 
-class Off(Struct, frozen=True, kw_only=True):
+class PoseErrors(Struct, frozen=True, kw_only=True):
     """How far poses are from the truth, both having begun in the same place."""
 
     mean_m: float
@@ -52,11 +55,11 @@ class WorldResult(Struct, frozen=True, kw_only=True):
     keyframes: int
     loops: int
     drawn_anew: int
-    fused: Off  # odometry with gyro
-    slam: Off
-    last_minute: Off
-    scan: Figures
-    growth: Growth  # of this process, simulation included
+    fused: PoseErrors  # odometry with gyro
+    slam: PoseErrors
+    last_minute: PoseErrors
+    scan: Latencies
+    growth: MapGrowth  # of this process, simulation included
 
 
 class WorldsResult(Struct, frozen=True, kw_only=True):
@@ -66,7 +69,7 @@ class WorldsResult(Struct, frozen=True, kw_only=True):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Toured:
+class MappedWorld:
     """A world that was mapped, with all that it takes to draw it."""
 
     result: WorldResult
@@ -75,21 +78,21 @@ class Toured:
     truth: Floats  # (n, 3), in the map
 
 
-def tour(body: str, world: str, seed: int, minutes: float, progress: Progress) -> Toured:
+def map_world(body: str, world: str, seed: int, minutes: float, progress: Progress) -> MappedWorld:
     """Let the body roam the world for so long. Raises ConfigError."""
-    from gigabrain_zenoh.qa.tour import Tour  # MuJoCo, which a bench of logs has no need of
+    from gigabrain_zenoh.qa.simulated_drives import ExploreRun  # needs MuJoCo
 
-    roaming = Tour(body, world, seed)
+    roaming = ExploreRun(body, world, seed)
     if (lidar := roaming.body.lidar) is None:
         raise ConfigError(f"{body} has no lidar, and so makes no map")
-    run = _Run(GrowingMap(PATIENCE_S))
-    watch = Watch()
-    for count, moment in enumerate(roaming.moments(round(minutes * TICKS_A_MINUTE)), 1):
-        run.fusion.add(moment.state, roaming.body)
-        if moment.scan:
-            run.scan(lidar, moment.scan, np.array(moment.truth))
+    run = _MappingRun(GrowingMap(CLOSE_LOOPS_S))
+    watch = GrowthSampler()
+    for count, one in enumerate(roaming.ticks(round(minutes * TICKS_A_MINUTE)), 1):
+        run.fusion.add(one.state, roaming.body)
+        if one.scan:
+            run.scan(lidar, one.scan, np.array(one.truth))
         if count % TICKS_A_MINUTE == 0:
-            watch.minute(rss_bytes(), run.chart.grid())
+            watch.minute(rss_bytes() / 1e6, run.chart.grid())
             progress()
     if not len(run.poses):
         raise ConfigError(f"--minutes: {minutes:g} is too short for a scan")
@@ -111,16 +114,16 @@ def tour(body: str, world: str, seed: int, minutes: float, progress: Progress) -
         keyframes=report["keyframes"],
         loops=report["loops"],
         drawn_anew=report["drawn_anew"],
-        fused=_off(between(seen, compose(begun, fused))),
-        slam=_off(off),
-        last_minute=_off(off[-600:]),
-        scan=figures(run.took_ms[COLD:]),
+        fused=_errors(between(seen, compose(begun, fused))),
+        slam=_errors(off),
+        last_minute=_errors(off[-600:]),
+        scan=latencies(run.took_ms[COLD:]),
         growth=watch.growth(grid),
     )
-    return Toured(result=result, grid=grid, poses=poses, truth=seen)
+    return MappedWorld(result=result, grid=grid, poses=poses, truth=seen)
 
 
-class _Run:
+class _MappingRun:
     """What perception does with scans and states, and what came of it."""
 
     def __init__(self, chart: GrowingMap) -> None:
@@ -161,11 +164,43 @@ class _Run:
         return compose(compose(self.poses[0], inverse(truth[0])), truth)
 
 
-def _off(off: Floats) -> Off:
+def _errors(off: Floats) -> PoseErrors:
     away, turn = np.hypot(off[:, 0], off[:, 1]), np.degrees(np.abs(off[:, 2]))
-    return Off(
+    return PoseErrors(
         mean_m=float(away.mean()),
         max_m=float(away.max()),
         mean_deg=float(turn.mean()),
         max_deg=float(turn.max()),
     )
+
+
+UNKNOWN = 55  # grey between free and occupied, in percent of black
+
+
+def draw_worlds(worlds: Sequence[MappedWorld], to: Path) -> None:
+    """Draw the maps side by side. Raises ConfigError."""
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        raise ConfigError(
+            "pictures need matplotlib: pip install 'gigabrain-zenoh[record]'"
+        ) from None
+    figure = Figure(figsize=(SIDE_INCHES * len(worlds), SIDE_INCHES), layout="constrained")
+    for axes, one in zip(figure.subplots(1, len(worlds), squeeze=False).flat, worlds, strict=True):
+        grid, shown = one.grid, cells(one.grid).astype(np.int16)
+        shown[shown < 0] = UNKNOWN
+        left, low = grid.origin_x, grid.origin_y
+        right, high = left + grid.width * grid.resolution, low + grid.height * grid.resolution
+        axes.imshow(
+            100 - shown, "gray", origin="lower", extent=(left, right, low, high), vmin=0, vmax=100
+        )
+        axes.plot(*one.truth[:, :2].T, color=REFERENCE, linewidth=1.2, label="true")
+        axes.plot(*one.poses[:, :2].T, color=DRIVEN, linewidth=0.8, label="as mapped")
+        axes.set_title(one.result.world)
+        axes.set_xlabel("x [m]")
+        axes.set_ylabel("y [m]")
+        axes.legend(loc="best")
+    try:
+        figure.savefig(to, format="png", dpi=DOTS_PER_INCH)
+    except OSError as error:
+        raise ConfigError(f"cannot write {to}: {error.strerror}") from None

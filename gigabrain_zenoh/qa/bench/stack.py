@@ -1,120 +1,128 @@
-"""`gigabrain bench stack`: what a whole robot costs at real time, and how fast it is there."""
+"""`gigabrain bench stack`: CPU, memory and start of a whole robot, and its first goal."""
 
+import asyncio
 import statistics
-import tempfile
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 from msgspec import Struct
 
+from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import Health
-from gigabrain_schemas.topics import HEALTH
-from gigabrain_zenoh.launch.specs import process_specs
-from gigabrain_zenoh.qa.bench.first_goal import ACCEPTED_S, FirstGoal, measure_first_goal
-from gigabrain_zenoh.qa.bench.group import client, driver_report, running
-from gigabrain_zenoh.qa.bench.runs import LOOPBACK
-from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
+from gigabrain_schemas.tasks import GoalRequest
+from gigabrain_schemas.topics import GOAL, HEALTH, INTENT
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.decision.navigating import DRIVE_KERNELS
+from gigabrain_zenoh.kernels.compiling import compiled
+from gigabrain_zenoh.perception.node import MAP_KERNELS
+from gigabrain_zenoh.qa.judging import Figure, Limit, table_of
+from gigabrain_zenoh.qa.robot_under_test import (
+    LOOPBACK,
+    START_S,
+    ProcessGroup,
+    driver_report,
+    measured_robot,
+)
+from gigabrain_zenoh.runtime.deployment import Deployment
+
+if TYPE_CHECKING:
+    from rich.console import Group
 
 SETTLE_S = 2.0  # imports and first calls are no part of what a running robot costs
 PERIOD_S = 1.0  # of the health messages
-READY_S, CPU_PERCENT, PHYSICS_PERCENT, RSS_MB = 1.5, 30.0, 5.0, 70.0  # targets
 SIMULATOR = "driver"  # the process that holds MuJoCo
+AHEAD = GoalRequest(x=0.5, y=0.0, source="bench")
+ASK_S, AGAIN_S = 1.0, 0.02
+MB = 1e6
+READY = Figure("all ready after", "s").at_most(1.5)
+CPU = Figure("CPU without physics", "%").at_most(30)
+PHYSICS = Figure("physics and lidar", "%").at_most(5)
+FIRST_GOAL = Figure("first goal accepted after", "s").at_most(2)
+MAX_RSS_MB = 70.0
 
 
-class Process(Struct, frozen=True, kw_only=True):
-    """What one process needs."""
+class ProcessCost(Struct, frozen=True, kw_only=True):
+    """CPU and memory of one process."""
 
     name: str
     cpu: float  # of one core, mean
     rss_bytes: int  # most
 
 
+class FirstGoal(Struct, frozen=True, kw_only=True):
+    """Times from the start of the first process; CPU time is of all processes together."""
+
+    accepted_s: float
+    accepted_cpu_s: float
+    told: str  # text of the reply
+    drives_s: float  # until it followed its first path
+    drives_cpu_s: float
+
+
 class StackResult(Struct, frozen=True, kw_only=True):
-    """What all of them need."""
+    """Cost of a whole robot."""
 
     body: str
     world: str
     seconds: float
     ready_s: float  # from the start of the first process until the last was ready
     physics_cpu: float | None  # of one core, with the lidar's rays; None for a body without physics
-    processes: tuple[Process, ...]
-    first_goal: FirstGoal | None = None  # of the same robot, started anew and making a map
+    processes: tuple[ProcessCost, ...]
+    first_goal: FirstGoal | None = None  # of the same robot, restarted with a map
 
     @property
     def cpu_without_physics(self) -> float:
-        """Of one core, all processes together."""
+        """CPU of all processes together, of one core."""
         return sum(process.cpu for process in self.processes) - (self.physics_cpu or 0.0)
 
 
-class Target(Struct, frozen=True, kw_only=True):
-    """A figure and what it must not exceed."""
+class Target(NamedTuple):
+    """A limit and the value that was measured."""
 
-    name: str
+    limit: Limit
     value: float
-    limit: float
-    unit: str
 
     @property
     def ok(self) -> bool:
-        """Whether it is reached."""
-        return self.value <= self.limit
+        """Whether the value is within the limit."""
+        return self.limit.allows(self.value)
 
 
 def targets(result: StackResult) -> list[Target]:
-    """The figures that have one. Memory counts in processes without MuJoCo."""
-    found = [
-        Target(name="all ready after", value=result.ready_s, limit=READY_S, unit="s"),
-        Target(
-            name="CPU without physics",
-            value=100 * result.cpu_without_physics,
-            limit=CPU_PERCENT,
-            unit="%",
-        ),
-    ]
+    """Return the figures that have a limit. Memory counts in processes without MuJoCo."""
+    found = [Target(READY, result.ready_s), Target(CPU, 100 * result.cpu_without_physics)]
     if result.physics_cpu is not None:
-        percent = 100 * result.physics_cpu
-        found.append(
-            Target(name="physics and lidar", value=percent, limit=PHYSICS_PERCENT, unit="%")
-        )
+        found.append(Target(PHYSICS, 100 * result.physics_cpu))
     if goal := result.first_goal:
-        name = "first goal accepted after"
-        found.append(Target(name=name, value=goal.accepted_s, limit=ACCEPTED_S, unit="s"))
+        found.append(Target(FIRST_GOAL, goal.accepted_s))
     small = [p for p in result.processes if p.name != SIMULATOR or result.physics_cpu is None]
     largest = max(small, key=lambda process: process.rss_bytes)
-    found.append(
-        Target(
-            name=f"largest without MuJoCo ({largest.name})",
-            value=largest.rss_bytes / 1e6,
-            limit=RSS_MB,
-            unit="MB",
-        )
-    )
-    return found
+    memory = Figure(f"largest without MuJoCo ({largest.name})", "MB").at_most(MAX_RSS_MB)
+    return [*found, Target(memory, largest.rss_bytes / MB)]
 
 
 async def measure_stack(
     body: str, world: str, seconds: float, say: Callable[[str], None], *, goal: bool = False
 ) -> StackResult:
-    """Run a robot that avoids, and then perhaps one that navigates, for its first `goal`.
+    """Run a robot that avoids obstacles; with `goal` also one that navigates, for its first goal.
 
-    Raises GigabrainError when a process dies on the way.
+    Raises GigabrainError when a process dies.
     """
-    deployment = with_free_port(Deployment(body=body, world=world, resume="auto", router=LOOPBACK))
-    with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as name:
-        folder = Path(name)
-        specs = process_specs(deployment, "robot", folder, folder / "state")
-        say(f"starting {body} in {world}")
-        async with running(specs) as group, client(client_endpoint(deployment)) as bus:
-            await group.go_on(SETTLE_S)
-            say(f"ready after {group.ready_s:.2f} s; measuring for {seconds:g} s")
-            told: defaultdict[str, list[Health]] = defaultdict(list)
-            close = bus.subscribe(HEALTH, lambda _key, health: told[health.process].append(health))
-            before, began_ns = await driver_report(bus), bus.clock.now_ns()
-            await group.go_on(max(seconds, 2 * PERIOD_S))
-            close()
-            after, ended_ns = await driver_report(bus), bus.clock.now_ns()
-            await group.until(lambda: len(told) >= len(specs))
+    deployment = Deployment(body=body, world=world, resume="auto", router=LOOPBACK)
+    say(f"starting {body} in {world}")
+    async with measured_robot(deployment) as (group, bus):
+        await group.run_for(SETTLE_S)
+        say(f"ready after {group.ready_s:.2f} s; measuring for {seconds:g} s")
+        names = list(group.supervisor.statuses)
+        healths: defaultdict[str, list[Health]] = defaultdict(list)
+        close = bus.subscribe(HEALTH, lambda _key, health: healths[health.process].append(health))
+        before, began_ns = await driver_report(bus), bus.clock.now_ns()
+        await group.run_for(max(seconds, 2 * PERIOD_S))
+        close()
+        after, ended_ns = await driver_report(bus), bus.clock.now_ns()
+        await group.until(lambda: len(healths) >= len(names), "health of all processes")
     first_goal = await measure_first_goal(body, world, say) if goal else None
     return StackResult(
         body=body,
@@ -122,7 +130,7 @@ async def measure_stack(
         seconds=seconds,
         ready_s=group.ready_s,
         physics_cpu=physics_share(before, after, (ended_ns - began_ns) / 1e9),
-        processes=tuple(_process(spec.name, told[spec.name]) for spec in specs),
+        processes=tuple(_cost(name, healths[name]) for name in names),
         first_goal=first_goal,
     )
 
@@ -130,16 +138,90 @@ async def measure_stack(
 def physics_share(
     before: Mapping[str, object], after: Mapping[str, object], seconds: float
 ) -> float | None:
-    """CPU time of the physics thread between two reports, of one core."""
+    """Return the CPU share of the physics thread between two reports, of one core."""
     spent = [report.get("physics_cpu_s") for report in (before, after)]
     if not all(isinstance(value, int | float) for value in spent):
         return None
     return (float(str(spent[1])) - float(str(spent[0]))) / seconds
 
 
-def _process(name: str, told: Sequence[Health]) -> Process:
-    return Process(
+def _cost(name: str, healths: Sequence[Health]) -> ProcessCost:
+    return ProcessCost(
         name=name,
-        cpu=statistics.fmean(health.cpu for health in told),
-        rss_bytes=max(health.rss_bytes for health in told),
+        cpu=statistics.fmean(health.cpu for health in healths),
+        rss_bytes=max(health.rss_bytes for health in healths),
     )
+
+
+async def measure_first_goal(body: str, world: str, say: Callable[[str], None]) -> FirstGoal:
+    """Start a robot that makes a map, and send it a goal until it accepts and drives.
+
+    Compiles first. Raises ConfigError where navigation is not installed, and GigabrainError when a
+    process dies.
+    """
+    for warm_up in (MAP_KERNELS, DRIVE_KERNELS):
+        await compiled(warm_up)
+    deployment = Deployment(
+        body=body, world=world, resume="auto", router=LOOPBACK,
+        perception=PerceptionConfig(mapping="slam"), decision=DecisionConfig(behaviour="navigate"),
+    )  # fmt: skip
+    say(f"starting {body} in {world} for a first goal")
+    async with measured_robot(deployment, ready_s=None) as (group, bus):
+        follows = asyncio.Event()
+
+        def on_intent(_key: str, intent: Intent) -> None:
+            if intent.follow:
+                follows.set()
+
+        bus.subscribe(INTENT, on_intent)
+        asking = asyncio.ensure_future(_accepted(group, bus))
+        try:
+            await group.until(lambda: asking.done() and follows.is_set(), "a first goal", START_S)
+        finally:
+            asking.cancel()
+        accepted_s, accepted_cpu_s, text = asking.result()
+        return FirstGoal(
+            accepted_s=accepted_s,
+            accepted_cpu_s=accepted_cpu_s,
+            told=text,
+            drives_s=group.seconds,
+            drives_cpu_s=group.cpu_s,
+        )
+
+
+async def _accepted(group: ProcessGroup, bus: Bus) -> tuple[float, float, str]:
+    """Return the time and CPU time [s] at which a goal was accepted, and the reply's text."""
+    while True:
+        replies = await bus.ask(GOAL, AHEAD, timeout_s=ASK_S)
+        if replies and replies[0].ok:
+            return group.seconds, group.cpu_s, replies[0].text
+        await asyncio.sleep(AGAIN_S)
+
+
+def stack_page(result: StackResult) -> "Group":
+    """Return what `gigabrain bench stack` prints."""
+    from rich.console import Group
+    from rich.text import Text
+
+    costs = table_of("process", "CPU", "memory")
+    for process in result.processes:
+        costs.add_row(process.name, f"{process.cpu:.1%}", f"{process.rss_bytes / MB:.0f} MB")
+    limits = table_of("figure", "measured", "at most", "")
+    for target in targets(result):
+        (figure, at_most), value = target
+        verdict = Text("ok", style="green") if target.ok else Text("over", style="yellow")
+        value_text, limit_text = f"{value:.2f} {figure.unit}", f"{at_most:g} {figure.unit}"
+        limits.add_row(figure.name, value_text, limit_text, verdict)
+    title = f"\n{result.body} in {result.world} at real time, {result.seconds:g} s"
+    page = Group(
+        Text(title, style="bold"), costs,
+        Text("\nTargets (CPU of one core)", style="bold"), limits,
+    )  # fmt: skip
+    if goal := result.first_goal:
+        text = (
+            f"The first goal was accepted after {goal.accepted_cpu_s:.2f} s of CPU ({goal.told}). "
+            f"The robot drove to it after {goal.drives_s:.2f} s with {goal.drives_cpu_s:.2f} s of "
+            "CPU."
+        )
+        page.renderables.append(Text(text, style="dim"))
+    return page

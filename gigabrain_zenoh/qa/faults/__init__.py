@@ -1,1 +1,5 @@
-"""Faults on purpose: chaos proxies, hostile input, and the suite that judges a robot by them."""
+"""The fault suite: breaks a robot in the ways of its rows, and judges it by their limits.
+
+`rows` holds the tests, grouped by subject; `rig` holds what they share.
+Only the `gigabrain faults` command and tests may import it.
+"""

@@ -1,92 +1,61 @@
-"""What a fault test is: what it does, by what it is judged, and what came of it."""
+"""A fault row: what breaks, by which limits it is judged, and the results of its runs."""
 
 import math
-import re
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal
 
 from msgspec import Struct
 
-from gigabrain_zenoh.errors import GigabrainError
+from gigabrain_zenoh.qa.judging import Limit, Measured, Verdict
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.qa.faults.rig import Rig
+    from gigabrain_zenoh.qa.faults.rig.rig import Rig
 
 Stage = Literal["sim", "auto", "line", "serial", "tcp", ""]
-Verdict = Literal["passed", "FAILED", "skipped"]
-Measured = Mapping[str, float]  # a figure for each limit of the criterion
-Test = Callable[["Rig"], Awaitable[Measured]]
-
-LIMIT = re.compile(
-    r"(?P<name>[^<>]+?) <= (?P<at_most>\d+(\.\d+)?)"
-    r"(?: (?P<unit>(?!wall|long)\S+))?(?P<wall> wall)?(?P<long> long)?"
-)
-
-
-class Failed(GigabrainError):
-    """The robot did not do what it promises, or what was waited for never came."""
-
-
-class Skipped(GigabrainError):
-    """The test cannot be run here; the text says why."""
-
-
-class Limit(NamedTuple):
-    """One figure that must not be exceeded."""
-
-    name: str
-    at_most: float
-    unit: str
-    wall: bool = False  # of wall time, which a busy or slow machine makes more
-    long: bool = False  # measured in the long form only
+FaultTest = Callable[["Rig"], Awaitable[Measured]]
 
 
 @dataclass(frozen=True)
-class Fault:
-    """One row of the table. Its test is the function of its name in the module of its group."""
+class FaultRow:
+    """One row of the fault suite."""
 
     number: int
-    name: str  # kebab-case
-    group: str  # the module that holds it: process, deaths, body_link, network ...
-    stage: Stage  # which running robot it needs; none for one that brings its own
-    criterion: str  # `brakes after <= 6 ticks, travel <= 0.1 m`: what the test has to measure
-    needs: tuple[str, ...] = ()  # root, netns, keys, recorder: what not every machine has
-    loads: bool = False  # the fault itself keeps the cores busy, so waiting for one is part of it
+    test: FaultTest
+    stage: Stage  # which shared robot it needs; none for a test that boots its own
+    limits: tuple[Limit, ...]
+    needs: tuple[str, ...] = ()  # keys, recorder, nav: extras that may be missing
+    loads: bool = False  # the fault itself keeps the cores busy
 
     @property
-    def path(self) -> str:
-        """Where its test is, as "module:name"."""
-        return f"gigabrain_zenoh.qa.faults.{self.group}:{self.name.replace('-', '_')}"
+    def name(self) -> str:
+        """The test's name with dashes."""
+        return self.test.__name__.replace("_", "-")
 
-    @cached_property
-    def limits(self) -> tuple[Limit, ...]:
-        """The criterion, figure by figure."""
-        return tuple(map(_limit, self.criterion.split(", ")))
+    @property
+    def group(self) -> str:
+        """The module of the test."""
+        return self.test.__module__.rpartition(".")[2].replace("_", " ")
 
-
-def _limit(text: str) -> Limit:
-    found = LIMIT.fullmatch(text)
-    if not found:
-        raise ValueError(f"{text!r} is no limit; expected one like 'travel <= 0.10 m'")
-    unit, wall, long = found["unit"] or "", bool(found["wall"]), bool(found["long"])
-    return Limit(found["name"], float(found["at_most"]), unit, wall, long)
+    @property
+    def criterion(self) -> str:
+        """All limits in words: `brakes after <= 120 ms, travel <= 0.1 m`."""
+        return ", ".join(map(str, self.limits))
 
 
-class Try(Struct, frozen=True, kw_only=True):
-    """One run of one fault test."""
+class FaultRun(Struct, frozen=True, kw_only=True):
+    """One run of a fault test."""
 
     verdict: Verdict
     reason: str = ""  # why it failed or was skipped
     measured: dict[str, float] = {}
-    waited_ms: float = 0.0  # the longest that a thread of the robot waited for a core, in 0.1 s
-    disturbed: bool = False  # it waited for so long that the run says nothing, passed or failed
+    waited_ms: float = 0.0  # longest wait of one of the robot's threads for a core, within 0.1 s
+    disturbed: bool = False  # it waited so long that the run does not count, passed or failed
     seconds: float = 0.0  # of wall time
 
 
-class Result(Struct, frozen=True, kw_only=True):
-    """What came of all runs of one fault test."""
+class FaultResult(Struct, frozen=True, kw_only=True):
+    """The verdict over all runs of a fault test."""
 
     number: int
     name: str
@@ -94,7 +63,7 @@ class Result(Struct, frozen=True, kw_only=True):
     verdict: Verdict
     reason: str = ""  # why it failed or was skipped
     worst: dict[str, float] = {}  # the greatest of all runs that count, by figure
-    tries: tuple[Try, ...] = ()
+    tries: tuple[FaultRun, ...] = ()
 
     @property
     def seconds(self) -> float:
@@ -102,50 +71,50 @@ class Result(Struct, frozen=True, kw_only=True):
         return sum(one.seconds for one in self.tries)
 
 
-def conclude(fault: Fault, tries: Sequence[Try]) -> Result:
-    """Judge the runs that were not disturbed; all of them where each was."""
-    counted = [one for one in tries if not one.disturbed] or list(tries)
+def conclude(row: FaultRow, runs: Sequence[FaultRun]) -> FaultResult:
+    """Judge the undisturbed runs; all of them where each was disturbed."""
+    counted = [one for one in runs if not one.disturbed] or list(runs)
     decisive = next((one for one in counted if one.verdict != "passed"), counted[-1])
     measured = [one.measured for one in counted if one.measured]
-    return Result(
-        number=fault.number,
-        name=fault.name,
-        criterion=fault.criterion,
+    return FaultResult(
+        number=row.number,
+        name=row.name,
+        criterion=row.criterion,
         verdict=decisive.verdict,
         reason=decisive.reason,
-        worst=worst_of(fault, measured) if measured else {},
-        tries=tuple(tries),
+        worst=worst_of(row, measured) if measured else {},
+        tries=tuple(runs),
     )
 
 
 def judge(
-    fault: Fault, measured: Measured, *, wall: bool = True, long: bool = False
+    row: FaultRow, measured: Measured, *, wall: bool = True, long: bool = False
 ) -> tuple[Verdict, str]:
     """Return the verdict on one run, and why it failed; without `wall`, not by the wall clock."""
-    limits = [limit for limit in fault.limits if long or not limit.long]
-    if set(measured) != {limit.name for limit in limits}:
-        raise ValueError(f"{fault.name} is judged by {fault.criterion!r}, not by {measured}")
-    judged = [limit for limit in limits if wall or not limit.wall]
-    missed = [limit for limit in judged if not measured[limit.name] <= limit.at_most]
-    reason = ", ".join(f"{one.name} is {measured[one.name]:g} {one.unit}".strip() for one in missed)
+    limits = [limit for limit in row.limits if long or not limit.figure.long]
+    if set(measured) != {limit.figure for limit in limits}:
+        raise ValueError(f"{row.name} is judged by {row.criterion!r}, not by {measured}")
+    judged = [limit for limit in limits if wall or not limit.figure.wall]
+    missed = [limit.figure for limit in judged if not limit.allows(measured[limit.figure])]
+    reason = ", ".join(f"{one.name} is {measured[one]:g} {one.unit}".strip() for one in missed)
     return ("FAILED" if missed else "passed"), reason
 
 
-def worst_of(fault: Fault, runs: Sequence[Measured]) -> dict[str, float]:
-    """Return the greatest of each figure."""
+def worst_of(row: FaultRow, runs: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Return the greatest value of each figure, by name; NaN is worse than any number."""
+    names = [limit.figure.name for limit in row.limits]
     return {
-        limit.name: max((measured[limit.name] for measured in runs), key=_badness)
-        for limit in fault.limits
-        if limit.name in runs[0]
+        name: max((run[name] for run in runs if name in run), key=_badness)
+        for name in names
+        if any(name in run for run in runs)
     }
 
 
 def _badness(value: float) -> float:
-    """What is no number is worse than any."""
     return math.inf if math.isnan(value) else value
 
 
-def in_words(fault: Fault, worst: Mapping[str, float]) -> str:
-    """`brakes after 5 ticks, travel 0.06 m`."""
-    shown = (limit for limit in fault.limits if limit.name in worst)
+def in_words(row: FaultRow, worst: Mapping[str, float]) -> str:
+    """Return `brakes after 5 ticks, travel 0.06 m`."""
+    shown = (limit.figure for limit in row.limits if limit.figure.name in worst)
     return ", ".join(f"{one.name} {worst[one.name]:.3g} {one.unit}".strip() for one in shown)

@@ -1,4 +1,10 @@
-"""Runs fault tests, one after the other, those that share a robot together."""
+"""Runs fault tests one after the other, those that share a robot together, and judges them.
+
+Speeds are 0.26 m/s unless a row says otherwise. Times are the robot's own (ticks of 20 ms) or the
+simulation's; those marked `wall` are wall time. Travel and contacts are the physics' truth. A body
+that brakes at 1 m/s2 from 0.26 m/s is at rest 260 ms later, and its own lag adds 100 ms: so much
+later than it brakes it is at zero. No run that counts may exceed a limit.
+"""
 
 import asyncio
 import contextlib
@@ -9,85 +15,131 @@ from types import MappingProxyType
 from typing import get_args
 
 import msgspec
+from msgspec import Struct
 
-from gigabrain_zenoh.errors import GigabrainError
-from gigabrain_zenoh.plugins import find
-from gigabrain_zenoh.qa.faults.disturbance import DISTURBED_MS, RunQueueWatch
-from gigabrain_zenoh.qa.faults.fault import (
-    Fault,
-    Measured,
-    Result,
-    Skipped,
-    Stage,
-    Test,
-    Try,
-    conclude,
-    judge,
+from gigabrain_zenoh.errors import ConfigError, GigabrainError, unknown
+from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.host.files import read_bounded
+from gigabrain_zenoh.qa.faults.fault import FaultResult, FaultRow, FaultRun, Stage, conclude, judge
+from gigabrain_zenoh.qa.faults.rig.rig import Options, Rig
+from gigabrain_zenoh.qa.faults.rows import (
+    body_line,
+    clocks,
+    deaths,
+    estop,
+    extreme_messages,
+    goal_recovery,
+    load,
+    network,
+    obstacles,
+    other_clients,
+    processes,
+    reversals,
+    security,
+    sensors,
+    values,
 )
-from gigabrain_zenoh.qa.faults.rig import Options, Rig
+from gigabrain_zenoh.qa.judging import Skipped
 
-PATIENCE = 3  # disturbed runs at most, passed or failed, beside each that counts
+MAX_DISTURBED = 3  # disturbed runs for each that counts, passed or failed
 LIMIT_S = 300.0  # for one run of one test in its short form
 STAGES = get_args(Stage)
+POLL_S = 0.1
+DISTURBED_MS = 30.0  # of 100: a tick and a half in which a part of the robot could not run
+MAX_FILE_BYTES = 100_000_000
+# names before 0.2.0; accepted for one release
+OLD_NAMES = {
+    "one-part-of-decision-hangs": "decision-loop-hangs",
+    "cpu-hogs": "busy-machine",
+    "goal-goes-on": "goal-recovery",
+    "map-goes-on": "map-recovery",
+    "frozen-for-ever": "frozen-until-restarted",
+    "one-message": "extreme-messages",
+}
 
-Begun = Callable[[Fault], None]
-Ended = Callable[[Fault, Try], None]
-Earlier = Mapping[int, Sequence[Try]]
+RowBegun = Callable[[FaultRow], None]
+RunEnded = Callable[[FaultRow, FaultRun], None]
+EarlierRuns = Mapping[int, Sequence[FaultRun]]
+
+
+MODULES = (
+    body_line, clocks, deaths, estop, extreme_messages, goal_recovery, load, network, obstacles,
+    other_clients, processes, reversals, security, sensors, values,
+)  # fmt: skip
+FAULTS: tuple[FaultRow, ...] = tuple(
+    sorted((row for one in MODULES for row in one.ROWS), key=lambda row: row.number)
+)
+
+
+def choose(wanted: Iterable[str]) -> tuple[FaultRow, ...]:
+    """Return the rows with these numbers or names, in order; all without any.
+
+    Raises UnknownName.
+    """
+    names = {row.name: row for row in FAULTS}
+    numbers = {str(row.number): row for row in FAULTS}
+    chosen = set()
+    for text in wanted:
+        found = numbers.get(text) or names.get(OLD_NAMES.get(text, text))
+        if not found:
+            raise unknown(f"fault (a name, or a number from 1 to {len(FAULTS)})", text, names)
+        chosen.add(found.number)
+    return tuple(row for row in FAULTS if not chosen or row.number in chosen)
 
 
 async def run_suite(
-    faults: Iterable[Fault],
+    rows: Iterable[FaultRow],
     options: Options,
     folder: Path,
     repeat: int = 1,
-    begun: Begun = lambda fault: None,
-    ended: Ended = lambda fault, one: None,
-    earlier: Earlier = MappingProxyType({}),
-) -> list[Result]:
-    """Run every fault until `repeat` runs of it count; the results in the table's order.
+    begun: RowBegun = lambda row: None,
+    ended: RunEnded = lambda row, run: None,
+    earlier: EarlierRuns = MappingProxyType({}),
+) -> list[FaultResult]:
+    """Run every row until `repeat` runs of it count; returns the results in order.
 
-    `earlier` are runs of before, by the fault's number: they count like those of now.
+    `earlier` are previous runs, by the row's number: they count like new ones.
     """
-    ordered = sorted(faults, key=lambda fault: (STAGES.index(fault.stage), fault.number))
+    ordered = sorted(rows, key=lambda row: (STAGES.index(row.stage), row.number))
     results = []
     async with Rig(options, folder) as rig:
-        for fault in ordered:
-            begun(fault)
-            before = earlier.get(fault.number, ())
-            results.append(conclude(fault, await _tries(fault, rig, repeat, ended, before)))
+        for row in ordered:
+            begun(row)
+            before = earlier.get(row.number, ())
+            results.append(conclude(row, await _runs(row, rig, repeat, ended, before)))
     return sorted(results, key=lambda result: result.number)
 
 
-async def _tries(
-    fault: Fault, rig: Rig, repeat: int, ended: Ended, before: Sequence[Try]
-) -> list[Try]:
-    """Run one fault; a run that was disturbed is followed by another, whatever came of it.
+async def _runs(
+    row: FaultRow, rig: Rig, repeat: int, ended: RunEnded, before: Sequence[FaultRun]
+) -> list[FaultRun]:
+    """Run one row; a disturbed run is followed by another, passed or failed.
 
-    A long form counts in any case: in an hour some thread always waits for a core for a while.
+    A long form always counts: within an hour some thread always waits for a core for a while.
     """
-    tries, disturbed = list(before), sum(one.disturbed for one in before)
-    while len(tries) - disturbed < repeat and disturbed < PATIENCE * repeat:
-        tries.append(await _try(fault, rig))
-        ended(fault, tries[-1])
-        disturbed += tries[-1].disturbed
-        if tries[-1].verdict == "skipped":
+    runs, disturbed = list(before), sum(one.disturbed for one in before)
+    while len(runs) - disturbed < repeat and disturbed < MAX_DISTURBED * repeat:
+        runs.append(await _run(row, rig))
+        ended(row, runs[-1])
+        disturbed += runs[-1].disturbed
+        if runs[-1].verdict == "skipped":
             break
-    return tries
+    return runs
 
 
-async def _try(fault: Fault, rig: Rig) -> Try:
+async def _run(row: FaultRow, rig: Rig) -> FaultRun:
     loop, watch = asyncio.get_running_loop(), RunQueueWatch(lambda: ("self", *rig.pids()))
     watch.start()
     began_s = loop.time()
     try:
         with uncollected():
-            judged = await _judged(fault, rig)
+            judged = await _judged(row, rig)
     finally:
         watch.close()
     return msgspec.structs.replace(
         judged,
         waited_ms=round(watch.longest_ms, 1),
-        disturbed=watch.longest_ms >= DISTURBED_MS and not (fault.loads or rig.long),
+        disturbed=watch.longest_ms >= DISTURBED_MS and not (row.loads or rig.long),
         seconds=round(loop.time() - began_s, 1),
     )
 
@@ -96,8 +148,8 @@ async def _try(fault: Fault, rig: Rig) -> Try:
 def uncollected() -> Iterator[None]:
     """Collect garbage before the block, and none in it.
 
-    The suite is the network and the people of its robots. One collection of all that it remembers
-    took 35 ms and more, and what it held up was taken for a fault of the robot.
+    The suite plays the network and the operators. One collection of all its objects took 35 ms and
+    more, and that delay was taken for a fault of the robot.
     """
     gc.collect()
     gc.disable()
@@ -107,27 +159,105 @@ def uncollected() -> Iterator[None]:
         gc.enable()
 
 
-async def _judged(fault: Fault, rig: Rig) -> Try:
-    """One run. The robot of one that failed is used no more."""
+async def _judged(row: FaultRow, rig: Rig) -> FaultRun:
+    """Run one test and judge it. The robot of a failed run is not used again."""
     try:
-        measured = await _run(fault, rig)
+        async with asyncio.timeout(None if rig.long else LIMIT_S):
+            measured = await row.test(rig)
+            await rig.check()
     except Skipped as error:
-        return Try(verdict="skipped", reason=str(error))
+        return FaultRun(verdict="skipped", reason=str(error))
     except (GigabrainError, TimeoutError) as error:
         await rig.give_up()
-        return Try(verdict="FAILED", reason=str(error) or f"not over after {LIMIT_S:g} s")
-    verdict, reason = judge(fault, measured, wall=rig.options.wall, long=rig.long)
-    return Try(verdict=verdict, reason=reason, measured=dict(measured))
+        return FaultRun(verdict="FAILED", reason=str(error) or f"not over after {LIMIT_S:g} s")
+    verdict, reason = judge(row, measured, wall=rig.options.wall, long=rig.long)
+    by_name = {figure.name: value for figure, value in measured.items()}
+    return FaultRun(verdict=verdict, reason=reason, measured=by_name)
 
 
-async def _run(fault: Fault, rig: Rig) -> Measured:
-    test: Test = find(fault.path)
-    async with asyncio.timeout(None if rig.long else LIMIT_S):
-        measured = await test(rig)
-        await rig.check()
-    return measured
-
-
-def failed(results: Sequence[Result]) -> bool:
-    """Whether any test has failed."""
+def failed(results: Sequence[FaultResult]) -> bool:
+    """Return whether any test has failed."""
     return any(result.verdict == "FAILED" for result in results)
+
+
+class RunQueueWatch:
+    """Measures the longest that one thread of some processes has waited for a core within 0.1 s.
+
+    A core that a virtual machine's host gave to others counts as a thread that waited for it. A
+    delay of this program's own event loop counts too: it plays the network and the operators.
+    """
+
+    def __init__(self, processes: Callable[[], Iterable[int | str]]) -> None:
+        self._processes = processes
+        self._before: dict[tuple[int | str, str], int] = {}
+        self._task: asyncio.Task[None] | None = None
+        self.longest_ms = 0.0
+
+    def start(self) -> None:
+        """Begin to look, ten times a second."""
+        self._task = asyncio.create_task(self._watch())
+
+    def close(self) -> None:
+        """Stop looking."""
+        if self._task:
+            self._task.cancel()
+
+    def look(self) -> None:
+        """Compare with the last look; threads that are new since then are not judged."""
+        now = {
+            (process, thread): waited_ns
+            for process in self._processes()
+            for thread, waited_ns in this_process.waited_ns_by_thread(process).items()
+        }
+        now |= {
+            ("host", core): stolen_ns
+            for core, stolen_ns in this_process.stolen_ns_by_core().items()
+        }
+        waits = (waited - self._before.get(thread, waited) for thread, waited in now.items())
+        self.longest_ms = max(self.longest_ms, max(waits, default=0) / 1e6)
+        self._before = now
+
+    async def _watch(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            self.look()
+            due_s = loop.time() + POLL_S
+            await asyncio.sleep(POLL_S)
+            self.longest_ms = max(self.longest_ms, (loop.time() - due_s) * 1e3)
+
+
+class RunLine(Struct, frozen=True, kw_only=True):
+    """One line of a file of runs."""
+
+    number: int
+    name: str
+    options: Options
+    run: FaultRun
+
+
+_line = msgspec.json.Decoder(RunLine)
+
+
+class RunsFile:
+    """Appends runs to a file, and reads those that were made with the same options."""
+
+    def __init__(self, path: Path, options: Options) -> None:
+        self._path, self._options = path, options
+
+    def read(self) -> dict[int, Sequence[FaultRun]]:
+        """Return the runs in the file, by the row's number. Raises ConfigError."""
+        runs: dict[int, list[FaultRun]] = {}
+        try:
+            text = read_bounded(self._path, MAX_FILE_BYTES) if self._path.exists() else b""
+            for line in map(_line.decode, text.splitlines()):
+                if line.options == self._options:
+                    runs.setdefault(line.number, []).append(line.run)
+        except (OSError, msgspec.MsgspecError) as error:
+            raise ConfigError(f"cannot continue {self._path}: {error}") from None
+        return dict(runs)
+
+    def append(self, row: FaultRow, run: FaultRun) -> None:
+        """Append one run."""
+        line = RunLine(number=row.number, name=row.name, options=self._options, run=run)
+        with self._path.open("ab") as file:
+            file.write(msgspec.json.encode(line) + b"\n")

@@ -1,5 +1,7 @@
-"""What may be wrong with a link, and how people write it down."""
+"""Faults of a link, how they are written, and what they do to its bytes."""
 
+import math
+import random
 from typing import Annotated, Literal, TypeVar
 
 import msgspec
@@ -33,7 +35,7 @@ class Chaos(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 CALM = Chaos()
 
 
-class Told(Struct, frozen=True, kw_only=True):
+class ProxyCommand(Struct, frozen=True, kw_only=True):
     """What a line of words asks of a proxy."""
 
     ways: tuple[Way, ...] = ()
@@ -46,20 +48,20 @@ class Told(Struct, frozen=True, kw_only=True):
 COMMANDS = ("cut", "cut=rst", "unplug", "plug", "figures", "off", *WAYS)
 
 
-def told(line: str) -> Told:
+def parse_command(line: str) -> ProxyCommand:
     """What `[up|down] FAULT[=VALUE] ...`, `cut`, `unplug`, `plug`, `figures` or `off` asks for.
 
     Raises ConfigError naming what there is.
     """
     words = line.split()
     if words in (["cut"], ["cut=fin"], ["cut=rst"]):
-        return Told(cut="rst" if words == ["cut=rst"] else "fin")
+        return ProxyCommand(cut="rst" if words == ["cut=rst"] else "fin")
     if words in (["unplug"], ["plug"]):
-        return Told(unplugged=words == ["unplug"])
+        return ProxyCommand(unplugged=words == ["unplug"])
     if words == ["figures"]:
-        return Told(figures=True)
+        return ProxyCommand(figures=True)
     ways = tuple(way for way in WAYS if words[:1] == [way])
-    return Told(ways=ways or WAYS, chaos=of_words(words[len(ways) :], Chaos, COMMANDS))
+    return ProxyCommand(ways=ways or WAYS, chaos=of_words(words[len(ways) :], Chaos, COMMANDS))
 
 
 def of_words(words: list[str], kind: type[S], others: tuple[str, ...] = ()) -> S:
@@ -72,3 +74,96 @@ def of_words(words: list[str], kind: type[S], others: tuple[str, ...] = ()) -> S
         return msgspec.convert({n: v or "true" for n, v in values.items()}, kind, strict=False)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{' '.join(words)!r}: {error}") from None
+
+
+LONGEST_GARBAGE = 64  # bytes
+RESENT_S = 0.2  # the least time after which Linux sends a lost segment again
+HALVES_S = 0.002  # between the halves of a piece
+FAR = 1e15  # bytes
+SMALLEST_S = 0.02  # a throttled line hands bytes on in pieces of so long
+
+
+class WayCounters(Struct, kw_only=True):
+    """What came of one way of a link since the proxy was made."""
+
+    taken: int = 0  # bytes from the sender
+    handed_on: int = 0  # bytes to the receiver, damaged ones and garbage included
+    waiting: int = 0  # bytes that were taken and not yet handed on
+    flipped: int = 0  # bits
+    dropped: int = 0  # bytes
+    garbage: int = 0  # bytes
+    late: int = 0  # pieces that were lost and sent again
+
+
+class LinkDamage:
+    """One way of one connection: pieces in, damaged pieces and their times of arrival out."""
+
+    def __init__(self, chance: random.Random, figures: WayCounters) -> None:
+        self._chance, self.figures = chance, figures
+        self._newest_s = 0.0  # when the last piece arrives; none overtakes it
+        self._free_s = 0.0  # when a throttled line is free again
+        self._rate = 0.0  # chance of a flipped bit for which the next line was drawn
+        self._clean = 0  # bytes until the next flipped bit
+
+    def damaged(self, data: bytes, chaos: Chaos, now_s: float) -> list[tuple[float, bytes]]:
+        """`data`, taken at `now_s`, as pieces with the time [s] at which each arrives."""
+        self.figures.taken += len(data)
+        if self._happens(chaos.drop):
+            self.figures.dropped += len(data)
+            return []
+        if self._happens(chaos.garbage):
+            noise = self._chance.randbytes(self._chance.randint(1, LONGEST_GARBAGE))
+            self.figures.garbage += len(noise)
+            data = noise + data
+        data = self._flipped(data, chaos.corrupt)
+        arrival_s = now_s + (chaos.delay_ms + self._chance.random() * chaos.jitter_ms) / 1e3
+        if self._happens(chaos.loss):
+            self.figures.late += 1
+            arrival_s += RESENT_S
+        half = len(data) // 2
+        if half and self._happens(chaos.split):
+            return [
+                *self._sent(data[:half], chaos, arrival_s),
+                *self._sent(data[half:], chaos, arrival_s + HALVES_S),
+            ]
+        return self._sent(data, chaos, arrival_s)
+
+    def _sent(self, data: bytes, chaos: Chaos, arrival_s: float) -> list[tuple[float, bytes]]:
+        """In order, as fast as the line is, and as merged as it is."""
+        size = max(1, int(chaos.bytes_s * SMALLEST_S)) if chaos.bytes_s else len(data)
+        pieces = []
+        for start in range(0, len(data), size):
+            piece = data[start : start + size]
+            due_s = max(arrival_s, self._newest_s)
+            if chaos.bytes_s:
+                self._free_s = max(due_s, self._free_s) + len(piece) / chaos.bytes_s
+                due_s = self._free_s
+            if chaos.merge_ms:
+                slot_s = chaos.merge_ms / 1e3
+                due_s = max(due_s, math.ceil(due_s / slot_s) * slot_s)
+            self._newest_s = due_s
+            pieces.append((due_s, piece))
+        return pieces
+
+    def _flipped(self, data: bytes, rate: float) -> bytes:
+        if rate != self._rate:
+            self._rate, self._clean = rate, self._drawn(rate)
+        if not rate:
+            return data
+        noisy = bytearray(data)
+        while self._clean < len(noisy):
+            noisy[self._clean] ^= 1 << self._chance.randrange(8)
+            self.figures.flipped += 1
+            self._clean += 1 + self._drawn(rate)
+        self._clean -= len(noisy)
+        return bytes(noisy)
+
+    def _drawn(self, rate: float) -> int:
+        """How many bytes arrive whole before one that does not."""
+        if rate in (0.0, 1.0):
+            return 0
+        least = 1.0 - self._chance.random()  # in (0, 1]
+        return int(min(FAR, math.log(least) / math.log1p(-rate)))
+
+    def _happens(self, chance: float) -> bool:
+        return chance > 0 and self._chance.random() < chance

@@ -15,8 +15,8 @@ from gigabrain_drivers.lidars.ld.source import Ld19
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.geometry.limits import limits_of, ramp
-from gigabrain_zenoh.qa.line_proxy import LineProxy
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
+from gigabrain_zenoh.qa.proxy.serial import LineProxy
 from gigabrain_zenoh.safety import lag
 from gigabrain_zenoh.testing.line import EmulatedLine
 from gigabrain_zenoh.testing.waiting import until

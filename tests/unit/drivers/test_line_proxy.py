@@ -12,8 +12,8 @@ from gigabrain_drivers.emulators.tcp import TcpPort
 from gigabrain_drivers.links.address import AddressLink
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.qa.line_proxy import LineProxy, in_front_of
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
+from gigabrain_zenoh.qa.proxy.serial import LineProxy, in_front_of
 from gigabrain_zenoh.testing.waiting import until
 
 

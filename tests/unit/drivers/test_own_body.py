@@ -19,9 +19,9 @@ from gigabrain_drivers.sim.scene import compile_scene
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.qa.conformance import timing
-from gigabrain_zenoh.qa.conformance.result import Failed
-from gigabrain_zenoh.qa.conformance.subject import Subject
+from gigabrain_zenoh.qa.conformance import gate_checks
+from gigabrain_zenoh.qa.conformance.robot import CheckedRobot
+from gigabrain_zenoh.qa.judging import Failed
 from gigabrain_zenoh.testing.samples import state
 
 MINE = robot_path("mycustombot")
@@ -50,7 +50,7 @@ def test_a_body_without_physics_is_not_said_to_be_emulated(tmp_path: Path) -> No
     own = mine(tmp_path, ("sim: {driver: mujoco, battery_capacity: 10.0}", "sim: {driver: mock}"))
     assert links_of(load_robot(own)) == ["sim", "real"]
     with pytest.raises(ConfigError, match="has no link 'emulated'; it has: sim, real"):
-        Subject(own, "emulated", tmp_path)
+        CheckedRobot(own, "emulated", tmp_path)
 
 
 def test_a_lidar_without_a_source_is_refused_with_file_and_line(tmp_path: Path) -> None:
@@ -67,12 +67,12 @@ async def test_a_lidar_that_never_scans_is_told_apart_from_a_busy_machine() -> N
     rig: Any = SimpleNamespace(
         robot=SimpleNamespace(lidar=lidar), until=in_vain, state=state(1), scan=None, states=350
     )
-    found = await timing.reports(rig)
+    found = await gate_checks.reports(rig)
     assert not found.ok
     assert "no scan within 350 ticks, though `lidar:` is in the robot's file" in found.measured
     rig.states = 100  # of 350: the machine had no time
     with pytest.raises(Failed, match="no state and scan within 350 ticks"):
-        await timing.reports(rig)
+        await gate_checks.reports(rig)
 
 
 @pytest.mark.parametrize("sign", [1, -1])

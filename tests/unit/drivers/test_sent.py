@@ -17,8 +17,8 @@ from gigabrain_drivers.kinematics import Twist, base_of
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
-from gigabrain_zenoh.qa.faults.fault import Failed
-from gigabrain_zenoh.qa.faults.reversals import let_through, over, told_over
+from gigabrain_zenoh.qa.faults.rows.reversals import commanded_over, let_through, over
+from gigabrain_zenoh.qa.judging import Failed
 from gigabrain_zenoh.testing.samples import DRIVING, state
 
 BODIES = ["alpha", "mock", "mycustombot", "turtlebot3_burger", "turtlebot3_waffle"]
@@ -98,12 +98,12 @@ def test_the_fault_suite_goes_by_what_was_sent_turning_included() -> None:
     beyond = Velocity(linear_x=0.018, angular_z=2.366)  # what a clamp in the driver made of it
     fast = Velocity(linear_x=0.2)
     gap = replace(told(fast)[0], tick=90)
-    assert told_over(BURGER, [*told(turning, within), gap]) == pytest.approx(0.0, abs=1e-6)
-    assert told_over(BURGER, [*told(turning, beyond), gap]) == pytest.approx(290.0)
+    assert commanded_over(BURGER, [*told(turning, within), gap]) == pytest.approx(0.0, abs=1e-6)
+    assert commanded_over(BURGER, [*told(turning, beyond), gap]) == pytest.approx(290.0)
     shut = replace(told(beyond)[0], tick=2, gate=replace(DRIVING, mode="stopping"))
-    assert told_over(BURGER, [*told(turning), shut, gap, replace(gap, tick=91)]) == 0.0
+    assert commanded_over(BURGER, [*told(turning), shut, gap, replace(gap, tick=91)]) == 0.0
 
 
 def test_the_fault_suite_judges_no_body_that_stood_still() -> None:
-    with pytest.raises(Failed, match=r"told 0.20 m/s, 0.00 rad/s at most"):
-        told_over(BURGER, told(Velocity(linear_x=0.2), Velocity(linear_x=0.2)))
+    with pytest.raises(Failed, match=r"0.20 m/s and 0.00 rad/s at most"):
+        commanded_over(BURGER, told(Velocity(linear_x=0.2), Velocity(linear_x=0.2)))

@@ -24,7 +24,7 @@ from gigabrain_zenoh.cli import driver_kit
 from gigabrain_zenoh.cli.driver_kit import trace
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.conformance import kit
-from gigabrain_zenoh.qa.trace import run
+from gigabrain_zenoh.qa.conformance.authoring import trace_line
 from gigabrain_zenoh.testing.line import BARE, bench
 
 LINE = Template("V,{linear_x:.3f},{angular_z|deg/s:.1f}\n", COMMAND)
@@ -113,7 +113,7 @@ def test_a_command_is_told_as_received_and_as_converted() -> None:
 
 async def test_a_trace_shows_both_ways_and_leaves_the_log_as_it_was(tmp_path: Path) -> None:
     before, lines = (links.log.level, list(links.log.handlers)), list[str]()
-    await run(
+    await trace_line(
         "mycustombot",
         "emulated",
         tmp_path,
@@ -142,7 +142,7 @@ async def test_the_log_has_the_same_lines_at_debug_level(
 
 async def test_a_real_body_is_not_moved_by_a_trace(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="not moved without its gate"):
-        await run(
+        await trace_line(
             "mycustombot",
             "real",
             tmp_path,
@@ -157,7 +157,7 @@ async def test_a_trace_says_whether_anything_was_received(tmp_path: Path) -> Non
     text = BARE.replace("{port}", str(tmp_path / "nothing"))
     (tmp_path / "robot.yaml").write_text(text)
     name, said = str(tmp_path / "robot.yaml"), list[str]()
-    received = await run(
+    received = await trace_line(
         name, "real", tmp_path, part="base", seconds=0.1, wanted=Velocity(), say=said.append
     )
     assert not received

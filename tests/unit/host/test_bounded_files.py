@@ -28,8 +28,8 @@ from gigabrain_zenoh.diagnostics import log_reading
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapping import arrays_file, map_file
 from gigabrain_zenoh.qa.bench import slam_logs
-from gigabrain_zenoh.qa.faults.rig import Options
-from gigabrain_zenoh.qa.faults.tries_file import TriesFile
+from gigabrain_zenoh.qa.faults.rig.rig import Options
+from gigabrain_zenoh.qa.faults.suite import RunsFile
 from gigabrain_zenoh.recording.bag_reader import MAGIC, Bag, BagDamage, read_records
 from gigabrain_zenoh.runtime import audit
 from gigabrain_zenoh.runtime.deployment import Deployment, load_deployment
@@ -100,7 +100,7 @@ def read_audit(path: Path) -> object:
 
 
 def read_tries(path: Path) -> object:
-    return TriesFile(path, Options()).read()
+    return RunsFile(path, Options()).read()
 
 
 def read_secret(path: Path) -> object:

@@ -18,8 +18,8 @@ from gigabrain_zenoh.navigation.rating import NO_DISC, Weights
 from gigabrain_zenoh.navigation.rollout import AWAY, CLOSE, COSINE, LANES, STATE, X
 from gigabrain_zenoh.navigation.window import Window
 from gigabrain_zenoh.navigation.window_cells import Place
-from gigabrain_zenoh.qa.bench.barn_drive import drive
-from gigabrain_zenoh.qa.bench.barn_worlds import Moving, World
+from gigabrain_zenoh.qa.bench.barn import drive_functions
+from gigabrain_zenoh.qa.bench.barn_course import BarnWorld, MovingDisc
 from gigabrain_zenoh.qa.bench.plant import HARD, JACKAL
 from tests.unit.navigation.drives import OMNI, WAFFLE, wall
 
@@ -143,14 +143,14 @@ def test_what_moves_takes_its_hits_along_and_a_wall_beside_it_stays() -> None:
 
 def test_a_stream_of_quick_discs_is_crossed_on_the_hard_plant() -> None:
     lanes = [
-        Moving(8.0, np.array([(0.0, 3.0 + i % 2, s * 6.4), (8.0, 3.0 + i % 2, -s * 6.4)]), 0.5)
+        MovingDisc(8.0, np.array([(0.0, 3.0 + i % 2, s * 6.4), (8.0, 3.0 + i % 2, -s * 6.4)]), 0.5)
         for i, s in enumerate((1.0, -1.0))
     ]
     later = [
-        Moving(8.0, np.roll(lane.keys, 0, axis=0) + np.array((0.0, 2.5, 0.0)), 0.5)
+        MovingDisc(8.0, np.roll(lane.keys, 0, axis=0) + np.array((0.0, 2.5, 0.0)), 0.5)
         for lane in lanes
     ]
-    world = World(5, np.empty((0, 3)), (*lanes, *later), (0.0, 0.0, 0.0), (9.0, 0.0), 9.0)
-    trial = drive(world, 0, HARD, 200)
+    world = BarnWorld(5, np.empty((0, 3)), (*lanes, *later), (0.0, 0.0, 0.0), (9.0, 0.0), 9.0)
+    trial = drive_functions(world, 0, HARD, 200)
     assert trial.result == "success"
     assert trial.least_clearance > 0.02

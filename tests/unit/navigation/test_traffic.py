@@ -15,8 +15,8 @@ from gigabrain_zenoh.navigation.footprint import distance_at
 from gigabrain_zenoh.navigation.local import Goal, LocalPlan, LocalPlanner, LocalSettings, Moment
 from gigabrain_zenoh.navigation.traffic import EVERY_TICKS, Traffic
 from gigabrain_zenoh.navigation.window import Place, Window
-from gigabrain_zenoh.qa.bench.barn_drive import drive
-from gigabrain_zenoh.qa.bench.barn_worlds import Moving, World
+from gigabrain_zenoh.qa.bench.barn import drive_functions
+from gigabrain_zenoh.qa.bench.barn_course import BarnWorld, MovingDisc
 from gigabrain_zenoh.qa.bench.plant import HARD, JACKAL
 
 NOTHING = np.empty((0, 2))
@@ -46,7 +46,7 @@ def test_what_is_compiled_before_it_drives_is_all_that_it_will_call() -> None:
     kernels: list[Any] = [traffic._watch, traffic._pass]
     kernels += [cost_to_go._make_dearer, cost_to_go._seed_rim]
     before = [len(kernel.signatures) for kernel in kernels]
-    drive(crowd(), 0, HARD, 64)
+    drive_functions(crowd(), 0, HARD, 64)
     assert [len(kernel.signatures) for kernel in kernels] == before
     assert 0 not in before
 
@@ -146,19 +146,21 @@ def test_where_things_move_it_looks_longer_and_makes_way_for_what_comes() -> Non
     assert math.hypot(makes_way.trajectory[-1].x, makes_way.trajectory[-1].y) < 3.0
 
 
-def crowd() -> World:
+def crowd() -> BarnWorld:
     """Ten discs that go to and fro between a Jackal and its goal."""
     rows = [3.0 + 1.5 * i for i in range(5)]
     times = np.array([0.0, 4.0, 8.0])
     movers = tuple(
-        Moving(8.0, np.column_stack((times, np.full(3, x), s * np.array([3.4, -3.4, 3.4]))), 0.5)
+        MovingDisc(
+            8.0, np.column_stack((times, np.full(3, x), s * np.array([3.4, -3.4, 3.4]))), 0.5
+        )
         for k, x in enumerate(rows)
         for s in ((1.0, -1.0) if k % 2 else (-1.0, 1.0))
     )
-    return World(3, np.empty((0, 3)), movers, (0.0, 0.0, 0.0), (13.0, 0.0), 13.0)
+    return BarnWorld(3, np.empty((0, 3)), movers, (0.0, 0.0, 0.0), (13.0, 0.0), 13.0)
 
 
 def test_it_goes_round_a_crowd() -> None:
-    trial = drive(crowd(), 0, HARD, 200)
+    trial = drive_functions(crowd(), 0, HARD, 200)
     assert trial.result == "success"
     assert trial.least_clearance > 0.3

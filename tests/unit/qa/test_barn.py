@@ -9,23 +9,23 @@ import pytest
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.qa.bench import barn_nodes
-from gigabrain_zenoh.qa.bench.barn_drive import drive
-from gigabrain_zenoh.qa.bench.barn_worlds import Moving, World, choose, read_worlds
-from gigabrain_zenoh.qa.bench.jackal import Jackal
-from gigabrain_zenoh.qa.bench.plant import HARD, IDEAL, LIDAR, MUJOCO, Conditions, Plant
+from gigabrain_zenoh.qa.bench import barn
+from gigabrain_zenoh.qa.bench.barn import drive_functions
+from gigabrain_zenoh.qa.bench.barn_course import BarnWorld, MovingDisc, choose_worlds, read_worlds
+from gigabrain_zenoh.qa.bench.jackal import MujocoJackal
+from gigabrain_zenoh.qa.bench.plant import HARD, IDEAL, LIDAR, MUJOCO, Conditions, KinematicJackal
 
 NONE = np.empty((0, 3))
 QUICK = 128  # plans per cycle
 
 
-def field(posts: np.ndarray) -> World:
-    return World(7, posts, (), (0.0, 0.0, 0.0), (4.0, 0.0), 4.0)
+def field(posts: np.ndarray) -> BarnWorld:
+    return BarnWorld(7, posts, (), (0.0, 0.0, 0.0), (4.0, 0.0), 4.0)
 
 
 def test_the_hard_plant_answers_after_its_delay_and_then_with_its_lag() -> None:
     calm = Conditions(slip=1.0, drift=0.0)
-    plant, speeds = Plant(calm, (0.0, 0.0, 0.0), 1), []
+    plant, speeds = KinematicJackal(calm, (0.0, 0.0, 0.0), 1), []
     for _ in range(13):
         plant.tick(Velocity(linear_x=0.6))
         speeds.append(plant.v)
@@ -35,7 +35,7 @@ def test_the_hard_plant_answers_after_its_delay_and_then_with_its_lag() -> None:
 
 
 def test_the_floor_lets_through_part_of_a_turn_and_the_odometry_drifts() -> None:
-    plant = Plant(HARD, (0.0, 0.0, 0.0), 5)
+    plant = KinematicJackal(HARD, (0.0, 0.0, 0.0), 5)
     for _ in range(200):
         plant.tick(Velocity(linear_x=0.5, angular_z=0.3))
     assert 0.6 <= plant.w / 0.3 <= 1.0
@@ -44,7 +44,7 @@ def test_the_floor_lets_through_part_of_a_turn_and_the_odometry_drifts() -> None
 
 
 def test_clearance_is_exact() -> None:
-    plant = Plant(IDEAL, (0.0, 0.0, math.pi / 2), 1)
+    plant = KinematicJackal(IDEAL, (0.0, 0.0, math.pi / 2), 1)
     assert plant.clearance(np.array([(0.0, 0.5, 0.1)])) == pytest.approx(0.5 - 0.229 - 0.1)
     assert plant.clearance(np.array([(0.5, 0.0, 0.1)])) == pytest.approx(0.5 - 0.208 - 0.1)
     corner = math.hypot(0.4 - 0.208, 0.4 - 0.229) - 0.1
@@ -55,7 +55,7 @@ def test_clearance_is_exact() -> None:
 
 def test_a_beam_ends_at_the_first_disc_in_its_way() -> None:
     still = Conditions(noise=0.0, dropouts=0.0)
-    plant = Plant(still, (0.0, 0.0, 0.0), 1)
+    plant = KinematicJackal(still, (0.0, 0.0, 0.0), 1)
     seen = plant.scan(LIDAR, np.array([(2.055, 0.0, 0.5), (4.0, 0.0, 0.5), (0.055, 3.0, 0.1)]))
     middle = seen[359:361]
     assert middle == pytest.approx([1.5, 1.5], abs=1e-4)
@@ -66,46 +66,46 @@ def test_a_beam_ends_at_the_first_disc_in_its_way() -> None:
 
 
 def test_a_free_way_is_driven_in_the_time_of_full_marks() -> None:
-    trial = drive(field(NONE), 0, HARD, QUICK)
+    trial = drive_functions(field(NONE), 0, HARD, QUICK)
     assert (trial.result, trial.score) == ("success", 0.5)
     assert trial.least_clearance == math.inf
-    again = drive(field(NONE), 0, HARD, QUICK)
+    again = drive_functions(field(NONE), 0, HARD, QUICK)
     assert again.seconds == trial.seconds
 
 
 def test_posts_are_gone_round_on_the_hard_plant() -> None:
     posts = np.array([(2.0, 0.1 * i, 0.075) for i in range(-4, 5)])
-    trial = drive(field(posts), 0, HARD, QUICK)
+    trial = drive_functions(field(posts), 0, HARD, QUICK)
     assert trial.result == "success"
     assert 0.0 < trial.least_clearance < 0.6
 
 
 def test_a_contact_ends_a_trial() -> None:
-    trial = drive(field(np.array([(0.25, 0.0, 0.075)])), 0, HARD, QUICK)
+    trial = drive_functions(field(np.array([(0.25, 0.0, 0.075)])), 0, HARD, QUICK)
     assert (trial.result, trial.score) == ("collision", 0.0)
 
 
 @pytest.mark.parametrize("plant", [HARD, MUJOCO])
 def test_the_robots_own_nodes_drive_a_world(plant: Conditions) -> None:
     posts = np.array([(2.0, 0.1 * i, 0.075) for i in range(-3, 4)])
-    trial = barn_nodes.drive(field(posts), 0, plant, QUICK)
+    trial = barn.drive_nodes(field(posts), 0, plant, QUICK)
     assert trial.result == "success"
     assert 0.03 < trial.least_clearance < 0.6
 
 
 def test_driven_again_by_its_nodes_a_trial_is_the_same() -> None:
     posts = np.array([(1.5, 0.3, 0.075), (1.5, -0.5, 0.075)])
-    one = barn_nodes.drive(field(posts), 1, HARD, QUICK)
+    one = barn.drive_nodes(field(posts), 1, HARD, QUICK)
     assert one.result == "success"
-    assert barn_nodes.drive(field(posts), 1, HARD, QUICK) == one
+    assert barn.drive_nodes(field(posts), 1, HARD, QUICK) == one
 
 
-def jackal(*posts: tuple[float, float, float]) -> Jackal:
+def jackal(*posts: tuple[float, float, float]) -> MujocoJackal:
     calm = Conditions(delay=0.1, drift=0.0, noise=0.0, dropouts=0.0, physics=True)
-    return Jackal(calm, (0.0, 0.0, 0.0), np.array(posts).reshape(-1, 3), 1)
+    return MujocoJackal(calm, (0.0, 0.0, 0.0), np.array(posts).reshape(-1, 3), 1)
 
 
-def told(body: Jackal, seconds: float, v: float, w: float) -> None:
+def told(body: MujocoJackal, seconds: float, v: float, w: float) -> None:
     for _ in range(round(seconds * 50)):
         body.tick(Velocity(linear_x=v, angular_z=w))
 
@@ -140,8 +140,8 @@ def test_in_mujoco_it_is_stopped_by_a_post_that_its_lidar_sees() -> None:
 
 
 def test_moving_discs_go_from_key_to_key_over_and_over() -> None:
-    mover = Moving(4.0, np.array([(0.0, 0.0, 1.0), (4.0, 2.0, 1.0)]), 0.5)
-    world = World(1, NONE, (mover,), (0.0, 0.0, 0.0), (1.0, 0.0), 20.0)
+    mover = MovingDisc(4.0, np.array([(0.0, 0.0, 1.0), (4.0, 2.0, 1.0)]), 0.5)
+    world = BarnWorld(1, NONE, (mover,), (0.0, 0.0, 0.0), (1.0, 0.0), 20.0)
     assert world.discs(1.0).tolist() == [[0.5, 1.0, 0.5]]
     assert world.discs(9.0).tolist() == [[0.5, 1.0, 0.5]]
 
@@ -158,12 +158,12 @@ def test_worlds_are_read_and_chosen(tmp_path: Path) -> None:
     assert worlds[0].length == pytest.approx(
         math.hypot(-2.325, 2.075) + math.hypot(2.325, 13.0 - 5.075)
     )
-    assert choose(worlds, "9") == [worlds[1]]
-    assert choose(worlds, "") == worlds
+    assert choose_worlds(worlds, "9") == [worlds[1]]
+    assert choose_worlds(worlds, "") == worlds
     with pytest.raises(ConfigError, match="no world 4 in the file; it has 2, from 3 to 9"):
-        choose(worlds, "4")
+        choose_worlds(worlds, "4")
     with pytest.raises(ConfigError, match="expected numbers like 1,7, got 'three'"):
-        choose(worlds, "three")
+        choose_worlds(worlds, "three")
 
 
 def test_a_file_that_holds_no_worlds_is_refused(tmp_path: Path) -> None:

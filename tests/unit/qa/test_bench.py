@@ -6,13 +6,16 @@ import msgspec
 import pytest
 from rich.console import Console, RenderableType
 
-from gigabrain_zenoh.qa.bench.chain import ChainResult
-from gigabrain_zenoh.qa.bench.costs import Hop
-from gigabrain_zenoh.qa.bench.estop import EstopResult, Presses
-from gigabrain_zenoh.qa.bench.first_goal import FirstGoal
-from gigabrain_zenoh.qa.bench.stack import Process, StackResult, physics_share, targets
-from gigabrain_zenoh.qa.bench.tables import chain_page, estop_page, stack_page, tools_page
-from gigabrain_zenoh.qa.bench.with_tools import Beside, Tool, ToolsResult
+from gigabrain_zenoh.qa.bench.chain import ChainResult, Hop, chain_page
+from gigabrain_zenoh.qa.bench.estop import EstopResult, PressTimes, estop_page
+from gigabrain_zenoh.qa.bench.stack import (
+    FirstGoal,
+    ProcessCost,
+    StackResult,
+    physics_share,
+    stack_page,
+    targets,
+)
 from tests.unit.qa.figures import compared, one
 
 
@@ -24,9 +27,9 @@ def stack(**changes: object) -> StackResult:
         "ready_s": 1.2,
         "physics_cpu": 0.04,
         "processes": (
-            Process(name="driver", cpu=0.125, rss_bytes=95_000_000),
-            Process(name="perception", cpu=0.025, rss_bytes=56_000_000),
-            Process(name="safety", cpu=0.0625, rss_bytes=58_500_000),
+            ProcessCost(name="driver", cpu=0.125, rss_bytes=95_000_000),
+            ProcessCost(name="perception", cpu=0.025, rss_bytes=56_000_000),
+            ProcessCost(name="safety", cpu=0.0625, rss_bytes=58_500_000),
         ),
     }
     return msgspec.convert(values | changes, StackResult)
@@ -47,7 +50,9 @@ def test_what_the_whole_robot_costs_leaves_its_physics_out() -> None:
 
 
 def test_targets_are_held_against_the_figures() -> None:
-    reached = [(t.name, round(t.value, 2), t.limit, t.ok) for t in targets(stack())]
+    reached = [
+        (t.limit.figure.name, round(t.value, 2), t.limit.at_most, t.ok) for t in targets(stack())
+    ]
     assert reached == [
         ("all ready after", 1.2, 1.5, True),
         ("CPU without physics", 17.25, 30.0, True),
@@ -60,11 +65,11 @@ def test_targets_are_held_against_the_figures() -> None:
     goal = FirstGoal(
         accepted_s=1.9, accepted_cpu_s=1.7, told="goal-1: accepted", drives_s=4.0, drives_cpu_s=5.1
     )
-    held = {target.name: target for target in targets(stack(first_goal=goal))}
+    held = {one.limit.figure.name: one for one in targets(stack(first_goal=goal))}
     assert held["first goal accepted after"].ok
-    assert not msgspec.structs.replace(held["first goal accepted after"], value=2.1).ok
+    assert not held["first goal accepted after"]._replace(value=2.1).ok
     without_mujoco = targets(stack(physics_cpu=None))
-    assert [t.name for t in without_mujoco][1:] == [
+    assert [t.limit.figure.name for t in without_mujoco][1:] == [
         "CPU without physics",
         "largest without MuJoCo (driver)",
     ]
@@ -81,7 +86,7 @@ def test_the_pages_say_it_all() -> None:
         hops=(hop,),
     )
     page = shown(chain_page(result))
-    for text in ("10 Hz", "0.70", "1.40 (≤ 1.5)", "1.67 (≤ 2)", "safety", "scan → world", "0.600"):
+    for text in ("10 Hz", "0.70", "1.40 (≤ 1.5)", "1.67 (≤ 2)", "Safety", "scan → world", "0.600"):
         assert text in page
     page = shown(stack_page(stack(ready_s=1.6)))
     for text in ("perception", "2.5%", "56 MB", "1.60 s", "over", "17.25 %"):
@@ -96,8 +101,8 @@ def test_the_pages_say_it_all() -> None:
 
 
 def test_the_page_of_the_e_stop_shows_each_figure_beside_its_target() -> None:
-    idle = Presses(name="idle", ms=(1.0, 2.0, 3.0, 49.0), travel_m=(0.031, 0.042))
-    flooded = Presses(name="flooded", ms=(60.0, 101.0), travel_m=())
+    idle = PressTimes(name="idle", ms=(1.0, 2.0, 3.0, 49.0), travel_m=(0.031, 0.042))
+    flooded = PressTimes(name="flooded", ms=(60.0, 101.0), travel_m=())
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(estop_page(EstopResult(body="mock", rounds=(idle, flooded))))
     rows = [line for line in console.export_text().splitlines() if "│" in line]
@@ -107,44 +112,3 @@ def test_the_page_of_the_e_stop_shows_each_figure_beside_its_target() -> None:
     assert [cell.strip() for cell in rows[1].split("│")[1:-1]] == [
         "flooded", "2", "60.0", "101.0 (≤ 50)", "101.0 (≤ 100)", "0.000 (≤ 0.06)",
     ]  # fmt: skip
-
-
-def beside(again_ms: tuple[float, ...] = (1.0, 2.0, 9.0)) -> ToolsResult:
-    return ToolsResult(
-        seconds=10.0,
-        recorded_hz=318.0,
-        rates=(
-            Beside(
-                rate_hz=10.0,
-                alone=(one(100, 0.6, 1.0), one(100, 0.7, 2.0), one(100, 0.8, 9.0)),
-                tools=(one(100, 0.7, 1.9), one(100, 0.8, 2.2), one(100, 0.9, 8.1)),
-                again=tuple(one(100, 0.7, p99) for p99 in again_ms),
-            ),
-        ),
-        tools=(
-            Tool(name="recorder", cpu=0.034, limit=3.0),
-            Tool(name="page", cpu=0.017, limit=2.0),
-            Tool(name="topic echo", cpu=0.05),
-        ),
-    )
-
-
-def test_what_tools_add_is_told_by_the_median_rounds() -> None:
-    assert beside().rates[0].added_p99 == pytest.approx((-10.0, 10.0, 90.0))
-    page = shown(tools_page(beside()))
-    assert "+10 % (-10 to +90)" in page
-    assert "+0 % (+0 to +0)" in page
-    assert "too noisy" not in page
-    assert "318 messages a second" in page
-    rows = [line.split() for line in page.splitlines()]
-    assert ["│", "recorder", "│", "3.4", "%", "│", "3", "%", "│"] in rows
-    assert ["│", "topic", "echo", "│", "5.0", "%", "│", "│"] in rows
-
-
-def test_a_machine_that_does_more_by_itself_is_said_to_be_too_noisy() -> None:
-    noisy = beside((1.2, 2.0, 7.2))
-    assert noisy.rates[0].noise_p99 == pytest.approx((-20.0, 0.0, 20.0))
-    assert noisy.rates[0].added_p99[1] == pytest.approx(10.0)
-    page = " ".join(shown(tools_page(noisy)).split())
-    assert "+0 % (-20 to +20)" in page
-    assert "more than that here: too noisy to judge by" in page

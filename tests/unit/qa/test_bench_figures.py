@@ -11,9 +11,8 @@ from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.diagnostics.rates import Heard, median_ms
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host.bounded import NewestValues, percentile
-from gigabrain_zenoh.qa.bench.costs import Hop, Timed
-from gigabrain_zenoh.qa.bench.figures import figures, over_rounds
-from gigabrain_zenoh.qa.bench.runs import relay_roles
+from gigabrain_zenoh.qa.bench.chain import Hop, Stopwatch, relay_roles
+from gigabrain_zenoh.qa.judging import latencies, over_rounds
 from tests.unit.qa.figures import compared, one
 
 MS = 1_000_000
@@ -53,9 +52,9 @@ def test_the_newest_values_are_those_that_came_last(
 
 
 def test_a_run_that_measured_nothing_is_no_result() -> None:
-    assert figures([0.4, 0.2, 0.3]) == one(3, 0.3, 0.4)
+    assert latencies([0.4, 0.2, 0.3]) == one(3, 0.3, 0.4)
     with pytest.raises(GigabrainError, match="nothing came back"):
-        figures([])
+        latencies([])
 
 
 def test_one_disturbed_round_does_not_count() -> None:
@@ -73,7 +72,7 @@ def test_what_a_hop_does_not_do_itself_is_the_rest() -> None:
 
 
 def test_work_is_timed_by_name_and_its_result_handed_on() -> None:
-    timed = Timed()
+    timed = Stopwatch()
     assert timed("step", lambda: 7) == 7
     assert timed.median("step") >= 0.0
     for duration_ns in (MS, 5 * MS, 2 * MS):

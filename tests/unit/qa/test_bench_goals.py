@@ -16,11 +16,18 @@ from gigabrain_schemas.topics import STATE
 from gigabrain_zenoh.cli.bench_goals import _table
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.errors import BodyLost, GigabrainError
-from gigabrain_zenoh.qa.bench import goals_sender
-from gigabrain_zenoh.qa.bench.goals import CAPACITY_AH, GoalFigures, GoalsResult, with_capacity
-from gigabrain_zenoh.qa.bench.goals_sender import Off, Sender, elsewhere
-from gigabrain_zenoh.qa.bench.group import Group
-from gigabrain_zenoh.qa.bench.growth import Growth
+from gigabrain_zenoh.qa.bench import goals
+from gigabrain_zenoh.qa.bench.goals import (
+    CAPACITY_AH,
+    GoalError,
+    GoalFigures,
+    GoalSender,
+    GoalsResult,
+    missed_by,
+    with_capacity,
+)
+from gigabrain_zenoh.qa.bench.growth import MapGrowth
+from gigabrain_zenoh.qa.robot_under_test import ProcessGroup
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.waiting import settle
 
@@ -35,7 +42,7 @@ GOOD = GoalFigures(
     explored_s=30.0,
     goals=100,
     reached=99,
-    off=(Off(0.08, None), Off(0.11, 0.05), Off(0.02, 0.1)),
+    off=(GoalError(0.08, None), GoalError(0.11, 0.05), GoalError(0.02, 0.1)),
     contacts=0,
     min_clearance_m=0.09,
     met=3,
@@ -43,7 +50,7 @@ GOOD = GoalFigures(
     seconds=1030.0,
     alone=0,
     failures=(),
-    growth=Growth(memory_mb=(), mb_an_hour=0.0, walls=()),
+    growth=MapGrowth(memory_mb=(), mb_an_hour=0.0, walls=()),
 )
 
 
@@ -55,10 +62,10 @@ def test_one_goal_in_a_hundred_may_be_missed_and_nothing_may_be_touched() -> Non
 
 
 def test_whoever_is_not_there_has_not_reached_it_whatever_it_says() -> None:
-    assert elsewhere(Off(9.8, None)) == "it said that it is there, 9.80 m from it"
-    assert elsewhere(Off(0.1, 3.0)) == "it said that it is there, turned by 172 degrees"
-    assert not elsewhere(Off(0.3, None))
-    assert not elsewhere(Off(0.3, 0.2))
+    assert missed_by(GoalError(9.8, None)) == "it said that it is there, 9.80 m from it"
+    assert missed_by(GoalError(0.1, 3.0)) == "it said that it is there, turned by 172 degrees"
+    assert not missed_by(GoalError(0.3, None))
+    assert not missed_by(GoalError(0.3, 0.2))
 
 
 async def test_a_question_that_the_host_has_slept_through_is_asked_again(
@@ -77,7 +84,7 @@ async def test_a_question_that_the_host_has_slept_through_is_asked_again(
             pass
 
     monkeypatch.setattr(Tasks, "go_to", go_to)
-    sender = Sender(Net().two, cast("Group", Alive()), seed=0)
+    sender = GoalSender(Net().two, cast("ProcessGroup", Alive()), seed=0)
     assert await sender._order(Goal(x=2.0, y=1.0)) == "goal-1"
     assert asked == [2.0, 2.0, 2.0]
 
@@ -91,7 +98,7 @@ async def test_a_robot_that_a_person_has_shut_in_is_sent_on_when_the_person_has_
         (1.0, 2.0),
     ]
 
-    def anywhere(_: Sender) -> tuple[float, float]:
+    def anywhere(_: GoalSender) -> tuple[float, float]:
         found = looks.pop(0)
         if isinstance(found, GigabrainError):
             raise found
@@ -101,10 +108,10 @@ async def test_a_robot_that_a_person_has_shut_in_is_sent_on_when_the_person_has_
         async def look(self) -> None:
             pass
 
-    monkeypatch.setattr(Sender, "_anywhere", anywhere)
-    sender = Sender(Net().two, cast("Group", Alive()), seed=0)
+    monkeypatch.setattr(GoalSender, "_anywhere", anywhere)
+    sender = GoalSender(Net().two, cast("ProcessGroup", Alive()), seed=0)
     assert await sender._somewhere() == (1.0, 2.0)
-    monkeypatch.setattr(goals_sender, "SILENT_S", 0.0)
+    monkeypatch.setattr(goals, "MAX_SILENCE_S", 0.0)
     looks.extend([GigabrainError("none")] * 100)
     with pytest.raises(GigabrainError, match="none"):
         await sender._somewhere()
@@ -117,7 +124,7 @@ async def test_a_robot_that_latches_ends_the_course() -> None:
         async def look(self) -> None:
             await settle()
 
-    sender = Sender(net.two, cast("Group", Alive()), seed=0)
+    sender = GoalSender(net.two, cast("ProcessGroup", Alive()), seed=0)
     low = Cause(code="battery_empty", text="battery at 5 %", latching=True)
     gate = GateStatus(mode="latched", causes=(low,))
     net.one.publish(STATE, replace(STILL, gate=gate))

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.qa.bench.growth import Watch
+from gigabrain_zenoh.qa.bench.growth import GrowthSampler
 from tests.unit.navigation.grids import grid_of
 
 
 def test_the_slope_leaves_out_the_first_quarter_and_walls_are_counted_by_the_hour() -> None:
-    watch = Watch()
+    watch = GrowthSampler()
     for minute in range(480):
         grown = 2 * min(minute, 100) + (minute / 60 if minute >= 120 else 0)  # MB
         walls = np.where(np.arange(100).reshape(10, 10) < 20 + minute // 60, 100, 0)
-        watch.minute(int((200 + grown) * 1e6), grid_of(walls))
+        watch.minute(200 + grown, grid_of(walls))
     growth = watch.growth(grid_of(np.full((3, 3), 100)))
     assert watch.minutes == len(growth.memory_mb) == 480
     assert growth.mb_an_hour == pytest.approx(1.0, abs=0.001)
@@ -21,5 +21,5 @@ def test_the_slope_leaves_out_the_first_quarter_and_walls_are_counted_by_the_hou
 
 
 def test_without_samples_nothing_has_grown() -> None:
-    growth = Watch().growth(grid_of(np.zeros((3, 3))))
+    growth = GrowthSampler().growth(grid_of(np.zeros((3, 3))))
     assert (growth.most_mb, growth.mb_an_hour, growth.walls) == (0.0, 0.0, (0,))

@@ -8,9 +8,16 @@ import pytest
 
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.se2 import Floats, compose
-from gigabrain_zenoh.qa.bench.slam import drive, judged, total
-from gigabrain_zenoh.qa.bench.slam_crispness import crispness
-from gigabrain_zenoh.qa.bench.slam_logs import Log, errors, load, relations
+from gigabrain_zenoh.qa.bench.slam_logs import (
+    LaserLog,
+    crispness,
+    errors,
+    judge_log,
+    load,
+    map_log,
+    relations,
+    total,
+)
 
 DATA = os.environ.get("GIGABRAIN_DATA")
 
@@ -22,8 +29,8 @@ def circles(scans: int = 120, radius: float = 8.0) -> Floats:
     return np.column_stack((radius * np.cos(turned), radius * np.sin(turned), ahead))
 
 
-def log(reference: Floats) -> Log:
-    return Log("circles", np.ones((len(reference), 180)), reference, reference)
+def log(reference: Floats) -> LaserLog:
+    return LaserLog("circles", np.ones((len(reference), 180)), reference, reference)
 
 
 def test_relations_are_near_in_place_and_far_in_time() -> None:
@@ -47,12 +54,12 @@ def test_a_map_in_another_frame_has_no_error_and_a_bent_one_has() -> None:
     assert bent.mean_deg == pytest.approx(0.0, abs=1e-9)
 
 
-def wall_from(poses: Floats) -> Log:
+def wall_from(poses: Floats) -> LaserLog:
     """A wall along y = 2.03 m, as seen from `poses` (n, 3) that look along x."""
     angles = np.radians(-90.0 + np.arange(180))
     ahead = (angles > 0.3) & (angles < 1.5)
     ranges = np.where(ahead, (2.03 - poses[:, 1:2]) / np.sin(np.where(ahead, angles, 1.0)), 50.0)
-    return Log("wall", ranges, poses, poses)
+    return LaserLog("wall", ranges, poses, poses)
 
 
 def test_a_wall_that_is_drawn_twice_fills_twice_the_cells() -> None:
@@ -116,7 +123,7 @@ def test_a_cut_log_is_refused_in_one_line(tmp_path: Path) -> None:
 def test_edmonton_is_mapped_within_7_cm_of_its_reference() -> None:
     recorded = load(Path(str(DATA)) / "slam" / "edmonton.npz")
     scans: list[None] = []
-    result = judged(recorded, drive(recorded, lambda: scans.append(None)))
+    result = judge_log(recorded, map_log(recorded, lambda: scans.append(None)))
     assert len(scans) == result.scans == 340
     assert result.graph.mean_m < 0.07
     assert result.graph.mean_deg < 1.0
@@ -128,8 +135,8 @@ def test_edmonton_is_mapped_within_7_cm_of_its_reference() -> None:
 def test_freiburg_is_mapped_where_its_odometry_has_the_wrong_sign() -> None:
     """Of every fourth scan: a stretch of it is driven backwards, and odometry says forwards."""
     dense = load(Path(str(DATA)) / "slam" / "freiburg-079.npz")
-    thin = Log("thin", *(a[:2000:4] for a in (dense.ranges, dense.reference, dense.odometry)))
-    result = judged(thin, drive(thin, lambda: None))
+    thin = LaserLog("thin", *(a[:2000:4] for a in (dense.ranges, dense.reference, dense.odometry)))
+    result = judge_log(thin, map_log(thin, lambda: None))
     assert result.graph.mean_m < 0.07
     assert result.breaks == 0
 
@@ -138,7 +145,7 @@ def test_freiburg_is_mapped_where_its_odometry_has_the_wrong_sign() -> None:
 def test_long_corridors_do_not_cross() -> None:
     """After 600 m without a loop the robot comes back 16 m from where it is thought to be."""
     recorded = load(Path(str(DATA)) / "slam" / "infinite-corridor.npz")
-    result = judged(recorded, drive(recorded, lambda: None))
+    result = judge_log(recorded, map_log(recorded, lambda: None))
     assert result.crispness < 1.0
     assert result.breaks == 0
 
@@ -147,5 +154,5 @@ def test_long_corridors_do_not_cross() -> None:
 def test_leaves_and_slopes_do_not_end_a_map_outdoors() -> None:
     """Scans that fit nothing broke it eight times, and gtsam raised at scan 976."""
     whole = load(Path(str(DATA)) / "slam" / "freiburg-campus.npz")
-    part = Log("part", *(a[:1000] for a in (whole.ranges, whole.reference, whole.odometry)))
-    assert judged(part, drive(part, lambda: None)).breaks == 0
+    part = LaserLog("part", *(a[:1000] for a in (whole.ranges, whole.reference, whole.odometry)))
+    assert judge_log(part, map_log(part, lambda: None)).breaks == 0

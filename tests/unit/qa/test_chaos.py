@@ -5,13 +5,20 @@ import random
 import pytest
 
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.qa.proxy.chaos import Chaos, Told, told
-from gigabrain_zenoh.qa.proxy.damage import Damage, Figures
+from gigabrain_zenoh.qa.proxy.chaos import (
+    Chaos,
+    LinkDamage,
+    ProxyCommand,
+    WayCounters,
+    parse_command,
+)
 
 
-def damaged(chaos: Chaos, pieces: list[bytes], seed: int = 0) -> tuple[bytes, list[float], Figures]:
+def damaged(
+    chaos: Chaos, pieces: list[bytes], seed: int = 0
+) -> tuple[bytes, list[float], WayCounters]:
     """All that arrives of `pieces`, one each 10 ms, and when."""
-    damage = Damage(random.Random(seed), Figures())
+    damage = LinkDamage(random.Random(seed), WayCounters())
     out = [out for n, piece in enumerate(pieces) for out in damage.damaged(piece, chaos, n / 100)]
     return b"".join(data for _, data in out), [due_s for due_s, _ in out], damage.figures
 
@@ -66,20 +73,23 @@ def test_what_is_lost_is_late_and_so_is_what_comes_after_it() -> None:
 @pytest.mark.parametrize(
     ("line", "wish"),
     [
-        ("", Told(ways=("up", "down"))),
-        ("off", Told(ways=("up", "down"))),
-        ("hole", Told(ways=("up", "down"), chaos=Chaos(hole=True))),
-        ("down delay_ms=50 loss=0.1", Told(ways=("down",), chaos=Chaos(delay_ms=50, loss=0.1))),
-        ("up off", Told(ways=("up",))),
-        ("cut", Told(cut="fin")),
-        ("cut=rst", Told(cut="rst")),
-        ("unplug", Told(unplugged=True)),
-        ("plug", Told(unplugged=False)),
-        ("figures", Told(figures=True)),
+        ("", ProxyCommand(ways=("up", "down"))),
+        ("off", ProxyCommand(ways=("up", "down"))),
+        ("hole", ProxyCommand(ways=("up", "down"), chaos=Chaos(hole=True))),
+        (
+            "down delay_ms=50 loss=0.1",
+            ProxyCommand(ways=("down",), chaos=Chaos(delay_ms=50, loss=0.1)),
+        ),
+        ("up off", ProxyCommand(ways=("up",))),
+        ("cut", ProxyCommand(cut="fin")),
+        ("cut=rst", ProxyCommand(cut="rst")),
+        ("unplug", ProxyCommand(unplugged=True)),
+        ("plug", ProxyCommand(unplugged=False)),
+        ("figures", ProxyCommand(figures=True)),
     ],
 )
-def test_what_is_typed_is_understood(line: str, wish: Told) -> None:
-    assert told(line) == wish
+def test_what_is_typed_is_understood(line: str, wish: ProxyCommand) -> None:
+    assert parse_command(line) == wish
 
 
 @pytest.mark.parametrize(
@@ -93,4 +103,4 @@ def test_what_is_typed_is_understood(line: str, wish: Told) -> None:
 )
 def test_what_cannot_be_understood_is_refused_in_one_line(line: str, complaint: str) -> None:
     with pytest.raises(ConfigError, match=complaint):
-        told(line)
+        parse_command(line)

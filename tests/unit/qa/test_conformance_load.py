@@ -9,7 +9,7 @@ import pytest
 
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.qa.conformance import kit
-from gigabrain_zenoh.qa.conformance.result import Failed, Finding, NotApplicable
+from gigabrain_zenoh.qa.judging import Failed, Finding, Skipped
 
 
 def waiting(monkeypatch: pytest.MonkeyPatch, each_ms: float) -> None:
@@ -44,7 +44,7 @@ async def test_late_three_times_on_such_a_machine_says_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     waiting(monkeypatch, 300.0)
-    with pytest.raises(NotApplicable, match="60 ticks of at most 50; this machine is too busy"):
+    with pytest.raises(Skipped, match="60 ticks of at most 50; this machine is too busy"):
         await kit._found(finds(LATE, LATE, LATE))
 
 
@@ -69,7 +69,7 @@ async def test_a_driver_that_does_not_come_as_far_fails_on_a_machine_with_time(
     waiting(monkeypatch, 0.0)
     assert (await kit._found(stuck)).measured == "the body did not move; gate idle"
     waiting(monkeypatch, 1e6)
-    with pytest.raises(NotApplicable, match="did not move; gate idle; this machine is too busy"):
+    with pytest.raises(Skipped, match="did not move; gate idle; this machine is too busy"):
         await kit._found(stuck)
 
 

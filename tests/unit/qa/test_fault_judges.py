@@ -16,16 +16,15 @@ from gigabrain_schemas.topics import BODY, CMD_VEL, STATE
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.qa.faults import clock
-from gigabrain_zenoh.qa.faults.body_link import first_disobeyed
-from gigabrain_zenoh.qa.faults.clock import OtherHost, age_error_ms
-from gigabrain_zenoh.qa.faults.estop import Presses
-from gigabrain_zenoh.qa.faults.onlooker import Onlooker
-from gigabrain_zenoh.qa.faults.reversals import steps_in_window
-from gigabrain_zenoh.qa.faults.smooth import starts_and_stops, stops
-from gigabrain_zenoh.qa.faults.soak import slope_mb_per_h
-from gigabrain_zenoh.qa.faults.stopping import first_slower, first_zero
-from gigabrain_zenoh.qa.faults.subject import Subject
+from gigabrain_zenoh.qa.faults.rig.rig import first_slower, first_zero
+from gigabrain_zenoh.qa.faults.rows import clocks, estop
+from gigabrain_zenoh.qa.faults.rows.body_line import first_disobeyed
+from gigabrain_zenoh.qa.faults.rows.clocks import OtherHost, age_error_ms
+from gigabrain_zenoh.qa.faults.rows.estop import PressLog
+from gigabrain_zenoh.qa.faults.rows.load import slope_mb_per_h
+from gigabrain_zenoh.qa.faults.rows.reversals import steps_in_window
+from gigabrain_zenoh.qa.probe import Probe
+from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, body, state
 from gigabrain_zenoh.testing.waiting import settle
 
@@ -65,14 +64,14 @@ async def test_a_host_that_goes_by_the_stamps_does_not(monkeypatch: pytest.Monke
     class ByStamp(Latest[Any]):
         """What the bus must not do."""
 
-        def __init__(self, topic: Any, clock: Clock, time: Any) -> None:
-            super().__init__(topic, clock, time)
-            self._by = clock
+        def __init__(self, topic: Any, clocks: Clock, time: Any) -> None:
+            super().__init__(topic, clocks, time)
+            self._by = clocks
 
         def age_ns(self) -> int | None:
             return self._by.unix_ns() - self.current.stamp_ns if self.current else None
 
-    monkeypatch.setattr(clock, "Latest", ByStamp)
+    monkeypatch.setattr(clocks, "Latest", ByStamp)
     async with reported() as bus:
         assert await age_error_ms(bus, OtherHost(), 5) > 4900.0
 
@@ -84,86 +83,86 @@ def test_memory_growth_is_the_slope_over_all_samples() -> None:
     assert slope_mb_per_h(leaks_180_mb_per_h) == pytest.approx(180.0)
 
 
-def drive(modes: Sequence[str], commanded: Sequence[int]) -> Onlooker:
+def drive(modes: Sequence[str], commanded: Sequence[int]) -> Probe:
     """Who has looked on while the gate was in these modes, and commands came in these ticks."""
-    onlooker = Onlooker(Bus(LocalNetwork().transport(), Clock(), "suite"))
+    probe = Probe(Bus(LocalNetwork().transport(), Clock(), "suite"))
     for tick, mode in enumerate(modes, start=1):
         gate = replace(DRIVING, mode=mode) if mode == "enabled" else GateStatus(mode="stopping")
-        onlooker.states.append(replace(state(tick), gate=gate))
+        probe.states.append(replace(state(tick), gate=gate))
     for tick in commanded:
-        onlooker.commands.append(CmdVel(linear_x=0.2, source="control", boot=BOOT, tick=tick))
-        onlooker.arrivals.append(tick)
-    return onlooker
+        probe.commands.append(CmdVel(linear_x=0.2, source="control", boot=BOOT, tick=tick))
+        probe.arrivals.append(tick)
+    return probe
 
 
 async def test_who_looks_on_hears_commands_again_whoever_else_listens_to_them() -> None:
     network = LocalNetwork()
-    onlooker = Onlooker(Bus(network.transport(), Clock(), "suite"))
+    probe = Probe(Bus(network.transport(), Clock(), "suite"))
     robot = Bus(network.transport(), Clock(), "robot")
     for deaf in (False, True, False):
-        end = onlooker.bus.tap(CMD_VEL.key, lambda *_: None)  # as the soak counts what comes
-        onlooker.deafen(deaf)
+        end = probe.bus.tap(CMD_VEL.key, lambda *_: None)  # as the soak counts what comes
+        probe.ignore_commands(deaf)
         robot.publish(BODY, body())
         await settle()
         robot.publish(CMD_VEL, CmdVel(linear_x=0.2, source="control"))
         await settle()
         end()
-    assert len(onlooker.commands) == 2
-    assert onlooker.bus.listens.count(CMD_VEL.key) == 1
+    assert len(probe.commands) == 2
+    assert probe.bus.listens.count(CMD_VEL.key) == 1
 
 
 @pytest.mark.parametrize(("seen", "slower"), [(20, 20), (23, 23), (40, 31)])
 async def test_ticks_that_control_did_not_answer_count_like_all_others(
     seen: int, slower: int
 ) -> None:
-    onlooker = drive(["enabled"] * 30 + ["stopping"] * 15, [*range(1, 20), *range(seen, 45)])
-    for n, command in enumerate(onlooker.commands):
+    probe = drive(["enabled"] * 30 + ["stopping"] * 15, [*range(1, 20), *range(seen, 45)])
+    for n, command in enumerate(probe.commands):
         if command.tick >= seen:
-            onlooker.commands[n] = replace(command, linear_x=0.1)
-    assert first_slower(onlooker, onlooker.states[0], 15) == slower
+            probe.commands[n] = replace(command, linear_x=0.1)
+    assert first_slower(probe, probe.states[0], 15) == slower
 
 
 async def test_zero_is_when_the_body_is_measured_at_rest_for_good() -> None:
-    onlooker = drive(["enabled"] * 20 + ["stopping"] * 25, range(1, 21))
-    for n, one in enumerate(onlooker.states):
+    probe = drive(["enabled"] * 20 + ["stopping"] * 25, range(1, 21))
+    for n, one in enumerate(probe.states):
         moving = one.tick < 30 or one.tick == 33
-        onlooker.states[n] = replace(one, velocity=Velocity(linear_x=0.2 if moving else 0.0))
-    assert first_zero(onlooker, onlooker.states[0], 20) == 34
+        probe.states[n] = replace(one, velocity=Velocity(linear_x=0.2 if moving else 0.0))
+    assert first_zero(probe, probe.states[0], 20) == 34
 
 
 async def test_every_start_and_every_stop_counts() -> None:
     modes = ["enabled"] * 30 + ["stopping"] * 15 + ["enabled"] * 30
     once = drive(modes, [*range(1, 25), *range(31, 76)])
-    assert stops(once, once.states[0]) == [31]
-    counts = [starts_and_stops(once, once.states[0], ticks) for ticks in (29, 30, 44, 45)]
+    assert once.stops(once.states[0]) == [31]
+    counts = [once.starts_and_stops(once.states[0], ticks) for ticks in (29, 30, 44, 45)]
     assert counts == [0, 1, 1, 2]
     never = drive(["enabled"] * 60, range(1, 61))
-    assert starts_and_stops(never, never.states[0], 60) == 0
+    assert never.starts_and_stops(never.states[0], 60) == 0
 
 
 async def test_measured_reversals_are_judged_where_the_body_was_told_one_way_before() -> None:
-    onlooker = drive(["enabled"] * 60, [])
-    for n, one in enumerate(onlooker.states):
+    probe = drive(["enabled"] * 60, [])
+    for n, one in enumerate(probe.states):
         told = 0.02 * (n % 2) if n < 20 else 0.02 * (n - 20)
-        onlooker.states[n] = replace(one, sent=Velocity(linear_x=told), stamp_ns=n * 20_000_000)
-    assert [steps_in_window(onlooker, tick) for tick in (10, 20, 24, 26, 30)] == [0, 0, 0, 12, 12]
+        probe.states[n] = replace(one, sent=Velocity(linear_x=told), stamp_ns=n * 20_000_000)
+    assert [steps_in_window(probe, tick) for tick in (10, 20, 24, 26, 30)] == [0, 0, 0, 12, 12]
 
 
 async def test_a_press_takes_as_long_as_its_answer_however_few_ticks_that_are() -> None:
-    onlooker = drive(["enabled"], [])
-    presses = Presses(cast("Subject", SimpleNamespace(onlooker=onlooker)))
+    probe = drive(["enabled"], [])
+    presses = PressLog(cast("RobotUnderTest", SimpleNamespace(probe=probe)))
 
     async def press() -> None:
-        before = onlooker.state
+        before = probe.state
         await asyncio.sleep(0.2)
         gate = GateStatus(mode="latched", estop_generation=1)
-        onlooker.states.append(replace(before, tick=before.tick + 1, gate=gate))
-        onlooker.on_state(onlooker.state)
+        probe.states.append(replace(before, tick=before.tick + 1, gate=gate))
+        probe.on_state(probe.state)
 
     await presses.press(press)
     figures = presses.figures()
-    assert figures["latched after"] == 20.0
-    assert min(figures["answer"], figures["answer p99"], figures["zero"]) >= 200.0
+    assert figures[estop.LATCHED] == 20.0
+    assert min(figures[estop.ANSWER], figures[estop.ANSWER_P99], figures[estop.ZERO_MAX]) >= 200.0
 
 
 def turned(*pairs: tuple[float, float]) -> list[RobotState]:

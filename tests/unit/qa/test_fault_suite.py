@@ -17,27 +17,27 @@ from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.host import this_process
-from gigabrain_zenoh.plugins import find
 from gigabrain_zenoh.qa.faults import suite
-from gigabrain_zenoh.qa.faults.disturbance import LOOK_S, RunQueueWatch
-from gigabrain_zenoh.qa.faults.fault import (
-    Failed,
-    Fault,
-    Limit,
-    Result,
-    Skipped,
-    Try,
-    judge,
-    worst_of,
+from gigabrain_zenoh.qa.faults.fault import FaultResult, FaultRow, FaultRun, judge, worst_of
+from gigabrain_zenoh.qa.faults.rig.broken_process import HangingBus
+from gigabrain_zenoh.qa.faults.rig.rig import Options, Rig, deployment_of
+from gigabrain_zenoh.qa.faults.rows.processes import decision_killed
+from gigabrain_zenoh.qa.faults.suite import (
+    FAULTS,
+    POLL_S,
+    RunQueueWatch,
+    RunsFile,
+    choose,
+    failed,
+    run_suite,
 )
-from gigabrain_zenoh.qa.faults.hanging import HangingBus
-from gigabrain_zenoh.qa.faults.rig import Options, Rig, deployment_of
-from gigabrain_zenoh.qa.faults.suite import failed, run_suite
-from gigabrain_zenoh.qa.faults.table import FAULTS, choose
-from gigabrain_zenoh.qa.faults.tries_file import TriesFile
+from gigabrain_zenoh.qa.judging import Failed, Figure, Skipped
 from gigabrain_zenoh.testing.waiting import settle
 
-FAULT = Fault(1, "decision-killed", "process", "", "brakes after <= 120 ms, travel <= 0.1 m")
+BRAKES, TRAVEL = Figure("brakes after", "ms"), Figure("travel", "m")
+LOST = Figure("lost")
+LIMITS = (BRAKES.at_most(120), TRAVEL.at_most(0.1))
+FAULT = FaultRow(1, decision_killed, "", LIMITS)
 
 
 def test_every_row_has_a_number_and_a_name_of_its_own() -> None:
@@ -47,18 +47,16 @@ def test_every_row_has_a_number_and_a_name_of_its_own() -> None:
 
 def test_every_criterion_can_be_measured() -> None:
     for fault in FAULTS:
-        names = [limit.name for limit in fault.limits]
-        assert len(set(names)) == len(names) > 0, fault.name
+        figures = [limit.figure for limit in fault.limits]
+        assert len({figure.name for figure in figures}) == len(figures) > 0, fault.name
 
 
 def test_a_criterion_says_figure_limit_unit_and_clock() -> None:
-    assert FAULT.limits == (Limit("brakes after", 120.0, "ms"), Limit("travel", 0.1, "m"))
-    pressed = Fault(2, "pressed", "", "", "answer <= 50 ms wall, slope <= 1 MB/h long, lost <= 0")
-    assert pressed.limits == (
-        Limit("answer", 50.0, "ms", wall=True),
-        Limit("slope", 1.0, "MB/h", long=True),
-        Limit("lost", 0.0, ""),
-    )
+    assert FAULT.criterion == "brakes after <= 120 ms, travel <= 0.1 m"
+    answer, slope = Figure("answer", "ms", wall=True), Figure("slope", "MB/h", long=True)
+    limits = (answer.at_most(50), slope.at_most(1), LOST.at_most(0))
+    pressed = replace(FAULT, limits=limits)
+    assert pressed.criterion == "answer <= 50 ms wall, slope <= 1 MB/h long, lost <= 0"
 
 
 def test_the_worst_of_all_runs_is_told() -> None:
@@ -68,30 +66,32 @@ def test_the_worst_of_all_runs_is_told() -> None:
 
 @pytest.mark.parametrize("travel", [0.1001, float("nan")])
 def test_one_figure_over_its_limit_fails(travel: float) -> None:
-    assert judge(FAULT, {"brakes after": 100.0, "travel": 0.1}) == ("passed", "")
-    judged = judge(FAULT, {"brakes after": 100.0, "travel": travel})
+    assert judge(FAULT, {BRAKES: 100.0, TRAVEL: 0.1}) == ("passed", "")
+    judged = judge(FAULT, {BRAKES: 100.0, TRAVEL: travel})
     assert judged == ("FAILED", f"travel is {travel:g} m")
 
 
 def test_a_limit_of_the_wall_clock_is_judged_on_request() -> None:
-    pressed = Fault(2, "pressed", "", "", "answer <= 50 ms wall, lost <= 0")
-    late = {"answer": 70.0, "lost": 0.0}
+    answer = Figure("answer", "ms", wall=True)
+    pressed = replace(FAULT, limits=(answer.at_most(50), LOST.at_most(0)))
+    late = {answer: 70.0, LOST: 0.0}
     assert judge(pressed, late) == ("FAILED", "answer is 70 ms")
     assert judge(pressed, late, wall=False) == ("passed", "")
 
 
 def test_a_limit_of_the_long_form_is_measured_there_alone() -> None:
-    soaked = Fault(2, "soaked", "", "", "lost <= 0, slope <= 1 MB/h long")
-    assert judge(soaked, {"lost": 0.0}) == ("passed", "")
-    grown = {"lost": 0.0, "slope": 180.0}
+    slope = Figure("slope", "MB/h", long=True)
+    soaked = replace(FAULT, limits=(LOST.at_most(0), slope.at_most(1)))
+    assert judge(soaked, {LOST: 0.0}) == ("passed", "")
+    grown = {LOST: 0.0, slope: 180.0}
     assert judge(soaked, grown, long=True) == ("FAILED", "slope is 180 MB/h")
     with pytest.raises(ValueError, match="is judged by"):
-        judge(soaked, {"lost": 0.0}, long=True)
+        judge(soaked, {LOST: 0.0}, long=True)
 
 
 def test_a_test_that_measures_something_else_is_no_pass() -> None:
     with pytest.raises(ValueError, match="is judged by"):
-        judge(FAULT, {"travel": 0.05})
+        judge(FAULT, {TRAVEL: 0.05})
 
 
 def test_tests_are_chosen_by_name_or_number() -> None:
@@ -101,10 +101,16 @@ def test_tests_are_chosen_by_name_or_number() -> None:
         choose(["decision-kiled"])
 
 
-def test_a_test_is_the_function_of_its_name_in_the_module_of_its_group() -> None:
-    assert [find(fault.path).__name__.replace("_", "-") for fault in FAULTS] == [
-        fault.name for fault in FAULTS
-    ]
+def test_a_fault_is_found_by_its_name_of_before_for_one_release() -> None:
+    assert [choose([old])[0].name for old in suite.OLD_NAMES] == list(suite.OLD_NAMES.values())
+
+
+def test_a_row_holds_its_test_and_takes_its_name_from_it() -> None:
+    assert (FAULT.test, FAULT.name, FAULT.group) == (
+        decision_killed,
+        "decision-killed",
+        "processes",
+    )
 
 
 def test_a_body_without_the_line_in_question_is_skipped() -> None:
@@ -135,7 +141,7 @@ async def test_what_cannot_run_is_skipped_and_says_why(tmp_path: Path) -> None:
     assert result.reason == "alpha has no serial line"
 
 
-Run = Callable[[], dict[str, float]]
+Run = Callable[[], dict[Figure, float]]
 SHORT = Options()
 
 
@@ -143,41 +149,40 @@ async def result_of(
     runs: Sequence[tuple[Run, float]],
     monkeypatch: pytest.MonkeyPatch,
     repeat: int = 1,
-    fault: Fault = FAULT,
+    fault: FaultRow = FAULT,
     options: Options = SHORT,
-) -> Result:
+) -> FaultResult:
     """What the suite makes of runs that do this, and wait for a core for so long [ms] meanwhile."""
     left, waits = iter(run for run, _ in runs), iter(wait for _, wait in runs)
 
-    async def test(_: Rig) -> dict[str, float]:
+    async def test(_: Rig) -> dict[Figure, float]:
         return next(left)()
 
     def start(watch: RunQueueWatch) -> None:
         watch.longest_ms = next(waits)
 
     monkeypatch.setattr(RunQueueWatch, "start", start)
-    monkeypatch.setattr(suite, "find", lambda path: test)
-    (result,) = await run_suite([fault], options, Path(), repeat)
+    (result,) = await run_suite([replace(fault, test=test)], options, Path(), repeat)
     return result
 
 
-def well() -> dict[str, float]:
-    return {"brakes after": 100.0, "travel": 0.05}
+def well() -> dict[Figure, float]:
+    return {BRAKES: 100.0, TRAVEL: 0.05}
 
 
-def worse() -> dict[str, float]:
-    return {"brakes after": 120.0, "travel": 0.04}
+def worse() -> dict[Figure, float]:
+    return {BRAKES: 120.0, TRAVEL: 0.04}
 
 
-def late() -> dict[str, float]:
-    return {"brakes after": 140.0, "travel": 0.05}
+def late() -> dict[Figure, float]:
+    return {BRAKES: 140.0, TRAVEL: 0.05}
 
 
-def badly() -> dict[str, float]:
+def badly() -> dict[Figure, float]:
     raise Failed("it drove on")
 
 
-def verdicts(result: Result) -> list[tuple[str, bool]]:
+def verdicts(result: FaultResult) -> list[tuple[str, bool]]:
     """Of each try: its verdict, and whether it was disturbed."""
     return [(one.verdict, one.disturbed) for one in result.tries]
 
@@ -237,40 +242,37 @@ async def test_a_long_form_counts_in_any_case(monkeypatch: pytest.MonkeyPatch) -
     assert result.tries[0].waited_ms == 90.0
 
 
-async def test_no_garbage_is_collected_while_a_fault_is_tried(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_no_garbage_is_collected_while_a_fault_is_tried() -> None:
     collects = list[bool]()
 
-    async def noted() -> dict[str, float]:
+    async def noted(_: Rig) -> dict[Figure, float]:
         collects.append(gc.isenabled())
         return well()
 
-    monkeypatch.setattr(suite, "find", lambda path: lambda rig: noted())
-    await run_suite([FAULT], Options(), Path())
+    await run_suite([replace(FAULT, test=noted)], Options(), Path())
     assert collects == [False]
     assert gc.isenabled()
 
 
-async def test_a_suite_goes_on_where_its_file_ends(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_suite_goes_on_where_its_file_ends(tmp_path: Path) -> None:
     path, options = tmp_path / "tries.jsonl", Options(body="alpha")
-    file = TriesFile(path, options)
+    file = RunsFile(path, options)
     assert file.read() == {}
-    before = Try(verdict="passed", measured={"brakes after": 80.0, "travel": 0.01}, waited_ms=3.0)
+    before = FaultRun(
+        verdict="passed", measured={"brakes after": 80.0, "travel": 0.01}, waited_ms=3.0
+    )
     file.append(FAULT, before)
-    TriesFile(path, Options()).append(FAULT, Try(verdict="FAILED", reason="another body"))
+    RunsFile(path, Options()).append(FAULT, FaultRun(verdict="FAILED", reason="another body"))
     assert file.read() == {1: [before]}
-    monkeypatch.setattr(suite, "find", lambda path: _well)
-    (result,) = await run_suite([FAULT], options, tmp_path, 2, earlier=file.read())
+    row = replace(FAULT, test=_well)
+    (result,) = await run_suite([row], options, tmp_path, 2, earlier=file.read())
     assert verdicts(result) == [("passed", False), ("passed", False)]
     path.write_text("{")
-    with pytest.raises(ConfigError, match=r"cannot go on with .*tries.jsonl"):
+    with pytest.raises(ConfigError, match=r"cannot continue .*tries.jsonl"):
         file.read()
 
 
-async def _well(_: Rig) -> dict[str, float]:
+async def _well(_: Rig) -> dict[Figure, float]:
     return well()
 
 
@@ -290,7 +292,7 @@ async def test_what_holds_up_the_suite_itself_was_waited_for() -> None:
     watch = RunQueueWatch(list)
     watch.start()
     await asyncio.sleep(0)
-    time.sleep(LOOK_S + 0.05)  # noqa: ASYNC251  it is to hold up the loop
+    time.sleep(POLL_S + 0.05)  # noqa: ASYNC251  it is to hold up the loop
     await asyncio.sleep(0.01)
     watch.close()
     assert watch.longest_ms >= 50.0

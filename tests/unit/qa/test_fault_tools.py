@@ -14,10 +14,15 @@ from gigabrain_schemas.topics import SCAN, STATE
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.qa.faults.obstacles import nothing
-from gigabrain_zenoh.qa.faults.skewed import clocks, jumps, other_host
-from gigabrain_zenoh.qa.faults.tampering import Steps, tampering_bus
-from gigabrain_zenoh.qa.track import Track
+from gigabrain_zenoh.qa.faults.rig.broken_process import (
+    TamperingSteps,
+    jumps,
+    other_host,
+    skewed_clocks,
+    tampering_bus,
+)
+from gigabrain_zenoh.qa.faults.rows.obstacles import nothing
+from gigabrain_zenoh.qa.simulated_drives import SafetyTrack
 
 SECOND_NS = 1_000_000_000
 
@@ -35,14 +40,14 @@ def test_the_other_host_is_five_seconds_ahead_and_gains_200_ppm() -> None:
 
 def test_python_s_clocks_are_wrong_while_they_are_skewed_and_right_again_after() -> None:
     true_ns, true_s = time.monotonic_ns(), time.time()
-    with clocks(lambda _: 10 * SECOND_NS, lambda _: 5 * SECOND_NS):
+    with skewed_clocks(lambda _: 10 * SECOND_NS, lambda _: 5 * SECOND_NS):
         assert time.time() - true_s >= 10
         assert time.monotonic_ns() - true_ns >= 5 * SECOND_NS
     assert time.monotonic_ns() - true_ns < 5 * SECOND_NS
 
 
 async def test_a_tampering_process_spoils_what_it_should_from_one_signal_to_the_next() -> None:
-    network, steps = LocalNetwork(), Steps("nan,crooked")
+    network, steps = LocalNetwork(), TamperingSteps("nan,crooked")
     bus = tampering_bus(steps, network.transport(), FakeClock(), "driver")
     scan, state = EXAMPLES["LaserScan"], EXAMPLES["RobotState"]
     for _ in range(4):
@@ -64,10 +69,10 @@ async def test_a_tampering_process_spoils_what_it_should_from_one_signal_to_the_
 
 def test_on_the_track_only_safety_keeps_a_blind_driver_from_a_post() -> None:
     post = ((0.6, 0.0, 0.035),)
-    seen, unseen = (Track("turtlebot3_waffle", 4, 4, post) for _ in range(2))
+    seen, unseen = (SafetyTrack("turtlebot3_waffle", 4, 4, post) for _ in range(2))
     unseen.sees = nothing
     for track in (seen, unseen):
-        track.go(150, 0.26)
+        track.run(150, 0.26)
     assert seen.simulation.truth.contacts == 0
-    assert seen.told.linear_x == 0.0
+    assert seen.output.linear_x == 0.0
     assert unseen.simulation.truth.contacts == 1

@@ -33,7 +33,7 @@ def test_no_string_names_a_module_that_its_room_must_not_import() -> None:
         ("safety/step.py", "gigabrain_zenoh.perception.node:run", "safety trusts"),
         ("mapping/slam.py", "gigabrain_zenoh.bus.bus:Bus", "gate, geometry"),
         ("decision/node.py", "gigabrain_drivers.bodies.mock.driver:Mock", "only the commands"),
-        ("host/heap.py", "gigabrain_zenoh.bus.bus:Bus", "each room"),
+        ("host/files.py", "gigabrain_zenoh.bus.bus:Bus", "each room"),
     ],
 )
 def test_a_name_in_a_string_is_found(copy: Path, where: str, name: str, contract: str) -> None:

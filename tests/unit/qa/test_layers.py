@@ -15,10 +15,10 @@ STANDARD = sys.stdlib_module_names
 PACKAGES = ("schemas/gigabrain_schemas", "gigabrain_zenoh", "drivers/gigabrain_drivers")
 ONLY_IN = {
     "zenoh": (
-        "gigabrain_zenoh/bus/zenoh/line.py",
         "gigabrain_zenoh/bus/zenoh/session.py",
         "gigabrain_zenoh/bus/zenoh/transport.py",
         "gigabrain_zenoh/qa/bench/relay.py",
+        "gigabrain_zenoh/testing/zenoh.py",
     ),
     "mujoco": ("drivers/gigabrain_drivers/sim/", "gigabrain_zenoh/qa/bench/jackal.py"),
 }

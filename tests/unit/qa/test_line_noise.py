@@ -2,7 +2,7 @@
 
 import pytest
 
-from gigabrain_zenoh.qa.conformance.noise import let_through, lost_after_garbage
+from gigabrain_zenoh.qa.faults.rows.body_line import let_through, lost_after_garbage
 
 
 def test_a_bare_line_lets_some_wrong_commands_through() -> None:

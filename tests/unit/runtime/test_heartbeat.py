@@ -14,7 +14,7 @@ from gigabrain_zenoh import codec
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision.behaviours import Plain
 from gigabrain_zenoh.host.threads import ScheduledWorker
-from gigabrain_zenoh.qa.faults.hanging import PARTS, HangingBus
+from gigabrain_zenoh.qa.faults.rig.broken_process import HANGING_TOPICS, HangingBus
 from gigabrain_zenoh.runtime.heartbeat import LOOK_S, Progress, Silence
 from gigabrain_zenoh.runtime.managed_process import (
     Backoff,
@@ -178,7 +178,7 @@ async def test_who_is_not_reached_by_its_own_input_makes_no_progress(
         await robot.go(SECOND_TICKS)
         await robot.kill(name)
         hangs = threading.Event()
-        robot.start(name, functools.partial(HangingBus, PARTS[name], hangs))
+        robot.start(name, functools.partial(HangingBus, HANGING_TOPICS[name], hangs))
         assert (await beats(robot, name, 3))[1:] == [True] * 2
         hangs.set()
         assert (await beats(robot, name, 4))[1:] == [False] * 3

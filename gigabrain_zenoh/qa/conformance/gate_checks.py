@@ -1,0 +1,223 @@
+"""Checks behind the gate: stops on silence, disorder and a dead commander; rates and latency."""
+
+import asyncio
+import contextlib
+import logging
+import math
+import sys
+from collections.abc import AsyncIterator, Iterator
+
+import msgspec
+
+from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.qa.conformance.gated_driver import ATTEMPTS, GatedDriver, stop_ticks
+from gigabrain_zenoh.qa.conformance.robot import link_of
+from gigabrain_zenoh.qa.judging import Failed, Finding
+
+SILENCE_TICKS = 7  # ticks: 100 ms without a command, told in the next tick
+AT_ONCE_TICKS = 2
+TICK_MS = TICK_NS / 1e6
+DISORDER_TICKS = 35
+LATE_TICKS = 100  # for which a body that still moves is watched, to say how late it is
+COMMANDER = "import time\nwhile True:\n print(flush=True)\n time.sleep(0.02)\n"
+
+
+async def silence(gated: GatedDriver) -> Finding:
+    """The commander falls silent at full drive."""
+    await gated.drive()
+    gated.wanted = None
+    return await _stopped(gated, stop_ticks(gated, SILENCE_TICKS))
+
+
+async def not_a_number(gated: GatedDriver) -> Finding:
+    """The commander sends NaN: zero at once, without a ramp."""
+    await gated.drive()
+    gated.wanted = None
+    last, calls = gated.last, len(gated.tap.calls)
+    if last is None:
+        raise Failed("nothing was commanded")
+    with _unsaid("gigabrain_zenoh.bus.bus"):
+        gated.deliver({**msgspec.structs.asdict(last), "linear_x": math.nan, "seq": last.seq + 1})
+        told = await gated.until(lambda: gated.tap.calls[calls:], AT_ONCE_TICKS)
+    zero = told is not None and gated.tap.calls[calls].asked == ZERO
+    found = await _stopped(gated, stop_ticks(gated, AT_ONCE_TICKS))
+    said = "zero at once" if zero else "not zero at once"
+    return Finding(found.ok and zero, f"{said}; {found.measured}")
+
+
+@contextlib.contextmanager
+def _unsaid(name: str) -> Iterator[None]:
+    """What the kit does wrong on purpose is not logged by the logger of that name."""
+    logger = logging.getLogger(name)
+    logger.addFilter(_nothing)
+    try:
+        yield
+    finally:
+        logger.removeFilter(_nothing)
+
+
+def _nothing(_: logging.LogRecord) -> bool:
+    return False
+
+
+async def disorder(gated: GatedDriver) -> Finding:
+    """Old, duplicated and reordered commands: none is obeyed, and none counts as being alive."""
+    wanted = await gated.drive()
+    earlier = gated.last
+    await gated.run_for(12)
+    gated.wanted, last, calls = None, gated.last, len(gated.tap.calls)
+    if earlier is None or last is None:
+        raise Failed("nothing was commanded")
+    before, end = sum(gated.refused.values()), gated.tick + DISORDER_TICKS
+    back = -wanted.linear_x
+    replace = msgspec.structs.replace
+    at_rest: int | None = None
+    begin = gated.tick
+    most = stop_ticks(gated, SILENCE_TICKS)
+    while gated.tick < end or (at_rest is None and gated.tick < begin + most + LATE_TICKS):
+        gated.deliver(replace(last, linear_x=back))  # a duplicate
+        gated.deliver(replace(last, linear_x=back, seq=last.seq - 3))  # overtaken
+        gated.deliver(
+            replace(earlier, linear_x=back, seq=last.seq + 100)
+        )  # old, but newly numbered
+        gated.deliver(replace(last, linear_x=back, seq=last.seq + 200, tick=gated.tick + 1000))
+        if at_rest is None and gated.rests:
+            at_rest = gated.tick - begin
+        await gated.run_for(1)
+    refused = sum(gated.refused.values()) - before
+    backward = sum(1 for call in gated.tap.calls[calls:] if call.asked.linear_x * back > 0)
+    text = f"{refused} refused, {backward} obeyed; "
+    if at_rest is None:
+        return Finding(False, text + "never at rest")
+    late_ms = 0.0 if backward else max((at_rest - most) * TICK_MS, 0.0)
+    good = backward == 0 and at_rest <= most
+    return Finding(good, f"{text}at rest after {at_rest} ticks", late_ms=late_ms)
+
+
+async def killed(gated: GatedDriver) -> Finding:
+    """The commander is a process, and ends by SIGKILL."""
+    for _ in range(ATTEMPTS):
+        await gated.drive()
+        async with _commander(gated):
+            if await gated.until(lambda: gated.wanted is None, 250) is None:
+                raise Failed("the commander's process did not start")
+            await gated.run_for(15)
+            obeyed = gated.mode == "enabled"
+        if obeyed:
+            return await _stopped(gated, stop_ticks(gated, SILENCE_TICKS))
+    raise Failed(f"the commander's process was not obeyed; gate {gated.mode}")
+
+
+@contextlib.asynccontextmanager
+async def _commander(gated: GatedDriver) -> AsyncIterator[None]:
+    """A process that commands what the gated commanded; killed at the end."""
+    commander = await asyncio.create_subprocess_exec(
+        sys.executable, "-S", "-c", COMMANDER, stdout=asyncio.subprocess.PIPE
+    )
+    relay = asyncio.create_task(_relay(gated, commander))
+    try:
+        yield
+    finally:
+        commander.kill()
+        relay.cancel()
+        await asyncio.gather(commander.wait(), relay, return_exceptions=True)
+
+
+async def _relay(gated: GatedDriver, commander: asyncio.subprocess.Process) -> None:
+    """A command for each line of the commander, which takes over from the gated with its first."""
+    assert commander.stdout
+    velocity = gated.wanted or ZERO
+    while await commander.stdout.readline():
+        gated.wanted = None
+        gated.command(velocity)
+
+
+async def _stopped(gated: GatedDriver, most: int) -> Finding:
+    ticks = await gated.until(lambda: gated.rests, most + LATE_TICKS)
+    if ticks is None:
+        return Finding(False, f"still moving after {most + LATE_TICKS} ticks of at most {most}")
+    text, late_ms = f"at rest after {ticks} ticks of at most {most}", (ticks - most) * TICK_MS
+    return Finding(ticks <= most, text, {"at rest": ticks * TICK_MS}, max(late_ms, 0.0))
+
+
+RATE_TICKS = 70  # 1.4 s
+SCAN_TICKS = 350  # a lidar may take so long to turn
+MIN_SHARE_OF_TICKS = 0.9  # of the ticks that must bring a state
+SCAN_SLACK = 0.25  # of the lidar's rate
+MAX_AGE_MS = 100.0
+SAMPLES = 40
+MID_TICK_S = 0.008
+MAX_LATENCY_MS = 1.0
+
+
+async def reports(gated: GatedDriver) -> Finding:
+    """A state per tick, fresh; scans as often as the body's file says."""
+    lidar = gated.robot.lidar
+    if await gated.until(lambda: gated.state and (gated.scan or not lidar), SCAN_TICKS) is None:
+        if gated.state and gated.states >= MIN_SHARE_OF_TICKS * SCAN_TICKS:
+            text = f"no scan within {SCAN_TICKS} ticks, though `lidar:` is in the robot's file"
+            return Finding(False, f"{text}; does its link have `scan:`?")
+        raise Failed(f"no state and scan within {SCAN_TICKS} ticks")
+    assert gated.state
+    begin, states, scans, oldest = gated.tick, gated.states, gated.scans, 0.0
+
+    def look() -> bool:
+        nonlocal oldest
+        assert gated.state
+        oldest = max(oldest, gated.state.link.age_ms)
+        return False
+
+    await gated.until(look, RATE_TICKS)
+    ticks, states, scans = gated.tick - begin, gated.states - states, gated.scans - scans
+    late_ms = max((MIN_SHARE_OF_TICKS * ticks - states) * TICK_NS / 1e6, oldest - MAX_AGE_MS, 0.0)
+    good = late_ms == 0
+    text = f"{states} in {ticks} ticks, at most {oldest:.0f} ms old"
+    if lidar and gated.scan:
+        rate = scans / (ticks * 0.02)
+        beams = len(gated.scan.ranges) // 4
+        good = good and abs(rate / lidar.rate_hz - 1) <= SCAN_SLACK and beams == lidar.beams
+        missing = 1 - rate / ((1 - SCAN_SLACK) * lidar.rate_hz)  # of the time
+        late_ms = max(late_ms, missing * ticks * TICK_NS / 1e6)
+        text += f"; scans of {beams} beams at {rate:.1f} Hz of {lidar.rate_hz:g}"
+    return Finding(good, text, late_ms=late_ms)
+
+
+async def latency(gated: GatedDriver) -> Finding:
+    """From a command on the bus, through the gate and the driver, to its bytes on the line.
+
+    Less what the loop's thread waited for a core in between.
+    """
+    link, clock = link_of(gated.tap.inner), Clock()
+    times: list[float] = []
+    asked_ns, waited_ms = 0, 0.0
+
+    def trace(way: str, _: bytes) -> None:
+        nonlocal asked_ns
+        if way == "tx" and gated.tap.speaking and asked_ns:
+            took_ms = (clock.now_ns() - asked_ns) / 1e6
+            times.append(took_ms - (this_process.own_waited_ms() - waited_ms))
+            asked_ns = 0
+
+    wanted = await gated.drive()
+    step = 0.02 * min(gated.robot.max_linear_acceleration, gated.robot.max_linear_deceleration)
+    gated.wanted, link.trace = None, trace
+    try:
+        for i in range(SAMPLES):
+            await gated.run_for(1)
+            await asyncio.sleep(MID_TICK_S)
+            waited_ms = this_process.own_waited_ms()
+            asked_ns = clock.now_ns()
+            gated.command(Velocity(linear_x=wanted.linear_x - (i % 2) * step))
+    finally:
+        link.trace = None
+    await gated.pause()
+    if len(times) < SAMPLES // 2:
+        return Finding(False, f"{len(times)} of {SAMPLES} commands led to bytes")
+    times.sort()
+    p50, p95 = times[len(times) // 2], times[int(len(times) * 0.95)]
+    late_ms = sum(max(ms - MAX_LATENCY_MS, 0.0) for ms in times[: len(times) // 2 + 1])
+    text = f"p50 {p50:.2f} ms, p95 {p95:.2f} ms of {len(times)}"
+    return Finding(p50 <= MAX_LATENCY_MS, text, late_ms=late_ms)

@@ -1,0 +1,218 @@
+"""The checked robot: one robot on one link, its emulated peer, and its driver alone."""
+
+import abc
+import asyncio
+import contextlib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.emulators.base import Device
+from gigabrain_drivers.emulators.emulator import BASE, Emulator
+from gigabrain_drivers.links.link import Link
+from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.body import RobotState
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.settings import LinkName
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.gate.state import at_rest
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.qa.judging import Failed, Skipped
+
+LOOK_S = 0.004
+PATIENCE_S = 10.0  # of wall time without a single tick
+
+
+class Timeline(abc.ABC):
+    """Somebody who lives by a driver's ticks."""
+
+    def __init__(self) -> None:
+        self.tick = 0
+
+    @abc.abstractmethod
+    def check_alive(self) -> None:
+        """Raise what has ended the driver, if anything has."""
+
+    async def until(self, condition: Callable[[], object], ticks: int) -> int | None:
+        """Wait for `condition`, at most so many ticks; after how many it held, or None."""
+        loop, begin = asyncio.get_running_loop(), self.tick
+        seen, seen_s = self.tick, loop.time()
+        while not condition():
+            self.check_alive()
+            if self.tick - begin >= ticks:
+                return None
+            if self.tick != seen:
+                seen, seen_s = self.tick, loop.time()
+            elif loop.time() - seen_s > PATIENCE_S:
+                raise Failed(f"no tick for {PATIENCE_S:.0f} s")
+            await asyncio.sleep(LOOK_S)
+        return self.tick - begin
+
+    async def firsts(
+        self, conditions: Mapping[str, Callable[[], object]], ticks: int
+    ) -> dict[str, float]:
+        """After how long each condition first held [ms]; ends with the last, or after `ticks`."""
+        loop = asyncio.get_running_loop()
+        begin_s, found = loop.time(), dict[str, float]()
+
+        def look() -> bool:
+            for name, holds in conditions.items():
+                if name not in found and holds():
+                    found[name] = (loop.time() - begin_s) * 1e3
+            return len(found) == len(conditions)
+
+        await self.until(look, ticks)
+        return found
+
+    async def run_for(self, ticks: int) -> None:
+        """Let so many ticks pass."""
+        await self.until(lambda: False, ticks)
+
+
+REST_SPEED = 0.02  # [m/s], of the true body, below which it stands
+WORLD = "arena"
+
+
+class CheckedRobot:
+    """A robot by name or by its file. Used as `async with`; its emulator runs inside.
+
+    `folder` is for ports and for what the gate remembers.
+    """
+
+    def __init__(self, name: str, link: LinkName, folder: Path) -> None:
+        if link == "real":
+            raise ConfigError("the kit drives at once; it is for the links sim and emulated")
+        self.name, self.link, self.folder = name, link, folder
+        self.run = Run(folder=folder, link=link, world=WORLD, emulator=str(folder / "ports"))
+        self.file, _, _, _ = catalog.load_link(name, self.run)
+        self._emulator: Emulator | None = None
+        self._way = -1
+
+    async def __aenter__(self) -> Self:
+        if self.link == "emulated":
+            self._emulator = await Emulator(self.name, self.run).__aenter__()
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._emulator:
+            await self._emulator.__aexit__(kind, error, traceback)
+
+    def driver(self) -> Driver:
+        """A new driver, not opened yet."""
+        return catalog.make_driver(self.name, self.run)[1]
+
+    def next_direction(self) -> int:
+        """1 or -1, the other one each time: who drives to and fro does not come to a wall."""
+        self._way = -self._way
+        return self._way
+
+    @property
+    def has_peer(self) -> bool:
+        """Whether there is somebody at the other end of a line."""
+        return self._emulator is not None
+
+    @property
+    def peer(self) -> Emulator:
+        """The other end of the line. Raises Skipped where there is none."""
+        if self._emulator is None:
+            raise Skipped(f"link {self.link} has no peer that could fail")
+        return self._emulator
+
+    def break_peer(self, words: str) -> None:
+        """Have these faults at the base's end of the line; none for an empty text."""
+        self.peer.set(self.peer.faults_of(f"{BASE} {words}"))
+
+    @property
+    def promise(self) -> str:
+        """After how long without a command the body's own firmware stops its motors."""
+        device = type(self._emulator.stations[BASE].device) if self._emulator else Device
+        return f"{device.watchdog_ns / 1e6:.0f} ms ({device.promised_in})"
+
+    @property
+    def promised_ms(self) -> float:
+        """The same as a number [ms]."""
+        return self.peer.stations[BASE].device.watchdog_ns / 1e6
+
+    def commanded(self, state: RobotState | None) -> tuple[float, float, float]:
+        """What the motors are told now, as the peer knows it, or as the body moves without one."""
+        if self._emulator:
+            return self._emulator.body.commanded
+        velocity = state.velocity if state else None
+        return (velocity.linear_x, velocity.linear_y, velocity.angular_z) if velocity else (0, 0, 0)
+
+    def rests(self, state: RobotState | None) -> bool:
+        """Whether the body stands still in truth, or as it says where nobody knows the truth."""
+        if self._emulator is None:
+            return state is not None and at_rest(state.velocity)
+        speed = self._emulator.body.report().get("true_speed")
+        still = isinstance(speed, float | int) and abs(speed) < REST_SPEED
+        return still and not any(self._emulator.body.commanded)
+
+
+def link_of(driver: Driver) -> Link:
+    """The line of a driver, which it keeps in `link`. Raises Skipped."""
+    link = getattr(driver, "link", None)
+    if not isinstance(link, Link):
+        raise Skipped("the driver keeps no Link in `link`: no bytes to look at")
+    return link
+
+
+OPEN_TICKS = 250  # 5 s
+
+
+class DriverSession(Timeline):
+    """Commands `wanted` in every tick and keeps what came of it. Used as `async with`."""
+
+    def __init__(self, robot: CheckedRobot) -> None:
+        super().__init__()
+        self.driver = robot.driver()
+        self.wanted = ZERO
+        self.sent: Velocity | None = None  # what the driver returned last
+        self.state: RobotState | None = None
+        self._live: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        await self.driver.__aenter__()
+        self._live = asyncio.create_task(self._run(), name="conformance session")
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._live:
+            self._live.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._live
+        await self.driver.__aexit__(kind, error, traceback)
+
+    async def connected(self) -> int:
+        """Wait for the body; after how many ticks it was heard."""
+        ticks = await self.until(lambda: self.state and self.state.link.connected, OPEN_TICKS)
+        if ticks is None:
+            raise Failed(f"the body was not heard within {OPEN_TICKS} ticks")
+        return ticks
+
+    def check_alive(self) -> None:
+        """Raise what the driver raised."""
+        if self._live and self._live.done():
+            self._live.result()
+            raise Failed("its ticks have ended")
+
+    async def _run(self) -> None:
+        async for passed in self.driver.ticks(Clock()):
+            self.tick += passed
+            self.state = await self.driver.read_state()
+            to = self.wanted
+            self.sent = await self.driver.set_base_velocity(to.linear_x, to.linear_y, to.angular_z)

@@ -1,0 +1,245 @@
+"""Hands out robots under test, and measures how a driving robot comes to rest after a fault."""
+
+import itertools
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, NamedTuple, Self
+
+from gigabrain_drivers.driver.catalog import load_robot
+from gigabrain_drivers.emulators.emulator import wire_of
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_zenoh.config.settings import DecisionConfig, LinkName, PerceptionConfig, Resume
+from gigabrain_zenoh.qa.faults.fault import Stage
+from gigabrain_zenoh.qa.judging import Failed, Figure, Skipped
+from gigabrain_zenoh.qa.probe import TICK_MS, Probe, at_rest, until
+from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, NEVER_GIVE_UP, Change, RobotUnderTest
+from gigabrain_zenoh.runtime.deployment import Deployment
+from gigabrain_zenoh.runtime.managed_process import Backoff, ProcessSpec
+
+BROKEN_PROCESS = (sys.executable, "-P", "-m", "gigabrain_zenoh.qa.faults.rig.broken_process")
+SPEED = 0.26  # [m/s], of all tests that do not say otherwise
+BODIES: dict[Stage, str] = {
+    "sim": "turtlebot3_waffle",
+    "auto": "turtlebot3_waffle",
+    "line": "mycustombot",
+    "serial": "mycustombot",
+    "tcp": "alpha",
+}
+SLOWER = 0.01  # [m/s], half of what a body brakes in a tick
+RESTED_TICKS = 50  # how long a robot must stand once all is well again
+
+BRAKES, ZERO = Figure("brakes after", "ms"), Figure("zero after", "ms")
+TRAVEL = Figure("travel", "m")
+MOVED_AGAIN = Figure("moved again", "m")  # before a person has enabled it again
+STALE = Figure("stale commands executed")  # they rest on data older than 250 ms
+STOPS_IN_TIME = (BRAKES.at_most(120), ZERO.at_most(480), TRAVEL.at_most(0.1))
+STAYS_STILL = MOVED_AGAIN.at_most(0.005)
+NONE_STALE = STALE.at_most(0)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a run of the suite."""
+
+    body: str = ""  # instead of each stage's own
+    world: str = "arena"
+    behaviour: Literal["avoid", "navigate"] = "avoid"
+    long: bool = False  # the forms for a release, instead of those for every change
+    wall: bool = True  # judge wall-clock limits too, which need an otherwise idle machine
+
+
+class Rig:
+    """Hands out running robots. Used as `async with`; no process is left afterwards."""
+
+    def __init__(self, options: Options, folder: Path) -> None:
+        self.options, self.folder = options, folder
+        self._numbers = itertools.count(1)
+        self._kept: tuple[Deployment, RobotUnderTest] | None = None
+        self._robots: list[RobotUnderTest] = []
+
+    def pids(self) -> list[int]:
+        """Return the pids of all processes that are ready, of all running robots."""
+        return [pid for robot in self._robots for pid in robot.ready_pids()]
+
+    @property
+    def long(self) -> bool:
+        """Whether to run the long forms."""
+        return self.options.long
+
+    @property
+    def body(self) -> str:
+        """The body of tests that run no robot."""
+        return self.options.body or BODIES["sim"]
+
+    @property
+    def description(self) -> BodyDescription:
+        """The description of `body`."""
+        return load_robot(self.body).description()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.give_up()
+
+    async def robot(self, stage: Stage) -> RobotUnderTest:
+        """Return the robot of a stage: the running one if it is reusable, else a new one.
+
+        Raises Skipped where the chosen body cannot play that part.
+        """
+        kept, wanted = self._kept, deployment_of(self.options, stage)
+        if kept and (kept[0] != wanted or not kept[1].reusable):
+            await self.give_up()
+        if self._kept is None:
+            self._kept = wanted, await self.new(wanted).__aenter__()
+        _, robot = self._kept
+        await robot.settle()
+        return robot
+
+    def new(
+        self, deployment: Deployment, change: Change | None = None,
+        backoff: Backoff = NEVER_GIVE_UP, *, keep_stuck: bool = True,
+    ) -> RobotUnderTest:  # fmt: skip
+        """Return a test's own robot, not started yet; to be used as `async with`.
+
+        Call `give_up` first, so that two robots do not share the machine.
+        """
+        folder = self.fresh_folder()
+        robot = RobotUnderTest(deployment, folder, change, backoff, keep_stuck=keep_stuck)
+        self._robots.append(robot)
+        return robot
+
+    def fresh_folder(self) -> Path:
+        """Return a new, empty folder."""
+        folder = self.folder / str(next(self._numbers))
+        folder.mkdir(parents=True)
+        return folder
+
+    async def give_up(self) -> None:
+        """End the running robot. The next test gets a new one."""
+        kept, self._kept = self._kept, None
+        if kept:
+            await kept[1].close()
+
+    async def check(self) -> None:
+        """Raise Failed where a test has left contacts or a dead process behind."""
+        if self._kept:
+            await self._kept[1].check()
+
+
+def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> Deployment:
+    """Return the deployment of a stage. Raises Skipped where the chosen body has no such link."""
+    body = options.body or BODIES[stage]
+    link: LinkName = "sim" if stage in ("sim", "auto") else "emulated"
+    wire: Literal["serial", "tcp", ""] = wire_of(body) if link == "emulated" else ""
+    if link == "emulated" and not (wire == stage or (wire and stage == "line")):
+        raise Skipped(f"{body} has no {stage} line" if stage != "line" else f"{body} has no line")
+    return Deployment(
+        body=body,
+        link=link,
+        world=options.world,
+        resume="auto" if stage == "auto" else resume,
+        router=LOOPBACK,
+        perception=PerceptionConfig(mapping="slam" if options.behaviour == "navigate" else "off"),
+        decision=DecisionConfig(
+            behaviour=options.behaviour, linear_speed=SPEED, speed_limit=SPEED, begin="roam"
+        ),
+    )
+
+
+def broken(names: tuple[str, ...], kind: str) -> Change:
+    """Return a change of deployment in which the named processes run broken."""
+
+    def change(specs: list[ProcessSpec]) -> list[ProcessSpec]:
+        return [
+            replace(spec, argv=(*BROKEN_PROCESS, kind, spec.argv[-1]))
+            if spec.name in names
+            else spec
+            for spec in specs
+        ]
+
+    return change
+
+
+@asynccontextmanager
+async def tampered(rig: Rig, *kinds: str) -> AsyncIterator[RobotUnderTest]:
+    """Boot a robot whose driver publishes what `kinds` of `broken_process.TAMPERINGS` say."""
+    await rig.give_up()
+    change = broken(("driver",), ",".join(kinds))
+    async with rig.new(deployment_of(rig.options, "sim"), change) as robot:
+        await robot.settle()
+        yield robot
+        await robot.check()
+
+
+def next_step(robot: RobotUnderTest) -> None:
+    """Begin the next kind of tampering, or end the present one."""
+    robot.signal("driver", signal.SIGUSR1)
+
+
+class Stop(NamedTuple):
+    """A stop from straight driving."""
+
+    brakes_ms: float  # from the last tick of the victim to the first that slows the body down
+    zero_ms: float  # to the first tick from which the body is measured at rest
+    travel_m: float  # by the physics, until at rest
+    distance_m: float  # the whole path so far, by the physics
+
+    def figures(self) -> dict[Figure, float]:
+        """Return the figures of `STOPS_IN_TIME`."""
+        return {BRAKES: self.brakes_ms, ZERO: self.zero_ms, TRAVEL: self.travel_m}
+
+
+async def stop_by(robot: RobotUnderTest, fault: Callable[[], object], victim: str = "") -> Stop:
+    """Cause a fault while the brain drives, and wait until the gate is shut and the body rests.
+
+    Times count from the last tick that the `victim` has answered.
+    """
+    probe = robot.probe
+    await robot.drive()
+    before_m = await robot.travelled()
+    start = probe.state
+    fault()
+    await until(lambda: probe.state.gate.mode != "enabled", "the gate begins to shut")
+    begin = max(start.tick, _last_answer(probe, victim, start))
+    await until(lambda: probe.state.gate.mode in ("idle", "latched"), "the gate shuts")
+    if not any(s.gate.causes for s in probe.states if s.tick > start.tick):
+        raise Failed("the gate gives no cause for being shut")
+    await probe.at_rest()
+    distance_m = await robot.travelled()
+    brakes, zero = first_slower(probe, start, begin), first_zero(probe, start, begin)
+    brakes_ms, zero_ms = (brakes - begin) * TICK_MS, (zero - begin) * TICK_MS
+    return Stop(brakes_ms, zero_ms, distance_m - before_m, distance_m)
+
+
+def _last_answer(probe: Probe, victim: str, start: RobotState) -> int:
+    """Return the newest tick that the victim has answered.
+
+    Called once the gate shuts: by then all answers have arrived, however busy the machine is, and
+    the victim has not been restarted yet.
+    """
+    newest = {
+        "decision": probe.intent.current,
+        "safety": probe.safety.current,
+        "control": probe.commands[-1] if probe.commands else None,
+    }.get(victim)
+    return newest.tick if newest and newest.boot == start.boot else 0
+
+
+def first_slower(probe: Probe, start: RobotState, begin: int) -> int:
+    """Return the first tick since `begin` that slows the body: a slower command, or a shut gate."""
+    shut = next(s.tick for s in probe.since(start)[1:] if s.gate.mode != "enabled")
+    ours = [c for c in probe.commands if c.boot == start.boot]
+    speed = next((c.linear_x for c in reversed(ours) if c.tick <= begin), 0.0)
+    slower = (c.tick for c in ours if c.tick > begin and c.linear_x < speed - SLOWER)
+    return min(shut, next(slower, shut))
+
+
+def first_zero(probe: Probe, start: RobotState, begin: int) -> int:
+    """Return the tick since `begin` from which the body is measured at rest."""
+    moving = [s.tick for s in probe.since(start) if s.tick > begin and not at_rest(s)]
+    return (moving[-1] if moving else begin) + 1

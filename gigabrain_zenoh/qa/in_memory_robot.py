@@ -1,0 +1,143 @@
+"""A robot's nodes in this process, in fake time, with a body that is computed elsewhere."""
+
+import asyncio
+import functools
+from collections.abc import AsyncIterator, Callable, Mapping
+from pathlib import Path
+from typing import Protocol, Self, TypeVar
+
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.process import DriverProcess
+from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_schemas.base import TICK_NS, Message, Velocity
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.topics import SCAN, Service
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.transport import LocalNetwork
+from gigabrain_zenoh.clock import Clock, FakeClock
+from gigabrain_zenoh.config.settings import DriverConfig
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.runtime.replay import Node
+
+Q = TypeVar("Q", bound=Message)
+R = TypeVar("R", bound=Message)
+
+ANSWER_S = 30.0  # of wall time: an answer may take work beside the loop
+
+
+class InMemoryRobot:
+    """Nodes on one network in this process; the last brings the ticks. Used as `async with`."""
+
+    def __init__(self, nodes: Mapping[str, Node]) -> None:
+        self._nodes = nodes
+        self._network, self._clock = LocalNetwork(), FakeClock()
+        self._running: dict[str, tuple[asyncio.Future[None], Bus]] = {}
+
+    async def __aenter__(self) -> Self:
+        self.operator = Bus(self._network.transport(), self._clock, "operator")
+        for name, node in self._nodes.items():
+            ready, bus = asyncio.Event(), Bus(self._network.transport(), self._clock, name)
+            running = asyncio.ensure_future(node(bus, ready.set))
+            self._running[name] = running, bus
+            waiting = asyncio.ensure_future(ready.wait())
+            await asyncio.wait((running, waiting), return_when=asyncio.FIRST_COMPLETED)
+            waiting.cancel()
+            self._check()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for running, bus in reversed(self._running.values()):
+            running.cancel()
+            await asyncio.wait((running,))
+            await bus.close()
+        await self.operator.close()
+
+    async def tick(self) -> None:
+        """Let 20 ms pass. Raises whatever has ended a node."""
+        await self._clock.advance(TICK_NS)
+        self._network.sent.clear()
+        self._check()
+
+    async def ask(self, service: Service[Q, R], request: Q) -> list[R]:
+        """What the nodes answer, while time stands still. Raises Refused, with why."""
+        return await self.operator.ask(service, request, timeout_s=ANSWER_S)
+
+    def _check(self) -> None:
+        for running, _ in self._running.values():
+            if running.done():
+                running.result()
+
+
+class ExternalPlant(Protocol):
+    """Whoever works it out."""
+
+    def advance(self, velocity: Velocity) -> None:
+        """Go on by 20 ms."""
+        ...
+
+    def state(self) -> RobotState:
+        """What the body measures of itself now."""
+        ...
+
+    def scan(self) -> LaserScan | None:
+        """What its lidar sees now; None in ticks without a scan."""
+        ...
+
+
+class ExternalPlantDriver(Driver):
+    """Hands on what the gate lets through, a tick at a time."""
+
+    def __init__(self, robot: RobotFile, plant: ExternalPlant) -> None:
+        super().__init__(robot, None, Run(folder=Path()))
+        self._plant, self._velocity = plant, ZERO
+
+    async def open(self) -> None:
+        """There is nothing to connect to."""
+
+    async def close(self) -> None:
+        """There is nothing to let go of."""
+
+    async def stop(self) -> None:
+        """Be told zero from the next tick on."""
+        self._velocity = ZERO
+
+    async def ticks(self, clock: Clock) -> AsyncIterator[int]:
+        """By the clock; a scan comes between two states, as a lidar keeps no step with them."""
+        async for passed in super().ticks(clock):
+            for _ in range(passed):
+                self._plant.advance(self._velocity)
+            yield passed
+            await clock.sleep_ns(TICK_NS // 2)
+            scan = self._plant.scan()
+            if scan:
+                self.emit(SCAN, scan)
+
+    async def set_base_velocity(
+        self, linear_x: float, linear_y: float, angular_z: float
+    ) -> Velocity:
+        """From the next tick on."""
+        self._velocity = self.bounded(linear_x, linear_y, angular_z)
+        return self._velocity
+
+    async def read_state(self) -> RobotState:
+        """As worked out."""
+        return self._plant.state()
+
+
+def node_of(body: BodyDescription, plant: ExternalPlant, folder: str) -> Node:
+    """The driver's process for a body; what latches its gate is kept in `folder`."""
+    names = BodyDescription.__struct_fields__
+    robot = RobotFile(summary="", **{name: getattr(body, name) for name in names})
+    config = DriverConfig(body=body.robot_type, resume="auto", state_dir=folder)
+    return functools.partial(_run, config, robot, plant)
+
+
+async def _run(
+    config: DriverConfig,
+    robot: RobotFile,
+    plant: ExternalPlant,
+    bus: Bus,
+    ready: Callable[[], None],
+) -> None:
+    await DriverProcess(config, robot, ExternalPlantDriver(robot, plant), bus).run(ready)

@@ -1,0 +1,392 @@
+"""Boots robots for faults and benchmarks: groups of processes, and a whole robot with a probe."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import tempfile
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self
+
+import msgspec
+import psutil
+
+from gigabrain_schemas.requests import DescribeRequest
+from gigabrain_schemas.topics import DESCRIBE
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.launch.specs import process_specs
+from gigabrain_zenoh.qa.judging import Failed
+from gigabrain_zenoh.qa.probe import Probe, probing, until
+from gigabrain_zenoh.runtime.deployment import EMULATOR, Deployment, client_endpoint, with_free_port
+from gigabrain_zenoh.runtime.managed_process import Backoff, ProcessSpec
+from gigabrain_zenoh.runtime.supervisor import Supervisor
+
+LOOPBACK = "tcp/127.0.0.1:0"
+Change = Callable[[list[ProcessSpec]], list[ProcessSpec]]
+# a process that is killed often is restarted each time: giving up has a test of its own
+NEVER_GIVE_UP = Backoff(factor=1.0, deaths=10_000)
+FAULTS_FILE = "faults.json"  # read by the emulator's process
+STOP_S = 1.5
+BENCH_START_S = 30.0  # longer than anything takes to start on a busy machine
+START_S = 300.0  # far more than it takes to compile what a navigating robot calls
+ASK_S = 0.5
+NEARLY_STRAIGHT = {"avoid": 0.1, "navigate": 0.3}  # [rad/s]; legs sway, and routes have bends
+FULL_SHARE = {"avoid": 0.96, "navigate": 0.6}  # of a speed; a busy host drives more slowly
+
+
+class ProcessGroup:
+    """Processes under the supervisor that `up` uses. Used as `async with`.
+
+    Where `strict`, any death of a process ends the measurement.
+    """
+
+    def __init__(
+        self, specs: Sequence[ProcessSpec], backoff: Backoff | None = None,
+        *, strict: bool = True, keep_stuck: bool = False,
+    ) -> None:  # fmt: skip
+        self.supervisor = Supervisor(
+            specs, self._record, backoff or Backoff(), keep_stuck=keep_stuck
+        )
+        self.records: list[Mapping[str, Any]] = []  # of all logs
+        self.ready_s = 0.0  # from the first start until all were ready
+        self._strict = strict
+        self._began_s = 0.0
+        self._running: asyncio.Task[None] | None = None
+        self._stack = AsyncExitStack()
+
+    async def __aenter__(self) -> Self:
+        self._began_s = asyncio.get_running_loop().time()
+        await self._stack.enter_async_context(self.supervisor)
+        self._running = asyncio.create_task(self.supervisor.run())
+        self._stack.push_async_callback(self._end)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._stack.aclose()
+
+    async def _end(self) -> None:
+        await self.supervisor.stop(STOP_S)
+        if self._running:
+            await self._running
+
+    def _record(self, _name: str, record: Mapping[str, Any]) -> None:
+        self.records.append(record)
+        if not self.ready_s and self.ready:
+            self.ready_s = self.seconds
+
+    @property
+    def seconds(self) -> float:
+        """Time since the first start [s]."""
+        return asyncio.get_running_loop().time() - self._began_s
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Pids of all processes that run, by name."""
+        return {name: one.pid for name, one in self.supervisor.statuses.items() if one.pid}
+
+    @property
+    def cpu_s(self) -> float:
+        """CPU time of all processes so far [s]."""
+        used = 0.0
+        for pid in self.pids.values():
+            with contextlib.suppress(psutil.Error):
+                times = psutil.Process(pid).cpu_times()
+                used += times.user + times.system
+        return used
+
+    @property
+    def ready(self) -> bool:
+        """Whether all processes are ready."""
+        return all(status.state == "ready" for status in self.supervisor.statuses.values())
+
+    def check_processes(self) -> None:
+        """Raise ConfigError for a refused configuration, Failed for a dead process."""
+        if self.supervisor.misconfigured:
+            raise ConfigError(self._complaint() or "a process refuses its configuration")
+        if self.supervisor.given_up:
+            raise Failed(f"{', '.join(self.supervisor.given_up)} cannot be started")
+        if self._strict and self.supervisor.deaths:
+            raise Failed(f"a process died during the measurement: {self._complaint()}")
+
+    def _complaint(self) -> str:
+        failed = [r for r in self.records if r.get("event") == "failed"]
+        errors = [r for r in self.records if r.get("level") in ("error", "critical")]
+        return str((failed[-1:] or errors[:1] or [{}])[0].get("text", ""))
+
+    async def until(
+        self, done: Callable[[], bool], what: str, within_s: float = BENCH_START_S
+    ) -> None:
+        """Wait for `done`. Raises Failed when a process dies or time is up, and ConfigError."""
+
+        def checked() -> bool:
+            self.check_processes()
+            return done()
+
+        await until(checked, what, within_s)
+
+    async def until_ready(self, within_s: float = START_S) -> None:
+        """Wait until every process is ready. Raises like `until`."""
+        await self.until(lambda: self.ready, "all processes are ready", within_s)
+
+    async def look(self, seconds: float = 0.02) -> None:
+        """Wait a little. Raises like `until`."""
+        await asyncio.sleep(seconds)
+        self.check_processes()
+
+    async def run_for(self, seconds: float) -> None:
+        """Let the processes run. Raises like `until`."""
+        end_s = asyncio.get_running_loop().time() + seconds
+        while asyncio.get_running_loop().time() < end_s:
+            await self.look()
+
+
+@asynccontextmanager
+async def client(endpoint: Endpoint) -> AsyncIterator[Bus]:
+    """Open a session that costs the robot nothing until it subscribes to something."""
+    bus = Bus(await ZenohTransport.open(endpoint), Clock(), "bench")
+    try:
+        yield bus
+    finally:
+        await bus.close()
+
+
+@asynccontextmanager
+async def measured_robot(
+    deployment: Deployment, folder: Path | None = None, ready_s: float | None = BENCH_START_S
+) -> AsyncIterator[tuple[ProcessGroup, Bus]]:
+    """Run a deployment for a benchmark; all processes are ready, and none is left afterwards.
+
+    With `ready_s` None the block begins with the start of the processes instead.
+    """
+    deployment = with_free_port(deployment)
+    with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as temporary:
+        folder = folder or Path(temporary)
+        specs = process_specs(deployment, "robot", folder, folder / "state")
+        async with ProcessGroup(specs) as group:
+            if ready_s is not None:
+                await group.until_ready(ready_s)
+            async with client(client_endpoint(deployment)) as bus:
+                yield group, bus
+
+
+async def driver_report(bus: Bus) -> dict[str, float | int | str | None]:
+    """Return the driver's report; empty while it does not answer."""
+    answers = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=ASK_S, name="driver")
+    return dict(answers[0].report) if answers else {}
+
+
+class RobotUnderTest(ProcessGroup):
+    """A whole robot with a probe on its bus. Used as `async with`, or closed by hand."""
+
+    probe: Probe
+    person: Robot  # acts as an operator
+
+    def __init__(
+        self, deployment: Deployment, folder: Path, change: Change | None = None,
+        backoff: Backoff = NEVER_GIVE_UP, *, keep_stuck: bool = True,
+    ) -> None:  # fmt: skip
+        self.deployment, self.folder = with_free_port(deployment), folder
+        specs = process_specs(self.deployment, "robot", folder / "run", folder / "state")
+        # a test that freezes a process thaws it itself, unless it tests the restart
+        super().__init__(
+            change(specs) if change else specs, backoff, strict=False, keep_stuck=keep_stuck
+        )
+        self._frozen: set[int] = set()
+        self._faulty = False
+        self._contacts = 0
+        self._judged = 0  # records that `check` has seen
+
+    async def __aenter__(self) -> Self:
+        try:
+            await super().__aenter__()
+            await self.until_ready()
+            endpoint = client_endpoint(self.deployment, "operator")
+            self.probe = await self._stack.enter_async_context(probing(endpoint, "suite"))
+            self.person = Robot(self.probe.bus)
+        except BaseException:
+            await self.close()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """End all processes. May be called any number of times."""
+        self.thaw()
+        await self._stack.aclose()
+
+    @property
+    def reusable(self) -> bool:
+        """Whether another test can use this robot."""
+        return bool(self._running and not (self.supervisor.given_up or self._running.done()))
+
+    @property
+    def ports(self) -> Path:
+        """The folder of an emulated body's ports."""
+        return self.folder / "run" / "ports"
+
+    def ready_pids(self) -> list[int]:
+        """Return the pids of all processes that are ready."""
+        statuses = self.supervisor.statuses.values()
+        return [status.pid for status in statuses if status.pid and status.state == "ready"]
+
+    def pid(self, name: str) -> int:
+        """Return the pid of a process. Raises Failed when it does not run."""
+        pid = self.supervisor.statuses[name].pid
+        if pid is None:
+            raise Failed(f"{name} does not run")
+        return pid
+
+    def signal(self, name: str, number: signal.Signals) -> int:
+        """Send a signal to a process; returns its pid. Raises Failed when it died by itself."""
+        pid = self.pid(name)
+        try:
+            os.kill(pid, number)
+        except ProcessLookupError:
+            raise Failed(f"{name} has died by itself") from None
+        return pid
+
+    def kill(self, name: str) -> int:
+        """Send SIGKILL; returns the pid."""
+        return self.signal(name, signal.SIGKILL)
+
+    def freeze(self, name: str) -> None:
+        """Send SIGSTOP; lasts until `thaw` or the end of the test."""
+        self._frozen.add(self.signal(name, signal.SIGSTOP))
+
+    def thaw(self) -> None:
+        """Send SIGCONT to all frozen processes that still run."""
+        for pid in self._frozen & set(self.pids.values()):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGCONT)
+        self._frozen.clear()
+
+    async def restarted(self, name: str, pid: int) -> None:
+        """Wait until the process that had this pid is ready under another one."""
+        status = self.supervisor.statuses[name]
+        await until(
+            lambda: status.state == "ready" and status.pid != pid, f"{name}'s restart", START_S
+        )
+
+    async def break_body(self, **faults: Mapping[str, Any]) -> None:
+        """Set the faults of an emulated body, by station; returns once the emulator has them."""
+        path, begin = self.ports / FAULTS_FILE, len(self.records)
+        fresh = path.with_suffix(".new")
+        fresh.write_bytes(msgspec.json.encode(faults))
+        fresh.replace(path)
+        self._faulty = bool(faults)
+
+        def taken() -> bool:
+            texts = (str(record.get("text", "")) for record in self.records[begin:])
+            logged = [text for text in texts if text.startswith("faults: ")]
+            return bool(logged) and (logged[-1] == "faults: none") != bool(faults)
+
+        await until(taken, "the emulator takes its faults")
+
+    async def truth(self) -> dict[str, Any]:
+        """Return the physics' own values: contacts, distance_m, true_speed and more."""
+        source = EMULATOR if self.deployment.link == "emulated" else "driver"
+        return dict((await self.probe.describe(source)).report)
+
+    async def travelled(self) -> float:
+        """Return the length of the body's path so far, by the physics [m]."""
+        return float((await self.truth())["distance_m"])
+
+    async def travel_within(self, ticks: int) -> float:
+        """Return how far the body goes within `ticks`, by the physics [m]."""
+        before_m = await self.travelled()
+        await self.probe.ticks(ticks)
+        return await self.travelled() - before_m
+
+    async def after_simulated(self, seconds: float) -> dict[str, Any]:
+        """Wait for an emulated body's own time, whatever else runs; return the truth then."""
+        truth = await self.truth()
+        end_s = float(truth["sim_seconds"]) + seconds
+        while float(truth["sim_seconds"]) < end_s:
+            await asyncio.sleep(0.02)
+            truth = await self.truth()
+        return truth
+
+    async def drive(self, room: float = 1.3, share: float = 1.0) -> None:
+        """Wait until the brain drives straight at its full speed; enables it as a person would.
+
+        `share` of the speed is enough where the gate is expected to slow the robot down.
+        """
+        probe, decision = self.probe, self.deployment.decision
+        await self.release()
+        await until(lambda: probe.bodies.current, "robot/body")
+        body = probe.bodies.current
+        fastest = body.description.max_linear_speed if body else 0.0
+        full = FULL_SHARE[decision.behaviour] * min(decision.linear_speed, fastest)
+        straight = NEARLY_STRAIGHT[decision.behaviour]
+        await probe.driving_straight(share * full, room, straight, by_hand=True)
+
+    async def release(self) -> None:
+        """Release a latched gate as a person would, as soon as it agrees."""
+        probe = self.probe
+        while probe.state.gate.mode == "latched":
+            try:
+                await self.person.release()
+            except Refused:
+                await probe.ticks(5)
+            else:
+                await until(lambda: probe.state.gate.mode != "latched", "released")
+
+    async def settle(self) -> None:
+        """Wait until all processes run, the body answers and the gate is released."""
+        self.thaw()
+        if self._faulty:
+            await self.break_body()
+        await self.until_ready()
+        boot = self.probe.state.boot
+        await until(lambda: self.probe.state.link.connected, "the body answers")
+        if self.probe.state.boot == boot:
+            await self.release()
+        self._contacts = int((await self.truth())["contacts"])
+        self._judged = len(self.records)
+
+    async def check(self) -> None:
+        """Raise Failed for a contact, or for a process that died by itself."""
+        contacts = int((await self.truth())["contacts"])
+        if contacts > self._contacts:
+            raise Failed(f"{contacts - self._contacts} contacts")
+        for record in self.records[self._judged :]:
+            if record.get("level") == "critical":
+                raise Failed(f"{record.get('process')}: {record.get('text')}")
+
+
+def reconfigured(
+    spec: ProcessSpec, change: Callable[[ProcessConfig], ProcessConfig]
+) -> ProcessSpec:
+    """Return the same process with another configuration."""
+    config = change(msgspec.json.decode(spec.argv[-1], type=ProcessConfig))
+    return replace(spec, argv=(*spec.argv[:-1], msgspec.json.encode(config).decode()))
+
+
+def rss_mb(pid: int) -> float:
+    """Return the memory of a process [MB]. Raises Failed when it has ended."""
+    with _existing(pid) as process:
+        return process.memory_info().rss / 1e6
+
+
+def open_files(pid: int) -> int:
+    """Return how many files and sockets a process has open. Raises Failed when it has ended."""
+    with _existing(pid) as process:
+        return process.num_fds()
+
+
+@contextlib.contextmanager
+def _existing(pid: int) -> Iterator[psutil.Process]:
+    try:
+        yield psutil.Process(pid)
+    except psutil.Error:
+        raise Failed(f"process {pid} has ended") from None
