@@ -30,7 +30,6 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
 
-MAX_CAMERAS = 8
 LEASE_S = 0.5  # after this time without a command, another viewer may steer
 STREAM_GAP_S = 0.2  # after a longer gap, commands count as a new stream
 SETTLE_S = 0.1  # start of a new stream that is ignored: commands the network had buffered
@@ -38,6 +37,8 @@ SETTLE_S = 0.1  # start of a new stream that is ignored: commands the network ha
 
 class RobotView:
     """Newest messages of a robot. Those of busy topics are decoded only when they are read."""
+
+    max_cameras = 8  # whose images are shown
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -75,7 +76,7 @@ class RobotView:
 
     def _take_image(self, key: str, encoding: str, payload: bytes) -> None:
         camera = key.rpartition("/")[2]
-        if camera in self.images or len(self.images) < MAX_CAMERAS:
+        if camera in self.images or len(self.images) < self.max_cameras:
             sampled = self.images.setdefault(camera, Sampled(self._bus, IMAGE))
             sampled.take(key, encoding, payload)
 

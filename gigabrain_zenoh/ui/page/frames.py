@@ -137,6 +137,8 @@ def decoded(content: bytes, kind: type[T]) -> T:
 class PageView(RobotView):
     """Newest messages of a robot as frames. `send` passes a frame and its slot to all viewers."""
 
+    max_cameras = 4
+
     def __init__(self, bus: Bus, send: Callable[[str, bytes], None]) -> None:
         self._send = send
         self._kept: dict[str, bytes] = {}  # map and task, by slot
