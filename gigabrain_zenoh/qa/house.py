@@ -18,7 +18,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("gigabrain_zenoh", "drivers/gigabrain_drivers", "schemas/gigabrain_schemas")
 NAME = re.compile(r"gigabrain_(?:zenoh|drivers|schemas)(?:\.\w+)+")
-MAX_FUNCTION_LINES, MAX_FILE_LINES = 50, 450
+MAX_FUNCTION_LINES, MAX_FILE_LINES, MIN_FILE_LINES = 50, 450, 50
 ROOMS = "each room names only rooms below it"
 BY_NAME = ("launch", "gigabrain_drivers")  # the table of processes names what runs a driver
 
@@ -163,6 +163,8 @@ def show(root: Path) -> None:
     console.print(table)
     too_long = [p.name for p in known.values() if size_of([p]).lines > MAX_FILE_LINES]
     console.print(f"files over {MAX_FILE_LINES} lines: {', '.join(too_long) or 'none'}")
+    small = sum(size_of([path]).lines < MIN_FILE_LINES for path in known.values())
+    console.print(f"files under {MIN_FILE_LINES} lines: {small}")
     screens = long_functions(list(known.values()))
     console.print(f"functions over {MAX_FUNCTION_LINES} lines: {', '.join(screens) or 'none'}")
     for package, names in repeated_classes(known).items():
