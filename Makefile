@@ -1,16 +1,23 @@
-# make demo   set up, and drive a robot round a room        make test   set up, and run all checks
-# make setup  the set-up alone                              make check  those that start no robot
-# make bench  measure this machine                          make qa     what takes hours
+# make demo    set up, and drive a robot round a room
+# make check   set up; lint, types, contracts and unit tests
+# make test    that, the node tests and the system tests: what to run before a commit is shared
+# make qa      what takes long, for a release; continued where it was stopped
+# make bench   measure this machine
+# ARGS is passed on: make unit ARGS="tests/unit/gate -k latch"
 
 VENV := .venv
 BIN := $(VENV)/bin
 PYTHON ?= python3
 INSTALLED := $(VENV)/.installed
-DONE := $(VENV)/.done
+WARM := $(VENV)/.done
+PYTEST := $(BIN)/pytest
+SIDE_BY_SIDE := -n 2 --dist loadfile
+MAKEFLAGS += --no-print-directory
 
-.PHONY: setup demo test check lint unit system bench faults soak mutation fuzz golden recordings pictures clean qa
+.PHONY: setup demo lint unit node system check test qa qa-tests extremes dockerfile signals \
+  ci-extra bench faults soak mutation fuzz golden recordings pictures clean
 
-setup: $(DONE)
+setup: $(WARM)
 
 # uv where it is installed, pip otherwise
 $(INSTALLED): pyproject.toml
@@ -25,46 +32,71 @@ $(INSTALLED): pyproject.toml
 	fi
 	@touch $@
 
-$(DONE): $(INSTALLED)
+# the kernels, compiled once
+$(WARM): $(INSTALLED)
 	@$(BIN)/gigabrain warm
 	@touch $@
 
 demo: setup
 	@$(BIN)/gigabrain demo $(ARGS)
 
-test:
-	@$(MAKE) --no-print-directory check
-	@$(MAKE) --no-print-directory system
-
-check:
-	@$(MAKE) --no-print-directory --jobs 2 setup lint  # one compiles while the other checks
-	@$(MAKE) --no-print-directory unit
+# ---- checks ----
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m gigabrain_zenoh.qa.house
+	$(BIN)/mypy
 
 unit: setup
-	$(BIN)/pytest -n 2 --dist loadfile -m 'not system' $(ARGS)
+	$(PYTEST) $(SIDE_BY_SIDE) -q $(or $(ARGS),tests/unit tests/fuzz)
 
+node: setup
+	$(PYTEST) $(SIDE_BY_SIDE) -q $(or $(ARGS),tests/node)
+
+# robots and sessions side by side; then those that need the machine to themselves
 system: setup
-	$(BIN)/pytest -m system $(ARGS)  # these start robots, which have the machine to themselves
+ifdef ARGS
+	$(PYTEST) -q $(ARGS)
+else
+	$(PYTEST) $(SIDE_BY_SIDE) -q -m 'not qa and not alone' tests/system
+	$(PYTEST) -q -m 'not qa and alone' tests/system
+endif
 
-# before a release, on a machine with nothing else to do: hours, and continued where it was stopped
+check: setup
+	@$(MAKE) lint
+	@$(MAKE) unit
+
+test: check
+	@$(MAKE) node
+	@$(MAKE) system
+
+# ---- what takes long ----
+
 qa: setup
-	$(BIN)/python -m tests.qa.dockerfile_steps
+	@$(MAKE) qa-tests extremes dockerfile signals faults mutation fuzz
+
+# every test that `make test` leaves out, and all properties with a thousand examples each
+qa-tests: setup
+	$(PYTEST) -q -m 'qa or hypothesis' --hypothesis-profile=qa $(ARGS)
+
+# every extreme value in every message
+extremes: setup
 	$(BIN)/python -m gigabrain_zenoh.qa.faults.rows.extreme_messages .qa/extremes.jsonl
 
-bench: setup
-	$(BIN)/gigabrain bench chain
-	$(BIN)/gigabrain bench stack
+dockerfile: setup
+	$(BIN)/python -m tests.qa.dockerfile_steps
 
-# every row ten times, the e-stop's thirty; hours, and continued where it was stopped
-INTO ?= faults.jsonl
+# signals to every command at random moments
+signals: setup
+	@mkdir -p .qa
+	$(BIN)/python -m tests.qa.signal_sweep --results .qa/signals.jsonl
+
+# every row ten times, the e-stop's thirty
+INTO ?= .qa/faults.jsonl
 faults: setup
+	@mkdir -p $(dir $(INTO))
 	$(BIN)/gigabrain faults --skip 39 43 44 --repeat 10 --into $(INTO)
 	$(BIN)/gigabrain faults --only 43 44 --repeat 30 --into $(INTO)
 
@@ -84,11 +116,16 @@ fuzz: setup
 	  $(BIN)/python $$target -max_total_time=$(FUZZ_S) -verbosity=0 -print_final_stats=1 || exit 1; \
 	done
 
-# signals to every command at random moments; goes on where it was stopped
-.PHONY: signals qa
-qa: signals
-signals: setup
-	$(BIN)/python -m tests.qa.signal_sweep --results .signals.jsonl $(ARGS)
+# what CI runs behind `make test`: the wheel in an empty environment
+ci-extra: $(INSTALLED)
+	$(BIN)/python -m tests.qa.wheel
+	$(PYTEST) -q -m ci_extra tests
+
+bench: setup
+	$(BIN)/gigabrain bench chain
+	$(BIN)/gigabrain bench stack
+
+# ---- files that are made ----
 
 golden: setup
 	$(BIN)/python -m gigabrain_schemas.golden
@@ -101,4 +138,4 @@ pictures: setup
 	$(BIN)/python -m tests.qa.pictures docs/pictures
 
 clean:
-	rm -rf .signals.jsonl $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .fuzz .fuzz-* .qa mutants
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .fuzz .fuzz-* .qa mutants

@@ -7,7 +7,7 @@ import random
 from types import ModuleType
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.fuzz import lines, messages, notes, yaml_files
@@ -63,26 +63,22 @@ def damaged(module: ModuleType, data: bytes, chance: random.Random) -> bytes:
     return data[:at] + bytes(body)
 
 
-@settings(max_examples=150, deadline=None)
 @given(name=st.sampled_from(lines.NAMES), data=st.binary(max_size=600))
 @example(name="protocol line", data=b"\xff" * 600)
 def test_bytes_at_random_on_a_line_break_nothing(name: str, data: bytes) -> None:
     lines.TARGETS[name](data)
 
 
-@settings(max_examples=150, deadline=None)
 @given(name=st.sampled_from(sorted(lines.SEALS)), data=st.binary(min_size=172, max_size=900))
 def test_well_formed_nonsense_from_a_body_is_no_invalid_state(name: str, data: bytes) -> None:
     lines.sealed(name, data)
 
 
-@settings(max_examples=150, deadline=None)
 @given(kind=st.sampled_from(yaml_files.KINDS), text=st.text(max_size=300))
 def test_text_at_random_is_refused_in_one_line_or_a_configuration(kind: str, text: str) -> None:
     yaml_files.check(f"{kind}\n{text}".encode("utf-8", "replace"))
 
 
-@settings(max_examples=100, deadline=None)
 @given(kind=st.sampled_from(sorted(notes.CHECKS)), data=st.binary(max_size=300))
 def test_bytes_at_random_in_a_small_file_break_nothing(kind: str, data: bytes) -> None:
     notes.CHECKS[kind](data)

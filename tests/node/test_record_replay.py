@@ -52,8 +52,15 @@ RECORDINGS = Path(__file__).parents[1] / "recordings"
 RENEW = "was the change meant? then: make recordings"
 
 
-@pytest.mark.parametrize("process", OUTPUTS)
-@pytest.mark.parametrize("name", DRIVES)
+LONG = {("exploring", "perception"), ("exploring", "decision")}
+REPLAYS = [
+    pytest.param(name, process, marks=pytest.mark.qa if (name, process) in LONG else ())
+    for name in DRIVES
+    for process in OUTPUTS
+]
+
+
+@pytest.mark.parametrize(("name", "process"), REPLAYS)
 async def test_every_process_does_what_it_did_on_the_recorded_drive(
     name: str, process: str
 ) -> None:

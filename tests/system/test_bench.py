@@ -9,6 +9,8 @@ import pytest
 from gigabrain_zenoh.qa.bench.stack import ProcessCost, StackResult
 from gigabrain_zenoh.testing.processes import Home
 
+pytestmark = pytest.mark.alone
+
 
 def stack(**changes: object) -> StackResult:
     values = {

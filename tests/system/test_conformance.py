@@ -8,6 +8,12 @@ import pytest
 from gigabrain_drivers.driver.catalog import links_of, load_robot, robot_files
 from gigabrain_zenoh.qa.conformance import kit
 
+pytestmark = pytest.mark.alone
+
+QUICK = ("mock", "mycustombot")  # the others in `make qa`
+BODIES = [
+    pytest.param(name, marks=() if name in QUICK else pytest.mark.qa) for name in robot_files()
+]
 NEEDS_A_PEER = {
     "stops when it is killed",
     "stops unplugged",
@@ -17,7 +23,7 @@ NEEDS_A_PEER = {
 }
 
 
-@pytest.mark.parametrize("name", robot_files())
+@pytest.mark.parametrize("name", BODIES)
 async def test_every_robot_passes_the_kit(
     name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -1,4 +1,4 @@
-"""The fault suite: its frame, and every fault once, in its short form, on real processes."""
+"""The fault suite on real processes: some rows here, all of them in `make qa`."""
 
 import asyncio
 
@@ -8,17 +8,29 @@ from gigabrain_zenoh.qa.faults.fault import FaultResult, FaultRow
 from gigabrain_zenoh.qa.faults.rig.rig import Options
 from gigabrain_zenoh.qa.faults.suite import FAULTS, run_suite
 
+pytestmark = pytest.mark.alone
+
+# a process, the gate, a link, the router, and the e-stop
+QUICK = ("decision-killed", "gate-killed", "serial-unplugged", "router-killed", "e-stop-pressed")
+ROWS = [
+    pytest.param(fault, id=fault.name, marks=() if fault.name in QUICK else pytest.mark.qa)
+    for fault in FAULTS
+]
+
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> dict[int, FaultResult]:
-    """What came of each fault, judged by ticks alone; they share robots, so they run in one go."""
-    options = Options(wall=False)
-    done = asyncio.run(run_suite(FAULTS, options, tmp_path_factory.mktemp("faults")))
+def results(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> dict[int, FaultResult]:
+    """The result of each chosen row, judged by ticks alone; they share robots: one go for all."""
+    own = [i for i in request.session.items if i.path == request.path]
+    chosen = [fault for fault in FAULTS if any(f"[{fault.name}]" in item.name for item in own)]
+    folder, options = tmp_path_factory.mktemp("faults"), Options(wall=False)
+    done = asyncio.run(run_suite(chosen, options, folder))
     return {result.number: result for result in done}
 
 
-@pytest.mark.system
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize("fault", ROWS)
 def test_the_robot_stops_whatever_breaks(fault: FaultRow, results: dict[int, FaultResult]) -> None:
     result = results[fault.number]
     if result.verdict == "skipped":

@@ -23,6 +23,8 @@ from gigabrain_zenoh.testing.zenoh import (
     under_way,
 )
 
+pytestmark = pytest.mark.alone
+
 
 def client_of(endpoint: str) -> Awaitable[ZenohTransport]:
     return ZenohTransport.open(Endpoint(connect=(endpoint,)))

@@ -1,7 +1,7 @@
 """Control by what the body really did: gaps, other wheels, and nothing that winds up."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -100,7 +100,6 @@ moments = st.lists(st.tuples(wishes, twists, caps, gates, st.integers(1, 4)), ma
 Moment = tuple[Intent | None, Velocity | None, SpeedCaps, GateStatus, int]
 
 
-@settings(deadline=None)
 @given(moments, st.floats(0.5, 1.5))
 def test_no_wish_makes_a_command_that_jumps_or_goes_beyond_the_limits(
     story: list[Moment], gain: float
@@ -122,7 +121,6 @@ def test_no_wish_makes_a_command_that_jumps_or_goes_beyond_the_limits(
         before, open_before = now, opened
 
 
-@settings(deadline=None)
 @given(moments, wishes, twists, caps, gates)
 def test_asked_again_within_a_tick_it_answers_the_same(
     story: list[Moment],

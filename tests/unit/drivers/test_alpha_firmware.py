@@ -4,7 +4,7 @@ import math
 from types import SimpleNamespace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_drivers.bodies.alpha import protocol as alpha
@@ -147,7 +147,6 @@ def test_after_silence_a_new_count_may_begin_anywhere() -> None:
     assert firmware.step(10).echo == 1
 
 
-@settings(max_examples=60)
 @given(st.lists(st.binary(max_size=80), max_size=20))
 def test_no_bytes_make_it_walk_or_end(pieces: list[bytes]) -> None:
     firmware = Firmware()

@@ -1,36 +1,21 @@
 """The MuJoCo driver, joined to the real brain over an in-memory network, in lock-step."""
 
-import asyncio
-import itertools
 import threading
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import msgspec
 import pytest
 
 from gigabrain_drivers.driver import catalog
-from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim import driver as sim_driver
 from gigabrain_drivers.sim.account import account_of
 from gigabrain_drivers.sim.driver import MujocoDriver
 from gigabrain_drivers.sim.physics import Simulation
-from gigabrain_schemas.brain import Intent
-from gigabrain_schemas.topics import IMU, INTENT, SCAN, STATE
-from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.config.settings import DecisionConfig, DriverConfig, PerceptionConfig
-from gigabrain_zenoh.control import node as control
-from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
-from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.recording.headers import header_of
-from gigabrain_zenoh.safety import node as safety
 
 WAFFLE = "turtlebot3_waffle"
-Node = Callable[[Bus, Callable[[], None]], Awaitable[None]]
 
 
 def make(speed: float = 100.0, seconds: float | None = None, **options: float) -> MujocoDriver:
@@ -39,70 +24,6 @@ def make(speed: float = 100.0, seconds: float | None = None, **options: float) -
     assert isinstance(driver, MujocoDriver)
     changed = msgspec.structs.replace(driver.options, **options)
     return MujocoDriver(robot, changed, driver.run)
-
-
-async def drive(driver: MujocoDriver, folder: Path) -> tuple[LocalNetwork, list[float]]:
-    """Let the whole brain drive until the simulation ends; the true speed at each state."""
-    network, speeds = LocalNetwork(), list[float]()
-    config = DriverConfig(body=WAFFLE, speed=driver.run.speed, resume="auto", state_dir=str(folder))
-
-    def bus() -> Bus:
-        return Bus(network.transport(), Clock())
-
-    brain: tuple[Node, ...] = (
-        lambda bus, ready: perception.run(PerceptionConfig(), bus, ready),
-        lambda bus, ready: decision.run(DecisionConfig(), bus, ready),
-        control.run,
-        safety.run,
-    )
-    tasks = [asyncio.ensure_future(node(bus(), lambda: None)) for node in brain]
-    watcher = bus()
-    watcher.subscribe(STATE, lambda key, state: speeds.append(float(driver.report()["true_speed"])))  # type: ignore[arg-type]
-    body = bus()
-    process = DriverProcess(config, driver.robot, driver, body)
-    tasks.append(asyncio.ensure_future(process.run(lambda: None)))
-    while not driver.finished:
-        await asyncio.sleep(0.01)
-        for task in tasks:
-            if task.done():
-                task.result()
-    for task in tasks:
-        task.cancel()
-    await asyncio.gather(*tasks, return_exceptions=True)
-    return network, speeds
-
-
-async def test_a_wheel_that_is_ten_percent_smaller_still_gives_the_commanded_speed(
-    tmp_path: Path,
-) -> None:
-    worn = make(seconds=6.0, wheel_scale=0.9, odometry_wheel_radius=0.0297)
-    _, speeds = await drive(worn, tmp_path)
-
-    straight = speeds[-100:]  # the last two seconds; the arena's first leg is longer than six
-    assert 0.196 <= sum(straight) / len(straight) <= 0.204
-
-
-async def test_the_brain_drives_the_simulated_body_and_the_report_tells_the_truth(
-    tmp_path: Path,
-) -> None:
-    driver = make(seconds=5.0)
-    network, _ = await drive(driver, tmp_path)
-
-    report = driver.report()
-    assert report["sim_seconds"] == 5.0
-    assert report["contacts"] == 0
-    assert 0.7 <= float(report["distance_m"] or 0) <= 0.95  # half a second to wake, then 0.2 m/s
-    assert ticks_of(network, STATE.key) == list(range(1, 251))
-    scans = ticks_of(network, SCAN.key)
-    assert scans == [1, *range(5, 251, 5)]  # one per 0.1 s, and one for the brain to wake up by
-    assert sum(key == IMU.key for key, _ in network.sent) == 500
-
-
-def ticks_of(network: LocalNetwork, key: str) -> list[int]:
-    """The ticks of all messages on a key; the first is announced until the brain is there."""
-    ticks = [header_of(payload).tick for sent, payload in network.sent if sent == key]
-    announced = len(list(itertools.takewhile(lambda tick: tick == ticks[0], ticks)))
-    return ticks[announced - 1 :]
 
 
 async def test_a_report_reads_nothing_that_the_physics_is_at_work_on(
@@ -124,17 +45,6 @@ async def test_a_report_reads_nothing_that_the_physics_is_at_work_on(
             assert driver.report()["sim_seconds"] == seconds
         await ticks.aclose()  # type: ignore[attr-defined]
     assert readers == {"physics"}
-
-
-async def test_two_runs_with_the_same_seed_decide_alike(tmp_path: Path) -> None:
-    def intents(network: LocalNetwork) -> list[Intent]:
-        decode = msgspec.msgpack.Decoder(Intent).decode
-        said = [decode(payload) for key, payload in network.sent if key == INTENT.key]
-        return [msgspec.structs.replace(i, stamp_ns=0, seq=0, boot=0) for i in said]
-
-    first, _ = await drive(make(seconds=3.0), tmp_path / "a")
-    second, _ = await drive(make(seconds=3.0), tmp_path / "b")
-    assert intents(first) == intents(second)
 
 
 async def test_the_body_stops_by_itself_when_nobody_commands_it_for_150_ms() -> None:

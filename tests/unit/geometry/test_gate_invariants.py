@@ -301,4 +301,4 @@ class GateMachine(RuleBasedStateMachine):
 
 
 TestGate = GateMachine.TestCase
-TestGate.settings = settings(max_examples=200, stateful_step_count=50, deadline=None)
+TestGate.settings = settings(stateful_step_count=50)

@@ -1,7 +1,7 @@
 """Stopping distances, against the table that was worked out by hand, and the room there is."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -43,7 +43,6 @@ def test_the_speed_cap_matches_the_table() -> None:
     assert found == pytest.approx([0, 0, 0.057, 0.172, 0.265, 0.416, 0.651, 1.07], abs=0.004)
 
 
-@settings(deadline=None)
 @given(st.floats(0.081, 10.0), st.floats(0.01, 2.0), st.floats(0.1, 5.0))
 def test_the_speed_cap_is_the_speed_that_needs_all_of_the_room(
     free: float, reaction_time: float, deceleration: float

@@ -5,7 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_zenoh.geometry.sweep import arc, depth, edges, radius, straight, turning
@@ -105,7 +105,6 @@ def test_without_a_turn_an_arc_is_straight() -> None:
     assert across == pytest.approx(0.37, abs=0.021)
 
 
-@settings(deadline=None, max_examples=200)
 @given(
     st.floats(-0.6, 0.6),
     st.floats(-0.6, 0.6),

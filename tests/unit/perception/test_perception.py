@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -183,7 +183,6 @@ def obvious(config: PerceptionConfig, body: BodyDescription, message: LaserScan)
     )
 
 
-@settings(deadline=None)
 @given(
     ranges=st.lists(
         st.one_of(st.floats(0.0, 4.0, width=32), st.sampled_from([NAN, INF, -INF, 0.1, 1.0])),
@@ -221,7 +220,6 @@ def test_it_agrees_with_the_obvious_way_beam_by_beam(
     assert world.sectors == tuple(d if d is None else pytest.approx(d) for d in slow.sectors)
 
 
-@settings(deadline=None)
 @given(st.binary(min_size=4, max_size=1440).map(lambda raw: raw[: len(raw) // 4 * 4]))
 def test_no_bit_pattern_breaks_it(raw: bytes) -> None:
     count = len(raw) // 4

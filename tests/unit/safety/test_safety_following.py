@@ -1,7 +1,7 @@
 """Odometry that does not follow the command: runaway, too slow, stuck, frozen."""
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -127,7 +127,6 @@ moments = st.tuples(
 )
 
 
-@settings(max_examples=20, deadline=None)
 @given(st.lists(moments, max_size=10))
 def test_a_body_whose_telemetry_is_known_to_be_frozen_is_never_told_to_move_again(
     moments: list[tuple[int, Velocity, bool]],

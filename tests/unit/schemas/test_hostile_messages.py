@@ -3,7 +3,7 @@ from typing import Any
 
 import msgspec
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_schemas.brain import CmdVel
@@ -103,7 +103,6 @@ def test_bytes_behind_the_message_are_refused(name: str, trailing: bytes) -> Non
 
 
 @by_name
-@settings(max_examples=60, deadline=None)
 @given(payload=st.binary(max_size=300))
 def test_random_bytes_are_refused(name: str, payload: bytes) -> None:
     taken = not refuses(name, payload)
@@ -111,7 +110,6 @@ def test_random_bytes_are_refused(name: str, payload: bytes) -> None:
 
 
 @by_name
-@settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_a_damaged_message_is_refused_or_still_a_valid_one(name: str, data: st.DataObject) -> None:
     encode = data.draw(st.sampled_from((msgspec.msgpack.encode, msgspec.json.encode)))
