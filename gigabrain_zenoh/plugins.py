@@ -1,7 +1,11 @@
-"""Objects that are named by a string, "module:name", and the version of this package."""
+"""Objects named by a string "module:name" or offered by packages, and this package's version."""
 
 import importlib
+from collections.abc import Mapping
+from importlib.metadata import entry_points
 from typing import Any
+
+from gigabrain_zenoh.errors import ConfigError, unknown
 
 
 def find(path: str) -> Any:
@@ -18,3 +22,24 @@ def package_version() -> str:
         return version("gigabrain-zenoh")
     except PackageNotFoundError:  # a checkout without an installation
         return "0+unknown"
+
+
+def plugin_names(shipped: Mapping[str, str], group: str) -> list[str]:
+    """Return the names in a table of shipped objects and of the entry points of a group."""
+    return list(dict.fromkeys((*shipped, *(point.name for point in entry_points(group=group)))))
+
+
+def load_plugin(kind: str, name: str, shipped: Mapping[str, str], group: str) -> Any:
+    """Return the object called `name`: a shipped one, or an entry point of `group`.
+
+    Raises UnknownName with all names, and ConfigError if it cannot be imported.
+    """
+    if name in shipped:
+        return find(shipped[name])
+    offered = {point.name: point for point in entry_points(group=group)}
+    if name not in offered:
+        raise unknown(kind, name, plugin_names(shipped, group))
+    try:
+        return offered[name].load()
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"{kind} {name!r} of {offered[name].value}: {error}") from None

@@ -19,6 +19,7 @@ class Params:
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[str, Get, Set]] = {}
+        self._renamed: dict[str, str] = {}
 
     def add(self, name: str, expected: str, get: Get, put: Set) -> None:
         """Add a parameter; `put` raises ValueError for a value that is not allowed."""
@@ -36,8 +37,13 @@ class Params:
 
         self.add(name, expected, lambda: _shown(getattr(settings(), name)), put)
 
+    def rename(self, old: str, new: str) -> None:
+        """Accept an old name as well, for one release."""
+        self._renamed[old] = new
+
     def change(self, name: str, text: str) -> tuple[str, str]:
         """Set a parameter; return its old and new value. Raises Refused with what is expected."""
+        name = name if name in self._known else self._renamed.get(name, name)
         if name not in self._known:
             near = difflib.get_close_matches(name, self._known, n=1, cutoff=0.5)
             hint = f"; did you mean {near[0]!r}?" if near else ";"

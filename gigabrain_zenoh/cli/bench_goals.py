@@ -89,7 +89,7 @@ def _show(result: "GoalsResult") -> None:
     """The table, and what was not reached and why."""
     from rich.console import Console
 
-    from gigabrain_zenoh.decision.tasks.orders import where
+    from gigabrain_zenoh.decision.tasks.drive_command import describe_goal
 
     console = Console()
     console.print(_table(result))
@@ -104,7 +104,7 @@ def _show(result: "GoalsResult") -> None:
     for run in result.runs:
         for one in run.failures:
             after = f"after {one.seconds:.0f} s"
-            failure = f"{run.body} in {run.world}, {where(one.goal)} {after}: {one.reason}"
+            failure = f"{run.body} in {run.world}, {describe_goal(one.goal)} {after}: {one.reason}"
             console.print(failure, markup=False, soft_wrap=True)
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -35,8 +35,8 @@ class Drive:
     "How long [s] time waits for the brain there; longer for a slow machine."
     behaviour: str = "navigate"
     "What it does: `navigate`, or `avoid`, which makes no map."
-    turn: Literal["right", "left", "clearer"] = "right"
-    "Which way it turns from an obstacle, where it avoids."
+    set: tuple[str, ...] = ()
+    "A setting of the behaviour, as NAME=VALUE; may be repeated."
     resume: Resume | None = None
     "Whether it goes on by itself after a stop that has passed; a real body never does."
 
@@ -45,13 +45,14 @@ class Drive:
         from gigabrain_drivers.driver.catalog import load_robot
         from gigabrain_drivers.sim.worlds import load_world
 
-        behaviours.check(self.behaviour)
+        behaviours.load(self.behaviour)
         load_robot(self.body)
         load_world(self.world, 0)
 
     def values(self) -> dict[str, object]:
         """The deployment, raw."""
-        decision = {"behaviour": self.behaviour, "turn": self.turn}
+        demo = behaviours.load(self.behaviour).DEMO
+        settings = {**demo, **behaviours.parse_settings(self.set)}
         values: dict[str, object] = {
             "body": self.body,
             "link": self.link,
@@ -62,10 +63,9 @@ class Drive:
             "resume": self.resume or ("manual" if self.link == "real" else "auto"),
             "router": "tcp/127.0.0.1:0",
         }
-        if self.behaviour == "navigate":
-            decision["begin"] = "roam"
+        if behaviours.needs_map(self.behaviour):
             values["perception"] = {"mapping": "slam"}
-        return values | {"decision": decision}
+        return values | {"decision": {"behaviour": self.behaviour, "settings": settings}}
 
 
 @Parameter(name="*")
@@ -108,6 +108,7 @@ def demo(*, drive: Drive = DRIVE, shown: Shown = SHOWN) -> int:
     above_zero("seconds", drive.seconds)
     values = drive.values() | (recorded(shown.record) if shown.record else {})
     deployment, where = checked(values, Deployment), ""
+    behaviours.check(deployment.decision)
     if shown.page or (shown.page is None and not shown.headless):
         deployment, where = with_page(deployment, shown.port, login=shown.login)
     options = DemoOptions(

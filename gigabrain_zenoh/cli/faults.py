@@ -5,12 +5,13 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from gigabrain_zenoh.cli.where import show
+from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.signals import run_async
@@ -31,7 +32,7 @@ class Robot:
     "Which robot, instead of the one that each test has."
     world: str = "arena"
     "Where it drives."
-    behaviour: Literal["avoid", "navigate"] = "avoid"
+    behaviour: str = "avoid"
     (
         "What drives it: navigate explores and visits places, with a map (tried with 1 to 9, 18, "
         "19, 43 and 45)."
@@ -45,6 +46,7 @@ class Robot:
         from gigabrain_drivers.sim.worlds import load_world
 
         load_world(self.world, 0)
+        behaviours.load(self.behaviour)
         if not self.body:
             return
         sim = load_robot(self.body).sim

@@ -35,7 +35,7 @@ def list_(process: Process = "", /, *, at: Which = HERE) -> int:
 def get(process: Process, name: str, /, *, at: Which = HERE) -> int:
     """Show one value.
 
-    Example: gigabrain param get decision speed_limit
+    Example: gigabrain param get decision max_linear_speed
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def get(process: Process, name: str, /, *, at: Which = HERE) -> int:
 def set_(process: Process, name: str, value: str, /, *, at: Which = HERE) -> int:
     """Change one value, until the process ends.
 
-    Example: gigabrain param set decision speed_limit 0.15
+    Example: gigabrain param set decision max_linear_speed 0.15
 
     Parameters
     ----------

@@ -93,41 +93,35 @@ def perception(*, place: Place = HERE) -> int:
 def decision(
     *,
     behaviour: str = "avoid",
-    turn: Literal["right", "left", "clearer"] = "right",
-    begin: Literal["wait", "roam"] = "wait",
+    set: tuple[str, ...] = (),
     scripts: Path | None = None,
     remember: Path | None = None,
     place: Place = HERE,
 ) -> int:
     """Start decision: what is round the robot becomes what to do.
 
-    Example: gigabrain decision --turn clearer
+    Example: gigabrain decision --set turn=clearer
 
     Parameters
     ----------
     behaviour
         What it does.
-    turn
-        Which way it turns from an obstacle, where it avoids.
-    begin
-        What it does until somebody sends it somewhere, where it navigates.
+    set
+        A setting of the behaviour, as NAME=VALUE; may be repeated.
     scripts
         The folder of the programs that missions may run.
     remember
         The folder for what must survive a restart: what it is to do.
     """
-    from gigabrain_zenoh.decision.tasks.scripts import check_folder
-
-    behaviours.load(behaviour)  # a wrong name is better told now than once there is a router
-    programs = str(scripts.absolute()) if scripts else ""
-    check_folder(programs)
+    values = behaviours.parse_settings(set)
+    if scripts:
+        values["scripts"] = str(scripts.absolute())
     settings = DecisionConfig(
         behaviour=behaviour,
-        turn=turn,
-        begin=begin,
-        scripts=programs,
+        settings=values,
         state_dir=str(remember or state_dir() / "robots" / (place.namespace or "decision")),
     )
+    behaviours.check(settings)
     return _run("decision", place, msgspec.to_builtins(settings))
 
 

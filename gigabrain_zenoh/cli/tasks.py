@@ -80,13 +80,12 @@ def patrol(
     loops
         How often; for ever without.
     """
-    from gigabrain_zenoh.decision.tasks.checks import load_patrol, round_of
-    from gigabrain_zenoh.decision.tasks.mission import MOST_LOOPS
+    from gigabrain_zenoh.decision.tasks.mission import MAX_LOOPS, load_patrol, patrol_mission
     from gigabrain_zenoh.errors import ConfigError
 
-    if loops is not None and not 1 <= loops <= MOST_LOOPS:
-        raise ConfigError(f"--loops: expected 1 to {MOST_LOOPS}, got {loops}")
-    text = round_of(load_patrol(file), loops)
+    if loops is not None and not 1 <= loops <= MAX_LOOPS:
+        raise ConfigError(f"--loops: expected 1 to {MAX_LOOPS}, got {loops}")
+    text = patrol_mission(load_patrol(file), loops)
     return _send(at, lambda tasks: tasks.carry_out(text, how=how, label=file.stem), wait)
 
 
@@ -110,7 +109,7 @@ def mission(
     check
         Only say whether the file is right; no robot is needed.
     """
-    from gigabrain_zenoh.decision.tasks.checks import load
+    from gigabrain_zenoh.decision.tasks.mission import load
 
     load(file)  # better told here than by the robot
     if check:
@@ -200,8 +199,8 @@ def _send(at: Which, send: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> i
 
 
 def _tell(ended: "Task") -> None:
-    from gigabrain_zenoh.decision.tasks.orders import became
+    from gigabrain_zenoh.decision.tasks.drive_command import describe_end
 
     if ended.state != "succeeded":
-        raise Refused(became(ended))
-    say(became(ended))
+        raise Refused(describe_end(ended))
+    say(describe_end(ended))

@@ -7,6 +7,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from gigabrain_zenoh.config.loading import located
+from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.signals import run_async
 from gigabrain_zenoh.host.terminal import LINES, Display, writer
@@ -44,6 +45,8 @@ def up(
     loaded = load_deployment(path, str(keys.expanduser().absolute()) if keys else "")
     try:
         where = host_of(loaded, host)
+        if "decision" in loaded.hosts[where]:
+            behaviours.check(loaded.decision, path)
         with Display(writer(sys.stdout), LINES) as display:
 
             def say(line: str) -> None:

@@ -19,7 +19,7 @@ def warm() -> None:
 
 async def _all() -> None:
     """Both at a time: they share no kernel."""
-    from gigabrain_zenoh.decision.navigating import DRIVE_KERNELS
+    from gigabrain_zenoh.decision.goal_server import DRIVE_KERNELS
     from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 
     print("compiling, which takes up to a minute", flush=True)

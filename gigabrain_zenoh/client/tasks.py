@@ -80,10 +80,7 @@ class Tasks:
         Raises ConfigError with the line number for an invalid mission, and Refused.
         """
         self._listen()
-        from gigabrain_zenoh.decision.tasks.checks import (  # slow import, only when used
-            load,
-            refuse_long,
-        )
+        from gigabrain_zenoh.decision.tasks.mission import load, refuse_long
 
         if isinstance(mission, Path):
             label = mission.stem

@@ -37,8 +37,38 @@ class Rename:
         return self.when is None or self.when(mapping)
 
 
-YAML_WORDS: tuple[Rename, ...] = ()
-CLI_WORDS: tuple[Rename, ...] = ()
+def _navigates(decision: Mapping[str, Any]) -> bool:
+    return bool(decision.get("behaviour") == "navigate")
+
+
+def _avoids(decision: Mapping[str, Any]) -> bool:
+    return bool(decision.get("behaviour", "avoid") == "avoid")
+
+
+YAML_WORDS: tuple[Rename, ...] = (
+    Rename("decision.turn", "settings.turn", when=_avoids),
+    Rename("decision.turn", "", when=_navigates),
+    Rename("decision.linear_speed", "settings.max_linear_speed", when=_avoids),
+    Rename("decision.linear_speed", "", when=_navigates),
+    Rename("decision.angular_speed", "settings.max_angular_speed", when=_avoids),
+    Rename("decision.angular_speed", "", when=_navigates),
+    Rename("decision.speed_limit", "settings.max_linear_speed", when=_navigates),
+    Rename("decision.speed_limit", "", when=_avoids),
+    Rename("decision.unknown", "settings.unknown_space", when=_navigates),
+    Rename("decision.unknown", "", when=_avoids),
+    Rename("decision.samples", "settings.samples", when=_navigates),
+    Rename("decision.samples", "", when=_avoids),
+    Rename("decision.begin", "settings.start", {"roam": "explore"}, when=_navigates),
+    Rename("decision.begin", "", when=_avoids),
+    Rename("decision.scripts", "settings.scripts", when=_navigates),
+    Rename("decision.scripts", "", when=_avoids),
+)
+_TURNS = {side: f"turn={side}" for side in ("left", "right", "clearer")}
+CLI_WORDS: tuple[Rename, ...] = (
+    Rename("demo --turn", "--set", _TURNS),
+    Rename("decision --turn", "--set", _TURNS),
+    Rename("decision --begin", "--set", {"wait": "start=wait", "roam": "start=explore"}),
+)
 
 _printed: set[str] = set()
 

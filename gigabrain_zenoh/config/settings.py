@@ -60,17 +60,8 @@ class PerceptionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 class DecisionConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings in the `decision` part of a deployment file."""
 
-    behaviour: str = "avoid"
-    turn: Literal["right", "left", "clearer"] = "right"
-    linear_speed: Annotated[float, Meta(gt=0, le=10)] = 0.2  # [m/s]
-    angular_speed: Annotated[float, Meta(gt=0, le=10)] = 0.5  # [rad/s]
-    # for `navigate`, which needs a map (perception: {mapping: slam}):
-    speed_limit: Annotated[float, Meta(gt=0, le=10)] | None = None  # [m/s]; the body's applies too
-    # paths through unknown cells; with `allow` also to goals beyond the map
-    unknown: Literal["avoid", "allow", "forbid"] = "avoid"
-    samples: Annotated[int, Meta(ge=64, le=20_000)] = 1000  # candidate plans per scan
-    begin: Literal["wait", "roam"] = "wait"  # roam: explore, then visit places, until a task comes
-    scripts: str = ""  # folder of the programs that missions may run; empty: none
+    behaviour: str = "avoid"  # shipped, or offered by an installed package
+    settings: dict[str, Any] = {}  # of the behaviour; see its Config
     state_dir: str = ""  # folder where it saves its tasks; empty: not saved
 
 

@@ -1,7 +1,8 @@
-"""Decision: what is known becomes what to do, with what is expected to come of it, and why."""
+"""The decision process: turns what is known into an intent, with a reason."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from typing import Any, Protocol
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import RobotState
@@ -12,78 +13,154 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
-from gigabrain_zenoh.decision.behaviours import Plain, Senses
+from gigabrain_zenoh.decision.behaviours import Behaviour, Inputs, Step, battery_nearly_empty
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.ages import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 
+RENAMED_PARAMS = {  # by behaviour; removed in 0.3, like the words in config/renames.py
+    "avoid": {"linear_speed": "max_linear_speed", "angular_speed": "max_angular_speed"},
+    "navigate": {"speed_limit": "max_linear_speed"},
+}
 
-class Thinker:
-    """Thinks once per world, and stands by its word in between.
 
-    A world of a tick whose state is still on its way waits for that state: no outcome may depend on
-    which of two messages was quicker.
+class InputSource(Protocol):
+    """Steps a behaviour with inputs beyond the world model, and gets its outcome."""
+
+    async def warm_up(self) -> None:
+        """Prepare everything that takes long, before anything drives."""
+        ...
+
+    def configure(self, config: Any) -> None:
+        """Use other settings from now on."""
+        ...
+
+    def observe(self, state: RobotState) -> None:
+        """Record a robot state; called with every state."""
+        ...
+
+    def step(
+        self,
+        behaviour: Behaviour,
+        state: RobotState,
+        world: WorldModel | None,
+        verdict: SafetyState | None,
+    ) -> Step:
+        """Step the behaviour once with the present inputs."""
+        ...
+
+    @property
+    def hung(self) -> bool:
+        """Whether a part of it will never finish, while the rest continues."""
+        ...
+
+    async def close(self) -> None:
+        """Return once all is written."""
+        ...
+
+
+class WorldOnly:
+    """Input source of behaviours that need no more than the world model."""
+
+    hung = False
+
+    async def warm_up(self) -> None: ...  # noqa: D102
+
+    def configure(self, config: Any) -> None: ...  # noqa: D102
+
+    def observe(self, state: RobotState) -> None: ...  # noqa: D102
+
+    def step(
+        self,
+        behaviour: Behaviour,
+        state: RobotState,
+        world: WorldModel | None,
+        verdict: SafetyState | None,
+    ) -> Step:
+        """Step the behaviour with the world and the odometry."""
+        must_charge = battery_nearly_empty(verdict)
+        return behaviour.step(Inputs(world=world, pose=state.pose, must_charge=must_charge))
+
+    async def close(self) -> None: ...  # noqa: D102
+
+
+class DecisionLoop:
+    """Steps the behaviour once per world, and keeps the intent in between.
+
+    A world whose state is still on its way waits for it: which of two messages is quicker must not
+    matter.
     """
 
-    def __init__(self, config: DecisionConfig, senses: Senses | None = None) -> None:
-        self._load, self._config = behaviours.load(config.behaviour), config
-        self._senses = senses or Plain()
-        self._behaviour, self._boot = self._load(config), 0
+    def __init__(self, config: DecisionConfig, source: InputSource | None = None) -> None:
+        self._type = behaviours.load(config.behaviour)
+        self._settings = behaviours.settings_of(config)
+        self._source = source or WorldOnly()
+        self._behaviour, self._boot = self._type(self._settings), 0
         self.intent = Intent(behaviour=config.behaviour, reason="starting")
+        self.activity = "starting"
         self.basis = 0
 
-    @property
-    def config(self) -> DecisionConfig:
-        """The settings that it goes by."""
-        return self._config
+    def serve_params(self, bus: Bus) -> None:
+        """Offer the behaviour's parameters on the bus."""
+        for name, expected in self._type.PARAMS.items():
+            bus.params.add_field(name, expected, lambda: self._settings, self.configure)
+        for old, new in RENAMED_PARAMS.get(self.intent.behaviour, {}).items():
+            bus.params.rename(old, new)
 
-    def configure(self, config: DecisionConfig) -> None:
-        """Go by other settings from now on; the behaviour keeps what it remembers."""
-        self._config = config
-        self._behaviour.configure(config)
+    def configure(self, settings: Any) -> None:
+        """Use other settings from now on; the behaviour keeps its memory."""
+        self._settings = settings
+        self._behaviour.configure(settings)
+        self._source.configure(settings)
 
-    @property
-    def params(self) -> Mapping[str, str]:
-        """The settings that may change while it runs, and what is expected of each."""
-        return self._load.PARAMS
-
-    def think(
+    def step(
         self,
         state: RobotState,
         world: WorldModel | None,
         verdict: SafetyState | None = None,
     ) -> None:
-        """Form a new intent if there is anything new to go by."""
-        if state.boot != self._boot:  # the driver has started anew, and with it the odometry
-            self._behaviour, self._boot, self.basis = self._load(self._config), state.boot, 0
+        """Form a new intent if there is a new world."""
+        if state.boot != self._boot:  # the driver has restarted, and with it the odometry
+            self._behaviour, self._boot, self.basis = self._type(self._settings), state.boot, 0
         if world is not None:
             if world.basis == self.basis or world.basis > state.tick:
                 return
             self.basis = world.basis
-        situation = self._senses.situation(state, world, verdict)
-        self.intent = self._behaviour.step(situation)
-        self._senses.heed(self._behaviour)
+        self.intent, outcome = self._source.step(self._behaviour, state, world, verdict)
+        self.activity = outcome.activity
 
 
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
-    """An intent per world, as soon as it comes; repeated with the newest tick at each state."""
-    senses = behaviours.senses(config, bus)
+    """Publish an intent per world at once, and again with the newest tick at each state."""
+    source = input_source(config, bus)
     try:
-        await senses.warm_up()
-        for name in behaviours.unread(config):
-            log.warning("%s has no effect: behaviour %s does not read it", name, config.behaviour)
-        _think(config, bus, senses)
+        await source.warm_up()
+        _serve(config, bus, source)
         ready()
         await bus.failed
     finally:
-        await senses.close()
+        await source.close()
 
 
-def _think(config: DecisionConfig, bus: Bus, senses: Senses) -> None:
-    thinker, said, too_old = Thinker(config, senses), "", 0
-    for name, expected in thinker.params.items():
-        bus.params.add_field(name, expected, lambda: thinker.config, thinker.configure)
+def input_source(config: DecisionConfig, bus: Bus) -> InputSource:
+    """Return the input source that the configured behaviour needs. Raises ConfigError."""
+    settings = behaviours.settings_of(config)
+    if not behaviours.needs_map(config.behaviour):
+        return WorldOnly()
+    try:
+        from gigabrain_zenoh.decision.goal_server import GoalServer
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"behaviour {config.behaviour} needs {error.name}; pip install 'gigabrain-zenoh[nav]'"
+        ) from None
+    return GoalServer(settings, bus, config.behaviour, state_dir=config.state_dir)
+
+
+def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
+    loop, logged, too_old = DecisionLoop(config, source), "", 0
+    loop.serve_params(bus)
     verdicts: PreviousTick[SafetyState] = PreviousTick()
 
     def newest_world() -> WorldModel | None:
@@ -91,32 +168,30 @@ def _think(config: DecisionConfig, bus: Bus, senses: Senses) -> None:
         return worlds.fresh(scan_limit_ns(body.description) if body else None)
 
     def decide(_: Message) -> None:
-        nonlocal said
+        nonlocal logged
         state = states.fresh()
         if state is None:
             return
-        senses.see(state)
+        source.observe(state)
         verdict = verdicts.at(state.boot, state.tick, SAFETY.stale_after_ns)
-        thinker.think(state, newest_world(), verdict)
-        intent = thinker.intent
-        bus.publish(INTENT, intent, basis=thinker.basis)
-        phrase = intent.reason.partition(":")[0]
-        if phrase != said:
-            said = phrase
-            data = {"event": "decision", "tick": state.tick, "reason": intent.reason}
-            log.info("%s", intent.reason, extra={"data": data})
+        loop.step(state, newest_world(), verdict)
+        bus.publish(INTENT, loop.intent, basis=loop.basis)
+        if loop.activity != logged:
+            logged, reason = loop.activity, loop.intent.reason
+            data = {"event": "decision", "tick": state.tick, "reason": reason}
+            log.info("%s", reason, extra={"data": data})
 
-    def see(world: WorldModel) -> None:
+    def on_world(world: WorldModel) -> None:
         nonlocal too_old
-        too_old += newest_world() is None  # over a slow link: looked at, and refused
+        too_old += newest_world() is None  # over a slow link: received, and refused
         if world.basis <= bus.time.tick:
             decide(world)
 
-    def came() -> tuple[object, ...]:
+    def received() -> tuple[object, ...]:
         return bus.arrived.get(STATE.key), bus.arrived.get(WORLD.key)
 
     bodies = bus.latest(BODY)
     states = bus.latest(STATE, decide)
-    worlds = bus.latest(WORLD, see)
+    worlds = bus.latest(WORLD, on_world)
     bus.latest(SAFETY, verdicts.receive)
-    bus.progress = Progress(came, lambda: () if senses.hung else (thinker.basis, too_old))
+    bus.progress = Progress(received, lambda: () if source.hung else (loop.basis, too_old))

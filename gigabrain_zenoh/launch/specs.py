@@ -15,6 +15,7 @@ from gigabrain_zenoh.config.settings import (
     ProcessConfig,
     RecorderConfig,
 )
+from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.runtime.deployment import (
     ALL,
     BUTTON,
@@ -75,7 +76,7 @@ def process_specs(
 def _patience_s(deployment: Deployment, name: str) -> float:
     """Return how long a process may take until it is ready [s]."""
     maps = name == "perception" and deployment.perception.mapping != "off"
-    navigates = name == "decision" and deployment.decision.behaviour == "navigate"
+    navigates = name == "decision" and behaviours.needs_map(deployment.decision.behaviour)
     return COMPILING_S if maps or navigates else SOON_S
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from gigabrain_zenoh import logs
-from gigabrain_zenoh.decision.tasks.scripts import check_folder
+from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.host.run_folders import new_run_dir, state_dir
 from gigabrain_zenoh.host.signals import stop_signals
@@ -110,7 +110,7 @@ async def up(
     """
     check_keys(deployment, host)
     if "decision" in deployment.hosts[host]:
-        check_folder(deployment.decision.scripts)
+        behaviours.check(deployment.decision)
     deployment = with_free_port(deployment)
     label = deployment.namespace or deployment.body.replace("/", "-")
     notifier = Notifier.from_environment()

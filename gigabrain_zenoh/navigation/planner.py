@@ -32,9 +32,17 @@ class Path:
 class Unreachable:
     """A goal that no way leads to: why, and how near the robot could come."""
 
-    reason: str
+    fault: str  # for people, without the nearest place
     nearest: Point | None = None
     distance: float = math.inf  # [m] from there to the goal, straight
+
+    @property
+    def reason(self) -> str:
+        """The fault and the nearest reachable place, for people."""
+        if self.nearest is None:
+            return self.fault
+        where = f"{self.distance:.2f} m away at ({self.nearest[0]:.2f}, {self.nearest[1]:.2f})"
+        return f"{self.fault}; nearest reachable point is {where}"
 
 
 class Planner:
@@ -46,10 +54,10 @@ class Planner:
     def plan(self, costmap: Costmap, start: Point, goal: Point) -> Path | Unreachable:
         """The cheapest path from `start` to `goal`, or why there is none."""
         if not all(math.isfinite(value) for value in (*start, *goal)):
-            return Unreachable(reason="the goal and the robot's place must be finite numbers")
+            return Unreachable(fault="the goal and the robot's place must be finite numbers")
         begin, end = costmap.cell(*start), costmap.cell(*goal)
         if begin is None:
-            return Unreachable(reason="the robot is outside the map")
+            return Unreachable(fault="the robot is outside the map")
         fault = _fault(costmap, goal)
         if fault or end is None:
             self.search.reach(costmap.cost, begin)
@@ -89,11 +97,10 @@ class Planner:
         column, row = _in_cells(costmap, np.array((goal,)))[0] - 0.5
         cell = self.search.nearest(costmap.cost, row, column)
         if cell is None:
-            return Unreachable(reason=f"{why}; the robot has no room to leave where it stands")
+            return Unreachable(fault=f"{why}; the robot has no room to leave where it stands")
         x, y = costmap.points(np.array(cell[:1]), np.array(cell[1:]))[0]
         away = math.hypot(x - goal[0], y - goal[1])
-        where = f"nearest reachable point is {away:.2f} m away at ({x:.2f}, {y:.2f})"
-        return Unreachable(reason=f"{why}; {where}", nearest=(float(x), float(y)), distance=away)
+        return Unreachable(fault=why, nearest=(float(x), float(y)), distance=away)
 
 
 def valid(path: Path, costmap: Costmap) -> bool:

@@ -35,7 +35,8 @@ class Drive(Struct, frozen=True):
 
 EXPLORES = Drive(
     "house", 1, 3.2, NAVIGATES,
-    PerceptionConfig(mapping="slam"), DecisionConfig(behaviour="navigate", begin="roam"),
+    PerceptionConfig(mapping="slam"),
+    DecisionConfig(behaviour="navigate", settings={"start": "explore"}),
 )  # fmt: skip
 DRIVES = {  # each of the first four meets something to turn away from
     "arena": Drive("arena", 10),

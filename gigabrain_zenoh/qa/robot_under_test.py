@@ -21,6 +21,7 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
+from gigabrain_zenoh.decision.behaviours import needs_map
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.qa.judging import Failed
@@ -38,8 +39,9 @@ STOP_S = 1.5
 BENCH_START_S = 30.0  # longer than anything takes to start on a busy machine
 START_S = 300.0  # far more than it takes to compile what a navigating robot calls
 ASK_S = 0.5
-NEARLY_STRAIGHT = {"avoid": 0.1, "navigate": 0.3}  # [rad/s]; legs sway, and routes have bends
-FULL_SHARE = {"avoid": 0.96, "navigate": 0.6}  # of a speed; a busy host drives more slowly
+# turn rate that counts as straight [rad/s], and share of the speed that counts as full
+STRAIGHT_RAD_S, FULL_SPEED = 0.1, 0.96
+STRAIGHT_ON_ROUTE_RAD_S, FULL_SPEED_ON_ROUTE = 0.3, 0.6  # routes bend; a busy host drives slower
 
 
 class ProcessGroup:
@@ -326,9 +328,11 @@ class RobotUnderTest(ProcessGroup):
         await until(lambda: probe.bodies.current, "robot/body")
         body = probe.bodies.current
         fastest = body.description.max_linear_speed if body else 0.0
-        full = FULL_SHARE[decision.behaviour] * min(decision.linear_speed, fastest)
-        straight = NEARLY_STRAIGHT[decision.behaviour]
-        await probe.driving_straight(share * full, room, straight, by_hand=True)
+        straight, full = STRAIGHT_RAD_S, FULL_SPEED
+        if needs_map(decision.behaviour):
+            straight, full = STRAIGHT_ON_ROUTE_RAD_S, FULL_SPEED_ON_ROUTE
+        speed = share * full * min(decision.settings["max_linear_speed"], fastest)
+        await probe.driving_straight(speed, room, straight, by_hand=True)
 
     async def release(self) -> None:
         """Release a latched gate as a person would, as soon as it agrees."""

@@ -27,9 +27,9 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
+from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.decision import behaviours
-from gigabrain_zenoh.decision.behaviours import Situation
+from gigabrain_zenoh.decision.behaviours.avoid import Avoid, AvoidConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import limits_of
@@ -156,8 +156,7 @@ class ExploreRun(_SimulatedBody):
     def __init__(self, body: str, world: str, seed: int = 0) -> None:
         run = Run(folder=Path(), world=world, seed=seed)
         super().__init__(body, load_world(world, seed), run, seed)
-        config = DecisionConfig(linear_speed=self.body.max_linear_speed)
-        self._avoid = behaviours.load("avoid")(config)
+        self._avoid = Avoid(AvoidConfig(max_linear_speed=self.body.max_linear_speed))
 
     def ticks(self, count: int) -> Iterator[ExploreTick]:
         """Yield `count` ticks."""
@@ -176,6 +175,6 @@ class ExploreRun(_SimulatedBody):
 
     def _decide(self, state: RobotState, scan: LaserScan) -> None:
         world = perception.step(PerceptionConfig(), self.body, scan)
-        twist = self._avoid.step(Situation(world, state.pose)).twist
+        twist = self._avoid.step(behaviours.Inputs(world=world, pose=state.pose))[0].twist
         if twist:
             self.simulation.drive(twist.linear_x, twist.linear_y, twist.angular_z)

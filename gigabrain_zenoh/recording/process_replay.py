@@ -31,6 +31,7 @@ from gigabrain_schemas.topics import (
     current_key,
 )
 from gigabrain_zenoh.codec import Codec
+from gigabrain_zenoh.config.renames import renamed_settings
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.gate import BRAIN
@@ -50,8 +51,6 @@ OUTPUTS: dict[str, tuple[Topic[Any], ...]] = {
 }
 NOT_COMPARED = ("stamp_ns", "seq")
 PROCESSES_WITH_SETTINGS = ("perception", "decision")
-# a replay runs no programs and saves nothing
-NO_SIDE_EFFECTS = {"perception": {"state_dir": ""}, "decision": {"scripts": "", "state_dir": ""}}
 # A process that is busy for a tick skips a state; a replay never is.
 MAX_UNMATCHED_SHARE = 0.1  # of outputs that only the recording or only the replay has
 
@@ -317,7 +316,17 @@ def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, 
                 "name the robot's deployment file: --deployment FILE"
             )
         settings = dict(msgspec.json.decode(notes.get(process, "{}")))
-    return settings | NO_SIDE_EFFECTS.get(process, {})
+    return _without_side_effects(renamed_settings(settings, process), process)
+
+
+def _without_side_effects(settings: dict[str, Any], process: str) -> dict[str, Any]:
+    """Return the settings for a replay, which runs no programs and saves nothing."""
+    if process in PROCESSES_WITH_SETTINGS:
+        settings = settings | {"state_dir": ""}
+    behaviour = settings.get("settings", {})
+    if "scripts" in behaviour:
+        settings["settings"] = behaviour | {"scripts": ""}
+    return settings
 
 
 async def replay_file(path: Path, process: str, deployment: str | None, node_of: NodeOf) -> int:

@@ -26,9 +26,12 @@ from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.testing.samples import TICK_NS
 
+DECISION = DecisionConfig(settings={"max_linear_speed": 0.26})
 BRAIN: dict[str, Node] = {
     "perception": functools.partial(perception.run, PerceptionConfig()),
-    "decision": functools.partial(decision.run, DecisionConfig(linear_speed=0.26)),
+    "decision": functools.partial(
+        decision.run, DecisionConfig(settings={"max_linear_speed": 0.26})
+    ),
     "control": control.run,
     "safety": safety.run,
 }

@@ -8,8 +8,8 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import BODY, CMD_VEL, GOAL
 from gigabrain_zenoh import codec
-from gigabrain_zenoh.config.settings import DecisionConfig
-from gigabrain_zenoh.decision.steering import Steering
+from gigabrain_zenoh.decision.behaviours import NavigationConfig
+from gigabrain_zenoh.decision.navigator import Navigator
 from gigabrain_zenoh.qa.faults.rig.extremes import chosen_extremes
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.samples import body, state
@@ -19,20 +19,19 @@ from tests.node.plane import ROOM, Plane, as_map, drawn
 
 async def test_the_brains_own_commands_count_as_the_gate_lets_them_through() -> None:
     net = Net()
-    steering = Steering(DecisionConfig(behaviour="navigate"), net.two)
+    navigator = Navigator(NavigationConfig(), net.two, "navigate")
     for bus in (net.one, net.two):
         bus.time.see(state(10))
     net.one.publish(BODY, body())
     await settle()
-    steering.see(state(10))
+    navigator.observe(state(10))
     net.one.publish(CMD_VEL, CmdVel(linear_x=90.0, angular_z=-90.0, source="control"))
     net.one.publish(CMD_VEL, CmdVel(linear_x=-90.0, source="stranger"))
     await settle()
-    steering.see(state(11))
-    bearings = steering.situation(state(11), None, None, None, "").bearings
-    steering.close()
-    assert bearings
-    assert [(one.tick, one.velocity) for one in bearings.sent] == [
+    navigator.observe(state(11))
+    context = navigator.at_scan(state(11), None, None)
+    navigator.close()
+    assert [(one.tick, one.velocity) for one in context.sent] == [
         (10, Velocity(linear_x=0.26, angular_z=-1.82))
     ]
 

@@ -12,7 +12,7 @@ from gigabrain_schemas.topics import GOAL, INTENT, MISSION, TASK
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.cli.task_line import progress
 from gigabrain_zenoh.config.settings import DecisionConfig
-from gigabrain_zenoh.decision import navigating
+from gigabrain_zenoh.decision import goal_server
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.kernels.compiling import compiled
@@ -32,18 +32,18 @@ async def test_a_goal_is_taken_while_decision_still_gets_ready(
         await warm.wait()
         await compiled(warm_up)
 
-    monkeypatch.setattr(navigating, "compiled", compiled_later)
+    monkeypatch.setattr(goal_server, "compiled", compiled_later)
     told: list[TaskStatus] = []
     async with NodeBench(functools.partial(decision.run, NAVIGATE)) as bench:
         operator = Bus(bench.network.transport(), bench.clock, "operator")
         operator.subscribe(TASK, lambda _key, status: told.append(status))
         replies = await operator.ask(GOAL, GoalRequest(x=4.0, y=0.8, source="ann"))
-        assert replies == [GoalReply(ok=True, text="goal-1: accepted; it is getting ready",
+        assert replies == [GoalReply(ok=True, text="goal-1: accepted; starting up",
                                      goal="goal-1")]  # fmt: skip
         for _ in range(3):
             await bench.clock.advance(200_000_000)
         assert len(told) >= 3
-        assert progress("goal-1", told[-1]) == "goal-1: accepted, waiting: it is getting ready"
+        assert progress("goal-1", told[-1]) == "goal-1: accepted, waiting: starting up"
         assert not bench.sent(INTENT)
         warm.set()
         await bench.ready()
@@ -53,7 +53,7 @@ async def test_a_goal_is_taken_while_decision_still_gets_ready(
 async def test_a_goal_that_was_given_before_there_was_a_map_is_driven_to() -> None:
     async with Plane(CELLS) as plane:
         reply = await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
-        assert reply.text == "goal-1: accepted; perception is getting ready"
+        assert reply.text == "goal-1: accepted; perception is starting up"
         assert (await plane.ask_at_once(MISSION, MissionRequest(mission="do: [{goto: [1, 2]}]"))).ok
         await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
         await plane.until("succeeded", seconds=60)
@@ -75,11 +75,11 @@ async def test_a_goal_waits_until_it_is_sure_for_the_first_time_where_it_is() ->
         plane.localized = False
         await plane.go(0.3)
         reply = await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
-        assert reply.text == "goal-1: accepted; it is not sure where in the map it is"
+        assert reply.text == "goal-1: accepted; the pose in the map is uncertain"
         await plane.go(1.0)
         assert plane.travelled == 0.0
         assert progress("goal-1", plane.status) == (
-            "goal-1: going to (4.00, 0.80), 0 %, waiting: it is not sure where in the map it is"
+            "goal-1: going to (4.00, 0.80), 0 %, waiting: the pose in the map is uncertain"
         )
         plane.localized = True
         await plane.until("succeeded", seconds=60)
@@ -96,7 +96,7 @@ async def test_what_is_missing_is_named_with_what_to_install(
 
 SERVES = """
 import sys
-import gigabrain_zenoh.decision.navigating
+import gigabrain_zenoh.decision.goal_server
 print(*(name for name in ("numpy", "numba", "cv2", "scipy") if name in sys.modules))
 """
 

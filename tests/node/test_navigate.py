@@ -79,7 +79,9 @@ async def test_a_room_without_a_door_is_refused_with_the_nearest_place() -> None
 async def test_whether_a_way_may_lead_through_the_unknown_is_a_setting(
     unknown: Literal["allow", "avoid", "forbid"], told: str
 ) -> None:
-    plane = Plane(CELLS, config=DecisionConfig(behaviour="navigate", unknown=unknown))
+    plane = Plane(
+        CELLS, config=DecisionConfig(behaviour="navigate", settings={"unknown_space": unknown})
+    )
     plane.known[:, 50:55] = -1
     async with plane:
         await plane.go(0.2)
@@ -111,7 +113,7 @@ async def test_it_stands_while_it_is_not_sure_where_it_is_and_goes_on_afterwards
         plane.localized = False
         await plane.go(1.5)
         assert plane.intent.twist == STANDS
-        assert plane.intent.reason == "waiting: it is not sure where in the map it is"
+        assert plane.intent.reason == "waiting: the pose in the map is uncertain"
         travelled = plane.travelled
         await plane.go(2.0)
         assert plane.travelled == travelled

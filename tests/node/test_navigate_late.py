@@ -10,11 +10,10 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, MAP
-from gigabrain_zenoh.config.settings import DecisionConfig
-from gigabrain_zenoh.decision import steering
-from gigabrain_zenoh.decision.behaviours.bearings import Route
-from gigabrain_zenoh.decision.behaviours.guide import Asked, Guide
-from gigabrain_zenoh.decision.navigating import Navigating
+from gigabrain_zenoh.decision import route_schedule
+from gigabrain_zenoh.decision.behaviours import NavigationConfig
+from gigabrain_zenoh.decision.navigator import Navigator
+from gigabrain_zenoh.decision.route import Route, RoutePlanner, RouteRequest
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.samples import BOOT, state
 from tests.node.plane import ROOM, Plane, as_map, drawn
@@ -78,14 +77,14 @@ LARGE = np.pad(CELLS, ((0, 300), (0, 300)), constant_values=100)
 
 async def ticks_to_a_way(monkeypatch: pytest.MonkeyPatch, thinks_s: float) -> list[int]:
     """The ticks in which a way came and in which another place was driven to."""
-    think = Guide.think
+    plan = RoutePlanner.plan
 
-    def slowly(guide: Guide, asked: Asked) -> Route:
+    def slowly(planner: RoutePlanner, request: RouteRequest) -> Route:
         time.sleep(thinks_s)
-        return think(guide, asked)
+        return plan(planner, request)
 
-    monkeypatch.setattr(Guide, "think", slowly)
-    monkeypatch.setattr(steering, "PATIENCE_S", 30.0)
+    monkeypatch.setattr(RoutePlanner, "plan", slowly)
+    monkeypatch.setattr(route_schedule, "PATIENCE_S", 30.0)
     ticks = []
     async with Plane(LARGE) as plane:
         await plane.go(0.2)
@@ -94,7 +93,7 @@ async def ticks_to_a_way(monkeypatch: pytest.MonkeyPatch, thinks_s: float) -> li
             while not plane.intent.reason.startswith(f"going to ({x:.2f}, 0.80): "):
                 await plane.go(0.02)
             ticks.append(plane.tick)
-    monkeypatch.setattr(Guide, "think", think)
+    monkeypatch.setattr(RoutePlanner, "plan", plan)
     return ticks
 
 
@@ -124,21 +123,18 @@ async def test_a_plan_for_a_huge_map_does_not_delay_the_first_one_for_the_real_m
 
 async def test_it_plans_with_the_place_and_the_speed_of_the_scan_however_late_that_is() -> None:
     net = Net()
-    senses = Navigating(DecisionConfig(behaviour="navigate"), net.one)
-    await senses.warm_up()
+    navigator = Navigator(NavigationConfig(), net.one, "navigate")
     states = [state(tick, v=0.01 * tick, pose=(0.1 * tick, 0.0, 0.0)) for tick in range(1, 8)]
     for one in states:
-        senses.see(one)
+        navigator.observe(one)
     seen = WorldModel(scan_ok=True, obstacle_ahead=False, boot=BOOT, tick=5, basis=5)
-    now = senses.situation(states[-1], seen, None)
-    assert now.bearings
-    assert (now.pose.x, now.bearings.velocity.linear_x) == (0.5, 0.05)
-    assert now.bearings.late_ticks == 2
-    assert now.bearings.may_back
+    now = navigator.at_scan(states[-1], seen, None)
+    assert (now.pose.x, now.velocity.linear_x) == (0.5, 0.05)
+    assert now.late_ticks == 2
+    assert now.may_reverse
     caps = SpeedCaps(backward=0.0)
-    held = senses.situation(states[-1], seen, SafetyState(verdict="slow", caps=caps))
-    assert held.bearings
-    assert not held.bearings.may_back
-    await senses.close()
+    held = navigator.at_scan(states[-1], seen, SafetyState(verdict="slow", caps=caps))
+    assert not held.may_reverse
+    navigator.close()
     await net.one.close()
     await net.two.close()

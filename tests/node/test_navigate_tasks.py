@@ -11,6 +11,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig
 from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
+EXPLORES = {"start": "explore"}
 STANDS = Velocity()
 
 
@@ -69,7 +70,9 @@ async def test_what_it_was_to_do_goes_on_after_a_restart_of_decision(tmp_path: P
 
 async def test_who_roams_explores_and_then_visits_places_until_it_is_sent_elsewhere() -> None:
     plane = Plane(
-        CELLS, at=(2.0, 1.0, 0.3), config=DecisionConfig(behaviour="navigate", begin="roam")
+        CELLS,
+        at=(2.0, 1.0, 0.3),
+        config=DecisionConfig(behaviour="navigate", settings=EXPLORES),
     )
     plane.known[:] = -1
     async with plane:
@@ -92,13 +95,14 @@ async def test_who_roams_explores_and_then_visits_places_until_it_is_sent_elsewh
 async def test_who_was_told_to_do_nothing_does_not_roam_after_a_restart_of_decision(
     tmp_path: Path,
 ) -> None:
-    config = DecisionConfig(behaviour="navigate", begin="roam", state_dir=str(tmp_path))
+    config = DecisionConfig(behaviour="navigate", settings=EXPLORES, state_dir=str(tmp_path))
     async with Plane(CELLS, config=config) as plane:
         await plane.go(0.5)
         await plane.ask(TASK_CHANGE, TaskRequest(do="cancel", task="all", source="ann"))
         await plane.go(0.5)
         assert plane.intent.reason == "waiting: for a goal"
-        while b'"jobs":[]' not in (tmp_path / "tasks.json").read_bytes():  # noqa: ASYNC110
+        saved = tmp_path / "tasks.json"
+        while not saved.exists() or b'"jobs":[]' not in saved.read_bytes():  # noqa: ASYNC110
             await asyncio.sleep(0.01)
         await plane.restart()
         await plane.go(1.0)

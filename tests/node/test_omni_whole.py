@@ -97,7 +97,7 @@ async def _safety(bus: Bus, ready: Callable[[], None]) -> None:
 
 
 def nodes(body: Body, folder: Path) -> dict[str, Node]:
-    settings = DecisionConfig(behaviour="navigate", unknown="allow")
+    settings = DecisionConfig(behaviour="navigate", settings={"unknown_space": "allow"})
     return {
         "perception": functools.partial(perception.run, PerceptionConfig(mapping="slam")),
         "decision": functools.partial(decision.run, settings),

@@ -4,6 +4,8 @@ import dataclasses
 import functools
 import logging
 from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,9 +18,9 @@ from gigabrain_schemas.topics import GOAL, INTENT, STATE, WORLD
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision import node as decision
-from gigabrain_zenoh.decision.behaviours import BEHAVIOURS
-from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.navigation.local import Goal, LocalPlanner
+from gigabrain_zenoh.runtime.deployment import load_deployment
 from gigabrain_zenoh.runtime.services import LOG_LEVEL, serve_params
 from gigabrain_zenoh.testing.bus import NodeBench
 from gigabrain_zenoh.testing.samples import state
@@ -50,15 +52,15 @@ async def wants(name: str, value: str, *, ahead: bool) -> list[Velocity | None]:
     return wanted
 
 
-async def linear_speed() -> None:
-    assert await wants("linear_speed", "0.05", ahead=False) == [
+async def max_linear_speed() -> None:
+    assert await wants("max_linear_speed", "0.05", ahead=False) == [
         Velocity(linear_x=0.2),
         Velocity(linear_x=0.05),
     ]
 
 
-async def angular_speed() -> None:
-    assert await wants("angular_speed", "0.3", ahead=True) == [
+async def max_angular_speed() -> None:
+    assert await wants("max_angular_speed", "0.3", ahead=True) == [
         Velocity(angular_z=-0.5),
         Velocity(angular_z=-0.3),
     ]
@@ -71,14 +73,14 @@ async def turn() -> None:
     ]
 
 
-async def speed_limit() -> None:
+async def route_speed() -> None:
     async with Plane(HALL, at=(0.6, 1.6, 0.0)) as plane:
         await plane.go(0.2)
         params = plane.bench.bus.params
         await plane.ask(GOAL, GoalRequest(x=4.2, y=1.6))
         await plane.go(3.0)
         assert plane.velocity.linear_x > 0.2
-        assert params.change("speed_limit", "0.05") == ("null", "0.05")
+        assert params.change("max_linear_speed", "0.05") == ("null", "0.05")
         await plane.go(1.0)
         slow = []
         for _ in range(10):
@@ -89,7 +91,7 @@ async def speed_limit() -> None:
         assert eta is not None
         assert left is not None
         assert eta == pytest.approx(left / 0.05)
-        assert params.change("speed_limit", "null") == ("0.05", "null")
+        assert params.change("max_linear_speed", "null") == ("0.05", "null")
         await plane.go(1.5)
         assert plane.velocity.linear_x > 0.2
 
@@ -106,10 +108,10 @@ async def log_level() -> None:
 
 # every parameter of every behaviour, with what shows that it is obeyed
 OBEYED: dict[tuple[str, str], Callable[[], Awaitable[None]]] = {
-    ("avoid", "linear_speed"): linear_speed,
-    ("avoid", "angular_speed"): angular_speed,
+    ("avoid", "max_linear_speed"): max_linear_speed,
+    ("avoid", "max_angular_speed"): max_angular_speed,
     ("avoid", "turn"): turn,
-    ("navigate", "speed_limit"): speed_limit,
+    ("navigate", "max_linear_speed"): route_speed,
 }
 
 
@@ -121,7 +123,7 @@ async def test_every_parameter_of_a_behaviour_changes_what_the_robot_does(
 
 
 def test_no_behaviour_has_a_parameter_without_such_a_test() -> None:
-    there = {(name, param) for name in BEHAVIOURS for param in behaviours.load(name).PARAMS}
+    there = {(name, param) for name in behaviours.SHIPPED for param in behaviours.load(name).PARAMS}
     assert there == set(OBEYED)
 
 
@@ -132,10 +134,9 @@ async def test_the_log_level_of_a_process_is_obeyed(root_level: None) -> None:
 @pytest.mark.parametrize(
     ("behaviour", "foreign", "known"),
     [
-        ("navigate", "linear_speed", "speed_limit"),
-        ("navigate", "angular_speed", "speed_limit"),
-        ("navigate", "turn", "speed_limit"),
-        ("avoid", "speed_limit", "linear_speed, angular_speed, turn"),
+        ("navigate", "max_angular_speed", "max_linear_speed"),
+        ("navigate", "turn", "max_linear_speed"),
+        ("avoid", "samples", "max_linear_speed, max_angular_speed, turn"),
     ],
 )
 async def test_what_the_present_behaviour_does_not_read_is_refused_with_what_can_be_set(
@@ -163,20 +164,61 @@ def test_a_speed_limit_is_set_without_forgetting_what_was_seen() -> None:
 
 
 @pytest.mark.parametrize(
-    ("config", "said"),
+    ("behaviour", "settings", "problem"),
     [
-        (DecisionConfig(behaviour="navigate", linear_speed=0.1), ["linear_speed"]),
-        (DecisionConfig(speed_limit=0.1, samples=400, turn="left"), ["speed_limit", "samples"]),
-        (DecisionConfig(behaviour="navigate", speed_limit=0.1, begin="roam", state_dir="/x"), []),
+        ("navigate", {"turn": "left"}, "unknown field 'turn'; known: "),
+        ("avoid", {"samples": 400}, "unknown field 'samples'; known: "),
+        ("avoid", {"turn": "up"}, "turn: expected "),
     ],
 )
-def test_settings_that_the_behaviour_does_not_read_are_named(
-    config: DecisionConfig, said: list[str]
+def test_settings_that_the_behaviour_does_not_have_are_refused(
+    behaviour: str, settings: dict[str, Any], problem: str
 ) -> None:
-    assert list(behaviours.unread(config)) == said
+    config = DecisionConfig(behaviour=behaviour, settings=settings)
+    with pytest.raises(ConfigError, match=f"^decision.settings of {behaviour}: {problem}"):
+        behaviours.check(config)
 
 
-async def test_they_are_named_in_the_log_at_the_start(caplog: pytest.LogCaptureFixture) -> None:
-    async with NodeBench(functools.partial(decision.run, DecisionConfig(samples=400))) as bench:
+OLD = """
+decision:
+  behaviour: {behaviour}
+  linear_speed: 0.1
+  speed_limit: 0.3
+  turn: left
+  begin: roam
+  unknown: allow
+"""
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "settings"),
+    [
+        ("avoid", {"max_linear_speed": 0.1, "turn": "left"}),
+        (
+            "navigate",
+            {"max_linear_speed": 0.3, "start": "explore", "unknown_space": "allow"},
+        ),
+    ],
+)
+def test_yaml_with_the_old_words_means_the_same(
+    tmp_path: Path, behaviour: str, settings: dict[str, Any]
+) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(OLD.format(behaviour=behaviour))
+    config = load_deployment(path).decision
+    assert config == DecisionConfig(behaviour=behaviour, settings=settings)
+    behaviours.check(config, path)
+
+
+def test_a_wrong_setting_of_a_behaviour_is_refused_with_file_and_line(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text("decision:\n  behaviour: navigate\n  settings:\n    start: roam\n")
+    with pytest.raises(ConfigError, match=r"robot\.yaml:4: start: expected "):
+        behaviours.check(load_deployment(path).decision, path)
+
+
+async def test_parameters_with_the_old_names_mean_the_same() -> None:
+    async with NodeBench(functools.partial(decision.run, DecisionConfig())) as bench:
         await bench.ready()
-    assert "samples has no effect: behaviour avoid does not read it" in caplog.messages
+        assert bench.bus.params.change("linear_speed", "0.1") == ("0.2", "0.1")
+        assert "linear_speed" not in {param.name for param in bench.bus.params.all()}

@@ -102,7 +102,7 @@ def test_of_a_process_that_was_changed_the_first_difference_is_shown(
 ) -> None:
     path = file_of(RECORDINGS, "arena")
     changed = tmp_path / "changed.yaml"
-    changed.write_text("decision:\n  linear_speed: 0.1\n")
+    changed.write_text("decision:\n  settings: {max_linear_speed: 0.1}\n")
     command = ("replay", "--check", str(path), "--process", "decision")
     assert call(*command) == 0
     assert "decision does what it did" in capsys.readouterr().out
@@ -188,7 +188,11 @@ def test_a_replay_runs_no_programs_and_remembers_nothing(tmp_path: Path) -> None
     with Recorder(path, RecorderConfig(notes=notes, keep_free_mb=0)) as recorder:
         recorder.intake.take(STATE.key, "", said(STATE, 1)[2])
     settings = settings_for(path, "decision", None)
-    assert settings == {"behaviour": "navigate", "scripts": "", "state_dir": ""}
+    assert settings == {
+        "behaviour": "navigate",
+        "settings": {"scripts": ""},
+        "state_dir": "",
+    }
 
 
 async def test_a_decision_that_was_sent_to_a_place_does_the_same_again() -> None:
@@ -219,7 +223,7 @@ async def test_a_parameter_that_was_changed_meanwhile_is_changed_again(tmp_path:
         events = record(robot.network, robot.clock)
         serve_params(robot.bus("decision"))
         await robot.go(100)
-        slower = ParamRequest(name="linear_speed", value="0.1", source="ann")
+        slower = ParamRequest(name="max_linear_speed", value="0.1", source="ann")
         assert (await robot.operator.ask(PARAM, slower, name="decision"))[0].ok
         speeds = await robot.go(100)
     assert (round(speeds[0], 2), round(speeds[-1], 2)) == (0.26, 0.1)

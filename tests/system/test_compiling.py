@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("numba")
 
 from gigabrain_zenoh.cli.warm import warm
-from gigabrain_zenoh.decision.navigating import DRIVE_KERNELS
+from gigabrain_zenoh.decision.goal_server import DRIVE_KERNELS
 from gigabrain_zenoh.kernels import compiling, numba_alone
 from gigabrain_zenoh.kernels import kernel as kernels
 from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS

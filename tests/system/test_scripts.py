@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh.decision.tasks.executive import Saved
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.scripts import LEASHED, Run, Scripts
-from gigabrain_zenoh.decision.tasks.store import TaskFile
+from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.testing.waiting import until
 

@@ -1,159 +1,137 @@
-"""What decision can do. Adding a behaviour means a module and a line in BEHAVIOURS."""
+"""Behaviours: what each must offer, and how one is found by its name.
 
-import importlib
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, ClassVar, Protocol, cast
+A behaviour is one module: its class, its `Config`, and the parameters that may change while it
+runs. Packages offer theirs as entry points of the group `gigabrain.behaviours`.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
 
 import msgspec
+from msgspec import Meta, Struct
 
 from gigabrain_schemas.base import Pose
-from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.settings import DecisionConfig
-from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand, Outcome
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.plugins import load_plugin, plugin_names
 
-if TYPE_CHECKING:
-    from gigabrain_zenoh.decision.behaviours.bearings import Bearings
-
-
-class Situation(msgspec.Struct, frozen=True):
-    """What a behaviour may look at."""
-
-    world: WorldModel | None  # None while perception is silent
-    pose: Pose  # odometry of the same tick
-    must_charge: bool = False  # safety says that the battery is nearly empty
-    bearings: "Bearings | None" = None  # for a behaviour that is sent to places
-
-
-def must_charge(verdict: SafetyState | None) -> bool:
-    """Whether safety wants the robot to come to rest and be charged."""
-    return verdict is not None and any(w.code == "battery_return" for w in verdict.warnings)
-
-
-class Behaviour(Protocol):
-    """Turns one situation after the other into intents. It keeps its own memory, and no clock."""
-
-    SETTINGS: ClassVar[frozenset[str]]  # the fields of DecisionConfig that it goes by
-    PARAMS: ClassVar[Mapping[str, str]]  # those that may change while it runs: what is expected
-
-    def __init__(self, config: DecisionConfig) -> None: ...
-
-    def configure(self, config: DecisionConfig) -> None:
-        """Go by other settings from now on, and keep what it remembers."""
-        ...
-
-    def step(self, situation: Situation) -> Intent:
-        """What to do now."""
-        ...
-
-
-class Senses(Protocol):
-    """What a behaviour goes by beside the world: hears it, and hands back what became of it."""
-
-    async def warm_up(self) -> None:
-        """Whatever takes its time, before anything drives."""
-        ...
-
-    def see(self, state: RobotState) -> None:
-        """Take note of each state."""
-        ...
-
-    def situation(
-        self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
-    ) -> Situation:
-        """What the behaviour is to look at now."""
-        ...
-
-    def heed(self, behaviour: Behaviour) -> None:
-        """Take note of what the behaviour has made of it."""
-        ...
-
-    @property
-    def hung(self) -> bool:
-        """Whether a part of it never ends, while the rest goes on."""
-        ...
-
-    async def close(self) -> None:
-        """Once all is written down."""
-        ...
-
-
-class Plain:
-    """The senses of a behaviour that goes by the world alone."""
-
-    async def warm_up(self) -> None:
-        """Nothing to do."""
-
-    def see(self, state: RobotState) -> None:
-        """Nothing to note."""
-
-    def situation(
-        self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
-    ) -> Situation:
-        """The world and the odometry."""
-        return Situation(world, state.pose, must_charge(verdict))
-
-    def heed(self, behaviour: Behaviour) -> None:
-        """Nothing to note."""
-
-    @property
-    def hung(self) -> bool:
-        """It has no parts."""
-        return False
-
-    async def close(self) -> None:
-        """Nothing to write."""
-
-
-# name in a deployment file -> "module:class"; the class takes the `decision` part of that file
-BEHAVIOURS = {
+GROUP = "gigabrain.behaviours"
+SHIPPED = {  # name in a deployment file -> "module:class"
     "avoid": "gigabrain_zenoh.decision.behaviours.avoid:Avoid",
     "navigate": "gigabrain_zenoh.decision.behaviours.navigate:Navigate",
 }
-SENSES = {"navigate": "gigabrain_zenoh.decision.navigating:Navigating"}  # of those that need more
+
+NAVIGATION_PACKAGES = ("numba", "cv2", "py_trees")
+
+SpeedLimit = Annotated[float, Meta(gt=0, le=10)]  # [m/s] or [rad/s]
+Step = tuple[Intent, Outcome]
+Drive = Callable[[DriveCommand | None], Step]
 
 
-OF_ALL = frozenset({"behaviour", "state_dir"})  # settings that hold for every behaviour
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Inputs:
+    """What a behaviour knows at one scan."""
+
+    world: WorldModel | None  # None while perception is silent
+    pose: Pose  # in the odometry frame, at the same tick
+    must_charge: bool = False  # the battery is nearly empty
+    # for behaviours with a NavigationConfig:
+    command: DriveCommand | None = None  # what the task queue wants
+    drive: Drive | None = None  # carries out a command: one step of the navigator
 
 
-def check(name: str) -> None:
-    """Raises UnknownName where there is no behaviour called `name`, listing the known ones."""
-    if name not in BEHAVIOURS:
-        raise unknown("behaviour", name, BEHAVIOURS)
+class Behaviour(Protocol):
+    """Turns inputs into intents, one step per scan. It has its own memory, no clock and no bus."""
+
+    Config: ClassVar[type[Struct]]  # a NavigationConfig, if it needs a map, goals and missions
+    PARAMS: ClassVar[Mapping[str, str]]  # fields of Config that may change, and what is expected
+    DEMO: ClassVar[Mapping[str, Any]]  # settings for a demonstration
+
+    def __init__(self, config: Any) -> None: ...
+
+    def configure(self, config: Any) -> None:
+        """Use other settings from now on, and keep the memory."""
+        ...
+
+    def step(self, inputs: Inputs) -> Step:
+        """Return the intent, and the outcome of `inputs.command` if there is one."""
+        ...
+
+
+class NavigationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Settings of a behaviour that drives by a map; perception must have `mapping` on."""
+
+    max_linear_speed: SpeedLimit | None = None  # [m/s]; the body's own limit applies too
+    # paths through unknown cells; with `allow` also to goals beyond the map
+    unknown_space: Literal["avoid", "allow", "forbid"] = "avoid"
+    samples: Annotated[int, Meta(ge=64, le=20_000)] = 1000  # candidate plans per scan
+    start: Literal["wait", "explore"] = "wait"  # explore, then visit places, until a task comes
+    scripts: str = ""  # folder of the programs that missions may run; empty: none
+
+
+def names() -> list[str]:
+    """Return the names of all behaviours."""
+    return plugin_names(SHIPPED, GROUP)
 
 
 def load(name: str) -> type[Behaviour]:
-    """The behaviour called `name`. Raises UnknownName listing the known ones, and ConfigError."""
-    check(name)
-    return cast("type[Behaviour]", _find(name, BEHAVIOURS[name]))
+    """Return the behaviour called `name`. Raises UnknownName, and ConfigError if it is broken."""
+    return cast("type[Behaviour]", load_plugin("behaviour", name, SHIPPED, GROUP))
 
 
-def unread(config: DecisionConfig) -> tuple[str, ...]:
-    """The settings that differ from their defaults and that the behaviour does not read."""
-    read = load(config.behaviour).SETTINGS | OF_ALL
-    plain = DecisionConfig()
-    return tuple(
-        name
-        for name in DecisionConfig.__struct_fields__
-        if name not in read and getattr(config, name) != getattr(plain, name)
-    )
+def needs_map(name: str) -> bool:
+    """Return whether a behaviour drives by a map. Raises UnknownName and ConfigError."""
+    return issubclass(load(name).Config, NavigationConfig)
 
 
-def senses(config: DecisionConfig, bus: Bus) -> Senses:
-    """What the configured behaviour goes by. Raises ConfigError."""
-    if config.behaviour not in SENSES:
-        return Plain()
-    make = _find(config.behaviour, SENSES[config.behaviour])
-    return cast("Callable[[DecisionConfig, Bus], Senses]", make)(config, bus)
-
-
-def _find(name: str, path: str) -> object:
-    module, _, attribute = path.partition(":")
+def settings_of(config: DecisionConfig) -> Any:
+    """Return the configured behaviour's settings. Raises UnknownName and ConfigError."""
+    kind, text = load(config.behaviour).Config, msgspec.json.encode(config.settings).decode()
     try:
-        return getattr(importlib.import_module(module), attribute)
-    except ModuleNotFoundError as error:
+        return loading.loads(text, kind, "settings")
+    except ConfigError as error:
+        problem = str(error).removeprefix("settings:1: ")
+        raise ConfigError(f"decision.settings of {config.behaviour}: {problem}") from None
+
+
+def check(config: DecisionConfig, path: Path | None = None) -> None:
+    """Raise ConfigError if the behaviour cannot run so; with the line in the file `path`."""
+    kind = load(config.behaviour).Config
+    if path:
+        loading.loads(loading.read(path), kind, str(path), at=("decision", "settings"))
+    settings = settings_of(config)
+    if not isinstance(settings, NavigationConfig):
+        return
+    for package in NAVIGATION_PACKAGES:
+        if find_spec(package) is None:
+            raise ConfigError(
+                f"behaviour {config.behaviour} needs {package}; pip install 'gigabrain-zenoh[nav]'"
+            )
+    if settings.scripts and not Path(settings.scripts).expanduser().is_dir():
         raise ConfigError(
-            f"behaviour {name} needs {error.name}; pip install 'gigabrain-zenoh[nav]'"
-        ) from None
+            f"no folder {settings.scripts!r}; "
+            "scripts: expected that of the programs that missions may run"
+        )
+
+
+def parse_settings(pairs: Iterable[str]) -> dict[str, Any]:
+    """Return settings given as `NAME=VALUE`, with values as in YAML. Raises ConfigError."""
+    found = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals:
+            raise ConfigError(f"expected NAME=VALUE, got {pair!r}")
+        found[name] = loading.loads(f"value: {value}", dict[str, Any], pair)["value"]
+    return found
+
+
+def battery_nearly_empty(verdict: SafetyState | None) -> bool:
+    """Return whether safety wants the robot to come to rest and be charged."""
+    return verdict is not None and any(w.code == "battery_return" for w in verdict.warnings)

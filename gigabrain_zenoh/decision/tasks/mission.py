@@ -1,23 +1,41 @@
-"""Missions: a YAML file becomes a behaviour tree of frozen Structs, or one line says why not."""
+"""Missions: a YAML file becomes a behaviour tree of frozen Structs, or a ConfigError.
 
-from typing import Annotated
+Checks that need more than one step, such as names of places and the depth of trees, come last.
+"""
 
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
 from msgspec import Meta, Struct
 
 from gigabrain_schemas.base import Finite, Name, Percentage
 from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.config import loading, yaml_text
+from gigabrain_zenoh.decision.tasks import conditions
+from gigabrain_zenoh.errors import ConfigError, unknown
+
+MAX_LOOPS = 1_000_000
+MAX_BYTES = 60_000  # of a mission that is sent to a robot
+MAX_STEPS = 2000  # with each `tree` written out
+MAX_DEPTH = 50  # of nested steps, likewise; carrying them out is recursive
+TOO_DEEP = f"more than {MAX_DEPTH} nested steps once every tree is written out"
 
 Point = Annotated[tuple[Finite, ...], Meta(min_length=2, max_length=3)]  # [m], [m], [rad]
 Place = Name | Point
+Places = Annotated[tuple[Place, ...], Meta(min_length=1, max_length=1000)]
 Steps = Annotated[tuple["Step", ...], Meta(min_length=1)]
 Seconds = Annotated[float, Meta(gt=0, le=1e7)]
-MOST_LOOPS = 1_000_000
-Times = Annotated[int, Meta(ge=1, le=MOST_LOOPS)]
+Pause = Annotated[float, Meta(ge=0, le=1e7)]
+Times = Annotated[int, Meta(ge=1, le=MAX_LOOPS)]
 Comparison = Annotated[str, Meta(max_length=200)]  # see conditions.py
 KINDS = (
     "goto", "patrol", "explore", "visit", "wait", "wait_until", "check", "script", "tree",
     "sequence", "fallback", "retry", "repeat", "timeout", "guard", "battery_below",
 )  # fmt: skip
+DRIVING = ("goto", "patrol", "explore", "visit", "battery_below")
+Keys = tuple[str | int, ...]  # from the top of the file
 
 
 class Part(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -25,52 +43,52 @@ class Part(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_d
 
 
 class Patrol(Part, frozen=True, kw_only=True):
-    """One place after the other, over and over."""
+    """Visit places in order, repeatedly."""
 
-    points: Annotated[tuple[Place, ...], Meta(min_length=1, max_length=1000)]
+    points: Places
     loops: Times | None = None  # None: for ever
-    wait: Annotated[float, Meta(ge=0, le=1e7)] = 0.0  # [s] at each
+    wait: Pause = 0.0  # [s] at each
 
 
 class Explore(Part, frozen=True, kw_only=True):
-    """Drive until nothing is left to be seen."""
+    """Drive until nothing unknown is reachable."""
 
 
 class Visit(Part, frozen=True, kw_only=True):
-    """Drive to a place that can be reached, chosen at random."""
+    """Drive to a random reachable place."""
 
 
 class Script(Part, frozen=True, kw_only=True):
-    """Run a program of the host, out of the folder that its deployment file allows."""
+    """Run a program of the host, from the folder that its deployment file allows."""
 
-    run: Name  # its file name
+    run: Name  # file name
     arguments: tuple[Name, ...] = ()
-    seconds: Seconds = 60.0  # after which it is ended, which is a failure
+    seconds: Seconds = 60.0  # time limit
 
 
 class Retry(Part, frozen=True, kw_only=True):
-    """Try again when it has failed."""
+    """Repeat after a failure."""
 
     times: Times  # attempts in all
     do: Steps
 
 
 class Repeat(Part, frozen=True, kw_only=True):
-    """Do it again when it has succeeded."""
+    """Repeat after a success."""
 
     times: Times | None = None  # None: for ever
     do: Steps
 
 
 class Timeout(Part, frozen=True, kw_only=True):
-    """Fail when it takes longer."""
+    """Fail after some seconds."""
 
     seconds: Seconds
     do: Steps
 
 
 class Guard(Part, frozen=True, kw_only=True):
-    """Do something else first whenever a condition holds, then go on where it was."""
+    """Run `then` whenever a condition holds; afterwards `do` continues."""
 
     when: Comparison
     then: Steps
@@ -78,11 +96,11 @@ class Guard(Part, frozen=True, kw_only=True):
 
 
 class BatteryBelow(Part, frozen=True, kw_only=True):
-    """Drive to a place whenever the charge is low, and go on once it is charged."""
+    """Drive to a place whenever the charge is low, and continue once charged."""
 
     percentage: Percentage
     goto: Place
-    until: Percentage | None = None  # charge to go on at; None: the mission ends there
+    until: Percentage | None = None  # charge to continue at; None: the mission ends there
     do: Steps
 
     def __post_init__(self) -> None:
@@ -94,7 +112,7 @@ class BatteryBelow(Part, frozen=True, kw_only=True):
 
 
 class Step(Part, frozen=True, kw_only=True):
-    """One node of the tree. Exactly one field says what it is."""
+    """One node of the tree. Exactly one field is set."""
 
     goto: Place | None = None
     patrol: Patrol | None = None
@@ -102,7 +120,7 @@ class Step(Part, frozen=True, kw_only=True):
     visit: Visit | None = None
     wait: Seconds | None = None
     wait_until: Comparison | None = None
-    check: Comparison | None = None  # fails where it does not hold
+    check: Comparison | None = None  # fails if it does not hold
     script: Script | None = None
     tree: Name | None = None  # one of the mission's `trees`
     sequence: Steps | None = None
@@ -114,46 +132,230 @@ class Step(Part, frozen=True, kw_only=True):
     battery_below: BatteryBelow | None = None
 
     def __post_init__(self) -> None:
-        said = [kind for kind in KINDS if getattr(self, kind) is not None]
-        if len(said) > 1:
-            raise ValueError(f"{said[1]}: a step is one thing, and this one is {said[0]} already")
-        if not said:
+        given = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{given[1]}: a step is one thing, and this one is {given[0]} already")
+        if not given:
             raise ValueError(f"a step that does nothing; expected one of {', '.join(KINDS)}")
 
     @property
     def kind(self) -> str:
-        """Which field says what it is."""
+        """Name of the field that is set."""
         return next(kind for kind in KINDS if getattr(self, kind) is not None)
 
 
 class Mission(Part, frozen=True, kw_only=True):
-    """A whole mission file."""
+    """A mission file."""
 
     places: dict[Name, Point] = {}
     trees: dict[Name, Steps] = {}
     do: Steps
 
-    def goal(self, place: str | tuple[float, ...]) -> Goal:
-        """Where a place is."""
+    def goal(self, place: Place) -> Goal:
+        """Return the goal of a place, given by name or coordinates."""
         x, y, *yaw = self.places[place] if isinstance(place, str) else place
         return Goal(x=x, y=y, yaw=yaw[0] if yaw else None)
+
+    @property
+    def scripts(self) -> Iterator[str]:
+        """Names of the host's programs that it runs."""
+        return (step.script.run for _, step in _steps(self) if step.script)
+
+    @property
+    def drives(self) -> bool:
+        """Whether any step drives."""
+        return any(step.kind in DRIVING for _, step in _steps(self))
 
 
 class PatrolFile(Part, frozen=True, kw_only=True):
     """The file of `gigabrain patrol`."""
 
     places: dict[Name, Point] = {}
-    points: Annotated[tuple[Place, ...], Meta(min_length=1, max_length=1000)]
-    wait: Annotated[float, Meta(ge=0, le=1e7)] = 0.0  # [s] at each
+    points: Places
+    wait: Pause = 0.0  # [s] at each
 
 
-def roaming() -> Mission:
-    """The mission that is to explore, and then to visit one place after the other."""
+def explore_mission() -> Mission:
+    """Return the mission that explores, and then visits one place after the other."""
     visit = Step(fallback=(Step(visit=Visit()), Step(wait=5.0)))
     return Mission(do=(Step(explore=Explore()), Step(repeat=Repeat(do=(visit,)))))
 
 
 def goal_mission(goal: Goal) -> Mission:
-    """The mission that is to be at one place."""
+    """Return the mission that drives to one goal."""
     point = (goal.x, goal.y) if goal.yaw is None else (goal.x, goal.y, goal.yaw)
     return Mission(do=(Step(goto=point),))
+
+
+def patrol_mission(patrol: PatrolFile, loops: int | None) -> str:
+    """Return the text of the mission for a patrol file."""
+    step = Step(patrol=Patrol(points=patrol.points, loops=loops, wait=patrol.wait))
+    return msgspec.json.encode(Mission(places=patrol.places, do=(step,))).decode()
+
+
+def load(path: Path) -> tuple[Mission, str]:
+    """Return the mission in a file, and its text. Raises ConfigError with file and line."""
+    text = loading.read(path)
+    refuse_long(text, str(path))
+    return loads(text, str(path)), text
+
+
+def refuse_long(text: str, source: str) -> None:
+    """Raise ConfigError for a mission that is too long to be sent to a robot."""
+    if (size := len(text.encode())) > MAX_BYTES:
+        raise ConfigError(f"{source}: {size} bytes; expected at most {MAX_BYTES}")
+
+
+def loads(text: str, source: str) -> Mission:
+    """Return the mission in a YAML text; `source` names it in errors. Raises ConfigError."""
+    mission = loading.loads(text, Mission, source)
+    for keys, problem in _problems(mission):
+        raise ConfigError(f"{source}:{_line(text, keys)}: {_dotted(keys)}: {problem}")
+    return mission
+
+
+def load_patrol(path: Path) -> PatrolFile:
+    """Return the patrol in a file. Raises ConfigError with file and line."""
+    text = loading.read(path)
+    patrol = loading.loads(text, PatrolFile, str(path))
+    for i, place in enumerate(patrol.points):
+        if problem := _unknown_place(place, patrol.places):
+            raise ConfigError(f"{path}:{_line(text, ('points', i))}: points[{i}]: {problem}")
+    return patrol
+
+
+def _problems(mission: Mission) -> Iterator[tuple[Keys, str]]:
+    for keys, step in _steps(mission):
+        yield from _in_step(keys, step, mission)
+    depths: dict[str, int] = {}
+    for name in mission.trees:
+        if problem := _tree_problem(name, mission, (), depths):
+            yield ("trees", name), problem
+    if _depth(mission.do, depths) > MAX_DEPTH:
+        yield ("do",), TOO_DEEP
+    if _size(mission.do, mission, {}) > MAX_STEPS:
+        yield ("do",), f"more than {MAX_STEPS} steps once every tree is written out"
+
+
+def _in_step(keys: Keys, step: Step, mission: Mission) -> Iterator[tuple[Keys, str]]:
+    for more, place in _places(step):
+        if problem := _unknown_place(place, mission.places):
+            yield (*keys, *more), problem
+    for more, text in _conditions(step):
+        try:
+            conditions.parse(text)
+        except (ValueError, ConfigError) as error:
+            yield (*keys, *more), str(error)
+    if step.tree is not None and step.tree not in mission.trees:
+        known = mission.trees or ("none",)
+        yield (*keys, "tree"), str(unknown("tree", step.tree, known))
+
+
+def _unknown_place(place: Place, places: dict[str, Any]) -> str:
+    if not isinstance(place, str) or place in places:
+        return ""
+    return str(unknown("place", place, places or ("none",)))
+
+
+def _places(step: Step) -> Iterator[tuple[Keys, Place]]:
+    if step.goto is not None:
+        yield ("goto",), step.goto
+    if step.patrol:
+        yield from ((("patrol", "points", i), place) for i, place in enumerate(step.patrol.points))
+    if step.battery_below:
+        yield ("battery_below", "goto"), step.battery_below.goto
+
+
+def _conditions(step: Step) -> Iterator[tuple[Keys, str]]:
+    if step.wait_until is not None:
+        yield ("wait_until",), step.wait_until
+    if step.check is not None:
+        yield ("check",), step.check
+    if step.guard:
+        yield ("guard", "when"), step.guard.when
+
+
+def _steps(mission: Mission) -> Iterator[tuple[Keys, Step]]:
+    """Yield every step of the file with the keys that lead to it."""
+    for name, steps in mission.trees.items():
+        yield from _below(("trees", name), steps)
+    yield from _below(("do",), mission.do)
+
+
+def _below(keys: Keys, steps: tuple[Step, ...]) -> Iterator[tuple[Keys, Step]]:
+    for i, step in enumerate(steps):
+        yield (*keys, i), step
+        for more, inner in _inner(step):
+            yield from _below((*keys, i, *more), inner)
+
+
+def _inner(step: Step) -> Iterator[tuple[Keys, tuple[Step, ...]]]:
+    """Yield the lists of steps within a step."""
+    kind = step.kind
+    value = getattr(step, kind)
+    if kind in ("sequence", "fallback"):
+        yield (kind,), value
+    elif isinstance(value, Struct):
+        for name in ("then", "do"):
+            if hasattr(value, name):
+                yield (kind, name), getattr(value, name)
+
+
+def _tree_problem(
+    name: str, mission: Mission, above: tuple[str, ...], depths: dict[str, int]
+) -> str:
+    """Return the problem of a tree, if any; `depths` has the depth of each valid tree."""
+    if name in above:
+        return f"is a cycle: {' → '.join((*above[above.index(name) :], name))}"
+    if name in depths:
+        return ""
+    if len(above) >= MAX_DEPTH:
+        return TOO_DEEP
+    for _, step in _below((), mission.trees[name]):
+        tree = step.tree
+        if tree is not None and (problem := _tree_problem(tree, mission, (*above, name), depths)):
+            return problem
+    depths[name] = _depth(mission.trees[name], depths)
+    return TOO_DEEP if depths[name] > MAX_DEPTH else ""
+
+
+def _depth(steps: tuple[Step, ...], of_trees: dict[str, int]) -> int:
+    """Return the greatest depth of nested steps, with every tree written out."""
+    return 1 + max(
+        max((_depth(inner, of_trees) for _, inner in _inner(step)), default=0)
+        if step.tree is None
+        else of_trees[step.tree]
+        for step in steps
+    )
+
+
+def _size(steps: tuple[Step, ...], mission: Mission, known: dict[str, int]) -> int:
+    """Return the number of steps with every tree written out. There must be no cycle."""
+    count = 0
+    for _, step in _below((), steps):
+        count += 1
+        if step.tree is not None:
+            if step.tree not in known:
+                known[step.tree] = _size(mission.trees[step.tree], mission, known)
+            count += known[step.tree]
+    return count
+
+
+def _line(text: str, keys: Keys) -> int:
+    node = yaml_text.read(text)
+    line = node.line
+    for part in keys:
+        if isinstance(part, int):
+            assert node.items is not None
+            node = node.items[part]
+            line = node.line
+        else:
+            assert node.entries is not None
+            entry = next(entry for entry in node.entries if entry.key == part)
+            node, line = entry.node, entry.line
+    return line
+
+
+def _dotted(keys: Keys) -> str:
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in keys)
+    return "".join(parts).lstrip(".")

@@ -25,7 +25,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.decision import node as decision
-from gigabrain_zenoh.decision.response import ResponseEstimator
+from gigabrain_zenoh.decision.actuation_model import ActuationEstimator
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of, ramp
@@ -157,7 +157,9 @@ async def _drive(course: BarnCourse, samples: int, folder: str) -> BarnTrial:
 
 def _nodes(plant: WatchedCourse, samples: int, folder: str) -> dict[str, Node]:
     """With the settings of a robot that drives where nobody has been."""
-    anywhere = DecisionConfig(behaviour="navigate", unknown="allow", samples=samples)
+    anywhere = DecisionConfig(
+        behaviour="navigate", settings={"unknown_space": "allow", "samples": samples}
+    )
     return {
         "perception": functools.partial(perception.run, PerceptionConfig(mapping="slam")),
         "decision": functools.partial(decision.run, anywhere),
@@ -201,7 +203,7 @@ class BarnBrain:
         self._goal = goal
         self._planner = LocalPlanner(JACKAL, settings)
         self._surroundings = Surroundings()
-        self._response = ResponseEstimator()
+        self._response = ActuationEstimator()
         self._memory = control.Memory()
         self._intent: Intent | None = None
         self._perception = PerceptionConfig(mapping="slam")

@@ -26,7 +26,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.config.settings import DecisionConfig, Endpoint, PerceptionConfig
 from gigabrain_zenoh.control import node as control
-from gigabrain_zenoh.decision.node import Thinker
+from gigabrain_zenoh.decision.node import DecisionLoop
 from gigabrain_zenoh.diagnostics.rates import HOPS, Heard, listen
 from gigabrain_zenoh.launch.processes import PROCESSES
 from gigabrain_zenoh.launch.specs import process_specs
@@ -281,11 +281,11 @@ async def measure_hops(heard: Heard, total: Latencies) -> list[Hop]:
 
 async def _take_turns(heard: Heard, bus: Bus, timed: Stopwatch) -> None:
     """In each turn do once what one scan makes all nodes do."""
-    first, thinker = heard.get(STATE).tick, Thinker(DecisionConfig())
+    first, loop = heard.get(STATE).tick, DecisionLoop(DecisionConfig())
     payloads = {topic.key: codec.encode(heard.get(topic)) for topic in HOPS}
     decoders = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in HOPS}
     for tick in range(first, first + TURNS):
-        steps = _steps_at(tick, heard, thinker)
+        steps = _steps_at(tick, heard, loop)
         await asyncio.sleep(PAUSE_S)
         for topic in HOPS:
             timed(f"put {topic.key}", partial(bus.publish, topic, heard.get(topic), basis=tick))
@@ -294,7 +294,7 @@ async def _take_turns(heard: Heard, bus: Bus, timed: Stopwatch) -> None:
                 timed(f"step {topic.key}", steps[topic.key])
 
 
-def _steps_at(tick: int, heard: Heard, thinker: Thinker) -> dict[str, Callable[[], object]]:
+def _steps_at(tick: int, heard: Heard, loop: DecisionLoop) -> dict[str, Callable[[], object]]:
     """Return the work of each message's receiver in a tick."""
     body, scan = heard.get(BODY).description, heard.get(SCAN)
     state = replace(heard.get(STATE), tick=tick)
@@ -303,7 +303,7 @@ def _steps_at(tick: int, heard: Heard, thinker: Thinker) -> dict[str, Callable[[
     inputs = control.Inputs(state=state, intent=intent)
     return {
         SCAN.key: partial(perception.step, PerceptionConfig(), body, scan),
-        WORLD.key: partial(thinker.think, state, world),
+        WORLD.key: partial(loop.step, state, world),
         INTENT.key: partial(control.step, body, control.Memory(boot=state.boot), inputs),
     }
 

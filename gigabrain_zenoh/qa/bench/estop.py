@@ -57,7 +57,7 @@ class EstopResult(Struct, frozen=True, kw_only=True):
 
 async def measure_estop(body: str, driving: int, latched: int, say: Say) -> EstopResult:
     """Press while it drives and while it is latched, on an idle and on a flooded network."""
-    decision = DecisionConfig(linear_speed=SPEED)
+    decision = DecisionConfig(settings={"max_linear_speed": SPEED})
     deployment = with_free_port(
         Deployment(body=body, resume="manual", router=LOOPBACK, decision=decision)
     )

@@ -14,7 +14,7 @@ from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, HEALTH, INTENT
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
-from gigabrain_zenoh.decision.navigating import DRIVE_KERNELS
+from gigabrain_zenoh.decision.goal_server import DRIVE_KERNELS
 from gigabrain_zenoh.kernels.compiling import compiled
 from gigabrain_zenoh.perception.node import MAP_KERNELS
 from gigabrain_zenoh.qa.judging import Figure, Limit, table_of

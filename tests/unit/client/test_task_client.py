@@ -10,7 +10,7 @@ import pytest
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskStatus
 from gigabrain_schemas.topics import GOAL
 from gigabrain_zenoh.client.tasks import Tasks
-from gigabrain_zenoh.decision.tasks.orders import GoTo, Outcome
+from gigabrain_zenoh.decision.tasks.drive_command import Outcome
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.waiting import until
@@ -29,8 +29,8 @@ async def test_a_script_hears_how_its_goal_ended(site: Site) -> None:
     seen: list[TaskStatus] = []
     waiting = asyncio.ensure_future(tasks.result(name, seen.append))
     await site.step(10)
-    assert isinstance(site.order, GoTo)
-    site.outcome = Outcome(number=site.order.number, state="failed", reason="a wall")
+    assert site.command
+    site.outcome = Outcome(number=site.command.number, state="failed", reason="a wall")
     await site.step(10)
     end = await waiting
     assert (end.id, end.state, end.reason) == ("goal-1", "failed", "a wall")
@@ -81,7 +81,7 @@ async def test_a_refusal_reaches_the_script(site: Site) -> None:
     tasks = Tasks(site.net.two)
     with pytest.raises(Refused, match="the goal is outside the map"):
         await tasks.go_to(1.0, 0.0)
-    with pytest.raises(Refused, match="there is nothing to do"):
+    with pytest.raises(Refused, match="there is no task"):
         await tasks.cancel()
     assert (await tasks.explore()) == "mission-1"
     assert await tasks.pause() == "mission-1 is paused"

@@ -49,7 +49,7 @@ class Window(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Robot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robot_type: str
     max_linear_speed: Speed
-    decision: Behaviour = Behaviour()
+    drive: Behaviour = Behaviour()
     links: dict[str, Simulated | Serial] = {}
     windows: list[Window] = []
     fallback: Behaviour | None = None
@@ -73,7 +73,7 @@ def refusal(text: str, source: str = "robot.yaml") -> str:
 
 def test_a_good_file_becomes_its_struct(tmp_path: Path) -> None:
     path = tmp_path / "robot.yaml"
-    path.write_text(HEAD + "decision: {turn: clearer}\nlinks:\n  real: {link: serial, port: a}\n")
+    path.write_text(HEAD + "drive: {turn: clearer}\nlinks:\n  real: {link: serial, port: a}\n")
     assert load(path, Robot) == Robot(
         "waffle", 0.26, Behaviour(turn="clearer"), {"real": Serial("a")}
     )
@@ -94,8 +94,8 @@ def test_text_that_looks_like_a_date_or_a_number_in_quotes_stays_text() -> None:
     ("rest", "said"),
     [
         ("lamps: 1\nlamps: 2\n", "robot.yaml:4: duplicate key 'lamps', first on line 3"),
-        ("decision:\n  turn: left\n  turn: left\n", "robot.yaml:5: duplicate key 'turn', first on"),
-        ("decision: {<<: {turn: left}}\n", "robot.yaml:3: merge key '<<' is not allowed;"),
+        ("drive:\n  turn: left\n  turn: left\n", "robot.yaml:5: duplicate key 'turn', first on"),
+        ("drive: {<<: {turn: left}}\n", "robot.yaml:3: merge key '<<' is not allowed;"),
         ("caps: &a {x: 1.0}\nmount: *a\n", "robot.yaml:4: alias '*a' is not allowed;"),
         ("lamps: 12:30\n", "robot.yaml:3: '12:30': write it as a plain decimal or quote it"),
         ("lamps: 010\n", "robot.yaml:3: '010': write it as a plain decimal or quote it"),
@@ -135,7 +135,7 @@ def test_a_file_that_is_no_mapping_is_refused(text: str) -> None:
     ("text", "said"),
     [
         (
-            "robot_type: waffle\nmax_linear_speed: 0.2\ndecision:\n  turm: left\n",
+            "robot_type: waffle\nmax_linear_speed: 0.2\ndrive:\n  turm: left\n",
             "deploy/demo.yaml:4: unknown field 'turm'; did you mean 'turn'? known: behaviour, turn",
         ),
         (
@@ -174,8 +174,8 @@ def test_an_unknown_field_is_named_on_its_own_line(text: str, said: str) -> None
         ("fallback: 3\n", "3: fallback: expected a mapping or null, got 3"),
         ("colour: gren\n", "3: colour: expected one of 'red', 'green', got 'gren'; did you mean"),
         (
-            "decision:\n  turn: rihgt\n",
-            "4: decision.turn: expected one of 'clearer', 'left', 'right', got 'rihgt'; "
+            "drive:\n  turn: rihgt\n",
+            "4: drive.turn: expected one of 'clearer', 'left', 'right', got 'rihgt'; "
             "did you mean 'right'?",
         ),
         (
@@ -261,7 +261,7 @@ def test_files_that_cannot_be_read_are_refused_in_one_line(tmp_path: Path) -> No
         load(tmp_path / "waffle.yaml" / "x.yaml", Robot)
 
 
-WORDS = ["links", "decision", "caps", "windows", "mount", "note", "turn", "link", "sim", "1e3"]
+WORDS = ["links", "drive", "caps", "windows", "mount", "note", "turn", "link", "sim", "1e3"]
 SIGNS = [*":-[]{},'\"&*!|>?#%@`~=\t\n", "<<", "1", "-1", ".nan", "0x1", "yes", "null", ": ", "\n "]
 
 

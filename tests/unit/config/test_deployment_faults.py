@@ -98,7 +98,8 @@ def test_a_folder_of_scripts_that_is_not_there_is_told_at_the_start(
 @pytest.mark.usefixtures("only_begun")
 def test_a_folder_of_scripts_is_looked_for_only_where_decision_runs(tmp_path: Path) -> None:
     file = tmp_path / "robot.yaml"
-    file.write_text("hosts: {a: [router], b: [decision]}\ndecision: {scripts: /nowhere/beeps}\n")
+    decision = "{behaviour: navigate, settings: {scripts: /nowhere/beeps}}"
+    file.write_text(f"hosts: {{a: [router], b: [decision]}}\ndecision: {decision}\n")
     with pytest.raises(Begun):
         up(str(file), host="a")
     with pytest.raises(ConfigError, match=r"robot\.yaml:2: no folder '/nowhere/beeps'; scripts: "):

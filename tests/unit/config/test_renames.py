@@ -131,5 +131,5 @@ def test_old_commands_and_options_are_read_as_the_new_ones(
 
 def test_every_row_of_the_tables_has_a_new_word() -> None:
     for rename in (*renames.YAML_WORDS, *renames.CLI_WORDS):
-        assert rename.new
+        assert rename.new or rename.when  # dropped where it has no effect
         assert rename.old != rename.new or rename.values

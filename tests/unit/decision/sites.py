@@ -20,11 +20,11 @@ from gigabrain_schemas.tasks import (
     TaskStatus,
 )
 from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, Topic
-from gigabrain_zenoh.decision.tasks import checks
-from gigabrain_zenoh.decision.tasks.executive import Executive, Saved
+from gigabrain_zenoh.decision.goal_server import TaskServer
+from gigabrain_zenoh.decision.tasks import mission as missions
+from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand, Outcome
 from gigabrain_zenoh.decision.tasks.mission import Script
-from gigabrain_zenoh.decision.tasks.orders import Explore, GoTo, Order, Outcome
-from gigabrain_zenoh.decision.tasks.service import TaskService
+from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.samples import BOOT, state
@@ -50,18 +50,18 @@ class Robot:
     def __init__(self, saved: Saved | None = None) -> None:
         self.charge, self.programs = 100.0, list[Program]()
         self.pose: PoseInMap | None = None
-        self.tasks = Executive(self._read, self._start, saved or Saved())
-        self.order: Order | None = None
+        self.tasks = TaskQueue(self._read, self._start, saved or Saved())
+        self.command: DriveCommand | None = None
         self.outcome: Outcome | None = None
 
     def carry_out(self, text: str, how: Any = "replace") -> str:
-        return self.tasks.carry_out(checks.loads(PLACES + text, "m"), "m", how, "ann")
+        return self.tasks.add_mission(missions.loads(PLACES + text, "m"), "m", how, "ann")
 
     def step(self, seconds: float = 0.1) -> float | str | None:
         """One step; where the robot is wanted: x of a goal, `explore`, or nowhere."""
-        self.order = self.tasks.step(seconds, self.outcome)
+        self.command = self.tasks.step(seconds, self.outcome)
         self.outcome = None
-        return _short(self.order)
+        return _short(self.command)
 
     def reached(self) -> float | str | None:
         """What comes once it has got there."""
@@ -81,8 +81,8 @@ class Robot:
         return self.status.done[0].state, self.status.done[0].reason
 
     def _became(self, state: Any, reason: str) -> float | str | None:
-        assert self.order
-        self.outcome = Outcome(number=self.order.number, state=state, reason=reason)
+        assert self.command
+        self.outcome = Outcome(number=self.command.number, state=state, reason=reason)
         return self.step()
 
     def _read(self, topic: Topic[Any]) -> Message | None:
@@ -93,10 +93,10 @@ class Robot:
         return self.programs[-1]
 
 
-def _short(order: Order | None) -> float | str | None:
-    if isinstance(order, GoTo):
-        return order.goal.x
-    return "explore" if isinstance(order, Explore) else None
+def _short(command: DriveCommand | None) -> float | str | None:
+    if command and command.goal:
+        return command.goal.x
+    return command.kind if command else None
 
 
 @contextmanager
@@ -113,20 +113,20 @@ class Site:
     def __init__(self, folder: Path, *, scripts: str = "") -> None:
         self.net = Net()
         self.wall, self.lost = "", ""
-        self.service = TaskService(self.net.one, self, folder=str(folder), scripts=scripts)
+        self.service = TaskServer(self.net.one, self, folder=str(folder), scripts=scripts)
         self.told: list[TaskStatus] = []
         self.net.two.subscribe(TASK, lambda _key, status: self.told.append(status))
-        self.tick, self.order, self.outcome = 0, None, None
-        self.order: Order | None
+        self.tick, self.command, self.outcome = 0, None, None
+        self.command: DriveCommand | None
         self.outcome: Outcome | None
 
-    async def can_reach(self, goal: Goal) -> str:
-        await self.can_drive()
+    async def check_goal(self, goal: Goal) -> str:
+        await self.check_located()
         if self.wall:
             raise Refused(self.wall)
         return "on the way, 4.2 m"
 
-    async def can_drive(self) -> None:
+    async def check_located(self) -> None:
         if self.lost:
             raise Refused(self.lost)
 
@@ -145,7 +145,7 @@ class Site:
     async def step(self, ticks: int = 5, boot: int = BOOT) -> None:
         self.tick += ticks
         self.net.one.time.see(state(self.tick, boot=boot))
-        self.order = self.service.step(state(self.tick, boot=boot), self.outcome)
+        self.command = self.service.step(state(self.tick, boot=boot), self.outcome)
         self.outcome = None
         await settle()
 

@@ -6,7 +6,7 @@ import pytest
 from gigabrain_schemas.arrays import cells
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.decision.behaviours.beyond import widened
+from gigabrain_zenoh.decision.route import enlarged
 
 
 def small() -> OccupancyGrid:
@@ -18,7 +18,7 @@ def small() -> OccupancyGrid:
 
 def test_a_map_that_holds_the_goal_stays_as_it_is() -> None:
     grid = small()
-    assert widened(grid, Goal(x=0.9, y=0.4)) is grid
+    assert enlarged(grid, Goal(x=0.9, y=0.4)) is grid
 
 
 @pytest.mark.parametrize(
@@ -34,13 +34,13 @@ def test_a_map_that_holds_the_goal_stays_as_it_is() -> None:
 def test_it_grows_towards_the_goal_and_two_metres_on(
     goal: tuple[float, float], size: tuple[int, int], corner: tuple[float, float]
 ) -> None:
-    wide = widened(small(), Goal(x=goal[0], y=goal[1]))
+    wide = enlarged(small(), Goal(x=goal[0], y=goal[1]))
     assert (wide.width, wide.height) == size
     assert (wide.origin_x, wide.origin_y) == corner
 
 
 def test_what_was_known_stays_in_its_place_and_all_else_is_unknown() -> None:
-    wide = widened(small(), Goal(x=-1.5, y=-1.0))
+    wide = enlarged(small(), Goal(x=-1.5, y=-1.0))
     assert cells(wide)[5:7, 5:].tolist() == cells(small()).tolist()
     assert (cells(wide)[:5] == -1).all()
     assert (cells(wide)[:, :5] == -1).all()
@@ -48,5 +48,5 @@ def test_what_was_known_stays_in_its_place_and_all_else_is_unknown() -> None:
 
 def test_no_map_is_made_for_a_goal_too_far_off() -> None:
     grid = small()
-    assert widened(grid, Goal(x=1e6, y=1e6)) is grid
-    assert widened(grid, Goal(x=1e9, y=0.0)) is grid
+    assert enlarged(grid, Goal(x=1e6, y=1e6)) is grid
+    assert enlarged(grid, Goal(x=1e9, y=0.0)) is grid

@@ -10,10 +10,15 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.decision.behaviours.bearings import Driven, Route
-from gigabrain_zenoh.decision.behaviours.guide import Asked, Guide
-from gigabrain_zenoh.decision.tasks.orders import GoTo
-from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.decision.route import (
+    PathCheck,
+    Route,
+    RouteFeedback,
+    RoutePlanner,
+    RouteRequest,
+)
+from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand
+from gigabrain_zenoh.navigation.planner import Unreachable
 from tests.unit.navigation.drives import WAFFLE
 from tests.unit.navigation.grids import empty, grid_of
 
@@ -27,7 +32,7 @@ AHEAD = Goal(x=5.0, y=1.0)
 
 
 def think(
-    guide: Guide,
+    guide: RoutePlanner,
     cells: np.ndarray,
     *,
     tick: int,
@@ -36,16 +41,16 @@ def think(
     goal: Goal = AHEAD,
     held_ticks: int = 0,
     slowed_by: str = "",
-    driven: Driven | None = None,
+    feedback: RouteFeedback | None = None,
 ) -> Route:
-    return guide.think(
-        Asked(
+    return guide.plan(
+        RouteRequest(
             tick=tick,
-            order=GoTo(1, goal),
+            command=DriveCommand(1, "goto", goal),
             here=Pose(x=x, y=y, yaw=0.0),
             grid=grid_of(cells),
             body=WAFFLE,
-            driven=driven,
+            feedback=feedback,
             seen=np.empty((0, 2)),
             held_ticks=held_ticks,
             slowed_by=slowed_by,
@@ -54,7 +59,7 @@ def think(
 
 
 def test_a_way_that_the_map_loses_is_kept_to_for_thirty_seconds() -> None:
-    guide = Guide()
+    guide = RoutePlanner()
     first = think(guide, OPEN, tick=1)
     assert first.points is not None
     for tick in (50, 1501):
@@ -68,7 +73,7 @@ def test_a_way_that_the_map_loses_is_kept_to_for_thirty_seconds() -> None:
 
 
 def test_a_way_that_opens_again_is_planned_anew() -> None:
-    guide = Guide()
+    guide = RoutePlanner()
     think(guide, OPEN, tick=1)
     think(guide, SHUT, tick=50, x=2.0)
     again = think(guide, OPEN, tick=1400, x=2.0)
@@ -79,7 +84,7 @@ def test_a_way_that_opens_again_is_planned_anew() -> None:
 
 
 def test_a_detour_has_its_own_time_and_going_to_and_fro_ends() -> None:
-    guide = Guide()
+    guide = RoutePlanner()
     barred = ROOM.copy()
     barred[10:, 40] = 100  # a wall at x = 4 m, round which the way is over 5 m longer
     ask = functools.partial(think, guide, goal=Goal(x=7.0, y=4.5), y=4.5)
@@ -92,7 +97,7 @@ def test_a_detour_has_its_own_time_and_going_to_and_fro_ends() -> None:
 
 
 def test_who_had_to_give_way_at_the_goal_has_time_to_settle_there_again() -> None:
-    guide = Guide()
+    guide = RoutePlanner()
     ask = functools.partial(think, guide, OPEN, goal=AHEAD)
     assert ask(tick=1).state == "running"
     assert ask(tick=1000, x=5.0).state == "running"
@@ -103,7 +108,7 @@ def test_who_had_to_give_way_at_the_goal_has_time_to_settle_there_again() -> Non
 
 
 def test_who_comes_no_nearer_than_a_hand_settles_there_and_says_so() -> None:
-    guide = Guide()
+    guide = RoutePlanner()
     goal = Goal(x=5.0, y=1.0, yaw=1.5)
     ask = functools.partial(think, guide, OPEN, goal=goal)
     for tick in (1, 1501):  # safety sees something right ahead that is not in the map
@@ -111,7 +116,7 @@ def test_who_comes_no_nearer_than_a_hand_settles_there_and_says_so() -> None:
     settled = ask(tick=1502, x=4.85)
     assert settled.goal == Goal(x=4.85, y=1.0, yaw=1.5)
     assert settled.reason == "0.15 m beside what was asked for: no progress for 30 s"
-    assert not settled.aside
+    assert not settled.temporary
     again = ask(tick=3002, x=4.86)  # while it turns
     assert (again.goal, again.reason) == (settled.goal, settled.reason)
     assert again.version == settled.version
@@ -119,14 +124,14 @@ def test_who_comes_no_nearer_than_a_hand_settles_there_and_says_so() -> None:
 
 
 def test_going_to_and_fro_at_the_goal_ends() -> None:
-    guide = Guide()
+    guide = RoutePlanner()
     ends = [think(guide, OPEN, tick=1 + 1000 * k, x=5.0 if k % 2 else 4.8) for k in range(8)]
     assert [one.state for one in ends] == ["running"] * 7 + ["failed"]
     assert ends[-1].reason.startswith("gave up: no progress for 30 s, 0.00 m from the goal")
 
 
 def test_the_time_in_which_the_robot_is_held_does_not_count() -> None:
-    guide = Guide()
+    guide = RoutePlanner()
     ask = functools.partial(think, guide, OPEN, x=2.0)
     ask(tick=1)
     assert ask(tick=1001).state == "running"
@@ -136,7 +141,7 @@ def test_the_time_in_which_the_robot_is_held_does_not_count() -> None:
 
 
 def test_a_robot_that_was_driven_away_meanwhile_has_to_come_nearer_than_there() -> None:
-    guide = Guide()
+    guide = RoutePlanner()
     think(guide, OPEN, tick=1, x=4.0)
     for step in range(20):  # an operator drives it back, 10 cm in a look
         held = think(guide, OPEN, tick=26 + 25 * step, x=4.0 - 0.1 * step, held_ticks=25)
@@ -147,67 +152,70 @@ def test_a_robot_that_was_driven_away_meanwhile_has_to_come_nearer_than_there() 
 
 def test_it_gives_up_with_what_is_known_of_why() -> None:
     def ended(**known: Any) -> str:
-        guide = Guide()
+        guide = RoutePlanner()
         think(guide, OPEN, tick=1, x=2.0)
         route = think(guide, OPEN, tick=1502, x=2.0, **known)
         assert route.state == "failed"
         return route.reason
 
-    doing = Driven(version=1, reason="waiting: no way on, 0.02 m of room")
+    doing = RouteFeedback(version=1, reason="waiting: no way on, 0.02 m of room")
     gave_up = "gave up: no progress for 30 s, 3.00 m from the goal"
     assert ended() == gave_up
-    assert ended(driven=doing) == f"{gave_up} (waiting: no way on, 0.02 m of room)"
+    assert ended(feedback=doing) == f"{gave_up} (waiting: no way on, 0.02 m of room)"
     near = "obstacle 0.14 m ahead of the body"
-    assert ended(driven=doing, slowed_by=near) == f"{gave_up} ({near})"
+    assert ended(feedback=doing, slowed_by=near) == f"{gave_up} ({near})"
 
 
 def test_a_goal_within_the_arrival_tolerance_of_a_reachable_place_is_driven_to() -> None:
     too_near = Goal(x=2.88, y=1.05)  # the nearest cell with room is at 2.75 m
-    with pytest.raises(Refused, match=r"^the goal is too close to something: .* 0\.13 m away at"):
-        Guide().check(grid_of(SHUT), WAFFLE, Pose(x=1.0, y=1.0, yaw=0.0), too_near)
-    assert think(Guide(), SHUT, tick=1, goal=too_near).state == "failed"
+    refused = RoutePlanner().check(grid_of(SHUT), WAFFLE, Pose(x=1.0, y=1.0, yaw=0.0), too_near)
+    assert isinstance(refused, Unreachable)
+    assert refused.distance == pytest.approx(0.13, abs=0.005)
+    assert think(RoutePlanner(), SHUT, tick=1, goal=too_near).state == "failed"
     near = replace(too_near, x=2.83)
-    told = Guide().check(grid_of(SHUT), WAFFLE, Pose(x=1.0, y=1.0, yaw=0.0), near)
-    assert told.startswith("on the way, 1.8 m; 0.08 m beside what was asked for: the goal is too c")
-    route = think(Guide(), SHUT, tick=1, goal=near)
+    checked = RoutePlanner().check(grid_of(SHUT), WAFFLE, Pose(x=1.0, y=1.0, yaw=0.0), near)
+    assert isinstance(checked, PathCheck)
+    assert checked.length_m == pytest.approx(1.8, abs=0.05)
+    assert checked.offset.startswith("0.08 m beside what was asked for: the goal is too c")
+    route = think(RoutePlanner(), SHUT, tick=1, goal=near)
     assert route.goal
     assert math.dist((route.goal.x, route.goal.y), (near.x, near.y)) == pytest.approx(0.08)
     assert route.reason.startswith("0.08 m beside what was asked for: the goal is too close to ")
 
 
 def test_what_no_way_has_ever_led_to_is_refused_at_once() -> None:
-    assert think(Guide(), SHUT, tick=1).state == "failed"
+    assert think(RoutePlanner(), SHUT, tick=1).state == "failed"
 
 
 def test_it_makes_room_when_somebody_stays_where_it_is_to_go() -> None:
-    guide = Guide()
+    guide = RoutePlanner()
     goal = Goal(x=5.0, y=3.0)
     ask = functools.partial(think, guide, goal=goal, x=4.0, y=3.0)
     ask(ROOM, tick=1)
     waits = ask(TAKEN, tick=50)
-    assert (waits.goal, waits.aside) == (goal, False)
-    assert not ask(TAKEN, tick=501).aside
+    assert (waits.goal, waits.temporary) == (goal, False)
+    assert not ask(TAKEN, tick=501).temporary
     leaves = ask(TAKEN, tick=502)
-    assert leaves.aside
-    assert leaves.reason == "making room: something is at the goal"
+    assert leaves.temporary
+    assert (leaves.activity, leaves.reason) == ("making room", "something is at the goal")
     assert leaves.version != waits.version
     assert leaves.goal
     assert abs(leaves.goal.y - 3.0) >= 1.0  # beside the line on which the other is likely to go on
     assert math.hypot(leaves.goal.x - 4.0, leaves.goal.y - 3.0) < 1.5
     stays = ask(TAKEN, tick=1251, x=leaves.goal.x, y=leaves.goal.y)
-    assert (stays.aside, stays.goal, stays.version) == (True, leaves.goal, leaves.version)
+    assert (stays.temporary, stays.goal, stays.version) == (True, leaves.goal, leaves.version)
     goes = ask(ROOM, tick=1252, x=leaves.goal.x, y=leaves.goal.y)
-    assert (goes.goal, goes.aside, goes.state) == (goal, False, "running")
+    assert (goes.goal, goes.temporary, goes.state) == (goal, False, "running")
     assert goes.version != leaves.version
 
 
 def test_what_stays_at_the_goal_for_ever_is_made_room_for_twice_and_then_told() -> None:
-    guide = Guide()
+    guide = RoutePlanner()
     ask = functools.partial(think, guide, goal=Goal(x=5.0, y=3.0), x=4.0, y=3.0)
     ask(ROOM, tick=1)
     ticks = (502, 1251, 1252, 1752, 1753, 2502, 2503, 4003)
     routes = [ask(TAKEN, tick=tick) for tick in ticks]
-    told = [one.reason.partition(":")[0] for one in routes]
+    told = [one.activity for one in routes]
     away, look = "making room", "looking whether there is room"
     assert told == [away, away, look, look, away, away, look, look]
     assert routes[4].goal
@@ -219,42 +227,43 @@ def test_what_stays_at_the_goal_for_ever_is_made_room_for_twice_and_then_told() 
 
 def test_who_stood_aside_comes_back_to_look_whether_there_is_room_again() -> None:
     """The map keeps whoever has gone meanwhile, where the robot cannot see it from aside."""
-    guide = Guide()
+    guide = RoutePlanner()
     goal = Goal(x=5.0, y=3.0)
     ask = functools.partial(think, guide, goal=goal)
     ask(ROOM, tick=1, x=4.0, y=3.0)
     ask(TAKEN, tick=502, x=4.0, y=3.0)
     looks = ask(TAKEN, tick=1252, x=1.0, y=1.0)
-    assert looks.reason == "looking whether there is room: the goal is inside something"
+    assert looks.activity == "looking whether there is room"
+    assert looks.reason == "the goal is inside something"
     assert looks.goal
     assert looks.points is not None
-    assert looks.aside  # to be there is not to have arrived
+    assert looks.temporary  # to be there is not to have arrived
     assert 0.2 < math.hypot(looks.goal.x - 5.0, looks.goal.y - 3.0) < 0.8
     back = ask(ROOM, tick=1400, x=looks.goal.x, y=looks.goal.y)
-    assert (back.goal, back.aside, back.reason) == (goal, False, "")
+    assert (back.goal, back.temporary, back.reason) == (goal, False, "")
 
 
 def test_it_makes_room_for_who_keeps_it_from_the_place_beside_its_goal() -> None:
     taken = ROOM.copy()
     taken[28:32, 50:54] = 100  # the goal is too close to it, and what is 0.1 m beside is not
-    guide = Guide()
+    guide = RoutePlanner()
     ask = functools.partial(think, guide, goal=Goal(x=4.85, y=3.0), x=4.0, y=3.0)
     ask(ROOM, tick=1)
     beside = ask(taken, tick=50)
     assert beside.reason.startswith("0.11 m beside what was asked for: the goal is too close to ")
-    assert not beside.aside
-    assert ask(taken, tick=502).aside
+    assert not beside.temporary
+    assert ask(taken, tick=502).temporary
 
 
 def test_a_robot_between_walls_goes_far_from_who_stands_at_its_goal() -> None:
     aisle = empty(8.0, 1.0)
     taken = aisle.copy()
     taken[3:7, 48:52] = 100
-    guide = Guide()
+    guide = RoutePlanner()
     ask = functools.partial(think, guide, goal=Goal(x=5.0, y=0.5), x=4.0, y=0.5)
     ask(aisle, tick=1)
     ask(taken, tick=50)
     leaves = ask(taken, tick=502)
-    assert leaves.aside
+    assert leaves.temporary
     assert leaves.goal
     assert leaves.goal.x < 1.0

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_zenoh.decision.tasks import checks
+from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.errors import ConfigError
 
 
@@ -26,11 +26,11 @@ from gigabrain_zenoh.errors import ConfigError
         (
             "trees:\n  a: [{tree: b}]\n  b: [{retry: {times: 2, do: [{tree: a}]}}]\n"
             "do: [{tree: a}]",
-            "m:2: trees.a: goes round in a circle: a → b → a",
+            "m:2: trees.a: is a cycle: a → b → a",
         ),
         (
             "trees:\n  a: [{tree: a}]\ndo: [{wait: 1}]",
-            "m:2: trees.a: goes round in a circle: a → a",
+            "m:2: trees.a: is a cycle: a → a",
         ),
         ("do:\n- check: nonsense", "m:2: do[0].check: expected a field, one of < <= > >= == != "),
         (
@@ -58,7 +58,7 @@ def test_a_mission_that_cannot_be_carried_out_is_refused_with_its_line(
     text: str, problem: str
 ) -> None:
     with pytest.raises(ConfigError) as refused:
-        checks.loads(text, "m")
+        missions.loads(text, "m")
     assert problem in str(refused.value)
 
 
@@ -66,7 +66,7 @@ def test_trees_that_multiply_are_refused() -> None:
     trees = "".join(f"  t{i}: [{{tree: t{i + 1}}}, {{tree: t{i + 1}}}]\n" for i in range(30))
     text = f"trees:\n{trees}  t30: [{{wait: 1}}]\ndo: [{{tree: t0}}]"
     with pytest.raises(ConfigError, match="more than 2000 steps once every tree is written out"):
-        checks.loads(text, "m")
+        missions.loads(text, "m")
 
 
 @pytest.mark.parametrize("order", [1, -1])
@@ -75,22 +75,22 @@ def test_trees_that_lead_deeper_than_can_be_carried_out_are_refused(order: int) 
         inner = [f"  t{i}: [{{tree: t{i + 1}}}]\n" for i in range(count)][::order]
         return f"trees:\n{''.join(inner)}  t{count}: [{{wait: 1}}]\ndo: [{{tree: t0}}]"
 
-    assert checks.drives(checks.loads(chain(48), "m")) is False
+    assert missions.loads(chain(48), "m").drives is False
     for count in (49, 1900):
-        with pytest.raises(ConfigError, match="more than 50 steps within one another"):
-            checks.loads(chain(count), "m")
+        with pytest.raises(ConfigError, match="more than 50 nested steps"):
+            missions.loads(chain(count), "m")
 
 
 def test_a_file_says_which_mission_and_which_programs_it_needs(tmp_path: Path) -> None:
     file = tmp_path / "m.yaml"
     file.write_text("do: [{script: {run: beep}}, {wait: 3}]")
-    mission, text = checks.load(file)
-    assert list(checks.scripts(mission)) == ["beep"]
-    assert not checks.drives(mission)
+    mission, text = missions.load(file)
+    assert list(mission.scripts) == ["beep"]
+    assert not mission.drives
     assert text == file.read_text()
     file.write_text(f"# {'x' * 60_000}\ndo: [{{wait: 3}}]")
     with pytest.raises(ConfigError, match=r"m\.yaml: 60018 bytes; expected at most 60000"):
-        checks.load(file)
+        missions.load(file)
     file.write_text("points: [[1, 2], b]")
     with pytest.raises(ConfigError, match=r"m.yaml:1: points\[1\]: no place 'b'"):
-        checks.load_patrol(file)
+        missions.load_patrol(file)

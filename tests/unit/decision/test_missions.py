@@ -17,7 +17,7 @@ def robot() -> Iterator[Robot]:
 
 
 def test_a_goal_is_an_order_until_it_is_reached(robot: Robot) -> None:
-    name = robot.tasks.go_to(Goal(x=4.0, y=1.0), "replace", "ann")
+    name = robot.tasks.add_goal(Goal(x=4.0, y=1.0), "replace", "ann")
     assert name == "goal-1"
     assert [robot.step(), robot.step()] == [4.0, 4.0]
     current = robot.status.current
@@ -29,7 +29,7 @@ def test_a_goal_is_an_order_until_it_is_reached(robot: Robot) -> None:
 
 
 def test_a_goal_that_cannot_be_reached_fails_with_the_reason(robot: Robot) -> None:
-    robot.tasks.go_to(Goal(x=4.0, y=1.0), "replace", "ann")
+    robot.tasks.add_goal(Goal(x=4.0, y=1.0), "replace", "ann")
     robot.step()
     assert robot.failed("a wall") is None
     assert robot.last == ("failed", "a wall")
@@ -75,8 +75,8 @@ def test_a_retry_gives_a_new_order_each_time_and_gives_up_after_so_many(robot: R
     robot.step()
     numbers = []
     for _ in range(3):
-        assert robot.order
-        numbers.append(robot.order.number)
+        assert robot.command
+        numbers.append(robot.command.number)
         robot.failed()
         robot.step()
     assert len(set(numbers)) == 3
@@ -140,7 +140,7 @@ def test_a_dock_that_does_not_charge_ends_the_mission(robot: Robot) -> None:
     robot.reached()
     assert robot.last == (
         "failed",
-        "battery.percentage < 20 still holds after what is done about it",
+        "battery.percentage < 20 still holds after the remedy",
     )
 
 

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import ActuationModel, CmdVel
-from gigabrain_zenoh.decision.response import PRIOR, ResponseEstimator
+from gigabrain_zenoh.decision.actuation_model import PRIOR, ActuationEstimator
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, state
 
 PARTS = 4  # of a tick, in which the plant moves
@@ -27,7 +27,7 @@ class Plant:
         gain: tuple[float, float] = (0.9, 0.8),
         noise: tuple[float, float] = (0.01, 0.03),
     ) -> None:
-        self.estimator, self.tick = ResponseEstimator(), 0
+        self.estimator, self.tick = ActuationEstimator(), 0
         self._random = np.random.default_rng(1)
         self._late = deque([(0.0, 0.0)] * round(delay_s / 0.02 * PARTS))
         self._follows = 1 - math.exp(-0.02 / PARTS / lag_s)
@@ -169,7 +169,7 @@ def told(tick: int, v: float = 0.0, source: str = "control", seq: int = 0) -> Cm
 
 
 def test_what_others_than_the_commander_say_was_not_told_to_the_body() -> None:
-    estimator = ResponseEstimator()
+    estimator = ActuationEstimator()
     estimator.state(state(10))
     estimator.command(told(10, 0.2))
     estimator.command(told(10, -2.0, source="stranger"))
@@ -177,7 +177,7 @@ def test_what_others_than_the_commander_say_was_not_told_to_the_body() -> None:
 
 
 def test_who_uses_the_commanders_name_is_believed_no_more_than_by_the_gate() -> None:
-    estimator = ResponseEstimator()
+    estimator = ActuationEstimator()
     estimator.state(state(11))
     for command in (told(10, -2.0), told(10, 0.2, seq=7), told(11, 0.3, seq=8), told(11, -2.0)):
         estimator.command(command)
@@ -185,7 +185,7 @@ def test_who_uses_the_commanders_name_is_believed_no_more_than_by_the_gate() -> 
 
 
 def test_after_a_change_of_commander_the_new_ones_commands_count() -> None:
-    estimator = ResponseEstimator()
+    estimator = ActuationEstimator()
     estimator.state(state(10))
     estimator.command(told(10, 0.2))
     estimator.state(state(11, gate=GateStatus(mode="enabled", commander="script")))
@@ -195,7 +195,7 @@ def test_after_a_change_of_commander_the_new_ones_commands_count() -> None:
 
 
 def test_commands_of_ticks_that_are_far_off_are_not_kept() -> None:
-    estimator = ResponseEstimator()
+    estimator = ActuationEstimator()
     estimator.state(state(10))
     for tick in range(10, 20_000):
         estimator.command(told(tick))
@@ -203,7 +203,7 @@ def test_commands_of_ticks_that_are_far_off_are_not_kept() -> None:
 
 
 def test_however_many_sources_and_ticks_are_named_little_is_kept() -> None:
-    estimator = ResponseEstimator()
+    estimator = ActuationEstimator()
     for tick in range(1, 200):
         estimator.state(state(tick))
         for n in range(50):

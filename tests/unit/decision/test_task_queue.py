@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.decision.tasks.orders import became
+from gigabrain_zenoh.decision.tasks.drive_command import describe_end
 from gigabrain_zenoh.errors import Refused
 from tests.unit.decision.sites import Robot, one_robot
 
@@ -18,16 +18,16 @@ def robot() -> Iterator[Robot]:
 
 def test_goals_wait_in_a_queue_or_go_first_or_stand_in_for_all(robot: Robot) -> None:
     tasks = robot.tasks
-    tasks.go_to(Goal(x=1.0, y=0.0), "replace", "ann")
-    tasks.go_to(Goal(x=2.0, y=0.0), "queue", "ann")
+    tasks.add_goal(Goal(x=1.0, y=0.0), "replace", "ann")
+    tasks.add_goal(Goal(x=2.0, y=0.0), "queue", "ann")
     assert robot.step() == 1.0
-    tasks.go_to(Goal(x=3.0, y=0.0), "preempt", "bob")
+    tasks.add_goal(Goal(x=3.0, y=0.0), "preempt", "bob")
     assert robot.step() == 3.0
     waiting = [(task.id, task.state, task.reason) for task in robot.status.queue]
     assert waiting == [("goal-1", "paused", "until goal-3 is done"), ("goal-2", "queued", "")]
     assert robot.reached() == 1.0
     assert robot.reached() == 2.0
-    tasks.go_to(Goal(x=4.0, y=0.0), "replace", "bob")
+    tasks.add_goal(Goal(x=4.0, y=0.0), "replace", "bob")
     assert robot.step() == 4.0
     assert robot.last == ("cancelled", "replaced by goal-4")
 
@@ -37,30 +37,30 @@ def test_how_a_task_ended_is_told_in_words(robot: Robot) -> None:
     robot.carry_out("do: [{goto: b}]")
     robot.step()
     robot.failed()
-    assert [became(task) for task in robot.status.done] == [
+    assert [describe_end(task) for task in robot.status.done] == [
         "mission-2 has failed: b: no way",
         "mission-1 was replaced by mission-2",
     ]
     robot.carry_out("do: [{goto: a}]")
     robot.tasks.cancel("", "bob")
-    assert became(robot.status.done[0]) == "mission-3 was cancelled by bob"
+    assert describe_end(robot.status.done[0]) == "mission-3 was cancelled by bob"
 
 
 def test_cancelling_goes_by_name_and_all_at_once(robot: Robot) -> None:
     for x in (1.0, 2.0, 3.0):
-        robot.tasks.go_to(Goal(x=x, y=0.0), "queue", "ann")
+        robot.tasks.add_goal(Goal(x=x, y=0.0), "queue", "ann")
     assert robot.tasks.cancel("goal-2", "bob") == "goal-2 is cancelled"
     assert robot.tasks.cancel("", "bob") == "goal-1 is cancelled"
     assert robot.last == ("cancelled", "cancelled by bob")
     assert robot.step() == 3.0
     assert robot.tasks.cancel("all", "bob") == "1 task is cancelled"
     assert robot.step() is None
-    with pytest.raises(Refused, match="there is nothing to do, so nothing to change"):
+    with pytest.raises(Refused, match="there is no task"):
         robot.tasks.cancel("", "bob")
 
 
 def test_a_task_that_is_not_there_is_named_with_those_that_are(robot: Robot) -> None:
-    robot.tasks.go_to(Goal(x=1.0, y=0.0), "queue", "ann")
+    robot.tasks.add_goal(Goal(x=1.0, y=0.0), "queue", "ann")
     with pytest.raises(Refused, match="no task 'goal-7' any more; there is: goal-1"):
         robot.tasks.cancel("goal-7", "bob")
     with pytest.raises(Refused, match="goal-1 is not paused"):
@@ -69,9 +69,9 @@ def test_a_task_that_is_not_there_is_named_with_those_that_are(robot: Robot) -> 
 
 def test_no_more_than_32_tasks_wait(robot: Robot) -> None:
     for _ in range(33):
-        robot.tasks.go_to(Goal(x=1.0, y=0.0), "queue", "ann")
+        robot.tasks.add_goal(Goal(x=1.0, y=0.0), "queue", "ann")
     with pytest.raises(Refused, match="32 tasks wait already; cancel some first"):
-        robot.tasks.go_to(Goal(x=1.0, y=0.0), "queue", "ann")
+        robot.tasks.add_goal(Goal(x=1.0, y=0.0), "queue", "ann")
     assert len(robot.status.queue) == 32
 
 
@@ -82,9 +82,9 @@ ROUND = (
 
 
 def test_after_a_restart_a_mission_goes_on_with_the_step_it_was_at(robot: Robot) -> None:
-    robot.tasks.meet(7)
+    robot.tasks.restart(7)
     robot.carry_out(ROUND)
-    robot.tasks.go_to(Goal(x=9.0, y=0.0), "queue", "ann")
+    robot.tasks.add_goal(Goal(x=9.0, y=0.0), "queue", "ann")
     assert robot.step() == 3.0
     robot.reached()
     robot.failed()  # a, in the first of three attempts
@@ -94,12 +94,12 @@ def test_after_a_restart_a_mission_goes_on_with_the_step_it_was_at(robot: Robot)
     assert robot.step() == 1.0
     assert robot.reached() == 2.0  # b, in the second
     again = Robot(robot.tasks.saved)
-    again.tasks.meet(7)
+    again.tasks.restart(7)
     assert again.step() == 2.0
     again.reached()
     seen = [again.step(), again.reached(), again.reached()]
     assert seen == [1.0, 2.0, 9.0]  # the third round, and what waited
-    assert again.tasks.go_to(Goal(x=1.0, y=0.0), "queue", "ann") == "goal-3"
+    assert again.tasks.add_goal(Goal(x=1.0, y=0.0), "queue", "ann") == "goal-3"
 
 
 def test_after_a_restart_two_failures_are_still_two(robot: Robot) -> None:
@@ -116,19 +116,19 @@ def test_after_a_restart_two_failures_are_still_two(robot: Robot) -> None:
 
 
 def test_after_a_start_of_the_whole_robot_tasks_wait_for_a_person(robot: Robot) -> None:
-    robot.tasks.meet(7)
+    robot.tasks.restart(7)
     robot.carry_out("do: [{goto: a}]")
     robot.step()
     again = Robot(robot.tasks.saved)
-    again.tasks.meet(8)
+    again.tasks.restart(8)
     assert again.step() is None
     current = again.status.current
     assert current
     assert (current.state, current.reason) == (
         "paused",
-        "the robot was started anew; resume it, or cancel it",
+        "the robot was restarted; resume the task, or cancel it",
     )
     assert again.tasks.resume("") == "mission-1 goes on"
     assert again.step() == 1.0
-    again.tasks.meet(9)  # a driver that starts anew alone: the gate asks for a person already
+    again.tasks.restart(9)  # a driver that starts anew alone: the gate asks for a person already
     assert again.step() == 1.0

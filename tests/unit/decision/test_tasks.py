@@ -10,10 +10,11 @@ import pytest
 from gigabrain_schemas.input_log import AcceptedRequest
 from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest
 from gigabrain_schemas.topics import REQUEST_LOG
-from gigabrain_zenoh.decision.tasks import checks, service
+from gigabrain_zenoh.decision import goal_server
+from gigabrain_zenoh.decision.tasks import mission
+from gigabrain_zenoh.decision.tasks.drive_command import Outcome
 from gigabrain_zenoh.decision.tasks.mission import Mission
-from gigabrain_zenoh.decision.tasks.orders import GoTo, Outcome
-from gigabrain_zenoh.decision.tasks.store import TaskFile
+from gigabrain_zenoh.decision.tasks.task_queue import TaskFile
 from gigabrain_zenoh.testing.samples import BOOT, state
 from gigabrain_zenoh.testing.waiting import settle
 from tests.unit.decision.sites import Site
@@ -29,13 +30,14 @@ async def test_a_goal_is_accepted_with_its_way_and_told_from_then_on(site: Site)
     reply = await site.go(3.0)
     assert reply == GoalReply(ok=True, text="goal-1: on the way, 4.2 m", goal="goal-1")
     await site.step()
-    assert isinstance(site.order, GoTo)
-    assert site.order.goal == Goal(x=3.0, y=0.0)
-    site.outcome = Outcome(number=site.order.number, progress=0.5, distance=2.1, eta=8.0)
+    assert site.command
+    assert site.command.goal
+    assert site.command.goal == Goal(x=3.0, y=0.0)
+    site.outcome = Outcome(number=site.command.number, progress=0.5, distance=2.1, eta=8.0)
     await site.step(10)
     now = site.told[-1]
     assert (now.doing, now.progress, now.distance_remaining) == ("going to (3.00, 0.00)", 0.5, 2.1)
-    site.outcome = Outcome(number=site.order.number, state="done", reason="at (3.00, 0.00)")
+    site.outcome = Outcome(number=site.command.number, state="done", reason="at (3.00, 0.00)")
     await site.step()
     assert [(task.id, task.state) for task in site.told[-1].done] == [("goal-1", "succeeded")]
     assert site.told[-1].current is None
@@ -49,9 +51,11 @@ async def test_the_loop_goes_on_while_a_mission_is_read(
 
     def loads(text: str, source: str) -> Mission:
         readers.append(threading.current_thread() is threading.main_thread())
-        return checks.loads(text, source)
+        return mission.loads(text, source)
 
-    monkeypatch.setattr(service, "checks", SimpleNamespace(**{**vars(checks), "loads": loads}))
+    monkeypatch.setattr(
+        goal_server, "missions", SimpleNamespace(**{**vars(mission), "loads": loads})
+    )
     await site.step()
     assert (await site.carry_out("do: [{wait: 5}]")).ok
     assert readers == [False]
@@ -73,8 +77,9 @@ async def test_a_goal_that_cannot_be_reached_is_refused_and_changes_nothing(site
     site.wall = "the goal is inside something; nearest reachable point is 0.4 m away at (1.2, 0.3)"
     assert await site.go(4.0) == GoalReply(ok=False, text=site.wall)
     await site.step()
-    assert isinstance(site.order, GoTo)
-    assert site.order.goal.x == 3.0
+    assert site.command
+    assert site.command.goal
+    assert site.command.goal.x == 3.0
     await site.end()
 
 
@@ -91,7 +96,7 @@ async def test_missions_are_checked_before_they_are_accepted(site: Site, tmp_pat
     await site.step()
     for text, why in (
         ("do:\n- gotoo: a", "tea:2: unknown field 'gotoo'; did you mean 'goto'?"),
-        ("trees: {a: [{tree: a}]}\ndo: [{tree: a}]", "goes round in a circle: a → a"),
+        ("trees: {a: [{tree: a}]}\ndo: [{tree: a}]", "is a cycle: a → a"),
         ("do: [{script: {run: beep}}]", "script 'beep': this robot runs none; name their folder"),
     ):
         reply = await site.carry_out(text)
@@ -109,14 +114,15 @@ async def test_pausing_resuming_and_cancelling(site: Site) -> None:
     await site.go(4.0, how="queue")
     assert (await site.change("pause")).text == "goal-1 is paused"
     await site.step()
-    assert site.order is None
+    assert site.command is None
     assert site.told[-1].current
     assert site.told[-1].current.reason == "paused by bob"
     assert (await site.change("resume")).text == "goal-1 goes on"
     assert (await site.change("cancel")).text == "goal-1 is cancelled"
     await site.step()
-    assert isinstance(site.order, GoTo)
-    assert site.order.goal.x == 4.0
+    assert site.command
+    assert site.command.goal
+    assert site.command.goal.x == 4.0
     refused = await site.change("cancel", "goal-1")
     assert (refused.ok, refused.text) == (
         False,
@@ -133,8 +139,9 @@ async def test_tasks_survive_a_restart_of_decision(site: Site, tmp_path: Path) -
     await site.end()
     again = Site(tmp_path)
     await again.step(site.tick + 50)
-    assert isinstance(again.order, GoTo)
-    assert again.order.goal.x == 3.0
+    assert again.command
+    assert again.command.goal
+    assert again.command.goal.x == 3.0
     assert [task.id for task in again.told[-1].queue] == ["goal-2"]
     assert (await again.go(5.0, how="queue")).goal == "goal-3"
     await again.end()
@@ -149,10 +156,10 @@ async def test_tasks_of_another_start_of_the_robot_wait_for_a_person(
     await site.end()
     again = Site(tmp_path)
     await again.step(boot=BOOT + 1)
-    assert again.order is None
+    assert again.command is None
     assert (await again.change("resume")).ok
     await again.step(boot=BOOT + 1)
-    assert isinstance(again.order, GoTo)
+    assert again.command
     await again.end()
 
 
@@ -165,8 +172,8 @@ async def test_a_file_that_is_cut_or_foreign_is_set_aside_and_told(
     (tmp_path / "tasks.json").write_bytes(content)
     site = Site(tmp_path)
     await site.step()
-    assert site.order is None
-    assert "tasks.bad now, and nothing is to be done" in caplog.text
+    assert site.command is None
+    assert "tasks.bad, no tasks restored" in caplog.text
     assert (tmp_path / "tasks.bad").read_bytes() == content
     await site.go(3.0)
     await site.end()
@@ -183,7 +190,7 @@ async def test_a_disk_that_cannot_be_written_is_told_and_the_robot_goes_on(
     await site.step()
     await site.end()
     await settle()
-    assert isinstance(site.order, GoTo)
+    assert site.command
     assert "tasks will not survive a restart" in caplog.text
 
 

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from gigabrain_drivers.driver.latch import Latched, LatchFile
-from gigabrain_zenoh.decision.tasks.executive import Saved
-from gigabrain_zenoh.decision.tasks.store import TaskFile
+from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.gate.causes import estop
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.mapping import map_file

@@ -21,9 +21,8 @@ from gigabrain_drivers.links.link import LinkProblem
 from gigabrain_drivers.sim.options import MujocoOptions, sim_body
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.loading import located
-from gigabrain_zenoh.decision.tasks import checks
-from gigabrain_zenoh.decision.tasks.executive import Saved
-from gigabrain_zenoh.decision.tasks.store import TaskFile
+from gigabrain_zenoh.decision.tasks import mission
+from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.diagnostics import log_reading
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapping import arrays_file, map_file
@@ -44,7 +43,7 @@ def read_deployment(path: Path) -> object:
 
 
 def read_mission(path: Path) -> object:
-    return checks.load(path)
+    return mission.load(path)
 
 
 def read_name(path: Path) -> object:
@@ -304,7 +303,7 @@ def test_tasks_that_are_no_plain_file_are_set_aside(
     make(tmp_path / "tasks.json")
     saved, problem = TaskFile(str(tmp_path)).read()
     assert saved == Saved()
-    assert "nothing is to be done" in problem
+    assert "no tasks restored" in problem
 
 
 @pytest.mark.parametrize("make", [device, fifo, endless])

@@ -121,7 +121,7 @@ def test_what_is_not_a_number_is_no_goal(wrong: float) -> None:
         ((wrong, 1), (1, 1)),
     ):
         found = refused(seen(rooms()), start, goal)
-        assert found == Unreachable(reason="the goal and the robot's place must be finite numbers")
+        assert found == Unreachable(fault="the goal and the robot's place must be finite numbers")
 
 
 def test_a_robot_outside_the_map_cannot_plan() -> None:

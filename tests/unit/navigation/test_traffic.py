@@ -8,7 +8,7 @@ import pytest
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import Obstacle
-from gigabrain_zenoh.decision.steering import ANY_BODY
+from gigabrain_zenoh.decision.navigator import ANY_BODY
 from gigabrain_zenoh.navigation import among, cost_to_go, local, traffic
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import distance_at

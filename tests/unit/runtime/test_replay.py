@@ -124,7 +124,7 @@ async def test_a_system_replayed_on_its_own_sends_the_same_bytes(name: str) -> N
 async def test_a_system_that_was_changed_sends_something_else() -> None:
     events = await asyncio.to_thread(drive)
     heard = [event for event in events if event[1] != "robot/intent"]
-    slower = functools.partial(decision.run, DecisionConfig(linear_speed=0.15))
+    slower = functools.partial(decision.run, DecisionConfig(settings={"max_linear_speed": 0.15}))
     same = [(key, payload) for _, key, payload in events if key == "robot/intent"]
     assert await replay(slower, heard) != same
 

@@ -13,6 +13,7 @@ from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.emulators.emulator import wire_of
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_zenoh.config.settings import DecisionConfig, LinkName, PerceptionConfig, Resume
+from gigabrain_zenoh.decision.behaviours import load, needs_map
 from gigabrain_zenoh.qa.faults.fault import Stage
 from gigabrain_zenoh.qa.judging import Failed, Figure, Skipped
 from gigabrain_zenoh.qa.probe import TICK_MS, Probe, at_rest, until
@@ -47,7 +48,7 @@ class Options:
 
     body: str = ""  # instead of each stage's own
     world: str = "arena"
-    behaviour: Literal["avoid", "navigate"] = "avoid"
+    behaviour: str = "avoid"
     long: bool = False  # the forms for a release, instead of those for every change
     wall: bool = True  # judge wall-clock limits too, which need an otherwise idle machine
 
@@ -144,9 +145,10 @@ def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> 
         world=options.world,
         resume="auto" if stage == "auto" else resume,
         router=LOOPBACK,
-        perception=PerceptionConfig(mapping="slam" if options.behaviour == "navigate" else "off"),
+        perception=PerceptionConfig(mapping="slam" if needs_map(options.behaviour) else "off"),
         decision=DecisionConfig(
-            behaviour=options.behaviour, linear_speed=SPEED, speed_limit=SPEED, begin="roam"
+            behaviour=options.behaviour,
+            settings={"max_linear_speed": SPEED, **load(options.behaviour).DEMO},
         ),
     )
 

@@ -116,7 +116,9 @@ def waiting_robot(options: Options) -> Deployment:
     """Return a robot with a map that waits for goals, and enables itself."""
     options = replace(options, behaviour="navigate", world="arena")
     deployment = deployment_of(options, "auto")
-    decision = msgspec.structs.replace(deployment.decision, begin="wait")
+    decision = msgspec.structs.replace(
+        deployment.decision, settings={**deployment.decision.settings, "start": "wait"}
+    )
     return msgspec.structs.replace(deployment, decision=decision)
 
 

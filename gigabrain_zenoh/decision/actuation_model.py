@@ -84,7 +84,7 @@ class Axis:
         return found
 
 
-class ResponseEstimator:
+class ActuationEstimator:
     """Estimates a body's response from its commands and states."""
 
     def __init__(self, prior: ActuationModel = PRIOR) -> None:

@@ -1,0 +1,202 @@
+"""Inputs of the navigator: poses, map, commands and body, as known at one scan."""
+
+from collections import deque
+from dataclasses import dataclass
+
+from msgspec.structs import asdict, replace
+
+from gigabrain_schemas.base import TICK_NS, Pose, Velocity
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.brain import ActuationModel, CmdVel, OccupancyGrid, PoseInMap, WorldModel
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.topics import BODY, MAP, POSE, STATE, command_topic
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.freshness import PreviousTick
+from gigabrain_zenoh.decision.actuation_model import ActuationEstimator, velocity_of
+from gigabrain_zenoh.decision.behaviours import battery_nearly_empty
+from gigabrain_zenoh.decision.tasks.drive_command import WaitReason
+from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.geometry.limits import clamp, limits_of
+from gigabrain_zenoh.geometry.planar import compose, inverse
+from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.navigation.moment import Sent
+
+MAX_POSE_AGE_NS = 1_000_000_000
+SENT_TICKS = 25  # local planning uses the commands of the last half second
+OPERATOR_HOLDS = "an operator holds the body; `gigabrain enable` hands it back"
+USUAL_LATENCY_TICKS = 2  # from a scan to the first state after its answer
+LATENCY_MEMORY_TICKS = 100
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NavigationContext:
+    """Everything that one step of the navigator depends on."""
+
+    tick: int  # of the scan
+    world: WorldModel | None  # None while perception is silent
+    pose: Pose  # in the odometry frame
+    must_charge: bool
+    late_ticks: int  # age of the scan
+    delayed_s: float  # [s], by how much scans have lately been answered later than usual
+    velocity: Velocity  # measured at the scan
+    may_reverse: bool
+    body: BodyDescription | None
+    map_from_odom: Pose | None
+    lost: WaitReason | None  # why `map_from_odom` is None
+    actuation: ActuationModel
+    sent: tuple[Sent, ...]
+    held: str  # why the body does not follow decision, for people; empty while it does
+    slowed_by: str  # causes that safety reports, for people
+
+    @property
+    def here(self) -> Pose | None:
+        """The robot's pose in the map, for planning."""
+        if self.world is None or self.body is None or self.map_from_odom is None:
+            return None
+        return compose(self.map_from_odom, self.pose)
+
+
+class ScanLatency:
+    """Measures how much longer than usual the answers to scans took in the last two seconds.
+
+    An answer ends at the next state that is processed: states wait while the process computes or is
+    not scheduled. In lock-step every answer is in time.
+    """
+
+    def __init__(self) -> None:
+        self._boot = 0
+        self._open: tuple[int, int] | None = None  # tick in which the answer began, and of its scan
+        self._late: deque[tuple[int, int]] = deque()  # tick, and latency [ticks]
+
+    def observe_state(self, boot: int, tick: int) -> None:
+        """Record that a state is being processed."""
+        if boot != self._boot:
+            self._boot, self._open = boot, None
+            self._late.clear()
+        if self._open and tick > self._open[0]:
+            self._late.append((tick, tick - 1 - self._open[1]))
+            self._open = None
+        while self._late and tick - self._late[0][0] > LATENCY_MEMORY_TICKS:
+            self._late.popleft()
+
+    def begin(self, tick: int, basis: int) -> None:
+        """Record that in this tick the answer to the scan of tick `basis` begins."""
+        self._open = tick, basis
+
+    @property
+    def excess_s(self) -> float:
+        """The largest latency beyond the usual one [s]; 0 if there is none."""
+        longest = max((late for _, late in self._late), default=0)
+        return max(0, longest - USUAL_LATENCY_TICKS) * TICK_NS / 1e9
+
+
+class ContextSource:
+    """Collects the navigator's inputs from the bus."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._estimator, self._history = ActuationEstimator(), PoseHistory()
+        self._states: deque[RobotState] = deque(maxlen=SENT_TICKS)
+        self._latency = ScanLatency()
+        self._poses: PreviousTick[PoseInMap] = PreviousTick()
+        self._maps: deque[OccupancyGrid] = deque(maxlen=2)
+        self._commands: PreviousTick[CmdVel] = PreviousTick()
+        self._subscribed_commands = False
+        self._bodies = bus.latest(BODY)
+        bus.latest(POSE, self._poses.receive)
+        bus.latest(MAP, self._maps.append)
+
+    def observe(self, state: RobotState) -> None:
+        """Record a robot state; to be called with every state."""
+        self._history = self._history.then(state)
+        self._states.append(state)
+        self._latency.observe_state(state.boot, state.tick)
+        self._estimator.state(state)
+        body = self._bodies.current
+        if body and not self._subscribed_commands:
+            self._subscribed_commands = True
+            self._bus.subscribe(command_topic(body.description), self._on_command)
+
+    def at_scan(
+        self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
+    ) -> NavigationContext:
+        """Return what is known at the scan of `world`, or at `state` without one."""
+        tick = world.basis if world else state.tick
+        if world:
+            self._latency.begin(state.tick, tick)
+        pose = self._history.at(state.boot, tick)
+        map_from_odom, lost = self._map_from_odom(state.boot, tick)
+        if pose is None:
+            map_from_odom, lost = None, WaitReason.NO_ODOMETRY_OF_SCAN
+        sent = self._estimator.sent(tick - SENT_TICKS, tick - 1)
+        return NavigationContext(
+            tick=tick,
+            world=world,
+            pose=pose or state.pose,
+            must_charge=battery_nearly_empty(verdict),
+            late_ticks=state.tick - tick,
+            delayed_s=self._latency.excess_s,
+            velocity=self._velocity(state, tick),
+            may_reverse=verdict is None or verdict.caps.backward != 0.0,
+            body=self.body,
+            map_from_odom=map_from_odom,
+            lost=lost,
+            actuation=self._estimator.response,
+            sent=tuple(Sent(*one) for one in sent),
+            held=self._held(state),
+            slowed_by="; ".join(one.text for one in verdict.causes)[:300] if verdict else "",
+        )
+
+    @property
+    def body(self) -> BodyDescription | None:
+        """The body's description, once received."""
+        body = self._bodies.current
+        return body.description if body else None
+
+    @property
+    def lost(self) -> WaitReason | None:
+        """Why the robot's pose in the map is unknown now; None if it is known."""
+        return self._map_from_odom(self._bus.time.boot, self._bus.time.tick)[1]
+
+    def grid(self, boot: int, tick: int) -> OccupancyGrid | None:
+        """Return the newest map from before `tick`, or from an earlier run of the driver.
+
+        A map is published only when it changes, and stays valid when the driver restarts.
+        """
+        earlier = (one for one in reversed(self._maps) if one.boot != boot or one.tick < tick)
+        return next(earlier, None)
+
+    def _on_command(self, _key: str, command: CmdVel) -> None:
+        """Record a command, clamped as by the gate: the body follows the clamped one."""
+        if body := self.body:
+            obeyed = clamp(velocity_of(command), limits_of(body))
+            self._estimator.command(replace(command, **asdict(obeyed)))
+        if command.source == BRAIN:
+            self._commands.receive(command)
+
+    def _velocity(self, state: RobotState, tick: int) -> Velocity:
+        """Return the speed measured at `tick` or last before it; the newest if none is kept."""
+        known = (one for one in reversed(self._states) if one.boot == state.boot)
+        return next((one.velocity for one in known if one.tick <= tick), state.velocity)
+
+    def _map_from_odom(self, boot: int, tick: int) -> tuple[Pose | None, WaitReason | None]:
+        """Return the odometry frame's pose in the map, or None and the reason."""
+        found = self._poses.at(boot, tick, MAX_POSE_AGE_NS)
+        if found is None:
+            return None, WaitReason.NO_LOCALIZATION
+        if not found.localized:
+            return None, WaitReason.NOT_LOCALIZED
+        then = self._history.at(boot, found.basis)
+        if then is None:
+            return None, WaitReason.NO_ODOMETRY_OF_POSE
+        return compose(Pose(x=found.x, y=found.y, yaw=found.yaw), inverse(then)), None
+
+    def _held(self, state: RobotState) -> str:
+        gate = state.gate
+        if gate.mode != "enabled":
+            why = "; ".join(cause.text for cause in gate.causes)
+            return f"the gate is {gate.mode}{f': {why}' if why else ''}"[:300]
+        if gate.commander != BRAIN:
+            return f"{gate.commander} has the body"
+        command = self._commands.at(state.boot, state.tick, STATE.stale_after_ns)
+        return OPERATOR_HOLDS if command and command.operator else ""

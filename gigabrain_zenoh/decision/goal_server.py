@@ -1,0 +1,344 @@
+"""Serves goals, missions and changes of tasks, and steps what they want.
+
+Goals are accepted from the start, while the planning kernels still compile.
+"""
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Any, Protocol
+
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import WorldModel
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.tasks import (
+    Goal,
+    GoalReply,
+    GoalRequest,
+    MissionReply,
+    MissionRequest,
+    TaskReply,
+    TaskRequest,
+    TaskStatus,
+)
+from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, Service, Topic
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.freshness import PreviousTick
+from gigabrain_zenoh.bus.input_log import log_accepted
+from gigabrain_zenoh.decision.behaviours import Behaviour, Inputs, NavigationConfig, Step
+from gigabrain_zenoh.decision.tasks import mission as missions
+from gigabrain_zenoh.decision.tasks.drive_command import (
+    DriveCommand,
+    Idle,
+    Outcome,
+    WaitReason,
+    describe_end,
+)
+from gigabrain_zenoh.decision.tasks.mission import Mission
+from gigabrain_zenoh.decision.tasks.scripts import Scripts
+from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile, TaskQueue
+from gigabrain_zenoh.errors import GigabrainError, Refused
+from gigabrain_zenoh.host.threads import BackgroundWriter
+from gigabrain_zenoh.kernels.compiling import compiled
+from gigabrain_zenoh.logs import Fault
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.decision.navigator import Navigator
+
+log = logging.getLogger(__name__)
+
+DRIVE_KERNELS = "gigabrain_zenoh.decision.navigator:warm_up"  # calls each kernel once
+STATUS_TICKS = 10  # robot/task is published at 5 Hz
+STARTING_STATUS_NS = 200_000_000  # the same while the kernels compile
+POSE_TIMEOUT_NS, POLL_NS = 700_000_000, 50_000_000  # wait for a first pose in the map
+
+
+class NavigatorPort(Protocol):
+    """What tasks ask of the navigator before they are accepted."""
+
+    async def check_located(self) -> WaitReason | None:
+        """Return what driving still waits for. Raises Refused if that will not come by itself."""
+        ...
+
+    async def check_goal(self, goal: Goal) -> str:
+        """Return how the robot would reach `goal`, for people. Raises Refused if it cannot."""
+        ...
+
+
+class TaskServer:
+    """Serves tasks on the bus: keeps the queue, publishes its status and writes it to disk."""
+
+    def __init__(
+        self, bus: Bus, navigator: NavigatorPort, *, folder: str = "", scripts: str = ""
+    ) -> None:
+        self._bus, self._navigator = bus, navigator
+        self._scripts, self._topics, file = Scripts(scripts), TopicCache(bus), TaskFile(folder)
+        saved, problem = file.read()
+        if problem:
+            log.warning("%s", problem, extra={"data": {"event": "tasks"}})
+        self._queue = TaskQueue(self._topics.read, self._scripts.start, saved)
+        self._writer: BackgroundWriter[Saved] = BackgroundWriter(file.write, 1)
+        self._written, self._write_fault = saved, Fault(log)
+        self._boot = self._tick = self._status_tick = self._basis = 0
+        self._logged: set[str] = set()  # tasks whose end was logged
+        self._waits = ""  # what all tasks wait for, before the first step
+        bus.serve(GOAL, self._on_goal)
+        bus.serve(MISSION, self._on_mission)
+        bus.serve(TASK_CHANGE, self._on_change)
+
+    def publish_starting(self) -> None:
+        """Publish the status while nothing can drive yet."""
+        self._waits = f"waiting: {WaitReason.STARTING}"
+        self._publish()
+
+    def step(
+        self, state: RobotState, outcome: Outcome | None, basis: int = 0
+    ) -> DriveCommand | None:
+        """Advance the queue, with the world of tick `basis`; return the next command."""
+        self._waits = ""
+        same_boot = state.boot == self._boot
+        seconds = max(0, state.tick - self._tick) * 0.02 if same_boot else 0.0
+        self._boot, self._tick, self._basis = state.boot, state.tick, basis
+        if not same_boot:
+            self._queue.restart(state.boot)
+            self._status_tick = 0
+        self._topics.observe(state)
+        command = self._queue.step(seconds, outcome)
+        if not 0 <= state.tick - self._status_tick < STATUS_TICKS or self._just_ended():
+            self._publish()
+        return command
+
+    @property
+    def idle(self) -> Idle:
+        """Why the robot stands where `step` returns no command."""
+        return self._queue.idle
+
+    def begin(self, mission: Mission, label: str, boot: int) -> None:
+        """Start a mission, unless there were tasks in this start of the driver."""
+        if self._queue.empty and not self._queue.knows(boot):
+            self._queue.add_mission(mission, label, "queue", "itself")
+
+    async def close(self) -> None:
+        """Return once all is written."""
+        await self._writer.close()
+
+    def _just_ended(self) -> bool:
+        done = self._queue.status.done
+        return bool(done) and done[0].id not in self._logged
+
+    def _publish(self) -> None:
+        """Publish the status, and write the queue where it has changed."""
+        self._status_tick = self._tick
+        status = self._bus.publish(TASK, self._status())
+        for task in reversed(status.done):
+            if task.id not in self._logged:
+                data = {"event": "task", "task": task.id, "state": task.state}
+                log.info("%s", describe_end(task), extra={"data": data})
+        self._logged = {task.id for task in status.done}
+        saved = self._queue.saved
+        if saved != self._written:
+            self._written = saved
+            written = self._writer.put(saved)
+            written.add_done_callback(lambda done: self._on_written(done.result()))
+
+    def _status(self) -> TaskStatus:
+        status = self._queue.status
+        if not self._waits or status.current is None or status.current.state != "active":
+            return status
+        return replace(status, current=replace(status.current, reason=self._waits))
+
+    def _on_written(self, problem: str) -> None:
+        if problem:
+            self._write_fault.begin(problem)
+        else:
+            self._write_fault.end("tasks are written down again")
+
+    async def _on_goal(self, request: GoalRequest) -> GoalReply:
+        goal = Goal(x=request.x, y=request.y, yaw=request.yaw)
+        try:
+            way = await self._navigator.check_goal(goal)
+            name = self._queue.add_goal(goal, request.how, request.source)
+        except GigabrainError as error:
+            _log_refusal("goal", request.source, error)
+            return GoalReply(ok=False, text=str(error)[:500])
+        self._accept(name, GOAL, request)
+        return GoalReply(ok=True, text=f"{name}: {way}"[:500], goal=name)
+
+    async def _on_mission(self, request: MissionRequest) -> MissionReply:
+        label = request.label or "mission"
+        try:
+            # a long one takes a tenth of a second to parse, which no scan should wait for
+            mission = await asyncio.to_thread(missions.loads, request.mission, label)
+            for script in mission.scripts:
+                self._scripts.path(script)
+            if mission.drives:
+                await self._navigator.check_located()
+            name = self._queue.add_mission(mission, label, request.how, request.source)
+        except GigabrainError as error:
+            _log_refusal("mission", request.source, error)
+            return MissionReply(ok=False, text=str(error)[:500])
+        self._accept(name, MISSION, request)
+        return MissionReply(ok=True, text=f"{name}: {label}"[:500], task=name)
+
+    async def _on_change(self, request: TaskRequest) -> TaskReply:
+        try:
+            if request.do == "cancel":
+                text = self._queue.cancel(request.task, request.source)
+            elif request.do == "pause":
+                text = self._queue.pause(request.task, request.source)
+            else:
+                text = self._queue.resume(request.task)
+        except GigabrainError as error:
+            return TaskReply(ok=False, text=str(error)[:500], task=request.task)
+        log.info("%s, by %s", text, request.source, extra={"data": {"event": "task"}})
+        self._record(TASK_CHANGE, request)
+        return TaskReply(ok=True, text=text[:500], task=request.task)
+
+    def _accept(
+        self, name: str, of: Service[Any, Any], request: GoalRequest | MissionRequest
+    ) -> None:
+        data = {"event": "task", "task": name, "source": request.source}
+        log.info("accepted %s from %s", name, request.source, extra={"data": data})
+        self._record(of, request)
+
+    def _record(
+        self, of: Service[Any, Any], request: GoalRequest | MissionRequest | TaskRequest
+    ) -> None:
+        """Publish when a request takes effect, so that a recording can be replayed."""
+        log_accepted(self._bus, of.key, request, self._basis)
+        self._publish()
+
+
+class GoalServer:
+    """Input source of behaviours that drive by a map: the task queue and the navigator."""
+
+    def __init__(
+        self, config: NavigationConfig, bus: Bus, behaviour: str, *, state_dir: str = ""
+    ) -> None:
+        self._bus, self._config, self._name = bus, config, behaviour
+        self._tasks = TaskServer(bus, self, folder=state_dir, scripts=config.scripts)
+        self._navigator: Navigator | None = None  # once the kernels are compiled
+        self._outcome: Outcome | None = None  # of the last command
+        self._started = False
+
+    async def warm_up(self) -> None:
+        """Import and compile everything that driving needs. Raises ConfigError."""
+        publishing = asyncio.ensure_future(self._publish_starting())
+        try:
+            await compiled(DRIVE_KERNELS)
+        finally:
+            publishing.cancel()
+        from gigabrain_zenoh.decision.navigator import Navigator  # imports numba
+
+        self._navigator = Navigator(self._config, self._bus, self._name)
+
+    def configure(self, config: NavigationConfig) -> None:
+        """Use other settings from now on."""
+        self._ready.configure(config)
+
+    def observe(self, state: RobotState) -> None:
+        """Record a robot state; to be called with every state."""
+        self._ready.observe(state)
+
+    def step(
+        self,
+        behaviour: Behaviour,
+        state: RobotState,
+        world: WorldModel | None,
+        verdict: SafetyState | None,
+    ) -> Step:
+        """Advance the queue and step the behaviour with the command that it wants."""
+        if self._config.start == "explore" and not self._started:
+            self._tasks.begin(missions.explore_mission(), "roaming", state.boot)
+        self._started = True
+        tick = world.basis if world else state.tick
+        command = self._tasks.step(state, self._outcome, tick)
+        idle, navigator = self._tasks.idle, self._ready
+        context = navigator.at_scan(state, world, verdict)
+        intent, outcome = behaviour.step(
+            Inputs(
+                world=world,
+                pose=context.pose,
+                must_charge=context.must_charge,
+                command=command,
+                drive=lambda wanted: navigator.drive(wanted, idle),
+            )
+        )
+        self._outcome = outcome if command else None
+        return intent, outcome
+
+    @property
+    def hung(self) -> bool:
+        """Whether a plan in the worker thread is so overdue that it will never finish."""
+        return self._navigator is not None and self._navigator.hung
+
+    async def close(self) -> None:
+        """Close the task server after its last write, then stop the worker thread."""
+        await self._tasks.close()
+        if self._navigator:
+            self._navigator.close()
+
+    async def check_located(self) -> WaitReason | None:
+        """Wait briefly for a pose in the map; raise Refused, with a remedy, if there is none."""
+        for _ in range(POSE_TIMEOUT_NS // POLL_NS):
+            waits = self._waits
+            if waits or self._ready.located:
+                return waits
+            await self._bus.clock.sleep_ns(POLL_NS)
+        raise Refused(self._ready.lost)
+
+    async def check_goal(self, goal: Goal) -> str:
+        """Return how the robot would reach `goal`, for people. Raises Refused if it cannot."""
+        if waits := await self.check_located():
+            return f"accepted; {waits}"
+        found = await self._ready.check(goal)
+        offset = f"; {found.offset}" if found.offset else ""
+        return f"on the way, {found.length_m:.1f} m{offset}"
+
+    @property
+    def _ready(self) -> "Navigator":
+        assert self._navigator
+        return self._navigator
+
+    @property
+    def _waits(self) -> WaitReason | None:
+        return self._navigator.waits if self._navigator else WaitReason.STARTING
+
+    async def _publish_starting(self) -> None:
+        while True:
+            self._tasks.publish_starting()
+            await self._bus.clock.sleep_ns(STARTING_STATUS_NS)
+
+
+class TopicCache:
+    """The newest message of each topic that conditions read, as of before the present tick."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._received: dict[str, PreviousTick[Any]] = {}
+        self._state: RobotState | None = None
+
+    def observe(self, state: RobotState) -> None:
+        """Record the present state."""
+        self._state = state
+
+    def read(self, topic: Topic[Any]) -> Message | None:
+        """Return the newest message while it is fresh; the first call subscribes."""
+        state = self._state
+        if state is None or topic.key == STATE.key:
+            return state
+        if topic.key not in self._received:
+            earlier: PreviousTick[Any] = PreviousTick()
+            self._received[topic.key] = earlier
+            self._bus.subscribe(topic, lambda _key, message: earlier.receive(message))
+        found: Message | None = self._received[topic.key].at(
+            state.boot, state.tick, topic.stale_after_ns
+        )
+        return found
+
+
+def _log_refusal(what: str, source: str, error: GigabrainError) -> None:
+    data = {"event": "task refused", "source": source}
+    log.warning("refused a %s from %s: %s", what, source, error, extra={"data": data})

@@ -1,0 +1,316 @@
+"""The navigator: owns map, route and local planner, and carries out one drive command per scan.
+
+The import takes long; until it is done, `goal_server` already serves goals.
+"""
+
+import asyncio
+import math
+from typing import Any
+
+import numpy as np
+
+from gigabrain_schemas.arrays import hits
+from gigabrain_schemas.base import TICK_NS, Pose, Velocity
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.brain import Intent, WorldModel
+from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.tasks import MOST_POINTS, Goal
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.decision.behaviours import NavigationConfig, Step
+from gigabrain_zenoh.decision.context import ContextSource, NavigationContext
+from gigabrain_zenoh.decision.route import Floats, PathCheck, Route, RouteFeedback, RoutePlanner
+from gigabrain_zenoh.decision.route_schedule import RouteSchedule, transformed
+from gigabrain_zenoh.decision.tasks.drive_command import (
+    DriveCommand,
+    Idle,
+    Outcome,
+    WaitReason,
+    describe_goal,
+)
+from gigabrain_zenoh.errors import Refused
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.geometry.planar import compose, inverse
+from gigabrain_zenoh.navigation import local, planner
+from gigabrain_zenoh.navigation.planner import Unreachable
+
+TICK_S = TICK_NS / 1e9
+MAX_SCAN_AGE_TICKS = 10  # of a scan to drive by
+NO_ROUTE = Idle("waiting", "waiting: for a way through the map")
+
+ANY_BODY = BodyDescription(
+    robot_type="any", drive_type="differential",
+    footprint=((0.1, 0.1), (-0.1, 0.1), (-0.1, -0.1), (0.1, -0.1)),
+    max_linear_speed=1.0, max_angular_speed=1.0, max_linear_acceleration=1.0,
+    max_linear_deceleration=1.0, max_angular_acceleration=1.0,
+)  # fmt: skip
+
+
+class Navigator:
+    """Drives one robot by its map."""
+
+    def __init__(self, config: NavigationConfig, bus: Bus, behaviour: str) -> None:
+        self._bus, self._config, self._behaviour = bus, config, behaviour
+        self._source = ContextSource(bus)
+        self._routes = RouteSchedule(config.unknown_space, bus)
+        self._context: NavigationContext | None = None
+        self._boot = 0
+        self._seen = False  # a plausible scan has come since the start
+        self._oriented = False  # pose and map have both been known since the start
+        self._number, self._longest_m = 0, 0.0  # of the present command; progress is a share of it
+        self._local: local.LocalPlanner | None = None
+        self._body: BodyDescription | None = None
+
+    def configure(self, config: NavigationConfig) -> None:
+        """Use another speed limit; what the local planner has seen and planned is kept."""
+        self._config = config
+        if self._local:
+            self._local.limit_speed(config.max_linear_speed)
+
+    def observe(self, state: RobotState) -> None:
+        """Record a robot state; to be called with every state."""
+        self._source.observe(state)
+
+    def at_scan(
+        self, state: RobotState, world: WorldModel | None, verdict: SafetyState | None
+    ) -> NavigationContext:
+        """Collect the inputs of the next step, and take a route that is due."""
+        if state.boot != self._boot:  # the driver has restarted, and with it the odometry
+            self._boot, self._local, self._number = state.boot, None, 0
+        if world:
+            self._seen = self._seen or world.scan_ok
+            self._routes.at_scan()
+        self._context = context = self._source.at_scan(state, world, verdict)
+        self._routes.count_held(state.boot, context.tick, context.held)
+        return context
+
+    def drive(self, command: DriveCommand | None, idle: Idle) -> Step:
+        """Carry out `command` for one scan, or stand as `idle`; once after each `at_scan`."""
+        context = self._context
+        assert context
+        route = self._update_route(context, command)
+        why_not = _why_not(context, command)
+        if why_not or command is None or route is None or route.number != command.number:
+            self._routes.report(None)
+            return self._stand(command, why_not or (NO_ROUTE if command else idle))
+        if command.number != self._number:
+            self._number, self._longest_m = command.number, 0.0
+        if route.goal is None or route.points is None:
+            self._routes.report(None)
+            return self._without_path(context, command, route)
+        return self._follow(context, command, route, route.goal, route.points)
+
+    def close(self) -> None:
+        """Stop the worker thread."""
+        self._routes.close()
+
+    @property
+    def hung(self) -> bool:
+        """Whether the plan in the worker thread will never finish."""
+        return self._routes.hung
+
+    @property
+    def located(self) -> bool:
+        """Whether the robot's pose in the map was known at the last scan."""
+        return self._context is not None and self._context.here is not None
+
+    @property
+    def waits(self) -> WaitReason | None:
+        """What start-up waits for; None once pose and map were known."""
+        if self._oriented:
+            return None
+        if not self._seen:
+            return WaitReason.PERCEPTION_STARTING
+        why = self._source.lost
+        return None if why is WaitReason.NO_LOCALIZATION else why or WaitReason.NO_MAP
+
+    @property
+    def lost(self) -> WaitReason:
+        """Why the robot's pose in the map is unknown, or that there is no map."""
+        return self._source.lost or WaitReason.NO_MAP
+
+    async def check(self, goal: Goal) -> PathCheck:
+        """Return the path to `goal`. Raises Refused, with the reason, if there is none."""
+        grid = self._source.grid(self._bus.time.boot, self._bus.time.tick + 1)
+        body, here = self._source.body, self._context.here if self._context else None
+        if grid is None or body is None or here is None:
+            raise Refused(self.lost)
+        # a second planner, as the first may be planning in the worker thread
+        routes = RoutePlanner(self._config.unknown_space)
+        found = await asyncio.to_thread(routes.check, grid, body, here, goal)
+        if isinstance(found, Unreachable):
+            raise Refused(found.reason)
+        return found
+
+    def _update_route(
+        self, context: NavigationContext, command: DriveCommand | None
+    ) -> Route | None:
+        here, world = context.here, context.world
+        if here and world:
+            grid = self._source.grid(world.boot, world.basis)
+            self._oriented = self._oriented or grid is not None
+            if command and grid:
+                self._routes.request(context, here, command, grid)
+        return self._routes.route
+
+    def _stand(self, command: DriveCommand | None, why: Idle) -> Step:
+        reason = why.reason[:500]
+        number = command.number if command else 0
+        outcome = Outcome(number=number, activity=why.activity, reason=reason)
+        return self._intent(reason=reason), outcome
+
+    def _without_path(
+        self, context: NavigationContext, command: DriveCommand, route: Route
+    ) -> Step:
+        assert context.map_from_odom
+        here = compose(context.map_from_odom, context.pose)
+        position_error, heading_error = _errors(command, here)
+        outcome = Outcome(
+            number=command.number, state=route.state, reason=route.reason, activity="waiting",
+            position_error=position_error, heading_error=heading_error,
+        )  # fmt: skip
+        return self._intent(reason=f"waiting: {route.reason}"[:500]), outcome
+
+    def _follow(
+        self,
+        context: NavigationContext,
+        command: DriveCommand,
+        route: Route,
+        goal: Goal,
+        points: Floats,
+    ) -> Step:
+        assert context.map_from_odom
+        assert context.world
+        to_odom = inverse(context.map_from_odom)
+        there = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
+        moment = local.Moment(
+            tick=context.tick,
+            pose=context.pose,
+            velocity=context.velocity,
+            goal=local.Goal(x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw),
+            hits=hits(context.world).astype(np.float64),
+            path=transformed(to_odom, points),
+            obstacles=context.world.obstacles,
+            response=context.actuation,
+            sent=context.sent,
+            delayed=context.delayed_s,
+            may_back=context.may_reverse,
+        )
+        plan = self._local_planner(context).plan(moment)
+        self._routes.report(
+            RouteFeedback(
+                version=route.version,
+                arrived=plan.arrived,
+                blocked=plan.blocked,
+                reason=plan.reason,
+            )
+        )
+        outcome = self._outcome(context, command, route, plan)
+        headline = f"{route.activity}: {route.reason}" if route.temporary else outcome.activity
+        late = context.delayed_s
+        slow = f"; slower, this host is busy: {late:.2f} s late" if late else ""
+        intent = self._intent(
+            twist=plan.twist,
+            trajectory=plan.trajectory,
+            follow=bool(plan.trajectory),
+            response=context.actuation,
+            progress=outcome.progress,
+            reason=f"{headline}: {plan.reason}{slow}"[:500],
+        )
+        return intent, outcome
+
+    def _outcome(
+        self,
+        context: NavigationContext,
+        command: DriveCommand,
+        route: Route,
+        plan: local.LocalPlan,
+    ) -> Outcome:
+        assert context.map_from_odom
+        assert context.body
+        assert route.goal
+        assert route.points is not None
+        here = compose(context.map_from_odom, context.pose)
+        position_error, heading_error = _errors(command, here)
+        left = _rest_of(route.points, here)
+        distance_m = float(np.hypot(*np.diff(left, axis=0).T).sum())
+        self._longest_m = max(self._longest_m, distance_m, 1e-6)
+        arrived = plan.arrived and command.kind != "explore" and not route.temporary
+        speed = min(self._config.max_linear_speed or math.inf, context.body.max_linear_speed)
+        place = describe_goal(route.goal)
+        driving = "exploring" if command.kind == "explore" else f"going to {place}"
+        at = f"at {place}, {route.reason}" if route.reason else f"at {place}"
+        return Outcome(
+            number=command.number,
+            state="done" if arrived else "running",
+            activity=route.activity or driving,
+            reason=at if arrived else context.held or plan.reason,
+            held=bool(context.held),
+            progress=1.0 if arrived else 1.0 - min(1.0, distance_m / self._longest_m),
+            distance=distance_m,
+            eta=distance_m / speed,
+            goal=route.goal,
+            path=_thinned(left),
+            position_error=position_error,
+            heading_error=heading_error,
+        )
+
+    def _local_planner(self, context: NavigationContext) -> local.LocalPlanner:
+        body, config = context.body, self._config
+        assert body
+        if self._local is None or body != self._body:
+            settings = local.LocalSettings(
+                linear_speed=config.max_linear_speed, samples=config.samples
+            )
+            self._local, self._body = local.LocalPlanner(body, settings), body
+        return self._local
+
+    def _intent(self, *, twist: Velocity = ZERO, reason: str, **more: Any) -> Intent:
+        return Intent(twist=twist, behaviour=self._behaviour, reason=reason, **more)
+
+
+def _why_not(context: NavigationContext, command: DriveCommand | None) -> Idle | None:
+    """Return why the robot must not drive now, whatever is wanted."""
+    if context.must_charge:
+        return Idle("resting", "resting: the battery is nearly empty; charge it")
+    why = ""
+    if context.world is None:
+        why = "perception is silent"
+    elif not context.world.scan_ok:
+        why = context.world.scan_problem
+    elif context.body is None:
+        why = "the driver has not said what body this is"
+    elif context.lost and command is not None:
+        why = context.lost
+    elif context.late_ticks > MAX_SCAN_AGE_TICKS:
+        late_s = context.late_ticks * TICK_S
+        why = f"this host is too busy, its newest scan is {late_s:.2f} s old"
+    return Idle("waiting", f"waiting: {why}") if why else None
+
+
+def _errors(command: DriveCommand, here: Pose) -> tuple[float | None, float | None]:
+    """Return the distance to the goal [m] and the heading error there [rad], if it has them."""
+    goal = command.goal
+    if goal is None:
+        return None, None
+    turned = None if goal.yaw is None else abs(math.remainder(goal.yaw - here.yaw, math.tau))
+    return math.hypot(goal.x - here.x, goal.y - here.y), turned
+
+
+def _rest_of(points: Floats, here: Pose) -> Floats:
+    """Return the part of a path that is left, (k, 2), with at least two points."""
+    nearest = int(np.argmin(np.hypot(points[:, 0] - here.x, points[:, 1] - here.y)))
+    rest = points[nearest + 1 :] if nearest + 1 < len(points) else points[-1:]
+    return np.vstack(((here.x, here.y), rest))
+
+
+def _thinned(points: Floats) -> tuple[tuple[float, float], ...]:
+    """Return few enough points to be drawn, with the first and the last."""
+    count = min(len(points), MOST_POINTS)
+    chosen = np.linspace(0, len(points) - 1, count).round().astype(int)
+    return tuple((round(x, 3), round(y, 3)) for x, y in points[chosen].tolist())
+
+
+def warm_up() -> None:
+    """Call every kernel of planning and driving once, so that it is compiled."""
+    planner.warm_up()
+    local.warm_up(ANY_BODY)

@@ -1,0 +1,363 @@
+"""Route planning for drive commands: the next place, the way there, and when to give up."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from msgspec import structs
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import cells
+from gigabrain_schemas.base import Pose
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.decision.route_progress import AT_GOAL_M, GiveWay, Point, ProgressMonitor
+from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand
+from gigabrain_zenoh.navigation.costmap import Costmap, Unknown, costmap, inflation
+from gigabrain_zenoh.navigation.frontiers import frontiers
+from gigabrain_zenoh.navigation.moment import LocalSettings
+from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable
+
+GIVE_UP_TICKS = 1500  # 30 s of driving without progress
+NO_PROGRESS = "no progress for 30 s"
+LEAVE_FRONTIER_TICKS = 500  # 10 s without progress towards a frontier or a visited place
+BLOCKED_MEMORY_TICKS = 500  # 10 s, for which a plan avoids what blocked the last route
+FRONTIER_HYSTERESIS_M = 1.5  # switch frontiers only for a gain of this much
+SAME_FRONTIER_M = 0.6  # a frontier moves as the map grows
+FRONTIER_CONFIRM_TICKS = 125  # 2.5 s: the map is published once a second
+MAX_VISIT_COST, MIN_VISIT_M = 2.0, 1.5  # cost of a place worth visiting, and length of the way [m]
+ARRIVED_M = LocalSettings().position_tolerance
+NEAR_GOAL_M = 0.25  # good enough for a goal that was free when it was requested: maps shift
+OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal
+GOAL_MARGIN_M = 2.0  # of unknown space around a goal outside the map
+MAX_ENLARGED_CELLS = 4_000_000
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Route:
+    """A path through the map for one drive command, or why there is none."""
+
+    number: int  # of the command
+    version: int  # changes with the destination
+    goal: Goal | None = None
+    points: Floats | None = None  # (n, 2) [m] in the map
+    state: Literal["running", "done", "failed"] = "running"
+    reason: str = ""  # for people
+    activity: str = ""  # of a temporary destination; arriving there is not arriving at the goal
+
+    @property
+    def temporary(self) -> bool:
+        """Whether the route leads to another place than the requested one for a while."""
+        return bool(self.activity)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RouteFeedback:
+    """How a route was driven within one scan."""
+
+    version: int
+    arrived: bool = False
+    blocked: bool = False  # another route is needed
+    reason: str = ""  # what the local planner did, for people
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RouteRequest:
+    """Input of the route planner."""
+
+    tick: int
+    command: DriveCommand
+    here: Pose  # in the map
+    grid: OccupancyGrid
+    body: BodyDescription
+    feedback: RouteFeedback | None  # of the last route
+    seen: Floats  # (n, 2) [m], hits of the newest scan, in the map
+    held_ticks: int = 0  # since the last route, in which the body could not follow it
+    slowed_by: str = ""  # causes that safety reports, for people
+
+
+@dataclass(frozen=True, kw_only=True)
+class PathCheck:
+    """Length of the path to a goal [m], and why it ends elsewhere, if it does."""
+
+    length_m: float
+    offset: str = ""
+
+
+class RoutePlanner:
+    """Plans routes for one command after the other. Not thread-safe."""
+
+    def __init__(self, unknown_space: Unknown = "avoid") -> None:
+        self._planner, self._unknown_space = Planner(), unknown_space
+        self._costmap: Costmap | None = None
+        self._costmap_key: tuple[object, ...] = ()
+        self._blocking: Floats = np.empty((0, 2))  # hits that blocked a route
+        self._blocking_tick = 0
+        self._version = 0
+        self._reset(0, 0)
+
+    def plan(self, request: RouteRequest) -> Route:
+        """Return the route for a command, from the robot's place."""
+        restarted = request.tick < self._last_tick  # of the driver
+        command = request.command
+        if restarted or command.number != self._number:
+            self._reset(command.number, request.tick)
+        self._update(request)
+        if command.goal:
+            request = replace(request, grid=self._enlarged(request.grid, command.goal))
+            return self._to_goal(command.goal, request, self._chart(request))
+        chart = self._chart(request)
+        if command.kind == "visit":
+            return self._to_goal(
+                self._goal or _random_place(request, chart, self._planner), request, chart
+            )
+        return self._explore(request, chart)
+
+    def check(
+        self, grid: OccupancyGrid, body: BodyDescription, here: Pose, goal: Goal
+    ) -> PathCheck | Unreachable:
+        """Return the length of the path to a goal, or why there is none."""
+        chart = costmap(
+            self._enlarged(grid, goal), inflation(body, self._unknown_space), before=None
+        )
+        start, planner = (here.x, here.y), Planner()
+        found, offset = planner.plan(chart, start, (goal.x, goal.y)), ""
+        if isinstance(found, Unreachable) and found.nearest and found.distance <= ARRIVED_M:
+            offset = _offset(found)
+            found = planner.plan(chart, start, found.nearest)
+        if isinstance(found, Unreachable):
+            return found
+        return PathCheck(length_m=float(found.remaining[0]), offset=offset)
+
+    def _enlarged(self, grid: OccupancyGrid, goal: Goal) -> OccupancyGrid:
+        return enlarged(grid, goal) if self._unknown_space == "allow" else grid
+
+    def _reset(self, number: int, tick: int) -> None:
+        self._number = number
+        self._path: Path | None = None
+        self._last_path: Path | None = None  # the last path to this goal that was found
+        self._goal: Goal | None = None
+        self._settled: tuple[Goal, str] | None = None  # where it stays near its goal, and why
+        self._visited: list[Point] = []
+        self._doing = ""  # what the local planner did last, for people
+        self._progress, self._last_tick = ProgressMonitor(tick), tick
+        self._last_frontier_tick = tick
+        self._version += 1
+        self._give_way = GiveWay()
+
+    def _update(self, request: RouteRequest) -> None:
+        """Record how the last route was driven."""
+        feedback = request.feedback
+        passed, self._last_tick = max(0, request.tick - self._last_tick), request.tick
+        self._progress.hold(min(request.held_ticks, passed))
+        self._doing = feedback.reason if feedback else self._doing
+        if feedback and feedback.blocked and feedback.version == self._version:
+            self._blocking, self._blocking_tick = request.seen, request.tick
+        elif request.tick - self._blocking_tick > BLOCKED_MEMORY_TICKS:
+            self._blocking = np.empty((0, 2))
+
+    def _chart(self, request: RouteRequest) -> Costmap:
+        key = (request.grid, request.body, self._blocking_tick if len(self._blocking) else 0)
+        known = self._costmap_key
+        same = known and all(a is b or a == b for a, b in zip(key, known, strict=True))
+        if self._costmap is None or not same:
+            rules = inflation(request.body, self._unknown_space)
+            self._costmap = costmap(request.grid, rules, self._blocking, self._costmap)
+            self._costmap_key = key
+        return self._costmap
+
+    def _to_goal(self, goal: Goal, request: RouteRequest, chart: Costmap) -> Route:
+        first, requested = self._goal is None, goal
+        goal, offset = self._settled or (goal, "")
+        found = self._find(goal, request.here, chart)
+        away = None if first else self._giving_way(goal, request, chart)
+        if away:
+            return away
+        near = ARRIVED_M if first else NEAR_GOAL_M
+        if isinstance(found, Unreachable) and found.nearest and found.distance <= near:
+            offset = _offset(found)
+            goal = Goal(x=found.nearest[0], y=found.nearest[1], yaw=goal.yaw)
+            found = self._planner.plan(chart, (request.here.x, request.here.y), found.nearest)
+        if isinstance(found, Unreachable):
+            if first or self._progress.stuck(request.tick, GIVE_UP_TICKS):
+                return self._end("failed", found.reason)
+            if self._last_path:  # noise closes narrow ways in the map; the scan shows them
+                return self._go(goal, self._last_path)
+            return self._approach(found, request, chart)
+        self._last_path = found
+        self._progress.measure(float(found.remaining[0]), request.tick)
+        if self._progress.stuck(request.tick, GIVE_UP_TICKS):
+            if not self._settle(requested, request):
+                left = f"{found.remaining[0]:.2f} m from the goal"
+                return self._end("failed", f"gave up: {NO_PROGRESS}, {left}{self._why(request)}")
+            return self._to_goal(requested, request, chart)
+        return self._go(goal, found, offset)
+
+    def _settle(self, goal: Goal, request: RouteRequest) -> bool:
+        """Accept the present place as the goal, if it is near enough; return whether it is."""
+        x, y = request.here.x, request.here.y
+        off = math.hypot(goal.x - x, goal.y - y)
+        if self._settled or not AT_GOAL_M < off <= NEAR_GOAL_M:
+            return False
+        why = f"{off:.2f} m beside what was asked for: {NO_PROGRESS}{self._why(request)}"
+        self._settled = Goal(x=x, y=y, yaw=goal.yaw), why
+        self._progress = ProgressMonitor(request.tick)
+        self._version += 1
+        return True
+
+    def _why(self, request: RouteRequest) -> str:
+        why = request.slowed_by or self._doing
+        return f" ({why})" if why else ""
+
+    def _giving_way(self, goal: Goal, request: RouteRequest, chart: Costmap) -> Route | None:
+        """Return a route away from an occupied goal, if the robot gives way there."""
+        here = (request.here.x, request.here.y)
+        stuck = self._progress.stuck(request.tick, OCCUPIED_TICKS)
+        if self._give_way.update(goal, here, request.tick, stuck, chart, self._planner.search):
+            self._progress, self._last_path = ProgressMonitor(request.tick), None
+            self._version += 1
+        place = self._give_way.place
+        way = self._planner.plan(chart, here, (place.x, place.y)) if place else None
+        if place is None or not isinstance(way, Path):
+            return None
+        return self._go(place, way, "something is at the goal", "making room")
+
+    def _approach(self, found: Unreachable, request: RouteRequest, chart: Costmap) -> Route:
+        """Return a route to the nearest reachable place, to see whether the goal is free again."""
+        here, nearest = (request.here.x, request.here.y), found.nearest
+        way = self._planner.plan(chart, here, nearest) if nearest else None
+        if nearest is None or not isinstance(way, Path):
+            return self._wait(found.reason)
+        x, y = nearest
+        return self._go(Goal(x=x, y=y), way, found.fault, "looking whether there is room")
+
+    def _explore(self, request: RouteRequest, chart: Costmap) -> Route:
+        """Return a route to the best frontier."""
+        here = request.here.x, request.here.y
+        arrived = request.feedback is not None and request.feedback.arrived
+        if self._goal and (arrived or self._progress.stuck(request.tick, LEAVE_FRONTIER_TICKS)):
+            self._visited.append((self._goal.x, self._goal.y))
+            self._leave(request.tick)
+        for _ in range(len(self._visited) + 10):
+            goal = self._frontier(chart, here)
+            if goal is None:
+                return self._explored(request, chart)
+            self._last_frontier_tick = request.tick
+            if self._goal and _apart(goal, self._goal) > SAME_FRONTIER_M:
+                self._leave(request.tick)
+            found = self._find(goal, request.here, chart)
+            if isinstance(found, Path):
+                self._progress.measure(float(found.remaining[0]), request.tick)
+                return self._go(goal, found)
+            self._visited.append((goal.x, goal.y))
+        return self._wait("no way leads to what is still unknown")
+
+    def _explored(self, request: RouteRequest, chart: Costmap) -> Route:
+        """End the exploration, once the map has been updated without a new frontier."""
+        cell = chart.cell(request.here.x, request.here.y)
+        if cell is None or chart.cells[cell] < 0:
+            return self._wait("the map does not reach here yet")
+        if request.tick - self._last_frontier_tick < FRONTIER_CONFIRM_TICKS:
+            return self._wait("nothing new in sight; looking once more")
+        return self._end("done", "all is mapped that can be reached")
+
+    def _frontier(self, chart: Costmap, here: Point) -> Goal | None:
+        """Return the best frontier; the present one, unless another is much better."""
+        found = frontiers(chart, here, self._visited, self._planner.search)
+        if not found:
+            return None
+        best = min(found, key=lambda one: one.score)
+        if self._goal:
+            x, y = self._goal.x, self._goal.y
+            same = min(found, key=lambda one: math.hypot(one.x - x, one.y - y))
+            near = math.hypot(same.x - x, same.y - y) <= SAME_FRONTIER_M
+            if near and same.score < best.score + FRONTIER_HYSTERESIS_M:
+                best = same
+        return Goal(x=best.x, y=best.y)
+
+    def _find(self, goal: Goal, here: Pose, chart: Costmap) -> Path | Unreachable:
+        start, end = (here.x, here.y), (goal.x, goal.y)
+        if self._path is None or goal != self._goal:
+            found = self._planner.plan(chart, start, end)
+        else:
+            found = self._planner.replan(chart, start, end, self._path)
+        self._goal = goal
+        self._path = found if isinstance(found, Path) else None
+        return found
+
+    def _leave(self, tick: int) -> None:
+        """Drop the present frontier."""
+        self._goal = self._path = self._last_path = None
+        self._progress = ProgressMonitor(tick)
+        self._version += 1
+
+    def _go(self, goal: Goal, path: Path, reason: str = "", activity: str = "") -> Route:
+        return self._route(goal=goal, points=path.points, reason=reason, activity=activity)
+
+    def _wait(self, reason: str) -> Route:
+        return self._route(reason=reason)
+
+    def _end(self, state: Literal["done", "failed"], reason: str) -> Route:
+        return self._route(state=state, reason=reason)
+
+    def _route(self, **fields: Any) -> Route:
+        return Route(number=self._number, version=self._version, **fields)
+
+
+def _random_place(request: RouteRequest, chart: Costmap, planner: Planner) -> Goal:
+    """Return a random reachable place away from obstacles; the robot's own if there is none."""
+    start, here = chart.cell(request.here.x, request.here.y), request.here
+    if start is not None:
+        way = planner.search.field(chart.cost, start, "from") * chart.resolution
+        free = (chart.cost < MAX_VISIT_COST) & (way > MIN_VISIT_M) & np.isfinite(way)
+        rows, columns = np.nonzero(free)
+        if len(rows):
+            one = int(np.random.default_rng(request.command.number).integers(len(rows)))
+            x, y = chart.points(rows[one : one + 1], columns[one : one + 1])[0].tolist()
+            return Goal(x=x, y=y)
+    return Goal(x=here.x, y=here.y)
+
+
+def enlarged(grid: OccupancyGrid, goal: Goal) -> OccupancyGrid:
+    """Return `grid` with unknown space around it, so that it contains `goal`.
+
+    Return the same grid if it contains the goal, or if the map would become too large.
+    """
+    columns = _cells_to_add(goal.x, grid.origin_x, grid.width, grid.resolution)
+    rows = _cells_to_add(goal.y, grid.origin_y, grid.height, grid.resolution)
+    width, height = grid.width + sum(columns), grid.height + sum(rows)
+    if (width, height) == (grid.width, grid.height) or width * height > MAX_ENLARGED_CELLS:
+        return grid
+    wide = np.full((height, width), -1, np.int8)
+    wide[rows[0] : height - rows[1], columns[0] : width - columns[1]] = cells(grid)
+    return structs.replace(
+        grid,
+        width=width,
+        height=height,
+        origin_x=grid.origin_x - columns[0] * grid.resolution,
+        origin_y=grid.origin_y - rows[0] * grid.resolution,
+        cells=wide.tobytes(),
+    )
+
+
+def _cells_to_add(value: float, origin: float, count: int, resolution: float) -> tuple[int, int]:
+    """Return how many cells to add before the first and after the last."""
+    end = origin + count * resolution
+    if origin <= value < end:
+        return 0, 0
+    before = math.ceil((origin - value + GOAL_MARGIN_M) / resolution)
+    after = math.ceil((value - end + GOAL_MARGIN_M) / resolution)
+    return max(0, before), max(0, after)
+
+
+def _apart(a: Goal, b: Goal) -> float:
+    return math.hypot(a.x - b.x, a.y - b.y)
+
+
+def _offset(found: Unreachable) -> str:
+    """Return how far from its goal the robot goes instead, and why, for people."""
+    return f"{found.distance:.2f} m beside what was asked for: {found.fault}"

@@ -1,0 +1,249 @@
+"""The queue of tasks, and the task that is active. Apart from `TaskFile`, it knows no disk."""
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+from msgspec import Struct
+from py_trees.common import Status
+
+from gigabrain_schemas.tasks import Goal, How, Task, TaskState, TaskStatus
+from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.decision.tasks.conditions import Read
+from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand, Idle, Outcome, describe_goal
+from gigabrain_zenoh.decision.tasks.mission import Mission, goal_mission, loads
+from gigabrain_zenoh.decision.tasks.tree_builder import Job, SavedJob
+from gigabrain_zenoh.decision.tasks.tree_nodes import MissionContext, StartScript
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
+
+MAX_QUEUED, MAX_DONE = 32, 16
+MAX_FILE_BYTES = 1_000_000
+AFTER_A_RESTART = "the robot was restarted; resume the task, or cancel it"
+NO_GOAL = Idle("waiting", "waiting: for a goal")
+
+
+class Saved(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="gigabrain tasks"):
+    """All tasks, as the file holds them."""
+
+    boot: int = 0  # start of the driver in which they were begun
+    count: int = 0  # of all tasks so far
+    jobs: tuple[SavedJob, ...] = ()  # the active one first
+
+
+class TaskQueue:
+    """Carries out one task after the other."""
+
+    def __init__(self, read: Read, start: StartScript, saved: Saved) -> None:
+        self._read, self._start, self._numbers = read, start, itertools.count(1)
+        self._count, self._boot = saved.count, saved.boot
+        self._jobs: list[Job] = []
+        self._done: list[Task] = []
+        self._outcome: Outcome | None = None
+        for one in saved.jobs:
+            try:
+                mission = loads(one.mission, one.label)
+            except ConfigError as error:
+                self._done.insert(0, _unreadable(one, error))
+                continue
+            self._jobs.append(Job(one, mission, self._context()))
+        self._from_disk = list(self._jobs)
+
+    def restart(self, boot: int) -> None:
+        """Record a start of the driver; tasks on disk from another one wait for a person."""
+        if self._boot != boot:
+            for job in self._from_disk:
+                job.held, job.why_held = True, AFTER_A_RESTART
+        self._boot, self._from_disk = boot, []
+
+    def add_goal(self, goal: Goal, how: How, source: str) -> str:
+        """Add a goal, and return its name. Raises Refused if the queue is full."""
+        return self._add("goal", goal_mission(goal), describe_goal(goal), how, source)
+
+    def add_mission(self, mission: Mission, label: str, how: How, source: str) -> str:
+        """Add a mission, and return its name. Raises Refused if the queue is full."""
+        return self._add("mission", mission, label, how, source)
+
+    def cancel(self, name: str, source: str) -> str:
+        """Cancel a task, the active one (no name) or all; return a text. Raises Refused."""
+        if name == "all":
+            count = len(self._jobs)
+            while self._jobs:
+                self._end(self._jobs[-1], "cancelled", f"cancelled by {source}")
+            return f"{count} tasks are cancelled" if count != 1 else "1 task is cancelled"
+        job = self._job(name)
+        self._end(job, "cancelled", f"cancelled by {source}")
+        return f"{job.id} is cancelled"
+
+    def pause(self, name: str, source: str) -> str:
+        """Pause a task; return a text. Raises Refused."""
+        job = self._job(name)
+        job.held, job.why_held = True, f"paused by {source}"
+        return f"{job.id} is paused"
+
+    def resume(self, name: str) -> str:
+        """Resume a paused task; return a text. Raises Refused."""
+        job = self._job(name)
+        if not job.held:
+            raise Refused(f"{job.id} is not paused")
+        job.held, job.why_held = False, ""
+        return f"{job.id} goes on"
+
+    def step(self, seconds: float, outcome: Outcome | None) -> DriveCommand | None:
+        """Advance by `seconds` with the last command's outcome; return the next command."""
+        self._outcome = outcome
+        while self._jobs:
+            job = self._jobs[0]
+            if job.held:
+                return None
+            status = job.step(seconds, outcome)
+            if status is Status.RUNNING:
+                return job.context.command
+            succeeded = status is Status.SUCCESS
+            reason = outcome.reason if outcome and succeeded else job.context.problem
+            self._end(job, "succeeded" if succeeded else "failed", reason, outcome)
+            outcome, seconds = None, 0.0
+        return None
+
+    def knows(self, boot: int) -> bool:
+        """Return whether it, or its file, was last used in this start of the driver."""
+        return self._boot == boot
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no task."""
+        return not self._jobs
+
+    @property
+    def idle(self) -> Idle:
+        """Why the robot stands where `step` returns no command."""
+        if not self._jobs:
+            return NO_GOAL
+        job = self._jobs[0]
+        if job.held:
+            return Idle(f"{job.id} is paused", f"{job.id} is paused: {job.why_held}")
+        doing = job.context.doing
+        return Idle(doing, doing) if doing else NO_GOAL
+
+    @property
+    def saved(self) -> Saved:
+        """The part that survives a restart."""
+        jobs = tuple(job.saved for job in self._jobs)
+        return Saved(boot=self._boot, count=self._count, jobs=jobs)
+
+    @property
+    def status(self) -> TaskStatus:
+        """All tasks, as published."""
+        queue = tuple(_queued(job, self._jobs[0].id) for job in self._jobs[1:])
+        done = tuple(self._done)
+        if not self._jobs:
+            return TaskStatus(done=done)
+        job = self._jobs[0]
+        if job.held:
+            return TaskStatus(current=job.task("paused", job.why_held), queue=queue, done=done)
+        context, outcome = job.context, self._outcome
+        command = context.command
+        if command is None or outcome is None or outcome.number != command.number:
+            outcome = Outcome(progress=context.progress or 0.0, eta=context.left_s)
+        return TaskStatus(
+            current=job.task("active", outcome.reason or context.doing),
+            doing=context.doing[:500],
+            drives=command is not None,
+            progress=min(1.0, max(0.0, outcome.progress)),
+            distance_remaining=outcome.distance,
+            eta=outcome.eta,
+            goal=outcome.goal,
+            path=outcome.path,
+            queue=queue,
+            done=done,
+        )
+
+    def _add(self, kind: str, mission: Mission, label: str, how: How, source: str) -> str:
+        if how != "replace" and len(self._jobs) > MAX_QUEUED:
+            raise Refused(f"{MAX_QUEUED} tasks wait already; cancel some first")
+        self._count += 1
+        name = f"{kind}-{self._count}"
+        saved = SavedJob(
+            id=name, kind="goal" if kind == "goal" else "mission", label=label, source=source,
+            mission=msgspec.json.encode(mission).decode(),
+        )  # fmt: skip
+        job = Job(saved, mission, self._context())
+        while how == "replace" and self._jobs:
+            self._end(self._jobs[-1], "cancelled", f"replaced by {name}")
+        self._jobs.insert(len(self._jobs) if how == "queue" else 0, job)
+        return name
+
+    def _context(self) -> MissionContext:
+        return MissionContext(self._read, self._start, self._numbers)
+
+    def _job(self, name: str) -> Job:
+        if not self._jobs:
+            raise Refused("there is no task")
+        if not name:
+            return self._jobs[0]
+        for job in self._jobs:
+            if job.id == name:
+                return job
+        known = ", ".join(job.id for job in self._jobs)
+        raise Refused(f"there is no task {name!r} any more; there is: {known}")
+
+    def _end(self, job: Job, state: TaskState, reason: str, outcome: Outcome | None = None) -> None:
+        self._jobs.remove(job)
+        job.stop()
+        self._done = [job.task(state, reason, outcome), *self._done][:MAX_DONE]
+
+
+def _queued(job: Job, first: str) -> Task:
+    if job.held:
+        return job.task("paused", job.why_held)
+    return job.task("paused", f"until {first} is done") if job.begun else job.task("queued")
+
+
+def _unreadable(one: SavedJob, error: ConfigError) -> Task:
+    return Task(
+        id=one.id[:64], kind=one.kind, label=one.label[:64], source=one.source[:64],
+        state="failed", reason=f"it cannot be carried out any more: {error}"[:500],
+    )  # fmt: skip
+
+
+class TaskFile:
+    """The file that keeps tasks over a restart of decision; none without a folder.
+
+    It is replaced as a whole and synced.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self._path = Path(folder) / "tasks.json" if folder else None
+
+    def read(self) -> tuple[Saved, str]:
+        """Return the saved tasks, and a problem in one line. A damaged file is set aside."""
+        if self._path is None:
+            return Saved(), ""
+        try:
+            return msgspec.json.decode(read_bounded(self._path, MAX_FILE_BYTES), type=Saved), ""
+        except FileNotFoundError:
+            return Saved(), ""
+        except OSError as error:
+            return Saved(), f"{self._path} cannot be read: {error.strerror}; no tasks restored"
+        except (ConfigError, *DECODE_ERRORS) as error:
+            return Saved(), self._set_aside(self._path, error)
+
+    def write(self, newest: Sequence[Saved]) -> str:
+        """Write the last of `newest`; return the problem in one line, or an empty text."""
+        if self._path is None:
+            return ""
+        try:
+            make_folder(self._path.parent)
+            replace_file(self._path, msgspec.json.encode(newest[-1]))
+        except OSError as error:
+            return f"cannot write {self._path}: {error.strerror}; tasks will not survive a restart"
+        return ""
+
+    def _set_aside(self, path: Path, error: Exception) -> str:
+        bad = path.with_suffix(".bad")
+        try:
+            path.replace(bad)
+        except OSError as problem:
+            return f"{path} is damaged ({error}) and stays: {problem.strerror}"
+        return f"{path} is damaged ({error}); renamed to {bad}, no tasks restored"
