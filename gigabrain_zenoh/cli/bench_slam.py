@@ -88,7 +88,7 @@ def _driven(logs: "list[LaserLog]") -> "list[tuple[LaserLog, MappedLog]]":
     from rich.console import Console
     from rich.progress import Progress
 
-    from gigabrain_zenoh.mapping.warm import warm_up
+    from gigabrain_zenoh.mapping.slam_map import warm_up
     from gigabrain_zenoh.qa.bench.slam_logs import map_log
 
     with Progress(console=Console(stderr=True), transient=True) as progress:

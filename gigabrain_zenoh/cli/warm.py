@@ -30,13 +30,13 @@ async def _all() -> None:
 
 
 async def _compile(name: str, *warm_ups: str) -> None:
-    from gigabrain_zenoh.kernels.compiling import compile_all, in_child, needs
+    from gigabrain_zenoh.kernels.precompile import compile_all, compile_in_child, missing_package
 
     began_s = time.monotonic()
     for warm_up in warm_ups:
-        if await in_child(warm_up):
+        if await compile_in_child(warm_up):
             try:
                 compile_all(warm_up)  # says why it cannot be done
             except ModuleNotFoundError as error:
-                raise needs(error) from None
+                raise missing_package(error) from None
     print(f"{name}: {time.monotonic() - began_s:.1f} s", flush=True)

@@ -17,7 +17,7 @@ from gigabrain_zenoh.control.teleop import Teleop
 from gigabrain_zenoh.control.tracking import LONGEST_DELAY_TICKS, undone, wanted
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, clamp, limits_of, ramp
-from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)

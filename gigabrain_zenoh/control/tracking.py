@@ -11,7 +11,7 @@ from gigabrain_schemas.base import TICK_NS, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, Intent, TrajectoryPoint
 from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.geometry.planar import between, compose, relative
+from gigabrain_zenoh.geometry.pose import compose, interpolate, relative
 
 TICK_S = TICK_NS / 1e9
 LONGEST_DELAY_TICKS = 15
@@ -45,7 +45,7 @@ def wanted(
     if i == len(points):
         return ZERO
     before, after = points[max(i - 1, 0)], points[i]
-    on_it = between(_pose(before), _pose(after), _share(before, after, t))
+    on_it = interpolate(_pose(before), _pose(after), _share(before, after, t))
     error = relative(predicted(here, velocity, told, late, intent.response), compose(start, on_it))
     if math.hypot(error.x, error.y) > FARTHEST_OFF_M or abs(error.yaw) > FARTHEST_OFF_RAD:
         return None

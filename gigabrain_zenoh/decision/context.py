@@ -17,9 +17,8 @@ from gigabrain_zenoh.decision.behaviours import battery_nearly_empty
 from gigabrain_zenoh.decision.tasks.drive_command import WaitReason
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
-from gigabrain_zenoh.geometry.planar import compose, inverse
-from gigabrain_zenoh.geometry.pose_history import PoseHistory
-from gigabrain_zenoh.navigation.moment import Sent
+from gigabrain_zenoh.geometry.pose import PoseHistory, compose, inverse
+from gigabrain_zenoh.navigation.local_planner import SentCommand
 
 MAX_POSE_AGE_NS = 1_000_000_000
 SENT_TICKS = 25  # local planning uses the commands of the last half second
@@ -44,7 +43,7 @@ class NavigationContext:
     map_from_odom: Pose | None
     lost: WaitReason | None  # why `map_from_odom` is None
     actuation: ActuationModel
-    sent: tuple[Sent, ...]
+    sent: tuple[SentCommand, ...]
     held: str  # why the body does not follow decision, for people; empty while it does
     slowed_by: str  # causes that safety reports, for people
 
@@ -142,7 +141,7 @@ class ContextSource:
             map_from_odom=map_from_odom,
             lost=lost,
             actuation=self._estimator.response,
-            sent=tuple(Sent(*one) for one in sent),
+            sent=tuple(SentCommand(*one) for one in sent),
             held=self._held(state),
             slowed_by="; ".join(one.text for one in verdict.causes)[:300] if verdict else "",
         )

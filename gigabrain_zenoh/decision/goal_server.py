@@ -41,7 +41,7 @@ from gigabrain_zenoh.decision.tasks.scripts import Scripts
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile, TaskQueue
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.host.threads import BackgroundWriter
-from gigabrain_zenoh.kernels.compiling import compiled
+from gigabrain_zenoh.kernels.precompile import ensure_compiled
 from gigabrain_zenoh.logs import Fault
 
 if TYPE_CHECKING:
@@ -227,7 +227,7 @@ class GoalServer:
         """Import and compile everything that driving needs. Raises ConfigError."""
         publishing = asyncio.ensure_future(self._publish_starting())
         try:
-            await compiled(DRIVE_KERNELS)
+            await ensure_compiled(DRIVE_KERNELS)
         finally:
             publishing.cancel()
         from gigabrain_zenoh.decision.navigator import Navigator  # imports numba

@@ -29,9 +29,9 @@ from gigabrain_zenoh.decision.tasks.drive_command import (
 )
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.geometry.planar import compose, inverse
-from gigabrain_zenoh.navigation import local, planner
-from gigabrain_zenoh.navigation.planner import Unreachable
+from gigabrain_zenoh.geometry.pose import compose, inverse
+from gigabrain_zenoh.navigation import global_planner, local_planner
+from gigabrain_zenoh.navigation.global_planner import Unreachable
 
 TICK_S = TICK_NS / 1e9
 MAX_SCAN_AGE_TICKS = 10  # of a scan to drive by
@@ -57,7 +57,7 @@ class Navigator:
         self._seen = False  # a plausible scan has come since the start
         self._oriented = False  # pose and map have both been known since the start
         self._number, self._longest_m = 0, 0.0  # of the present command; progress is a share of it
-        self._local: local.LocalPlanner | None = None
+        self._local: local_planner.LocalPlanner | None = None
         self._body: BodyDescription | None = None
 
     def configure(self, config: NavigationConfig) -> None:
@@ -182,11 +182,13 @@ class Navigator:
         assert context.world
         to_odom = inverse(context.map_from_odom)
         there = compose(to_odom, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
-        moment = local.Moment(
+        moment = local_planner.PlanRequest(
             tick=context.tick,
             pose=context.pose,
             velocity=context.velocity,
-            goal=local.Goal(x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw),
+            goal=local_planner.Goal(
+                x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw
+            ),
             hits=hits(context.world).astype(np.float64),
             path=transformed(to_odom, points),
             obstacles=context.world.obstacles,
@@ -223,7 +225,7 @@ class Navigator:
         context: NavigationContext,
         command: DriveCommand,
         route: Route,
-        plan: local.LocalPlan,
+        plan: local_planner.LocalPlan,
     ) -> Outcome:
         assert context.map_from_odom
         assert context.body
@@ -254,14 +256,14 @@ class Navigator:
             heading_error=heading_error,
         )
 
-    def _local_planner(self, context: NavigationContext) -> local.LocalPlanner:
+    def _local_planner(self, context: NavigationContext) -> local_planner.LocalPlanner:
         body, config = context.body, self._config
         assert body
         if self._local is None or body != self._body:
-            settings = local.LocalSettings(
+            settings = local_planner.LocalSettings(
                 linear_speed=config.max_linear_speed, samples=config.samples
             )
-            self._local, self._body = local.LocalPlanner(body, settings), body
+            self._local, self._body = local_planner.LocalPlanner(body, settings), body
         return self._local
 
     def _intent(self, *, twist: Velocity = ZERO, reason: str, **more: Any) -> Intent:
@@ -312,5 +314,5 @@ def _thinned(points: Floats) -> tuple[tuple[float, float], ...]:
 
 def warm_up() -> None:
     """Call every kernel of planning and driving once, so that it is compiled."""
-    planner.warm_up()
-    local.warm_up(ANY_BODY)
+    global_planner.warm_up()
+    local_planner.warm_up(ANY_BODY)

@@ -15,7 +15,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision.behaviours import Behaviour, Inputs, Step, battery_nearly_empty
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.geometry.ages import scan_limit_ns
+from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)

@@ -16,9 +16,8 @@ from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.route_progress import AT_GOAL_M, GiveWay, Point, ProgressMonitor
 from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand
 from gigabrain_zenoh.navigation.costmap import Costmap, Unknown, costmap, inflation
-from gigabrain_zenoh.navigation.frontiers import frontiers
-from gigabrain_zenoh.navigation.moment import LocalSettings
-from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable
+from gigabrain_zenoh.navigation.global_planner import GlobalPlanner, Path, Unreachable, frontiers
+from gigabrain_zenoh.navigation.local_planner import LocalSettings
 
 GIVE_UP_TICKS = 1500  # 30 s of driving without progress
 NO_PROGRESS = "no progress for 30 s"
@@ -92,7 +91,7 @@ class RoutePlanner:
     """Plans routes for one command after the other. Not thread-safe."""
 
     def __init__(self, unknown_space: Unknown = "avoid") -> None:
-        self._planner, self._unknown_space = Planner(), unknown_space
+        self._planner, self._unknown_space = GlobalPlanner(), unknown_space
         self._costmap: Costmap | None = None
         self._costmap_key: tuple[object, ...] = ()
         self._blocking: Floats = np.empty((0, 2))  # hits that blocked a route
@@ -124,7 +123,7 @@ class RoutePlanner:
         chart = costmap(
             self._enlarged(grid, goal), inflation(body, self._unknown_space), before=None
         )
-        start, planner = (here.x, here.y), Planner()
+        start, planner = (here.x, here.y), GlobalPlanner()
         found, offset = planner.plan(chart, start, (goal.x, goal.y)), ""
         if isinstance(found, Unreachable) and found.nearest and found.distance <= ARRIVED_M:
             offset = _offset(found)
@@ -308,7 +307,7 @@ class RoutePlanner:
         return Route(number=self._number, version=self._version, **fields)
 
 
-def _random_place(request: RouteRequest, chart: Costmap, planner: Planner) -> Goal:
+def _random_place(request: RouteRequest, chart: Costmap, planner: GlobalPlanner) -> Goal:
     """Return a random reachable place away from obstacles; the robot's own if there is none."""
     start, here = chart.cell(request.here.x, request.here.y), request.here
     if start is not None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costmap
-from gigabrain_zenoh.navigation.search import Search
+from gigabrain_zenoh.navigation.grid_search import GridSearch
 
 PROGRESS_M = 0.3  # a smaller gain is no progress
 DETOUR_M = 1.0  # a path that is longer than the last plan by this is another way
@@ -70,7 +70,7 @@ class GiveWay:
         self.place: Goal | None = None  # where the robot waits now
 
     def update(
-        self, goal: Goal, here: Point, tick: int, stuck: bool, chart: Costmap, search: Search
+        self, goal: Goal, here: Point, tick: int, stuck: bool, chart: Costmap, search: GridSearch
     ) -> bool:
         """Begin, continue or stop giving way; return whether that has changed."""
         before, cell = self.place, chart.cell(goal.x, goal.y)
@@ -86,7 +86,7 @@ class GiveWay:
 
 
 def waiting_place(
-    chart: Costmap, search: Search, here: Point, goal: Goal, *, far: bool
+    chart: Costmap, search: GridSearch, here: Point, goal: Goal, *, far: bool
 ) -> Goal | None:
     """Return the nearest place away from the line goal-`here`, or the one farthest from the goal.
 

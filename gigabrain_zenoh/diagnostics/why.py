@@ -11,8 +11,8 @@ from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, STATE, WORLD
 from gigabrain_zenoh.diagnostics.standing import leaves_nothing, stands
 from gigabrain_zenoh.diagnostics.why_facts import Facts
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.geometry.ages import scan_limit_ns
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO
+from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 
 Link = Literal[
     "router", "driver", "link", "scan", "world", "intent", "control", "safety", "gate", "body"

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory
 
 
 class PlacedScans:

@@ -21,11 +21,11 @@ from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.se2 import Floats
 from gigabrain_zenoh.host.files import make_folder, replacing
-from gigabrain_zenoh.mapping import arrays_file
-from gigabrain_zenoh.mapping.arrays_file import Arrays
+from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping.map_file import Arrays
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.mapping.growing import Still  # and gtsam: only who makes maps pays
+    from gigabrain_zenoh.mapping.slam_map import Still  # and gtsam: only who makes maps pays
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class Autosave:
         good = [path for path, head in heads.items() if head.boot == boot]
         for path in sorted(good, key=lambda path: heads[path].tick, reverse=True):
             try:
-                arrays = arrays_file.read(path, "the map")
+                arrays = map_file.read_arrays(path, "the map")
             except ConfigError as error:
                 refuse(str(error))
                 continue
@@ -144,7 +144,7 @@ def _head(path: Path) -> Head | None:
     if not path.exists():
         return None
     try:
-        content = arrays_file.read(path, "the map", only=HEAD)[HEAD].tobytes()
+        content = map_file.read_arrays(path, "the map", only=HEAD)[HEAD].tobytes()
         return msgspec.json.decode(content, type=Head)
     except (ConfigError, *DECODE_ERRORS) as error:
         refuse(str(error))
@@ -160,7 +160,7 @@ def _write(path: Path, head: Head, still: "Still") -> int:
         raise ValueError(f"less than {wanted / 1e6:.0f} MB are free")
     arrays[HEAD] = np.frombuffer(msgspec.json.encode(head), np.uint8)
     with replacing(path) as file:
-        arrays_file.write(file, arrays, compress=False)
+        map_file.write_arrays(file, arrays, compress=False)
     return path.stat().st_size
 
 

@@ -1,10 +1,11 @@
-"""The front end: where each scan lies in the map of the last few keyframes.
+"""SLAM front end: places each scan in the map of the last few keyframes.
 
-It knows nothing of loops: its own frame is smooth and drifts, and a correction never moves it.
+It closes no loops. Its own frame is smooth and drifts, and a correction never moves it.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -17,14 +18,9 @@ from gigabrain_zenoh.geometry.se2 import (
     turned,
     wrapped,
 )
-from gigabrain_zenoh.mapping.adrift import UNKNOWN, Adrift
-from gigabrain_zenoh.mapping.correlative import Found, Window, search
+from gigabrain_zenoh.mapping.keyframes import KeyframePolicy, Scan, seen_through, thinned
 from gigabrain_zenoh.mapping.local_map import LocalMap, build, room_for
-from gigabrain_zenoh.mapping.match import Kind, Match
-from gigabrain_zenoh.mapping.matching import Fit, icp
-from gigabrain_zenoh.mapping.points import Scan, thinned
-from gigabrain_zenoh.mapping.spacing import Spacing
-from gigabrain_zenoh.mapping.visibility import seen_through
+from gigabrain_zenoh.mapping.scan_matching import Fit, Found, Window, icp, search
 
 CELL, SIGMA = 0.05, 0.08  # [m], of the likelihood image
 GATE = 0.3  # [m]
@@ -51,11 +47,82 @@ SETTLED, SETTLED_INLIERS = (0.1, 0.03), 0.8  # [m] and [rad]; share of the point
 SETTLED_RMS = 0.06  # [m]
 UNMOVED = np.zeros((3, 3))
 
+Kind = Literal["matched", "searched", "recovered", "odometry", "broken"]
+
+MISSES, MISSED_TRAVEL, MISSED_TURN = 3, 0.5, 0.5  # scans, [m], [rad]: after these it is broken,
+MISSES_STANDING = 30  # or after so many scans
+UNKNOWN = np.diag((10.0, 10.0, np.pi)) ** 2  # covariance of a link that nothing is known of
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """Where the front end puts a scan, and how it came to that.
+
+    matched: by ICP. searched: by search alone. recovered: far from where odometry had it.
+    odometry: by odometry alone. broken: no longer joined to what was before.
+    """
+
+    pose: Floats  # in the front end's own frame
+    covariance: Floats  # (3, 3), of x, y and yaw in that frame, against the local map
+    kind: Kind
+    score: float  # 0 to 1, of the search
+    inliers: float  # share of the points that ICP laid onto lines
+    guided: bool = False  # by odometry whose covariance is known, and does not speak against it
+
+
+@dataclass(frozen=True, slots=True)
+class Adrift:
+    """What odometry did since a scan was matched."""
+
+    misses: int = 0  # scans in a row that fit one another, but not the map
+    travel: float = 0.0  # [m]
+    turn: float = 0.0  # [rad]
+    blind: bool = False  # there was nothing to match for a while, so odometry may be right
+
+    def moved(self, delta: Floats, blind: bool) -> "Adrift":
+        """After odometry has moved by `delta` (3,) once more."""
+        travel = self.travel + float(np.hypot(delta[0], delta[1]))
+        turn = self.turn + abs(float(delta[2]))
+        return Adrift(self.misses, travel, turn, self.blind or blind)
+
+    def missed(self, fits: bool) -> "Adrift":
+        """Return the state after a scan that was not matched; `fits` the one missed before it."""
+        return replace(self, misses=self.misses + 1 if fits else 1)
+
+    @property
+    def covariance(self) -> Floats:
+        """Of the odometry since; generous, as wheels slip and bad odometry is common."""
+        away, turn = 0.1 + 0.2 * self.travel, 0.1 + 0.3 * self.turn
+        return np.diag((away**2, away**2, turn**2))
+
+    @property
+    def broken(self) -> bool:
+        """Whether nothing joins what comes to what was before: the robot was carried off.
+
+        Scans that fit neither the map nor one another say nothing: trees in the wind, a slope.
+        """
+        return (self.misses >= MISSES and self.far) or self.misses >= MISSES_STANDING
+
+    @property
+    def far(self) -> bool:
+        """Whether what was matched last may be out of sight by now."""
+        return self.travel > MISSED_TRAVEL or self.turn > MISSED_TURN
+
+    def after_break(self) -> Floats:
+        """The covariance of the link over a break."""
+        return self.covariance if self.blind else UNKNOWN
+
+    @property
+    def window(self) -> Window:
+        """Where to search: the farther odometry has moved, the wider."""
+        effort = min(1.0, self.travel / 0.5 + self.turn / 0.3)
+        return Window(0.15 + 0.2 * effort, 0.12 + 0.23 * effort)
+
 
 class FrontEnd:
     """Tracks the robot from scan to scan. The first scan lies at `pose`."""
 
-    def __init__(self, spacing: Spacing, pose: Floats) -> None:
+    def __init__(self, spacing: KeyframePolicy, pose: Floats) -> None:
         self._spacing = spacing
         self._scans: list[Scan] = []
         self._poses: list[Floats] = []

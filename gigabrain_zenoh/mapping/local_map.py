@@ -9,8 +9,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.geometry.se2 import Floats
-from gigabrain_zenoh.kernels.kernel import kernel, lean_kernel
-from gigabrain_zenoh.mapping.points import Points, Scan
+from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
+from gigabrain_zenoh.mapping.keyframes import Points, Scan
 
 BUCKET = 0.15  # [m]
 REACH = 30.0  # [m], points farther from the centre are left out

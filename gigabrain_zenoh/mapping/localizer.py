@@ -1,7 +1,7 @@
-"""Where the robot is in a map that is known: followed from scan to scan, or found from nothing.
+"""Localizes in a known map: tracks hypotheses, searches when lost, detects kidnapping.
 
-While more than one place explains what is seen, none is believed. Each is followed until what is
-seen elsewhere speaks against it; the last one left is where the robot is.
+While more than one place explains the scans, none is believed. Each is followed until scans
+contradict it.
 """
 
 import math
@@ -10,10 +10,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose, inverse, turned
-from gigabrain_zenoh.mapping.field import Field, clearance, fit
-from gigabrain_zenoh.mapping.likeness import alike
-from gigabrain_zenoh.mapping.points import Scan
-from gigabrain_zenoh.mapping.relocalize import FEWEST_POINTS, Candidate, apart
+from gigabrain_zenoh.host.threads import ScheduledWorker, Take
+from gigabrain_zenoh.mapping.global_localization import FEWEST_POINTS, Candidate, apart, search
+from gigabrain_zenoh.mapping.keyframes import View
+from gigabrain_zenoh.mapping.likelihood_field import (
+    LikelihoodField,
+    clearance,
+    contradiction,
+    field_of,
+    fit,
+    matches_itself,
+)
+from gigabrain_zenoh.mapping.occupancy_grid import CELL, Grid
 
 LOST_SCORE, LOST_SCANS = 0.45, 5  # so bad a fit for so long: the robot is somewhere else
 SURE_SCORE, SURE_SCANS = 0.65, 3  # so good a fit for so long, and the only one: it is here
@@ -29,17 +37,16 @@ SHOWN = 0.1  # of the hits: of a place that the map shows less of, nothing can b
 GONE_SCANS = 20  # after so many, it is asked whether that place is likely at all
 VIEW_M, VIEW_RAD = 0.1, math.radians(6)  # farther on, what is seen counts as seen elsewhere
 LOOSE_M, LOOSE_RAD = 0.5, math.radians(20)  # a deviation beyond that is no position
-SEARCH_SCANS = 10  # from one search of the whole map to the next
+SEARCH_INTERVAL_SCANS = 10  # from one search of the whole map to the next
 SPREAD = np.diag((0.1, 0.1, 0.05)) ** 2  # the covariance of a place that a search has found
 NOWHERE = np.diag((1e3, 1e3, math.pi)) ** 2  # the covariance of what is not known
 
+SEARCH_DEADLINE_SCANS = 8  # after which what a search has found is taken
 
-@dataclass(frozen=True, slots=True)
-class View:
-    """One scan in the body's frame."""
-
-    scan: Scan
-    sensor: Floats  # (2,) [m], where the beams start
+JUDGED_RADIUS_M = 5.0  # round the robot, beams that end farther off are not judged
+SUDDEN_INCREASE = 0.3  # so many more of all beams than before
+USUAL_GAIN = 0.1  # of a new scan in what is usual
+KIDNAPPED_SCANS = 3  # in a row, then it is certain
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +78,11 @@ class Hypothesis:
 class Localizer:
     """Follows hypotheses through one map."""
 
-    map: Field
+    map: LikelihoodField
     why: str = "not found yet"
     _places: list[Hypothesis] = field(default_factory=list)
     _localized: bool = False
-    _unsearched: int = SEARCH_SCANS  # scans since the last search
+    _unsearched: int = SEARCH_INTERVAL_SCANS  # scans since the last search
     _still: int = 0  # scans since the last view
     _moved: Floats = field(default_factory=lambda: IDENTITY.copy())  # since the last view
     _last: Hypothesis = field(default_factory=lambda: Hypothesis(IDENTITY, NOWHERE))
@@ -83,7 +90,7 @@ class Localizer:
     @property
     def wants_search(self) -> bool:
         """Whether somebody should search the whole map now."""
-        return not self._places and self._unsearched >= SEARCH_SCANS
+        return not self._places and self._unsearched >= SEARCH_INTERVAL_SCANS
 
     @property
     def place(self) -> Place:
@@ -103,7 +110,7 @@ class Localizer:
         if self._places:
             self._last = self._places[0]
         self._places, self._localized, self.why = [], False, why
-        self._unsearched = SEARCH_SCANS
+        self._unsearched = SEARCH_INTERVAL_SCANS
 
     def searching(self) -> None:
         """Somebody has begun to search with the scan of the last step."""
@@ -186,7 +193,7 @@ class Localizer:
         """Whether `one` has led off what is shown, to where the map gives no reason to be."""
         if one.shown >= SHOWN or one.bad % GONE_SCANS != GONE_SCANS - 1 or not best.good:
             return False
-        return not alike(self.map, compose(one.pose, inverse(best.pose)))
+        return not matches_itself(self.map, compose(one.pose, inverse(best.pose)))
 
 
 def _possible(one: Hypothesis) -> bool:
@@ -220,7 +227,7 @@ def _predicted(one: Hypothesis, motion: Floats, noise: Floats) -> Hypothesis:
     return replace(one, pose=pose, covariance=spread)
 
 
-def _followed(into: Field, one: Hypothesis, view: View | None) -> Hypothesis:
+def _followed(into: LikelihoodField, one: Hypothesis, view: View | None) -> Hypothesis:
     """`one` moved to where the scan fits best, unless it fits nowhere near."""
     if view is None:
         return one
@@ -248,3 +255,79 @@ def _judged(one: Hypothesis, bar: float) -> Hypothesis:
 
 def _inverse(matrix: Floats) -> Floats:
     return np.asarray(np.linalg.inv(matrix), np.float64)
+
+
+class BackgroundLocalizer:
+    """Where the robot is in a map that does not change."""
+
+    def __init__(
+        self,
+        field: LikelihoodField,
+        why: str,
+        background: ScheduledWorker,
+        last: Floats | None = None,
+    ) -> None:
+        self._localizer = Localizer(field, why)
+        self._background = background
+        self._moved = IDENTITY  # since the scan that a search goes by
+        self.last = last  # where it was before it was lost, by odometry: it may still be there
+        self._lost = 0  # how often
+
+    def step(self, view: View, motion: Floats, noise: Floats) -> Place:
+        """One scan, after a `motion` (3,) of that covariance (3, 3), in its own frame."""
+        self._moved = compose(self._moved, motion)
+        self.last = None if self.last is None else compose(self.last, motion)
+        place = self._localizer.step(view, motion, noise)
+        if place.localized:
+            self.last = place.pose
+        if self._localizer.wants_search and self._background.idle:
+            self._search(view)
+        return place
+
+    def lose(self, why: str) -> None:
+        """The robot may be anywhere; a search that is under way is too late."""
+        self._lost += 1
+        self._localizer.lose(why)
+
+    def _search(self, view: View) -> None:
+        localizer, number, last = self._localizer, self._lost, self.last
+        localizer.searching()
+        self._moved = IDENTITY
+
+        def work() -> Take:
+            found = search(localizer.map, view.scan.points, view.scan.free, view.sensor, last)
+
+            def take() -> None:
+                if number == self._lost:
+                    localizer.found(found, self._moved, self.last)
+
+            return take
+
+        self._background.start(work, SEARCH_DEADLINE_SCANS)
+
+
+class KidnapDetector:
+    """Looks at each scan before the map takes it."""
+
+    def __init__(self) -> None:
+        self._usual = 0.0  # share of beams that the map rules out
+        self.scans = 0  # in a row that do not belong here
+
+    @property
+    def certain(self) -> bool:
+        """Whether the robot is somewhere else."""
+        return self.scans >= KIDNAPPED_SCANS
+
+    def look(self, grid: Grid, view: View, pose: Floats) -> bool:
+        """Whether the scan does not belong at `pose`, where odometry has the robot."""
+        cells, corner = grid.around(float(pose[0]), float(pose[1]), JUDGED_RADIUS_M)
+        if not cells.size:
+            return False
+        field = field_of(cells, CELL, corner)
+        share = contradiction(field, view.scan.points, view.scan.free, view.sensor, pose)
+        if share > self._usual + SUDDEN_INCREASE:
+            self.scans += 1
+            return True
+        self._usual += USUAL_GAIN * (share - self._usual)
+        self.scans = 0
+        return False

@@ -1,15 +1,24 @@
-"""Maps on disk: ROS's PGM and YAML, and the pose graph beside them to go on with.
+"""Map files: ROS's PGM and YAML, and the pose graph as bounded .npz arrays.
 
-All files of a save come into being at once. They are written into a folder of their own, whose
-renaming decides; whoever looks next finishes what a crash left between that and their own places.
+All files of a save appear at once: they are written into a folder whose renaming decides. The next
+reader finishes what a crash left. Arrays are bounded before they are read: a zip may hold a
+thousand times its own size.
 """
 
 import hashlib
+import io
+import math
+import os
+import re
 import shutil
+import struct
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, BinaryIO, Literal
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -18,18 +27,43 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import Finite, Fraction
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.host.files import make_folder, sync_folder, write_synced
+from gigabrain_zenoh.host.files import (
+    make_folder,
+    open_regular,
+    read_bounded,
+    sync_folder,
+    write_synced,
+)
 from gigabrain_zenoh.host.run_folders import state_dir
-from gigabrain_zenoh.mapping import arrays_file, pgm
-from gigabrain_zenoh.mapping.arrays_file import Arrays
 
 Cells = NDArray[np.int8]
-
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # grey values, as ROS's map_server writes them
 OCCUPIED_PERCENT, FREE_PERCENT = 65, 40  # from here on, and up to here
 LEAST_FREE_M2, LEAST_WALL_M = 1.0, 1.0  # less than that is no map
 GRAPH = ".graph.npz"
 STAMP = "grid"  # in the graph's file: which grid it belongs to
+
+MAX_PIXELS = 8_000_000  # what a message may carry
+MAX_HEADER_BYTES = 100_000  # bytes, with all its comments
+PGM_GAP = rb"(?:\s|#[^\n]*\n)+"  # white space and comments
+PGM_HEADER = re.compile(rb"P5" + (PGM_GAP + rb"(\d{1,9})") * 3 + rb"\s")
+
+Arrays = Mapping[str, NDArray[Any]]
+MAX_ARRAY_BYTES = 80_000_000  # of all arrays of a file together
+MAX_ARRAYS = 64
+DIRECTORY_BYTES = 512  # of a zip's directory, for each array
+ZIP_END, ZIP_END_BYTES, MAX_COMMENT_BYTES = b"PK\5\6", 22, 65_535  # of a zip's end record
+MAX_NUMBER = 1e9  # of any number, as on the bus
+NPY_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+# all that zipfile, zlib and numpy's reading of headers raise on hostile input
+READ_ERRORS = (
+    ValueError, EOFError, KeyError, OSError, TypeError, NotImplementedError, RuntimeError,
+    SyntaxError, OverflowError, MemoryError, struct.error, tokenize.TokenError, zlib.error,
+    zipfile.BadZipFile,
+)  # fmt: skip
 
 
 class MapYaml(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -81,7 +115,7 @@ def load(path: Path) -> SavedMap:
         raise ConfigError(f"{path}: origin: turned by {about.origin[2]:g} rad; expected yaw 0")
     if about.free_thresh >= about.occupied_thresh:
         raise ConfigError(f"{path}: free_thresh must be below occupied_thresh")
-    grey = pgm.read(path.parent / about.image)
+    grey = read_pgm(path.parent / about.image)
     share = grey / 255 if about.negate else (255 - grey.astype(np.float64)) / 255
     cells = np.full(grey.shape, -1, np.int8)
     cells[share > about.occupied_thresh] = 100
@@ -94,7 +128,7 @@ def load_graph(path: Path) -> dict[str, NDArray[Any]]:
     """The pose graph beside the YAML file `path`. Raises ConfigError, in one line."""
     _finish(path)
     file = path.with_suffix(GRAPH)
-    graph = arrays_file.read(file, "the pose graph to go on with; expected it beside the YAML file")
+    graph = read_arrays(file, "the pose graph to go on with; expected it beside the YAML file")
     stamp = graph.pop(STAMP, None)
     if stamp is not None and not np.array_equal(stamp, _stamp(load(path))):
         raise ConfigError(
@@ -163,7 +197,7 @@ def _files(path: Path, found: SavedMap, graph: Arrays) -> dict[str, bytes]:
     )
     return {
         image: b"P5\n%d %d\n255\n" % (width, height) + grey[::-1].tobytes(),
-        path.with_suffix(GRAPH).name: arrays_file.written({**graph, STAMP: _stamp(found)}),
+        path.with_suffix(GRAPH).name: arrays_bytes({**graph, STAMP: _stamp(found)}),
         path.name: about.encode(),
     }
 
@@ -207,3 +241,104 @@ def _finish(path: Path) -> None:
 
 def _complete(path: Path) -> Path:
     return path.with_name(f".{path.stem}.complete")
+
+
+def read_pgm(file: Path) -> NDArray[np.uint8]:
+    """The grey values of a file (height, width), the top row first. Raises ConfigError."""
+    try:
+        data = read_bounded(file, MAX_PIXELS + MAX_HEADER_BYTES)
+    except OSError as error:
+        raise ConfigError(f"{file}: the map's image: {error.strerror}") from None
+    header = PGM_HEADER.match(data)
+    if header is None:
+        raise ConfigError(f"{file}: no binary PGM; expected a header such as 'P5 640 480 255'")
+    width, height, most = (int(number) for number in header.groups())
+    if most != 255:
+        raise ConfigError(f"{file}: a maxval of {most}; expected 255")
+    if not 0 < width * height <= MAX_PIXELS:
+        raise ConfigError(f"{file}: {width} x {height} pixels; expected 1 to {MAX_PIXELS} in all")
+    there = len(data) - header.end()
+    if there != width * height:
+        what = "cut" if there < width * height else "of another size"
+        raise ConfigError(f"{file}: {what}: {there} of {width} x {height} pixels are there")
+    return np.frombuffer(data, np.uint8, offset=header.end()).reshape(height, width)
+
+
+def read_arrays(path: Path, what: str, only: str = "") -> dict[str, NDArray[Any]]:
+    """The arrays in a file, which holds `what`; `only` one of them, if it is named.
+
+    Raises ConfigError, in one line.
+    """
+    try:
+        with open_regular(path, MAX_ARRAY_BYTES) as file:
+            return _read_zip(file, only)
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: {what}: {error.strerror}") from None
+    except READ_ERRORS as error:
+        text = " ".join(str(error).split())[:120] or type(error).__name__
+        raise ConfigError(f"{path}: cut or damaged: {text}") from None
+
+
+def write_arrays(file: BinaryIO, arrays: Arrays, *, compress: bool) -> None:
+    """Write `arrays` to `file`. Raises OSError, and ValueError for more than can be read."""
+    size = sum(values.nbytes for values in arrays.values())
+    if size > MAX_ARRAY_BYTES * 0.99:  # the headers count too
+        raise ValueError(
+            f"it holds {size / 1e6:.0f} MB; at most {MAX_ARRAY_BYTES / 1e6:g} MB can be read_arrays"
+        )
+    save = np.savez_compressed if compress else np.savez
+    save(file, allow_pickle=False, **arrays)
+
+
+def arrays_bytes(arrays: Arrays) -> bytes:
+    """The content of a compressed file. Raises ValueError, as `write_arrays` does."""
+    content = io.BytesIO()
+    write_arrays(content, arrays, compress=True)
+    return content.getvalue()
+
+
+def _read_zip(file: BinaryIO, only: str) -> dict[str, NDArray[Any]]:
+    if _directory_bytes(file) > MAX_ARRAYS * DIRECTORY_BYTES:
+        raise ValueError(f"expected at most {MAX_ARRAYS} arrays")  # zipfile reads all entries
+    with zipfile.ZipFile(file) as members:
+        infos = members.infolist()
+        size = sum(info.file_size for info in infos)
+        if size > MAX_ARRAY_BYTES or len(infos) > MAX_ARRAYS:
+            raise ValueError(
+                f"{len(infos)} arrays of {size / 1e6:.0f} MB; expected at most {MAX_ARRAYS} "
+                f"of {MAX_ARRAY_BYTES / 1e6:g} MB"
+            )
+        names = {info.filename.removesuffix(".npy"): info for info in infos}
+        wanted = {only: names[only]} if only else names
+        return {name: _read_array(name, members, info) for name, info in wanted.items()}
+
+
+def _directory_bytes(file: BinaryIO) -> int:
+    """Return how large the zip's directory is, by its end record (APPNOTE.TXT, 4.3.16) [bytes]."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(max(0, size - ZIP_END_BYTES - MAX_COMMENT_BYTES))
+    tail = file.read()
+    file.seek(0)
+    at = len(tail) - ZIP_END_BYTES
+    if tail[at : at + 4] != ZIP_END or tail[-2:] != b"\0\0":
+        at = tail.rfind(ZIP_END)
+    if at < 0 or len(tail) - at < ZIP_END_BYTES:
+        return 0  # no zip, as zipfile will say
+    if b"PK\6\7" in tail[max(0, at - 20) : at]:
+        raise ValueError("it is a zip of the large format, which no map needs")
+    return int.from_bytes(tail[at + 12 : at + 16], "little")
+
+
+def _read_array(name: str, members: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    """One array, if it holds plain numbers; else one of READ_ERRORS."""
+    with members.open(info) as stream:
+        shape, fortran, dtype = NPY_HEADERS[np.lib.format.read_magic(stream)](stream)
+        if dtype.kind not in "biuf" or min(shape, default=0) < 0:
+            raise ValueError(f"{name} holds something else than numbers")
+        data = stream.read()  # no more than the zip says, which is bounded; and its checksum
+    if len(data) != math.prod(shape) * dtype.itemsize:
+        raise ValueError(f"{name}: {len(data)} bytes for {shape} of {dtype}")
+    values: NDArray[Any] = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
+    if values.size and not -MAX_NUMBER <= values.min() <= values.max() <= MAX_NUMBER:
+        raise ValueError(f"{name} holds something else than numbers up to {MAX_NUMBER:g}")
+    return values

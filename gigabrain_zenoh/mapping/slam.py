@@ -1,7 +1,8 @@
-"""Simultaneous localisation and mapping: front end, pose graph and loop search put together.
+"""SLAM: front end, pose graph and loop closure together.
 
-`add` is what each scan costs. `close_loops` may run in a thread of its own meanwhile; what it finds
-moves nothing until `apply`. The front end sees a correction only where it comes to known ground.
+`add` is the work per scan. `close_loops` may run in another thread meanwhile; its result moves
+nothing until `apply`. On ground that earlier passes mapped, scans are matched to existing
+keyframes, so that a map grows with the ground and not with the time driven.
 """
 
 import copy
@@ -11,30 +12,36 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose, inverse, turned
-from gigabrain_zenoh.mapping.drift import Rates
-from gigabrain_zenoh.mapping.familiar import Ground
-from gigabrain_zenoh.mapping.front_end import FrontEnd
-from gigabrain_zenoh.mapping.frozen import (
+from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose, inverse, turned, wrap
+from gigabrain_zenoh.mapping.front_end import FrontEnd, Kind, Match
+from gigabrain_zenoh.mapping.keyframes import (
     Arrays,
+    Edge,
+    Keyframe,
+    KeyframePolicy,
+    Scan,
     freeze_edges,
     freeze_keyframes,
     shaped,
     thaw_edges,
     thaw_keyframes,
 )
-from gigabrain_zenoh.mapping.graph import Graph
-from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
-from gigabrain_zenoh.mapping.loops import LoopSearch, around
-from gigabrain_zenoh.mapping.match import Kind, Match
-from gigabrain_zenoh.mapping.points import Scan
-from gigabrain_zenoh.mapping.spacing import Spacing
+from gigabrain_zenoh.mapping.loop_closure import LoopSearch, around
+from gigabrain_zenoh.mapping.pose_graph import Graph, Rates
 
 LINK = np.diag((0.05, 0.05, 0.01)) ** 2  # covariance of a link beside that of its match,
 GUIDED = np.diag((0.02, 0.02, 0.005)) ** 2  # and where odometry was known to be good
 TIED = 4.0  # [m] of travel since a loop, so long the way is known to lie right on earlier ones
 DRIFTED = np.diag((0.05, 0.05, 0.02)) ** 2  # covariance of that
 AGAIN = 12.0  # [m] of travel between the ends of a loop that ties the way to an earlier one
+
+TRAVEL = 12.0  # [m] since, or it is the same pass
+NEAR = 0.75  # [m], keyframes so near are of this place
+PASSES = 2  # over a place, from then on it is known
+REACH = 3.0  # [m], keyframes farther off show other places
+SQUARE, SECTOR = 0.4, np.pi / 2  # [m] and [rad]: of keyframes seen from one place one is enough
+TURNED = 0.5  # [m] that a keyframe may be farther off, for each rad that it is less turned away
+MOST = 16  # keyframes
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +70,12 @@ class Slam:
     """A map that grows. All but `close_loops` belongs to one thread."""
 
     def __init__(
-        self, pose: Floats = IDENTITY, spacing: Spacing | None = None, rates: Rates | None = None
+        self,
+        pose: Floats = IDENTITY,
+        spacing: KeyframePolicy | None = None,
+        rates: Rates | None = None,
     ) -> None:
-        self._front = FrontEnd(spacing or Spacing(), pose)
+        self._front = FrontEnd(spacing or KeyframePolicy(), pose)
         self._anchor = (0, pose)  # a keyframe, and where the front end has it
         self._poses: list[Floats] = []
         self._segment = 0
@@ -260,7 +270,7 @@ class Slam:
 
     @classmethod
     def thaw(
-        cls, arrays: Arrays, spacing: Spacing | None = None, rates: Rates | None = None
+        cls, arrays: Arrays, spacing: KeyframePolicy | None = None, rates: Rates | None = None
     ) -> "Slam":
         """Go on from what was frozen; KeyError or ValueError if it does not belong together."""
         slam = cls(shaped(arrays, "front", 3), spacing, rates)
@@ -323,3 +333,50 @@ def _graph_of(keyframes: Sequence[Keyframe], poses: Floats, loops: Sequence[Edge
     while not settled:
         settled = graph.settle()
     return graph
+
+
+class Ground:
+    """The keyframes of a map by place. Corrections move them, so it is told the poses each time."""
+
+    def __init__(self) -> None:
+        self._travel: Floats = np.empty(0)
+        self._segments: NDArray[np.int64] = np.empty(0, np.int64)
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Add the next keyframe of the map."""
+        self._travel = np.append(self._travel, keyframe.travel)
+        self._segments = np.append(self._segments, keyframe.segment)
+
+    def round(self, pose: Floats, travel: float, poses: Floats, joined: set[int]) -> list[int]:
+        """Return the keyframes that show the ground round `pose` (3,), the nearest last.
+
+        Earlier passes count only, after `travel` [m] now, and segments that are joined to the map.
+        Nothing is returned where there were fewer than PASSES of them.
+        """
+        earlier = np.flatnonzero(travel - self._travel > TRAVEL)
+        away = np.hypot(*(poses[earlier, :2] - pose[:2]).T)
+        around = away < REACH
+        around &= np.isin(self._segments[earlier], list(joined))
+        ids, away = earlier[around], away[around]
+        if self._passes(ids[away < NEAR]) < PASSES:
+            return []
+        return _chosen(ids, poses[ids], pose)
+
+    def _passes(self, ids: NDArray[np.intp]) -> int:
+        """Return how often the robot has come by these keyframes, which are in their order."""
+        passes, last = 0, -np.inf
+        for travel in self._travel[ids].tolist():
+            if travel - last > TRAVEL:
+                passes, last = passes + 1, travel
+        return passes
+
+
+def _chosen(ids: NDArray[np.intp], poses: Floats, pose: Floats) -> list[int]:
+    """Return the newest keyframe of each place and direction, of those the nearest MOST."""
+    places = np.floor(poses / (SQUARE, SQUARE, SECTOR))
+    _, newest = np.unique(places[::-1], axis=0, return_index=True)
+    ids, poses = ids[::-1][newest], poses[::-1][newest]
+    off = poses - pose
+    far = np.hypot(off[:, 0], off[:, 1]) + TURNED * np.abs(wrap(off[:, 2]))
+    order = np.lexsort((ids, far))[:MOST]
+    return [int(k) for k in ids[order[::-1]]]

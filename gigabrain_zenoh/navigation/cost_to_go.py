@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels.kernel import kernel
+from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.footprint import Grid, between
 
 COARSER = 2  # cells of the window per cell of the field, along each axis

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.geometry.sweep import Corners, box
-from gigabrain_zenoh.kernels.kernel import NONE, lean_kernel
+from gigabrain_zenoh.kernels.jit import NONE, lean_kernel
 
 SPACING = 0.05  # [m], between points on the outline at most,
 MOST_POINTS = 500  # unless there were more than so many: those of a long outline are farther apart

@@ -1,6 +1,6 @@
-"""Model predictive path integral control: many plans, their costs, and the mean of the good ones.
+"""Model predictive path integral control: samples plans, and averages the good ones by their cost.
 
-Williams et al., "Information theoretic MPC for model-based reinforcement learning", ICRA 2017.
+Williams et al., Information theoretic MPC for model-based reinforcement learning, ICRA 2017.
 """
 
 import math
@@ -9,24 +9,98 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.kernels.kernel import NONE, kernel, lean_kernel
-from gigabrain_zenoh.navigation.draws import STANDING, noise_of, propose, simple_of
+from gigabrain_zenoh.kernels.jit import NONE, kernel, lean_kernel
+from gigabrain_zenoh.navigation.cost import Scene, Weights, look_round, price, rooms_of
 from gigabrain_zenoh.navigation.footprint import Outline
-from gigabrain_zenoh.navigation.models import Model
-from gigabrain_zenoh.navigation.price import look_round, price, rooms_of
-from gigabrain_zenoh.navigation.rating import Scene, Weights
-from gigabrain_zenoh.navigation.rollout import LANES, STATE, Start, move, obey
+from gigabrain_zenoh.navigation.motion_model import (
+    LANES,
+    STATE,
+    InitialState,
+    MotionModel,
+    make_feasible,
+    simulate,
+)
 
 Floats = NDArray[np.float64]
+NOISE_KEPT, NOISE_FRESH = 0.85, 0.53  # of the noise from step to step
+NOISE_SHARE, TURN_NOISE_SHARE = 0.175, 0.3  # of the noise, as a share of the largest speeds
+SIMPLE_EVERY = 4  # every so manieth plan is one twist and then another, and no noise
+BRAKING_LANE = 2  # the plan that brakes
+SHARP_TURN_SHARE = 0.3  # how much of the yaw rate simple plans take at high speed
 
 TEMPERATURE = 0.6  # how much worse than the best still counts
-LEAST_SHARE = 1e-3  # in units of the best one's; what would have less has none: under 1 % of all
-WORTHLESS = -TEMPERATURE * math.log(LEAST_SHARE)  # so much worse than the best has less
-WORSE = 0.3  # a mean this much worse than the best has run into what its parts went round
-SETS = 8  # of noise, drawn once and taken in turn
+MIN_SHARE = 1e-3  # in units of the best one's; what would have less has none: under 1 % of all
+WORTHLESS_MARGIN = -TEMPERATURE * math.log(MIN_SHARE)  # so much worse than the best has less
+MEAN_MARGIN = 0.3  # a mean this much worse than the best has run into what its parts went round
+NOISE_SETS = 8  # of noise, drawn once and taken in turn
 
 
-class Planned(NamedTuple):
+def noise_of(
+    random: np.random.Generator, shape: tuple[int, ...], model: MotionModel
+) -> NDArray[np.float32]:
+    """Autoregressive noise: neighbouring commands go together."""
+    noise = random.standard_normal(shape, dtype=np.float32)
+    for t in range(1, shape[2]):
+        noise[:, :, t] = NOISE_KEPT * noise[:, :, t - 1] + NOISE_FRESH * noise[:, :, t]
+    spread = (
+        NOISE_SHARE * model.forward,
+        NOISE_SHARE * model.lateral,
+        TURN_NOISE_SHARE * model.turning,
+    )
+    scaled: NDArray[np.float32] = noise * np.array(spread, dtype=np.float32)
+    return scaled
+
+
+def simple_of(
+    random: np.random.Generator, sets: int, samples: int, steps: int, model: MotionModel
+) -> Floats:
+    """Plans of two twists, (sets, samples, 7): both, and the step in which the second begins.
+
+    Of every three, one keeps its first twist, and one turns on the spot before it drives on.
+    """
+    first, second = (_twists(random, (sets, samples, 3), model) for _ in range(2))
+    turning = np.arange(samples) // SIMPLE_EVERY % 3
+    if model.radius == 0.0:
+        first[:, turning == 1, :2] = 0.0
+        second[:, turning == 1, 0] = model.forward * random.random(
+            (sets, int((turning == 1).sum()))
+        )
+        second[:, turning == 1, 2] = 0.0
+    when = random.uniform(1.0, steps, (sets, samples, 1))
+    when[:, turning == 0] = steps
+    return np.concatenate([first, second, when], axis=2)
+
+
+def _twists(random: np.random.Generator, shape: tuple[int, ...], model: MotionModel) -> Floats:
+    """Any twists that the body can have; the faster, the less they turn."""
+    share = random.random(shape)
+    twists = np.empty(shape)
+    twists[..., 0] = -model.backward + (model.forward + model.backward) * share[..., 0]
+    twists[..., 1] = model.lateral * (2.0 * share[..., 1] - 1.0)
+    most = np.where(twists[..., 0] > 0.5 * model.forward, SHARP_TURN_SHARE, 0.9)
+    twists[..., 2] = model.turning * most * (2.0 * share[..., 2] - 1.0)
+    return twists
+
+
+@lean_kernel
+def propose(plans: Floats, last: Floats, noise: NDArray[np.float32], simple: Floats) -> None:
+    """Fill `plans` (blocks, T, 3, LANES)."""
+    blocks, steps, axes, _ = plans.shape
+    for block in range(blocks):
+        for t in range(steps):
+            for axis in range(axes):
+                plan, disturbed = plans[block, t, axis], noise[block, t, axis]
+                for lane in range(LANES):
+                    plan[lane] = last[t, axis] + disturbed[lane]
+                for lane in range(0, LANES, SIMPLE_EVERY):
+                    one = simple[block * LANES + lane]
+                    plan[lane] = one[axis] if t < one[6] else one[axes + axis]
+    for t in range(steps):
+        for axis in range(axes):
+            plans[0, t, axis, 0], plans[0, t, axis, BRAKING_LANE] = last[t, axis], 0.0
+
+
+class SampledPlan(NamedTuple):
     """The plan that was chosen, and what it leads to."""
 
     commands: Floats  # (T, 3)
@@ -35,7 +109,7 @@ class Planned(NamedTuple):
     standing_cost: float  # of braking and staying
 
 
-class Work(NamedTuple):
+class SamplerBuffers(NamedTuple):
     """Arrays that are used again, plans in lanes."""
 
     plans: Floats  # (blocks + 1, T, 3, LANES); the last block is for what comes of the others
@@ -49,15 +123,15 @@ class Sampler:
     It takes as many `samples` as asked for or a few more, for all lanes to be full.
     """
 
-    def __init__(self, model: Model, samples: int, steps: int, dt: float, seed: int) -> None:
+    def __init__(self, model: MotionModel, samples: int, steps: int, dt: float, seed: int) -> None:
         self.dt, self._turn = dt, 0
         random = np.random.default_rng(seed)
         blocks = math.ceil(samples / LANES)
-        noise = noise_of(random, (SETS, blocks * LANES, steps, 3), model)
-        lanes = noise.reshape(SETS, blocks, LANES, steps, 3).transpose(0, 1, 3, 4, 2)
+        noise = noise_of(random, (NOISE_SETS, blocks * LANES, steps, 3), model)
+        lanes = noise.reshape(NOISE_SETS, blocks, LANES, steps, 3).transpose(0, 1, 3, 4, 2)
         self._noise = np.ascontiguousarray(lanes)
-        self._simple = simple_of(random, SETS, blocks * LANES, steps, model)
-        self._work = Work(
+        self._simple = simple_of(random, NOISE_SETS, blocks * LANES, steps, model)
+        self._work = SamplerBuffers(
             np.zeros((blocks + 1, steps, 3, LANES)),
             np.empty((steps + 1, STATE)),
             np.empty((blocks, LANES)),
@@ -70,27 +144,32 @@ class Sampler:
 
     def shift(self, seconds: float) -> None:
         """Let time pass: the last plan begins so much later."""
-        self.last = _at(self.last, np.arange(len(self.last)) + seconds / self.dt)
+        self.last = _resampled(self.last, np.arange(len(self.last)) + seconds / self.dt)
 
     def step_by(self, dt: float) -> None:
         """Plan in as many steps of this length [s] from now on."""
         if dt != self.dt:
             steps = np.arange(len(self.last))
-            self.last, self.dt = _at(self.last, (steps + 0.5) * dt / self.dt - 0.5), dt
+            self.last, self.dt = _resampled(self.last, (steps + 0.5) * dt / self.dt - 0.5), dt
 
     def plan(
-        self, model: Model, outline: Outline, weights: Weights, scene: Scene, start: Start
-    ) -> Planned:
+        self,
+        model: MotionModel,
+        outline: Outline,
+        weights: Weights,
+        scene: Scene,
+        start: InitialState,
+    ) -> SampledPlan:
         """The best that was found for a body that can move like `model`."""
         noise, simple = self._noise[self._turn], self._simple[self._turn]
-        self._turn = (self._turn + 1) % SETS
+        self._turn = (self._turn + 1) % NOISE_SETS
         work, given = self._work, (model, outline, weights, scene, start, self.dt)
         commands, track, cost, standing = _search(*given, self.last, noise, simple, work)
         self.last = commands
-        return Planned(commands, track, cost, standing)
+        return SampledPlan(commands, track, cost, standing)
 
 
-def _at(plan: Floats, steps: NDArray[np.floating]) -> Floats:
+def _resampled(plan: Floats, steps: NDArray[np.floating]) -> Floats:
     """The commands of `plan` (T, 3) at `steps` (T,) and between them; its ends go on for ever."""
     inside = np.minimum(np.maximum(steps, 0.0), len(plan) - 1.0)
     before = np.minimum(inside.astype(np.int64), len(plan) - 2)
@@ -101,16 +180,16 @@ def _at(plan: Floats, steps: NDArray[np.floating]) -> Floats:
 
 @kernel
 def _search(
-    model: Model,
+    model: MotionModel,
     outline: Outline,
     weights: Weights,
     scene: Scene,
-    start: Start,
+    start: InitialState,
     dt: float,
     last: Floats,
     noise: NDArray[np.float32],
     simple: Floats,
-    work: Work,
+    work: SamplerBuffers,
 ) -> tuple[Floats, Floats, float, float]:
     """The commands (T, 3) and the track (T + 1, 6) that were found, their cost, that of standing.
 
@@ -126,20 +205,20 @@ def _search(
     for block in range(blocks + 1):
         if block == blocks:
             _gather(plans, costs, found, mean, best)
-        obey(model, start, dt, plans[block])
-        move(model, outline.far, start, dt, plans[block], states)
+        make_feasible(model, start, dt, plans[block])
+        simulate(model, outline.far, start, dt, plans[block], states)
         look_round(weights, outline, scene, dt, states)
         if block == 0:
             rooms_of(scene, outline, states, rooms)
         of = found if block == blocks else costs[block]
         for lane in range(LANES if block < blocks else 2):
-            free = block == blocks or (block == 0 and lane == STANDING)
-            limit = math.inf if free else least + WORTHLESS
+            free = block == blocks or (block == 0 and lane == BRAKING_LANE)
+            limit = math.inf if free else least + WORTHLESS_MARGIN
             of[lane] = price(model, outline, weights, scene, dt, rooms, states, lane, limit)
             least = min(least, of[lane])
-    taken = best if found[mean] > found[best] + WORSE else mean
+    taken = best if found[mean] > found[best] + MEAN_MARGIN else mean
     commands, track = _of_lane(plans[blocks], states, taken)
-    return commands, track, found[taken], costs[0, STANDING]
+    return commands, track, found[taken], costs[0, BRAKING_LANE]
 
 
 @kernel
@@ -171,9 +250,9 @@ def _gather(plans: Floats, costs: Floats, shares: Floats, mean: int, best: int) 
         counts = False
         for lane in range(LANES):
             worse = costs[block, lane] - least
-            shares[lane] = math.exp(-worse / TEMPERATURE) if worse < WORTHLESS else 0.0
+            shares[lane] = math.exp(-worse / TEMPERATURE) if worse < WORTHLESS_MARGIN else 0.0
             total += shares[lane]
-            counts |= worse < WORTHLESS
+            counts |= worse < WORTHLESS_MARGIN
         if counts:
             for n in range(steps * axes):
                 one, sums = plans[block, n // axes, n % axes], gathered[n // axes, n % axes]
@@ -188,7 +267,7 @@ def _gather(plans: Floats, costs: Floats, shares: Floats, mean: int, best: int) 
         sums[best] = plans[top // LANES, n // axes, n % axes, top % LANES]
 
 
-def step_of(model: Model) -> float:
+def step_of(model: MotionModel) -> float:
     """How long one step of a plan is [s]: slow bodies look farther ahead."""
     return max(0.05, min(0.1, 0.1 / model.forward))
 

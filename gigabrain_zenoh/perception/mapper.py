@@ -27,10 +27,10 @@ from gigabrain_zenoh.host.bounded import NewestValues
 from gigabrain_zenoh.host.threads import InTime, done
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.autosave import Autosave, refuse
-from gigabrain_zenoh.mapping.fusion import Fusion, Moment, way
-from gigabrain_zenoh.mapping.known import Chart, KnownMap
-from gigabrain_zenoh.mapping.localizer import Place, View
-from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.keyframes import Scan, View
+from gigabrain_zenoh.mapping.localizer import Place
+from gigabrain_zenoh.mapping.odometry import Fusion, Moment, way
+from gigabrain_zenoh.mapping.static_map import Chart, KnownMap
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ def chart_of(config: PerceptionConfig, in_time: InTime = done) -> Chart:
         if problem := map_file.what_is_wrong(saved):
             raise ConfigError(f"{path}: {problem}; expected one to find the way in")
         return KnownMap(saved, in_time=in_time)
-    from gigabrain_zenoh.mapping.growing import GrowingMap  # imports gtsam: for slam only
+    from gigabrain_zenoh.mapping.slam_map import GrowingMap  # imports gtsam: for slam only
 
     if path:
         graph = map_file.load_graph(path)
@@ -144,7 +144,7 @@ class Mapper:
 
     def _go_on(self, autosave: Autosave, boot: int) -> None:
         """Resume the newest intact map that was saved during this run of the driver, if any."""
-        from gigabrain_zenoh.mapping.growing import GrowingMap  # imports gtsam, as above
+        from gigabrain_zenoh.mapping.slam_map import GrowingMap  # imports gtsam, as above
 
         for head, arrays in autosave.found(boot):
             last = None if head.place is None else np.array(head.place)

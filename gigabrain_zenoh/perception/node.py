@@ -19,15 +19,15 @@ from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.geometry.placed_scans import PlacedScans
 from gigabrain_zenoh.geometry.scan import EDGE, Floats, blind_ahead, hits, scan_problem
-from gigabrain_zenoh.kernels.compiling import compiled
-from gigabrain_zenoh.perception.obstacles.surroundings import Surroundings
+from gigabrain_zenoh.kernels.precompile import ensure_compiled
+from gigabrain_zenoh.perception.obstacle_tracker import Surroundings
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.perception.mapper import Mapper
 
-MAP_KERNELS = "gigabrain_zenoh.mapping.warm:warm_up"  # calls each kernel once, to compile it
-LOCALIZE_KERNELS = "gigabrain_zenoh.mapping.warm:warm_up_finding"
+MAP_KERNELS = "gigabrain_zenoh.mapping.slam_map:warm_up"  # calls each kernel once, to compile it
+LOCALIZE_KERNELS = "gigabrain_zenoh.mapping.static_map:warm_up"
 
 
 def step(config: PerceptionConfig, body: BodyDescription, scan: LaserScan) -> WorldModel:
@@ -108,7 +108,7 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
         ready()
         await bus.failed
         return
-    await compiled(MAP_KERNELS if config.mapping == "slam" else LOCALIZE_KERNELS)
+    await ensure_compiled(MAP_KERNELS if config.mapping == "slam" else LOCALIZE_KERNELS)
     from gigabrain_zenoh.perception.mapper import Mapper  # imports numba: for maps only
 
     with closing(Mapper(config, bus, body)) as mapper:

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import TICK_NS, Cause
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.safety import lag, scan_lag
 from gigabrain_zenoh.safety.lag import Lag
 from gigabrain_zenoh.safety.scan_lag import ScanLag

@@ -15,7 +15,7 @@ from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.geometry.planar import relative
+from gigabrain_zenoh.geometry.pose import relative
 from gigabrain_zenoh.geometry.scan import Floats
 from gigabrain_zenoh.geometry.sweep import depth, edges, radius
 

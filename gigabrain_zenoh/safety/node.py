@@ -9,7 +9,7 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import SAFETY, STATE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.gate.causes import in_words
-from gigabrain_zenoh.geometry.ages import REPEAT_TICKS
+from gigabrain_zenoh.geometry.stopping import REPEAT_TICKS
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime.heartbeat import Progress
 from gigabrain_zenoh.safety.host import HostWatch, Look

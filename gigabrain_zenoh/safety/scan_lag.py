@@ -17,7 +17,7 @@ from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory
 
 Floats = NDArray[np.float64]
 

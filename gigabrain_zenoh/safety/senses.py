@@ -27,7 +27,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.bus.freshness import LEAD_TICKS, PreviousTick
 from gigabrain_zenoh.gate.state import BRAIN
-from gigabrain_zenoh.geometry.ages import scan_limit_ns
+from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.safety.attitude import horizontal
 from gigabrain_zenoh.safety.host import Look
 from gigabrain_zenoh.safety.progress import SYSTEMS, Bases

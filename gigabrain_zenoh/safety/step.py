@@ -8,9 +8,9 @@ from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.geometry.ages import scan_limit_ns
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO
-from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory
+from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.safety import (
     attitude,
     following,

@@ -10,9 +10,9 @@ from gigabrain_schemas.base import TICK_NS, Cause, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.geometry.scan import Floats, blind_ahead, hits, scan_problem
-from gigabrain_zenoh.geometry.stop_zone import brakes
+from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.geometry.sweep import arc, straight, turning
 from gigabrain_zenoh.safety import looks, unknown
 from gigabrain_zenoh.safety.words import say

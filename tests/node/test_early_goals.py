@@ -15,7 +15,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import goal_server
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.kernels.compiling import compiled
+from gigabrain_zenoh.kernels.precompile import ensure_compiled
 from gigabrain_zenoh.testing.bus import NodeBench
 from tests.node.plane import ROOM, Plane, drawn
 
@@ -30,9 +30,9 @@ async def test_a_goal_is_taken_while_decision_still_gets_ready(
 
     async def compiled_later(warm_up: str) -> None:
         await warm.wait()
-        await compiled(warm_up)
+        await ensure_compiled(warm_up)
 
-    monkeypatch.setattr(goal_server, "compiled", compiled_later)
+    monkeypatch.setattr(goal_server, "ensure_compiled", compiled_later)
     told: list[TaskStatus] = []
     async with NodeBench(functools.partial(decision.run, NAVIGATE)) as bench:
         operator = Bus(bench.network.transport(), bench.clock, "operator")
@@ -88,10 +88,10 @@ async def test_a_goal_waits_until_it_is_sure_for_the_first_time_where_it_is() ->
 async def test_what_is_missing_is_named_with_what_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name in ("gigabrain_zenoh.kernels.kernel", "numba"):
+    for name in ("gigabrain_zenoh.kernels.jit", "numba"):
         monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ConfigError, match=r"pip install 'gigabrain-zenoh\[nav\]'"):
-        await compiled("gigabrain_zenoh.kernels.kernel:kernel")
+        await ensure_compiled("gigabrain_zenoh.kernels.jit:kernel")
 
 
 SERVES = """

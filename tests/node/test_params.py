@@ -19,7 +19,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.navigation.local import Goal, LocalPlanner
+from gigabrain_zenoh.navigation.local_planner import Goal, LocalPlanner
 from gigabrain_zenoh.runtime.deployment import load_deployment
 from gigabrain_zenoh.runtime.services import LOG_LEVEL, serve_params
 from gigabrain_zenoh.testing.bus import NodeBench

@@ -14,8 +14,8 @@ pytest.importorskip("numba")
 
 from gigabrain_zenoh.cli.warm import warm
 from gigabrain_zenoh.decision.goal_server import DRIVE_KERNELS
-from gigabrain_zenoh.kernels import compiling, numba_alone
-from gigabrain_zenoh.kernels import kernel as kernels
+from gigabrain_zenoh.kernels import jit, precompile
+from gigabrain_zenoh.kernels import jit as kernels
 from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
 from gigabrain_zenoh.plugins import find
 
@@ -45,18 +45,18 @@ def who(calls: Path) -> list[bool]:
 
 
 async def test_the_first_start_compiles_in_a_process_of_its_own(calls: Path) -> None:
-    await compiling.compiled(WARM_UP)
+    await precompile.ensure_compiled(WARM_UP)
     assert who(calls) == [False, True]
-    await compiling.compiled(WARM_UP)
+    await precompile.ensure_compiled(WARM_UP)
     assert who(calls) == [False, True, True]
 
 
 async def test_after_a_change_of_any_kernel_it_does_so_again(
     calls: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    await compiling.compiled(WARM_UP)
+    await precompile.ensure_compiled(WARM_UP)
     monkeypatch.setattr(kernels, "PACKAGE", tmp_path)
-    await compiling.compiled(WARM_UP)
+    await precompile.ensure_compiled(WARM_UP)
     assert who(calls) == [False, True, False, True]
 
 
@@ -65,7 +65,7 @@ async def test_where_nothing_can_be_kept_it_compiles_here(
 ) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "below"))
-    await compiling.compiled(WARM_UP)
+    await precompile.ensure_compiled(WARM_UP)
     assert who(calls) == [True]
 
 
@@ -73,7 +73,7 @@ def test_what_was_compiled_beforehand_is_not_compiled_at_the_start(calls: Path) 
     mark = kernels.mark_of(WARM_UP)
     assert mark
     assert not mark.exists()
-    compiling.compile_all(WARM_UP)
+    precompile.compile_all(WARM_UP)
     assert mark.exists()
 
 
@@ -92,8 +92,8 @@ def test_what_is_compiled_beforehand_is_what_each_process_calls(
         tried.append(warm_up)
         return code
 
-    monkeypatch.setattr(compiling, "in_child", in_child)
-    monkeypatch.setattr(compiling, "compile_all", done.append)
+    monkeypatch.setattr(precompile, "compile_in_child", in_child)
+    monkeypatch.setattr(precompile, "compile_all", done.append)
     warm()
     assert sorted(tried) == sorted((MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS))
     assert done == (tried if code else [])  # what a child cannot do
@@ -101,14 +101,14 @@ def test_what_is_compiled_beforehand_is_what_each_process_calls(
 
 
 def test_a_child_that_fails_says_so(calls: Path) -> None:
-    assert asyncio.run(compiling.in_child(WARM_UP)) == 0
+    assert asyncio.run(precompile.compile_in_child(WARM_UP)) == 0
     assert who(calls) == [False]
-    assert asyncio.run(compiling.in_child("counted:nothing")) == 1
+    assert asyncio.run(precompile.compile_in_child("counted:nothing")) == 1
 
 
 ALONE = """
 import importlib, sys
-from gigabrain_zenoh.kernels import kernel as kernels
+from gigabrain_zenoh.kernels import jit as kernels
 @kernels.kernel
 def double(x):
     return 2 * x
@@ -120,7 +120,7 @@ for name in sys.argv[1:]:
 
 
 def test_numba_imports_nothing_that_we_do_not_use_and_hides_nothing_for_good() -> None:
-    there = [name for name in numba_alone.UNUSED if find_spec(name.partition(".")[0])]
+    there = [name for name in jit.UNUSED if find_spec(name.partition(".")[0])]
     assert "coverage" in there
     command = (sys.executable, "-c", ALONE, *there)
     done = subprocess.run(command, capture_output=True, text=True)
@@ -130,8 +130,8 @@ def test_numba_imports_nothing_that_we_do_not_use_and_hides_nothing_for_good() -
 FINDING = """
 import sys
 import gigabrain_zenoh.perception.mapper
-from gigabrain_zenoh.mapping.warm import warm_up_finding
-warm_up_finding()
+from gigabrain_zenoh.mapping.static_map import warm_up
+warm_up()
 print("gtsam" in sys.modules)
 """
 
@@ -149,12 +149,12 @@ def test_the_child_imports_nothing_from_the_current_folder(
     for name in ("msgspec", "signal", "gigabrain_schemas"):
         (here / f"{name}.py").write_text(f"open({str(here / 'was_run')!r}, 'w')\n")
     monkeypatch.chdir(here)
-    assert asyncio.run(compiling.in_child(WARM_UP)) == 0
+    assert asyncio.run(precompile.compile_in_child(WARM_UP)) == 0
     assert not (here / "was_run").exists()
     assert who(calls) == [False]
 
 
 def test_why_the_child_failed_is_in_the_log(calls: Path, caplog: pytest.LogCaptureFixture) -> None:
-    assert asyncio.run(compiling.in_child("counted:nothing")) == 1
+    assert asyncio.run(precompile.compile_in_child("counted:nothing")) == 1
     (said,) = (record.getMessage() for record in caplog.records if "compil" in record.getMessage())
     assert said.endswith("AttributeError: module 'counted' has no attribute 'nothing'")

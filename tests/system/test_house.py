@@ -38,7 +38,11 @@ def add(path: Path, text: str) -> None:
 @pytest.mark.parametrize(
     ("where", "statement", "contract"),
     [
-        ("safety/step.py", "from gigabrain_zenoh.mapping.field import OCCUPIED", "safety trusts"),
+        (
+            "safety/step.py",
+            "from gigabrain_zenoh.mapping.likelihood_field import OCCUPIED",
+            "safety trusts",
+        ),
         ("mapping/slam.py", "def late():\n    import gigabrain_zenoh.bus.bus", "gate, geometry"),
         ("host/heap.py", "from gigabrain_zenoh.bus.bus import Bus", "each room"),
         (

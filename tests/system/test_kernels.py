@@ -10,7 +10,7 @@ from gigabrain_zenoh.testing.processes import SOURCES
 
 numba = pytest.importorskip("numba")
 
-from gigabrain_zenoh.kernels import kernel as kernels  # noqa: E402
+from gigabrain_zenoh.kernels import jit as kernels  # noqa: E402
 
 
 def test_a_change_in_any_source_with_kernels_asks_for_a_folder_of_its_own(
@@ -36,7 +36,7 @@ def test_where_nothing_can_be_written_it_is_compiled_all_the_same(tmp_path: Path
         "NUMBA_CACHE_DIR": str(no_folder / "below"),
     }
     code = (
-        "import numba; from gigabrain_zenoh.kernels.kernel import kernel\n"
+        "import numba; from gigabrain_zenoh.kernels.jit import kernel\n"
         "@kernel\ndef double(x: int) -> int:\n    return 2 * x\n"
         "print(double(21))"
     )

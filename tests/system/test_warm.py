@@ -5,8 +5,8 @@ DRIVE = """
 import importlib, pkgutil
 from numba.core.registry import CPUDispatcher
 from gigabrain_zenoh import mapping
-from gigabrain_zenoh.qa.bench.slam_world import tour
-from gigabrain_zenoh.mapping.warm import warm_up
+from gigabrain_zenoh.qa.bench.slam_world import map_world
+from gigabrain_zenoh.mapping.slam_map import warm_up
 
 def compiled():
     inside = pkgutil.iter_modules(mapping.__path__, mapping.__name__ + ".")
@@ -21,7 +21,7 @@ def compiled():
 
 warm_up()
 before = compiled()
-tour("turtlebot3_waffle", "house", 0, 0.5, lambda _: None)
+map_world("turtlebot3_waffle", "house", 0, 0.5, lambda _: None)
 print(len(before), sorted(compiled() - before))
 """
 

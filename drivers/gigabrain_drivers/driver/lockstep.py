@@ -6,7 +6,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.gate.causes import BRAIN_SILENT
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.geometry.ages import REPEAT_TICKS
+from gigabrain_zenoh.geometry.stopping import REPEAT_TICKS
 
 TIMEOUT_S = 0.15  # of wall time per tick
 REPEAT_S = 0.1  # how often the first tick is announced until the brain is there

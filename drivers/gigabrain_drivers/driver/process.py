@@ -37,8 +37,8 @@ from gigabrain_zenoh.config.settings import DriverConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
-from gigabrain_zenoh.geometry.ages import scan_limit_ns
 from gigabrain_zenoh.geometry.limits import ZERO, limits_of
+from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)

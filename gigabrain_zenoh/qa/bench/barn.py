@@ -30,10 +30,16 @@ from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of, ramp
 from gigabrain_zenoh.host.bounded import percentile
-from gigabrain_zenoh.navigation import local
-from gigabrain_zenoh.navigation.local import Goal, LocalPlanner, LocalSettings, Moment, Sent
+from gigabrain_zenoh.navigation import local_planner
+from gigabrain_zenoh.navigation.local_planner import (
+    Goal,
+    LocalPlanner,
+    LocalSettings,
+    PlanRequest,
+    SentCommand,
+)
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.perception.obstacles.surroundings import Surroundings
+from gigabrain_zenoh.perception.obstacle_tracker import Surroundings
 from gigabrain_zenoh.qa.bench.barn_course import BarnCourse, BarnTrial, BarnWorld
 from gigabrain_zenoh.qa.bench.plant import HARD, IDEAL, JACKAL, LIDAR, MUJOCO, Conditions
 from gigabrain_zenoh.qa.in_memory_robot import InMemoryRobot, node_of
@@ -108,7 +114,7 @@ def measure_barn(
 
 def _get_ready() -> None:
     """As a robot's process before it drives: all is compiled, and what is there no garbage."""
-    local.warm_up(JACKAL)
+    local_planner.warm_up(JACKAL)
     gc.collect()
     gc.freeze()
 
@@ -225,7 +231,7 @@ class BarnBrain:
     def _decide(self, state: RobotState, world: WorldModel) -> Intent:
         began = time.thread_time()
         sent = self._response.sent(state.tick - SENT_TICKS, state.tick - 1)
-        moment = Moment(
+        moment = PlanRequest(
             tick=state.tick,
             pose=state.pose,
             velocity=state.velocity,
@@ -233,7 +239,7 @@ class BarnBrain:
             hits=hits(world).astype(np.float64),
             obstacles=world.obstacles,
             response=self._response.response,
-            sent=tuple(Sent(tick, velocity) for tick, velocity in sent),
+            sent=tuple(SentCommand(tick, velocity) for tick, velocity in sent),
         )
         plan = self._planner.plan(moment)
         self.cycles_ms.append((time.thread_time() - began) * 1e3)

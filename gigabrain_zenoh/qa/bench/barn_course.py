@@ -14,7 +14,7 @@ from gigabrain_schemas.base import TICK_NS, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.navigation.moment import Goal
+from gigabrain_zenoh.navigation.local_planner import Goal
 from gigabrain_zenoh.qa.bench.plant import (
     FIELD_OF_VIEW_RAD,
     JACKAL,

@@ -22,10 +22,10 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
-from gigabrain_zenoh.geometry.planar import compose, inverse, wrapped
+from gigabrain_zenoh.geometry.pose import compose, inverse, wrap_angle
 from gigabrain_zenoh.navigation.costmap import costmap, inflation
-from gigabrain_zenoh.navigation.planner import Point, warm_up
-from gigabrain_zenoh.navigation.search import Search
+from gigabrain_zenoh.navigation.global_planner import Point, warm_up
+from gigabrain_zenoh.navigation.grid_search import GridSearch
 from gigabrain_zenoh.qa.bench.growth import GrowthSampler, MapGrowth
 from gigabrain_zenoh.qa.robot_under_test import (
     LOOPBACK,
@@ -236,7 +236,7 @@ class GoalSender:
         self._bus, self._group, self._tasks = bus, group, Tasks(bus, silent_s=MAX_SILENCE_S)
         self._maps, self._poses, self._bodies = bus.latest(MAP), bus.latest(POSE), bus.latest(BODY)
         self._states = bus.latest(STATE)  # also: which start of the driver all else has to be of
-        self._random, self._search = np.random.default_rng(seed), Search()
+        self._random, self._search = np.random.default_rng(seed), GridSearch()
         self._world_from_map: Pose | None = None
         self._watch = GrowthSampler()
         self.sent = self.reached = 0
@@ -332,7 +332,7 @@ class GoalSender:
         assert self._world_from_map
         there = compose(self._world_from_map, Pose(x=goal.x, y=goal.y, yaw=goal.yaw or 0.0))
         truth = await self._true_pose()
-        turn = None if goal.yaw is None else abs(wrapped(truth.yaw - there.yaw))
+        turn = None if goal.yaw is None else abs(wrap_angle(truth.yaw - there.yaw))
         return GoalError(math.hypot(truth.x - there.x, truth.y - there.y), turn)
 
     async def _true_pose(self) -> Pose:

@@ -7,7 +7,7 @@ from msgspec import Struct
 
 from gigabrain_schemas.arrays import cells
 from gigabrain_schemas.brain import OccupancyGrid
-from gigabrain_zenoh.mapping.field import OCCUPIED
+from gigabrain_zenoh.mapping.likelihood_field import OCCUPIED
 
 WARM_UP = 0.25  # share of the time that the slope leaves out: six hours of eight are judged
 MINUTES_PER_HOUR = 60  # minutes

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.navigation.costmap import Costmap, Costs, Inflation, costmap
-from gigabrain_zenoh.navigation.planner import Path, Planner, Point, warm_up
-from gigabrain_zenoh.navigation.search import Ints, Search
+from gigabrain_zenoh.navigation.global_planner import GlobalPlanner, Path, Point, warm_up
+from gigabrain_zenoh.navigation.grid_search import GridSearch, Ints
 from gigabrain_zenoh.qa.bench.plan_maps import grid_of, office, scattered, something_new
 
 RULES = Inflation(fits=0.2, turns=0.3)
@@ -110,7 +110,7 @@ def _measure(
     size: int, queries: int, rng: np.random.Generator
 ) -> tuple[SizeFigures, Costmap, list[Path]]:
     cells = office(size, rng)
-    grid, planner = grid_of(cells), Planner()
+    grid, planner = grid_of(cells), GlobalPlanner()
     made, anew, changed, first = costmap(grid, RULES), Stopwatch(), Stopwatch(), Stopwatch()
     asked = list(itertools.islice(_queries(made, planner.search, rng), queries))
     for i in range(ROUNDS):
@@ -143,7 +143,7 @@ def _measure(
     return SizeFigures(size=size, path_m=length, timings=timings, ratio=worst), made, paths
 
 
-def _queries(made: Costmap, search: Search, rng: np.random.Generator) -> Iterator[Query]:
+def _queries(made: Costmap, search: GridSearch, rng: np.random.Generator) -> Iterator[Query]:
     """Starts and goals as far apart as wanted, by Dijkstra."""
     wanted = SHARE * len(made.cost)
     open_ = np.argwhere(made.cost < 2)
@@ -170,7 +170,7 @@ def _corner_to_corner(
     size: int, rng: np.random.Generator, ratios: list[float]
 ) -> tuple[Timing, Timing]:
     """A* and a whole field of Dijkstra's over a random map; their ratio joins `ratios`."""
-    cost, search, one, all_ = scattered(size, rng), Search(), Stopwatch(), Stopwatch()
+    cost, search, one, all_ = scattered(size, rng), GridSearch(), Stopwatch(), Stopwatch()
     goal = (size - 1, size - 1)
     for _ in range(ROUNDS):
         with one:

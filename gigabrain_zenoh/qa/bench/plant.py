@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Lidar, Thresholds
 from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.kernels.kernel import kernel
+from gigabrain_zenoh.kernels.jit import kernel
 
 Floats = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.se2 import Floats, between, compose, inverse, transform
 from gigabrain_zenoh.host.posix import resource
-from gigabrain_zenoh.mapping import arrays_file
-from gigabrain_zenoh.mapping.points import Scan, from_beams
+from gigabrain_zenoh.mapping import map_file
+from gigabrain_zenoh.mapping.keyframes import Scan, from_beams
 from gigabrain_zenoh.mapping.slam import Estimate, Slam
 from gigabrain_zenoh.qa.judging import Latencies, latencies
 
@@ -60,7 +60,7 @@ class RelationErrors(Struct, frozen=True, kw_only=True):
 
 def load(path: Path) -> LaserLog:
     """The log in an .npz file: `ranges` [cm], `ref` and `odom`. Raises ConfigError."""
-    arrays = arrays_file.read(path, "no laser log")
+    arrays = map_file.read_arrays(path, "no laser log")
     if missing := set(FIELDS) - arrays.keys():
         raise ConfigError(f"{path}: no {', '.join(sorted(missing))}; expected {', '.join(FIELDS)}")
     ranges, reference, odometry = (arrays[name] for name in FIELDS)

@@ -17,8 +17,8 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.se2 import Floats, between, compose, inverse
-from gigabrain_zenoh.mapping.fusion import Fusion, Moment, way
-from gigabrain_zenoh.mapping.growing import GrowingMap
+from gigabrain_zenoh.mapping.odometry import Fusion, Moment, way
+from gigabrain_zenoh.mapping.slam_map import GrowingMap
 from gigabrain_zenoh.perception.mapper import view_of
 from gigabrain_zenoh.qa.bench.growth import GrowthSampler, MapGrowth
 from gigabrain_zenoh.qa.bench.slam_logs import DOTS_PER_INCH, DRIVEN, REFERENCE, SIDE_INCHES

@@ -15,7 +15,7 @@ from gigabrain_schemas.topics import GOAL, HEALTH, INTENT
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.decision.goal_server import DRIVE_KERNELS
-from gigabrain_zenoh.kernels.compiling import compiled
+from gigabrain_zenoh.kernels.precompile import ensure_compiled
 from gigabrain_zenoh.perception.node import MAP_KERNELS
 from gigabrain_zenoh.qa.judging import Figure, Limit, table_of
 from gigabrain_zenoh.qa.robot_under_test import (
@@ -160,7 +160,7 @@ async def measure_first_goal(body: str, world: str, say: Callable[[str], None]) 
     process dies.
     """
     for warm_up in (MAP_KERNELS, DRIVE_KERNELS):
-        await compiled(warm_up)
+        await ensure_compiled(warm_up)
     deployment = Deployment(
         body=body, world=world, resume="auto", router=LOOPBACK,
         perception=PerceptionConfig(mapping="slam"), decision=DecisionConfig(behaviour="navigate"),

@@ -11,7 +11,7 @@ from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, CmdVel, Intent, TrajectoryPoint
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_zenoh.control.node import Inputs, Memory, step
-from gigabrain_zenoh.geometry.planar import compose, relative
+from gigabrain_zenoh.geometry.pose import compose, relative
 from gigabrain_zenoh.testing.samples import WAFFLE, state
 
 AGILE = replace(

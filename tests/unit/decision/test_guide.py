@@ -18,7 +18,7 @@ from gigabrain_zenoh.decision.route import (
     RouteRequest,
 )
 from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand
-from gigabrain_zenoh.navigation.planner import Unreachable
+from gigabrain_zenoh.navigation.global_planner import Unreachable
 from tests.unit.navigation.drives import WAFFLE
 from tests.unit.navigation.grids import empty, grid_of
 

@@ -6,7 +6,7 @@ import pytest
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.host.threads import ScheduledWorker
-from gigabrain_zenoh.mapping.growing import GrowingMap
+from gigabrain_zenoh.mapping.slam_map import GrowingMap
 from tests.unit.mapping.houses import HALL, HOUSE, PATIENCE_S, Rooms, Walker, at, error, grown
 
 START = (1.0, 2.5)

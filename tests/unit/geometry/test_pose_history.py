@@ -5,8 +5,7 @@ import math
 import pytest
 
 from gigabrain_schemas.base import Pose
-from gigabrain_zenoh.geometry.planar import compose, inverse, relative
-from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory, compose, inverse, relative
 from gigabrain_zenoh.testing.samples import BOOT, state
 
 

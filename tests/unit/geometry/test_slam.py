@@ -8,7 +8,7 @@ import pytest
 
 from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose
 from gigabrain_zenoh.mapping.front_end import FEW
-from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.keyframes import Scan
 from gigabrain_zenoh.mapping.slam import Estimate, Slam
 from tests.unit.mapping.rooms import Lidar, Walls, box, dead_reckoned, drifting, line
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from gigabrain_schemas.body import BodyDescription, Thresholds
-from gigabrain_zenoh.geometry.stop_zone import Brake, brakes
+from gigabrain_zenoh.geometry.stopping import Brake, brakes
 from gigabrain_zenoh.testing.samples import WAFFLE
 
 

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between
-from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.keyframes import Scan, seen_through
 from gigabrain_zenoh.mapping.slam import Slam
-from gigabrain_zenoh.mapping.visibility import seen_through
 from tests.unit.mapping.rooms import Lidar, box, drifting, line
 
 ROOM = np.array([*box(-3, -2, 6, 4), *box(1, 0.5, 0.6, 0.4)])

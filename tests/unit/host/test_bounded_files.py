@@ -25,7 +25,7 @@ from gigabrain_zenoh.decision.tasks import mission
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.diagnostics import log_reading
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.mapping import arrays_file, map_file
+from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.qa.bench import slam_logs
 from gigabrain_zenoh.qa.faults.rig.rig import Options
 from gigabrain_zenoh.qa.faults.suite import RunsFile
@@ -243,7 +243,7 @@ def test_the_directory_of_a_zip_is_not_read_where_it_is_large(tmp_path: Path, co
 
 def test_a_map_too_large_to_be_read_again_is_not_written() -> None:
     with pytest.raises(ValueError, match="it holds 88 MB; at most 80 MB can be read"):
-        arrays_file.write(io.BytesIO(), {"hits": np.zeros(11_000_000)}, compress=False)
+        map_file.write_arrays(io.BytesIO(), {"hits": np.zeros(11_000_000)}, compress=False)
 
 
 def record(opcode: int, content: bytes) -> bytes:

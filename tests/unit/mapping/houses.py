@@ -6,12 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, compose
-from gigabrain_zenoh.mapping.grid import CELL, Grid
-from gigabrain_zenoh.mapping.growing import GrowingMap
-from gigabrain_zenoh.mapping.known import KnownMap
-from gigabrain_zenoh.mapping.localizer import Place, View
+from gigabrain_zenoh.mapping.keyframes import Scan, View
+from gigabrain_zenoh.mapping.localizer import Place
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.mapping.points import Scan
+from gigabrain_zenoh.mapping.occupancy_grid import CELL, Grid
+from gigabrain_zenoh.mapping.slam_map import GrowingMap
+from gigabrain_zenoh.mapping.static_map import KnownMap
 
 Wall = tuple[float, float, float, float]  # from x, y to x, y [m]
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_zenoh.geometry.se2 import Floats, compose
-from gigabrain_zenoh.mapping.points import Scan, from_beams
+from gigabrain_zenoh.mapping.keyframes import Scan, from_beams
 
 Walls = Floats  # (n, 4): x and y of both ends [m]
 

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import ImuData
-from gigabrain_zenoh.mapping.fusion import Fusion, uncertainty, way
+from gigabrain_zenoh.mapping.odometry import Fusion, uncertainty, way
 from gigabrain_zenoh.testing.samples import WAFFLE, state
 
 LEVEL = (0.0, 0.0, 0.0, 1.0)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.geometry.se2 import Floats, between, compose
-from gigabrain_zenoh.mapping import graph
-from gigabrain_zenoh.mapping.graph import Graph
-from gigabrain_zenoh.mapping.growing import GrowingMap
-from gigabrain_zenoh.mapping.keyframe import Edge
+from gigabrain_zenoh.mapping import pose_graph
+from gigabrain_zenoh.mapping.keyframes import Edge
+from gigabrain_zenoh.mapping.pose_graph import Graph
+from gigabrain_zenoh.mapping.slam_map import GrowingMap
 from tests.unit.mapping.houses import HOUSE, PATIENCE_S, Rooms, at, error, grown
 
 SURE = np.diag((0.05, 0.05, 0.01)) ** 2
@@ -40,11 +40,11 @@ class Failing:
 
 @pytest.fixture
 def fail(monkeypatch: pytest.MonkeyPatch) -> Callable[[Plan], None]:
-    real = graph._optimiser
+    real = pose_graph._optimiser
 
     def planned(plan: Plan) -> None:
         calls = [0]
-        monkeypatch.setattr(graph, "_optimiser", lambda s: Failing(real(s), s, plan, calls))
+        monkeypatch.setattr(pose_graph, "_optimiser", lambda s: Failing(real(s), s, plan, calls))
 
     return planned
 
@@ -93,7 +93,7 @@ def off(found: Graph, other: Graph) -> float:
 def test_an_optimiser_that_raises_once_is_rebuilt_and_no_loop_is_lost(
     call: int, fail: Callable[[Plan], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(graph, "PIECE", 10)  # so that loops settle in several pieces
+    monkeypatch.setattr(pose_graph, "PIECE", 10)  # so that loops settle in several pieces
     undisturbed = driven()
     fail(lambda number, _: number == call)
     found = driven()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.mapping import grid as grids
-from gigabrain_zenoh.mapping.grid import Grid
+from gigabrain_zenoh.mapping import occupancy_grid as grids
+from gigabrain_zenoh.mapping.occupancy_grid import Grid
 from tests.unit.mapping.houses import HOUSE, Rooms, at
 
 NONE = np.empty((0, 2), np.float32)

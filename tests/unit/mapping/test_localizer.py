@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.mapping.field import field_of, fit
-from gigabrain_zenoh.mapping.known import KnownMap
-from gigabrain_zenoh.mapping.likeness import alike
+from gigabrain_zenoh.mapping.global_localization import Candidate, search
+from gigabrain_zenoh.mapping.likelihood_field import field_of, fit, matches_itself
 from gigabrain_zenoh.mapping.localizer import Localizer
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.mapping.relocalize import Candidate, search
+from gigabrain_zenoh.mapping.static_map import KnownMap
 from tests.unit.mapping.houses import (
     BEAMS,
     CORRIDOR,
@@ -145,10 +144,10 @@ def test_in_a_hall_that_is_the_same_from_both_ends_neither_is_believed(reach: in
 def test_a_hall_goes_on_as_itself_turned_about() -> None:
     half = hall(9)
     field = field_of(half.cells, half.resolution, (half.origin_x, half.origin_y))
-    assert alike(field, at(16.0, 6.0, 180))
-    assert not alike(field, at(15.0, 6.0, 180))
-    assert not alike(field, at(-3.5, 0.0))  # but for its long walls
-    assert not alike(field, at(-20.0, 0.0))  # nothing comes to lie on anything
+    assert matches_itself(field, at(16.0, 6.0, 180))
+    assert not matches_itself(field, at(15.0, 6.0, 180))
+    assert not matches_itself(field, at(-3.5, 0.0))  # but for its long walls
+    assert not matches_itself(field, at(-20.0, 0.0))  # nothing comes to lie on anything
 
 
 def test_where_it_was_known_to_be_last_stays_a_place_if_it_explains_what_is_seen() -> None:

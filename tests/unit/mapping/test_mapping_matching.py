@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats
-from gigabrain_zenoh.mapping.correlative import Window, search
+from gigabrain_zenoh.mapping.keyframes import Scan, from_beams
 from gigabrain_zenoh.mapping.local_map import LocalMap, build
-from gigabrain_zenoh.mapping.matching import icp
-from gigabrain_zenoh.mapping.points import Scan, from_beams
+from gigabrain_zenoh.mapping.scan_matching import Window, icp, search
 from tests.unit.mapping.rooms import Lidar, box
 
 ROOM = np.array([*box(-3, -2, 6, 4), *box(1, 0.5, 0.6, 0.4)])

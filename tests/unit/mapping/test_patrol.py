@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between
-from gigabrain_zenoh.mapping.familiar import Ground
-from gigabrain_zenoh.mapping.growing import GrowingMap
-from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
-from gigabrain_zenoh.mapping.localizer import View
+from gigabrain_zenoh.mapping.keyframes import Edge, Keyframe, Scan, View
 from gigabrain_zenoh.mapping.map_file import SavedMap
-from gigabrain_zenoh.mapping.points import Scan
-from gigabrain_zenoh.mapping.sweeps import Sweeps
+from gigabrain_zenoh.mapping.occupancy_grid import Sweeps
+from gigabrain_zenoh.mapping.slam import Ground
+from gigabrain_zenoh.mapping.slam_map import GrowingMap
 from tests.unit.mapping.houses import HOUSE, PATIENCE_S, Rooms, Walker, at, box, error
 
 START = (1.0, 2.5)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.geometry.se2 import Floats, between, compose
-from gigabrain_zenoh.mapping.drift import Drift, Rates
-from gigabrain_zenoh.mapping.keyframe import Edge, Keyframe
-from gigabrain_zenoh.mapping.places import PlaceSearch
+from gigabrain_zenoh.mapping.keyframes import Edge, Keyframe
+from gigabrain_zenoh.mapping.loop_closure import PlaceSearch
+from gigabrain_zenoh.mapping.pose_graph import Drift, Rates
 from tests.unit.geometry.test_slam import BLOCK, lap
 from tests.unit.mapping.rooms import Lidar, Walls, box, line
 

@@ -11,15 +11,15 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.brain import ActuationModel, Obstacle
 from gigabrain_zenoh.geometry.sweep import depth, edges
-from gigabrain_zenoh.navigation.local import (
+from gigabrain_zenoh.navigation.local_planner import (
     Goal,
     LocalPlan,
     LocalPlanner,
     LocalSettings,
-    Moment,
-    Sent,
+    PlanRequest,
+    SentCommand,
 )
-from gigabrain_zenoh.navigation.models import answer, lag_of
+from gigabrain_zenoh.navigation.motion_model import lag_of, lagged_step
 
 Floats = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ class Drive:
         self.pose = Pose(x=0.0, y=0.0, yaw=0.0)
         self.velocity = Velocity()
         self._queue = deque([Velocity()] * round(response.delay / TICK_S))
-        self._sent: deque[Sent] = deque(maxlen=25)
+        self._sent: deque[SentCommand] = deque(maxlen=25)
         self.tick = 0
         self.least = math.inf  # [m], from any wall or disc
         self.plans: list[LocalPlan] = []
@@ -101,12 +101,12 @@ class Drive:
                 self._tick(plan.twist)
         return self.plans[-1]
 
-    def moment(self) -> Moment:
+    def moment(self) -> PlanRequest:
         """What it sees now."""
         cosine, sine = math.cos(self.pose.yaw), math.sin(self.pose.yaw)
         off = self.walls - (self.pose.x, self.pose.y)
         hits = off @ np.array(((cosine, -sine), (sine, cosine)))
-        return Moment(
+        return PlanRequest(
             tick=self.tick,
             pose=self.pose,
             velocity=self.velocity,
@@ -118,12 +118,12 @@ class Drive:
         )
 
     def _tick(self, command: Velocity) -> None:
-        self._sent.append(Sent(self.tick, command))
+        self._sent.append(SentCommand(self.tick, command))
         self._queue.append(command)
         told, lag = self._queue.popleft(), lag_of(self.response.lag, TICK_S)
-        vx, ahead = answer(self.velocity.linear_x, told.linear_x, lag, TICK_S)
-        vy, aside = answer(self.velocity.linear_y, told.linear_y, lag, TICK_S)
-        w, turned = answer(self.velocity.angular_z, told.angular_z, lag, TICK_S)
+        vx, ahead = lagged_step(self.velocity.linear_x, told.linear_x, lag, TICK_S)
+        vy, aside = lagged_step(self.velocity.linear_y, told.linear_y, lag, TICK_S)
+        w, turned = lagged_step(self.velocity.angular_z, told.angular_z, lag, TICK_S)
         middle = self.pose.yaw + 0.5 * turned
         self.pose = Pose(
             x=self.pose.x + math.cos(middle) * ahead - math.sin(middle) * aside,

@@ -9,15 +9,19 @@ import pytest
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Obstacle
-from gigabrain_zenoh.navigation import among
+from gigabrain_zenoh.navigation import cost, dynamic_obstacles
+from gigabrain_zenoh.navigation.cost import NO_DISC, Weights
 from gigabrain_zenoh.navigation.footprint import outline_of
-from gigabrain_zenoh.navigation.local import Goal, LocalPlan, LocalPlanner, LocalSettings, Moment
-from gigabrain_zenoh.navigation.models import model_of
+from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
+from gigabrain_zenoh.navigation.local_planner import (
+    Goal,
+    LocalPlan,
+    LocalPlanner,
+    LocalSettings,
+    PlanRequest,
+)
+from gigabrain_zenoh.navigation.motion_model import AWAY, CLOSE, COSINE, LANES, STATE, X, model_of
 from gigabrain_zenoh.navigation.mppi import Sampler
-from gigabrain_zenoh.navigation.rating import NO_DISC, Weights
-from gigabrain_zenoh.navigation.rollout import AWAY, CLOSE, COSINE, LANES, STATE, X
-from gigabrain_zenoh.navigation.window import Window
-from gigabrain_zenoh.navigation.window_cells import Place
 from gigabrain_zenoh.qa.bench.barn import drive_functions
 from gigabrain_zenoh.qa.bench.barn_course import BarnWorld, MovingDisc
 from gigabrain_zenoh.qa.bench.plant import HARD, JACKAL
@@ -26,7 +30,7 @@ from tests.unit.navigation.drives import OMNI, WAFFLE, wall
 NOTHING = np.empty((0, 2))
 NOBODY = np.empty((0, 6))
 FEW = LocalSettings(samples=128, window=6.0)
-LOOKED = round(among.LOOKS_S / 0.02) + 1  # ticks
+LOOKED = round(dynamic_obstacles.LOOK_AROUND_S / 0.02) + 1  # ticks
 
 
 def plans(body: BodyDescription, speed: float, cycles: int = 3) -> list[LocalPlan]:
@@ -39,7 +43,7 @@ def plans(body: BodyDescription, speed: float, cycles: int = 3) -> list[LocalPla
         somebody = Obstacle(id=1, x=1.5, y=y, velocity_y=speed, radius=0.3)
         made.append(
             planner.plan(
-                Moment(
+                PlanRequest(
                     tick=tick,
                     pose=Pose(x=0.0, y=0.0, yaw=0.0),
                     velocity=Velocity(),
@@ -59,7 +63,7 @@ def test_slow_bodies_and_those_among_what_is_slow_plan_as_ever(
     body: BodyDescription, speed: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here = plans(body, speed)
-    monkeypatch.setattr(among, "moving_quickly", lambda discs: discs[:0])
+    monkeypatch.setattr(dynamic_obstacles, "moving_quickly", lambda discs: discs[:0])
     assert plans(body, speed) == here
 
 
@@ -68,7 +72,7 @@ def test_a_quick_body_among_quick_things_looks_two_seconds_ahead(
 ) -> None:
     here = plans(JACKAL, 1.2)
     assert here[0].trajectory[-1].t == pytest.approx(2.0)
-    monkeypatch.setattr(among, "moving_quickly", lambda discs: discs[:0])
+    monkeypatch.setattr(dynamic_obstacles, "moving_quickly", lambda discs: discs[:0])
     there = plans(JACKAL, 1.2)
     assert there[0].trajectory[-1].t == pytest.approx(1.5)
     assert there != here
@@ -76,7 +80,7 @@ def test_a_quick_body_among_quick_things_looks_two_seconds_ahead(
 
 def test_a_quick_body_looks_round_before_it_first_drives_off() -> None:
     planner = LocalPlanner(JACKAL, FEW)
-    moment = Moment(
+    moment = PlanRequest(
         tick=100,
         pose=Pose(x=0.0, y=0.0, yaw=0.0),
         velocity=Velocity(),
@@ -98,7 +102,7 @@ def near(discs: list[tuple[float, ...]], seconds: float) -> tuple[float, float]:
     state = np.zeros(STATE)
     state[COSINE : COSINE + LANES] = 1.0
     state[X : X + LANES - 1] = 50.0  # the others are elsewhere
-    among.near_discs(weights, np.array(discs), outline_of(JACKAL.footprint), seconds, state)
+    cost.near_discs(weights, np.array(discs), outline_of(JACKAL.footprint), seconds, state)
     assert (state[AWAY], state[CLOSE]) == (NO_DISC, 0.0)
     return float(state[AWAY + LANES - 1]), float(state[CLOSE + LANES - 1])
 
@@ -127,7 +131,7 @@ def test_a_plan_goes_on_as_it_was_where_its_steps_become_longer() -> None:
 
 
 def test_what_moves_takes_its_hits_along_and_a_wall_beside_it_stays() -> None:
-    window, here = Window(4.0, 10.0), Place(0.0, 0.0, 0.0)
+    window, here = LocalCostmap(4.0, 10.0), Pose2D(0.0, 0.0, 0.0)
     beside = wall((0.4, 0.38), (1.6, 0.38))
     for tick in range(1, 40, 2):
         x = 1.5 - 0.02 * tick  # 1 m/s, towards the lidar

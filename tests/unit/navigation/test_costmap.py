@@ -7,8 +7,13 @@ import numpy as np
 import pytest
 
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_zenoh.navigation.costmap import Inflation, Unknown, costmap, inflation
-from gigabrain_zenoh.navigation.distance import squared_distance
+from gigabrain_zenoh.navigation.costmap import (
+    Inflation,
+    Unknown,
+    costmap,
+    inflation,
+    squared_distance,
+)
 from tests.unit.navigation.grids import drawn, empty, grid_of
 
 RULES = Inflation(fits=0.25, turns=0.45)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.navigation.costmap import Costmap, Inflation, costmap
-from gigabrain_zenoh.navigation.frontiers import frontiers, next_frontier
-from gigabrain_zenoh.navigation.search import Search
+from gigabrain_zenoh.navigation.global_planner import frontiers, next_frontier
+from gigabrain_zenoh.navigation.grid_search import GridSearch
 from tests.unit.navigation.grids import grid_of
 
 HERE = (1.05, 1.05)
@@ -23,13 +23,13 @@ def room(width: int = 40, height: int = 30) -> np.ndarray:
 
 
 def test_a_room_that_is_closed_and_known_is_mapped() -> None:
-    assert next_frontier(seen(room()), HERE, (), Search()) is None
+    assert next_frontier(seen(room()), HERE, (), GridSearch()) is None
 
 
 def test_the_edge_of_the_known_is_the_frontier() -> None:
     cells = room()
     cells[1:-1, 30:-1] = -1
-    found = next_frontier(seen(cells), HERE, (), Search())
+    found = next_frontier(seen(cells), HERE, (), GridSearch())
     assert found is not None
     assert (found.x, found.y) == pytest.approx((2.95, 1.45), abs=0.06)  # the middle of the edge
     assert found.size == pytest.approx(2.6)  # 2.8 m without what is too close to the walls
@@ -39,8 +39,8 @@ def test_the_edge_of_the_known_is_the_frontier() -> None:
 def test_the_nearer_of_two_alike_is_taken() -> None:
     cells = room(80)
     cells[1:-1, 1:4] = cells[1:-1, -10:-1] = -1
-    near = next_frontier(seen(cells), (1.05, 1.45), (), Search())
-    far = next_frontier(seen(cells), (6.55, 1.45), (), Search())
+    near = next_frontier(seen(cells), (1.05, 1.45), (), GridSearch())
+    far = next_frontier(seen(cells), (6.55, 1.45), (), GridSearch())
     assert near is not None
     assert far is not None
     assert (near.x, far.x) == pytest.approx((0.45, 6.95))
@@ -50,7 +50,7 @@ def test_a_larger_one_is_worth_some_way() -> None:
     cells = room(60)
     cells[1:-1, -6:-1] = -1  # 2.4 m of edge, 3 m away
     cells[10:16, 1:4] = -1  # 0.9 m of edge, 2 m away
-    found = next_frontier(seen(cells), (2.35, 1.35), (), Search())
+    found = next_frontier(seen(cells), (2.35, 1.35), (), GridSearch())
     assert found is not None
     assert found.x == pytest.approx(5.35)
 
@@ -60,26 +60,26 @@ def test_what_is_narrower_than_the_body_does_not_count() -> None:
     cells[10:12, 20] = -1  # 2 x 2 cells of edge about it, 0.3 m is the body
     cells[10, 20] = 0
     cells[20, 30] = -1
-    wide = frontiers(seen(cells), HERE, (), Search())
+    wide = frontiers(seen(cells), HERE, (), GridSearch())
     assert [one.size for one in wide if one.size < 0.3] == []
     cells[11, 20] = cells[20, 30] = 0
     cells[-1, 20:22] = -1  # a slit in the wall
-    assert next_frontier(seen(cells), HERE, (), Search()) is None
+    assert next_frontier(seen(cells), HERE, (), GridSearch()) is None
 
 
 def test_what_cannot_be_reached_does_not_count() -> None:
     cells = room(80)
     cells[:, 40] = 100
     cells[1:-1, 60:-1] = -1
-    assert next_frontier(seen(cells), HERE, (), Search()) is None
+    assert next_frontier(seen(cells), HERE, (), GridSearch()) is None
     cells[10:20, 40] = 0
-    assert next_frontier(seen(cells), HERE, (), Search()) is not None
+    assert next_frontier(seen(cells), HERE, (), GridSearch()) is not None
 
 
 def test_nothing_is_reached_through_what_is_unknown() -> None:
     cells = room(80)
     cells[1:-1, 40:50] = -1
-    found = frontiers(seen(cells), HERE, (), Search())
+    found = frontiers(seen(cells), HERE, (), GridSearch())
     assert [one.x for one in found] == pytest.approx([3.95])
 
 
@@ -87,7 +87,7 @@ def test_what_was_given_up_is_not_asked_for_again() -> None:
     """Giving up one place after another ends, whatever the map never shows."""
     cells = room()
     cells[1:-1, 30:-1] = -1
-    made, given_up, search = seen(cells), [], Search()
+    made, given_up, search = seen(cells), [], GridSearch()
     for _ in range(5):
         found = next_frontier(made, HERE, given_up, search)
         if found is None:
@@ -101,7 +101,7 @@ def test_what_was_given_up_is_not_asked_for_again() -> None:
 def test_a_place_of_the_blacklist_outside_the_map_takes_nothing_away() -> None:
     cells = room()
     cells[1:-1, 30:-1] = -1
-    made, search = seen(cells), Search()
+    made, search = seen(cells), GridSearch()
     anywhere = [(-9.0, -9.0), (99.0, 99.0), (-9.0, 1.0), (1.0, 99.0)]
     assert frontiers(made, HERE, anywhere, search) == frontiers(made, HERE, (), search)
 
@@ -109,13 +109,13 @@ def test_a_place_of_the_blacklist_outside_the_map_takes_nothing_away() -> None:
 def test_free_space_at_the_rim_of_the_map_goes_on() -> None:
     cells = room()
     cells[:, -1] = 0
-    found = next_frontier(seen(cells), HERE, (), Search())
+    found = next_frontier(seen(cells), HERE, (), GridSearch())
     assert found is not None
     assert found.x == pytest.approx(3.95)
 
 
 def test_a_robot_outside_the_map_sees_no_frontier() -> None:
-    assert frontiers(seen(room()), (-5.0, 0.0), (), Search()) == []
+    assert frontiers(seen(room()), (-5.0, 0.0), (), GridSearch()) == []
 
 
 def test_a_robot_that_stands_in_unknown_cells_finds_out_of_them() -> None:
@@ -123,6 +123,6 @@ def test_a_robot_that_stands_in_unknown_cells_finds_out_of_them() -> None:
     cells = room()
     cells[8:13, 8:13] = -1
     cells[1:-1, 30:-1] = -1
-    found = next_frontier(seen(cells), HERE, [HERE], Search())
+    found = next_frontier(seen(cells), HERE, [HERE], GridSearch())
     assert found is not None
     assert found.x == pytest.approx(2.95)

@@ -9,7 +9,6 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_zenoh.navigation.chamfer import Chamfer
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import (
     Grid,
@@ -19,10 +18,15 @@ from gigabrain_zenoh.navigation.footprint import (
     middle_of,
     outline_of,
 )
-from gigabrain_zenoh.navigation.models import answer, feasible, lag_of, model_of, slowed
+from gigabrain_zenoh.navigation.local_costmap import Chamfer, LocalCostmap, Pose2D
+from gigabrain_zenoh.navigation.motion_model import (
+    feasible,
+    lag_of,
+    lagged_step,
+    model_of,
+    slowed_model,
+)
 from gigabrain_zenoh.navigation.mppi import past_of
-from gigabrain_zenoh.navigation.window import Window
-from gigabrain_zenoh.navigation.window_cells import Place
 from tests.unit.navigation.drives import CAR, WAFFLE, wall
 
 NOBODY = np.empty((0, 6))
@@ -61,7 +65,7 @@ def test_a_slower_speed_can_be_asked_for() -> None:
 @pytest.mark.parametrize("late", [0.02, 0.1, 0.5])
 def test_a_body_that_reacts_later_is_driven_so_that_it_needs_no_longer_to_stop(late: float) -> None:
     model = model_of(WAFFLE)
-    slow = slowed(model, late)
+    slow = slowed_model(model, late)
 
     def way(speed: float, reaction: float) -> float:
         return speed * reaction + speed**2 / (2 * 0.9)
@@ -69,14 +73,14 @@ def test_a_body_that_reacts_later_is_driven_so_that_it_needs_no_longer_to_stop(l
     assert way(slow.forward, 0.22 + late) == pytest.approx(way(0.26, 0.22))
     assert slow.forward / model.forward == pytest.approx(slow.turning / model.turning)
     assert slow.forward < model.forward
-    assert slowed(model, 0.0) is model
+    assert slowed_model(model, 0.0) is model
 
 
 def test_a_lag_closes_the_gap_by_the_same_share_in_each_step() -> None:
-    velocity, way = answer(0.0, 1.0, lag_of(0.15, 0.05), 0.05)
+    velocity, way = lagged_step(0.0, 1.0, lag_of(0.15, 0.05), 0.05)
     assert velocity == pytest.approx(0.2834687)
     assert way == pytest.approx(0.0074797, abs=1e-6)
-    assert answer(0.0, 1.0, lag_of(0.0, 0.05), 0.05) == (1.0, 0.05)
+    assert lagged_step(0.0, 1.0, lag_of(0.0, 0.05), 0.05) == (1.0, 0.05)
 
 
 def test_commands_on_their_way_are_averaged_over_each_step() -> None:
@@ -89,11 +93,11 @@ def test_commands_on_their_way_are_averaged_over_each_step() -> None:
 
 
 def test_clearance_is_the_outlines_distance_to_the_nearest_obstacle() -> None:
-    window = Window(4.0, 10.0)
+    window = LocalCostmap(4.0, 10.0)
     random = np.random.default_rng(3)
     points = random.uniform(-1.5, 1.5, (25, 2))
     points = points[np.hypot(points[:, 0], points[:, 1]) > 0.5]
-    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), points)
+    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), points)
     grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
     for x, y, yaw in random.uniform((-0.3, -0.3, -3.0), (0.3, 0.3, 3.0), (50, 3)).tolist():
         got = clearance(grid, outline, x, y, math.cos(yaw), math.sin(yaw))
@@ -161,8 +165,8 @@ def test_what_is_inside_the_body_leaves_no_clearance() -> None:
 
 
 def test_the_way_straight_on_ends_at_a_wall() -> None:
-    window = Window(4.0, 10.0)
-    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.9, -0.5), (0.9, 0.5)))
+    window = LocalCostmap(4.0, 10.0)
+    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.9, -0.5), (0.9, 0.5)))
     grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
     free = free_ahead(grid, outline, 0.0, 0.0, 1.0, 0.0, 1.0, 0.03, 2.0)
     assert free == pytest.approx(0.8, abs=0.05)
@@ -170,7 +174,7 @@ def test_the_way_straight_on_ends_at_a_wall() -> None:
 
 
 def test_what_has_moved_leaves_no_ghost() -> None:
-    window, here = Window(4.0, 10.0), Place(0.0, 0.0, 0.0)
+    window, here = LocalCostmap(4.0, 10.0), Pose2D(0.0, 0.0, 0.0)
     behind = wall((1.5, -0.5), (1.5, 0.5))
     window.see(1, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
     assert window.grid(1, NOTHING, NOBODY).distance[80, 112] < 0.03
@@ -181,7 +185,7 @@ def test_what_has_moved_leaves_no_ghost() -> None:
 
 
 def test_what_no_beam_can_check_is_believed_for_its_time() -> None:
-    window, here = Window(4.0, 1.0), Place(0.0, 0.0, 0.0)
+    window, here = LocalCostmap(4.0, 1.0), Pose2D(0.0, 0.0, 0.0)
     window.see(1, here, (0.0, 0.0), np.array([(-0.8, 0.0)]))
     window.see(50, here, (0.0, 0.0), np.array([(0.8, 0.0)]))
     assert window.grid(50, NOTHING, NOBODY).distance[80, 48] < 0.03
@@ -190,9 +194,9 @@ def test_what_no_beam_can_check_is_believed_for_its_time() -> None:
 
 
 def test_the_window_goes_with_the_robot_and_keeps_what_it_saw() -> None:
-    window = Window(4.0, 10.0)
-    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), np.array([(1.0, 0.5)]))
-    window.see(2, Place(0.5, 0.0, math.pi / 2), (0.0, 0.0), np.array([(0.0, 1.2)]))
+    window = LocalCostmap(4.0, 10.0)
+    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), np.array([(1.0, 0.5)]))
+    window.see(2, Pose2D(0.5, 0.0, math.pi / 2), (0.0, 0.0), np.array([(0.0, 1.2)]))
     grid = window.grid(2, NOTHING, NOBODY)
     for x, y in ((1.0, 0.5), (-0.7, 0.0)):
         row, column = int((y - grid.y) / 0.025), int((x - grid.x) / 0.025)
@@ -201,13 +205,13 @@ def test_the_window_goes_with_the_robot_and_keeps_what_it_saw() -> None:
 
 @pytest.mark.parametrize(("x", "y"), [(3.5, 0.0), (0.0, -3.5), (-2.5, 2.0), (9.0, 0.0)])
 def test_what_leaves_the_window_is_forgotten(x: float, y: float) -> None:
-    window, around = Window(4.0, 10.0), np.random.default_rng(6).uniform(-1.9, 1.9, (200, 2))
-    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), around)
+    window, around = LocalCostmap(4.0, 10.0), np.random.default_rng(6).uniform(-1.9, 1.9, (200, 2))
+    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), around)
     there = _occupied(window.grid(1, NOTHING, NOBODY))
-    window.see(2, Place(x, y, 0.0), (0.0, 0.0), NOTHING)
+    window.see(2, Pose2D(x, y, 0.0), (0.0, 0.0), NOTHING)
     kept = {(a, b) for a, b in there if abs(a - 40 * x) <= 80 and abs(b - 40 * y) <= 80}
     assert _occupied(window.grid(2, NOTHING, NOBODY)) == kept
-    window.see(3, Place(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    window.see(3, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
     assert _occupied(window.grid(3, NOTHING, NOBODY)) == kept < there
 
 
@@ -221,15 +225,15 @@ def _occupied(grid: Grid) -> set[tuple[float, float]]:
 
 
 def test_known_points_of_the_map_count_and_are_not_remembered() -> None:
-    window = Window(4.0, 10.0)
-    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    window = LocalCostmap(4.0, 10.0)
+    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
     known = np.array([(0.5, 0.0), (99.0, 0.0)])
     assert window.grid(1, known, NOBODY).distance[80, 100] < 0.03
     assert window.grid(1, NOTHING, NOBODY).distance[80, 100] == 3.0
 
 
 def test_a_post_that_seems_to_move_is_believed_only_where_it_was_not_before() -> None:
-    window, here = Window(4.0, 10.0), Place(0.0, 0.0, 0.0)
+    window, here = LocalCostmap(4.0, 10.0), Pose2D(0.0, 0.0, 0.0)
     claimed = np.array([(1.0, 0.0, 0.8, 0.0, 0.1, 0.1)])
     for tick in range(1, 32, 5):
         window.see(tick, here, (0.0, 0.0), np.array([(0.95, 0.0)]))
@@ -239,8 +243,8 @@ def test_a_post_that_seems_to_move_is_believed_only_where_it_was_not_before() ->
 
 
 def test_the_way_to_the_goal_goes_round_a_wall() -> None:
-    window = Window(4.0, 10.0)
-    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.8, -1.0), (0.8, 1.0)))
+    window = LocalCostmap(4.0, 10.0)
+    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.8, -1.0), (0.8, 1.0)))
     grid = window.grid(1, NOTHING, NOBODY)
     field = CostToGo(window.cells).field(grid, 0.155, (1.6, 0.0), None)
     middle = field.distance.shape[0] // 2
@@ -250,8 +254,8 @@ def test_the_way_to_the_goal_goes_round_a_wall() -> None:
 
 
 def test_a_path_is_followed_to_where_it_leaves_the_window() -> None:
-    window = Window(4.0, 10.0)
-    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    window = LocalCostmap(4.0, 10.0)
+    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
     grid = window.grid(1, NOTHING, NOBODY)
     path = np.array([(0.0, 0.1 * i) for i in range(60)])
     field = CostToGo(window.cells).field(grid, 0.155, (5.0, 5.0), path)
@@ -262,7 +266,7 @@ def test_a_path_is_followed_to_where_it_leaves_the_window() -> None:
 
 
 def test_the_way_straight_on_is_looked_at_no_farther_than_the_window_is_large() -> None:
-    window = Window(4.0, 10.0)
+    window = LocalCostmap(4.0, 10.0)
     grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
     found = list[float]()
     ways = (grid, outline, 0.0, 0.0, 1.0, 0.0, 1.0, 0.03, 1e18)
@@ -279,6 +283,6 @@ def test_the_outline_of_a_large_or_jagged_body_has_a_bounded_number_of_points() 
 
 
 def test_a_goal_that_is_a_hundred_kilometres_off_is_as_far_as_anything() -> None:
-    grid = Window(4.0, 10.0).grid(1, NOTHING, NOBODY)
+    grid = LocalCostmap(4.0, 10.0).grid(1, NOTHING, NOBODY)
     field = CostToGo(160).field(grid, 0.15, (1e5, -1e5), None).distance
     assert 9_990.0 < field.min() <= field.max() <= 10_010.0

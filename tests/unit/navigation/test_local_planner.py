@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, Obstacle
-from gigabrain_zenoh.navigation.local import Goal, LocalPlanner, Moment, Sent
+from gigabrain_zenoh.navigation.local_planner import Goal, LocalPlanner, PlanRequest, SentCommand
 from tests.unit.navigation.drives import CAR, OMNI, QUICK, WAFFLE, Drive, wall
 
 NOTHING = np.empty((0, 2))
@@ -59,7 +59,7 @@ def test_a_narrow_door_is_passed() -> None:
 def test_who_may_not_back_plans_no_way_backwards(may_back: bool) -> None:
     planner = LocalPlanner(WAFFLE)
     ahead = wall((0.35, -0.5), (0.35, 0.5))
-    moment = Moment(
+    moment = PlanRequest(
         tick=1,
         pose=Pose(x=0.0, y=0.0, yaw=0.0),
         velocity=Velocity(),
@@ -155,9 +155,9 @@ def test_the_same_questions_get_the_same_answers() -> None:
 )
 def test_a_goal_that_is_no_place_is_refused(goal: Goal) -> None:
     planner = LocalPlanner(WAFFLE, QUICK)
-    moment = Moment(
+    moment = PlanRequest(
         tick=1, pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity(), goal=goal, hits=NOTHING,
-        sent=(Sent(0, Velocity()),),
+        sent=(SentCommand(0, Velocity()),),
     )  # fmt: skip
     with pytest.raises(ValueError, match="a goal has finite numbers"):
         planner.plan(moment)

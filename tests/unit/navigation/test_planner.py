@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from gigabrain_zenoh.navigation.costmap import Costmap, Inflation, Unknown, costmap
-from gigabrain_zenoh.navigation.planner import Path, Planner, Unreachable, rest_of, valid
+from gigabrain_zenoh.navigation.global_planner import (
+    GlobalPlanner,
+    Path,
+    Unreachable,
+    is_valid,
+    remaining_path,
+)
 from tests.unit.navigation.grids import drawn, empty, grid_of
 
 NAN, INF = float("nan"), float("inf")
@@ -17,13 +23,13 @@ def seen(cells: np.ndarray, unknown: Unknown = "avoid", fits: float = 0.15) -> C
 
 
 def path(made: Costmap, start: tuple[float, float], goal: tuple[float, float]) -> Path:
-    found = Planner().plan(made, start, goal)
+    found = GlobalPlanner().plan(made, start, goal)
     assert isinstance(found, Path), found
     return found
 
 
 def refused(made: Costmap, start: tuple[float, float], goal: tuple[float, float]) -> Unreachable:
-    found = Planner().plan(made, start, goal)
+    found = GlobalPlanner().plan(made, start, goal)
     assert isinstance(found, Unreachable)
     return found
 
@@ -63,19 +69,19 @@ def test_pulling_tight_costs_no_more_than_the_cells_did() -> None:
     rng = np.random.default_rng(5)
     cells = np.where(rng.random((80, 80)) < 0.03, 100, 0)
     cells[:4, :4] = cells[-4:, -4:] = 0
-    made, planner = seen(cells, fits=0.1), Planner()
+    made, planner = seen(cells, fits=0.1), GlobalPlanner()
     found = planner.plan(made, (0.05, 0.05), (7.95, 7.95))
     assert isinstance(found, Path)
     field = planner.field(made, (7.95, 7.95))
     assert field is not None
     assert found.cost[0] <= field[0, 0] * (1 + 1e-6)
-    assert valid(found, made)
+    assert is_valid(found, made)
 
 
 @pytest.mark.parametrize(("door", "passes"), [(2, False), (3, True)])
 def test_a_door_lets_through_what_fits(door: int, passes: bool) -> None:
     """It needs 0.15 m to each side, and the cells are 0.1 m."""
-    found = Planner().plan(seen(rooms(door)), (0.5, 2.5), (5.5, 2.5))
+    found = GlobalPlanner().plan(seen(rooms(door)), (0.5, 2.5), (5.5, 2.5))
     assert isinstance(found, Path) is passes
 
 
@@ -95,7 +101,7 @@ def test_a_goal_where_the_body_cannot_be_is_refused_with_the_nearest_place_where
     assert found.reason.startswith(why + "; nearest reachable point is ")
     assert found.nearest is not None
     assert found.distance == pytest.approx({3.05: 0.2, 2.95: 0.1, 6.35: 0.3, -0.25: 0.3}[goal[0]])
-    assert isinstance(Planner().plan(seen(rooms()), (0.55, 2.05), found.nearest), Path)
+    assert isinstance(GlobalPlanner().plan(seen(rooms()), (0.55, 2.05), found.nearest), Path)
 
 
 def test_the_refusal_says_it_in_words() -> None:
@@ -144,7 +150,7 @@ def test_a_robot_too_close_to_a_wall_plans_away_from_it() -> None:
     found = path(made, (2.95, 2.05), (0.5, 2.05))
     assert tuple(found.points[0]) == (2.95, 2.05)
     assert (np.diff(found.points[:5, 0]) < 0).all()
-    assert valid(found, made)
+    assert is_valid(found, made)
 
 
 def test_a_robot_too_close_to_a_wall_does_not_plan_through_it() -> None:
@@ -179,20 +185,20 @@ def test_avoided_unknown_space_is_crossed_where_nothing_else_leads() -> None:
 def test_a_path_is_valid_until_something_stands_on_it() -> None:
     cells = rooms()
     found = path(seen(cells), (0.5, 2.5), (5.5, 2.5))
-    assert valid(found, seen(cells))
+    assert is_valid(found, seen(cells))
     cells[5:13, 30] = 100
-    assert not valid(found, seen(cells))
+    assert not is_valid(found, seen(cells))
 
 
 def test_a_path_beyond_a_map_that_shrank_is_not_valid() -> None:
     found = path(seen(empty(5, 5)), (0.5, 0.5), (4.5, 4.5))
-    assert not valid(found, seen(empty(3, 3)))
+    assert not is_valid(found, seen(empty(3, 3)))
 
 
 def test_of_two_equal_ways_the_one_taken_is_kept() -> None:
     cells = empty(6.1, 6.1)
     cells[25:36, 25:36] = 100
-    made, planner = seen(cells), Planner()
+    made, planner = seen(cells), GlobalPlanner()
     goal = (5.55, 3.05)
     right_round = path(made, (0.55, 3.05), goal)
     below = right_round.points[:, 1].min() < 2.5
@@ -211,12 +217,12 @@ def test_a_much_better_way_is_taken_and_a_slightly_better_one_is_not() -> None:
     start, goal = (0.55, 0.55), (5.55, 0.55)
     over = path(seen(cells, fits=0.1), start, goal)
     cells[5:12, 30] = 0
-    opened = Planner().replan(seen(cells, fits=0.1), start, goal, over)
+    opened = GlobalPlanner().replan(seen(cells, fits=0.1), start, goal, over)
     assert isinstance(opened, Path)
     assert opened.remaining[0] < 0.9 * over.remaining[0]
     cells[5:12, 30] = 100
     cells[21:26, 30] = 0  # not much lower
-    kept = Planner().replan(seen(cells, fits=0.1), start, goal, over)
+    kept = GlobalPlanner().replan(seen(cells, fits=0.1), start, goal, over)
     assert isinstance(kept, Path)
     np.testing.assert_allclose(kept.points[-20:], over.points[-20:])
 
@@ -224,18 +230,18 @@ def test_a_much_better_way_is_taken_and_a_slightly_better_one_is_not() -> None:
 def test_who_has_strayed_or_has_another_goal_gets_a_new_path() -> None:
     made = seen(empty(6, 6))
     old = path(made, (0.5, 0.5), (5.5, 0.5))
-    assert rest_of(old, made, (2.0, 1.2)) is None
-    strayed = Planner().replan(made, (2.0, 1.2), (5.5, 0.5), old)
+    assert remaining_path(old, made, (2.0, 1.2)) is None
+    strayed = GlobalPlanner().replan(made, (2.0, 1.2), (5.5, 0.5), old)
     assert isinstance(strayed, Path)
     assert strayed.remaining[0] == pytest.approx(math.hypot(3.5, 0.7))
-    other = Planner().replan(made, (0.5, 0.5), (5.5, 5.5), old)
+    other = GlobalPlanner().replan(made, (0.5, 0.5), (5.5, 5.5), old)
     assert isinstance(other, Path)
     assert tuple(other.points[-1]) == (5.5, 5.5)
 
 
 def test_what_is_left_of_a_path_begins_where_the_robot_is() -> None:
     made = seen(empty(6, 6))
-    rest = rest_of(path(made, (0.5, 0.5), (5.5, 0.5)), made, (3.02, 0.6))
+    rest = remaining_path(path(made, (0.5, 0.5), (5.5, 0.5)), made, (3.02, 0.6))
     assert rest is not None
     assert tuple(rest.points[0]) == (3.02, 0.6)
     assert rest.remaining[0] == pytest.approx(2.5, abs=0.1)
@@ -256,7 +262,7 @@ def test_the_cost_to_go_falls_along_the_path_and_is_infinite_where_no_way_leads(
     cells = rooms()
     cells[20:25, 50:55] = 100
     cells[22, 52] = 0
-    made, planner = seen(cells), Planner()
+    made, planner = seen(cells), GlobalPlanner()
     field = planner.field(made, (5.5, 0.5))
     assert field is not None
     found = path(made, (0.5, 2.5), (5.5, 0.5))

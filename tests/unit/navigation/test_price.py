@@ -6,13 +6,21 @@ import cv2
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.kernels.kernel import kernel
-from gigabrain_zenoh.navigation.among import WEIGHTS
+from gigabrain_zenoh.kernels.jit import kernel
+from gigabrain_zenoh.navigation.cost import Scene, Weights, look_round, price, rooms_of
+from gigabrain_zenoh.navigation.dynamic_obstacles import WEIGHTS
 from gigabrain_zenoh.navigation.footprint import Grid, Outline, outline_of
-from gigabrain_zenoh.navigation.models import Model, lag_of, model_of
-from gigabrain_zenoh.navigation.price import look_round, price, rooms_of
-from gigabrain_zenoh.navigation.rating import Scene, Weights
-from gigabrain_zenoh.navigation.rollout import LANES, STATE, Floats, Start, move, obey
+from gigabrain_zenoh.navigation.motion_model import (
+    LANES,
+    STATE,
+    Floats,
+    InitialState,
+    MotionModel,
+    lag_of,
+    make_feasible,
+    model_of,
+    simulate,
+)
 from gigabrain_zenoh.qa.bench.plant import JACKAL
 
 STEPS, DT, BLOCKS = 30, 0.05, 25
@@ -22,14 +30,14 @@ SOMEBODY = np.array([(1.2, 0.6, 0.0, -0.8, 0.3, 0.05), (1.0, -1.5, 0.5, 1.0, 0.3
 
 @kernel
 def prices(
-    model: Model, outline: Outline, weights: Weights, scene: Scene, start: Start, dt: float,
-    plans: Floats, states: Floats, limits: Floats, costs: Floats,
+    model: MotionModel, outline: Outline, weights: Weights, scene: Scene, start: InitialState,
+    dt: float, plans: Floats, states: Floats, limits: Floats, costs: Floats,
 ) -> None:  # fmt: skip
     """Fill `costs` (limits, blocks, LANES)."""
     rooms = np.empty(len(start.past))
     for block in range(len(plans)):
-        obey(model, start, dt, plans[block])
-        move(model, outline.far, start, dt, plans[block], states)
+        make_feasible(model, start, dt, plans[block])
+        simulate(model, outline.far, start, dt, plans[block], states)
         look_round(weights, outline, scene, dt, states)
         rooms_of(scene, outline, states, rooms)
         for n in range(len(limits)):
@@ -62,7 +70,7 @@ def test_a_plan_is_given_up_only_where_it_costs_as_much_as_the_limit(
     random = np.random.default_rng(1)
     plans = np.cumsum(random.normal(0.0, 0.5, (BLOCKS, STEPS, 3, LANES)), axis=1)
     plans[:, :, 0] += random.uniform(-0.5, 2.0, (BLOCKS, 1, LANES))
-    start = Start(
+    start = InitialState(
         0.0, 0.0, 0.2, 0.8, 0.0, 0.3, (0.8, 0.0, 0.3), np.tile((0.8, 0.0, 0.3), (3, 1)), 0.4,
         lag_of(0.15, DT), 1.0,
     )  # fmt: skip

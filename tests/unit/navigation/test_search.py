@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.navigation.search import Search
+from gigabrain_zenoh.navigation.grid_search import GridSearch
 from tests.unit.navigation.grids import cheapest
 
 OPEN = np.ones((9, 9), np.float32)
@@ -28,7 +28,7 @@ def spent(cost: np.ndarray, cells: np.ndarray) -> float:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_no_way_is_cheaper_on_random_grids(seed: int) -> None:
-    cost, search = random_costs(seed), Search()
+    cost, search = random_costs(seed), GridSearch()
     rng = np.random.default_rng(seed)
     for _ in range(10):
         start, goal = (tuple(int(v) for v in rng.integers(0, cost.shape)) for _ in range(2))
@@ -47,7 +47,7 @@ def test_no_way_is_cheaper_on_random_grids(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(5))
 def test_the_field_from_a_cell_is_what_dijkstra_finds(seed: int) -> None:
     cost = random_costs(seed)
-    field = Search().field(cost, (15, 11), "from")
+    field = GridSearch().field(cost, (15, 11), "from")
     expected = np.full(cost.shape, np.inf)
     for cell, value in cheapest(cost, (15, 11)).items():
         expected[cell] = value
@@ -55,7 +55,7 @@ def test_the_field_from_a_cell_is_what_dijkstra_finds(seed: int) -> None:
 
 
 def test_the_field_to_a_cell_is_what_the_way_from_each_costs() -> None:
-    cost, search = random_costs(3, (12, 10)), Search()
+    cost, search = random_costs(3, (12, 10)), GridSearch()
     goal = (5, 5)
     cost[goal] = 1.0
     field = search.field(cost, goal, "to")
@@ -66,7 +66,7 @@ def test_the_field_to_a_cell_is_what_the_way_from_each_costs() -> None:
 
 
 def test_in_the_open_the_way_is_straight_and_diagonal_steps() -> None:
-    cells = Search().path(OPEN, (0, 0), (2, 5))
+    cells = GridSearch().path(OPEN, (0, 0), (2, 5))
     assert cells is not None
     assert spent(OPEN, cells) == pytest.approx(3 + 2 * 1.4142135623730951)
 
@@ -74,7 +74,7 @@ def test_in_the_open_the_way_is_straight_and_diagonal_steps() -> None:
 def test_corners_are_not_cut() -> None:
     cost = OPEN.copy()
     cost[4, :4] = cost[5, 5:] = 200.0  # they touch at a corner, between (4, 3) and (5, 5)
-    cells = Search().path(cost, (3, 3), (5, 4))
+    cells = GridSearch().path(cost, (3, 3), (5, 4))
     assert cells is not None
     assert spent(cost, cells) == 3.0  # one aside, two on: 1 + sqrt(2) would pass the corner
 
@@ -82,14 +82,14 @@ def test_corners_are_not_cut() -> None:
 def test_a_diagonal_gap_is_no_gap() -> None:
     cost = OPEN.copy()
     cost[4, :5] = cost[5, 5:] = 200.0
-    assert Search().path(cost, (0, 0), (8, 8)) is None
+    assert GridSearch().path(cost, (0, 0), (8, 8)) is None
 
 
 def test_a_door_of_one_cell_is_found() -> None:
     cost = OPEN.copy()
     cost[4] = 200.0
     cost[4, 7] = 1.0
-    cells = Search().path(cost, (0, 0), (8, 0))
+    cells = GridSearch().path(cost, (0, 0), (8, 0))
     assert cells is not None
     assert [4, 7] in cells.tolist()
 
@@ -97,21 +97,21 @@ def test_a_door_of_one_cell_is_found() -> None:
 def test_who_stands_too_close_may_leave_but_nobody_may_enter() -> None:
     cost = OPEN.copy()
     cost[:3] = np.array([200.0, 150.0, 120.0], np.float32)[:, np.newaxis]
-    out = Search().path(cost, (0, 4), (8, 4))
+    out = GridSearch().path(cost, (0, 4), (8, 4))
     assert out is not None
     assert out[:, 0].tolist() == [0, 1, 2, 3, 4, 5, 6, 7, 8]
-    assert Search().path(cost, (8, 4), (2, 4)) is None
+    assert GridSearch().path(cost, (8, 4), (2, 4)) is None
 
 
 def test_nobody_leaves_through_what_is_closer_still() -> None:
     cost = OPEN.copy()
     cost[3:6] = np.array([150.0, 180.0, 150.0], np.float32)[:, np.newaxis]
     cost[:3] = 200.0
-    assert Search().path(cost, (3, 4), (8, 4)) is None
+    assert GridSearch().path(cost, (3, 4), (8, 4)) is None
 
 
 def test_the_same_memory_serves_many_searches_and_sizes() -> None:
-    search = Search()
+    search = GridSearch()
     for size in (9, 30, 9, 12):
         cost = np.ones((size, size), np.float32)
         for _ in range(3):
@@ -121,22 +121,22 @@ def test_the_same_memory_serves_many_searches_and_sizes() -> None:
 
 
 def test_a_way_to_where_it_begins_is_one_cell() -> None:
-    cells = Search().path(OPEN, (4, 4), (4, 4))
+    cells = GridSearch().path(OPEN, (4, 4), (4, 4))
     assert cells is not None
     assert cells.tolist() == [[4, 4]]
 
 
 def test_a_grid_that_needs_more_room_than_thought_gets_it() -> None:
-    cost, search = random_costs(7, (60, 60)), Search()
+    cost, search = random_costs(7, (60, 60)), GridSearch()
     search.path(cost, (0, 0), (59, 59))
     search._memory = search._memory._replace(entries=np.empty((3, 16), np.int32))
     field = search.field(cost, (30, 30), "from")
     assert search._memory.entries.shape[1] > 16
-    np.testing.assert_array_equal(field, Search().field(cost, (30, 30), "from"))
+    np.testing.assert_array_equal(field, GridSearch().field(cost, (30, 30), "from"))
 
 
 def test_marks_of_months_of_searches_are_reset_in_time() -> None:
-    search, cost = Search(), np.ones((20, 30))
+    search, cost = GridSearch(), np.ones((20, 30))
     expected = search.path(cost, (1, 1), (15, 22))
     search._turn = np.iinfo(np.int32).max // 32 - 3  # 6.7e7 searches later
     for _ in range(6):

@@ -9,12 +9,18 @@ import pytest
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import Obstacle
 from gigabrain_zenoh.decision.navigator import ANY_BODY
-from gigabrain_zenoh.navigation import among, cost_to_go, local, traffic
+from gigabrain_zenoh.navigation import cost_to_go, dynamic_obstacles, local_planner
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
+from gigabrain_zenoh.navigation.dynamic_obstacles import UPDATE_TICKS, TrafficMap
 from gigabrain_zenoh.navigation.footprint import distance_at
-from gigabrain_zenoh.navigation.local import Goal, LocalPlan, LocalPlanner, LocalSettings, Moment
-from gigabrain_zenoh.navigation.traffic import EVERY_TICKS, Traffic
-from gigabrain_zenoh.navigation.window import Place, Window
+from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
+from gigabrain_zenoh.navigation.local_planner import (
+    Goal,
+    LocalPlan,
+    LocalPlanner,
+    LocalSettings,
+    PlanRequest,
+)
 from gigabrain_zenoh.qa.bench.barn import drive_functions
 from gigabrain_zenoh.qa.bench.barn_course import BarnWorld, MovingDisc
 from gigabrain_zenoh.qa.bench.plant import HARD, JACKAL
@@ -24,9 +30,9 @@ NOBODY = np.empty((0, 6))
 GOAL = (12.0, 0.0)
 
 
-def crossing(seconds: float, speed: float) -> Traffic:
+def crossing(seconds: float, speed: float) -> TrafficMap:
     """What a body of 2 m/s sees of discs that go along x = 5 from y = -4 to 4 m, 2 m apart."""
-    traffic = Traffic(0.4, 2.0, 10.0)
+    traffic = TrafficMap(0.4, 2.0, 10.0)
     for tick in range(1, round(seconds * 50), 2):
         ys = [(speed * 0.02 * tick + k * 2.0) % 8.0 - 4.0 for k in range(4)]
         discs = np.array([(5.0, y, 0.0, speed, 0.5, 0.0) for y in ys])
@@ -35,15 +41,15 @@ def crossing(seconds: float, speed: float) -> Traffic:
 
 
 def test_where_nothing_quick_was_seen_ways_cost_what_they_are_long() -> None:
-    traffic = Traffic(0.4, 2.0, 10.0)
+    traffic = TrafficMap(0.4, 2.0, 10.0)
     traffic.see(1, 0.0, 0.0, NOBODY)
     traffic.see(3, 0.0, 0.0, NOBODY)
     assert traffic.ways(GOAL) is None
 
 
 def test_what_is_compiled_before_it_drives_is_all_that_it_will_call() -> None:
-    local.warm_up(ANY_BODY)
-    kernels: list[Any] = [traffic._watch, traffic._pass]
+    local_planner.warm_up(ANY_BODY)
+    kernels: list[Any] = [dynamic_obstacles._watch, dynamic_obstacles._pass]
     kernels += [cost_to_go._make_dearer, cost_to_go._seed_rim]
     before = [len(kernel.signatures) for kernel in kernels]
     drive_functions(crowd(), 0, HARD, 64)
@@ -74,7 +80,7 @@ def test_it_fades_and_is_forgotten() -> None:
     traffic = crossing(1.0, 1.7)
     dearest = [price_of(traffic)]
     for minute in range(5):
-        for tick in range(51 + 3000 * minute, 51 + 3000 * (minute + 1), EVERY_TICKS):
+        for tick in range(51 + 3000 * minute, 51 + 3000 * (minute + 1), UPDATE_TICKS):
             traffic.see(tick, 0.0, 0.0, NOBODY)
             traffic.ways(GOAL)
         dearest.append(price_of(traffic))
@@ -83,7 +89,7 @@ def test_it_fades_and_is_forgotten() -> None:
     assert traffic.ways(GOAL) is None
 
 
-def price_of(traffic: Traffic) -> float:
+def price_of(traffic: TrafficMap) -> float:
     ways = traffic.ways(GOAL)
     return float(ways.price.distance.max()) if ways else 1.0
 
@@ -92,7 +98,7 @@ def price_of(traffic: Traffic) -> float:
 def test_it_stays_where_it_was_when_the_robot_goes_on(to: tuple[float, float]) -> None:
     traffic = crossing(2.0, 1.7)
     before = traffic.ways(GOAL)
-    for tick in range(101, 105 + EVERY_TICKS, 2):
+    for tick in range(101, 105 + UPDATE_TICKS, 2):
         traffic.see(tick, *to, NOBODY)
     after = traffic.ways(GOAL)
     assert before
@@ -107,8 +113,8 @@ def test_it_stays_where_it_was_when_the_robot_goes_on(to: tuple[float, float]) -
 
 
 def test_the_local_field_leads_round_what_it_cannot_see_the_end_of() -> None:
-    window = Window(8.0, 10.0)
-    window.see(1, Place(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
+    window = LocalCostmap(8.0, 10.0)
+    window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), NOTHING)
     grid, costs = window.grid(1, NOTHING, NOBODY), CostToGo(window.cells)
     traffic = crossing(2.0, 1.7)
     plain = costs.field(grid, 0.2, GOAL, None)
@@ -122,7 +128,7 @@ def looks(discs: tuple[Obstacle, ...], seconds: float) -> LocalPlan:
     """What a Jackal plans so long after it was sent somewhere."""
     planner = LocalPlanner(JACKAL, LocalSettings(samples=128, window=6.0))
     for tick in (1, 1 + round(seconds / 0.02)):
-        moment = Moment(
+        moment = PlanRequest(
             tick=tick,
             pose=Pose(x=0.0, y=0.0, yaw=0.0),
             velocity=Velocity(),
@@ -140,7 +146,7 @@ def test_where_things_move_it_looks_longer_and_makes_way_for_what_comes() -> Non
     wait = "waiting: it looks round for what moves"
     assert looks((), 1.0).reason != wait
     assert looks((far,), 1.0).reason == wait
-    assert looks((far,), among.SIZES_UP_S).reason != wait
+    assert looks((far,), dynamic_obstacles.LOOK_AROUND_IN_TRAFFIC_S).reason != wait
     makes_way = looks((far, coming), 1.0)
     assert makes_way.reason == "making way: it looks round for what moves"
     assert math.hypot(makes_way.trajectory[-1].x, makes_way.trajectory[-1].y) < 3.0

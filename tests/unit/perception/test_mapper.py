@@ -14,7 +14,7 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.mapping import grid, map_file
+from gigabrain_zenoh.mapping import map_file, occupancy_grid
 from gigabrain_zenoh.perception.mapper import chart_of
 from gigabrain_zenoh.runtime.services import publish_health
 from gigabrain_zenoh.testing.samples import scan, state
@@ -77,7 +77,7 @@ async def test_the_map_comes_once_a_second_and_only_when_it_has_changed() -> Non
         robot.say()
         robot.drive(30)
         maps = robot.sent(MAP)
-    assert [grid.basis for grid in maps] == [5, 55, 105]
+    assert [occupancy_grid.basis for occupancy_grid in maps] == [5, 55, 105]
     last: OccupancyGrid = maps[-1]
     assert last.resolution == 0.05
     cells = np.frombuffer(last.cells, np.int8).reshape(last.height, last.width)
@@ -166,7 +166,7 @@ async def test_after_a_new_start_of_the_driver_the_map_stays_and_the_robot_is_fo
 async def test_a_map_that_may_grow_no_more_is_told_once_and_in_the_health(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(grid, "MOST_CELLS", 100)
+    monkeypatch.setattr(occupancy_grid, "MOST_CELLS", 100)
     async with Robot() as robot:
         robot.say()
         robot.drive(30)
@@ -216,5 +216,5 @@ async def test_a_map_that_does_not_change_is_said_again_every_two_seconds() -> N
         robot.say()
         robot.drive(45, still=True)
         maps = robot.sent(MAP)
-    assert [grid.basis for grid in maps] == [5, 105, 205]
-    assert len({grid.cells for grid in maps}) == 1
+    assert [occupancy_grid.basis for occupancy_grid in maps] == [5, 105, 205]
+    assert len({occupancy_grid.cells for occupancy_grid in maps}) == 1

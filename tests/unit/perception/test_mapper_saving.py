@@ -12,7 +12,7 @@ import pytest
 from gigabrain_schemas.topics import MAP, MAP_SAVE, POSE, WORLD
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.mapping import map_file
-from gigabrain_zenoh.mapping.growing import Still
+from gigabrain_zenoh.mapping.slam_map import Still
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay

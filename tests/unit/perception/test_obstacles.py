@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle
-from gigabrain_zenoh.perception.obstacles.tracker import MOST, ObstacleTracker
+from gigabrain_zenoh.perception.obstacle_tracker import MAX_OBSTACLES, ObstacleTracker
 
 Disc = tuple[float, float, float]  # x, y, radius [m]
 Wall = tuple[float, float, float, float]  # from x, y to x, y [m]
@@ -330,5 +330,5 @@ def test_of_very_many_things_the_nearest_are_told() -> None:
     watch = Watch(lidar, ())
     for _ in range(3):
         obstacles = watch.scan(*many)
-    assert len(obstacles) == MOST
+    assert len(obstacles) == MAX_OBSTACLES
     assert (obstacles[0].x, obstacles[0].y) == pytest.approx((2.0, 0.0), abs=0.05)

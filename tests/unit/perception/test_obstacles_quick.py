@@ -7,9 +7,7 @@ import pytest
 
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle
-from gigabrain_zenoh.perception.obstacles.arc import place_of
-from gigabrain_zenoh.perception.obstacles.clusters import find_clusters
-from gigabrain_zenoh.perception.obstacles.partly import discs_of
+from gigabrain_zenoh.perception.obstacle_detection import discs_of, find_clusters, fit_disc
 from tests.unit.perception.test_obstacles import JACKAL, Watch, nearest
 
 RADIUS = 0.5
@@ -26,7 +24,7 @@ def off(one: Obstacle, vx: float, vy: float) -> float:
 
 
 def test_a_third_of_a_rim_says_where_the_middle_is() -> None:
-    place = place_of(rim(150, 270, 20), 2.1, 1.08, RADIUS)
+    place = fit_disc(rim(150, 270, 20), 2.1, 1.08, RADIUS)
     assert place is not None
     x, y, noise = place
     assert (x, y) == pytest.approx((2.0, 1.0), abs=0.005)
@@ -34,7 +32,7 @@ def test_a_third_of_a_rim_says_where_the_middle_is() -> None:
 
 
 def test_the_less_of_a_rim_is_seen_the_less_sure_is_its_middle() -> None:
-    wide, narrow = (place_of(rim(210 - a, 210 + a, 20), 2.0, 1.0, RADIUS) for a in (60, 8))
+    wide, narrow = (fit_disc(rim(210 - a, 210 + a, 20), 2.0, 1.0, RADIUS) for a in (60, 8))
     assert wide is not None
     assert narrow is not None
     assert narrow[2] > 3 * wide[2]
@@ -42,8 +40,8 @@ def test_the_less_of_a_rim_is_seen_the_less_sure_is_its_middle() -> None:
 
 def test_a_wall_and_a_few_hits_are_no_rim() -> None:
     straight = np.column_stack((np.linspace(1.0, 3.0, 60), np.full(60, 1.4)))
-    assert place_of(straight, 2.0, 1.0, RADIUS) is None
-    assert place_of(rim(150, 270, 3), 2.0, 1.0, RADIUS) is None
+    assert fit_disc(straight, 2.0, 1.0, RADIUS) is None
+    assert fit_disc(rim(150, 270, 3), 2.0, 1.0, RADIUS) is None
 
 
 def test_a_quick_thing_that_turns_back_is_believed_within_a_fifth_of_a_second() -> None:

@@ -27,7 +27,7 @@ from gigabrain_schemas.topics import (
     WORLD,
 )
 from gigabrain_zenoh.gate import gate
-from gigabrain_zenoh.geometry.stop_zone import brakes
+from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.step import Inputs, step
 from gigabrain_zenoh.testing.bus import NodeBench

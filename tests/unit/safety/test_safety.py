@@ -8,7 +8,7 @@ from gigabrain_schemas.body import BodyDescription, GateStatus, RobotState, Thre
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.gate.causes import BRAIN_SILENT
-from gigabrain_zenoh.geometry.ages import scan_limit_ns
+from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.safety.step import Inputs, Memory, step
 from gigabrain_zenoh.safety.zones import Field
 from gigabrain_zenoh.testing.samples import DRIVING, LIDAR, WAFFLE, open_space, scan, state

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.safety import looks, zones
 from gigabrain_zenoh.safety.zones import Field, Motion
 from gigabrain_zenoh.testing.samples import DRIVING, LIDAR, WAFFLE, scan, state

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState, Thresholds
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.geometry.pose_history import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.safety.late import Late, look, slows, stops
 from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, scan, state
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gigabrain_schemas.body import BodyDescription
-from gigabrain_zenoh.geometry.stop_zone import brakes
+from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.qa.faults.fault import FaultRow
 from gigabrain_zenoh.qa.faults.rig.rig import Rig
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured

@@ -1,0 +1,105 @@
+"""Compiles kernels before the robot drives, in a child process where the result can be kept.
+
+A compiler leaves some 200 MB behind in its process.
+"""
+
+import asyncio
+import contextlib
+import logging
+import os
+import sys
+from collections.abc import Awaitable
+
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.host.this_process import join_in
+from gigabrain_zenoh.plugins import find
+
+log = logging.getLogger(__name__)
+QUIET_S = 5.0  # of compiling, before people are told
+
+
+async def ensure_compiled(warm_up: str) -> None:
+    """Have the function at "module:name" call all that is to be ensure_compiled, beside the loop.
+
+    Says so if that lasts. Raises ConfigError where something for it is not installed.
+    """
+    try:
+        if await asyncio.to_thread(_is_missing, warm_up):
+            await _log_if_slow(compile_in_child(warm_up))
+        await _log_if_slow(asyncio.to_thread(_call, warm_up))
+    except ModuleNotFoundError as error:
+        raise missing_package(error) from None
+
+
+def missing_package(error: ModuleNotFoundError) -> ConfigError:
+    """What to install."""
+    return ConfigError(
+        f"navigation missing_package {error.name}: pip install 'gigabrain-zenoh[nav]'"
+    )
+
+
+def _is_missing(warm_up: str) -> bool:
+    """Whether something of it is still to be ensure_compiled, and can be kept."""
+    from gigabrain_zenoh.kernels.jit import mark_of  # numba: only who drives by kernels pays
+
+    mark = mark_of(warm_up)
+    return mark is not None and not mark.exists()
+
+
+def _call(warm_up: str) -> None:
+    find(warm_up)()  # imports too
+
+
+async def _log_if_slow(work: Awaitable[object]) -> None:
+    compiling = asyncio.ensure_future(work)
+    try:
+        done, _ = await asyncio.wait((compiling,), timeout=QUIET_S)
+        if not done:
+            join_in()  # a whole minute is too long to go before others
+            said = {"event": "compiling"}
+            log.info("compiling: the first start takes about a minute", extra={"data": said})
+        await compiling
+    finally:
+        compiling.cancel()
+
+
+async def compile_in_child(warm_up: str) -> int:
+    """Compile in a process of its own; its exit code. What it cannot do is to be done here."""
+    paths = os.pathsep.join(path for path in sys.path if path)
+    child = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-P", "-m"),  # -P: nothing is imported from the current folder
+        __name__,
+        warm_up,
+        str(os.getpid()),
+        env={**os.environ, "PYTHONPATH": paths},
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        _, errors = await child.communicate()
+        if child.returncode and (said := errors.decode(errors="replace").strip()):
+            log.warning("compiling %s beforehand failed: %s", warm_up, said.splitlines()[-1])
+            log.debug("%s", said)
+        return child.returncode or 0
+    finally:
+        if child.returncode is None:
+            child.kill()
+            await child.wait()
+
+
+def compile_all(warm_up: str) -> None:
+    """Compile here, and mark it as done where it is kept. Raises ModuleNotFoundError."""
+    from gigabrain_zenoh.kernels.jit import mark_of
+
+    find(warm_up)()
+    mark = mark_of(warm_up)
+    if mark:
+        with contextlib.suppress(OSError):  # a folder that can be read only: as if nothing was kept
+            mark.touch()
+
+
+if __name__ == "__main__":
+    this_process.die_with_parent(int(sys.argv[2]))
+    compile_all(sys.argv[1])

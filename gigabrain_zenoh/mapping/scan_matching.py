@@ -1,0 +1,336 @@
+"""Matches a scan to a local map: a correlative search, then point-to-line ICP.
+
+E. Olson, Real-time correlative scan matching, ICRA 2009: blocks of poses are bounded first, and
+only those that may beat the best known one are searched. A. Censi, An ICP variant using a point-
+to-line metric, ICRA 2008.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
+from gigabrain_zenoh.mapping.keyframes import Points, thinned
+from gigabrain_zenoh.mapping.local_map import BLOCK, BUCKET, Buckets, Bytes, Image
+
+SEARCHED = 90  # points of a scan are enough to search with
+ASIDE = 0.01  # of the score, at the window's rim: of equals, the one nearest to the guess
+
+ITERATIONS = 25
+STILL = 1e-4  # [m] and [rad], a step this small ends ICP
+SHRINK = 0.6  # of the gate, each iteration
+GATE_LEAST = 0.12  # [m]
+SIGMA = 0.06  # [m], residuals beyond it lose their weight
+SOFT = 1e-9  # keeps the normal equations regular where the points say nothing
+
+
+class Hits(NamedTuple):
+    """Points of a scan at each heading of a window, at the window's first row and column."""
+
+    inside: NDArray[np.uint32]  # (headings, n): cells, counted row by row, of points that
+    inside_count: NDArray[np.int64]  # stay in the image all over the window; how many
+    rim: NDArray[np.int64]  # (headings, n, 2): row and column of those that may be in it
+    rim_count: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """How far round the guess to search."""
+
+    away: float  # [m], to each side
+    turn: float  # [rad], to each side
+    step: float = 0.025  # [rad]
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The likeliest pose of a search."""
+
+    pose: Floats
+    score: float  # 0 to 1, the mean likelihood of the hits
+
+
+def search(
+    image: Image,
+    points: Points,
+    guess: Floats,
+    window: Window,
+    least: float = -np.inf,
+    most: int = SEARCHED,
+) -> Found:
+    """The pose within the window whose points fall on the likeliest cells.
+
+    The guess, with a score of 0, where none scores `least`, which saves most of the search. At
+    most `most` of the points are searched with.
+    """
+    if not len(points):
+        return Found(guess, 0.0)
+    steps = int(np.ceil(window.away / image.cell))
+    turns = int(np.ceil(window.turn / window.step))
+    few = thinned(points, most)
+    sides = BLOCK * (2 * steps // BLOCK + 1)
+    hits = _placed(
+        few, guess, image.origin, image.cell, steps, turns, window.step, image.cells.shape, sides
+    )
+    bounds = _bounds(image.coarse, hits, len(few), steps)
+    score, t, i, j = _best(image.cells, hits, bounds, len(few), steps, least)
+    off = np.array(((j - steps) * image.cell, (i - steps) * image.cell, (t - turns) * window.step))
+    return Found(guess + off, score)
+
+
+@kernel
+def _placed(
+    points: Points,
+    guess: Floats,
+    origin: Floats,
+    cell: float,
+    steps: int,
+    turns: int,
+    turn: float,
+    shape: tuple[int, int],
+    sides: int,
+) -> Hits:
+    """The points at each heading, the body being in the first corner of a window of `sides`."""
+    headings, count, (height, width) = 2 * turns + 1, len(points), shape
+    inside, inside_count = np.empty((headings, count), np.uint32), np.zeros(headings, np.int64)
+    rim, rim_count = np.empty((headings, count, 2), np.int64), np.zeros(headings, np.int64)
+    for t in range(headings):
+        yaw = guess[2] + (t - turns) * turn
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        for k in range(count):
+            px = guess[0] + cos * points[k, 0] - sin * points[k, 1]
+            py = guess[1] + sin * points[k, 0] + cos * points[k, 1]
+            row = int(np.floor((py - origin[1]) / cell)) - steps
+            column = int(np.floor((px - origin[0]) / cell)) - steps
+            if 0 <= row <= height - sides and 0 <= column <= width - sides:
+                inside[t, inside_count[t]] = row * width + column
+                inside_count[t] += 1
+            elif -sides < row < height and -sides < column < width:
+                rim[t, rim_count[t], 0], rim[t, rim_count[t], 1] = row, column
+                rim_count[t] += 1
+    return Hits(inside, inside_count, rim, rim_count)
+
+
+@lean_kernel
+def _worth(total: int, count: int, down: int, right: int, t: int, steps: int, turns: int) -> float:
+    """What a pose so many cells and headings off the guess is worth, its points being so likely."""
+    away = (down * down + right * right) / (steps * steps + 1)
+    return total / (255 * count) - ASIDE * (away + t * t / (turns * turns + 1))
+
+
+@lean_kernel
+def _total(cells: Bytes, flat: NDArray[np.uint8], hits: Hits, t: int, row: int, column: int) -> int:
+    """How likely all points of heading `t` are together, so many rows and columns on."""
+    total = 0
+    on = np.uint32(row * cells.shape[1] + column)
+    for k in range(hits.inside_count[t]):
+        total += flat[hits.inside[t, k] + on]
+    for k in range(hits.rim_count[t]):
+        i, j = hits.rim[t, k, 0] + row, hits.rim[t, k, 1] + column
+        if 0 <= i < cells.shape[0] and 0 <= j < cells.shape[1]:
+            total += cells[i, j]
+    return total
+
+
+@kernel
+def _bounds(coarse: Bytes, hits: Hits, count: int, steps: int) -> Floats:
+    """What the poses of each block are worth at most (headings, blocks, blocks)."""
+    headings, flat = len(hits.inside), coarse.ravel()
+    blocks, turns = 2 * steps // BLOCK + 1, headings // 2
+    bounds = np.empty((headings, blocks, blocks))
+    for t in range(headings):
+        for i in range(blocks):
+            for j in range(blocks):
+                down = max(i * BLOCK - steps, steps - i * BLOCK - BLOCK + 1, 0)
+                right = max(j * BLOCK - steps, steps - j * BLOCK - BLOCK + 1, 0)
+                total = _total(coarse, flat, hits, t, i * BLOCK, j * BLOCK)
+                bounds[t, i, j] = _worth(total, count, down, right, t - turns, steps, turns)
+    return bounds
+
+
+@kernel
+def _best(
+    cells: Bytes, hits: Hits, bounds: Floats, count: int, steps: int, least: float
+) -> tuple[float, int, int, int]:
+    """Score, heading, row and column of the pose that is worth most; of equals, the first."""
+    (headings, blocks, _), best, flat = bounds.shape, least, cells.ravel()
+    turns = headings // 2
+    score, at_t, at_i, at_j = 0.0, turns, steps, steps
+    likeliest = np.argmax(bounds)  # the sooner something good is found, the more can be left out
+    for n in range(-1, bounds.size):
+        block = likeliest if n < 0 else n
+        t, top, left = block // (blocks * blocks), block // blocks % blocks, block % blocks
+        if bounds[t, top, left] < best:
+            continue
+        for i in range(top * BLOCK, min(top * BLOCK + BLOCK, 2 * steps + 1)):
+            for j in range(left * BLOCK, min(left * BLOCK + BLOCK, 2 * steps + 1)):
+                total = _total(cells, flat, hits, t, i, j)
+                worth = _worth(total, count, i - steps, j - steps, t - turns, steps, turns)
+                if worth > best or (worth == best and (t, i, j) < (at_t, at_i, at_j)):
+                    best, score, at_t, at_i, at_j = worth, total / (255 * count), t, i, j
+    return score, at_t, at_i, at_j
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """What ICP arrived at."""
+
+    pose: Floats
+    information: Floats  # (3, 3), of x, y and yaw about the body, in the map's axes
+    inliers: float  # share of the scan's points
+    rms: float  # [m], of the inliers
+
+
+def icp(
+    local: Buckets, points: Points, start: Floats, gate: float, prior: Floats, guess: Floats
+) -> Fit:
+    """Slide `points` onto the lines of `local`, beginning at `start`.
+
+    `prior` is the (3, 3) information about `guess`, the pose that odometry expects: it decides
+    where the lines leave a direction open.
+    """
+    pose, information, inliers, rms = _icp(
+        local.points, local.normals, local.starts, local.width, local.origin,
+        points, start, gate, prior, guess,
+    )  # fmt: skip
+    return Fit(pose, information, inliers, rms)
+
+
+@lean_kernel
+def _nearest(
+    local: Points,
+    starts: NDArray[np.int32],
+    width: int,
+    origin: Floats,
+    x: float,
+    y: float,
+    gate: float,
+    known: int,
+) -> int:
+    """The index of the nearest point within `gate`, or -1; one that is `known` to be near helps."""
+    best, found = gate * gate, -1
+    if known >= 0:
+        away = _away(local, known, x, y)
+        if away < best:
+            best, found, gate = away, known, np.sqrt(away)
+    height = (len(starts) - 1) // width
+    left = max(int(np.floor((x - gate - origin[0]) / BUCKET)), 0)
+    right = min(int(np.floor((x + gate - origin[0]) / BUCKET)), width - 1)
+    top = max(int(np.floor((y - gate - origin[1]) / BUCKET)), 0)
+    bottom = min(int(np.floor((y + gate - origin[1]) / BUCKET)), height - 1)
+    if left > right:
+        return found
+    for row in range(top, bottom + 1):
+        for k in range(starts[row * width + left], starts[row * width + right + 1]):
+            away = _away(local, k, x, y)
+            if away < best:
+                best, found = away, k
+    return found
+
+
+@lean_kernel
+def _away(local: Points, k: int, x: float, y: float) -> float:
+    """The squared distance of a point from (x, y)."""
+    dx, dy = local[k, 0] - x, local[k, 1] - y
+    away: float = dx * dx + dy * dy
+    return away
+
+
+@kernel
+def solved(m: Floats, v: Floats) -> Floats:
+    """x of m x = v, m being a symmetric (3, 3) matrix, by Cramer's rule."""
+    a, b, c = m[0, 0], m[0, 1], m[0, 2]
+    d, e, f = m[1, 1], m[1, 2], m[2, 2]
+    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
+    whole = a * aa + b * bb + c * cc
+    x = np.empty(3)
+    x[0] = (aa * v[0] + bb * v[1] + cc * v[2]) / whole
+    x[1] = (bb * v[0] + dd * v[1] + ee * v[2]) / whole
+    x[2] = (cc * v[0] + ee * v[1] + ff * v[2]) / whole
+    return x
+
+
+@kernel
+def _lay(
+    local: Points,
+    normals: Points,
+    starts: NDArray[np.int32],
+    width: int,
+    origin: Floats,
+    points: Points,
+    pose: Floats,
+    gate: float,
+    nearest: NDArray[np.int32],
+    hessian: Floats,
+    gradient: Floats,
+) -> tuple[int, float]:
+    """Add the points at `pose` to the normal equations; how many have a line, and squares.
+
+    `nearest` are the points of `local` that they were laid onto before, or -1.
+    """
+    inliers, squares, near = 0, 0.0, -1
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    for k in range(len(points)):
+        rx = cos * points[k, 0] - sin * points[k, 1]
+        ry = sin * points[k, 0] + cos * points[k, 1]
+        near = nearest[k] if nearest[k] >= 0 else near  # or that of the beam beside
+        j = _nearest(local, starts, width, origin, pose[0] + rx, pose[1] + ry, gate, near)
+        nearest[k] = j
+        if j < 0:
+            continue
+        near = j
+        nx, ny = normals[j, 0], normals[j, 1]
+        error = (pose[0] + rx - local[j, 0]) * nx + (pose[1] + ry - local[j, 1]) * ny
+        weight = (SIGMA / (SIGMA * SIGMA + error * error)) ** 2  # divided by the variance
+        lever = rx * ny - ry * nx  # how the error grows with yaw
+        inliers += 1
+        squares += error * error
+        gradient[0] += weight * error * nx
+        gradient[1] += weight * error * ny
+        gradient[2] += weight * error * lever
+        hessian[0, 0] += weight * nx * nx
+        hessian[0, 1] += weight * nx * ny
+        hessian[0, 2] += weight * nx * lever
+        hessian[1, 1] += weight * ny * ny
+        hessian[1, 2] += weight * ny * lever
+        hessian[2, 2] += weight * lever * lever
+    hessian[1, 0], hessian[2, 0], hessian[2, 1] = hessian[0, 1], hessian[0, 2], hessian[1, 2]
+    return inliers, squares
+
+
+@kernel
+def _icp(
+    local: Points,
+    normals: Points,
+    starts: NDArray[np.int32],
+    width: int,
+    origin: Floats,
+    points: Points,
+    start: Floats,
+    gate: float,
+    prior: Floats,
+    guess: Floats,
+) -> tuple[Floats, Floats, float, float]:
+    pose = start.copy()
+    hessian = np.zeros((3, 3))
+    inliers, squares = 0, 0.0
+    nearest = np.full(len(points), -1, np.int32)
+    for _ in range(ITERATIONS):
+        hessian, gradient = np.zeros((3, 3)), np.zeros(3)
+        inliers, squares = _lay(
+            local, normals, starts, width, origin, points, pose, gate, nearest, hessian, gradient
+        )
+        off = pose - guess
+        off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi
+        for row in range(3):  # `@` would call for a BLAS
+            gradient[row] += (prior[row] * off).sum()
+        step = solved(hessian + prior + SOFT * np.eye(3), gradient)
+        pose -= step
+        if np.abs(step).max() < STILL and gate <= GATE_LEAST:
+            break
+        gate = max(gate * SHRINK, GATE_LEAST)
+    return pose, hessian, inliers / max(len(points), 1), np.sqrt(squares / max(inliers, 1))

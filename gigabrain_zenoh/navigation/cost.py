@@ -1,0 +1,411 @@
+"""Cost of a plan, in units of which a second is worth 8.
+
+Looking at the whole outline in each pose takes most of the time. Bounds that need no outline come
+first, for all lanes at once, and decide whether to look.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.kernels.jit import NONE, lean_kernel
+from gigabrain_zenoh.navigation.footprint import (
+    ROOM,
+    STRETCH,
+    UNSURE,
+    Grid,
+    Outline,
+    between,
+    clearance_of,
+    distance_at,
+    free_ahead,
+)
+from gigabrain_zenoh.navigation.motion_model import (
+    AWAY,
+    CLOSE,
+    COSINE,
+    LANES,
+    MIDDLE,
+    MOVED,
+    SINE,
+    SURE,
+    VX,
+    VY,
+    YAW,
+    MotionModel,
+    W,
+    X,
+    Y,
+)
+
+Floats = NDArray[np.float64]
+SECOND = 8.0  # what a second costs
+LOOK_AHEAD = 0.25  # [m], from where the last pose's heading is judged
+NEAR_GOAL = 0.2  # [m], nearer the field is too coarse
+SLOW = 0.05  # [m/s], slower than this it always stops in time
+NO_DISC = 1e3  # [m], where nothing moves
+DISC_ROOM = 1.5  # [m], what moves farther away makes no difference
+TOO_FAST = 16.0  # per second at full speed where it cannot stop in time, by the square of the share
+
+GROWS_S = 0.5  # how long what is known of a thing fades
+TOUCHED_DISC = 200.0  # what a contact with a moving thing costs
+DECAYS = 4.0  # times the way over which the cost of being near decays; farther off is nothing
+
+TOUCHED = 300.0  # what a contact costs
+IMPACT = 50.0  # per m/s of a contact
+BRAKE_EVERY = 3  # steps
+AT_EASE = 0.25  # [m], room of more than that is not looked at anew before it can have gone
+SPARE = 0.003  # [m], less room than at the start is a contact only from here on
+
+
+class Scene(NamedTuple):
+    """All that is round the body."""
+
+    grid: Grid  # distances to what stands still
+    field: Grid  # cost to go [m]
+    discs: Floats  # (m, 6): x, y [m], velocity x, y [m/s], radius [m] and its growth [m/s]
+    goal_x: float  # [m]
+    goal_y: float
+    goal_yaw: float  # [rad]; nan where any will do
+    tolerance: float  # [m]
+    yaw_tolerance: float  # [rad]
+
+
+class Weights(NamedTuple):
+    """What is preferred, by how much."""
+
+    margin: float = 0.03  # [m], nearer than this is a contact
+    near: float = 3.0  # of having obstacles near, per second
+    near_over: float = 0.08  # [m], over which that decays
+    tight: float = 1.5  # of speed in tight places, per second
+    tight_speed: float = 0.45  # [m/s], always allowed
+    tight_rate: float = 4.0  # [1/s], more speed per metre of room
+    turning: float = 0.02  # per (rad/s)2 and second
+    backwards: float = 1.0  # per m
+    heading: float = 0.8  # of facing away from the goal, in units of the time it takes to turn
+    disc: float = 3.0  # of having moving things near, per second
+    disc_over: float = 0.3  # [m]
+    disc_margin: float = 0.02  # [m]
+    disc_lead: float = 0.0  # [s], so much farther per m/s of a thing's speed
+    trust: float = 0.0  # [s], over which what is foreseen of them fades; 0 where it does not
+
+
+@lean_kernel
+def of_place(
+    weights: Weights, scene: Scene, room: float, away: float, x: float, y: float, yaw: float
+) -> float:
+    """What it costs to be here for a second, with obstacles and moving things so far away [m]."""
+    cost = 0.0
+    if room < ROOM:
+        cost += weights.near * exponential((weights.margin - room) / weights.near_over)
+    if away < NO_DISC and weights.trust == 0.0:
+        cost += weights.disc * math.exp(-away / weights.disc_over)
+    return cost + of_time(scene, x, y, yaw)
+
+
+@lean_kernel
+def exponential(x: float) -> float:
+    """The exponential function, to eight digits from -5 to 5: a call of math.exp takes longer."""
+    y = x * (1.0 / 32.0)
+    square = y * y
+    power = (
+        1.0
+        + y
+        + square * (0.5 + y * (1.0 / 6.0))
+        + square * square * (1.0 / 24.0 + y * (1.0 / 120.0) + square * (1.0 / 720.0))
+    )
+    for _ in range(5):
+        power *= power
+    return power
+
+
+@lean_kernel
+def of_time(scene: Scene, x: float, y: float, yaw: float) -> float:
+    """What a second costs wherever it is; or it would put off the last turn for ever."""
+    return 0.0 if _arrived(scene, x, y, yaw) else 0.5 * SECOND
+
+
+@lean_kernel
+def _arrived(scene: Scene, x: float, y: float, yaw: float) -> bool:
+    dx, dy = x - scene.goal_x, y - scene.goal_y
+    if dx * dx + dy * dy > scene.tolerance * scene.tolerance:
+        return False
+    any_yaw = math.isnan(scene.goal_yaw)
+    return any_yaw or _turn_between(yaw, scene.goal_yaw) <= scene.yaw_tolerance
+
+
+@lean_kernel
+def of_motion(weights: Weights, room: float, vx: float, vy: float, w: float) -> float:
+    """What it costs to move so for a second."""
+    cost = weights.turning * w * w
+    over = math.sqrt(vx * vx + vy * vy) - (
+        weights.tight_speed + weights.tight_rate * (room - weights.margin)
+    )
+    if over > 0.0:
+        cost += weights.tight * over * over
+    if vx < 0.0:
+        cost -= weights.backwards * vx
+    return cost
+
+
+@lean_kernel
+def of_braking(
+    model: MotionModel, outline: Outline, scene: Scene, room: float, x: float, y: float,
+    cosine: float, sine: float, vx: float, vy: float,
+) -> float:  # fmt: skip
+    """What it costs to be faster for a second than what is ahead allows: safety would step in."""
+    speed = math.sqrt(vx * vx + vy * vy)
+    brake, t = model.deceleration, model.reaction_time
+    needs = speed * t + speed * speed / (2.0 * brake) + model.margin
+    if speed < SLOW or room >= needs:
+        return 0.0
+    sign = 1.0 if vx >= 0.0 else -1.0
+    free = free_ahead(scene.grid, outline, x, y, cosine, sine, sign, model.side_margin, needs)
+    allowed = math.sqrt((brake * t) ** 2 + 2.0 * brake * max(0.0, free - model.margin)) - brake * t
+    over = max(0.0, speed - allowed) / model.forward
+    return TOO_FAST * over * over
+
+
+@lean_kernel
+def rest(model: MotionModel, scene: Scene, x: float, y: float) -> float:
+    """The cost of the way from (x, y) to the goal."""
+    away = math.hypot(x - scene.goal_x, y - scene.goal_y)
+    way = away if away < NEAR_GOAL else distance_in(scene.field, x, y)
+    return SECOND * way / model.forward
+
+
+@lean_kernel
+def distance_in(field: Grid, x: float, y: float) -> float:
+    """The cost to go from (x, y) [m]; beyond the rim that of the rim."""
+    rows, columns = field.distance.shape
+    cell = field.cell
+    inner_x = min(max(x, field.x + cell), field.x + (columns - 1) * cell)
+    inner_y = min(max(y, field.y + cell), field.y + (rows - 1) * cell)
+    return distance_at(field, inner_x, inner_y)
+
+
+@lean_kernel
+def of_end(
+    model: MotionModel, weights: Weights, scene: Scene, x: float, y: float, yaw: float,
+    cosine: float, sine: float, vx: float, vy: float,
+) -> float:  # fmt: skip
+    """What is left to do after the last step: to turn to the way, to drive it, to turn at its end.
+
+    A body that has all but arrived only has to stand, with the right yaw.
+    """
+    cost = rest(model, scene, x, y)
+    dx, dy = scene.goal_x - x, scene.goal_y - y
+    near = math.hypot(dx, dy) < NEAR_GOAL
+    if not math.isnan(scene.goal_yaw):
+        arrives = yaw if near else math.atan2(dy, dx)
+        cost += SECOND * _turn_between(arrives, scene.goal_yaw) / model.turning
+    if near:
+        return cost + 0.5 * SECOND * math.hypot(vx, vy) / model.forward
+    here = distance_in(scene.field, x, y)
+    ahead = distance_in(scene.field, x + LOOK_AHEAD * cosine, y + LOOK_AHEAD * sine)
+    rise = max(-1.0, min(1.0, (ahead - here) / LOOK_AHEAD))
+    turn = 0.5 * math.pi * (1.0 + rise)
+    return cost + SECOND * weights.heading * turn / model.turning
+
+
+@lean_kernel
+def _turn_between(one: float, other: float) -> float:
+    """The angle between two directions [rad], 0 to pi."""
+    turn = one - other
+    return abs(turn - math.tau * math.floor(turn / math.tau + 0.5))
+
+
+@lean_kernel
+def of_contact(weights: Weights, seconds: float, share: float) -> float:
+    """What a contact with a moving thing costs, so late and after such a share of the plan."""
+    if weights.trust > 0.0:
+        return TOUCHED_DISC * math.exp(-seconds / weights.trust)
+    return TOUCHED_DISC * (1.0 - 0.6 * share)
+
+
+@lean_kernel
+def near_discs(
+    weights: Weights, discs: Floats, outline: Outline, seconds: float, state: Floats
+) -> None:
+    """How near the bodies of a `state` are to `discs` (m, 6), so many `seconds` from now.
+
+    AWAY takes how far each body's box is from the nearest [m], CLOSE, where that is counted, what
+    it costs for a second to be so near to them all.
+    """
+    for lane in range(LANES):
+        state[AWAY + lane], state[CLOSE + lane] = NO_DISC, 0.0
+    fades = weights.trust > 0.0
+    for disc in discs:
+        vx, vy = disc[2], disc[3]
+        x, y = disc[0] + vx * seconds, disc[1] + vy * seconds
+        radius = disc[4] + disc[5] * (min(seconds, GROWS_S) if fades else seconds)
+        over = weights.disc_over + weights.disc_lead * math.sqrt(vx * vx + vy * vy)
+        room = DECAYS * over if fades else DISC_ROOM
+        if _any_near(state, x, y, outline.far + radius + room):
+            _add_disc(outline, x, y, radius, room, 1.0 / over if fades else 0.0, state)
+    if fades:
+        for lane in range(LANES):
+            state[CLOSE + lane] *= weights.disc
+
+
+@lean_kernel
+def _any_near(state: Floats, x: float, y: float, reach: float) -> bool:
+    near = False
+    for lane in range(LANES):
+        dx, dy = x - state[X + lane], y - state[Y + lane]
+        near |= dx * dx + dy * dy < reach * reach
+    return near
+
+
+@lean_kernel
+def _add_disc(
+    outline: Outline, x: float, y: float, radius: float, room: float, decay: float, state: Floats
+) -> None:
+    """One disc more. What is farther from it than `room` [m] takes no notice."""
+    reach = outline.far + radius + room
+    for lane in range(LANES):
+        dx, dy = x - state[X + lane], y - state[Y + lane]
+        cosine, sine = state[COSINE + lane], state[SINE + lane]
+        ahead, aside = cosine * dx + sine * dy, cosine * dy - sine * dx
+        out_x = max(outline.rear - ahead, 0.0, ahead - outline.front)
+        out_y = max(outline.right - aside, 0.0, aside - outline.left)
+        away = math.sqrt(out_x * out_x + out_y * out_y) - radius
+        near = dx * dx + dy * dy < reach * reach
+        cost = exponential(-decay * max(0.0, away)) if near and decay > 0.0 else 0.0
+        state[AWAY + lane] = min(state[AWAY + lane], away if near else NO_DISC)
+        state[CLOSE + lane] += cost
+
+
+@lean_kernel
+def look_round(weights: Weights, outline: Outline, scene: Scene, dt: float, states: Floats) -> None:
+    """Fill in what is round the bodies in `states` (T + 1, STATE), and what that costs at least.
+
+    MIDDLE takes how far an obstacle is from the body's middle [m], SURE what a second there costs
+    without anything that moves, AWAY and CLOSE what `near_discs` says.
+    """
+    grid, per_cell = scene.grid, 1.0 / scene.grid.cell
+    for t in range(states.shape[0]):
+        state = states[t]
+        for lane in range(LANES):  # where the middle is, in cells
+            x, y = state[X + lane] - grid.x, state[Y + lane] - grid.y
+            cosine, sine = state[COSINE + lane], state[SINE + lane]
+            x += cosine * outline.center_x - sine * outline.center_y
+            y += sine * outline.center_x + cosine * outline.center_y
+            state[MIDDLE + lane], state[SURE + lane] = x * per_cell - 0.5, y * per_cell - 0.5
+        for lane in range(LANES):
+            column, row = state[MIDDLE + lane], state[SURE + lane]
+            state[MIDDLE + lane] = between(grid.distance, column, row)
+        for lane in range(LANES):
+            room = state[MIDDLE + lane] - outline.inner  # it is no more than that
+            room = room if room < AT_EASE else ROOM
+            near = weights.near * exponential((weights.margin - room) / weights.near_over)
+            motion = of_motion(weights, room, state[VX + lane], state[VY + lane], state[W + lane])
+            time = of_time(scene, state[X + lane], state[Y + lane], state[YAW + lane])
+            state[SURE + lane] = time + motion + (near if room < AT_EASE else 0.0)
+        near_discs(weights, scene.discs, outline, t * dt, state)
+
+
+@lean_kernel
+def rooms_of(scene: Scene, outline: Outline, states: Floats, rooms: Floats) -> None:
+    """Fill `rooms` (n,) with the clearances [m] in the first `states`, which all lanes share."""
+    for t in range(len(rooms)):
+        one = states[t]
+        found = clearance_of(
+            scene.grid, outline, one[X], one[Y], one[COSINE], one[SINE], one[MIDDLE], int(NONE)
+        )
+        rooms[t] = found[0]
+
+
+@lean_kernel
+def price(
+    model: MotionModel, outline: Outline, weights: Weights, scene: Scene, dt: float, rooms: Floats,
+    states: Floats, lane: int, limit: float,
+) -> float:  # fmt: skip
+    """The cost of going through a lane's `states`, or inf as soon as it is clear that it reaches
+    `limit`. `rooms` are those of `rooms_of`.
+    """
+    least = min(weights.margin, rooms[0] - SPARE)
+    least_disc = min(weights.disc_margin, states[0, AWAY + lane] - SPARE)
+    last = states[-1]
+    end = of_end(
+        model, weights, scene, last[X + lane], last[Y + lane], last[YAW + lane],
+        last[COSINE + lane], last[SINE + lane], last[VX + lane], last[VY + lane],
+    )  # fmt: skip
+    to_come = -math.inf
+    if limit < math.inf:
+        touching, passing = _at_least(
+            model, outline, weights, scene, dt, states, lane, (least, least_disc)
+        )
+        to_come = passing + end if touching >= limit else -math.inf
+        if min(touching, passing + end) >= limit:
+            return math.inf
+    cost: float = 0.0
+    room, slack, touches, looked = ROOM, 0.0, int(NONE), False
+    steps = states.shape[0] - 1
+    for t in range(1, steps + 1):
+        if cost + to_come >= limit:
+            return math.inf
+        one = states[t]
+        x, y, vx, vy = one[X + lane], one[Y + lane], one[VX + lane], one[VY + lane]
+        cosine, sine = one[COSINE + lane], one[SINE + lane]
+        slack -= one[MOVED + lane]
+        looked = slack < 0.0 and not (looked and room - one[MOVED + lane] > least)
+        if looked:
+            if t < len(rooms):
+                room = rooms[t]
+            else:
+                room, touches = clearance_of(
+                    scene.grid, outline, x, y, cosine, sine, one[MIDDLE + lane], touches
+                )
+            slack = room - AT_EASE
+        away = one[AWAY + lane]
+        if room < least:
+            cost += _of_touch(t / steps) + rest(model, scene, x, y)
+            return cost + IMPACT * math.hypot(vx, vy)
+        if away < least_disc:
+            return cost + of_contact(weights, t * dt, t / steps) + rest(model, scene, x, y)
+        cost += dt * one[CLOSE + lane]
+        cost += dt * of_place(weights, scene, room, away, x, y, one[YAW + lane])
+        cost += dt * of_motion(weights, room, vx, vy, one[W + lane])
+        to_come -= dt * (one[SURE + lane] + one[CLOSE + lane])
+        if t % BRAKE_EVERY == 1:
+            braking = of_braking(model, outline, scene, room, x, y, cosine, sine, vx, vy)
+            cost += dt * BRAKE_EVERY * braking
+    return cost + end
+
+
+@lean_kernel
+def _of_touch(share: float) -> float:
+    """What a contact costs after such a share of the plan."""
+    return TOUCHED * (1.0 - 0.7 * share)
+
+
+@lean_kernel
+def _at_least(
+    model: MotionModel, outline: Outline, weights: Weights, scene: Scene, dt: float, states: Floats,
+    lane: int, least: tuple[float, float],
+) -> tuple[float, float]:  # fmt: skip
+    """What a lane costs at least with a contact, and without one but for its end; inf for never.
+
+    A contact is possible where the middle of the body is so near to an obstacle that it may, and
+    comes at the latest where it is well inside: what the plan would be worth behind says nothing.
+    """
+    may = least[0] + STRETCH * outline.outer + UNSURE * scene.grid.cell
+    must = outline.inner + min(0.0, least[0])
+    steps = states.shape[0] - 1
+    touching, spent = math.inf, 0.0
+    for t in range(1, steps + 1):
+        one = states[t]
+        middle, struck = one[MIDDLE + lane], one[AWAY + lane] < least[1]
+        if middle < may or struck:
+            left = spent + rest(model, scene, one[X + lane], one[Y + lane])
+            if middle < may:
+                touching = min(touching, left + _of_touch(t / steps))
+            if struck:
+                touching = min(touching, left + of_contact(weights, t * dt, t / steps))
+        if middle < must or struck:
+            return touching, math.inf
+        spent += dt * (one[SURE + lane] + one[CLOSE + lane])
+    return touching, spent

@@ -1,0 +1,278 @@
+"""Global planner: paths to goals over the whole map, and frontiers to explore."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.brain import OccupancyGrid
+from gigabrain_zenoh.navigation.costmap import LETHAL, OCCUPIED_PERCENT, Costmap, Inflation
+from gigabrain_zenoh.navigation.costmap import costmap as make_costmap
+from gigabrain_zenoh.navigation.grid_search import (
+    Floats,
+    GridSearch,
+    costs_to_go,
+    is_free,
+    smooth_path,
+)
+
+POINT_SPACING_M = 0.1  # [m] between the points of a path, at most
+MAX_STRAY_M = 0.5  # [m] off its path: then it is planned anew
+SWITCH_COST_RATIO = (
+    0.85  # of what the present path costs: a new one must not cost more, or it flips
+)
+Point = tuple[float, float]  # [m], in the map's frame
+
+BLACKLIST_RADIUS_M = 0.5  # [m]: what is nearer to a place of the blacklist does not count
+SIZE_GAIN = 1.0  # a metre of frontier is worth a metre of way
+MAX_SIZE_M = 4.0  # [m] of frontier count
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Path:
+    """A way to a goal, in the map's frame."""
+
+    points: Floats  # (n, 2) [m], from where the robot is to the goal
+    remaining: Floats  # (n,) [m] from each to the goal
+    cost: Floats  # (n,) the same, weighted: metres in the open
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unreachable:
+    """A goal that no way leads to: why, and how near the robot could come."""
+
+    fault: str  # for people, without the nearest place
+    nearest: Point | None = None
+    distance: float = math.inf  # [m] from there to the goal, straight
+
+    @property
+    def reason(self) -> str:
+        """The fault and the nearest reachable place, for people."""
+        if self.nearest is None:
+            return self.fault
+        where = f"{self.distance:.2f} m away at ({self.nearest[0]:.2f}, {self.nearest[1]:.2f})"
+        return f"{self.fault}; nearest reachable point is {where}"
+
+
+class GlobalPlanner:
+    """Plans with the same memory again and again. Not for two threads at once."""
+
+    def __init__(self) -> None:
+        self.search = GridSearch()
+
+    def plan(self, costmap: Costmap, start: Point, goal: Point) -> Path | Unreachable:
+        """The cheapest path from `start` to `goal`, or why there is none."""
+        if not all(math.isfinite(value) for value in (*start, *goal)):
+            return Unreachable(fault="the goal and the robot's place must be finite numbers")
+        begin, end = costmap.cell(*start), costmap.cell(*goal)
+        if begin is None:
+            return Unreachable(fault="the robot is outside the map")
+        fault = _goal_problem(costmap, goal)
+        if fault or end is None:
+            self.search.reach(costmap.cost, begin)
+            return self._nearest(costmap, goal, fault)
+        cells = self.search.path(costmap.cost, begin, end)
+        if cells is None:
+            return self._nearest(costmap, goal, "no way leads to the goal")
+        places = np.column_stack((cells[:, 1] + 0.5, cells[:, 0] + 0.5))
+        places = np.vstack((places[:1], places)) if len(places) == 1 else places
+        places[0], places[-1] = _in_cells(costmap, np.array((start, goal)))
+        corners = _in_metres(costmap, smooth_path(costmap.cost, places))
+        corners[0], corners[-1] = start, goal  # exactly
+        return _path(costmap, corners)
+
+    def replan(self, costmap: Costmap, start: Point, goal: Point, path: Path) -> Path | Unreachable:
+        """What is left of `path` while that is free and nothing much better turns up."""
+        found = self.plan(costmap, start, goal)
+        rest = remaining_path(path, costmap, start)
+        if rest is None or tuple(path.points[-1]) != goal or not is_valid(rest, costmap):
+            return found
+        if isinstance(found, Path) and found.cost[0] < SWITCH_COST_RATIO * rest.cost[0]:
+            return found
+        return rest
+
+    def field(self, costmap: Costmap, goal: Point) -> Floats | None:
+        """What it costs to get to `goal` from each cell, (height, width) [m in the open].
+
+        None outside the map; inf from where no way leads there.
+        """
+        cell = costmap.cell(*goal)
+        if cell is None:
+            return None
+        return self.search.field(costmap.cost, cell, "to") * costmap.resolution
+
+    def _nearest(self, costmap: Costmap, goal: Point, why: str) -> Unreachable:
+        """How near to `goal` one gets with what the last grid_search has reached."""
+        column, row = _in_cells(costmap, np.array((goal,)))[0] - 0.5
+        cell = self.search.nearest(costmap.cost, row, column)
+        if cell is None:
+            return Unreachable(fault=f"{why}; the robot has no room to leave where it stands")
+        x, y = costmap.points(np.array(cell[:1]), np.array(cell[1:]))[0]
+        away = math.hypot(x - goal[0], y - goal[1])
+        return Unreachable(fault=why, nearest=(float(x), float(y)), distance=away)
+
+
+def is_valid(path: Path, costmap: Costmap) -> bool:
+    """Whether all of `path` is still free."""
+    return is_free(costmap.cost, _in_cells(costmap, path.points))
+
+
+def remaining_path(path: Path, costmap: Costmap, start: Point) -> Path | None:
+    """`path` from where the robot is now; None if it has strayed from it."""
+    begin, end = path.points[:-1], path.points[1:]
+    along = end - begin
+    lengths = (along**2).sum(axis=1)
+    share = ((start - begin) * along).sum(axis=1) / np.where(lengths > 0, lengths, 1.0)
+    beside = begin + share.clip(0, 1)[:, np.newaxis] * along
+    away = np.hypot(*(beside - start).T)
+    at = int(away.argmin())
+    if away[at] > MAX_STRAY_M:
+        return None
+    return _path(costmap, np.vstack((start, path.points[at + 1 :])))
+
+
+def warm_up() -> None:
+    """Compile all that planning calls: it takes seconds, or a moment where it is kept."""
+    cells = np.zeros((40, 40), np.int8)
+    rules = Inflation(fits=0.1, turns=0.2)
+    planner = GlobalPlanner()
+    grid = OccupancyGrid(
+        resolution=0.1, width=40, height=40, origin_x=0.0, origin_y=0.0, cells=cells.tobytes()
+    )
+    before = make_costmap(grid, rules)
+    now = make_costmap(grid, rules, np.array([[3.9, 3.9]]), before)
+    path = planner.plan(now, (0.1, 0.1), (1.0, 0.1))
+    if isinstance(path, Path):
+        planner.replan(now, (0.1, 0.1), (1.0, 0.1), path)
+    planner.plan(now, (0.1, 0.1), (3.9, 3.9))
+    planner.field(now, (0.1, 0.1))
+
+
+def _goal_problem(costmap: Costmap, goal: Point) -> str:
+    """What is wrong with a goal; nothing if the body fits there."""
+    cell = costmap.cell(*goal)
+    if cell is None:
+        return "the goal is outside the map"
+    if costmap.cells[cell] >= OCCUPIED_PERCENT:
+        return "the goal is inside something"
+    if costmap.cost[cell] > LETHAL:
+        fits = costmap.inflation.fits
+        return f"the goal is too close to something: the body needs {fits:.2f} m"
+    if costmap.cost[cell] == LETHAL:
+        return "the goal is in unknown space, which is forbidden"
+    return ""
+
+
+def _path(costmap: Costmap, corners: Floats) -> Path:
+    """The path along straight lines between `corners` (n, 2) [m]."""
+    points = _resampled(corners)
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    remaining = np.append(np.cumsum(steps[::-1])[::-1], 0.0)
+    cost = costs_to_go(costmap.cost, _in_cells(costmap, points)) * costmap.resolution
+    return Path(points=points, remaining=remaining, cost=cost)
+
+
+def _resampled(corners: Floats) -> Floats:
+    """Return points (n, 2) along straight lines, all corners among them."""
+    lengths = np.hypot(*np.diff(corners, axis=0).T)
+    counts = np.maximum(np.ceil(lengths / POINT_SPACING_M).astype(np.intp), 1)
+    first = np.concatenate(([0], np.cumsum(counts)))
+    at = np.arange(first[-1] + 1)
+    return np.column_stack([np.interp(at, first, values) for values in corners.T])
+
+
+def _in_cells(costmap: Costmap, points: Floats) -> Floats:
+    cells: Floats = (points - (costmap.origin_x, costmap.origin_y)) / costmap.resolution
+    return cells
+
+
+def _in_metres(costmap: Costmap, places: Floats) -> Floats:
+    points: Floats = places * costmap.resolution + (costmap.origin_x, costmap.origin_y)
+    return points
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frontier:
+    """A piece of the edge of the known, as wide as the body, and reachable through the known."""
+
+    x: float  # [m], of its cell nearest to its middle
+    y: float  # [m]
+    size: float  # [m]
+    cost: float  # [m in the open] to get there
+
+    @property
+    def score(self) -> float:
+        """The lower the better."""
+        return self.cost - SIZE_GAIN * min(self.size, MAX_SIZE_M)
+
+
+def next_frontier(
+    costmap: Costmap, robot: Point, blacklist: Iterable[Point], search: GridSearch
+) -> Frontier | None:
+    """The best frontier; None when all is mapped that can be reached.
+
+    In the blacklist is where the robot could not get to, and where it has been: what is unknown
+    there will stay so.
+    """
+    return min(
+        frontiers(costmap, robot, blacklist, search), key=lambda one: one.score, default=None
+    )
+
+
+def frontiers(
+    costmap: Costmap, robot: Point, blacklist: Iterable[Point], search: GridSearch
+) -> list[Frontier]:
+    """All frontiers that count, from `robot` [m]."""
+    start = costmap.cell(*robot)
+    if start is None:
+        return []
+    known = np.where(costmap.cells < 0, np.float32(LETHAL), costmap.cost)
+    way = search.field(known, start, "from") * costmap.resolution
+    edge = _edge(costmap.cells) & (known < LETHAL) & np.isfinite(way)
+    for x, y in blacklist:
+        _erase_around(edge, costmap, x, y)
+    count, labels, stats, middles = cv2.connectedComponentsWithStats(edge.view(np.uint8))
+    found = []
+    for label in range(1, count):
+        size = float(stats[label, cv2.CC_STAT_AREA]) * costmap.resolution
+        if size >= 2 * costmap.inflation.fits:
+            left, top, width, height = stats[label, : cv2.CC_STAT_AREA]
+            part = slice(top, top + height), slice(left, left + width)
+            rows, columns = np.nonzero(labels[part] == label)
+            found.append(_frontier(costmap, way, rows + top, columns + left, middles[label], size))
+    return found
+
+
+def _frontier(
+    costmap: Costmap,
+    way: Floats,
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    middle: Floats,
+    size: float,
+) -> Frontier:
+    best = int(np.hypot(columns - middle[0], rows - middle[1]).argmin())
+    x, y = costmap.points(rows[best : best + 1], columns[best : best + 1])[0]
+    return Frontier(x=float(x), y=float(y), size=size, cost=float(way[rows[best], columns[best]]))
+
+
+def _edge(cells: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """Known cells beside an unknown one; beyond the map all is unknown."""
+    unknown = np.pad(cells < 0, 1, constant_values=True)
+    beside = unknown[:-2, 1:-1] | unknown[2:, 1:-1] | unknown[1:-1, :-2] | unknown[1:-1, 2:]
+    edge: NDArray[np.bool_] = beside & (cells >= 0)
+    return edge
+
+
+def _erase_around(edge: NDArray[np.bool_], costmap: Costmap, x: float, y: float) -> None:
+    """Take away what is near a place."""
+    radius = BLACKLIST_RADIUS_M / costmap.resolution
+    column = (x - costmap.origin_x) / costmap.resolution - 0.5
+    row = (y - costmap.origin_y) / costmap.resolution - 0.5
+    top, left = max(int(row - radius), 0), max(int(column - radius), 0)
+    part = edge[top : max(int(row + radius) + 2, 0), left : max(int(column + radius) + 2, 0)]
+    rows, columns = np.ogrid[top : top + part.shape[0], left : left + part.shape[1]]
+    part &= np.hypot(rows - row, columns - column) > radius

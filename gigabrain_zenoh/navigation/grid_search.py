@@ -1,0 +1,350 @@
+"""Cheapest paths over a cost grid, eight-connected (A*, Dijkstra), and their smoothing.
+
+A step costs its length in cells times the mean cost of both cells. Corners are not cut. From cells
+of cost LETHAL or more a path may lead to lower cost only, so that a body too close to something
+can leave. Open cells lie in buckets by total cost, in half the time of a heap. Smoothing keeps
+straight lines that cost no more than the cells.
+"""
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_zenoh.kernels.jit import NONE, kernel
+from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
+
+DIAGONAL = math.sqrt(2.0)
+ROW_STEPS = (0, -1, -1, -1, 0, 1, 1, 1)  # by way: round the compass, the odd ones are diagonal
+COLUMN_STEPS = (1, 1, 0, -1, -1, -1, 0, 1)
+HALF_LENGTHS = (
+    0.5,
+    DIAGONAL / 2,
+    0.5,
+    DIAGONAL / 2,
+    0.5,
+    DIAGONAL / 2,
+    0.5,
+    DIAGONAL / 2,
+)  # its length
+MAX_BEND = 2  # ways to either side of that by which a cell was reached: behind, nothing is cheaper
+BUCKETS_PER_COST = 12.0  # buckets for a cost of 1
+BUCKETS = 4096  # in a ring: they hold more than any one step can add
+SUM_TOLERANCE = 1e-10  # sums of the same numbers in another order differ by less
+SPARE_ENTRIES = 1024
+ROOT_MARK = 8  # the way came from nowhere: it began here
+SETTLED_MARK = 16  # and more: the cell was settled
+RUN_STRIDE = 32  # and more: of this search
+LAST_RUN = np.iinfo(np.int32).max // RUN_STRIDE - 1  # the marks hold no greater one
+NOWHERE = -1
+OUT_OF_ENTRIES = -1  # no room for more entries
+NO_TARGET = (NOWHERE, NOWHERE)
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int32]
+Cell = tuple[int, int]  # row, column
+Direction = Literal["from", "to"]
+
+STRAIGHT_TOLERANCE = 1 + 1e-9  # of two ways that cost the same the straight one
+
+
+class SearchMemory(NamedTuple):
+    """What a search fills."""
+
+    g: Floats  # by cell, what the way to it costs
+    mark: Ints  # by cell, by what way it was reached, and in what turn
+    first: Ints  # by bucket, the entry on top
+    entries: Ints  # row, column, and the entry below
+
+
+class GridSearch:
+    """Searches with the same memory again and again. Not for two threads at once."""
+
+    def __init__(self) -> None:
+        self._shape = (0, 0)
+        self._turn = 0
+        none, first = np.empty(0, np.int32), np.empty(BUCKETS, np.int32)
+        self._memory = SearchMemory(np.empty(0), none, first, np.empty((3, 0), np.int32))
+
+    def path(self, cost: Costs, start: Cell, goal: Cell) -> Ints | None:
+        """The cheapest way from cell to cell (row, column), (n, 2); None when there is none."""
+        target = goal[0] * cost.shape[1] + goal[1]
+        self._run(cost, start, goal, reverse=False)
+        if self._memory.mark[target] < RUN_STRIDE * self._turn + SETTLED_MARK:
+            return None
+        cells = _trace(self._memory.mark, cost.shape[1], target)
+        return np.column_stack(np.divmod(cells, np.int32(cost.shape[1])))
+
+    def field(self, cost: Costs, cell: Cell, way: Direction) -> Floats:
+        """What the cheapest way costs, "to" `cell` from each or "from" it; inf where none leads.
+
+        (height, width), in cells: times the resolution it is metres at cost 1.
+        """
+        self._run(cost, cell, NO_TARGET, reverse=way == "to")
+        field = np.where(
+            self._memory.mark >= RUN_STRIDE * self._turn + SETTLED_MARK, self._memory.g, np.inf
+        )
+        return field.reshape(cost.shape)
+
+    def reach(self, cost: Costs, start: Cell) -> None:
+        """Go wherever a way leads from `start`, for `nearest` to be asked."""
+        self._run(cost, start, NO_TARGET, reverse=False)
+
+    def nearest(self, cost: Costs, row: float, column: float) -> Cell | None:
+        """The cell nearest to a place of all that the last search reached, where the body fits."""
+        found = _nearest(
+            cost,
+            self._memory.mark,
+            RUN_STRIDE * self._turn + SETTLED_MARK,
+            self._memory.g,
+            row,
+            column,
+        )
+        return None if found == NOWHERE else divmod(found, cost.shape[1])
+
+    def _run(self, cost: Costs, start: Cell, target: Cell, *, reverse: bool) -> None:
+        if cost.shape != self._shape:
+            self._make_room(cost.shape)
+        cost = np.ascontiguousarray(cost)
+        while True:
+            if self._turn >= LAST_RUN:
+                self._memory.mark[:] = self._turn = 0
+            self._turn += 1
+            if (
+                _search(cost, start, target, reverse, RUN_STRIDE * self._turn, self._memory)
+                != OUT_OF_ENTRIES
+            ):
+                return
+            more = np.empty((3, 2 * self._memory.entries.shape[1]), np.int32)
+            self._memory = self._memory._replace(entries=more)
+
+    def _make_room(self, shape: tuple[int, ...]) -> None:
+        """Memory for a grid. What no search comes to is never touched, and costs nothing."""
+        size = shape[0] * shape[1]
+        self._shape, self._turn = (shape[0], shape[1]), 0
+        entries = np.empty((3, size + SPARE_ENTRIES), np.int32)
+        self._memory = SearchMemory(
+            np.empty(size), np.zeros(size, np.int32), self._memory.first, entries
+        )
+
+
+@kernel
+def _search(
+    cost: Costs, start: Cell, target: Cell, reverse: bool, turn: int, held: SearchMemory
+) -> int:
+    """Settle cells until no way to `target` is cheaper; return how many, or OUT_OF_ENTRIES."""
+    (height, width), flat, (g, mark, first, entries) = cost.shape, cost.ravel(), held
+    first[:] = NOWHERE
+    at, best = start[0] * width + start[1], np.inf  # what the way to `target` costs, so far
+    g[at], mark[at] = 0.0, turn + ROOT_MARK
+    now = int(_bound(start[0], start[1], target) * BUCKETS_PER_COST)
+    _put(first, entries, int(NONE), now, start[0], start[1])
+    free, used, count, settled = NOWHERE, 1, 1, 0
+    while count:
+        top = first[now % BUCKETS]
+        if top == NOWHERE:
+            now += 1
+            continue
+        row, column, first[now % BUCKETS] = entries[0, top], entries[1, top], entries[2, top]
+        entries[2, top], free, count = free, top, count - 1
+        cell = row * width + column
+        base, here, way = g[cell], flat[cell], mark[cell] - turn
+        if way >= SETTLED_MARK:
+            continue  # a duplicate: it was reached at less meanwhile
+        if base + _bound(row, column, target) >= best - SUM_TOLERANCE and (row, column) != target:
+            continue
+        mark[cell] += SETTLED_MARK
+        settled += 1
+        begin, end = (0, 8) if way == ROOT_MARK else (way - MAX_BEND, way + MAX_BEND + 1)
+        for onward in range(begin, end):
+            to = onward & 7
+            down, right = row + ROW_STEPS[to], column + COLUMN_STEPS[to]
+            if not (0 <= down < height and 0 <= right < width):
+                continue
+            other = down * width + right
+            found = base + HALF_LENGTHS[to] * here + HALF_LENGTHS[to] * flat[other]
+            if mark[other] >= turn and found >= g[other] - SUM_TOLERANCE:
+                continue
+            if not _may_step(
+                flat, cell, other, row * width + right, down * width + column, reverse
+            ):
+                continue
+            g[other], mark[other] = found, turn + to
+            if (down, right) == target:
+                best = found
+            if free != NOWHERE:
+                entry, free = free, entries[2, free]
+            elif used < entries.shape[1]:
+                entry, used = used, used + 1
+            else:
+                return OUT_OF_ENTRIES
+            key = int((found + _bound(down, right, target)) * BUCKETS_PER_COST)
+            _put(first, entries, entry, max(now, key), down, right)
+            count += 1
+    return settled
+
+
+@kernel
+def _put(first: Ints, entries: Ints, entry: int, bucket: int, row: int, column: int) -> None:
+    """Lay `entry`, for a cell, on top of a bucket."""
+    entries[0, entry], entries[1, entry] = row, column
+    entries[2, entry], first[bucket % BUCKETS] = first[bucket % BUCKETS], entry
+
+
+@kernel
+def _may_step(flat: Costs, cell: int, other: int, aside: int, above: int, reverse: bool) -> bool:
+    """Whether a step may be taken. Of a diagonal one both cells beside it must be free as well."""
+    source, into = (flat[other], flat[cell]) if reverse else (flat[cell], flat[other])
+    return (
+        _may_enter(source, into)
+        and _may_enter(source, flat[aside])
+        and _may_enter(source, flat[above])
+    )
+
+
+@kernel
+def _may_enter(source: float, into: float) -> bool:
+    """Whether a body may come from a cell of that cost into one of the other."""
+    return into < LETHAL or into <= source
+
+
+@kernel
+def _bound(row: int, column: int, target: Cell) -> float:
+    """What the way to `target` costs at least: nowhere costs less than 1."""
+    if target[0] == NOWHERE:
+        return 0.0
+    down, right = abs(row - target[0]), abs(column - target[1])
+    return down + (DIAGONAL - 1) * right if down > right else right + (DIAGONAL - 1) * down
+
+
+@kernel
+def _trace(mark: Ints, width: int, target: int) -> Ints:
+    """The cells from the start to `target`, (n,)."""
+    count, cell = 1, target
+    while mark[cell] % SETTLED_MARK != ROOT_MARK:
+        cell -= (
+            ROW_STEPS[mark[cell] % SETTLED_MARK] * width + COLUMN_STEPS[mark[cell] % SETTLED_MARK]
+        )
+        count += 1
+    cells = np.empty(count, np.int32)
+    cell = target
+    for i in range(count - 1, 0, -1):
+        cells[i] = cell
+        cell -= (
+            ROW_STEPS[mark[cell] % SETTLED_MARK] * width + COLUMN_STEPS[mark[cell] % SETTLED_MARK]
+        )
+    cells[0] = cell
+    return cells
+
+
+@kernel
+def _nearest(cost: Costs, mark: Ints, done: int, g: Floats, row: float, column: float) -> int:
+    """The cell that was settled and is nearest; of equals the one that is cheaper to reach."""
+    best, least, flat = NOWHERE, np.inf, cost.ravel()
+    width = cost.shape[1]
+    for cell in range(flat.size):
+        if mark[cell] >= done and flat[cell] < LETHAL:
+            away = (cell // width - row) ** 2 + (cell % width - column) ** 2
+            if away < least or (away == least and g[cell] < g[best]):
+                best, least = cell, away
+    return best
+
+
+@kernel
+def line_cost(cost: Costs, x: float, y: float, to_x: float, to_y: float) -> tuple[float, float]:
+    """What a straight line_cost costs, and the highest cost on it; infinite outside the map."""
+    height, width = cost.shape
+    length = math.hypot(to_x - x, to_y - y)
+    column, row = math.floor(x), math.floor(y)
+    right, down = (1 if to_x > x else -1), (1 if to_y > y else -1)
+    every_x = abs(length / (to_x - x)) if to_x != x else np.inf
+    every_y = abs(length / (to_y - y)) if to_y != y else np.inf
+    next_x = every_x * (column + 1 - x if right > 0 else x - column) if to_x != x else np.inf
+    next_y = every_y * (row + 1 - y if down > 0 else y - row) if to_y != y else np.inf
+    spent, worst, gone = 0.0, 0.0, 0.0
+    while True:
+        if not (0 <= row < height and 0 <= column < width):
+            return np.inf, np.inf
+        here, until = cost[row, column], min(next_x, next_y, length)
+        spent += (until - gone) * here
+        worst = max(worst, here)
+        if until >= length:
+            return spent, worst
+        gone = until
+        if abs(next_x - next_y) < 1e-9:  # through a corner: both cells beside it must be free
+            if 0 <= column + right < width and 0 <= row + down < height:
+                worst = max(worst, cost[row, column + right], cost[row + down, column])
+            column, row = column + right, row + down
+            next_x, next_y = next_x + every_x, next_y + every_y
+        elif next_x < next_y:
+            column, next_x = column + right, next_x + every_x
+        else:
+            row, next_y = row + down, next_y + every_y
+
+
+@kernel
+def smooth_path(cost: Costs, points: Floats) -> Floats:
+    """Those of `points` (n, 2) between which the way may go straight."""
+    count = len(points)
+    spent = np.zeros(count)
+    for i in range(1, count):
+        x, y, to_x, to_y = points[i - 1, 0], points[i - 1, 1], points[i, 0], points[i, 1]
+        mean = 0.5 * (cost[int(y), int(x)] + cost[int(to_y), int(to_x)])
+        spent[i] = spent[i - 1] + mean * math.hypot(to_x - x, to_y - y)
+    kept, size, at = np.zeros(count, np.int64), 1, int(NONE)
+    while at < count - 1:
+        at = _farthest(cost, points, spent, at)
+        kept[size] = at
+        size += 1
+    return points[kept[:size]]
+
+
+@kernel
+def _farthest(cost: Costs, points: Floats, spent: Floats, at: int) -> int:
+    """Return the farthest point found that a straight line leads to: doubled steps, then halved."""
+    last = len(points) - 1
+    good, bad, hop = at + 1, last + 1, 2
+    while good < last:
+        tried = min(at + hop, last)
+        if not _is_straight(cost, points, spent, at, tried):
+            bad = tried
+            break
+        good, hop = tried, 2 * hop
+    while bad - good > 1:
+        middle = (good + bad) // 2
+        if _is_straight(cost, points, spent, at, middle):
+            good = middle
+        else:
+            bad = middle
+    return good
+
+
+@kernel
+def _is_straight(cost: Costs, points: Floats, spent: Floats, at: int, to: int) -> bool:
+    value, worst = line_cost(cost, points[at, 0], points[at, 1], points[to, 0], points[to, 1])
+    return worst < LETHAL and value <= (spent[to] - spent[at]) * STRAIGHT_TOLERANCE
+
+
+@kernel
+def costs_to_go(cost: Costs, points: Floats) -> Floats:
+    """What is left to the end of a line_cost from each of its `points` (n, 2), (n,)."""
+    left = np.zeros(len(points))
+    for i in range(len(points) - 2, -1, -1):
+        x, y, to_x, to_y = points[i, 0], points[i, 1], points[i + 1, 0], points[i + 1, 1]
+        left[i] = left[i + 1] + line_cost(cost, x, y, to_x, to_y)[0]
+    return left
+
+
+@kernel
+def is_free(cost: Costs, points: Floats) -> bool:
+    """Whether a body may go along `points` (n, 2): at first it may be leaving a tight spot."""
+    if line_cost(cost, points[0, 0], points[0, 1], points[0, 0], points[0, 1])[1] == np.inf:
+        return False
+    limit = cost[int(points[0, 1]), int(points[0, 0])]
+    for i in range(len(points) - 1):
+        x, y, to_x, to_y = points[i, 0], points[i, 1], points[i + 1, 0], points[i + 1, 1]
+        worst = line_cost(cost, x, y, to_x, to_y)[1]
+        if worst == np.inf or (worst >= LETHAL and worst > limit):
+            return False
+        limit = cost[int(to_y), int(to_x)]
+    return True

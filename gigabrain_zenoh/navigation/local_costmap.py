@@ -1,0 +1,325 @@
+"""Local costmap: a window around the robot that remembers recent lidar hits.
+
+A hit marks a cell; two beams that pass it clear it. What no beam can check expires, as odometry
+drifts. Distances are a 5 x 5 chamfer (Borgefors 1986). cv2.distanceTransform took 0.51 ms where
+this took 0.20 ms (320 x 320 cells), and differs in the last bits.
+"""
+
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gigabrain_schemas.base import TICK_NS
+from gigabrain_zenoh.kernels.jit import kernel
+from gigabrain_zenoh.navigation.footprint import FAR, Grid
+
+RIM_CELLS = 2  # cells round the window, from which nothing is near
+UNIT = 1 << 20  # of a cell
+STRAIGHT, SLANT, KNIGHT = UNIT, round(1.4 * UNIT), round(2.1969 * UNIT)
+UNREACHED = np.int32(1 << 29)
+FreeCells = NDArray[np.uint8]
+Steps = NDArray[np.int32]
+Singles = NDArray[np.float32]
+
+CELL_M = 0.025
+BEARING_BINS = 720  # of the bearings round the lidar
+MARK_LEVEL = 2  # of a cell that was just hit; each beam that passes takes one
+BEYOND_M = 0.1  # [m], how far past a cell a beam must go to have passed it
+Floats = NDArray[np.float64]
+
+DISC_MARGIN_M = 0.1  # [m], hits so near a moving thing are its own
+LATE_TICKS = 10  # so much longer than it seems a disc may have been over a cell
+
+STATIC_TICKS = 20  # a cell that was hit so long ago, and is now, belongs to what stands
+MAX_STATIC_SHARE = 0.5  # share of its cells that may, of a thing that moves
+RECENTER_SHARE = 0.05  # share of the window that the robot may be off its middle
+
+
+class Chamfer:
+    """Distances in windows of (side, side) cells of so many metres, `most` [m] at most."""
+
+    def __init__(self, side: int, cell: float, most: float) -> None:
+        self._steps = np.full(
+            (side + 2 * RIM_CELLS, side + 2 * RIM_CELLS), UNREACHED, dtype=np.int32
+        )
+        self._cell, self._most = cell, most
+
+    def distance(self, free: FreeCells) -> Singles:
+        """How far each cell is from the nearest that is 0 in `free`, by their centres [m]."""
+        distance = np.empty(free.shape, dtype=np.float32)
+        _chamfer(free, self._steps, np.float32(self._cell), np.float32(self._most), distance)
+        return distance
+
+
+@kernel
+def _chamfer(
+    free: FreeCells, steps: Steps, cell: np.float32, most: np.float32, distance: Singles
+) -> None:
+    rows, columns = free.shape
+    for row in range(rows):
+        here, cells = steps[row + RIM_CELLS, RIM_CELLS : RIM_CELLS + columns], free[row]
+        for column in range(columns):
+            here[column] = UNREACHED if cells[column] else np.int32(0)
+        _from_beside(steps[row + 1], steps[row], here)
+        now = UNREACHED
+        for column in range(columns):
+            now = min(np.int32(now + STRAIGHT), here[column])
+            here[column] = now
+    unit = np.float32(1.0 / UNIT)
+    for row in range(rows - 1, -1, -1):
+        here, out = steps[row + RIM_CELLS, RIM_CELLS : RIM_CELLS + columns], distance[row]
+        _from_beside(steps[row + RIM_CELLS + 1], steps[row + RIM_CELLS + 2], here)
+        now = UNREACHED
+        for column in range(columns - 1, -1, -1):
+            now = min(np.int32(now + STRAIGHT), here[column])
+            here[column] = now
+        for column in range(columns):
+            away = np.float32(here[column]) * unit * cell
+            out[column] = away if away < most else most
+
+
+@kernel
+def _from_beside(beside: Steps, beyond: Steps, here: Steps) -> None:
+    """Lower `here` by steps from the two rows on one side. Slices, and 32 bits: vectorised."""
+    n = len(here)
+    a, b, c, d, e = beside[:n], beside[1 : n + 1], beside[2 : n + 2], beside[3 : n + 3], beside[4:]
+    f, g = beyond[1 : n + 1], beyond[3 : n + 3]
+    for j in range(n):
+        knight = np.int32(min(min(a[j], e[j]), min(f[j], g[j])) + KNIGHT)
+        slant, straight = np.int32(min(b[j], d[j]) + SLANT), np.int32(c[j] + STRAIGHT)
+        here[j] = min(min(here[j], straight), min(slant, knight))
+
+
+class Pose2D(NamedTuple):
+    """A pose in the frame that is planned in."""
+
+    x: float  # [m]
+    y: float  # [m]
+    yaw: float  # [rad]
+
+
+class WindowCells(NamedTuple):
+    """The window as compiled functions take it, (rows, columns) each."""
+
+    level: NDArray[np.uint8]  # 0 where nothing is
+    seen: NDArray[np.int64]  # tick of the last hit
+    since: NDArray[np.int64]  # tick of the first hit since it was last free
+    x: float  # [m], of the corner of cell (0, 0)
+    y: float
+
+
+@kernel
+def observe(
+    cells: WindowCells,
+    marked: NDArray[np.int64],
+    place: Pose2D,
+    lidar: tuple[float, float],
+    hits: Floats,
+    tick: int,
+    oldest: int,
+) -> None:
+    """Forget what is older than `oldest`, take back what beams have passed, mark what they hit."""
+    level, seen = cells.level, cells.seen
+    cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
+    eye_x = place.x + cosine * lidar[0] - sine * lidar[1]
+    eye_y = place.y + sine * lidar[0] + cosine * lidar[1]
+    reach = np.full(BEARING_BINS, -1.0)
+    count = hits.shape[0]
+    points = np.empty((count, 2))
+    for i in range(count):
+        x = place.x + cosine * hits[i, 0] - sine * hits[i, 1]
+        y = place.y + sine * hits[i, 0] + cosine * hits[i, 1]
+        points[i, 0], points[i, 1] = x, y
+        k = _bin(x - eye_x, y - eye_y)
+        r = math.hypot(x - eye_x, y - eye_y)
+        if reach[k] < 0.0 or r < reach[k]:
+            reach[k] = r
+    (rows, columns), passed = level.shape, _passed(reach)
+    for n in marked:
+        i, j = n // columns, n % columns
+        x = cells.x + (j + 0.5) * CELL_M
+        y = cells.y + (i + 0.5) * CELL_M
+        if seen[i, j] < oldest:
+            level[i, j] = 0
+        elif math.hypot(x - eye_x, y - eye_y) + BEYOND_M < passed[_bin(x - eye_x, y - eye_y)]:
+            level[i, j] -= 1
+    for i in range(count):
+        x, y = points[i, 0], points[i, 1]
+        row = math.floor((y - cells.y) / CELL_M)
+        column = math.floor((x - cells.x) / CELL_M)
+        if 0 <= row < rows and 0 <= column < columns:
+            if level[row, column] == 0:
+                cells.since[row, column] = tick
+            level[row, column] = MARK_LEVEL
+            seen[row, column] = tick
+
+
+@kernel
+def _bin(x: float, y: float) -> int:
+    """Into which of the BEARING_BINS the direction of (x, y) falls: a series is quicker than atan2.
+
+    Abramowitz and Stegun, 4.4.47: to 1e-5 rad, a thousandth of a bin.
+    """
+    far, near = max(abs(x), abs(y), 1e-12), min(abs(x), abs(y))
+    r = near / far
+    s = r * r
+    series = -0.3302995 + s * (0.1801410 + s * (-0.0851330 + s * 0.0208351))
+    turn = r * (0.9998660 + s * series)
+    turn = 0.5 * math.pi - turn if abs(y) > abs(x) else turn
+    turn = math.pi - turn if x < 0.0 else turn
+    turn = -turn if y < 0.0 else turn
+    return math.floor((turn / math.tau + 0.5) * BEARING_BINS) % BEARING_BINS
+
+
+@kernel
+def _passed(reach: Floats) -> Floats:
+    """How far all beams round each bin went at least [m]; -1 where none is known to have."""
+    passed = np.full(BEARING_BINS, -1.0)
+    for k in range(BEARING_BINS):
+        for n in (k - 1, k, k + 1):
+            r, nearest = reach[n % BEARING_BINS], passed[k]
+            if r >= 0.0 and (nearest < 0.0 or r < nearest):
+                passed[k] = r
+    return passed
+
+
+@kernel
+def stays(cells: WindowCells, disc: Floats, tick: int, long_ago: int) -> float:
+    """The share of the cells of `disc` hit at `tick` that were hit `long_ago` already."""
+    x, y, radius = disc[0], disc[1], disc[4] + DISC_MARGIN_M
+    top, bottom, left, end = _box(cells, x, y, radius)
+    hit = old = 0
+    for i in range(top, bottom):
+        down = cells.y + (i + 0.5) * CELL_M - y
+        for j in range(left, end):
+            near = math.hypot(cells.x + (j + 0.5) * CELL_M - x, down) <= radius
+            if near and cells.level[i, j] > 0 and cells.seen[i, j] == tick:
+                hit += 1
+                old += cells.since[i, j] <= long_ago
+    return old / hit if hit else 0.0
+
+
+@kernel
+def take_back(cells: WindowCells, disc: Floats, tick: int) -> None:
+    """Free the cells that were first hit after `disc` had come to be over them."""
+    x, y, vx, vy, radius = disc[0], disc[1], disc[2], disc[3], disc[4] + DISC_MARGIN_M
+    square, (top, bottom, left, end) = max(vx * vx + vy * vy, 1e-6), _box(cells, x, y, radius)
+    for i in range(top, bottom):
+        down = cells.y + (i + 0.5) * CELL_M - y
+        for j in range(left, end):
+            right = cells.x + (j + 0.5) * CELL_M - x
+            inside, along = radius**2 - right**2 - down**2, right * vx + down * vy
+            if inside >= 0.0 and cells.level[i, j] > 0:
+                ago = (math.sqrt(along**2 + square * inside) - along) / square * 1e9 / TICK_NS
+                if cells.since[i, j] >= tick - ago - LATE_TICKS:
+                    cells.level[i, j] = 0
+
+
+@kernel
+def _box(cells: WindowCells, x: float, y: float, radius: float) -> tuple[int, int, int, int]:
+    """The rows and columns that a disc may touch: the first, and that after the last, of each."""
+    rows, columns = cells.level.shape
+    top, bottom = (y - radius - cells.y) / CELL_M, (y + radius - cells.y) / CELL_M
+    left, end = (x - radius - cells.x) / CELL_M, (x + radius - cells.x) / CELL_M
+    return (
+        max(0, int(top)),
+        min(rows, int(bottom) + 1),
+        max(0, int(left)),
+        min(columns, int(end) + 1),
+    )
+
+
+class LocalCostmap:
+    """A square of `size` [m] round the robot, its axes those of the frame that is planned in."""
+
+    def __init__(self, size: float, memory_s: float) -> None:
+        self.cells = 2 * round(size / CELL_M / 2)
+        self._chamfer = Chamfer(self.cells, CELL_M, FAR)
+        self._memory = round(memory_s * 1e9 / TICK_NS)
+        self._held, self._spare = _nothing(self.cells), _nothing(self.cells)
+        self._row = self._column = 0  # of cell (0, 0), counted from the frame's origin
+        self._empty = True
+
+    @property
+    def x(self) -> float:
+        """Where the window begins [m]."""
+        return self._column * CELL_M
+
+    @property
+    def y(self) -> float:
+        """Where the window begins [m]."""
+        return self._row * CELL_M
+
+    def see(self, tick: int, place: Pose2D, lidar: tuple[float, float], hits: Floats) -> None:
+        """Take in a scan: `hits` (n, 2) [m] in the body's frame, the `lidar` at (x, y) in it."""
+        self._follow(place)
+        observe(self._held, _marked(self._held), place, lidar, hits, tick, tick - self._memory)
+
+    def moving(self, tick: int, discs: Floats) -> Floats:
+        """Those of the `discs` (n, 6), x, y [m] first and the radius fifth, that really move.
+
+        What moves hits cells that were free a moment ago. Posts and corners can be taken for one
+        another, and then seem to move; but they keep hitting the same cells.
+        """
+        held, long_ago = self._held, tick - STATIC_TICKS
+        return discs[[stays(held, disc, tick, long_ago) <= MAX_STATIC_SHARE for disc in discs]]
+
+    def take_back(self, tick: int, discs: Floats) -> None:
+        """Free what each of `discs` (n, 6) covered on its way here: nothing stands there."""
+        for disc in discs:
+            take_back(self._held, disc, tick)
+
+    def grid(self, tick: int, known: Floats, moving: Floats) -> Grid:
+        """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m].
+
+        What was hit of late on one of the discs `moving` does not count: it will be elsewhere soon.
+        """
+        free = (self._held.level == 0).view(np.uint8)
+        if len(moving):
+            near = np.zeros_like(free)
+            for x, y, radius in moving[:, [0, 1, 4]].tolist():
+                at = round((x - self.x) / CELL_M), round((y - self.y) / CELL_M)
+                cv2.circle(near, at, math.ceil((radius + DISC_MARGIN_M) / CELL_M), 1, cv2.FILLED)
+            free |= near & (self._held.since > tick - STATIC_TICKS)
+        if len(known):
+            cells = np.floor((known - (self.x, self.y)) / CELL_M).astype(np.int64)
+            cells = cells[((cells >= 0) & (cells < self.cells)).all(axis=1)]
+            free[cells[:, 1], cells[:, 0]] = 0
+        return Grid(self._chamfer.distance(free), CELL_M, self.x, self.y)
+
+    def _follow(self, place: Pose2D) -> None:
+        """Keep the robot in the middle; what leaves the window is forgotten."""
+        half = self.cells // 2
+        row = math.floor(place.y / CELL_M) - half
+        column = math.floor(place.x / CELL_M) - half
+        down, right = row - self._row, column - self._column
+        if max(abs(down), abs(right)) <= RECENTER_SHARE * self.cells and not self._empty:
+            return
+        _carry(self._held, self._spare, down, right)
+        self._row, self._column, self._empty = row, column, False
+        self._held, self._spare = self._spare._replace(x=self.x, y=self.y), self._held
+
+
+def _nothing(side: int) -> WindowCells:
+    ticks = np.zeros((2, side, side), dtype=np.int64)
+    return WindowCells(np.zeros((side, side), dtype=np.uint8), ticks[0], ticks[1], 0.0, 0.0)
+
+
+def _marked(cells: WindowCells) -> NDArray[np.int64]:
+    """The marked cells (n,), counted along the rows: few of many."""
+    return np.flatnonzero(cells.level > 0)
+
+
+def _carry(cells: WindowCells, to: WindowCells, down: int, right: int) -> None:
+    """Fill `to` with what a window over `cells` sees that has moved on by so many of them."""
+    side = len(cells.level)
+    at = np.array(divmod(_marked(cells), side))
+    then = at - np.array([[down], [right]])
+    stays = ((then >= 0) & (then < side)).all(axis=0)
+    (i, j), (row, column) = at[:, stays], then[:, stays]
+    to.level.fill(0)
+    to.level[row, column] = cells.level[i, j]
+    to.seen[row, column], to.since[row, column] = cells.seen[i, j], cells.since[i, j]

@@ -1,0 +1,427 @@
+"""Local planner: from what is near now to the motion of the next seconds, and its reason."""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Literal
+
+import numpy as np
+from msgspec import Meta, Struct, structs
+from numpy.typing import NDArray
+
+from gigabrain_schemas.base import TICK_NS, Pose, Positive, Velocity
+from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.brain import ActuationModel, Obstacle, TrajectoryPoint
+from gigabrain_zenoh.navigation import dynamic_obstacles
+from gigabrain_zenoh.navigation.cost import Scene, Weights, distance_in
+from gigabrain_zenoh.navigation.cost_to_go import CostToGo
+from gigabrain_zenoh.navigation.footprint import clearance, outline_of
+from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
+from gigabrain_zenoh.navigation.motion_model import (
+    InitialState,
+    MotionModel,
+    lag_of,
+    model_of,
+    slowed_model,
+)
+from gigabrain_zenoh.navigation.mppi import SampledPlan, Sampler, past_of, step_of
+
+Floats = NDArray[np.float64]
+PlanKind = Literal["going", "going round", "waiting", "backing out", "turning in place", "arrived"]
+
+SOON_S = 1.0  # what the body does within this time is what it is said to do
+STILL_SHARE = 0.08  # share of the largest speed that counts as standing
+NAMED_WITHIN_M = 1.5  # [m], what moves within this is named
+AT_GOAL_M = 0.2  # [m], so little is left where only standing and turning are
+DETOUR_M = 0.15  # [m], so far off the straight way is round something
+
+TICK_S = TICK_NS / 1e9
+MOVING_SPEED = 0.15  # [m/s], slower things are part of the grid
+MOVING_SIGMAS = 3.0  # standard deviations of its velocity that a thing must be faster than to move
+DEFAULT_SPEED_SIGMA = 0.05  # [m/s], standard deviation of a velocity that comes without
+MAX_GROWTH_SPEED = 0.3  # [m/s], of a disc: how fast what is known of it fades at most
+STUCK_RADIUS_M = 0.3  # [m], who gets no farther than this is in one place
+MAKING_WAY = "making way: it looks round for what moves"
+ARRIVED_SPEED_SHARE = 0.05  # share of the largest speeds at which a body has arrived
+
+
+class LocalSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """How the local planner works."""
+
+    samples: Annotated[int, Meta(ge=64, le=20_000)] = 1000  # plans per cycle
+    steps: Annotated[int, Meta(ge=10, le=60)] = 30  # of 0.05 s for quick bodies, 0.1 s for slow
+    window: Annotated[float, Meta(ge=2.0, le=20.0)] = 8.0  # [m], side of what is looked at
+    memory: Positive = 10.0  # [s], how long what no beam can check is believed
+    linear_speed: Positive | None = None  # [m/s], no faster; the body's own limit holds as well
+    position_tolerance: Positive = 0.1  # [m]
+    yaw_tolerance: Positive = 0.1  # [rad]
+    stuck_after: Positive = 5.0  # [s] in one place, then another way is wanted
+    seed: Annotated[int, Meta(ge=0, le=2**32)] = 0
+
+
+DEFAULTS = LocalSettings()
+
+
+class Goal(Struct, frozen=True, kw_only=True):
+    """Where to go, in the frame that is planned in."""
+
+    x: float  # [m]
+    y: float  # [m]
+    yaw: float | None = None  # [rad]; None where any will do
+
+
+class SentCommand(Struct, frozen=True):
+    """A command that the body has been given."""
+
+    tick: int  # from which on it holds
+    velocity: Velocity
+
+
+def no_points() -> Floats:
+    """(0, 2)."""
+    return np.empty((0, 2))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanRequest:
+    """All that the local planner goes by, in one frame that does not jump: that of the odometry."""
+
+    tick: int  # of the scan
+    pose: Pose  # of that tick
+    velocity: Velocity  # measured at that tick
+    goal: Goal
+    hits: Floats  # (n, 2) [m], in the body's frame
+    path: Floats | None = None  # (k, 2) [m], to the goal; without one it looks for its own
+    known: Floats = field(default_factory=no_points)  # (m, 2) [m], obstacles of the map near by
+    obstacles: tuple[Obstacle, ...] = ()
+    response: ActuationModel = field(default_factory=ActuationModel)
+    sent: tuple[SentCommand, ...] = ()  # oldest first; those of the last 0.5 s are enough
+    delayed: float = 0.0  # [s], how much later than usual what is planned will be obeyed
+    may_back: bool = True  # else something is behind it, or it cannot see there
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalPlan:
+    """What to do now, what will come of it, and why."""
+
+    twist: Velocity  # to command now
+    trajectory: tuple[TrajectoryPoint, ...]  # expected, in the body's frame of the moment
+    kind: PlanKind
+    reason: str  # in words, for people
+    blocked: bool = False  # nothing has come of it for a while: another way is wanted
+    arrived: bool = False
+    remaining: float = 0.0  # [m of free way], cost to go from here
+
+
+def kind_of(model: MotionModel, track: Floats, dt: float, goal: Goal) -> PlanKind:
+    """What `track` (T + 1, 6) amounts to within the next second."""
+    soon = min(len(track) - 1, max(1, round(SOON_S / dt)))
+    begin, end = track[0].tolist(), track[soon].tolist()  # plain numbers are quicker
+    made = math.hypot(end[0] - begin[0], end[1] - begin[1])
+    turned = abs(end[2] - begin[2])
+    if made < STILL_SHARE * model.forward * soon * dt:
+        return "waiting" if turned < STILL_SHARE * model.turning * soon * dt else "turning in place"
+    back = (end[0] - begin[0]) * math.cos(begin[2]) + (end[1] - begin[1]) * math.sin(begin[2])
+    if model.lateral == 0.0 and back < 0.0:
+        return "backing out"
+    return "going round" if _aside(track, goal) > DETOUR_M else "going"
+
+
+def reason_of(kind: PlanKind, track: Floats, discs: Floats, room: float, left: float) -> str:
+    """Why, with what is in the way: `room` [m] round the body, `left` [m] to go."""
+    moving = _nearest_moving(track, discs)
+    if left < AT_GOAL_M and not moving and kind in ("waiting", "turning in place"):
+        return f"{kind}: at the goal"
+    if kind == "waiting":
+        return f"waiting: {moving}" if moving else f"waiting: no way on, {room:.2f} m of room"
+    if kind == "going round":
+        return f"going round: {moving or f'something {room:.2f} m away'}"
+    if kind == "backing out":
+        return f"backing out: {moving or f'no way on ahead, {room:.2f} m of room'}"
+    if kind == "turning in place":
+        return "turning in place: the way on is to the side"
+    return f"going: {left:.1f} m to go"
+
+
+def _nearest_moving(track: Floats, discs: Floats) -> str:
+    """What moves near the way, if anything does."""
+    if not len(discs):
+        return ""
+    away = np.hypot(discs[:, 0] - track[0, 0], discs[:, 1] - track[0, 1]) - discs[:, 4]
+    nearest = int(np.argmin(away))
+    if away[nearest] > NAMED_WITHIN_M:
+        return ""
+    dx, dy = discs[nearest, :2] - track[0, :2]
+    side = math.remainder(math.atan2(dy, dx) - track[0, 2], math.tau)
+    where = _side(side)
+    speed = float(np.hypot(*discs[nearest, 2:4]))
+    return f"somebody at {speed:.1f} m/s {max(0.0, float(away[nearest])):.1f} m {where}"
+
+
+def _side(bearing: float) -> str:
+    if abs(bearing) < math.radians(45):
+        return "ahead"
+    if abs(bearing) > math.radians(135):
+        return "behind"
+    return "to the left" if bearing > 0 else "to the right"
+
+
+def _aside(track: Floats, goal: Goal) -> float:
+    """How far the track leaves the straight way to the goal [m]."""
+    then: list[tuple[float, float]] = track[:, :2].tolist()
+    x, y = then[0]
+    dx, dy = goal.x - x, goal.y - y
+    length = math.hypot(dx, dy)
+    if length < DETOUR_M:
+        return 0.0
+    return max(abs((to_y - y) * dx - (to_x - x) * dy) for to_x, to_y in then) / length
+
+
+class LocalPlanner:
+    """Drives one body. It keeps what it saw and planned, and no clock."""
+
+    def __init__(self, body: BodyDescription, settings: LocalSettings = DEFAULTS) -> None:
+        self._body, self._settings = body, settings
+        self._model = model_of(body, settings.linear_speed)
+        self._outline = outline_of(body.footprint)
+        self._lidar = (body.lidar.x, body.lidar.y) if body.lidar else (0.0, 0.0)
+        half_y = (self._outline.left - self._outline.right) / 2
+        half_x = (self._outline.front - self._outline.rear) / 2
+        self._half_width = min(half_x, half_y) if self._model.lateral > 0 else half_y
+        self._sampler, self._traffic = self._sampler_of(), self._traffic_of()
+        self._weights = Weights()
+        self.reset()
+
+    def limit_speed(self, linear_speed: float | None) -> None:
+        """Drive no faster than this [m/s] from now on; what was seen and planned is kept."""
+        self._settings = structs.replace(self._settings, linear_speed=linear_speed)
+        self._model = model_of(self._body, linear_speed)
+        before = self._sampler
+        self._sampler, self._traffic = self._sampler_of(), self._traffic_of()
+        self._sampler.last, self._sampler.dt = before.last, before.dt
+
+    def _sampler_of(self) -> Sampler:
+        model, settings = self._model, self._settings
+        return Sampler(model, settings.samples, settings.steps, step_of(model), settings.seed)
+
+    def _traffic_of(self) -> dynamic_obstacles.TrafficMap | None:
+        """What a quick body looks out for."""
+        lidar, model = self._body.lidar, self._model
+        if not dynamic_obstacles.is_quick(model):
+            return None
+        sight = lidar.range_max if lidar else 0.0
+        return dynamic_obstacles.TrafficMap(2.0 * self._half_width, model.forward, sight)
+
+    def reset(self) -> None:
+        """Forget all that was seen and planned: the odometry has begun anew."""
+        self._window = LocalCostmap(self._settings.window, self._settings.memory)
+        self._costs = CostToGo(self._window.cells)
+        self._sampler.forget()
+        if self._traffic:
+            self._traffic.reset()
+        self._tick: int | None = None
+        self._began = 0
+        self._anchor, self._anchor_tick = Pose(x=0.0, y=0.0, yaw=0.0), 0
+
+    def plan(self, moment: PlanRequest) -> LocalPlan:
+        """What to do at this moment. Raises ValueError for a goal that is no place."""
+        goal = moment.goal
+        if not all(math.isfinite(v) for v in (goal.x, goal.y, goal.yaw or 0.0)):
+            raise ValueError(f"a goal has finite numbers, got {goal}")
+        self._pass_time(moment)
+        place = Pose2D(moment.pose.x, moment.pose.y, moment.pose.yaw)
+        discs = _discs(moment.obstacles)
+        hits = np.ascontiguousarray(moment.hits, dtype=np.float64)
+        self._window.see(moment.tick, place, self._lidar, hits)
+        discs = self._window.moving(moment.tick, discs)
+        weights = self._look_out(moment.tick, place, discs)
+        if self._arrived(moment):
+            return _standing("arrived: at the goal", arrived=True)
+        looks_round = self._looks_round(moment.tick)
+        if looks_round:
+            if weights is self._weights or dynamic_obstacles.stay_clear(discs, place.x, place.y):
+                return _standing("waiting: it looks round for what moves")
+            moment = replace(moment, goal=Goal(x=place.x, y=place.y), path=None)
+        scene = self._scene(moment, discs)
+        model = slowed_model(self._model, moment.delayed)
+        planned = self._sampler.plan(
+            model if moment.may_back else model._replace(backward=0.0),
+            self._outline,
+            weights,
+            scene,
+            self._start(moment, place),
+        )
+        answer = self._answer(moment, scene, planned)
+        return replace(answer, reason=MAKING_WAY) if looks_round else answer
+
+    def _look_out(self, tick: int, place: Pose2D, discs: Floats) -> Weights:
+        """Get ready for what moves: a quick body among quick things plans in another way."""
+        quick = dynamic_obstacles.moving_quickly(discs) if self._traffic else discs[:0]
+        if self._traffic:
+            self._traffic.see(tick, place.x, place.y, quick)
+        if not len(quick):
+            self._sampler.step_by(step_of(self._model))
+            return self._weights
+        self._window.take_back(tick, quick)
+        self._sampler.step_by(dynamic_obstacles.HORIZON_S / self._settings.steps)
+        return dynamic_obstacles.WEIGHTS
+
+    def _looks_round(self, tick: int) -> bool:
+        """Whether a quick body has yet to see what moves, and where, before it drives off."""
+        if not self._traffic:
+            return False
+        looks = (
+            dynamic_obstacles.LOOK_AROUND_IN_TRAFFIC_S
+            if self._traffic.any
+            else dynamic_obstacles.LOOK_AROUND_S
+        )
+        return (tick - self._began) * TICK_S < looks
+
+    def _scene(self, moment: PlanRequest, discs: Floats) -> Scene:
+        goal = moment.goal
+        grid = self._window.grid(moment.tick, moment.known, discs)
+        ways = self._traffic.ways((goal.x, goal.y)) if self._traffic else None
+        field = self._costs.field(grid, self._half_width, (goal.x, goal.y), moment.path, ways)
+        yaw = math.nan if goal.yaw is None else goal.yaw
+        near, turned = self._settings.position_tolerance, self._settings.yaw_tolerance
+        return Scene(grid, field, discs, goal.x, goal.y, yaw, near, turned)
+
+    def _start(self, moment: PlanRequest, place: Pose2D) -> InitialState:
+        v, sent, dt = moment.velocity, moment.sent, self._sampler.dt
+        times = [((one.tick - moment.tick) * TICK_S, *_axes(one.velocity)) for one in sent]
+        rows = np.array([row for row in times if row[0] <= 0.0]).reshape(-1, 4)
+        gain = moment.response.turn_gain
+        rows[:, 3] *= gain  # what the floor makes of it; control undoes that in what is to come
+        before = tuple(rows[-1, 1:].tolist()) if len(rows) else _axes(v)
+        past, share = past_of(rows, _axes(v), moment.response.delay, dt)
+        lag = lag_of(moment.response.lag, dt)
+        return InitialState(*place, *_axes(v), before, past, share, lag, gain)
+
+    def _answer(self, moment: PlanRequest, scene: Scene, planned: SampledPlan) -> LocalPlan:
+        place = moment.pose
+        cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
+        room = clearance(scene.grid, self._outline, place.x, place.y, cosine, sine)
+        left = distance_in(scene.field, place.x, place.y)
+        blocked = self._stuck(moment)
+        kind = kind_of(self._model, planned.track, self._sampler.dt, moment.goal)
+        vx, vy, w = planned.commands[0].tolist()
+        return LocalPlan(
+            twist=Velocity(linear_x=vx, linear_y=vy, angular_z=w),
+            trajectory=_trajectory(planned.track, self._sampler.dt),
+            kind=kind,
+            reason=reason_of(kind, planned.track, scene.discs, room, left),
+            blocked=blocked,
+            remaining=left,
+        )
+
+    def _pass_time(self, moment: PlanRequest) -> None:
+        if self._tick is None:
+            self._began = moment.tick
+        elif moment.tick > self._tick:
+            self._sampler.shift((moment.tick - self._tick) * TICK_S)
+        self._tick = moment.tick
+
+    def _arrived(self, moment: PlanRequest) -> bool:
+        goal, pose, v = moment.goal, moment.pose, moment.velocity
+        off = math.hypot(goal.x - pose.x, goal.y - pose.y)
+        turn = 0.0 if goal.yaw is None else abs(math.remainder(goal.yaw - pose.yaw, math.tau))
+        settings, model = self._settings, self._model
+        slow = math.hypot(v.linear_x, v.linear_y) <= max(0.02, ARRIVED_SPEED_SHARE * model.forward)
+        near = off <= settings.position_tolerance and turn <= settings.yaw_tolerance
+        return near and slow and abs(v.angular_z) <= max(0.05, ARRIVED_SPEED_SHARE * model.turning)
+
+    def _stuck(self, moment: PlanRequest) -> bool:
+        """Whether it has been in one place for too long."""
+        here, then = moment.pose, self._anchor
+        gone = math.hypot(here.x - then.x, here.y - then.y) > STUCK_RADIUS_M
+        if gone or not self._anchor_tick:
+            self._anchor, self._anchor_tick = here, moment.tick
+        return (moment.tick - self._anchor_tick) * TICK_S > self._settings.stuck_after
+
+
+def _standing(reason: str, *, arrived: bool = False, blocked: bool = False) -> LocalPlan:
+    return LocalPlan(
+        twist=Velocity(),
+        trajectory=(),
+        kind="arrived" if arrived else "waiting",
+        reason=reason,
+        arrived=arrived,
+        blocked=blocked,
+    )
+
+
+def _trajectory(track: Floats, dt: float) -> tuple[TrajectoryPoint, ...]:
+    """`track` (T + 1, 6) as seen from its first pose."""
+    rows = track.tolist()  # plain numbers are quicker where they are few
+    x, y, yaw, *_ = rows[0]
+    cosine, sine = math.cos(yaw), math.sin(yaw)
+    return tuple(
+        TrajectoryPoint(
+            n * dt,
+            cosine * (to_x - x) + sine * (to_y - y),
+            cosine * (to_y - y) - sine * (to_x - x),
+            to_yaw - yaw,
+            *velocity,
+        )
+        for n, (to_x, to_y, to_yaw, *velocity) in enumerate(rows)
+    )
+
+
+def _axes(of: Velocity) -> tuple[float, float, float]:
+    return of.linear_x, of.linear_y, of.angular_z
+
+
+def _discs(obstacles: tuple[Obstacle, ...]) -> Floats:
+    """(m, 6): what moves, and how fast what is known of it fades."""
+    rows = [
+        (
+            one.x,
+            one.y,
+            one.velocity_x,
+            one.velocity_y,
+            one.radius,
+            min(MAX_GROWTH_SPEED, _growth(one)),
+        )
+        for one in obstacles
+        if math.hypot(one.velocity_x, one.velocity_y)
+        > max(MOVING_SPEED, MOVING_SIGMAS * _growth(one))
+    ]
+    return np.array(rows, dtype=np.float64).reshape(-1, 6)
+
+
+def _growth(obstacle: Obstacle) -> float:
+    """Standard deviation of the velocity [m/s]."""
+    if not obstacle.covariance:
+        return DEFAULT_SPEED_SIGMA
+    return math.sqrt(max(0.0, obstacle.covariance[10], obstacle.covariance[15]))
+
+
+def warm_up(body: BodyDescription) -> None:
+    """Compile all that a driving robot will call, with `body`'s own shapes."""
+    _warm_up_traffic()
+    goal, here = Goal(x=0.5, y=0.0), Pose(x=0.0, y=0.0, yaw=0.0)
+    planner = LocalPlanner(body, LocalSettings(samples=64, steps=10, window=2.0))
+    for tick, x in ((1, 0.9), (51, 0.7)):  # once it has looked round
+        somebody = Obstacle(id=1, x=x, y=0.0, velocity_x=1.0, radius=0.3)
+        planner.plan(
+            PlanRequest(
+                tick=tick,
+                pose=here,
+                velocity=Velocity(),
+                goal=goal,
+                hits=np.array([[x, 0.0]]),
+                obstacles=(somebody,),
+            )
+        )
+
+
+def _warm_up_traffic() -> None:
+    """Compile what only quick bodies among quick things call."""
+    seen, disc = (
+        dynamic_obstacles.TrafficMap(1.0, 1.0, 1.0),
+        np.array([[0.5, 0.0, 1.0, 0.0, 0.3, 0.0]]),
+    )
+    for tick in (1, 1 + dynamic_obstacles.UPDATE_TICKS):
+        seen.see(tick, 0.0, 0.0, disc)
+    window, goal = LocalCostmap(1.0, 1.0), (9.0, 0.0)
+    grid = window.grid(1, np.empty((0, 2)), np.empty((0, 6)))
+    CostToGo(window.cells).field(grid, 0.1, goal, None, seen.ways(goal))

@@ -1,0 +1,345 @@
+"""Tracks obstacles from scan to scan in the odometry frame: a constant-velocity Kalman filter each.
+
+Both axes have the same noise, so that one 2 x 2 covariance serves both.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from gigabrain_schemas import arrays
+from gigabrain_schemas.base import TICK_NS, Pose
+from gigabrain_schemas.body import Lidar
+from gigabrain_schemas.brain import Obstacle, WorldModel
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.geometry.pose import compose
+from gigabrain_zenoh.perception.obstacle_detection import (
+    Cluster,
+    FreeSpace,
+    PastScan,
+    discs_of,
+    find_clusters,
+    fit_disc,
+    off_rims,
+    on_rim,
+)
+
+ACCELERATION_SIGMA = (
+    0.8  # [m/s2], standard deviation of what a walking person does from scan to scan
+)
+INITIAL_SPEED_SIGMA = 1.0  # [m/s], standard deviation of a speed of which nothing is known
+TURNS_S = 0.06  # since it was last seen it may have gone the other way, for so long at most
+TURNED, TURNED_PARTLY = 10.0, 16.0  # squares of the deviations off that noise does not explain
+MAX_OFF_SIGMAS = 4.0  # deviations, [m]: what shows in part is so near
+SHIFT_M = 0.05
+MAX_OFF_M = 0.5
+RADIUS_GAIN = 0.25  # of a new radius in the filtered one
+MOVING_M, MOVING_SPEED = 0.15, 0.15  # [m], [m/s]: a thing must go so far, so fast, to count
+QUICK_SPEED = 0.5  # [m/s]
+MOVING_SIGMAS = 2.5  # standard deviations that a speed must be off zero
+STANDING_SPEED, STANDING_S = 0.12, 0.6  # slower for so long, it stands
+
+Floats = NDArray[np.float64]
+TICK_S = TICK_NS / 1e9
+GATE_SIGMAS = 4.0  # standard deviations; what is farther from where a thing should be is another
+MAX_JUMP_M = 0.6
+PARTIAL_NOISE_FACTOR = 4.0  # times as far off may be what is partly hidden
+CONFIRMED_SCANS = 2  # scans, before others hear of it
+FORGET_S, FORGET_NEW_S = 1.0, 0.25  # without having been seen, for what may be hidden
+FORGET_QUICK_S = 1.5  # what is quick may be behind a body that does not look there
+FORGET_GONE_S = 0.45  # where beams go through the place
+MAX_GAP_S = 1.0  # between scans; after a longer one it begins anew
+MAX_OBSTACLES = 64  # obstacles, the nearest of which are told
+
+
+@dataclass
+class ObstacleTrack:
+    """Position and velocity in the frame of the odometry."""
+
+    id: int
+    x: float  # [m]
+    y: float  # [m]
+    radius: float  # [m]
+    position_variance: float  # [m2]
+    velocity_x: float = 0.0  # [m/s]
+    velocity_y: float = 0.0  # [m/s]
+    covariance: float = 0.0  # [m2/s], of position and velocity
+    velocity_variance: float = INITIAL_SPEED_SIGMA**2  # [m2/s2]
+    seen: int = 1  # scans
+    unseen_s: float = 0.0
+    moving: bool = False
+    partly: bool = False  # when it was first seen, only a part of it was
+    standing_s: float = 0.0
+    anchor_x: float = 0.0  # [m], where it last stood
+    anchor_y: float = 0.0
+
+    def predict(self, dt: float) -> None:
+        """Let `dt` [s] pass."""
+        self.x += dt * self.velocity_x
+        self.y += dt * self.velocity_y
+        q = ACCELERATION_SIGMA**2
+        self.position_variance += dt * (
+            2 * self.covariance + dt * self.velocity_variance + dt**3 * q / 4
+        )
+        self.covariance += dt * (self.velocity_variance + dt * dt * q / 2)
+        self.velocity_variance += dt * dt * q
+        self.unseen_s += dt
+
+    def correct(
+        self, x: float, y: float, radius: float, noise: float, *, most_off: float = math.inf
+    ) -> None:
+        """It was seen at (x, y) [m] with a deviation of `noise` [m].
+
+        Where it is more than `most_off` from where it should be (squares of deviations), it has
+        turned.
+        """
+        dx, dy = x - self.x, y - self.y
+        off = (dx * dx + dy * dy) / (self.position_variance + noise * noise)
+        if self.moving and off > most_off:
+            self._turn()
+        innovation = self.position_variance + noise * noise
+        k, kv = self.position_variance / innovation, self.covariance / innovation
+        self.x += k * dx
+        self.y += k * dy
+        self.velocity_x += kv * dx
+        self.velocity_y += kv * dy
+        self.velocity_variance -= kv * self.covariance
+        self.covariance *= 1.0 - k
+        self.position_variance *= 1.0 - k
+        self.radius += RADIUS_GAIN * (radius - self.radius)
+        self.seen += 1
+        self._stand(self.unseen_s)
+        self.unseen_s = 0.0
+
+    def _turn(self) -> None:
+        """It is not where it should be: since it was last seen it goes another way, or stands."""
+        square = max(self.velocity_x**2 + self.velocity_y**2, INITIAL_SPEED_SIGMA**2)
+        self.velocity_variance += square
+        self.covariance += self.unseen_s * square / 2
+        self.position_variance += self.unseen_s**2 * square / 3
+
+    def may_be_at(self, x: float, y: float, noise: float) -> bool:
+        """Whether it can be what was seen at (x, y) [m], with a deviation of `noise` [m]."""
+        most = SHIFT_M + MAX_OFF_SIGMAS * math.sqrt(self.position_variance + noise * noise)
+        return math.hypot(x - self.x, y - self.y) < min(MAX_OFF_M, most)
+
+    def covers(self, place: tuple[float, float]) -> bool:
+        """Whether a place [m] is within it."""
+        return math.hypot(place[0] - self.x, place[1] - self.y) < self.radius
+
+    @property
+    def may_be_off(self) -> float:
+        """How far it may be from where it should be, for it may have turned round [m]."""
+        speed = math.hypot(self.velocity_x, self.velocity_y)
+        return 2 * speed * min(self.unseen_s, TURNS_S) if self.moving else 0.0
+
+    @property
+    def moves_quickly(self) -> bool:
+        """Whether it moves, and not at a stroll."""
+        return self.moving and math.hypot(self.velocity_x, self.velocity_y) > QUICK_SPEED
+
+    def seems_to_move(self) -> bool:
+        """Whether it has gone so far and so fast that it must be told whether it moves."""
+        if self.moving or self.unseen_s > 0:
+            return False
+        speed = math.hypot(self.velocity_x, self.velocity_y)
+        gone = math.hypot(self.x - self.anchor_x, self.y - self.anchor_y)
+        sure = speed > MOVING_SIGMAS * math.sqrt(self.velocity_variance)
+        return gone > MOVING_M and speed > MOVING_SPEED and sure
+
+    def _stand(self, dt: float) -> None:
+        """Notice when it has stopped."""
+        speed = math.hypot(self.velocity_x, self.velocity_y)
+        self.standing_s = self.standing_s + dt if speed < STANDING_SPEED else 0.0
+        if self.moving and self.standing_s >= STANDING_S:
+            self.moving, self.anchor_x, self.anchor_y = False, self.x, self.y
+
+    def obstacle(self) -> Obstacle:
+        """As the world shows it; what stands has no velocity."""
+        p, c, v = self.position_variance, self.covariance, self.velocity_variance
+        return Obstacle(
+            id=self.id,
+            x=self.x,
+            y=self.y,
+            velocity_x=self.velocity_x if self.moving else 0.0,
+            velocity_y=self.velocity_y if self.moving else 0.0,
+            radius=self.radius,
+            covariance=(p, 0.0, c, 0.0, 0.0, p, 0.0, c, c, 0.0, v, 0.0, 0.0, c, 0.0, v),
+        )
+
+
+class ObstacleTracker:
+    """Hands out an id per thing, which it keeps for as long as it is followed."""
+
+    def __init__(self) -> None:
+        self._tracks: list[ObstacleTrack] = []
+        self._space = FreeSpace()
+        self._boot = self._tick = self._ids = 0
+
+    def update(
+        self, hits: Floats, lidar: Lidar, spacing: float, pose: Pose, boot: int, tick: int
+    ) -> tuple[Obstacle, ...]:
+        """One scan more: `hits` (n, 2) [m] in the body's frame, taken at `tick` from `pose`.
+
+        `spacing` [rad] is from beam to beam. A scan that is not newer than the last changes
+        nothing; a new start of the driver begins anew.
+        """
+        dt = (tick - self._tick) * TICK_S
+        if boot != self._boot or dt > MAX_GAP_S:
+            self._tracks.clear()
+            self._space.clear()
+        elif dt <= 0:
+            return self._told(pose)
+        self._boot, self._tick = boot, tick
+        for track in self._tracks:
+            track.predict(dt)
+        clusters = find_clusters(hits, lidar, abs(spacing)) if len(hits) else []
+        places = [_place(cluster, lidar, pose, cluster.radius) for cluster in clusters]
+        taken = self._match(clusters, places)
+        points = _placed(hits, pose)
+        parts = self._correct_all(clusters, taken, points, lidar, pose)
+        self._space.see(PastScan(tick, points, lidar, abs(spacing), pose))
+        self._judge()
+        self._tracks = [track for track in self._tracks if self._lives(track)]
+        self._begin_parts(points, lidar, pose)
+        for j in set(range(len(clusters))) - set(taken.values()):
+            if clusters[j].whole and not any(track.covers(places[j]) for track in parts):
+                self._begin(clusters[j], places[j])
+        return self._told(pose)
+
+    def _match(self, clusters: list[Cluster], places: list[tuple[float, float]]) -> dict[int, int]:
+        """Which track is which cluster: the best pairs first, within the gates."""
+        if not clusters or not self._tracks:
+            return {}
+        mine = np.array(
+            [(t.x, t.y, t.position_variance, t.radius, t.may_be_off) for t in self._tracks]
+        )
+        seen = np.array([(*p, c.noise, c.radius) for p, c in zip(places, clusters, strict=True)])
+        dx, dy = (mine[:, None, k] - seen[:, k] for k in (0, 1))
+        squares = dx * dx + dy * dy
+        variance = mine[:, None, 2] + (2 * seen[:, 2]) ** 2
+        other_size = np.abs(mine[:, None, 3] - seen[:, 3])
+        gates = np.maximum(GATE_SIGMAS * np.sqrt(variance), mine[:, None, 4] + 2 * seen[:, 2])
+        fits = (squares < gates**2) & (squares < (MAX_JUMP_M + other_size) ** 2)
+        cost = squares / variance + (other_size / 0.2) ** 2
+        pairs = np.argwhere(fits)
+        taken: dict[int, int] = {}
+        used: set[int] = set()
+        for i, j in pairs[np.argsort(cost[fits], kind="stable")].tolist():
+            if i not in taken and j not in used:
+                taken[i] = j
+                used.add(j)
+        return taken
+
+    def _correct_all(
+        self, clusters: list[Cluster], taken: dict[int, int], points: Floats, lidar: Lidar,
+        pose: Pose,
+    ) -> list[ObstacleTrack]:  # fmt: skip
+        """Correct what was seen. Told are the moving things of which only a part was."""
+        whole, parts = [], []
+        for i, track in enumerate(self._tracks):
+            cluster = clusters[taken[i]] if i in taken else None
+            if (track.moving or track.partly) and not (cluster and cluster.whole):
+                parts.append(track)
+            elif cluster:
+                self._correct(track, cluster, lidar, pose)
+                whole.append(track)
+        parts.sort(key=lambda track: track.position_variance)
+        if parts:
+            points = _beside(points, whole)
+        found = []
+        for track in parts:
+            place = fit_disc(points, track.x, track.y, track.radius)
+            if place and track.may_be_at(*place):
+                track.correct(place[0], place[1], track.radius, place[2], most_off=TURNED_PARTLY)
+                points = points[~on_rim(points, track.x, track.y, track.radius)]
+                found.append(track)
+        return found
+
+    def _correct(self, track: ObstacleTrack, cluster: Cluster, lidar: Lidar, pose: Pose) -> None:
+        x, y = _place(cluster, lidar, pose, track.radius)
+        if cluster.whole:
+            track.correct(x, y, cluster.radius, cluster.noise, most_off=TURNED)
+        else:  # what is hidden of it is not missing from its size
+            track.correct(x, y, track.radius, PARTIAL_NOISE_FACTOR * cluster.noise)
+
+    def _judge(self) -> None:
+        """Which things move: what only turns another side to the robot does not."""
+        for t in self._tracks:
+            if t.seems_to_move():
+                t.moving = self._space.shows_motion(t.x, t.y, t.velocity_x, t.velocity_y, t.radius)
+
+    def _lives(self, track: ObstacleTrack) -> bool:
+        limit = FORGET_S if track.seen > CONFIRMED_SCANS else FORGET_NEW_S
+        if track.moves_quickly:
+            limit = FORGET_QUICK_S
+        if FORGET_GONE_S <= track.unseen_s < limit and self._space.is_free(track.x, track.y):
+            return False
+        return track.unseen_s < limit
+
+    def _begin(self, cluster: Cluster, place: tuple[float, float]) -> None:
+        self._add(*place, cluster.radius, cluster.noise, partly=False)
+
+    def _add(self, x: float, y: float, radius: float, noise: float, *, partly: bool) -> None:
+        self._ids += 1
+        self._tracks.append(
+            ObstacleTrack(self._ids, x, y, radius, noise**2, anchor_x=x, anchor_y=y, partly=partly)
+        )
+
+    def _begin_parts(self, points: Floats, lidar: Lidar, pose: Pose) -> None:
+        """Follow also what others hide in part, where things move: it is taken to be as large."""
+        sizes = [track.radius for track in self._tracks if track.moves_quickly]
+        if not sizes:
+            return
+        radius = float(np.median(sizes))
+        eye = compose(pose, Pose(x=lidar.x, y=lidar.y, yaw=0.0))
+        for x, y, noise in discs_of(_beside(points, self._tracks), (eye.x, eye.y), radius):
+            if not any(track.covers((x, y)) for track in self._tracks):
+                self._add(x, y, radius, noise, partly=True)
+
+    def _told(self, pose: Pose) -> tuple[Obstacle, ...]:
+        known = [track for track in self._tracks if track.seen >= CONFIRMED_SCANS]
+        known.sort(key=lambda track: math.hypot(track.x - pose.x, track.y - pose.y))
+        return tuple(track.obstacle() for track in known[:MAX_OBSTACLES])
+
+
+def _beside(points: Floats, tracks: list[ObstacleTrack]) -> Floats:
+    """Those of the `points` (n, 2) that are hits on none of the `tracks`."""
+    return off_rims(points, np.array([(t.x, t.y, t.radius) for t in tracks]).reshape(-1, 3))
+
+
+def _placed(hits: Floats, pose: Pose) -> Floats:
+    """`hits` (n, 2) of the body's frame in that of `pose`."""
+    cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
+    x = pose.x + cosine * hits[:, 0] - sine * hits[:, 1]
+    y = pose.y + sine * hits[:, 0] + cosine * hits[:, 1]
+    return np.column_stack((x, y))
+
+
+def _place(cluster: Cluster, lidar: Lidar, pose: Pose, radius: float) -> tuple[float, float]:
+    """The centre of a cluster [m] in the frame of `pose`, were it so large."""
+    distance = cluster.near + radius
+    ahead = lidar.x + distance * math.cos(cluster.bearing)
+    left = lidar.y + distance * math.sin(cluster.bearing)
+    cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
+    return pose.x + cosine * ahead - sine * left, pose.y + sine * ahead + cosine * left
+
+
+class Surroundings:
+    """Remembers what was round the robot in the scans before."""
+
+    def __init__(self) -> None:
+        self._tracker = ObstacleTracker()
+
+    def add(
+        self, world: WorldModel, lidar: Lidar | None, scan: LaserScan, pose: Pose | None
+    ) -> WorldModel:
+        """`world` with the obstacles in the frame of `pose`; without, where that is not known."""
+        if lidar is None or pose is None or not world.scan_ok:
+            return world
+        hits = arrays.hits(world).astype(np.float64)
+        found = self._tracker.update(hits, lidar, scan.angle_increment, pose, scan.boot, scan.basis)
+        return replace(world, obstacles=found)

@@ -1,1 +1,0 @@
-"""Things round the robot that are followed from scan to scan."""
