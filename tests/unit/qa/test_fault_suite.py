@@ -130,8 +130,9 @@ def test_deaths_of_the_driver_are_judged_on_whatever_line_a_body_has() -> None:
 
 def test_the_same_robots_can_be_had_navigating() -> None:
     robot = deployment_of(Options(behaviour="navigate"), "serial")
-    assert (robot.decision.behaviour, robot.decision.begin) == ("navigate", "roam")
-    assert (robot.perception.mapping, robot.decision.speed_limit) == ("slam", 0.26)
+    assert robot.decision.behaviour == "navigate"
+    assert robot.decision.settings == {"start": "explore", "max_linear_speed": 0.26}
+    assert robot.perception.mapping == "slam"
     assert deployment_of(Options(), "serial").perception.mapping == "off"
 
 
