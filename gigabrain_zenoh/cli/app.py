@@ -1,6 +1,6 @@
-"""The table of commands. Importing it is what `gigabrain --help` costs: keep it light."""
+"""The table of commands. `gigabrain --help` imports this module alone, so it stays light."""
 
-# Nothing here that Python has not imported already: signals are handled as early as can be
+# only what Python has imported already: the signal handlers are to be installed first
 import os
 import sys
 
@@ -12,108 +12,108 @@ if TYPE_CHECKING:
 
 MODULES = "gigabrain_zenoh.cli"
 
-# command -> where it is, and what it does in a line
+# command -> its function, and its help in one line
 COMMANDS = {
-    "demo": ("demo:demo", "Drive a simulated robot round its world, until Ctrl-C."),
-    "up": ("up:up", "Start what a deployment file puts on this host, and keep it running."),
-    "router": ("process:router", "Start the router that joins the other processes."),
-    "perception": ("process:perception", "Start perception."),
-    "decision": ("process:decision", "Start decision."),
-    "control": ("process:control", "Start control."),
-    "safety": ("process:safety", "Start safety."),
-    "driver run": ("process:driver", "Start the driver of a body."),
-    "driver new": ("driver_kit:new", "Write the package of a new driver."),
-    "driver test": ("driver_kit:test", "Check a driver against all that it must do."),
-    "driver trace": ("driver_kit:trace", "Show the bytes on a body's line, decoded."),
-    "button": ("process:button", "Start an e-stop button on a serial adapter."),
-    "emulate": ("emulate:emulate", "Be a robot's body on real ports, in MuJoCo."),
-    "estop": ("operate:estop", "Stop the robot at once, and latch it."),
-    "release": ("operate:release", "Let go of a latched gate."),
-    "enable": ("operate:enable", "Let the robot's brain drive."),
-    "goto": ("tasks:goto", "Send the robot to a place in its map, and wait until it is there."),
-    "explore": ("tasks:explore", "Have it drive until nothing is left to be seen."),
-    "patrol": ("tasks:patrol", "Have it go round the places of a file."),
-    "mission": ("tasks:mission", "Have it carry out a mission, which is a file."),
-    "task list": ("tasks:list_", "Show what it is at, what waits, and what was last."),
-    "task cancel": ("tasks:cancel", "End what it is at, or another task."),
-    "task pause": ("tasks:pause", "Have a task wait."),
-    "task resume": ("tasks:resume", "Have a task go on that waits for a person."),
-    "keys new": ("keys:new", "Make a fleet's own authority, which issues identities."),
-    "keys issue": ("keys:issue", "Make an identity: a folder to copy to its host."),
-    "keys revoke": ("keys:revoke", "Call back all identities of a role."),
+    "demo": ("demo:demo", "Run a simulated robot on this machine, until Ctrl-C."),
+    "up": ("demo:up", "Run the processes of a deployment file on this host, until Ctrl-C."),
+    "router": ("processes:router", "Run the router that connects the other processes."),
+    "perception": ("processes:perception", "Run perception."),
+    "decision": ("processes:decision", "Run decision."),
+    "control": ("processes:control", "Run control."),
+    "safety": ("processes:safety", "Run safety."),
+    "driver run": ("processes:driver", "Run the driver of a robot."),
+    "driver new": ("driver:new", "Create the package of a new driver."),
+    "driver test": ("driver:test", "Run the conformance checks on a driver."),
+    "driver trace": ("driver:trace", "Print the bytes on a robot's line, decoded."),
+    "button": ("processes:button", "Run an e-stop button on a serial adapter."),
+    "emulate": ("driver:emulate", "Emulate a robot's hardware on serial and TCP ports."),
+    "estop": ("gate:estop", "Stop the robot at once, and latch it."),
+    "release": ("gate:release", "Release a latched robot."),
+    "enable": ("gate:enable", "Let the robot's brain drive."),
+    "goto": ("task:goto", "Send the robot to a place in its map, and wait until it arrives."),
+    "explore": ("task:explore", "Explore until the map is complete."),
+    "patrol": ("task:patrol", "Visit the places of a file in turn."),
+    "mission": ("task:mission", "Run a mission from a file."),
+    "task list": ("task:list_", "List the current task, the queue and the last tasks."),
+    "task cancel": ("task:cancel", "Cancel the current task, or another one."),
+    "task pause": ("task:pause", "Pause a task."),
+    "task resume": ("task:resume", "Resume a paused task."),
+    "keys new": ("keys:new", "Create the authority of a fleet, which issues identities."),
+    "keys issue": ("keys:issue", "Issue an identity: a folder to copy to its host."),
+    "keys revoke": ("keys:revoke", "Revoke all identities of a role."),
     "keys list": ("keys:identities", "List identities, and when they expire."),
-    "keys zenohd": ("keys:zenohd", "Print the configuration of a router for a larger site."),
-    "teleop": ("teleop:teleop", "Drive by keys or by a gamepad."),
-    "page": ("page:page", "Serve the operator page: the robot in a browser."),
-    "foxglove": ("foxglove:foxglove", "Show the robot in Foxglove or Lichtblick, live."),
-    "audit": ("audit:audit", "Show who did what to the robot."),
-    "topic list": ("topic:list_", "List topics, their rates, and who talks to whom."),
-    "topic echo": ("topic:echo", "Show messages as they come."),
-    "topic hz": ("topic:hz", "How often messages come."),
-    "topic bw": ("topic:bw", "How many bytes they take."),
-    "topic delay": ("topic:delay", "How long they were on their way."),
-    "topic info": ("topic:info", "All about one topic."),
-    "topic pub": ("topic:pub", "Send a message."),
-    "node list": ("node:list_", "List the processes that run."),
-    "node info": ("node:info", "All about one process."),
-    "graph": ("graph:graph", "Draw who talks to whom."),
-    "top": ("top:top", "Watch processes and topics, live."),
-    "why": ("why:why", "Why does it not move?"),
-    "warm": ("warm:warm", "Compile navigation, so that the first start is quick."),
-    "doctor": ("doctor:doctor", "Check this machine and the robot, and say what to do."),
-    "log": ("log:log", "Show what the processes have logged."),
-    "param list": ("param:list_", "List what may be changed while the robot runs."),
-    "param get": ("param:get", "Show one value."),
-    "param set": ("param:set_", "Change one value."),
-    "map save": ("map:save", "Save the map that a robot makes."),
-    "map info": ("map:info", "Check a saved map, and tell its size."),
-    "proxy": ("proxy:proxy", "Be a bad network in front of a router or a body's TCP port."),
-    "robots": ("names:robots", "List the robots that there are."),
-    "worlds": ("names:worlds", "List the simulated worlds that there are."),
-    "record": ("record:record", "Record what a robot says into an MCAP file, until Ctrl-C."),
-    "bag info": ("bag:info", "What is in a recording."),
-    "bag check": ("bag:check", "Whether a recording is whole."),
-    "bag recover": ("bag:recover", "Write what can be read of a damaged recording anew."),
-    "bag play": ("bag:play", "Send a recording again."),
-    "bag plot": ("bag:plot", "Draw numbers of a recording over time, as a PNG."),
-    "bag convert": ("bag:convert", "A recording as tables, or as a LeRobot dataset."),
-    "replay": ("replay:replay", "Feed a recording to a process and compare what it sends."),
-    "view": ("view:view", "Draw a robot in its world into a PNG file."),
-    "bench chain": ("bench:chain", "From scan to command, timed."),
-    "bench stack": ("bench:stack", "CPU, memory and time to start."),
-    "faults": ("faults:faults", "Break the robot on purpose, and see whether it stops."),
-    "bench estop": ("bench:estop", "From the press to zero, timed."),
-    "bench bodies": ("bench_bodies:bodies", "One brain, all bodies, side by side."),
-    "bench goals": ("bench_goals:goals", "Explore, then get to random places."),
-    "bench plan": ("bench_plan:plan", "Global planning, timed and checked."),
-    "bench slam": ("bench_slam:slam", "Maps from recorded laser logs, and their errors."),
-    "bench barn": ("bench_barn:barn", "BARN: through a field of posts, scored."),
-    "schema export": ("schema:export", "Write JSON Schema of every message."),
-    "completion": ("completion:completion", "Shell completion."),
+    "keys zenohd": ("keys:zenohd", "Print a zenohd configuration for a larger site."),
+    "teleop": ("views:teleop", "Drive the robot by keyboard or gamepad."),
+    "page": ("views:page", "Serve the operator page: the robot in a browser."),
+    "foxglove": ("views:foxglove", "Show the robot live in Foxglove or Lichtblick."),
+    "audit": ("gate:audit", "Show who did what to the robot."),
+    "topic list": ("topic:list_", "List topics, rates, senders and receivers."),
+    "topic echo": ("topic:echo", "Print messages as they arrive."),
+    "topic hz": ("topic:hz", "Measure message rates."),
+    "topic bw": ("topic:bw", "Measure bandwidth."),
+    "topic delay": ("topic:delay", "Measure the delay of messages."),
+    "topic info": ("topic:info", "Describe one topic."),
+    "topic pub": ("topic:pub", "Publish a message."),
+    "node list": ("node:list_", "List the running processes."),
+    "node info": ("node:info", "Describe one process."),
+    "graph": ("node:graph", "Draw which process sends what to which."),
+    "top": ("node:top", "Watch processes and topics live."),
+    "why": ("diagnose:why", "Say why the robot does not move."),
+    "precompile": ("map:precompile", "Compile mapping and navigation for a quick first start."),
+    "doctor": ("diagnose:doctor", "Check this machine and the robot, and say what to fix."),
+    "log": ("diagnose:log", "Show the logs of the processes."),
+    "param list": ("node:list_params", "List the parameters that can be changed at run time."),
+    "param get": ("node:get_param", "Print one parameter."),
+    "param set": ("node:set_param", "Change one parameter."),
+    "map save": ("map:save", "Save the map that the robot makes."),
+    "map info": ("map:info", "Check a saved map, and print its size."),
+    "proxy": ("faults:proxy", "Emulate a bad network in front of a router or a robot's port."),
+    "robots": ("demo:robots", "List the known robots."),
+    "worlds": ("demo:worlds", "List the simulated worlds."),
+    "record": ("bag:record", "Record a robot's messages to an MCAP file, until Ctrl-C."),
+    "bag info": ("bag:info", "Describe a recording."),
+    "bag check": ("bag:check", "Check that a recording is complete."),
+    "bag recover": ("bag:recover", "Copy what is readable of a damaged recording."),
+    "bag play": ("bag:play", "Publish a recording again."),
+    "bag plot": ("bag:plot", "Plot values of a recording over time, as a PNG."),
+    "bag convert": ("bag:convert", "Convert a recording to CSV tables or a LeRobot dataset."),
+    "replay": ("bag:replay", "Feed a recording to a process, and compare its output."),
+    "render": ("demo:render", "Draw a robot in its world to a PNG file."),
+    "bench chain": ("bench:chain", "Time the way from scan to command."),
+    "bench stack": ("bench:stack", "Measure CPU, memory and start-up time."),
+    "faults": ("faults:faults", "Break the robot on purpose, and check that it stops."),
+    "bench estop": ("bench:estop", "Time the e-stop."),
+    "bench bodies": ("bench:bodies", "Drive all robots with one brain, side by side."),
+    "bench goals": ("bench_navigation:goals", "Explore, then drive to random goals."),
+    "bench plan": ("bench:plan", "Time and check global planning."),
+    "bench slam": ("bench_navigation:slam", "Measure map errors on laser logs or in simulation."),
+    "bench barn": ("bench_navigation:barn", "Run the BARN and DynaBARN benchmarks."),
+    "schema export": ("topic:export", "Write JSON Schema of every message."),
+    "completion": ("options:completion", "Print a shell completion script."),
 }
 GROUPS = {
-    "driver": "Drivers of bodies.",
-    "keys": "Who may do what.",
-    "bag": "Recordings.",
-    "topic": "What goes over the bus.",
-    "node": "The processes of a robot.",
-    "task": "What the robot was sent to do.",
-    "param": "What may be changed at run time.",
-    "map": "Maps that a robot has made.",
-    "bench": "Measure this machine.",
-    "schema": "Messages.",
+    "driver": "Run, create and check drivers.",
+    "keys": "Issue and revoke identities.",
+    "bag": "Read, play and convert recordings.",
+    "topic": "Inspect and publish messages.",
+    "node": "Inspect processes.",
+    "task": "List and control the robot's tasks.",
+    "param": "Read and change parameters at run time.",
+    "map": "Save and check maps.",
+    "bench": "Run benchmarks.",
+    "schema": "Export message definitions.",
 }
 
 
 def make_app(chosen: "Sequence[str]" = ()) -> "App":
-    """All commands, by name, with the module that holds each.
+    """Return the app with all commands.
 
-    A command that is among the `chosen` words brings its own help; of the others a line will do,
-    so that they need not be imported.
+    A command whose name is among the words `chosen` shows its own help. The others keep their line
+    of the table, so that their modules are not imported.
     """
     from cyclopts import App
 
-    from gigabrain_zenoh.cli.whole import refuse_fractions
+    from gigabrain_zenoh.cli.options import refuse_fractions
 
     app = App(
         name="gigabrain",
@@ -125,21 +125,22 @@ def make_app(chosen: "Sequence[str]" = ()) -> "App":
     groups = {name: App(name=name, help=about) for name, about in GROUPS.items()}
     for group in groups.values():
         app.command(group)
-    for command, (where, summary) in COMMANDS.items():
-        within, _, name = command.rpartition(" ")
-        told = None if name in chosen else summary
-        groups.get(within, app).command(f"{MODULES}.{where}", name=name, help=told)
+    for command, (function, summary) in COMMANDS.items():
+        group_name, _, name = command.rpartition(" ")
+        group = groups.get(group_name, app)
+        shown = None if name in chosen else summary
+        group.command(f"{MODULES}.{function}", name=name, help=shown)
     return app
 
 
 def _version() -> str:
-    from gigabrain_zenoh.plugins import package_version  # takes a while: only when asked for
+    from gigabrain_zenoh.plugins import package_version  # slow import, for --version alone
 
-    return package_version()
+    return package_version
 
 
 def main() -> None:
-    """Entry of the `gigabrain` command."""
+    """Run the `gigabrain` command, and end the process with its exit code."""
     try:
         from contextlib import suppress
 
@@ -152,19 +153,19 @@ def main() -> None:
         code = _call(sys.argv[1:])
     except KeyboardInterrupt:
         code = interrupts.exit_code
-    except BrokenPipeError:  # nobody reads on, as in `gigabrain robots | head -1`
+    except BrokenPipeError:  # the reader is gone, as in `gigabrain robots | head -1`
         code = 1
-    except Exception:  # what a signal has broken off may complain in any words
+    except Exception:  # an error that a signal caused is not shown
         if not interrupts.received:
             raise
         code = interrupts.exit_code
-    with suppress(OSError):  # nobody is there to read it, or the disk is full
-        sys.stdout.flush()  # stderr owes nothing: it is written line by line
-    os._exit(code if isinstance(code, int) else 0)  # Zenoh's threads must not hold it back
+    with suppress(OSError):  # the reader is gone, or the disk is full
+        sys.stdout.flush()  # stderr is written line by line
+    os._exit(code if isinstance(code, int) else 0)  # without waiting for Zenoh's threads
 
 
 def _call(words: "Sequence[str]") -> object:
-    """Parse and run a command. What it imports is done by then, so that a signal leaves nothing."""
+    """Parse and run a command. Signals raise only after its imports, so they break none off."""
     from cyclopts import CycloptsError
 
     from gigabrain_zenoh.config.renames import renamed_arguments

@@ -1,29 +1,76 @@
-"""`gigabrain bag`: what can be done with a recording."""
+"""`gigabrain record`, `bag` and `replay`: recordings."""
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-import msgspec
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.where import HERE, Which
+from gigabrain_zenoh.cli.options import (
+    LOCAL,
+    Output,
+    RobotAddress,
+    TopicNames,
+    check_positive,
+    checked,
+)
+from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.signals import run_async
 
+Recording = Annotated[Path, Parameter(help="MCAP file.")]
 
-def info(file: Path, *, json: bool = False) -> int:
-    """Show what is in a recording: duration, and per topic counts, rates, gaps and size.
+
+def record(
+    *,
+    output: Output = None,
+    topics: TopicNames = None,
+    at: RobotAddress = LOCAL,
+    seconds: float | None = None,
+    split_size: float | None = None,
+    split_time: float | None = None,
+    raw_only: bool = False,
+    keep_free: float = 200.0,
+) -> int:
+    """Record a robot's messages to an MCAP file, until Ctrl-C.
+
+    Example: gigabrain record -o drive.mcap --topics scan state cmd_vel
+
+    Exit code 1 if messages were lost on the way to the disk.
+
+    Args:
+        output: File to write. Default: named by the time, in this folder.
+        seconds: End after this time [s].
+        split_size: Start a new file after this size [MB].
+        split_time: Start a new file after this time [s].
+        raw_only: Leave out the drawings for Foxglove, Lichtblick and Rerun: half the size.
+        keep_free: Stop writing while less than this is free on the disk [MB].
+    """
+    from gigabrain_zenoh.recording.node import file_name
+    from gigabrain_zenoh.recording.node import record as run
+
+    check_positive(seconds=seconds, split_size=split_size, split_time=split_time)
+    values = {
+        "file": str(output or file_name()),
+        "topics": topics or (),
+        "viewers": not raw_only,
+        "split_mb": split_size,
+        "split_s": split_time,
+        "keep_free_mb": keep_free,
+    }
+    return run_async(run(checked(values, RecorderConfig), at.where(), seconds))
+
+
+def info(file: Recording, *, json: bool = False) -> int:
+    """Describe a recording: duration, and count, rate, gaps and size per topic.
 
     Example: gigabrain bag info drive.mcap --json
 
-    Parameters
-    ----------
-    file
-        The recording.
-    json
-        For programs instead of people.
+    Args:
+        json: Print JSON.
     """
+    import msgspec
+
     from gigabrain_zenoh.recording.bag_info import print_info
     from gigabrain_zenoh.recording.bag_info import read_info as read
 
@@ -35,47 +82,38 @@ def info(file: Path, *, json: bool = False) -> int:
     return 0
 
 
-def check(file: Path) -> int:
-    """Check a recording: checksums, its end, and gaps in what was sent.
+def check(file: Recording) -> int:
+    """Check that a recording is complete: checksums, its end, and gaps between messages.
 
     Example: gigabrain bag check drive.mcap
 
-    Ends with 0 where it is whole, with 1 where it is not.
-
-    Parameters
-    ----------
-    file
-        The recording.
+    Exit code 1 if it is not complete.
     """
     from gigabrain_zenoh.recording.bag_info import faults
     from gigabrain_zenoh.recording.bag_info import read_info as read
 
     found = read(file)
-    wrong = faults(found)
-    for fault in wrong:
-        print(f"{file}: {fault}")
+    problems = faults(found)
+    for problem in problems:
+        print(f"{file}: {problem}")
     if found.damages or not found.finished:
-        print(f"mend it with: gigabrain bag recover {file}")
-    if not wrong:
-        print(f"{file}: whole, {found.messages} messages in {found.seconds:g} s")
-    return 1 if wrong else 0
+        print(f"repair it with: gigabrain bag recover {file}")
+    if not problems:
+        print(f"{file}: complete, {found.messages} messages in {found.seconds:g} s")
+    return 1 if problems else 0
 
 
-def recover(file: Path, *, output: Annotated[Path | None, Parameter(alias="-o")] = None) -> int:
-    """Write all that can be read of a damaged or unfinished recording into a new one.
+def recover(file: Recording, *, output: Output = None) -> int:
+    """Copy what is readable of a damaged or unfinished recording to a new file.
 
-    Example: gigabrain bag recover drive.mcap -o mended.mcap
+    Example: gigabrain bag recover drive.mcap -o recovered.mcap
 
-    Parameters
-    ----------
-    file
-        The recording.
-    output
-        The new file; without it, beside the old one with `_recovered` in its name.
+    Args:
+        output: File to write. Default: the same name with `_recovered`.
     """
-    from gigabrain_zenoh.recording.bag_recovery import recover as mend
+    from gigabrain_zenoh.recording.bag_recovery import recover as run
 
-    done = mend(file, output or file.with_name(f"{file.stem}_recovered{file.suffix}"))
+    done = run(file, output or file.with_name(f"{file.stem}_recovered{file.suffix}"))
     for damage in done.damages:
         print(f"{file}: byte {damage.offset}: {damage.text}")
     if not done.messages:
@@ -87,36 +125,27 @@ def recover(file: Path, *, output: Annotated[Path | None, Parameter(alias="-o")]
 
 
 def play(
-    file: Path,
+    file: Recording,
     *,
     rate: float = 1.0,
     start: float = 0.0,
     loop: bool = False,
-    topics: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
+    topics: TopicNames = None,
     remap: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
     beside_robot: bool = False,
-    at: Which = HERE,
+    at: RobotAddress = LOCAL,
 ) -> int:
-    """Send a recording again, the last map first.
+    """Publish a recording again, its last map first.
 
     Example: gigabrain bag play drive.mcap --rate 2 --start 30 --remap robot/scan=old/scan
 
-    Parameters
-    ----------
-    file
-        The recording.
-    rate
-        Times the recorded pace.
-    start
-        Where to begin, from its first message [s].
-    loop
-        Again and again, until Ctrl-C.
-    topics
-        Names, such as scan, or key expressions, such as "robot/image/*"; all without.
-    remap
-        Send a key on another: robot/scan=old/scan.
-    beside_robot
-        Even where a driver runs. Its gate refuses recorded commands; its brain is confused.
+    Args:
+        rate: Factor of the recorded pace.
+        start: Start this long after its first message [s].
+        loop: Repeat until Ctrl-C.
+        remap: Publish a key on another: robot/scan=old/scan.
+        beside_robot: Also while a driver runs. Its gate refuses recorded commands; its brain
+            is confused.
     """
     from gigabrain_zenoh.recording.player import PlayOptions
     from gigabrain_zenoh.recording.player import play as run
@@ -124,7 +153,7 @@ def play(
     if not 0.01 <= rate <= 100:
         raise ConfigError(f"--rate: expected a number from 0.01 to 100, got {rate:g}")
     if not 0 <= start < math.inf:
-        raise ConfigError(f"--start: expected seconds from 0 on, got {start:g}")
+        raise ConfigError(f"--start: expected 0 or more seconds, got {start:g}")
     options = PlayOptions(
         rate=rate, start_s=start, loop=loop, topics=tuple(topics or ()), remap=_pairs(remap or [])
     )
@@ -141,23 +170,15 @@ def _pairs(texts: list[str]) -> dict[str, str]:
 
 
 def plot(
-    file: Path,
-    fields: Annotated[list[str], Parameter(negative="")],
-    *,
-    output: Annotated[Path | None, Parameter(alias="-o")] = None,
+    file: Recording, fields: Annotated[list[str], Parameter(negative="")], *, output: Output = None
 ) -> int:
-    """Draw numbers of a recording over time, as a PNG.
+    """Plot values of a recording over time, as a PNG.
 
     Example: gigabrain bag plot drive.mcap state.velocity.linear_x cmd_vel.linear_x
 
-    Parameters
-    ----------
-    file
-        The recording.
-    fields
-        Topic and field: cmd_vel.linear_x, state.joints.0.position, robot/state.pose.x.
-    output
-        The file to write; without it, beside the recording.
+    Args:
+        fields: Topic and field: cmd_vel.linear_x, state.joints.0.position, robot/state.pose.x.
+        output: File to write. Default: the recording's name with .png.
     """
     from gigabrain_zenoh.recording.message_tables import plot as draw
 
@@ -165,27 +186,45 @@ def plot(
     return 0
 
 
-def convert(file: Path, *, csv: Path | None = None, lerobot: Path | None = None) -> int:
-    """Write a recording as tables, one per topic, or as a LeRobot dataset.
+def convert(file: Recording, *, csv: Path | None = None, lerobot: Path | None = None) -> int:
+    """Convert a recording to CSV tables, one per topic, or to a LeRobot dataset.
 
     Example: gigabrain bag convert drive.mcap --csv tables
 
-    Parameters
-    ----------
-    file
-        The recording.
-    csv
-        The folder for the tables.
-    lerobot
-        A new folder for the dataset.
+    Args:
+        csv: Folder for the tables.
+        lerobot: New folder for the dataset.
     """
     from gigabrain_zenoh.recording.lerobot import convert as write_lerobot
     from gigabrain_zenoh.recording.message_tables import write_csv
 
     if csv is None and lerobot is None:
-        raise ConfigError("say into what: --csv FOLDER or --lerobot FOLDER")
+        raise ConfigError("no output; add --csv FOLDER or --lerobot FOLDER")
     for path in write_csv(file, csv) if csv else ():
         print(path)
     if lerobot:
         print(write_lerobot(file, lerobot))
     return 0
+
+
+def replay(
+    *,
+    check: Path,
+    process: Literal["perception", "decision", "control", "safety"],
+    deployment: str | None = None,
+) -> int:
+    """Feed a recording to a process in fake time, and compare its output with the recorded one.
+
+    Example: gigabrain replay --check drive.mcap --process decision
+
+    Exit code 1 if the output differs; the first difference is printed.
+
+    Args:
+        check: Recording, made from the start of the run.
+        process: Process to run.
+        deployment: Deployment file with its settings. Default: the recorded settings.
+    """
+    from gigabrain_zenoh.launch.processes import node_of
+    from gigabrain_zenoh.recording.process_replay import replay_file
+
+    return run_async(replay_file(check, process, deployment, node_of))

@@ -1,19 +1,60 @@
-"""`gigabrain bench chain`, `stack` and `estop`: what this machine makes of it."""
+"""`gigabrain bench chain`, `stack`, `estop`, `bodies` and `plan`: what this machine achieves."""
 
 import sys
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import msgspec
 from cyclopts import Parameter
 from rich.console import Console, RenderableType
+from rich.table import Table
+from rich.text import Text
 
-from gigabrain_zenoh.cli.checked import above_zero
+from gigabrain_zenoh.cli.options import (
+    Body,
+    JsonFile,
+    Seed,
+    World,
+    check_positive,
+    print_progress,
+)
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
 from gigabrain_zenoh.host.signals import run_async
 
-FASTEST_HZ = 50.0  # one scan per tick of the robot's clock
+if TYPE_CHECKING:
+    from gigabrain_zenoh.qa.bench.bodies import BodiesResult
+    from gigabrain_zenoh.qa.bench.plan import PlanResult
+
+MAX_SCAN_HZ = 50.0  # one scan per tick of the robot's clock
+MIN_CELLS = 400  # a smaller map has no path of the wanted length
+PUBLISHED_MS = (  # from the documents of Nav2
+    ("Nav2 NavFn, about 75 m", 146.0),
+    ("Nav2 Smac 2D A*, about 75 m", 243.0),
+    ("Nav2 Smac Hybrid-A*, about 75 m", 144.0),
+    ("Nav2 Smac Lattice, about 75 m", 113.0),
+    ("Nav2 Theta*, 87.5 m", 46.0),
+    ("Nav2 inflation, 2000 x 2000, one core", 48.9),
+)
+
+
+def finish(page: RenderableType, result: object, json: Path | None) -> None:
+    """Print the table of a benchmark, and write its results if a file is given."""
+    Console().print(page)
+    files.write_result(result, json)
+
+
+def side_by_side(
+    title: str, caption: str, names: Sequence[str], rows: Mapping[str, Sequence[str]]
+) -> Table:
+    """Return a table with one column per name, and one row per figure, which fits a terminal."""
+    table = Table("", title=title, caption=caption)
+    for name in names:
+        table.add_column(name, justify="right")
+    for figure, cells in rows.items():
+        table.add_row(Text(figure), *map(Text, cells))
+    return table
 
 
 def chain(
@@ -21,107 +62,188 @@ def chain(
     seconds: float = 10.0,
     rounds: int = 3,
     rates: Annotated[tuple[float, ...], Parameter(consume_multiple=True)] = (10.0, 50.0),
-    json: Path | None = None,
+    json: JsonFile = None,
 ) -> int:
-    """Time the way from a scan to its command, in turns with a bare Zenoh relay.
+    """Time the way from scan to command, in turns with a bare Zenoh relay.
 
     Example: gigabrain bench chain --seconds 10 --rounds 3 --rates 10 50
 
-    Parameters
-    ----------
-    seconds
-        Length of each run [s].
-    rounds
-        How often the chain and the relay take turns.
-    rates
-        How many scans a second [Hz].
-    json
-        Write all figures into this file.
+    Args:
+        seconds: Length of each run [s].
+        rounds: Number of turns of chain and relay.
+        rates: Scans per second [Hz].
     """
     from gigabrain_zenoh.qa.bench.chain import chain_page, measure_chain
 
     files.check_result_path(json)
-    above_zero("seconds", seconds)
-    above_zero("rounds", rounds)
+    check_positive(seconds=seconds, rounds=rounds)
     for rate in rates:
-        if not 0 < rate <= FASTEST_HZ:
-            raise ConfigError(f"--rates: expected above 0, at most {FASTEST_HZ:g}, got {rate:g}")
-
-    result = run_async(measure_chain(seconds, rounds, rates, _progress))
-    _finish(chain_page(result), result, json)
+        if not 0 < rate <= MAX_SCAN_HZ:
+            raise ConfigError(f"--rates: expected above 0, at most {MAX_SCAN_HZ:g}, got {rate:g}")
+    result = run_async(measure_chain(seconds, rounds, rates, print_progress))
+    finish(chain_page(result), result, json)
     return 0
 
 
 def stack(
     *,
     seconds: float = 20.0,
-    body: str = "turtlebot3_waffle",
-    world: str = "arena",
+    body: Body = "turtlebot3_waffle",
+    world: World = "arena",
     goal: bool = False,
-    json: Path | None = None,
+    json: JsonFile = None,
 ) -> int:
-    """Measure what a whole robot needs: CPU, memory, and time to start.
+    """Measure CPU, memory and start-up time of a whole robot.
 
     Example: gigabrain bench stack --seconds 20 --world house --goal
 
-    Parameters
-    ----------
-    seconds
-        How long to measure [s].
-    body
-        Which robot; see `gigabrain robots`.
-    world
-        Where it drives; see `gigabrain worlds`.
-    goal
-        Start it once more, with a map, and time how soon it may be sent to a place.
-    json
-        Write all figures into this file.
+    Args:
+        seconds: Duration [s].
+        goal: Also time a second start with a map, until it accepts a goal.
     """
     from gigabrain_zenoh.qa.bench.stack import measure_stack, stack_page
 
     files.check_result_path(json)
-    above_zero("seconds", seconds)
-    result = run_async(measure_stack(body, world, seconds, _progress, goal=goal))
-    _finish(stack_page(result), result, json)
+    check_positive(seconds=seconds)
+    result = run_async(measure_stack(body, world, seconds, print_progress, goal=goal))
+    finish(stack_page(result), result, json)
     return 0
 
 
 def estop(
     *,
-    body: str = "turtlebot3_waffle",
+    body: Body = "turtlebot3_waffle",
     driving: int = 10,
     latched: int = 200,
-    json: Path | None = None,
+    json: JsonFile = None,
 ) -> int:
-    """Time the e-stop, from the press to the gate's zero, idle and while the network is flooded.
+    """Time the e-stop, from the press to zero at the gate, idle and on a flooded network.
 
     Example: gigabrain bench estop --driving 10 --latched 200
 
-    Parameters
-    ----------
-    body
-        Which robot; see `gigabrain robots`.
-    driving
-        How often to press while it drives.
-    latched
-        How often to press after that, while it is latched.
-    json
-        Write all figures into this file.
+    Args:
+        driving: Number of presses while it drives.
+        latched: Number of presses after that, while it is latched.
     """
     from gigabrain_zenoh.qa.bench.estop import estop_page, measure_estop
 
     files.check_result_path(json)
-    above_zero("driving", driving)
-    above_zero("latched", latched)
-    result = run_async(measure_estop(body, driving, latched, _progress))
-    _finish(estop_page(result), result, json)
+    check_positive(driving=driving, latched=latched)
+    result = run_async(measure_estop(body, driving, latched, print_progress))
+    finish(estop_page(result), result, json)
     return 0
 
 
-def _progress(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+def bodies(
+    *names: str,
+    link: Literal["sim", "emulated"] = "emulated",
+    world: World = "arena",
+    seed: Seed = 0,
+    seconds: float = 30.0,
+    json: JsonFile = None,
+) -> int:
+    """Drive all robots in turn with one brain, which is neither restarted nor reconfigured.
+
+    Example: gigabrain bench bodies --seconds 30 --world house
+
+    Exit code 1 after a contact, or if a process of the brain was restarted.
+
+    Args:
+        names: Robots. Default: all that have the link.
+        link: How to reach them.
+        seconds: Time that each drives [s of its own time].
+    """
+    from gigabrain_drivers.driver.catalog import simulated
+    from gigabrain_zenoh.qa.bench.bodies import measure_bodies
+    from gigabrain_zenoh.runtime.deployment import Deployment
+
+    check_positive(seconds=seconds)
+    files.check_result_path(json)
+    chosen = names or simulated(link)
+    deployment = Deployment(
+        link=link, world=world, seed=seed, resume="auto", router="tcp/127.0.0.1:0"
+    )
+    console = Console()
+    with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder, console.status("") as status:
+        measuring = measure_bodies(chosen, deployment, seconds, Path(folder), status.update)
+        result = run_async(measuring)
+    finish(_bodies_table(result), result, json)
+    return 0 if result.ok else 1
 
 
-def _finish(page: RenderableType, result: msgspec.Struct, json: Path | None) -> None:
-    Console().print(page)
-    files.write_result(result, json)
+def _bodies_table(result: "BodiesResult") -> Table:
+    brain = ", ".join(f"{name} {pid}" for name, pid in result.brain_pids.items())
+    rows = {
+        "driven [s]": "seconds",
+        "contacts": "contacts",
+        "distance [m]": "distance_m",
+        "mean speed commanded [m/s]": "commanded",
+        "mean speed measured [m/s]": "measured",
+        "least clearance [m]": "min_clearance_m",
+        "command to motion, median [ticks]": "latency_ticks",
+        "... of this many motions": "motions",
+        "CPU of the driver [% of a core]": "driver_cpu",
+        "reconnects": "reconnects",
+        "stops by the gate": "stops",
+    }
+    return side_by_side(
+        f"link {result.link}, {result.world}, seed {result.seed}",
+        f"one brain: {brain}; restarts {result.brain_restarts}",
+        [one.body for one in result.bodies],
+        {
+            title: [_figure(getattr(one, field)) for one in result.bodies]
+            for title, field in rows.items()
+        },
+    )
+
+
+def _figure(value: float | None) -> str:
+    return "-" if value is None else f"{value:g}"
+
+
+def plan(
+    *,
+    size: tuple[int, ...] = (1000, 2000),
+    queries: int = 20,
+    seed: int = 0,
+    json: JsonFile = None,
+    png: Path | None = None,
+) -> int:
+    """Time global planning on an office and on a random map of 5 cm cells, and check the paths.
+
+    Example: gigabrain bench plan --size 1000 --size 2000 --queries 20
+
+    Exit code 1 if a path costs more than the cheapest one.
+
+    Args:
+        size: Cells per side of the map; may be given again.
+        queries: Number of paths, each about three quarters of the map's side.
+        seed: Random seed of the maps and the queries.
+        png: Draw the last map and its paths to this file.
+    """
+    from gigabrain_zenoh.qa.bench.plan import measure_plan
+
+    check_positive(queries=queries)
+    if any(one < MIN_CELLS for one in size):
+        raise ConfigError(f"--size: expected at least {MIN_CELLS}, got {min(size)}")
+    files.check_result_path(json)
+    result = measure_plan(size, queries, seed, png, lambda text: print(text, file=sys.stderr))
+    finish(_plan_table(result), result, json)
+    return 0 if result.ok else 1
+
+
+def _plan_table(result: "PlanResult") -> Table:
+    table = Table(caption="Published figures are of other maps on other machines.")
+    for name in ("map", "what", "n", "p50 [ms]", "p95 [ms]", "CPU p50 [ms]"):
+        table.add_column(Text(name), justify="left" if name in ("map", "what") else "right")
+    for one in result.sizes:
+        for timing in one.timings:
+            times = (timing.p50_ms, timing.p95_ms, timing.cpu_p50_ms)
+            what = timing.what.replace("office", f"office, {one.path_m:.0f} m")
+            row = (f"{one.size}²", what, str(timing.n), *(f"{ms:.1f}" for ms in times))
+            table.add_row(*row)
+        table.add_row(f"{one.size}²", "cost over Dijkstra's, worst", "", f"{one.ratio:.6f}", "", "")
+        table.add_section()
+    for what, ms in PUBLISHED_MS:
+        table.add_row("published", what, "", f"{ms:g}", "", "")
+    return table

@@ -1,58 +1,63 @@
-"""`gigabrain demo`: a whole robot on this machine, watched."""
+"""Whole robots on this machine: `demo`, `up`, and what can be simulated."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.checked import above_zero, checked
+from gigabrain_zenoh.cli.options import Body, KeepStuck, Seed, World, check_positive, checked
+from gigabrain_zenoh.config.loading import located
 from gigabrain_zenoh.config.settings import LinkName, Resume
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.signals import run_async
-from gigabrain_zenoh.runtime.deployment import Deployment, recorded
+from gigabrain_zenoh.runtime.deployment import (
+    Deployment,
+    deployment_path,
+    host_of,
+    load_deployment,
+    recorded,
+)
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class Drive:
-    """What drives, where and how."""
+class RobotOptions:
+    """Robot, world and behaviour of a demo."""
 
-    body: str = "turtlebot3_waffle"
-    "Which robot; see `gigabrain robots`."
+    body: Body = "turtlebot3_waffle"
     link: LinkName = "sim"
-    "How to reach it."
-    world: str = "arena"
-    "Where it drives; see `gigabrain worlds`."
+    "How to reach the robot: simulated, emulated or real."
+    world: World = "arena"
     seconds: float | None = None
     "End after this much simulated time [s]."
-    seed: int = 0
-    "For the start pose and the noise of the sensors."
+    seed: Seed = 0
     speed: float = 1.0
-    "Simulated over real time; other than 1, time waits for the brain."
+    "Simulated over real time. At any speed but 1, time waits for the brain."
     lockstep_timeout: float = 0.15
-    "How long [s] time waits for the brain there; longer for a slow machine."
+    "How long time waits for the brain [s]; longer for a slow machine."
     behaviour: str = "navigate"
-    "What it does: `navigate`, or `avoid`, which makes no map."
+    "Behaviour: `navigate`, or `avoid`, which makes no map."
     set: tuple[str, ...] = ()
-    "A setting of the behaviour, as NAME=VALUE; may be repeated."
+    "Setting of the behaviour, as NAME=VALUE; may be given again."
     resume: Resume | None = None
-    "Whether it goes on by itself after a stop that has passed; a real body never does."
+    "Drive on after a stop whose cause has passed. Default: auto; manual with --link real."
 
     def check(self) -> None:
-        """Raises ConfigError, and UnknownName, for what can be told before anything starts."""
+        """Raise ConfigError or UnknownName for a value that does not fit."""
         from gigabrain_drivers.driver.catalog import load_robot
         from gigabrain_drivers.sim.worlds import load_world
 
         behaviours.load(self.behaviour)
         load_robot(self.body)
         load_world(self.world, 0)
+        check_positive(seconds=self.seconds)
 
     def values(self) -> dict[str, object]:
-        """The deployment, raw."""
-        demo = behaviours.load(self.behaviour).DEMO
-        settings = {**demo, **behaviours.parse_settings(self.set)}
+        """Return the fields of a Deployment, unchecked."""
+        defaults = behaviours.load(self.behaviour).DEMO
+        settings = {**defaults, **behaviours.parse_settings(self.set)}
         values: dict[str, object] = {
             "body": self.body,
             "link": self.link,
@@ -70,52 +75,129 @@ class Drive:
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class Shown:
-    """What is to be seen of it, and what stays."""
+class ViewOptions:
+    """What a demo shows and writes."""
 
     headless: bool = False
-    "Progress in a line instead of the live view."
+    "Print progress in one line instead of the live view."
     report: Path | None = None
-    "Write what the run came to, as JSON, into this file."
+    "Write the results of the run as JSON to this file."
     record: Path | None = None
-    "Record the run from its very start into this file, for `gigabrain replay`."
+    "Record the whole run to this file, for `gigabrain replay`."
     page: bool | None = None
-    "Serve the operator page; as a rule where there is a live view too."
+    "Serve the operator page. Default: with the live view."
     port: int = 8080
-    "Where the page is; another free one where that is taken."
+    "Port of the page; a free one if it is taken."
     login: bool = False
-    "Have the page want a token, which is in the address that is printed; for a shared machine."
-    keep_stuck: Annotated[bool, Parameter(negative=())] = False
-    "Leave a process alone that makes no progress, for a debugger."
+    "Require a token for the page, for a shared machine. The printed address holds it."
+    keep_stuck: KeepStuck = False
 
 
-DRIVE, SHOWN = Drive(), Shown()
+ROBOT, VIEW = RobotOptions(), ViewOptions()
 
 
-def demo(*, drive: Drive = DRIVE, shown: Shown = SHOWN) -> int:
-    """Drive a simulated robot round its world, until Ctrl-C: it makes a map, then visits places.
+def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
+    """Run a simulated robot until Ctrl-C: it makes a map, then visits places.
 
-    Example: gigabrain demo --world house --seconds 60 --speed 5 --headless --report run.json
+    Example: gigabrain demo --world house --seconds 60 --speed 5 --headless
 
-    Ends with 1 after any contact, without motion, or when a process has died.
+    Exit code 1 after a contact, if it did not move, or if a process died.
     """
     from gigabrain_zenoh.launch.demo import Demo, DemoOptions
     from gigabrain_zenoh.ui.page.node import with_page
 
-    drive.check()
-    if shown.record and shown.record.exists():
-        raise ConfigError(f"{shown.record} exists; choose another file")
-    above_zero("seconds", drive.seconds)
-    values = drive.values() | (recorded(shown.record) if shown.record else {})
-    deployment, where = checked(values, Deployment), ""
+    robot.check()
+    if view.record and view.record.exists():
+        raise ConfigError(f"--record: {view.record} exists; choose another file")
+    values = robot.values() | (recorded(view.record) if view.record else {})
+    deployment, address = checked(values, Deployment), ""
     behaviours.check(deployment.decision)
-    if shown.page or (shown.page is None and not shown.headless):
-        deployment, where = with_page(deployment, shown.port, login=shown.login)
+    if view.page or (view.page is None and not view.headless):
+        deployment, address = with_page(deployment, view.port, login=view.login)
     options = DemoOptions(
-        seconds=drive.seconds,
-        headless=shown.headless,
-        report=shown.report,
-        page=where,
-        keep_stuck=shown.keep_stuck,
+        seconds=robot.seconds,
+        headless=view.headless,
+        report=view.report,
+        page=address,
+        keep_stuck=view.keep_stuck,
     )
     return run_async(Demo(deployment, options).run())
+
+
+def up(
+    deployment: str,
+    *,
+    host: str | None = None,
+    keys: Path | None = None,
+    level: str = "info",
+    keep_stuck: KeepStuck = False,
+) -> int:
+    """Run the processes of a deployment file on this host, until Ctrl-C.
+
+    Example: gigabrain up deploy/demo.yaml
+
+    A process that dies or hangs is started again.
+
+    Args:
+        deployment: Deployment file, or the name of a known one.
+        host: Which of the file's hosts this is; required if it has several.
+        keys: Folder of this host's identity, instead of the one in the file.
+        level: Lowest level to log: debug, info, warning or error.
+    """
+    from gigabrain_zenoh.host.terminal import LINES, Display, writer
+    from gigabrain_zenoh.launch.up import up as run
+
+    path = deployment_path(deployment)
+    loaded = load_deployment(path, str(keys.expanduser().absolute()) if keys else "")
+    try:
+        where = host_of(loaded, host)
+        if "decision" in loaded.hosts[where]:
+            behaviours.check(loaded.decision, path)
+        with Display(writer(sys.stdout), LINES) as display:
+
+            def put(line: str) -> None:
+                display.put(f"{line}\n")
+
+            return run_async(run(loaded, where, put, level, keep_stuck=keep_stuck))
+    except ConfigError as error:
+        raise located(path, error) from None
+
+
+def robots() -> None:
+    """List the known robots, their links and their files.
+
+    Example: gigabrain robots
+    """
+    from gigabrain_drivers.driver.catalog import links_of, load_robot, robot_files
+
+    for name, path in robot_files().items():
+        robot = load_robot(name)
+        links = ", ".join(links_of(robot))
+        print(f"{name:<20} {robot.summary} ({links})  {path}")
+
+
+def worlds() -> None:
+    """List the simulated worlds.
+
+    Example: gigabrain worlds
+    """
+    from gigabrain_drivers.sim.worlds import world_names
+
+    for name, about in world_names().items():
+        print(f"{name:<14} {about}")
+
+
+def render(
+    file: Path, *, body: Body = "turtlebot3_waffle", world: World = "house", seed: Seed = 0
+) -> None:
+    """Draw a robot in its world to a PNG file.
+
+    Example: gigabrain render waffle.png --world house
+
+    Args:
+        file: File to write.
+    """
+    from gigabrain_drivers.sim.portrait import portray
+
+    portray(body, world, seed, file)
+    print(file)

@@ -1,20 +1,36 @@
-"""`gigabrain faults`: break the robot on purpose, and see whether it stops."""
+"""`gigabrain faults` and `proxy`: break the robot or its network on purpose."""
 
+import asyncio
 import logging
+import re
 import tempfile
 from collections.abc import Sequence
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Protocol
 
+import msgspec
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from gigabrain_zenoh.cli.where import show
+from gigabrain_zenoh.cli.options import JsonFile, print_line, print_table
+from gigabrain_zenoh.host.network import is_loopback
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
+from gigabrain_zenoh.host.terminal import typed_lines
 from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.qa.proxy.chaos import (
+    CALM,
+    WAYS,
+    Chaos,
+    ProxyCommand,
+    Way,
+    WayCounters,
+    parse_command,
+)
+from gigabrain_zenoh.qa.proxy.tcp import Address, TcpProxy
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -22,26 +38,25 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.qa.faults.fault import FaultResult, FaultRow, FaultRun
     from gigabrain_zenoh.qa.faults.rig.rig import Options
 
+ENDPOINT = re.compile(r"(?:(?:tcp|tls|ws)/)?(?P<host>\[[^\]]+\]|[^/:\[\]]+):(?P<port>\d+)")
+
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class Robot:
-    """What is broken."""
+class SuiteOptions:
+    """Robot of the fault suite."""
 
     body: str = ""
-    "Which robot, instead of the one that each test has."
+    "Robot, instead of the one of each test."
     world: str = "arena"
-    "Where it drives."
+    "Simulated world; see `gigabrain worlds`."
     behaviour: str = "avoid"
-    (
-        "What drives it: navigate explores and visits places, with a map (tried with 1 to 9, 18, "
-        "19, 43 and 45)."
-    )
+    "Behaviour. `navigate` makes a map (tried with tests 1 to 9, 18, 19, 43 and 45)."
     long: Annotated[bool, Parameter(negative=())] = False
-    "The long forms, for a release: soak, load, all orders of deaths."
+    "Run the long forms, as before a release: soak, load, all orders of deaths."
 
     def check(self) -> None:
-        """Raises ConfigError for what the suite cannot be run with."""
+        """Raise ConfigError if the suite cannot run with these."""
         from gigabrain_drivers.driver.catalog import load_robot, simulated
         from gigabrain_drivers.sim.worlds import load_world
 
@@ -52,18 +67,16 @@ class Robot:
         sim = load_robot(self.body).sim
         if not sim or sim.get("driver") != "mujoco":
             able = ", ".join(simulated("sim"))
-            raise ConfigError(
-                f"--body {self.body}: no physics knows what becomes of it; choose of: {able}"
-            )
+            raise ConfigError(f"--body {self.body}: not simulated in MuJoCo; choose one of: {able}")
 
     def options(self) -> "Options":
-        """As the suite takes it."""
+        """Return the options in the form that the suite takes."""
         from gigabrain_zenoh.qa.faults.rig.rig import Options
 
         return Options(self.body, self.world, self.behaviour, self.long)
 
 
-ROBOT = Robot()
+DEFAULT = SuiteOptions()
 
 
 def faults(
@@ -72,44 +85,37 @@ def faults(
     only: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
     skip: Annotated[tuple[str, ...], Parameter(consume_multiple=True)] = (),
     repeat: Annotated[int, Parameter(validator=Number(gte=1))] = 1,
-    robot: Robot = ROBOT,
+    robot: SuiteOptions = DEFAULT,
     into: Path | None = None,
-    json: Path | None = None,
+    json: JsonFile = None,
 ) -> int:
-    """Break a running robot in all the ways of the table, and judge how it stops.
+    """Break a running robot in every way of the table, and check that it stops.
 
     Example: gigabrain faults --only decision-killed 12 --repeat 3
 
-    Real processes, a simulated or emulated body; the robot's own time and the physics' truth
-    decide. Ends with 1 when any test failed.
+    It uses real processes, and a simulated or emulated robot. Results are
+    judged by the robot's own time and by the simulator's true state. Exit code
+    1 if a test fails.
 
-    Parameters
-    ----------
-    list_
-        Show the table, and run nothing.
-    only
-        Which tests, by name or number.
-    skip
-        Which tests not.
-    repeat
-        How many runs of each count; the worst of them is judged.
-    into
-        Append each run to this file, and go on from those that are in it.
-    json
-        Write all results into this file.
+    Args:
+        list_: Print the table of tests, and exit.
+        only: Names or numbers of the tests to run.
+        skip: Names or numbers of the tests to leave out.
+        repeat: Number of runs per test; the worst one is judged.
+        into: Append each run to this file, and skip the runs that it holds.
     """
     from gigabrain_zenoh.qa.faults.suite import choose, failed
 
     left_out = choose(skip) if skip else ()
     chosen = tuple(fault for fault in choose(only) if fault not in left_out)
     if list_:
-        show(_plan(chosen))
+        print_table(_plan(chosen))
         return 0
     robot.check()
     files.check_result_path(json)
     files.check_result_path(into)
     judged = _run(chosen, robot.options(), repeat, into)
-    show(_table(judged, chosen))
+    print_table(_table(judged, chosen))
     files.write_result(judged, json)
     return 1 if failed(judged) else 0
 
@@ -117,12 +123,12 @@ def faults(
 def _run(
     chosen: "Sequence[FaultRow]", options: "Options", repeat: int, into: Path | None
 ) -> "list[FaultResult]":
-    """Run them, with a line for each run that has ended."""
+    """Run the tests, and print a line after each run."""
     from rich.console import Console
 
     from gigabrain_zenoh.qa.faults.suite import RunsFile, run_suite
 
-    # the suite hears what it forges itself; nobody has to read that
+    # warnings about the messages that the suite itself forges
     logging.getLogger("gigabrain_zenoh").addHandler(logging.NullHandler())
     console, file = Console(), RunsFile(into, options) if into else None
     earlier = file.read() if file else {}
@@ -171,19 +177,125 @@ def _table(results: "Sequence[FaultResult]", chosen: "Sequence[FaultRow]") -> "T
     for name in ("no.", "fault", "criterion", "worst", "tries", "waited", "verdict"):
         table.add_column(name, overflow="fold", no_wrap=name == "fault")
     for result in results:
-        told = f"[{COLOURS[result.verdict]}]{result.verdict}[/]"
+        verdict = f"[{COLOURS[result.verdict]}]{result.verdict}[/]"
         if result.reason:
-            told += f": {escape(result.reason)}"
+            verdict += f": {escape(result.reason)}"
         worst = in_words(rows[result.number], result.worst)
         waited = f"{max(one.waited_ms for one in result.tries):.0f} ms"
         number, tries = str(result.number), _tries(result.tries)
-        table.add_row(number, result.name, result.criterion, worst, tries, waited, told)
+        table.add_row(number, result.name, result.criterion, worst, tries, waited, verdict)
     return table
 
 
 def _tries(tries: "Sequence[FaultRun]") -> str:
-    """Say what came of all runs: `9 of 10, disturbed: 1 of 2`."""
+    """Return how many runs passed: `9 of 10, disturbed: 1 of 2`."""
     counted = [one.verdict == "passed" for one in tries if not one.disturbed]
     disturbed = [one.verdict == "passed" for one in tries if one.disturbed]
     beside = f", disturbed: {sum(disturbed)} of {len(disturbed)}" if disturbed else ""
     return f"{sum(counted)} of {len(counted)}{beside}"
+
+
+def proxy(
+    to: str,
+    *,
+    listen: str = "tcp/127.0.0.1:0",
+    baud: int = 115200,
+    chaos: str = "",
+    seed: int = 0,
+    insecure: bool = False,
+) -> int:
+    """Emulate a bad network in front of a router or a robot's port, until Ctrl-C.
+
+    Example: gigabrain proxy tcp/127.0.0.1:7447 --listen tcp/127.0.0.1:7448
+
+    In another terminal: gigabrain control --connect tcp/127.0.0.1:7448
+
+    Type faults, one per line: `delay_ms=50 jitter_ms=20`, `down hole`,
+    `corrupt=0.001`, `cut=rst`, `figures`, `off`.
+
+    Args:
+        to: Zenoh endpoint, HOST:PORT, or path of a serial port to forward to.
+        listen: Endpoint to listen on; port 0 for a free one. For a serial port, a new path.
+        baud: Baud rate of a serial port.
+        chaos: Faults from the start, in the same words.
+        seed: Random seed of the faults.
+        insecure: Listen beyond loopback: others on the network can then reach the robot.
+    """
+    begin = parse_command(chaos)
+    if to.startswith("/"):
+        from gigabrain_zenoh.qa.proxy.serial import LineProxy
+
+        made: FaultyLine = LineProxy(to, _path(listen), baud=baud, seed=seed)
+    else:
+        made = TcpProxy(_address(to), _own(listen, insecure), seed=seed)
+    run_async(_run_proxy(made, begin, to))
+    return 0
+
+
+class FaultyLine(AbstractAsyncContextManager[object], Protocol):
+    """Proxy of a network or serial line."""
+
+    figures: dict[Way, WayCounters]
+
+    def set(self, chaos: Chaos = CALM, *ways: Way) -> None:
+        """Set the faults of one direction or both."""
+
+    def cut(self, *, reset: bool = False) -> None:
+        """Close all connections."""
+
+    async def plug(self) -> None:
+        """Listen."""
+
+    async def unplug(self) -> None:
+        """Stop listening, and close all connections."""
+
+
+async def _run_proxy(proxy: FaultyLine, begin: ProxyCommand, to: str) -> None:
+    async with proxy:
+        await obey(proxy, begin)
+        print_line(f"{proxy} forwards to {to}")
+        print_line(f"type [{'|'.join(WAYS)}] {' '.join(CALM.__struct_fields__)}; "
+                   "cut[=rst] unplug plug figures; off ends it")  # fmt: skip
+        typed: asyncio.Queue[str] = asyncio.Queue()
+        with typed_lines(typed.put_nowait):
+            while True:
+                try:
+                    await obey(proxy, parse_command(await typed.get()))
+                except ConfigError as error:
+                    print_line(str(error))
+
+
+async def obey(proxy: FaultyLine, command: ProxyCommand) -> None:
+    """Execute a typed line."""
+    if command.cut:
+        proxy.cut(reset=command.cut == "rst")
+    if command.unplugged is not None:
+        await (proxy.unplug if command.unplugged else proxy.plug)()
+    if command.figures:
+        for way, figures in proxy.figures.items():
+            print_line(f"{way}: {msgspec.json.encode(figures).decode()}")
+    if command.ways:
+        proxy.set(command.chaos, *command.ways)
+
+
+def _path(listen: str) -> Path:
+    if "/" not in listen or listen.startswith("tcp/"):
+        raise ConfigError(f"--listen: expected the path of the new port, got {listen!r}")
+    return Path(listen)
+
+
+def _own(listen: str, insecure: bool) -> Address:
+    address = _address(listen)
+    if not insecure and not is_loopback(address[0]):
+        raise ConfigError(
+            f"--listen: anybody on the network can reach {listen}, and the robot through it; "
+            "use a loopback address, or add --insecure"
+        )
+    return address
+
+
+def _address(text: str) -> Address:
+    found = ENDPOINT.fullmatch(text)
+    if not found or int(found["port"]) > 65535:
+        raise ConfigError(f"expected an endpoint such as tcp/127.0.0.1:7447, got {text!r}")
+    return found["host"].strip("[]"), int(found["port"])

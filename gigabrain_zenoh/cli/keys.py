@@ -1,36 +1,41 @@
-"""`gigabrain keys`: a fleet's own authority, and identities for its hosts and people."""
+"""`gigabrain keys`: the authority of a fleet, and identities for its hosts and people."""
 
 import contextlib
 import datetime
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
+from gigabrain_zenoh.security.identity_files import INSTALL
+from gigabrain_zenoh.security.identity_files import CA_KEY, CERTIFICATE
+from gigabrain_zenoh.security.identity_files import generations_in
 from gigabrain_zenoh.security.acl import Role, common_name
-from gigabrain_zenoh.security.identity_files import CA_KEY, CERTIFICATE, INSTALL, generations_in
 
-SOON_DAYS = 30
+EXPIRES_SOON_DAYS = 30
+FleetFolder = Annotated[
+    Path | None, Parameter(help="Folder of the fleet. Default: the only one in this folder.")
+]
 
 
 def new(fleet: str, *, dir: Path | None = None) -> None:
-    """Make a fleet's own authority, which issues identities.
+    """Create the authority of a fleet, which issues identities.
 
     Example: gigabrain keys new home
 
-    Parameters
-    ----------
-    fleet
-        What it is called.
-    dir
-        The folder to make; without it, one named after the fleet.
+    Args:
+        fleet: Name of the fleet.
+        dir: Folder to create. Default: the name of the fleet.
     """
-    with _importing():
+    with _needs_cryptography():
         from gigabrain_zenoh.security.authority import new_fleet
 
     folder = dir or Path(fleet)
     new_fleet(fleet, folder)
-    print(f"{folder / CA_KEY}: keep it on this machine; whoever has it can be anybody")
+    print(f"{folder / CA_KEY}: keep it on this machine; with it anybody can issue identities")
     print(f"next: gigabrain keys issue robot --host ADDRESS --dir {_quoted(folder)}")
 
 
@@ -41,83 +46,70 @@ def issue(
     host: tuple[str, ...] = (),
     robot: str = "",
     days: int = 365,
-    dir: Path | None = None,
+    dir: FleetFolder = None,
 ) -> None:
-    """Make an identity: a folder to copy to its host.
+    """Issue an identity: a folder to copy to its host.
 
     Example: gigabrain keys issue robot --host 192.168.1.10
 
-    Parameters
-    ----------
-    role
-        robot: all of its own; brain: perception and decision; operator: drive, stop and release;
-        viewer: listen; router: a site's router on a host of its own.
-    name
-        What its folder is called; without it, what the role and the robot are.
-    host
-        An address or name under which others will reach the router that runs there.
-    robot
-        The robot's namespace, if it has one; an operator or viewer without one is of all robots.
-    days
-        For how long it is good.
-    dir
-        The fleet's folder; without it, the only one here.
+    Roles: robot: all processes of a robot. brain: perception and decision.
+    operator: drive, stop and release. viewer: receive only. router: the router
+    of a site, on a host of its own.
+
+    Args:
+        role: Role of the identity.
+        name: Name of its folder. Default: role and robot.
+        host: Address or name under which others reach the router there; may be given again.
+        robot: Namespace of the robot. Without it, an operator or viewer is for all robots.
+        days: Days until it expires.
     """
-    with _importing():
+    with _needs_cryptography():
         from gigabrain_zenoh.security import authority
 
     folder = authority.issue(_fleet(dir), role, robot=robot, name=name, hosts=host, days=days)
-    print(f"{folder}: copy it to its host, and let nobody else read it")
-    print(f"next: {_use(role, robot, folder)}")
+    print(f"{folder}: copy it to its host, and keep others from reading it")
+    print(f"next: {_first_use(role, robot, folder)}")
 
 
-def revoke(role: Role, *, robot: str = "", dir: Path | None = None) -> None:
-    """Call back all identities of a role, such as those of a lost laptop. New ones are good again.
+def revoke(role: Role, *, robot: str = "", dir: FleetFolder = None) -> None:
+    """Revoke all identities of a role, such as those of a lost laptop. New ones are valid.
 
     Example: gigabrain keys revoke operator
 
-    Routers refuse them once they have the new list and were started again.
+    Routers refuse them once they have the new list and are restarted.
 
-    Parameters
-    ----------
-    role
-        brain, operator or viewer.
-    robot
-        The robot's namespace, where the identities name one.
-    dir
-        The fleet's folder; without it, the only one here.
+    Args:
+        role: Role of the identities: brain, operator or viewer.
+        robot: Namespace of the robot, for identities that name one.
     """
-    with _importing():
+    with _needs_cryptography():
         from gigabrain_zenoh.security import authority
 
     folder = _fleet(dir)
     lists = authority.revoke(folder, role, robot)
     for path in lists:
-        print(
-            f"{path}: copy it into that identity's folder on its host, and start its router again"
-        )
+        print(f"{path}: copy it to that identity's folder on its host, and restart its router")
     if not lists:
-        print("no router's identity here: whoever is issued one from now on has the list")
-    of = f" --robot {robot}" if robot else ""
-    print(f"next, for those who stay: gigabrain keys issue {role}{of} --dir {_quoted(folder)}")
+        print("no identity of a router here; those issued from now on include the list")
+    option = f" --robot {robot}" if robot else ""
+    print(f"next, for those who keep access: gigabrain keys issue {role}{option}"
+          f" --dir {_quoted(folder)}")  # fmt: skip
 
 
-def identities(*, dir: Path | None = None) -> int:
-    """List identities, and when they expire. Ends with 1 where one cannot be used.
+def identities(*, dir: FleetFolder = None) -> int:
+    """List identities, and when they expire. Exit code 1 if one is not valid.
 
     Example: gigabrain keys list
 
-    Parameters
-    ----------
-    dir
-        The fleet's folder, or that of one identity; without it, the only fleet here.
+    Args:
+        dir: Folder of a fleet or of one identity. Default: the only fleet in this folder.
     """
     folder = dir if dir and (dir / CERTIFICATE).exists() else _fleet(dir)
-    good = True
-    for line, ok in _listed(folder):
+    all_valid = True
+    for line, valid in _listed(folder):
         print(line)
-        good &= ok
-    return 0 if good else 1
+        all_valid &= valid
+    return 0 if all_valid else 1
 
 
 def zenohd(
@@ -127,36 +119,31 @@ def zenohd(
     listen: str = "tls/0.0.0.0:7447",
     dir: Path | None = None,
 ) -> None:
-    """Print the configuration of a router for a larger site.
+    """Print a zenohd configuration for a larger site.
 
     Example: gigabrain keys zenohd --robot red --robot blue
 
-    Parameters
-    ----------
-    robot
-        The namespaces of its robots.
-    keys
-        The folder of its identity on its host.
-    listen
-        The Zenoh endpoint to listen on.
-    dir
-        The fleet's folder, where some of its identities were revoked.
+    Args:
+        robot: Namespace of a robot; may be given again.
+        keys: Folder of its identity on its host.
+        listen: Zenoh endpoint to listen on.
+        dir: Folder of the fleet, if identities were revoked.
     """
-    with _importing():
+    with _needs_cryptography():
         from gigabrain_zenoh.bus.zenoh.config import configuration
 
     generations = generations_in(_fleet(dir)) if dir else {}
     print(configuration(robot or ("",), str(keys), listen, generations), end="")
 
 
-def _use(role: Role, robot: str, folder: Path) -> str:
-    """The command with which an identity is used first."""
-    keys, of = _quoted(folder), f" --namespace {robot}" if robot else ""
+def _first_use(role: Role, robot: str, folder: Path) -> str:
+    """Return the command that uses a new identity."""
+    keys, namespace = _quoted(folder), f" --namespace {robot}" if robot else ""
     if role == "router":
         return f"gigabrain router --listen tls/0.0.0.0:7447 --fleet NAMESPACE --keys {keys}"
     if role in ("operator", "viewer"):
-        tool = "estop" if role == "operator" else "topic list"
-        return f"gigabrain {tool} --connect tls/ADDRESS:7447{of} --keys {keys}"
+        command = "estop" if role == "operator" else "topic list"
+        return f"gigabrain {command} --connect tls/ADDRESS:7447{namespace} --keys {keys}"
     return f"gigabrain up FILE --host HOST --keys {keys}, where FILE has a line `keys:`"
 
 
@@ -165,8 +152,8 @@ def _quoted(path: Path) -> str:
 
 
 def _listed(folder: Path) -> Iterator[tuple[str, bool]]:
-    """A line for each identity in a fleet's folder, or for the only one, and whether it is good."""
-    with _importing():
+    """Yield a line for each identity of a fleet or a folder, and whether it is valid."""
+    with _needs_cryptography():
         from gigabrain_zenoh.security import identity as identities
 
     places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
@@ -179,37 +166,37 @@ def _listed(folder: Path) -> Iterator[tuple[str, bool]]:
         except GigabrainError as error:
             yield f"{place.name:<20} {error}", False
             continue
-        good = generations.get(common_name(identity.role, identity.robot), 1)
-        if identity.generation < good:
+        if identity.generation < generations.get(common_name(identity.role, identity.robot), 1):
             yield f"{place.name:<20} {identity.name} was revoked; delete it", False
             continue
-        left = identity.days_left(now)
-        soon = "  SOON" if left < SOON_DAYS else ""
-        of = f"{identity.name} of {identity.fleet}"
-        where = f"  ({', '.join(identity.hosts)})" if identity.hosts else ""
-        until = f"expires {identity.expires:%Y-%m-%d}, in {left:.0f} days{soon}"
-        yield f"{place.name:<20} {of:<28} {until}{where}", True
+        days_left = identity.days_left(now)
+        soon = "  SOON" if days_left < EXPIRES_SOON_DAYS else ""
+        name = f"{identity.name} of {identity.fleet}"
+        hosts = f"  ({', '.join(identity.hosts)})" if identity.hosts else ""
+        expires = f"expires {identity.expires:%Y-%m-%d}, in {days_left:.0f} days{soon}"
+        yield f"{place.name:<20} {name:<28} {expires}{hosts}", True
 
 
 def _fleet(dir: Path | None) -> Path:
-    """The folder of the fleet. Raises ConfigError where there is none, or more than one."""
+    """Return the folder of the fleet. Raises ConfigError if there is none, or several."""
     if dir:
         if not (dir / CA_KEY).exists():
-            raise ConfigError(f"{dir}: no {CA_KEY} of a fleet; make one with `gigabrain keys new`")
+            raise ConfigError(f"{dir}: no {CA_KEY}; create a fleet with `gigabrain keys new`")
         return dir
     here = Path()
     fleets = [place for place in (here, *sorted(here.iterdir())) if (place / CA_KEY).exists()]
     if not fleets:
-        raise ConfigError("no fleet here; make one with `gigabrain keys new`, or name its --dir")
+        raise ConfigError("no fleet in this folder; create one with `gigabrain keys new`, "
+                          "or name its folder with --dir")  # fmt: skip
     if len(fleets) > 1:
         names = ", ".join(map(str, fleets))
-        raise ConfigError(f"several fleets here; choose one with --dir: {names}")
+        raise ConfigError(f"several fleets in this folder; choose one with --dir: {names}")
     return fleets[0]
 
 
 @contextlib.contextmanager
-def _importing() -> Iterator[None]:
-    """Import what works with certificates. Raises ConfigError where its library is missing."""
+def _needs_cryptography() -> Iterator[None]:
+    """Raise ConfigError with the way to install it if the library is missing."""
     try:
         yield
     except ModuleNotFoundError as error:

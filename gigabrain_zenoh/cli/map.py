@@ -1,25 +1,25 @@
-"""`gigabrain map`: save the map that a robot makes, and look at saved ones."""
+"""`gigabrain map`: saves and checks maps; `precompile`: the kernels that make and use them."""
 
-from gigabrain_zenoh.cli.where import HERE, Which, say
+import asyncio
+import time
+
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, print_line
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.host.signals import run_async
 
-PATIENCE_S = 20.0  # a large map takes a while to write
+SAVE_TIMEOUT_S = 20.0  # a large map takes long to write
 
 
-def save(name: str, /, *, at: Which = HERE, replace: bool = False) -> int:
-    """Save the map that perception makes, where perception runs.
+def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> int:
+    """Save the map that the robot makes, on the host where perception runs.
 
     Example: gigabrain map save office
 
-    An empty map is refused, and one in which the robot does not know where it is.
+    It is refused if the map is empty, or if the robot is not localized.
 
-    Parameters
-    ----------
-    name
-        Of the files: NAME.yaml and NAME.pgm for ROS, NAME.graph.npz to go on with.
-    replace
-        Another map of that name.
+    Args:
+        name: Name of the files: NAME.yaml and NAME.pgm for ROS, NAME.graph.npz to continue.
+        replace: Replace a map of the same name.
     """
     import getpass
 
@@ -27,7 +27,7 @@ def save(name: str, /, *, at: Which = HERE, replace: bool = False) -> int:
 
     from gigabrain_schemas.requests import MapRequest
     from gigabrain_schemas.topics import MAP_SAVE
-    from gigabrain_zenoh.diagnostics.hearing import NAME
+    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
     from gigabrain_zenoh.runtime.connect import joined
 
     try:
@@ -35,33 +35,32 @@ def save(name: str, /, *, at: Which = HERE, replace: bool = False) -> int:
         request = msgspec.convert(fields, MapRequest)
     except msgspec.ValidationError:
         raise ConfigError(
-            f"no name for a map: {name!r}; expected letters, digits, - _ . and no ending"
+            f"invalid map name {name!r}; expected letters, digits, - _ . and no file extension"
         ) from None
 
     async def ask() -> None:
-        async with joined(at.where(), NAME) as (bus, _):
-            replies = await bus.ask(MAP_SAVE, request, timeout_s=PATIENCE_S)
+        async with joined(at.where(), CLIENT_NAME) as (bus, _):
+            replies = await bus.ask(MAP_SAVE, request, timeout_s=SAVE_TIMEOUT_S)
         if not replies:
             raise BodyLost(
-                "nobody makes a map: perception needs `mapping: slam`; or may your keys not ask?"
+                "no process makes a map; set perception: {mapping: slam}, "
+                "and check that your keys may ask"
             )
         if not replies[0].ok:
             raise Refused(replies[0].text)
-        say(replies[0].text)
+        print_line(replies[0].text)
 
     run_async(ask())
     return 0
 
 
 def info(name: str, /) -> int:
-    """Check a saved map, and tell its size.
+    """Check a saved map, and print its size.
 
     Example: gigabrain map info office
 
-    Parameters
-    ----------
-    name
-        Its name, or the path of its YAML file.
+    Args:
+        name: Name of the map, or path of its YAML file.
     """
     from gigabrain_zenoh.mapping import map_file
 
@@ -69,12 +68,48 @@ def info(name: str, /) -> int:
     saved = map_file.load(path)
     if problem := map_file.what_is_wrong(saved):
         raise ConfigError(f"{path}: {problem}")
-    say(f"{path}: {map_file.in_words(saved)}, {saved.resolution:g} m a cell")
-    if path.with_suffix(map_file.GRAPH).exists():
-        graph = map_file.load_graph(path)
-        if (poses := graph.get("poses")) is None or poses.ndim != 2:
-            raise ConfigError(f"{path.with_suffix(map_file.GRAPH)}: no pose graph")
-        say(f"pose graph: {len(poses)} keyframes; mapping can go on from it")
-    else:
-        say("no pose graph: the robot can find its way in it, but not go on mapping")
+    print_line(f"{path}: {map_file.in_words(saved)}, {saved.resolution:g} m per cell")
+    if not path.with_suffix(map_file.GRAPH).exists():
+        print_line("no pose graph: usable for localization, not to continue mapping")
+        return 0
+    poses = map_file.load_graph(path).get("poses")
+    if poses is None or poses.ndim != 2:
+        raise ConfigError(f"{path.with_suffix(map_file.GRAPH)}: no pose graph")
+    print_line(f"pose graph: {len(poses)} keyframes; mapping can continue from it")
     return 0
+
+
+def precompile() -> None:
+    """Compile mapping and navigation, so that the first start is as quick as every other.
+
+    Example: gigabrain precompile
+
+    The compiled code is kept in the user's cache folder, or in NUMBA_CACHE_DIR.
+    After an update it is compiled again, at the latest at the first start,
+    before the robot drives.
+    """
+    run_async(_compile_all())
+
+
+async def _compile_all() -> None:
+    from gigabrain_zenoh.decision.goal_server import DRIVE_KERNELS
+    from gigabrain_zenoh.perception.node import LOCALIZE_KERNELS, MAP_KERNELS
+
+    print_line("compiling, which takes up to a minute")
+    await asyncio.gather(  # they share no kernel
+        _compile("mapping", MAP_KERNELS, LOCALIZE_KERNELS),
+        _compile("planning and driving", DRIVE_KERNELS),
+    )
+
+
+async def _compile(name: str, *warm_ups: str) -> None:
+    from gigabrain_zenoh.kernels.precompile import compile_all, compile_in_child, missing_package
+
+    start_s = time.monotonic()
+    for warm_up in warm_ups:
+        if await compile_in_child(warm_up):
+            try:
+                compile_all(warm_up)  # raises the reason of the failure
+            except ModuleNotFoundError as error:
+                raise missing_package(error) from None
+    print_line(f"{name}: {time.monotonic() - start_s:.1f} s")

@@ -1,65 +1,246 @@
-"""`gigabrain node`: the processes of a robot."""
+"""`gigabrain node`, `graph`, `top` and `param`: the processes of a robot."""
 
+import asyncio
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.live_names import processes
-from gigabrain_zenoh.cli.where import HERE, Which, say, show
-from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.cli.options import (
+    LOCAL,
+    JsonLines,
+    Process,
+    RobotAddress,
+    print_line,
+    print_table,
+)
+from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused, unknown
+from gigabrain_zenoh.host.signals import run_async, stop_signals
 
 if TYPE_CHECKING:
-    from gigabrain_zenoh.diagnostics.nodes import Nodes
+    from gigabrain_schemas.requests import ParamReply
+    from gigabrain_zenoh.diagnostics.discovery import Processes
+    from gigabrain_zenoh.diagnostics.top import Feed
+
+INSTALL_TOP = "for the live view: pip install 'gigabrain-zenoh[view]'; or use: gigabrain top --once"
 
 
-def list_(*, at: Which = HERE, json: bool = False) -> int:
-    """List the processes that run: where, since when, and what they take.
+def list_(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> int:
+    """List the running processes: host, uptime, CPU, memory.
 
     Example: gigabrain node list
-
-    Parameters
-    ----------
-    json
-        One JSON object per line.
     """
     import msgspec
 
-    from gigabrain_zenoh.diagnostics.nodes import table
+    from gigabrain_zenoh.diagnostics.discovery import process_table
 
-    nodes = _census(at)
+    processes = _find(at)
     if not json:
-        show(table(nodes))
+        print_table(process_table(processes))
         return 0
-    for name in sorted({*nodes.there, *nodes.health}):
-        told = {"process": name, "description": nodes.there.get(name)}
-        say(msgspec.json.encode({**told, "health": nodes.health.get(name)}).decode())
+    for name in processes.names():
+        row = {
+            "process": name,
+            "description": processes.described.get(name),
+            "health": processes.health.get(name),
+        }
+        print_line(msgspec.json.encode(row).decode())
     return 0
 
 
-def info(process: Annotated[str, Parameter(completer=processes)], /, *, at: Which = HERE) -> int:
-    """Show all about one process: what it sends and hears, its figures and counts.
+def info(process: Process, /, *, at: RobotAddress = LOCAL) -> int:
+    """Describe one process: what it sends and receives, latencies and counters.
 
     Example: gigabrain node info driver
 
-    Parameters
-    ----------
-    process
-        Its name.
+    Args:
+        process: Name of the process.
     """
-    from gigabrain_zenoh.diagnostics.nodes import about
+    from gigabrain_zenoh.diagnostics.discovery import describe
 
-    for line in about(_census(at), process):
-        say(line)
+    for line in describe(_find(at), process):
+        print_line(line)
     return 0
 
 
-def _census(at: Which) -> "Nodes":
-    from gigabrain_zenoh.diagnostics.hearing import NAME
-    from gigabrain_zenoh.diagnostics.nodes import census
+def graph(
+    *,
+    at: RobotAddress = LOCAL,
+    dot: bool = False,
+    mermaid: bool = False,
+    png: Path | None = None,
+    everything: Annotated[bool, Parameter(name="--all")] = False,
+) -> int:
+    """Draw which process sends what to which, and how often, as measured on the bus.
+
+    Example: gigabrain graph --png robot.png
+
+    Args:
+        dot: Print a Graphviz file.
+        mermaid: Print a Mermaid flowchart.
+        png: Draw a picture to this file.
+        everything: Also show health, log and audit, which every process sends.
+    """
+    from gigabrain_zenoh.diagnostics import graph as draw
+    from gigabrain_zenoh.diagnostics.discovery import flows
+
+    if dot + mermaid + (png is not None) > 1:
+        raise ConfigError("choose only one of --dot, --mermaid and --png")
+    processes = _find(at)
+    found = draw.chain(flows(processes.described.values(), processes.health), everything=everything)
+    if png:
+        draw.write_png(found, png)
+        print_line(str(png))
+        return 0
+    as_lines = draw.as_dot if dot else draw.as_mermaid if mermaid else draw.as_text
+    for line in as_lines(found):
+        print_line(line)
+    return 0
+
+
+def _find(at: RobotAddress) -> "Processes":
+    from gigabrain_zenoh.diagnostics.discovery import find_processes
+    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
     from gigabrain_zenoh.runtime.connect import joined
 
-    async def look() -> "Nodes":
-        async with joined(at.where(), NAME) as (bus, _):
-            return await census(bus)
+    async def find() -> "Processes":
+        async with joined(at.where(), CLIENT_NAME) as (bus, _):
+            return await find_processes(bus)
 
-    return run_async(look())
+    return run_async(find())
+
+
+def top(*, at: RobotAddress = LOCAL, once: bool = False) -> int:
+    """Watch processes and topics: load, rates, sizes and latencies.
+
+    Example: gigabrain top
+
+    TAB: other table. < and >: sort by another column. r: reverse the order.
+    Space: pause. q: quit.
+
+    Args:
+        once: Print both tables once, and exit.
+    """
+    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME, widest_pattern
+    from gigabrain_zenoh.diagnostics.top import BusFeed
+    from gigabrain_zenoh.diagnostics.topic_stats import monitored
+    from gigabrain_zenoh.runtime.connect import joined
+
+    async def run() -> None:
+        where = at.where()
+        async with joined(where, CLIENT_NAME) as (bus, _):
+            with monitored(bus, widest_pattern(where)) as monitor:
+                feed = BusFeed(bus, monitor)
+                await (_print_once(feed) if once else _watch(feed))
+
+    run_async(run())
+    return 0
+
+
+async def _watch(feed: "Feed") -> None:
+    try:
+        from gigabrain_zenoh.diagnostics.top_app import TopApp
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{error}; {INSTALL_TOP}") from None
+    app = TopApp(feed)
+    with stop_signals() as stop:
+        running = asyncio.ensure_future(app.run_async())
+        stopped = asyncio.ensure_future(stop.wait())
+        await asyncio.wait((running, stopped), return_when=asyncio.FIRST_COMPLETED)
+        stopped.cancel()
+        while not running.done():  # Textual shows a traceback if cancelled while it starts
+            app.exit()
+            await asyncio.wait((running,), timeout=0.1)
+        running.result()
+
+
+async def _print_once(feed: "Feed") -> None:
+    from rich.table import Table
+
+    from gigabrain_zenoh.diagnostics.top import (
+        PROCESS_COLUMNS,
+        TOPIC_COLUMNS,
+        cell_text,
+        sorted_rows,
+    )
+
+    await asyncio.sleep(1.3)
+    for columns, rows in zip((PROCESS_COLUMNS, TOPIC_COLUMNS), feed.refresh(), strict=True):
+        table = Table(box=None, pad_edge=False, header_style="dim")
+        for i, column in enumerate(columns):
+            table.add_column(column, justify="right" if i else "left", no_wrap=True)
+        for _, cells in sorted_rows(rows, 0, down=False):
+            table.add_row(*map(cell_text, cells))
+        print_table(table)
+
+
+def list_params(process: Process = "", /, *, at: RobotAddress = LOCAL) -> int:
+    """List the parameters that can be changed at run time: value, and what is accepted.
+
+    Example: gigabrain param list decision
+
+    Args:
+        process: Name of one process. Default: all.
+    """
+    for name, reply in sorted(run_async(_ask(at, process, "", "")).items()):
+        for one in reply.params:
+            print_line(f"{name:<12} {one.name:<14} {one.value:<10} {one.expected}")
+    return 0
+
+
+def get_param(process: Process, name: str, /, *, at: RobotAddress = LOCAL) -> int:
+    """Print one parameter.
+
+    Example: gigabrain param get decision max_linear_speed
+
+    Args:
+        process: Name of the process.
+        name: Name of the parameter.
+    """
+    reply = run_async(_ask(at, process, "", ""))[process]
+    params = {one.name: one for one in reply.params}
+    if name not in params:
+        raise unknown("parameter", name, params)
+    print_line(params[name].value)
+    return 0
+
+
+def set_param(process: Process, name: str, value: str, /, *, at: RobotAddress = LOCAL) -> int:
+    """Change one parameter, until the process ends.
+
+    Example: gigabrain param set decision max_linear_speed 0.15
+
+    Args:
+        process: Name of the process.
+        name: Name of the parameter.
+        value: New value.
+    """
+    reply = run_async(_ask(at, process, name, value))[process]
+    if not reply.ok:
+        raise Refused(f"{process}: {reply.text}")
+    print_line(f"{process}: {reply.text}")
+    return 0
+
+
+async def _ask(at: RobotAddress, process: str, name: str, value: str) -> "dict[str, ParamReply]":
+    """Return the replies of one process, or of all without a name."""
+    import getpass
+
+    from gigabrain_schemas.requests import ParamRequest
+    from gigabrain_schemas.topics import PARAM
+    from gigabrain_zenoh.diagnostics.discovery import discover
+    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
+    from gigabrain_zenoh.runtime.connect import joined
+
+    request = ParamRequest(name=name, value=value, source=getpass.getuser())
+    async with joined(at.where(), CLIENT_NAME) as (bus, _):
+        known = await discover(bus)
+        if process and process not in known:
+            raise unknown("process", process, known)
+        asked = [process] if process else list(known)
+        answers = await asyncio.gather(*(bus.ask(PARAM, request, name=each) for each in asked))
+    replies = {each: some[0] for each, some in zip(asked, answers, strict=True) if some}
+    if not replies or (process and process not in replies):
+        silent = process or "any process"
+        raise BodyLost(f"no answer from {silent}; check that it runs, and that your keys may ask")
+    return replies

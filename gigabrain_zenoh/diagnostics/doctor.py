@@ -1,34 +1,72 @@
-"""What is wrong with a machine and its robot, and the cure. Pure, over what was looked at."""
+"""`gigabrain doctor`: examines this machine and its robot. `examine` is pure; the rest looks."""
 
+import asyncio
+import datetime
+import importlib.metadata
 import itertools
+import os
+import platform
 import re
-from collections.abc import Iterator, Sequence
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 from msgspec import Struct
+from serial.tools import list_ports
 
-from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, SCAN, STATE, WORLD, Topic
-from gigabrain_zenoh.diagnostics.doctor_facts import Machine, Robot
+from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.requests import Description
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import (
+    BODY,
+    CMD_VEL,
+    HEALTH,
+    INTENT,
+    SAFETY,
+    SCAN,
+    STATE,
+    WORLD,
+    Topic,
+)
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.zenoh.config import session_config
+from gigabrain_zenoh.config.settings import Endpoint
+from gigabrain_zenoh.diagnostics.discovery import discover
+from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
+from gigabrain_zenoh.errors import BusError, ConfigError
+from gigabrain_zenoh.host.run_folders import state_dir
+from gigabrain_zenoh.runtime import running
+from gigabrain_zenoh.runtime.connect import Where, joined
+from gigabrain_zenoh.security.identity_files import identity_in
 
 Grade = Literal["ok", "hint", "bad"]
 SYSTEMS = ("router", "driver", "perception", "decision", "control", "safety")
-LEAST = {"eclipse-zenoh": (1, 10), "msgspec": (0, 19), "numpy": (1, 26), "cyclopts": (5, 0)}
-NEEDED = ("eclipse-zenoh", "msgspec", "numpy", "pyserial", "pyyaml", "cyclopts", "rich")
-EXTRAS = {
+LIBRARIES: Mapping[str, tuple[int, ...]] = {  # with the lowest version
+    "eclipse-zenoh": (1, 10), "msgspec": (0, 19), "numpy": (1, 26), "pyserial": (), "pyyaml": (),
+    "cyclopts": (5, 0), "rich": (), "mujoco-core": (), "cryptography": (), "mcap": (),
+    "textual": (), "uvloop": (),
+}  # fmt: skip
+EXTRAS = {  # optional libraries, and the extra of the package that installs each
     "mujoco-core": "sim", "cryptography": "keys", "mcap": "record", "textual": "view",
     "uvloop": "fast",
 }  # fmt: skip
-FREE_MB, CLOCK_MS, DAYS = 500.0, 500.0, 30.0
-SENT_BY: dict[Topic[Any], str] = {
+SENDERS: dict[Topic[Any], str] = {
     STATE: "driver", SCAN: "driver", BODY: "driver", WORLD: "perception", INTENT: "decision",
     CMD_VEL: "control", SAFETY: "safety",
 }  # fmt: skip
-SLOW = 0.5  # of the promised rate
-BUSY = 0.9  # of one core
+MIN_PYTHON = (3, 11)
+MIN_FREE_MB = 500.0
+MIN_KEY_DAYS = 30.0
+MAX_CLOCK_OFFSET_MS = 500.0
+MIN_RATE = 0.5  # of the promised rate
+MAX_CPU = 0.9  # of one core
+WINDOW_S = 2.5  # every process reports its health twice
 
 
-class Finding(Struct, frozen=True, kw_only=True):
-    """One thing that was looked at."""
+class CheckResult(Struct, frozen=True, kw_only=True):
+    """Result of one check."""
 
     about: str
     grade: Grade
@@ -36,180 +74,337 @@ class Finding(Struct, frozen=True, kw_only=True):
     cure: str = ""
 
 
-def examine(machine: Machine, robot: Robot) -> list[Finding]:
-    """Everything, in the order in which it matters."""
-    looks = (
+class Folder(Struct, frozen=True, kw_only=True):
+    """A folder that the robot writes to."""
+
+    path: str
+    writable: bool
+    free_mb: float
+
+
+class Port(Struct, frozen=True, kw_only=True):
+    """A serial device."""
+
+    path: str
+    about: str
+    usb: str = ""  # VID:PID
+    usable: bool
+
+
+class Certificate(Struct, frozen=True, kw_only=True):
+    """An identity, or the problem with it."""
+
+    folder: str
+    name: str = ""
+    days_left: float = 0.0
+    problem: str = ""
+
+
+class MachineFacts(Struct, frozen=True, kw_only=True):
+    """State of this computer."""
+
+    python: tuple[int, int, int]
+    system: str
+    libraries: Mapping[str, str | None]  # version; None where it is not installed
+    folders: tuple[Folder, ...]
+    ports: tuple[Port, ...]
+    multicast: bool  # whether sessions search for others by multicast
+    certificate: Certificate | None = None
+
+
+class RobotFacts(Struct, frozen=True, kw_only=True):
+    """State of the robot, or why it cannot be reached."""
+
+    problem: str = ""
+    router: str = ""
+    port_open: bool = False  # whether anything listens at `router`, where it does not answer
+    described: Mapping[str, Description] = {}
+    health: Mapping[str, Health] = {}  # newest, by process
+    lead_ms: Mapping[str, float] = {}  # by host: smallest offset by which its clock is behind ours
+    control_topic: str = CMD_VEL.key  # which the body obeys
+    pace: float | None = None  # robot's time over real time
+
+
+def examine(machine: MachineFacts, robot: RobotFacts) -> list[CheckResult]:
+    """Return the results of all checks, the basic ones first."""
+    checks = (
         _python(machine), _libraries(machine), _folders(machine), _serial(machine),
         _multicast(machine), _certificate(machine), _router(robot), _processes(robot),
         _rates(robot), _clocks(robot), _load(robot),
     )  # fmt: skip
-    return list(itertools.chain.from_iterable(looks))
+    return list(itertools.chain.from_iterable(checks))
 
 
-def exit_code(findings: Sequence[Finding]) -> int:
-    """0 where nothing is bad; hints do not count."""
-    return int(any(finding.grade == "bad" for finding in findings))
+def exit_code(results: Sequence[CheckResult]) -> int:
+    """Return 1 if any result is bad; hints do not count."""
+    return int(any(one.grade == "bad" for one in results))
 
 
-def _ok(about: str, text: str) -> Finding:
-    return Finding(about=about, grade="ok", text=text)
+def _ok(about: str, text: str) -> CheckResult:
+    return CheckResult(about=about, grade="ok", text=text)
 
 
-def _bad(about: str, text: str, cure: str) -> Finding:
-    return Finding(about=about, grade="bad", text=text, cure=cure)
+def _bad(about: str, text: str, cure: str) -> CheckResult:
+    return CheckResult(about=about, grade="bad", text=text, cure=cure)
 
 
-def _hint(about: str, text: str, cure: str) -> Finding:
-    return Finding(about=about, grade="hint", text=text, cure=cure)
+def _hint(about: str, text: str, cure: str) -> CheckResult:
+    return CheckResult(about=about, grade="hint", text=text, cure=cure)
 
 
-def _python(machine: Machine) -> Iterator[Finding]:
+def _python(machine: MachineFacts) -> Iterator[CheckResult]:
     version = ".".join(map(str, machine.python))
-    if machine.python < (3, 11):
+    if machine.python < MIN_PYTHON:
         yield _bad("python", f"{version} is too old", "install Python 3.11 or newer")
     else:
         yield _ok("python", f"{version} on {machine.system}")
 
 
-def _libraries(machine: Machine) -> Iterator[Finding]:
+def _libraries(machine: MachineFacts) -> Iterator[CheckResult]:
     for name, version in machine.libraries.items():
-        extra = EXTRAS.get(name)
+        extra, lowest = EXTRAS.get(name), LIBRARIES.get(name, ())
         if version is None and extra:
-            cure = f"pip install 'gigabrain-zenoh[{extra}]', if you want it"
+            cure = f"optional; to install it: pip install 'gigabrain-zenoh[{extra}]'"
             yield _hint(name, "is not installed", cure)
         elif version is None:
             yield _bad(name, "is not installed", "pip install gigabrain-zenoh")
-        elif _numbers(version) < LEAST.get(name, ()):
-            least = ".".join(map(str, LEAST[name]))
-            yield _bad(name, f"{version} is too old", f"pip install -U '{name}>={least}'")
+        elif tuple(map(int, re.findall(r"\d+", version)[:3])) < lowest:
+            cure = f"pip install -U '{name}>={'.'.join(map(str, lowest))}'"
+            yield _bad(name, f"{version} is too old", cure)
         else:
             yield _ok(name, version)
 
 
-def _numbers(version: str) -> tuple[int, ...]:
-    return tuple(map(int, re.findall(r"\d+", version)[:3]))
-
-
-def _folders(machine: Machine) -> Iterator[Finding]:
+def _folders(machine: MachineFacts) -> Iterator[CheckResult]:
     for folder in machine.folders:
         if not folder.writable:
             cure = f"chown or chmod {folder.path}, or set XDG_STATE_HOME and XDG_RUNTIME_DIR"
-            yield _bad("folder", f"{folder.path} cannot be written by this user", cure)
-        elif folder.free_mb < FREE_MB:
+            yield _bad("folder", f"this user cannot write to {folder.path}", cure)
+        elif folder.free_mb < MIN_FREE_MB:
             cure = "delete old runs and recordings"
-            yield _bad("disk", f"{folder.free_mb:.0f} MB left for {folder.path}", cure)
+            yield _bad("disk", f"only {folder.free_mb:.0f} MB free for {folder.path}", cure)
         else:
-            yield _ok("folder", f"{folder.path} can be written, {folder.free_mb / 1e3:.0f} GB left")
+            yield _ok("folder", f"{folder.path} is writable, {folder.free_mb / 1e3:.0f} GB free")
 
 
-def _serial(machine: Machine) -> Iterator[Finding]:
+def _serial(machine: MachineFacts) -> Iterator[CheckResult]:
     if not machine.ports:
-        yield _ok("serial", "no USB serial device is plugged in")
+        yield _ok("serial", "no USB serial device is connected")
     for port in machine.ports:
-        what = f"{port.path} ({port.usb} {port.about})"
+        device = f"{port.path} ({port.usb} {port.about})"
         if port.usable:
-            yield _ok("serial", f"{what} can be opened")
-        else:
-            vendor, _, product = port.usb.partition(":")
-            rule = (
-                f'SUBSYSTEM=="tty", ATTRS{{idVendor}}=="{vendor}", '
-                f'ATTRS{{idProduct}}=="{product}", MODE="0660", GROUP="dialout"'
-            )
-            cure = (
-                "add yourself to its group (`sudo usermod -aG dialout $USER`, then log in again); "
-                f"if that does not help, this udev rule: {rule}"
-            )
-            yield _bad("serial", f"{what} may not be opened by this user", cure)
+            yield _ok("serial", f"{device} can be opened")
+            continue
+        vendor, _, product = port.usb.partition(":")
+        rule = (
+            f'SUBSYSTEM=="tty", ATTRS{{idVendor}}=="{vendor}", '
+            f'ATTRS{{idProduct}}=="{product}", MODE="0660", GROUP="dialout"'
+        )
+        cure = (
+            "add yourself to its group (`sudo usermod -aG dialout $USER`, then log in again); "
+            f"if that does not help, add this udev rule: {rule}"
+        )
+        yield _bad("serial", f"this user may not open {device}", cure)
 
 
-def _multicast(machine: Machine) -> Iterator[Finding]:
+def _multicast(machine: MachineFacts) -> Iterator[CheckResult]:
     if machine.multicast:
-        yield _bad("multicast", "sessions look for others by themselves", "reinstall the package")
+        yield _bad("multicast", "on: sessions search for others", "reinstall the package")
     else:
-        yield _ok("multicast", "off: nobody joins but who is told the router's address")
+        yield _ok("multicast", "off: a process joins only by the router's address")
 
 
-def _certificate(machine: Machine) -> Iterator[Finding]:
+def _certificate(machine: MachineFacts) -> Iterator[CheckResult]:
     mine = machine.certificate
     if mine is None:
         return
-    cure = "make a new identity with `gigabrain keys issue` and copy its folder here"
+    cure = "issue a new identity with `gigabrain keys issue`, and copy its folder here"
     if mine.problem:
         yield _bad("keys", mine.problem, cure)
-    elif mine.days_left < DAYS:
-        yield _bad("keys", f"{mine.name} in {mine.folder}: {mine.days_left:.0f} days left", cure)
-    else:
-        yield _ok("keys", f"{mine.name} in {mine.folder}: {mine.days_left:.0f} days left")
+        return
+    text = f"{mine.name} in {mine.folder}: {mine.days_left:.0f} days left"
+    yield _bad("keys", text, cure) if mine.days_left < MIN_KEY_DAYS else _ok("keys", text)
 
 
-def _router(robot: Robot) -> Iterator[Finding]:
+def _router(robot: RobotFacts) -> Iterator[CheckResult]:
     if robot.problem and robot.port_open:
-        cure = "use the robot's --keys, or stop what else has that port"
+        cure = "use the robot's --keys, or stop what else uses that port"
         yield _bad("router", f"{robot.problem} Something listens on that port.", cure)
     elif robot.problem and robot.router:
         cure = "start the robot there, open its port in the firewall, or name it with --connect"
         yield _bad("router", f"{robot.problem} Nothing listens on that port.", cure)
     elif robot.problem:
-        problem, _, cure = robot.problem.partition("; ")
-        yield _hint("router", problem, cure)
+        yield _hint("router", robot.problem, "")
     else:
         yield _ok("router", f"answers at {robot.router}")
 
 
-def _processes(robot: Robot) -> Iterator[Finding]:
+def _processes(robot: RobotFacts) -> Iterator[CheckResult]:
     if robot.problem:
         return
     for name in SYSTEMS:
-        if name not in robot.there:
+        if name not in robot.described:
             cure = f"start it, or read its log: gigabrain log --process {name}"
             yield _bad(name, "does not answer", cure)
-    for name, one in robot.there.items():
+    for name, one in robot.described.items():
         health = robot.health.get(name)
         if health is None:
             cure = f"it may hang; read its log: gigabrain log --process {name}"
-            yield _bad(name, f"pid {one.pid} on {one.host}, but reports no health", cure)
+            yield _bad(name, f"pid {one.pid} on {one.host} reports no health", cure)
         else:
             memory = f"{health.rss_bytes / 1e6:.0f} MB"
-            yield _ok(
-                name, f"{one.version}, pid {one.pid} on {one.host}, {health.cpu:.1%}, {memory}"
-            )
-    versions = {one.version for one in robot.there.values()}
+            text = f"{one.version}, pid {one.pid} on {one.host}, {health.cpu:.1%}, {memory}"
+            yield _ok(name, text)
+    versions = {one.version for one in robot.described.values()}
     if len(versions) > 1:
         cure = "install the same version on all hosts"
         yield _bad("versions", f"the processes differ: {', '.join(sorted(versions))}", cure)
 
 
-def _rates(robot: Robot) -> Iterator[Finding]:
+def _rates(robot: RobotFacts) -> Iterator[CheckResult]:
     pace = min(robot.pace or 1.0, 1.0)
-    for topic, process in SENT_BY.items():
+    for topic, process in SENDERS.items():
         health = robot.health.get(process)
         if health is None:
             continue
         key = robot.control_topic if topic is CMD_VEL else topic.key
         hz, promised = health.sent_hz.get(key, 0.0), topic.hz * pace
-        if hz < SLOW * promised and topic.key != BODY.key:
-            cure = f"relieve this computer, or read the log: gigabrain log --process {process}"
+        if hz < MIN_RATE * promised and topic.key != BODY.key:
+            cure = f"reduce the load here, or read its log: gigabrain log --process {process}"
             yield _bad(key, f"{hz:g} Hz from {process}, promised {promised:g}", cure)
     for process, health in robot.health.items():
         for key, count in health.rejected.items():
-            cure = f"find out who sends it: gigabrain topic info {key.removeprefix('robot/')}"
-            yield _hint(key, f"{process} has thrown away {count} invalid messages", cure)
+            cure = f"find the sender: gigabrain topic info {key.removeprefix('robot/')}"
+            yield _hint(key, f"{process} has dropped {count} invalid messages", cure)
 
 
-def _clocks(robot: Robot) -> Iterator[Finding]:
+def _clocks(robot: RobotFacts) -> Iterator[CheckResult]:
     for host, lead_ms in robot.lead_ms.items():
-        if abs(lead_ms) > CLOCK_MS:
+        if abs(lead_ms) > MAX_CLOCK_OFFSET_MS:
             side = "behind" if lead_ms > 0 else "ahead of"
             cure = f"run an NTP client, such as chrony, on {host} and here"
             yield _bad("clock", f"{host} is {abs(lead_ms) / 1e3:.1f} s {side} this one", cure)
         else:
-            yield _ok("clock", f"{host} differs by {abs(lead_ms):.0f} ms at most")
+            yield _ok("clock", f"{host} differs by at most {abs(lead_ms):.0f} ms")
     if robot.pace is not None:
-        yield _ok("ticks", f"the robot's time goes by at ×{robot.pace:.2f}")
+        yield _ok("ticks", f"the robot's time runs at ×{robot.pace:.2f}")
 
 
-def _load(robot: Robot) -> Iterator[Finding]:
+def _load(robot: RobotFacts) -> Iterator[CheckResult]:
     for process, health in robot.health.items():
-        if health.cpu > BUSY:
-            cure = "see what it does with `gigabrain top`, or give it a faster computer"
-            yield _hint(process, f"takes {health.cpu:.0%} of a core", cure)
+        if health.cpu > MAX_CPU:
+            cure = "look at `gigabrain top`, or use a faster computer"
+            yield _hint(process, f"uses {health.cpu:.0%} of a core", cure)
+
+
+def look_at_machine(keys: str = "") -> MachineFacts:
+    """Return the state of this computer; `keys` is the folder of an identity."""
+    major, minor, micro = platform.python_version_tuple()
+    config = session_config(Endpoint(connect=("tcp/127.0.0.1:1",)))
+    return MachineFacts(
+        python=(int(major), int(minor), int("".join(filter(str.isdigit, micro)) or 0)),
+        system=f"{platform.system()} {platform.release()} {platform.machine()}",
+        libraries={name: _version(name) for name in LIBRARIES},
+        folders=tuple(map(_folder, (state_dir(), running.folder(), Path(tempfile.gettempdir())))),
+        ports=tuple(_ports()),
+        multicast=bool(config["scouting/multicast/enabled"]),
+        certificate=_load_certificate(keys) if keys else None,
+    )
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _folder(path: Path) -> Folder:
+    existing = path
+    while not existing.exists():
+        existing = existing.parent
+    free_mb = shutil.disk_usage(existing).free / 1e6
+    return Folder(path=str(path), writable=os.access(existing, os.W_OK), free_mb=free_mb)
+
+
+def _ports() -> Iterator[Port]:
+    for port in sorted(list_ports.comports(), key=lambda port: str(port.device)):
+        if port.vid is None:
+            continue  # built into the computer, so no robot
+        usable = os.access(port.device, os.R_OK | os.W_OK)
+        usb, about = f"{port.vid:04x}:{port.pid:04x}", str(port.description or "")
+        yield Port(path=port.device, about=about, usb=usb, usable=usable)
+
+
+def _load_certificate(keys: str) -> Certificate:
+    try:
+        identity = identity_in(Path(keys).expanduser())
+    except ConfigError as error:
+        return Certificate(folder=keys, problem=str(error))
+    days = identity.days_left(datetime.datetime.now(datetime.UTC))
+    return Certificate(folder=keys, name=identity.name, days_left=days)
+
+
+async def look_at_robot(where: Where, seconds: float = WINDOW_S) -> tuple[RobotFacts, str]:
+    """Return the state of the robot, and the folder of the identity that reaches it."""
+    try:
+        endpoint = running.find_endpoint(where.connect, where.namespace, where.keys)
+    except BusError as error:
+        return RobotFacts(problem=str(error)), where.keys
+    router = endpoint.connect[-1]
+    try:
+        async with joined(where, CLIENT_NAME) as (bus, _):
+            return await _collect(bus, router, seconds), endpoint.keys
+    except (BusError, ConfigError) as error:
+        problem, port_open = str(error), await _port_open(router)
+        return RobotFacts(problem=problem, router=router, port_open=port_open), endpoint.keys
+
+
+async def _port_open(endpoint: str) -> bool:
+    """Return whether anything accepts connections at an endpoint such as tcp/127.0.0.1:7447."""
+    host, _, port = endpoint.partition("/")[2].rpartition(":")
+    if not port.isdigit():
+        return False
+    try:
+        _, writer = await asyncio.wait_for(
+            asyncio.open_connection(host.strip("[]"), int(port)), 1.0
+        )
+    except (OSError, TimeoutError):
+        return False
+    writer.close()
+    return True
+
+
+async def _collect(bus: Bus, router: str, seconds: float) -> RobotFacts:
+    health: dict[str, Health] = {}
+    lead_ms: dict[str, float] = {}
+    states: list[RobotState] = []
+
+    def add(_key: str, newest: Health) -> None:
+        health[newest.process] = newest
+        lead = (bus.clock.unix_ns() - newest.stamp_ns) / 1e6
+        lead_ms[newest.host] = min(lead, lead_ms.get(newest.host, lead), key=abs)
+
+    bus.subscribe(HEALTH, add)
+    bodies = bus.latest(BODY)
+    bus.subscribe(STATE, lambda _key, state: states.append(state))
+    described, _ = await asyncio.gather(discover(bus), asyncio.sleep(seconds))
+    body = bodies.current
+    return RobotFacts(
+        router=router,
+        described=described,
+        health=health,
+        lead_ms=lead_ms,
+        control_topic=body.description.control_topic if body else CMD_VEL.key,
+        pace=_pace(states),
+    )
+
+
+def _pace(states: list[RobotState]) -> float | None:
+    """Return the robot's time over real time; None with fewer than two states."""
+    same_boot = [state for state in states if state.boot == states[-1].boot]
+    if len(same_boot) < 2:
+        return None
+    seconds = (same_boot[-1].stamp_ns - same_boot[0].stamp_ns) / 1e9
+    ticks = same_boot[-1].tick - same_boot[0].tick
+    return ticks * 0.02 / seconds if seconds > 0 else None

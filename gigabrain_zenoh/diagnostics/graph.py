@@ -1,4 +1,4 @@
-"""Who talks to whom, as text, for Graphviz, for Mermaid, and as a picture."""
+"""The graph of processes and messages: as text, for Graphviz, for Mermaid, and as a PNG."""
 
 import math
 import re
@@ -7,24 +7,24 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from gigabrain_zenoh.diagnostics.names import short
-from gigabrain_zenoh.diagnostics.roll_call import Flow
+from gigabrain_zenoh.diagnostics.discovery import Flow
+from gigabrain_zenoh.diagnostics.topic_names import short
 from gigabrain_zenoh.errors import ConfigError
 
-NEEDS = "a picture needs more: pip install 'gigabrain-zenoh[record]'"
+INSTALL = "for pictures install: pip install 'gigabrain-zenoh[record]'"
 INK, PLAIN = "#1e293b", {"facecolor": "white", "edgecolor": "none", "pad": 1}
 BOX = {"facecolor": "#e0f2fe", "edgecolor": "#0369a1"}
 ORDER = ("driver", "perception", "decision", "control", "safety")  # along the chain
-CHATTER = ("health", "log", "audit")  # everybody sends these: too much for a picture
+COMMON = ("health", "log", "audit")  # every process sends these: too much for a picture
 
 
 def chain(flows: Iterable[Flow], *, everything: bool = False) -> list[Flow]:
-    """Those that make the robot move; `everything` leaves none out."""
-    return [f for f in flows if everything or short(f.key).split("/")[0] not in CHATTER]
+    """Return the flows that make the robot move, or all flows with `everything`."""
+    return [f for f in flows if everything or short(f.key).split("/")[0] not in COMMON]
 
 
 def as_text(flows: Iterable[Flow]) -> Iterator[str]:
-    """Each process with what it sends, to whom, and how often."""
+    """Yield each process, with its keys, their rates and their receivers."""
     for sender, of in groupby(sorted(flows), key=lambda flow: flow.sender):
         yield sender
         for key, same in groupby(of, key=lambda flow: flow.key):
@@ -34,7 +34,7 @@ def as_text(flows: Iterable[Flow]) -> Iterator[str]:
 
 
 def as_dot(flows: Iterable[Flow]) -> Iterator[str]:
-    """For Graphviz."""
+    """Yield the lines of a Graphviz file."""
     yield "digraph robot {"
     yield "  rankdir=LR; node [shape=box, style=rounded]; edge [fontsize=10];"
     for flow in sorted(flows):
@@ -44,7 +44,7 @@ def as_dot(flows: Iterable[Flow]) -> Iterator[str]:
 
 
 def as_mermaid(flows: Iterable[Flow]) -> Iterator[str]:
-    """For Mermaid, as GitHub draws it."""
+    """Yield the lines of a Mermaid flowchart."""
     yield "flowchart LR"
     for flow in sorted(flows):
         sender, receiver = (re.sub(r"\W", "_", name) for name in (flow.sender, flow.receiver))
@@ -53,12 +53,12 @@ def as_mermaid(flows: Iterable[Flow]) -> Iterator[str]:
 
 
 def write_png(flows: Iterable[Flow], path: Path) -> None:
-    """Processes on a circle, arrows between them. Raises ConfigError."""
+    """Draw processes on a circle, with arrows between them. Raises ConfigError."""
     try:
         from matplotlib.figure import Figure
         from matplotlib.patches import FancyArrowPatch
     except ModuleNotFoundError as error:
-        raise ConfigError(f"{error}; {NEEDS}") from None
+        raise ConfigError(f"{error}; {INSTALL}") from None
     pairs = {
         pair: [f"{short(flow.key)} {flow.hz:.0f} Hz" for flow in group]
         for pair, group in groupby(
@@ -79,7 +79,7 @@ def write_png(flows: Iterable[Flow], path: Path) -> None:
                 shrinkA=42, shrinkB=42, color="#64748b",
             )
         )  # fmt: skip
-        bow = 0.15  # to the same side as the arrow
+        bow = 0.15  # to the side to which the arrow bends
         x = (a[0] + b[0]) / 2 + (b[1] - a[1]) * bow / 2
         y = (a[1] + b[1]) / 2 - (b[0] - a[0]) * bow / 2
         _text(axes, (x, y), "\n".join(labels), 8, PLAIN)
@@ -96,7 +96,7 @@ def _text(axes: Any, place: tuple[float, float], text: str, size: int, box: dict
 
 
 def positions(names: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """Places on a circle, clockwise from the left, in the order of the chain."""
+    """Return places on a circle, clockwise from the left, in the order of the chain."""
     order = {name: i for i, name in enumerate(ORDER)}
     found = sorted(names, key=lambda name: (order.get(name, len(order)), name))
     places = {}

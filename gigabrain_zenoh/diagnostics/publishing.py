@@ -1,4 +1,4 @@
-"""`gigabrain topic pub`: what people type becomes messages, and drives the body where it must."""
+"""`gigabrain topic pub`: builds a message from typed words, and publishes it or drives by it."""
 
 import asyncio
 import getpass
@@ -13,7 +13,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.robot import Robot, connect
-from gigabrain_zenoh.diagnostics.names import OURS, not_found, short
+from gigabrain_zenoh.diagnostics.topic_names import PREFIX, no_topic, short
 from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.signals import stop_signals
@@ -21,13 +21,13 @@ from gigabrain_zenoh.runtime.connect import Where
 
 M = TypeVar("M", bound=Message)
 NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
-LISTENERS_S = 0.5  # for those who listen to be known everywhere, before the first message goes
+SUBSCRIBERS_S = 0.5  # until routers know all subscribers, before the first message
 
 
-def typed_in(topic: Topic[M], words: Sequence[str]) -> M:
-    """The message in `{"json": 1}`, or in words such as `linear_x=0.1 pose.x=2`.
+def parse_message(topic: Topic[M], words: Sequence[str]) -> M:
+    """Return the message of a JSON object, or of words such as `linear_x=0.1 pose.x=2`.
 
-    Raises ConfigError, which says what was expected, and UnknownName for a field.
+    Raises ConfigError, and UnknownName for a field.
     """
     if len(words) == 1 and words[0].lstrip().startswith("{"):
         try:
@@ -41,10 +41,9 @@ def typed_in(topic: Topic[M], words: Sequence[str]) -> M:
         if name not in known:
             raise unknown(f"field of {topic.type.__name__}", name, known)
     try:
-        made = msgspec.convert(values, topic.type)
+        return msgspec.convert(values, topic.type)
     except msgspec.ValidationError as error:
         raise ConfigError(f"not a valid {topic.type.__name__}: {error}") from None
-    return made
 
 
 def _tree(words: Sequence[str]) -> dict[str, Any]:
@@ -58,13 +57,13 @@ def _tree(words: Sequence[str]) -> dict[str, Any]:
         for parent in parents:
             here = here.setdefault(parent, {})
             if not isinstance(here, dict):
-                raise ConfigError(f"{word!r}: {parent} is given a value already")
+                raise ConfigError(f"{word!r}: {parent} already has a value")
         here[name] = _value(text)
     return tree
 
 
 def _value(text: str) -> Any:
-    """A number, true, false, null, a list or an object in JSON; else the text itself."""
+    """Return a number, or a JSON value; else the text itself."""
     if NUMBER.fullmatch(text):
         return int(text) if re.fullmatch(r"[-+]?\d+", text) else float(text)
     if text in ("true", "false", "null") or text[:1] in '[{"':
@@ -75,7 +74,7 @@ def _value(text: str) -> Any:
     return text
 
 
-async def send(
+async def publish(
     bus: Bus,
     topic: Topic[Any],
     message: Message,
@@ -83,13 +82,13 @@ async def send(
     count: int | None,
     name: str = "",
 ) -> int:
-    """Send it once, `count` times, or at `rate` [Hz] until Ctrl-C; how often it was sent."""
-    left = count if count is not None else (None if rate else 1)
+    """Publish a message once, `count` times, or at `rate` [Hz] until Ctrl-C; return how often."""
+    wanted = count if count is not None else (None if rate else 1)
     sent = 0
     with stop_signals() as stop:
-        await asyncio.sleep(LISTENERS_S)
+        await asyncio.sleep(SUBSCRIBERS_S)
         async for _ in bus.clock.every(round(1e9 / (rate or 10.0))):
-            if stop.is_set() or left == sent:
+            if stop.is_set() or wanted == sent:
                 break
             bus.publish(topic, message, name=name)
             sent += 1
@@ -100,11 +99,11 @@ async def send(
 async def drive(
     where: Where, name: str, words: Sequence[str], seconds: float | None, *, take: bool
 ) -> str:
-    """Drive by cmd_vel, or by the key of its own that this body obeys; what became of it.
+    """Drive by cmd_vel, or by the control topic of this body; return the result as text.
 
-    Raises UnknownName for any other key, ConfigError, and Refused.
+    Raises UnknownName for any other topic, ConfigError and Refused.
     """
-    command = typed_in(CMD_VEL, words)
+    command = parse_message(CMD_VEL, words)
     async with connect(
         where.connect,
         namespace=where.namespace,
@@ -112,25 +111,26 @@ async def drive(
         source=command.source or f"{getpass.getuser()}-pub",
         take=take,
     ) as robot:
-        obeyed = (await robot.read_body()).control_topic
-        if OURS + short(name) not in (CMD_VEL.key, obeyed) and name != obeyed:
-            raise not_found(name, (obeyed,))
-        return await obey(robot, command, seconds, take=take)
+        control_topic = (await robot.read_body()).control_topic
+        if PREFIX + short(name) not in (CMD_VEL.key, control_topic) and name != control_topic:
+            raise no_topic(name, (control_topic,))
+        return await hold_velocity(robot, command, seconds, take=take)
 
 
-async def obey(robot: Robot, command: CmdVel, seconds: float | None, *, take: bool) -> str:
-    """Have the body obey a command for `seconds` of its time, or until Ctrl-C; what became of it.
+async def hold_velocity(robot: Robot, command: CmdVel, seconds: float | None, *, take: bool) -> str:
+    """Hold a velocity for `seconds` of the robot's time, or until Ctrl-C; return the result.
 
-    It is asked for first, and goes back to whoever had it. Raises Refused where it is not given.
+    The gate is asked for the body before, and gives it back to the brain afterwards. Raises
+    Refused.
     """
     before = (await robot.read_state()).gate
     if before.mode == "enabled" and not take:
-        raise Refused(f"{before.commander} drives; take it over with --take")
+        raise Refused(f"{before.commander} drives; take over with --take")
     await robot.enable(take=take)
     start_tick = (await robot.read_state()).tick
     try:
         with stop_signals() as stop:
-            driving = asyncio.ensure_future(_hold(robot, command, seconds))
+            driving = asyncio.ensure_future(_send_velocity(robot, command, seconds))
             stopped = asyncio.ensure_future(stop.wait())
             await asyncio.wait((driving, stopped), return_when=asyncio.FIRST_COMPLETED)
             stopped.cancel()
@@ -142,7 +142,7 @@ async def obey(robot: Robot, command: CmdVel, seconds: float | None, *, take: bo
     return f"driven for {ticks * 0.02:.1f} s; {await _give_back(robot, before.commander)}"
 
 
-async def _hold(robot: Robot, command: CmdVel, seconds: float | None) -> None:
+async def _send_velocity(robot: Robot, command: CmdVel, seconds: float | None) -> None:
     start = (await robot.read_state()).tick
     while seconds is None or (await robot.read_state()).tick - start < seconds * 50:
         await robot.set_base_velocity(command.linear_x, command.linear_y, command.angular_z)
@@ -150,10 +150,10 @@ async def _hold(robot: Robot, command: CmdVel, seconds: float | None) -> None:
 
 
 async def _give_back(robot: Robot, commander: str) -> str:
-    """Only the brain goes on by itself; for anybody else silence closes the gate."""
+    """Enable the brain again if it drove before; for any other commander silence idles the gate."""
     if commander != BRAIN:
-        return "the body is nobody's now"
+        return "the robot is idle now"
     try:
         return (await robot.enable(BRAIN, take=True)).text
     except Refused as error:
-        return f"the brain has not got it back: {error}"
+        return f"the brain does not drive again: {error}"

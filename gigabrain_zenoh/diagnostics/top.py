@@ -1,102 +1,184 @@
-"""`gigabrain top`: processes and topics in the terminal, live."""
+"""Rows of `gigabrain top`: processes and topics, each with a sparkline of its newest values."""
 
-from typing import ClassVar
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Protocol
 
-from textual.app import App, ComposeResult
-from textual.binding import BindingType
-from textual.widgets import Footer, Header
+from msgspec import Struct
 
-from gigabrain_zenoh.diagnostics.plain_table import PlainTable
-from gigabrain_zenoh.diagnostics.top_feed import Feed, Rows
-from gigabrain_zenoh.diagnostics.top_rows import PROCESS_COLUMNS, TOPIC_COLUMNS, in_order
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import HEALTH
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.diagnostics.topic_names import short, topic_of
+from gigabrain_zenoh.diagnostics.topic_stats import StreamStats, TopicMonitor
+from gigabrain_zenoh.host.bounded import put_newest
 
-PERIOD_S = 1.0
-DOWN, UP = " ▼", " ▲"
+BARS = "▁▂▃▄▅▆▇█"
+MAX_BARS = 20
+MAX_PROCESSES = 64
+SILENT_AFTER_S = 3.0  # a process that reports no health
+Cell = str | float
+Rows = dict[str, tuple[Cell, ...]]
 
 
-class Top(App[None]):
-    """Two tables. Left and right choose the column that a table is sorted by."""
+class ProcessRow(Struct, frozen=True, kw_only=True):
+    """One process. The fields are the columns, in their order."""
 
-    CSS = """
-    PlainTable { max-height: 50%; margin: 0 1 1 1; }
-    #topics { max-height: 1fr; }
-    """
-    TITLE = "gigabrain top"
-    BINDINGS: ClassVar[list[BindingType]] = [
-        ("q", "quit", "Quit"),
-        ("tab", "app.focus_next", "Other table"),
-        ("less_than_sign,comma", "column(-1)", "Sort left"),
-        ("greater_than_sign,full_stop", "column(1)", "Sort right"),
-        ("r", "turn", "Reverse"),
-        ("space", "hold", "Hold still"),
-    ]
-    ENABLE_COMMAND_PALETTE = False
+    process: str
+    state: str  # "ok", "silent"
+    cpu: float  # [% of a core]
+    rss_mb: float
+    sends_hz: float
+    receives_hz: float
+    rejected: int
+    latency_ms: float | str  # the largest that it measures
+    latency: str  # sparkline
+    uptime_s: float
 
-    def __init__(self, feed: Feed, about: str) -> None:
-        super().__init__()
-        self._feed, self.sub_title = feed, about
-        self._sorted: dict[str, tuple[int, bool]] = {"processes": (0, False), "topics": (0, False)}
-        self._rows: dict[str, Rows] = {"processes": {}, "topics": {}}
-        self._holds = False
 
-    def compose(self) -> ComposeResult:
-        """The two tables."""
-        yield Header()
-        for name in self._sorted:
-            yield PlainTable(name=name)
-        yield Footer()
+class StreamRow(Struct, frozen=True, kw_only=True):
+    """One key. The fields are the columns, in their order."""
 
-    def on_mount(self) -> None:
-        """Begin to look."""
-        self.query_one("#processes").focus()
-        self._refresh()
-        self.set_interval(PERIOD_S, self._refresh)
+    topic: str
+    hz: float
+    promised_hz: float | str
+    kb_s: float
+    size: int
+    delay_ms: float | str  # median, by stamp
+    delay: str  # sparkline
+    jitter_ms: float | str  # standard deviation of the gaps
+    age_s: float
+    missing: int
 
-    def on_plain_table_heading_clicked(self, event: PlainTable.HeadingClicked) -> None:
-        """A click on a column sorts by it; another turns the order round."""
-        name = event.table.id or "topics"
-        column, down = self._sorted[name]
-        self._sorted[name] = event.column, not down if column == event.column else down
-        self._draw(name)
 
-    def action_column(self, step: int) -> None:
-        """Sort by the next column."""
-        name = self._chosen()
-        column, down = self._sorted[name]
-        self._sorted[name] = (column + step) % len(self._columns(name)), down
-        self._draw(name)
+PROCESS_COLUMNS = ("process", "state", "CPU %", "MB", "sends Hz", "receives Hz", "rejected",
+                   "latency ms", "latency", "up s")  # fmt: skip
+TOPIC_COLUMNS = ("topic", "Hz", "promised", "kB/s", "bytes", "delay ms", "delay", "jitter ms",
+                 "age s", "missing")  # fmt: skip
 
-    def action_turn(self) -> None:
-        """Turn the order round."""
-        name = self._chosen()
-        column, down = self._sorted[name]
-        self._sorted[name] = column, not down
-        self._draw(name)
 
-    def action_hold(self) -> None:
-        """Hold still, or go on."""
-        self._holds = not self._holds
-        self.title = "gigabrain top (held)" if self._holds else "gigabrain top"
+def process_row(health: Health, age_s: float, latency: str = "") -> ProcessRow:
+    """Return the row of a process whose newest health is `age_s` old."""
+    return ProcessRow(
+        process=health.process,
+        state="ok" if age_s < SILENT_AFTER_S else "silent",
+        cpu=health.cpu * 100,
+        rss_mb=health.rss_bytes / 1e6,
+        sends_hz=sum(health.sent_hz.values()),
+        receives_hz=sum(health.received_hz.values()),
+        rejected=sum(health.rejected.values()),
+        latency_ms=max(health.latency_ms.values(), default=""),
+        latency=latency,
+        uptime_s=health.uptime_s,
+    )
 
-    def _chosen(self) -> str:
-        return "topics" if self.focused is self.query_one("#topics") else "processes"
 
-    @staticmethod
-    def _columns(name: str) -> tuple[str, ...]:
-        return PROCESS_COLUMNS if name == "processes" else TOPIC_COLUMNS
+def stream_row(
+    key: str, stats: StreamStats | None, age_s: float, missing: int, delay: str = ""
+) -> StreamRow:
+    """Return the row of a key; `stats` is None where nothing arrived."""
+    topic = topic_of(key)
+    return StreamRow(
+        topic=short(key),
+        hz=stats.hz if stats else 0.0,
+        promised_hz=topic.hz if topic else "",
+        kb_s=stats.bytes_s / 1e3 if stats else 0.0,
+        size=stats.size if stats else 0,
+        delay_ms=_or_empty(stats.delay_median_ms if stats else None),
+        delay=delay,
+        jitter_ms=_or_empty(stats.gap_std_ms if stats else None),
+        age_s=age_s,
+        missing=missing,
+    )
 
-    def _refresh(self) -> None:
-        if self._holds:
-            return
-        self._rows["processes"], self._rows["topics"] = self._feed.refresh()
-        for name in self._sorted:
-            self._draw(name)
 
-    def _draw(self, name: str) -> None:
-        column, down = self._sorted[name]
-        headings = [
-            label + (DOWN if down else UP) if i == column else label
-            for i, label in enumerate(self._columns(name))
-        ]
-        rows = [cells for _, cells in in_order(self._rows[name], column, down=down)]
-        self.query_one(f"#{name}", PlainTable).show(headings, rows)
+def _or_empty(value: float | None) -> Cell:
+    return "" if value is None else value
+
+
+def cells(row: Struct) -> tuple[Cell, ...]:
+    """Return the values of a row, in the order of its columns."""
+    return tuple(getattr(row, name) for name in row.__struct_fields__)
+
+
+def cell_text(cell: Cell) -> str:
+    """Return a cell as text."""
+    if isinstance(cell, str):
+        return cell
+    return str(cell) if isinstance(cell, int) else f"{cell:.1f}"
+
+
+def sorted_rows(
+    rows: Mapping[str, tuple[Cell, ...]], column: int, *, down: bool
+) -> list[tuple[str, tuple[Cell, ...]]]:
+    """Return rows sorted by one column; empty cells come last in both directions."""
+    empty = [item for item in rows.items() if item[1][column] == ""]
+    rest = [item for item in rows.items() if item[1][column] != ""]
+    rest.sort(key=lambda item: (isinstance(item[1][column], str), item[1][column]), reverse=down)
+    return rest + empty
+
+
+class History:
+    """Newest values by name, as sparklines."""
+
+    def __init__(self) -> None:
+        self._values: dict[str, deque[float]] = {}
+
+    def add(self, name: str, value: float | None) -> None:
+        """Add a value; None adds nothing."""
+        if value is not None:
+            self._values.setdefault(name, deque(maxlen=MAX_BARS)).append(value)
+
+    def line(self, name: str) -> str:
+        """Return the sparkline of a name."""
+        return sparkline(tuple(self._values.get(name, ())))
+
+
+def sparkline(values: Sequence[float]) -> str:
+    """Return bars, from zero to the largest value."""
+    largest = max(values, default=0.0)
+    if largest <= 0:
+        return BARS[0] * len(values)
+    return "".join(BARS[min(7, int(max(value, 0.0) / largest * 8))] for value in values)
+
+
+class Feed(Protocol):
+    """Source of both tables."""
+
+    def refresh(self) -> tuple[Rows, Rows]:
+        """Return the rows of processes and topics since the last call."""
+        ...
+
+
+class BusFeed:
+    """Feed from a running robot."""
+
+    def __init__(self, bus: Bus, monitor: TopicMonitor) -> None:
+        self._bus, self._monitor = bus, monitor
+        self._since_ns = bus.clock.now_ns()
+        self._health: dict[str, tuple[Health, int]] = {}
+        self._latencies, self._delays = History(), History()
+        bus.subscribe(HEALTH, self._add)
+
+    def _add(self, _key: str, health: Health) -> None:
+        put_newest(self._health, health.process, (health, self._bus.clock.now_ns()), MAX_PROCESSES)
+        self._latencies.add(health.process, max(health.latency_ms.values(), default=None))
+
+    def refresh(self) -> tuple[Rows, Rows]:
+        """Return the rows of processes and topics since the last call."""
+        now_ns = self._bus.clock.now_ns()
+        processes = {
+            name: cells(process_row(health, (now_ns - at_ns) / 1e9, self._latencies.line(name)))
+            for name, (health, at_ns) in self._health.items()
+        }
+        return processes, self._streams(now_ns)
+
+    def _streams(self, now_ns: int) -> Rows:
+        found, rows = self._monitor.stats(self._since_ns), {}
+        for key, stream in self._monitor.streams().items():
+            stats, age_s = found.get(key), stream.age_s(now_ns) or 0.0
+            self._delays.add(key, stats.delay_median_ms if stats else None)
+            missing, delay = self._monitor.missing(key), self._delays.line(key)
+            rows[key] = cells(stream_row(key, stats, age_s, missing, delay))
+        self._since_ns = now_ns
+        return rows

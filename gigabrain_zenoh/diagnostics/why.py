@@ -1,15 +1,36 @@
-"""Why does it not move? Follows one command from link to link. Pure."""
+"""`gigabrain why`: follows one command along the chain, to the link that stops the robot.
 
-from collections.abc import Callable
+`ChainWatcher` collects the facts, and `judge`, which is pure, draws the conclusion.
+"""
+
+import asyncio
+import itertools
+from collections.abc import Callable, Mapping
 from typing import Literal, get_args
 
 from msgspec import Struct
 
-from gigabrain_schemas.base import Cause
+from gigabrain_schemas.base import Cause, Velocity
+from gigabrain_schemas.body import Body, RobotState
+from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
+from gigabrain_schemas.requests import Description
+from gigabrain_schemas.safety import Health, SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import TaskStatus
-from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, STATE, WORLD
-from gigabrain_zenoh.diagnostics.standing import leaves_nothing, stands
-from gigabrain_zenoh.diagnostics.why_facts import Facts
+from gigabrain_schemas.topics import (
+    BODY,
+    CMD_VEL,
+    HEALTH,
+    INTENT,
+    SAFETY,
+    SCAN,
+    STATE,
+    TASK,
+    WORLD,
+    command_topic,
+)
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.diagnostics.discovery import discover
+from gigabrain_zenoh.diagnostics.topic_stats import HOPS, ChainMonitor, monitor_chain
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
@@ -18,34 +39,65 @@ Link = Literal[
     "router", "driver", "link", "scan", "world", "intent", "control", "safety", "gate", "body"
 ]
 LINKS: tuple[Link, ...] = get_args(Link)
-FIRST_CODE = 10  # the exit code where the router is what is broken; the next link's is the next
+FIRST_CODE = 10  # exit code for a broken router; each further link has the next code
+WINDOW_S = 1.5
+SILENT_NS = 500_000_000  # wall time: also for a simulation that runs slowly
+AT_REST_LINEAR, AT_REST_ANGULAR = 0.01, 0.05  # [m/s], [rad/s]
+# the watcher and the monitor both subscribe to these, so `Bus.received` counts them twice
+COUNTED_TWICE = frozenset(topic.key for topic in (*HOPS, STATE, BODY))
+
+START_ROUTER = (
+    "start the robot with `gigabrain up` or `gigabrain demo`, or name its router with --connect"
+)
+READ_SAFETY_LOG = "read its log with `gigabrain log --process safety`"
+CHECK_LIDAR = "check the lidar's power and cable"
 
 
-class Finding(Struct, frozen=True, kw_only=True):
-    """One link."""
+class ChainFacts(Struct, frozen=True, kw_only=True):
+    """State of the chain. None for a message that has not arrived, or is stale."""
+
+    router: str = ""  # why it cannot be reached; empty where it answers
+    described: Mapping[str, Description] = {}  # processes that answer, by name
+    state: RobotState | None = None
+    body: Body | None = None
+    scan_age_ms: float | None = None  # by the robot's clock
+    world: WorldModel | None = None
+    intent: Intent | None = None
+    command: CmdVel | None = None  # of the robot's own control
+    fastest: Velocity = ZERO  # largest of the commander's commands, per axis
+    strangers: tuple[str, ...] = ()  # other senders of commands
+    safety: SafetyState | None = None
+    tasks: TaskStatus | None = None  # None where decision has no tasks
+    problems: tuple[Cause, ...] = ()  # that the processes report
+    hz: Mapping[str, float] = {}  # measured, by key
+    after_ms: Mapping[str, float] = {}  # from the hop before to this one, median, by key
+
+
+class LinkStatus(Struct, frozen=True, kw_only=True):
+    """Status of one link of the chain."""
 
     link: Link
     ok: bool
-    text: str  # a phrase for people
+    text: str
     remedy: str = ""
-    waits: bool = False  # it works and stands: as it should where `ok`, else for the reason given
+    waits: bool = False  # works and stands: as it should where `ok`, else for the given reason
 
 
 class Verdict(Struct, frozen=True, kw_only=True):
-    """Every link as far as it can be judged, and what follows."""
+    """Status of every link that can be judged, and the conclusion."""
 
-    findings: tuple[Finding, ...]
+    findings: tuple[LinkStatus, ...]
     notes: tuple[str, ...] = ()
 
     @property
-    def broken(self) -> Finding | None:
-        """The first link that is broken; one that works and only waits comes after all others."""
+    def broken(self) -> LinkStatus | None:
+        """Return the first broken link; one that only waits comes after all others."""
         broken = [one for one in self.findings if not one.ok]
         return min(broken, key=lambda one: one.waits, default=None)
 
     @property
-    def waits(self) -> Finding | None:
-        """Where nothing is broken: the first link that stands as it should."""
+    def waits(self) -> LinkStatus | None:
+        """Return the first link that stands as it should, if none is broken."""
         return None if self.broken else next((one for one in self.findings if one.waits), None)
 
     @property
@@ -56,234 +108,334 @@ class Verdict(Struct, frozen=True, kw_only=True):
 
     @property
     def exit_code(self) -> int:
-        """0 where nothing is broken, else 10 for the router to 19 for the body itself."""
+        """Return 0 if no link is broken, else 10 (router) to 19 (body)."""
         return FIRST_CODE + LINKS.index(self.broken.link) if self.broken else 0
 
 
-def judge(facts: Facts) -> Verdict:
-    """Of what one look has found. Without a router or a state nothing behind them can be told."""
+def judge(facts: ChainFacts) -> Verdict:
+    """Return the verdict on `facts`. Behind a broken router or driver nothing can be judged."""
     if facts.router:
-        return Verdict(findings=(_no("router", facts.router, ROUTER),))
+        return Verdict(findings=(_broken("router", facts.router, START_ROUTER),))
     findings = [_ok("router", "answers")]
-    for look in LOOKS:
-        found = look(facts)
+    for check in CHECKS:
+        found = check(facts)
         findings.append(found)
         if found.link == "driver" and not found.ok:
             break
     return Verdict(findings=tuple(findings), notes=_notes(facts))
 
 
-ROUTER = (
-    "start the robot with `gigabrain up` or `gigabrain demo`, or name its router with --connect"
-)
+def _ok(link: Link, text: str) -> LinkStatus:
+    return LinkStatus(link=link, ok=True, text=text)
 
 
-def _ok(link: Link, text: str) -> Finding:
-    return Finding(link=link, ok=True, text=text)
+def _waits(link: Link, text: str, remedy: str = "") -> LinkStatus:
+    return LinkStatus(link=link, ok=True, text=text, remedy=remedy, waits=True)
 
 
-def _waits(link: Link, text: str, remedy: str = "") -> Finding:
-    return Finding(link=link, ok=True, text=text, remedy=remedy, waits=True)
+def _broken(link: Link, text: str, remedy: str) -> LinkStatus:
+    return LinkStatus(link=link, ok=False, text=text, remedy=remedy)
 
 
-def _no(link: Link, text: str, remedy: str) -> Finding:
-    return Finding(link=link, ok=False, text=text, remedy=remedy)
+def _silent(facts: ChainFacts, link: Link, process: str, what: str) -> LinkStatus:
+    """Return the status of a process that sends nothing."""
+    read_log = f"read its log with `gigabrain log --process {process}`"
+    if process in facts.described:
+        return _broken(link, f"{process} runs, but sends no {what}", read_log)
+    start = f"start it (`gigabrain up` does), or end it if it hangs; {read_log}"
+    return _broken(link, f"{process} does not answer, and sends no {what}", start)
 
 
-def _silent(facts: Facts, link: Link, process: str, what: str) -> Finding:
-    """A process from which nothing comes: is it gone, or is it only mute?"""
-    look = f"read its log with `gigabrain log --process {process}`"
-    if process in facts.there:
-        return _no(link, f"{process} runs, but no {what} comes from it", look)
-    start = f"start it (`gigabrain up` does), or end it if it hangs; {look}"
-    return _no(link, f"{process} does not answer, and no {what} comes from it", start)
-
-
-def _driver(facts: Facts) -> Finding:
+def _driver(facts: ChainFacts) -> LinkStatus:
     state = facts.state
     if state is None:
         return _silent(facts, "driver", "driver", "state")
     return _ok("driver", f"{state.robot_type}, state {facts.hz.get(STATE.key, 0):g} Hz")
 
 
-def _link(facts: Facts) -> Finding:
+def _link(facts: ChainFacts) -> LinkStatus:
     state = facts.state
     assert state
-    line = state.link
-    told = [cause for cause in state.gate.causes if cause.code == "link_lost"]
-    if not line.connected or told:
-        remedy = "look at the body's power, its cable or its network"
-        return _no("link", f"the body has not answered for {line.age_ms / 1e3:.1f} s", remedy)
-    return _ok("link", f"the body was heard {line.age_ms:.0f} ms ago")
+    lost = any(cause.code == "link_lost" for cause in state.gate.causes)
+    if lost or not state.link.connected:
+        text = f"no answer from the body for {state.link.age_ms / 1e3:.1f} s"
+        return _broken("link", text, "check the body's power, its cable or its network")
+    return _ok("link", f"the body answered {state.link.age_ms:.0f} ms ago")
 
 
-def _scan(facts: Facts) -> Finding:
-    body, age = facts.body, facts.scan_age_ms
+def _scan(facts: ChainFacts) -> LinkStatus:
+    body, age_ms = facts.body, facts.scan_age_ms
     if body and body.description.lidar is None:
         return _ok("scan", "the body has no lidar")
-    lidar = "look at the lidar's power and cable"
-    if age is None:
-        return _no("scan", "no scan has come", lidar)
-    if body and age > scan_limit_ns(body.description) / 1e6:
-        return _no("scan", f"the newest scan is {age / 1e3:.1f} s old", lidar)
+    if age_ms is None:
+        return _broken("scan", "no scan has arrived", CHECK_LIDAR)
+    if body and age_ms > scan_limit_ns(body.description) / 1e6:
+        return _broken("scan", f"the newest scan is {age_ms / 1e3:.1f} s old", CHECK_LIDAR)
     if facts.world and not facts.world.scan_ok:
         remedy = "clean and uncover the lidar, or move the robot to where it sees walls"
-        return _no("scan", f"it cannot be believed: {facts.world.scan_problem}", remedy)
-    return _ok("scan", f"{age:.0f} ms old, {facts.hz.get(SCAN.key, 0):g} Hz")
+        return _broken("scan", f"not plausible: {facts.world.scan_problem}", remedy)
+    return _ok("scan", f"{age_ms:.0f} ms old, {facts.hz.get(SCAN.key, 0):g} Hz")
 
 
-def _world(facts: Facts) -> Finding:
+def _world(facts: ChainFacts) -> LinkStatus:
     world = facts.world
     if world is None:
         return _silent(facts, "world", "perception", "world")
     ahead = "free ahead"
     if world.obstacle_ahead:
         near = world.distance_ahead
-        ahead = "something ahead" if near is None else f"obstacle {near:.2f} m ahead"
+        ahead = "obstacle ahead" if near is None else f"obstacle {near:.2f} m ahead"
     return _ok("world", f"{ahead}{_after(facts, WORLD.key, 'the scan')}")
 
 
-def _by_another(facts: Facts) -> str:
-    """Who drives instead of the brain; empty where it is the brain, or nobody."""
+def _other_commander(facts: ChainFacts) -> str:
+    """Return the commander that drives instead of the brain; empty if there is none."""
     gate = facts.state.gate if facts.state else None
     other = gate is not None and gate.mode == "enabled" and gate.commander != BRAIN
     return gate.commander if gate and other else ""
 
 
-def _intent(facts: Facts) -> Finding:
-    intent, other = facts.intent, _by_another(facts)
+def _intent(facts: ChainFacts) -> LinkStatus:
+    intent, other = facts.intent, _other_commander(facts)
     if other:
-        return _ok("intent", f"not asked: {other} drives")
+        return _ok("intent", f"not used: {other} drives")
     if intent is None and facts.tasks:
         return _waits("intent", "decision is starting up", "wait until it is ready")
     if intent is None:
         return _silent(facts, "intent", "decision", "intent")
     if not _wants_to_move(facts):
-        return _idle(facts.tasks) or Finding(
-            link="intent", ok=False, waits=True,
+        return _idle(facts.tasks) or LinkStatus(
+            link="intent",
+            ok=False,
+            waits=True,
             text=f"decision wants to stand: {intent.reason}",
-            remedy="remove the cause; decision goes on by itself then",
-        )  # fmt: skip
+            remedy="remove the cause; decision then goes on by itself",
+        )
     return _ok("intent", f"{intent.reason}{_after(facts, INTENT.key, 'the world')}")
 
 
-def _wants_to_move(facts: Facts) -> bool:
+def _wants_to_move(facts: ChainFacts) -> bool:
     twist = facts.intent.twist if facts.intent else None
-    return twist is not None and not stands(twist)
+    return twist is not None and not _at_rest(twist)
 
 
-def _idle(tasks: TaskStatus | None) -> Finding | None:
-    """That there is nowhere to drive to now, where that is so."""
+def _idle(tasks: TaskStatus | None) -> LinkStatus | None:
+    """Return that there is nowhere to drive to now; None where there is."""
     if tasks is None:
-        return None  # a behaviour that is not sent anywhere drives by itself
+        return None  # a behaviour without tasks drives by itself
     task = tasks.current
     if task is None:
-        return _waits("intent", "waiting for a goal", "send it one, as with `gigabrain goto 1 2`")
+        return _waits("intent", "waiting for a goal", "send a goal, as in `gigabrain goto 1 2`")
     if task.state == "paused":
-        remedy = f"let it go on with `gigabrain task resume {task.id}`"
+        remedy = f"resume it with `gigabrain task resume {task.id}`"
         return _waits("intent", f"{task.id} is paused: {task.reason}", remedy)
     if tasks.drives:
         return None
     return _waits("intent", f"{task.id}: {tasks.doing}", "it goes on by itself after that step")
 
 
-def _control(facts: Facts) -> Finding:
-    command, intent, other = facts.command, facts.intent, _by_another(facts)
+def _control(facts: ChainFacts) -> LinkStatus:
+    command, intent, other = facts.command, facts.intent, _other_commander(facts)
     if other:
-        return _ok("control", f"not asked: {other} drives")
+        return _ok("control", f"not used: {other} drives")
     if command is None:
         return _silent(facts, "control", "control", "command")
     gate = facts.state.gate if facts.state else None
-    still = gate is not None and gate.mode == "enabled" and stands(facts.fastest)
+    still = gate is not None and gate.mode == "enabled" and _at_rest(facts.fastest)
     if still and command.operator:
-        text = "an operator holds the body"
-        remedy = "hand the body back to decision with `gigabrain enable`"
+        text = "an operator holds the robot still"
+        remedy = "let the brain drive with `gigabrain enable`"
         if _wants_to_move(facts):
-            return _no("control", f"{text}; decision wants to move", remedy)
+            return _broken("control", f"{text}, while decision wants to move", remedy)
         return _waits("control", text, remedy)
     free = facts.safety is not None and facts.safety.verdict != "stop"
     caps = facts.safety.caps if facts.safety else NO_CAPS
-    wants = intent.twist if intent and intent.twist else ZERO
-    if still and free and not stands(wants) and not leaves_nothing(wants, caps):
+    wanted = intent.twist if intent and intent.twist else ZERO
+    if still and free and not _at_rest(wanted) and not _capped_to_rest(wanted, caps):
         remedy = "read its log with `gigabrain log --process control`"
-        return _no("control", "control sends zero although decision wants to move", remedy)
-    who = "an operator drives: " if command.operator else ""
+        return _broken("control", "control sends zero, while decision wants to move", remedy)
+    operator = "an operator drives: " if command.operator else ""
     return _ok(
         "control",
-        f"{who}{command.linear_x:+.2f} m/s {command.angular_z:+.2f} rad/s"
+        f"{operator}{command.linear_x:+.2f} m/s {command.angular_z:+.2f} rad/s"
         f"{_after(facts, CMD_VEL.key, 'the intent')}",
     )
 
 
-def _safety(facts: Facts) -> Finding:
-    said = facts.safety
-    if said is None:
+def _safety(facts: ChainFacts) -> LinkStatus:
+    safety = facts.safety
+    if safety is None:
         return _silent(facts, "safety", "safety", "verdict")
-    text, remedy = _told(said.causes)
-    if said.verdict == "stop":
-        return _no("safety", f"safety says stop: {text or 'no reason given'}", remedy or READ)
-    wants = facts.intent.twist if facts.intent else None
-    if wants and not _by_another(facts) and leaves_nothing(wants, said.caps):
-        return _no("safety", f"safety lets it go no farther that way: {text}", remedy or READ)
-    return _ok("safety", f"{said.verdict}{': ' if text else ''}{text}")
+    text, remedy = _in_words(safety.causes)
+    if safety.verdict == "stop":
+        text = f"safety stops the robot: {text or 'no reason given'}"
+        return _broken("safety", text, remedy or READ_SAFETY_LOG)
+    wanted = facts.intent.twist if facts.intent else None
+    if wanted and not _other_commander(facts) and _capped_to_rest(wanted, safety.caps):
+        text = f"safety allows no speed in that direction: {text}"
+        return _broken("safety", text, remedy or READ_SAFETY_LOG)
+    return _ok("safety", f"{safety.verdict}{': ' if text else ''}{text}")
 
 
-READ = "read its log with `gigabrain log --process safety`"
-
-
-def _gate(facts: Facts) -> Finding:
+def _gate(facts: ChainFacts) -> LinkStatus:
     assert facts.state
     gate = facts.state.gate
-    text, remedy = _told(gate.causes)
+    text, remedy = _in_words(gate.causes)
     if gate.mode == "latched":
         act = "`gigabrain release`, then `gigabrain enable`"
-        return _no("gate", f"it is latched: {text}", f"{remedy}: {act}" if remedy else act)
+        return _broken("gate", f"latched: {text}", f"{remedy}: {act}" if remedy else act)
     if gate.mode != "enabled":
-        why = text or "nobody has enabled it"
         act = "enable it with `gigabrain enable`"
-        return _no("gate", f"it is {gate.mode}: {why}", f"{remedy}; {act}" if remedy else act)
-    if stands(facts.fastest) and gate.commander != BRAIN:
-        remedy = "let it drive, or take the body back with `gigabrain enable --take`"
-        return _no("gate", f"{gate.commander} has the body, and stands still", remedy)
+        text = f"{gate.mode}: {text or 'not enabled yet'}"
+        return _broken("gate", text, f"{remedy}; {act}" if remedy else act)
+    if _at_rest(facts.fastest) and gate.commander != BRAIN:
+        remedy = "let it drive, or take the robot back with `gigabrain enable --take`"
+        return _broken("gate", f"{gate.commander} has control, and stands still", remedy)
     return _ok("gate", f"open for {gate.commander}")
 
 
-def _body(facts: Facts) -> Finding:
+def _body(facts: ChainFacts) -> LinkStatus:
     assert facts.state
-    now, told = facts.state.velocity, facts.fastest
+    now, commanded = facts.state.velocity, facts.fastest
     if not facts.state.link.connected:
-        return _no("body", "how fast it moves is not known", "mend its link first")
+        return _broken("body", "its speed is unknown", "repair its link first")
     speed = f"{now.linear_x:+.2f} m/s {now.angular_z:+.2f} rad/s"
-    if stands(now) and not stands(told):
-        remedy = "see whether something holds it, at its motors, and whether its power is on"
-        wanted = f"{told.linear_x:+.2f} m/s {told.angular_z:+.2f} rad/s"
-        return _no("body", f"the body stands although it is told {wanted}", remedy)
-    if stands(now):
-        return _waits("body", "it stands, as it is told", "send it a command or a goal")
+    if _at_rest(now) and not _at_rest(commanded):
+        wanted = f"{commanded.linear_x:+.2f} m/s {commanded.angular_z:+.2f} rad/s"
+        remedy = "check whether it is blocked, its motors, and their power"
+        return _broken("body", f"it stands, while the command is {wanted}", remedy)
+    if _at_rest(now):
+        return _waits("body", "it stands, as commanded", "send it a command or a goal")
     return _ok("body", f"it moves: {speed}")
 
 
-LOOKS: tuple[Callable[[Facts], Finding], ...] = (
+CHECKS: tuple[Callable[[ChainFacts], LinkStatus], ...] = (
     _driver, _link, _scan, _world, _intent, _control, _safety, _gate, _body,
 )  # fmt: skip
 
 
-def _after(facts: Facts, key: str, before: str) -> str:
+def _after(facts: ChainFacts, key: str, before: str) -> str:
     value = facts.after_ms.get(key)
     return "" if value is None else f", {value:.1f} ms after {before}"
 
 
-def _told(causes: tuple[Cause, ...]) -> tuple[str, str]:
-    """What holds it back, and what to do about it."""
+def _in_words(causes: tuple[Cause, ...]) -> tuple[str, str]:
+    """Return the texts and the remedies of causes, each joined."""
     text = "; ".join(cause.text for cause in causes)
     return text, "; ".join(dict.fromkeys(cause.remedy for cause in causes if cause.remedy))
 
 
-def _notes(facts: Facts) -> tuple[str, ...]:
+def _notes(facts: ChainFacts) -> tuple[str, ...]:
     notes = []
     if facts.strangers:
         names = ", ".join(facts.strangers)
-        notes.append(f"{names} sends commands as well, which the gate does not obey")
+        notes.append(f"the gate ignores further commands, from: {names}")
     warnings = facts.safety.warnings if facts.safety else ()
     notes += [f"warning: {one.text} ({one.remedy})" for one in (*warnings, *facts.problems)]
     return tuple(notes)
+
+
+def _at_rest(velocity: Velocity) -> bool:
+    linear = max(abs(velocity.linear_x), abs(velocity.linear_y))
+    return linear < AT_REST_LINEAR and abs(velocity.angular_z) < AT_REST_ANGULAR
+
+
+def _capped_to_rest(wanted: Velocity, caps: SpeedCaps) -> bool:
+    """Return whether the caps of safety leave nothing of a wanted motion."""
+    axes = (
+        (wanted.linear_x, caps.forward, caps.backward),
+        (wanted.linear_y, caps.left, caps.right),
+        (wanted.angular_z, _lower(caps.turn_left, caps), _lower(caps.turn_right, caps)),
+    )
+    capped = []
+    for value, positive, negative in axes:
+        cap = positive if value > 0 else negative
+        capped.append(value if cap is None else max(-cap, min(cap, value)))
+    x, y, turn = capped
+    return not _at_rest(wanted) and _at_rest(Velocity(linear_x=x, linear_y=y, angular_z=turn))
+
+
+def _lower(side: float | None, caps: SpeedCaps) -> float | None:
+    return min((cap for cap in (side, caps.rotation) if cap is not None), default=None)
+
+
+class ChainWatcher:
+    """Subscribes to the whole chain, and collects its facts."""
+
+    def __init__(self, bus: Bus) -> None:
+        self._bus = bus
+        self._state, self._body = bus.latest(STATE), bus.latest(BODY, self._add_control_topic)
+        self._scan, self._world = bus.latest(SCAN), bus.latest(WORLD)
+        self._intent, self._safety = bus.latest(INTENT), bus.latest(SAFETY)
+        self._tasks = bus.latest(TASK)
+        self._monitor = monitor_chain(bus)
+        self._commands: dict[str, list[tuple[int, CmdVel]]] = {}
+        self._problems: dict[str, tuple[Cause, ...]] = {}  # by process
+        bus.subscribe(CMD_VEL, self._add_command)
+        bus.subscribe(HEALTH, self._add_problems)
+
+    def _add_problems(self, _key: str, health: Health) -> None:
+        if health.problems:
+            self._problems[health.process] = health.problems
+
+    def _add_control_topic(self, body: Body) -> None:
+        """Subscribe to the control topic of a body that has its own."""
+        topic = command_topic(body.description)
+        if topic.key not in self._bus.listens:
+            self._bus.subscribe(topic, self._add_command)
+
+    def _add_command(self, _key: str, command: CmdVel) -> None:
+        commands = self._commands.setdefault(command.source, [])
+        commands.append((self._bus.clock.now_ns(), command))
+
+    async def collect(self, seconds: float = WINDOW_S) -> ChainFacts:
+        """Return the facts after `seconds`."""
+        bus = self._bus
+        start_ns, counts = bus.clock.now_ns(), bus.received.copy()
+        described, _ = await asyncio.gather(discover(bus), bus.clock.sleep_ns(round(seconds * 1e9)))
+        state = self._state.fresh()
+        elapsed_s = (bus.clock.now_ns() - start_ns) / 1e9
+        commander = state.gate.commander if state else ""
+        scan_ns = self._scan.age_ns()
+        return ChainFacts(
+            described=described,
+            state=state,
+            body=self._body.current,
+            scan_age_ms=None if scan_ns is None else scan_ns / 1e6,
+            world=self._world.fresh(),
+            intent=self._intent.fresh(),
+            command=self._newest(BRAIN),
+            fastest=_fastest([command for _, command in self._commands.get(commander, [])]),
+            strangers=tuple(sorted(set(self._commands) - {BRAIN, commander})),
+            safety=self._safety.fresh(),
+            tasks=self._tasks.fresh(),
+            problems=tuple(itertools.chain.from_iterable(self._problems.values())),
+            hz={
+                key: round(
+                    (count - counts[key]) / elapsed_s / (2 if key in COUNTED_TWICE else 1), 1
+                )
+                for key, count in bus.received.items()
+            },
+            after_ms=_latencies(self._monitor),
+        )
+
+    def _newest(self, source: str) -> CmdVel | None:
+        """Return the newest command of `source`, unless it is silent now."""
+        commands = self._commands.get(source)
+        if not commands or self._bus.clock.now_ns() - commands[-1][0] > SILENT_NS:
+            return None
+        return commands[-1][1]
+
+
+def _latencies(monitor: ChainMonitor) -> dict[str, float]:
+    if not monitor.complete:
+        return {}
+    return {after.key: monitor.between(before, after) for before, after in itertools.pairwise(HOPS)}
+
+
+def _fastest(commands: list[CmdVel]) -> Velocity:
+    return Velocity(
+        linear_x=max((c.linear_x for c in commands), key=abs, default=0.0),
+        linear_y=max((c.linear_y for c in commands), key=abs, default=0.0),
+        angular_z=max((c.angular_z for c in commands), key=abs, default=0.0),
+    )

@@ -10,7 +10,7 @@ import pytest
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, MissionRequest, TaskStatus
 from gigabrain_schemas.topics import GOAL, INTENT, MISSION, TASK
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.cli.task_line import progress
+from gigabrain_zenoh.cli.task import progress
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import goal_server
 from gigabrain_zenoh.decision import node as decision

@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("numba")
 
-from gigabrain_zenoh.cli.warm import warm
+from gigabrain_zenoh.cli import map as map_commands
 from gigabrain_zenoh.decision.goal_server import DRIVE_KERNELS
 from gigabrain_zenoh.kernels import jit, precompile
 from gigabrain_zenoh.kernels import jit as kernels
@@ -94,7 +94,7 @@ def test_what_is_compiled_beforehand_is_what_each_process_calls(
 
     monkeypatch.setattr(precompile, "compile_in_child", in_child)
     monkeypatch.setattr(precompile, "compile_all", done.append)
-    warm()
+    map_commands.precompile()
     assert sorted(tried) == sorted((MAP_KERNELS, LOCALIZE_KERNELS, DRIVE_KERNELS))
     assert done == (tried if code else [])  # what a child cannot do
     assert capsys.readouterr().out.count(" s\n") == 2

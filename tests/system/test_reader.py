@@ -7,7 +7,7 @@ import pytest
 
 QUIET = """
 import asyncio
-from gigabrain_zenoh.diagnostics.reader import ended_with_reader
+from gigabrain_zenoh.diagnostics.listener import ended_with_reader
 
 async def quiet():
     stop = asyncio.Event()

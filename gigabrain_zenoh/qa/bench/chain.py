@@ -27,7 +27,7 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.config.settings import DecisionConfig, Endpoint, PerceptionConfig
 from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.decision.node import DecisionLoop
-from gigabrain_zenoh.diagnostics.rates import HOPS, Heard, listen
+from gigabrain_zenoh.diagnostics.topic_stats import HOPS, ChainMonitor, monitor_chain
 from gigabrain_zenoh.launch.processes import PROCESSES
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.perception import node as perception
@@ -172,10 +172,12 @@ async def time_chain(rate_hz: float, seconds: float, folder: Path) -> Latencies:
         return await _chain_latencies(bus)
 
 
-async def listen_to_chain(rate_hz: float, seconds: float, folder: Path) -> tuple[Heard, Latencies]:
+async def listen_to_chain(
+    rate_hz: float, seconds: float, folder: Path
+) -> tuple[ChainMonitor, Latencies]:
     """Measure with a subscriber on every hop, which slows the chain a little."""
     async with brain(rate_hz, folder) as (group, bus):
-        heard = listen(bus)
+        heard = monitor_chain(bus)
         await group.run_for(seconds)
         await group.until(lambda: heard.complete, "a message of every hop")
         return heard, await _chain_latencies(bus)
@@ -264,7 +266,7 @@ class Stopwatch:
         return statistics.median(self._ms.get(name, (0.0,)))
 
 
-async def measure_hops(heard: Heard, total: Latencies) -> list[Hop]:
+async def measure_hops(heard: ChainMonitor, total: Latencies) -> list[Hop]:
     """Time the work of each hop by itself, and set it against the time in the running chain."""
     timed = Stopwatch()
     deployment = with_free_port(ROUTER_ONLY)
@@ -279,7 +281,7 @@ async def measure_hops(heard: Heard, total: Latencies) -> list[Hop]:
     return [_hop(heard, total, timed, topic) for topic in HOPS]
 
 
-async def _take_turns(heard: Heard, bus: Bus, timed: Stopwatch) -> None:
+async def _take_turns(heard: ChainMonitor, bus: Bus, timed: Stopwatch) -> None:
     """In each turn do once what one scan makes all nodes do."""
     first, loop = heard.get(STATE).tick, DecisionLoop(DecisionConfig())
     payloads = {topic.key: codec.encode(heard.get(topic)) for topic in HOPS}
@@ -294,7 +296,7 @@ async def _take_turns(heard: Heard, bus: Bus, timed: Stopwatch) -> None:
                 timed(f"step {topic.key}", steps[topic.key])
 
 
-def _steps_at(tick: int, heard: Heard, loop: DecisionLoop) -> dict[str, Callable[[], object]]:
+def _steps_at(tick: int, heard: ChainMonitor, loop: DecisionLoop) -> dict[str, Callable[[], object]]:
     """Return the work of each message's receiver in a tick."""
     body, scan = heard.get(BODY).description, heard.get(SCAN)
     state = replace(heard.get(STATE), tick=tick)
@@ -325,7 +327,7 @@ async def _time_bridge(timed: Stopwatch) -> None:
     bridge.close()
 
 
-def _hop(heard: Heard, total: Latencies, timed: Stopwatch, topic: Topic[Any]) -> Hop:
+def _hop(heard: ChainMonitor, total: Latencies, timed: Stopwatch, topic: Topic[Any]) -> Hop:
     """Return the hop that begins with `topic`. The last ends where the driver stops its clock."""
     after = HOPS[HOPS.index(topic) + 1] if topic is not HOPS[-1] else None
     took = heard.between(topic, after) if after else total.p50_ms - heard.between(HOPS[0], topic)

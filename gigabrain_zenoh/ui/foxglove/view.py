@@ -24,7 +24,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.diagnostics.graph import chain
-from gigabrain_zenoh.diagnostics.roll_call import flows, roll_call
+from gigabrain_zenoh.diagnostics.discovery import flows, discover
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn
 from gigabrain_zenoh.ui.robot_view import RobotView
 
@@ -100,7 +100,7 @@ class FoxgloveView(RobotView):
 async def connection_graph(bus: Bus) -> ConnectionGraph:
     """Return the graph of the robot's processes and the topics between them."""
     senders, receivers = defaultdict[str, set[str]](set), defaultdict[str, set[str]](set)
-    processes = await roll_call(bus)
+    processes = await discover(bus)
     for flow in chain(flows(processes.values(), {})):
         senders[flow.key].add(flow.sender)
         receivers[flow.key].add(flow.receiver)

@@ -2,7 +2,7 @@
 
 from rich.console import Console
 
-from gigabrain_zenoh.cli.side_by_side import side_by_side
+from gigabrain_zenoh.cli.bench import side_by_side
 
 
 def test_four_logs_fit_a_terminal_and_units_are_no_markup() -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from gigabrain_schemas.body import Thresholds
-from gigabrain_zenoh.cli.process import button
-from gigabrain_zenoh.cli.up import up
+from gigabrain_zenoh.cli.demo import up
+from gigabrain_zenoh.cli.processes import button
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import ConfigError
@@ -131,7 +131,7 @@ def test_a_button_may_be_at_any_port(port: str) -> None:
 def test_a_button_whose_adapter_is_missing_is_told_of_before_there_is_a_robot(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("gigabrain_zenoh.cli.process.run_process", lambda config: 0)
+    monkeypatch.setattr("gigabrain_zenoh.cli.processes.run_process", lambda config: 0)
     assert button(port="/dev/nope") == 0
     said = "gigabrain: no /dev/nope: is it plugged in? Waiting for it.\n"
     assert capsys.readouterr().err == said

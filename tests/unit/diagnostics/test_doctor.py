@@ -8,8 +8,16 @@ from msgspec.structs import replace
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import Description
 from gigabrain_schemas.safety import Health
-from gigabrain_zenoh.diagnostics.doctor import Finding, examine, exit_code
-from gigabrain_zenoh.diagnostics.doctor_facts import Certificate, Folder, Machine, Port, Robot
+from gigabrain_zenoh.diagnostics.doctor import (
+    Certificate,
+    CheckResult,
+    Folder,
+    MachineFacts,
+    Port,
+    RobotFacts,
+    examine,
+    exit_code,
+)
 
 SENT = {
     "driver": {"robot/state": 50.0, "robot/scan": 10.0},
@@ -19,7 +27,7 @@ SENT = {
     "safety": {"robot/safety": 25.0},
     "router": {},
 }
-MACHINE = Machine(
+MACHINE = MachineFacts(
     python=(3, 11, 7),
     system="Linux",
     libraries={"eclipse-zenoh": "1.10.2", "textual": "8.2.8"},
@@ -34,7 +42,7 @@ def health(name: str, **other: Any) -> Health:
     return replace(told, **other)
 
 
-ROBOT = Robot(
+ROBOT = RobotFacts(
     router="tcp/127.0.0.1:7447",
     there={name: replace(example(Description), process=name) for name in SENT},
     health={name: health(name) for name in SENT},
@@ -45,7 +53,7 @@ PORT = Port(path="/dev/ttyACM0", about="OpenCR", usb="0483:5740", usable=False)
 EXPIRED = Certificate(folder="keys/red", problem="identity.crt expired on 2026-01-01")
 
 
-def found(machine: Machine = MACHINE, robot: Robot = ROBOT) -> list[Finding]:
+def found(machine: MachineFacts = MACHINE, robot: RobotFacts = ROBOT) -> list[CheckResult]:
     return [one for one in examine(machine, robot) if one.grade != "ok"]
 
 
@@ -129,18 +137,20 @@ def test_what_is_wrong_with_a_robot_is_found(
     [(True, "Something listens on that port."), (False, "Nothing listens on that port.")],
 )
 def test_a_router_that_does_not_answer_is_found(port_open: bool, words: str) -> None:
-    gone = Robot(problem="no router answers.", router="tcp/127.0.0.1:1", port_open=port_open)
+    gone = RobotFacts(problem="no router answers.", router="tcp/127.0.0.1:1", port_open=port_open)
     (one,) = found(robot=gone)
     assert (one.about, one.text) == ("router", f"no router answers. {words}")
 
 
 def test_that_no_robot_runs_is_no_fault_of_the_machine() -> None:
-    (one,) = found(robot=Robot(problem="no robot runs here; start one"))
+    (one,) = found(robot=RobotFacts(problem="no robot runs here; start one"))
     assert (one.grade, one.text, one.cure) == ("hint", "no robot runs here", "start one")
 
 
 def test_of_several_robots_one_is_to_be_chosen() -> None:
-    (one,) = found(robot=Robot(problem="several robots run here; choose one with --connect: a, b"))
+    (one,) = found(
+        robot=RobotFacts(problem="several robots run here; choose one with --connect: a, b")
+    )
     assert (one.grade, one.text) == ("hint", "several robots run here")
     assert one.cure == "choose one with --connect: a, b"
 

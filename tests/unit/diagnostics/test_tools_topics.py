@@ -17,17 +17,28 @@ from gigabrain_schemas.examples import EXAMPLES, example
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, SERVICES, STATE, TOPICS, WORLD
 from gigabrain_zenoh import codec
-from gigabrain_zenoh.diagnostics.arrays_in_words import summary
-from gigabrain_zenoh.diagnostics.hearing import Heard, look
-from gigabrain_zenoh.diagnostics.keyexpr import matches
-from gigabrain_zenoh.diagnostics.names import Target, not_found, target
-from gigabrain_zenoh.diagnostics.nodes import census
-from gigabrain_zenoh.diagnostics.publishing import typed_in
-from gigabrain_zenoh.diagnostics.readable import as_json, in_a_line, lines, pick, read, tree
-from gigabrain_zenoh.diagnostics.roll_call import Flow, flows
-from gigabrain_zenoh.diagnostics.tally import Tally
-from gigabrain_zenoh.diagnostics.topic_table import about, rows
-from gigabrain_zenoh.diagnostics.topic_watch import Shown, echo, in_words, shown
+from gigabrain_zenoh.diagnostics.discovery import Flow, find_processes, flows
+from gigabrain_zenoh.diagnostics.listener import RawMessage, snapshot
+from gigabrain_zenoh.diagnostics.message_text import (
+    as_json,
+    in_a_line,
+    lines,
+    pick,
+    read,
+    summary,
+    tree,
+)
+from gigabrain_zenoh.diagnostics.publishing import parse_message
+from gigabrain_zenoh.diagnostics.topic_names import Target, matches, no_topic, target
+from gigabrain_zenoh.diagnostics.topic_stats import TopicMonitor
+from gigabrain_zenoh.diagnostics.topics import (
+    EchoOptions,
+    describe,
+    echo,
+    message_lines,
+    rows,
+    stats_text,
+)
 from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName
 from gigabrain_zenoh.runtime.services import NameClaim, publish_health
 from gigabrain_zenoh.testing.bus import Net
@@ -75,16 +86,18 @@ def test_topics_are_found_by_the_names_that_people_use(name: str, pattern: str, 
 
 def test_an_unknown_topic_is_answered_with_the_nearest_that_is_alive() -> None:
     assert target("wether/today", {"weather/today"}) is None
-    assert "did you mean 'weather/today'" in str(not_found("wether/today", {"weather/today"}))
-    assert "did you mean 'cmd_vel'" in str(not_found("cmdvel", ()))
+    assert "did you mean 'weather/today'" in str(no_topic("wether/today", {"weather/today"}))
+    assert "did you mean 'cmd_vel'" in str(no_topic("cmdvel", ()))
     for service in SERVICES:
-        assert "is a question, and no topic; ask it: gigabrain " in str(not_found(service.key, ()))
+        assert "is a question, and no topic; ask it: gigabrain " in str(no_topic(service.key, ()))
 
 
-def tally_of(times_ms: list[float], size: int = 4, delay_ms: float = 3.0) -> tuple[Tally, int]:
+def tally_of(
+    times_ms: list[float], size: int = 4, delay_ms: float = 3.0
+) -> tuple[TopicMonitor, int]:
     """A tally that has heard messages at these times, and the time of the last."""
     now = [0]
-    tally = Tally(lambda: now[0], lambda: now[0])
+    tally = TopicMonitor(lambda: now[0], lambda: now[0])
     for i, at in enumerate(times_ms, 1):
         now[0] = round(at * 1e6)
         message = CmdVel(
@@ -95,7 +108,7 @@ def tally_of(times_ms: list[float], size: int = 4, delay_ms: float = 3.0) -> tup
 
 
 def test_who_makes_up_keys_costs_a_bounded_number_of_them() -> None:
-    tally = Tally()
+    tally = TopicMonitor()
     tally.hear("robot/scan", "", b"")
     for n in range(10_000):
         tally.hear(f"robot/{n}", "", b"")
@@ -113,10 +126,10 @@ def test_rates_gaps_and_delays_are_those_of_the_arrivals() -> None:
     assert figures.gap_std_ms == pytest.approx(17.3205, abs=1e-3)
     assert (figures.delay_min_ms, figures.delay_median_ms, figures.delay_max_ms) == (3.0, 3.0, 3.0)
     assert figures.bytes_s == pytest.approx(figures.size * 5 / 0.22)
-    assert in_words("hz", figures, CMD_VEL) == (
+    assert stats_text("hz", figures, CMD_VEL) == (
         "33.33 Hz  promised 50  gap min 20.0 ms  max 60.0  std 17.3"
     )
-    assert in_words("delay", figures, None) == "delay median 3.00 ms  min 3.00  max 3.00"
+    assert stats_text("delay", figures, None) == "delay median 3.00 ms  min 3.00  max 3.00"
 
 
 def test_only_what_came_lately_counts_and_silence_has_no_figures() -> None:
@@ -141,10 +154,10 @@ def test_arrays_are_summarised_and_what_is_no_number_is_counted() -> None:
 
 def test_a_scan_is_shown_in_words_and_whole_in_json() -> None:
     assert read("robot/scan", SCAN_BYTES, whole=False)["ranges"].nan == 1
-    text = list(shown(Heard("robot/scan", "", SCAN_BYTES), Shown()))
+    text = list(message_lines(RawMessage("robot/scan", "", SCAN_BYTES), EchoOptions()))
     assert text[0] == "--- robot/scan"
     assert "ranges: 8 values, min 0.83, median 1.25, max 3.49, 1 nan, 2 inf" in text
-    (line,) = shown(Heard("robot/scan", "", SCAN_BYTES), Shown(json=True))
+    (line,) = message_lines(RawMessage("robot/scan", "", SCAN_BYTES), EchoOptions(json=True))
     ranges = json.loads(line)["ranges"]
     assert [round(r, 2) if isinstance(r, float) else r for r in ranges] == [
         0.83, 1.25, 3.49, "inf", "inf", None, 2.5, 0.9,
@@ -168,8 +181,8 @@ def test_every_message_can_be_shown(name: str) -> None:
 
 @given(st.binary(max_size=200), st.sampled_from(["robot/scan", "somebody/else"]))
 def test_nothing_that_comes_can_break_the_display(payload: bytes, key: str) -> None:
-    for how in (Shown(), Shown(json=True)):
-        for line in shown(Heard(key, "", payload), how):
+    for how in (EchoOptions(), EchoOptions(json=True)):
+        for line in message_lines(RawMessage(key, "", payload), how):
             assert "\n" not in line
             assert "\x1b" not in line
 
@@ -206,12 +219,12 @@ def test_fields_are_picked_by_dotted_names() -> None:
     ],
 )
 def test_what_is_typed_becomes_a_message(words: list[str], expected: CmdVel) -> None:
-    assert typed_in(CMD_VEL, words) == expected
+    assert parse_message(CMD_VEL, words) == expected
 
 
 def test_parts_lists_and_texts_can_be_typed() -> None:
     words = ["behaviour=by_hand", "reason=on and on", "twist.linear_x=1", "trajectory=[[1,0,0,0]]"]
-    made: Any = typed_in(INTENT, words)
+    made: Any = parse_message(INTENT, words)
     assert (made.twist.linear_x, made.reason, len(made.trajectory)) == (1.0, "on and on", 1)
 
 
@@ -232,7 +245,7 @@ def test_what_is_mistyped_is_answered_with_what_was_expected(
     words: list[str], complaint: str
 ) -> None:
     with pytest.raises(ConfigError) as refused:
-        typed_in(CMD_VEL, words)
+        parse_message(CMD_VEL, words)
     assert complaint in str(refused.value)
 
 
@@ -243,7 +256,7 @@ async def net() -> Net:
 
 async def test_echo_shows_what_comes_and_ends_after_so_many(net: Net) -> None:
     out: list[str] = []
-    how = Shown(count=2, fields=("linear_x",))
+    how = EchoOptions(count=2, fields=("linear_x",))
     work = asyncio.ensure_future(echo(net.one, Target("robot/cmd_vel", CMD_VEL), how, out.append))
     await settle()
     for speed in (0.1, 0.2, 0.3):
@@ -254,14 +267,14 @@ async def test_echo_shows_what_comes_and_ends_after_so_many(net: Net) -> None:
 
 async def test_echo_of_what_nobody_sends_says_so_when_its_time_is_over(net: Net) -> None:
     await NameClaim(net.two).take()
-    how = Shown(within_s=0.01)
+    how = EchoOptions(within_s=0.01)
     with pytest.raises(BodyLost) as told:
         await echo(net.one, Target("robot/world", WORLD), how, lambda _: None)
     assert str(told.value) == "nothing comes on robot/world (senders: nobody; receivers: nobody)"
 
 
 async def test_a_field_that_is_not_there_ends_echo_with_the_nearest(net: Net) -> None:
-    how = Shown(fields=("linar_x",))
+    how = EchoOptions(fields=("linar_x",))
     work = asyncio.ensure_future(echo(net.one, Target("robot/cmd_vel", CMD_VEL), how, print))
     await settle()
     net.two.publish(CMD_VEL, CmdVel(linear_x=0.1))
@@ -273,7 +286,7 @@ async def test_the_table_names_senders_receivers_sizes_and_strangers(net: Net) -
     net.one.subscribe(STATE, lambda *_: None)
     await NameClaim(net.one).take()
     await NameClaim(net.two).take()
-    looking = asyncio.ensure_future(look(net.bus("tool"), seconds=0.05))
+    looking = asyncio.ensure_future(snapshot(net.bus("tool"), seconds=0.05))
     await settle()
     net.two.publish(STATE, example(RobotState))
     net.network.deliver("weather/today", b"rain")
@@ -282,7 +295,7 @@ async def test_the_table_names_senders_receivers_sizes_and_strangers(net: Net) -
     assert (told["robot/state"].senders, told["robot/state"].receivers) == (("two",), ("one",))
     assert (told["robot/state"].type, told["robot/state"].promised_hz) == ("RobotState", 50)
     assert (told["weather/today"].type, told["weather/today"].size) == (None, 4)
-    text = list(about(Target("robot/state", STATE), found, net.clock.now_ns()))
+    text = list(describe(Target("robot/state", STATE), found, net.clock.now_ns()))
     assert text[0] == "robot/state"
     assert any("from two to one" in line for line in text)
     assert any("joints: tuple[Joint]" in line for line in text)
@@ -298,7 +311,7 @@ async def test_flows_are_what_really_goes_from_one_to_another(net: Net) -> None:
     for _ in range(10):
         net.two.publish(SCAN, example(LaserScan))
     net.two.publish(WORLD, example(WorldModel))  # which nobody hears
-    counting = asyncio.ensure_future(census(net.bus("tool"), 0.05))
+    counting = asyncio.ensure_future(find_processes(net.bus("tool"), 0.05))
     await net.clock.advance(0)
     await net.clock.advance(10**9)
     nodes = await counting

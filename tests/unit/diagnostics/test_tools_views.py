@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from gigabrain_zenoh.diagnostics.plain_table import PlainTable
 from msgspec.structs import replace
 
 from gigabrain_schemas.examples import example
@@ -15,6 +16,7 @@ from gigabrain_schemas.safety import Health, LogRecord
 from gigabrain_schemas.topics import PARAM
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.diagnostics.discovery import Flow, Processes, describe
 from gigabrain_zenoh.diagnostics.graph import (
     as_dot,
     as_mermaid,
@@ -23,24 +25,21 @@ from gigabrain_zenoh.diagnostics.graph import (
     positions,
     write_png,
 )
-from gigabrain_zenoh.diagnostics.log_reading import Wanted, ago_ns, as_line, read, run_folder
-from gigabrain_zenoh.diagnostics.nodes import Nodes, about
-from gigabrain_zenoh.diagnostics.plain_table import PlainTable
-from gigabrain_zenoh.diagnostics.roll_call import Flow
-from gigabrain_zenoh.diagnostics.top import Top
-from gigabrain_zenoh.diagnostics.top_feed import Rows
-from gigabrain_zenoh.diagnostics.top_rows import (
+from gigabrain_zenoh.diagnostics.log_reader import LogFilter, ago_ns, as_line, read, run_folder
+from gigabrain_zenoh.diagnostics.top import (
     PROCESS_COLUMNS,
     TOPIC_COLUMNS,
-    Past,
-    in_order,
+    History,
+    Rows,
+    cell_text,
     process_cells,
     process_row,
-    shown,
+    sorted_rows,
     sparkline,
+    stream_row,
     topic_cells,
-    topic_row,
 )
+from gigabrain_zenoh.diagnostics.top_app import TopApp
 from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
 from gigabrain_zenoh.runtime.services import serve_params
 from gigabrain_zenoh.testing.bus import Net
@@ -75,14 +74,14 @@ def test_the_graph_is_drawn_into_a_picture(tmp_path: Path) -> None:
 
 
 def test_a_node_is_described_with_what_it_sends_and_counts() -> None:
-    nodes = Nodes(
+    nodes = Processes(
         {"driver": example(Description)}, {"driver": replace(example(Health), process="driver")}
     )
-    text = "\n".join(about(nodes, "driver"))
+    text = "\n".join(describe(nodes, "driver"))
     assert text.startswith("driver: version 0.1.0, pid 4710 on waffle")
     assert "scan_to_world_p50" in text
     with pytest.raises(UnknownName, match="did you mean 'driver'"):
-        list(about(nodes, "drivr"))
+        list(describe(nodes, "drivr"))
 
 
 class Feed:
@@ -91,10 +90,10 @@ class Feed:
     def refresh(self) -> tuple[Rows, Rows]:
         calm = process_row(replace(example(Health), process="calm", cpu=0.01), 0.5)
         busy = process_row(replace(example(Health), process="busy", cpu=0.9), 9.0)
-        processes = {row.name: process_cells(row, Past()) for row in (calm, busy)}
-        scan = topic_row("robot/scan", None, 0.5, 0)
-        pose = topic_row("robot/pose", None, 1.5, 3)
-        topics = {row.name: topic_cells(row, Past()) for row in (scan, pose)}
+        processes = {row.name: process_cells(row, History()) for row in (calm, busy)}
+        scan = stream_row("robot/scan", None, 0.5, 0)
+        pose = stream_row("robot/pose", None, 1.5, 3)
+        topics = {row.name: topic_cells(row, History()) for row in (scan, pose)}
         return processes, topics
 
 
@@ -107,7 +106,7 @@ def line_of(table: PlainTable, y: int) -> str:
 
 
 async def test_top_shows_both_tables_and_sorts_them_by_keys() -> None:
-    app = Top(Feed(), "")
+    app = TopApp(Feed(), "")
     async with app.run_test(size=(120, 40)) as pilot:
         processes, topics = (
             app.query_one(f"#{name}", PlainTable) for name in ("processes", "topics")
@@ -135,10 +134,10 @@ async def test_top_shows_both_tables_and_sorts_them_by_keys() -> None:
 
 def test_rows_without_a_value_come_last_whichever_way_they_are_sorted() -> None:
     rows: Rows = {"a": (1.0,), "b": ("",), "c": (2.0,)}
-    assert [key for key, _ in in_order(rows, 0, down=False)] == ["a", "c", "b"]
-    assert [key for key, _ in in_order(rows, 0, down=True)] == ["c", "a", "b"]
+    assert [key for key, _ in sorted_rows(rows, 0, down=False)] == ["a", "c", "b"]
+    assert [key for key, _ in sorted_rows(rows, 0, down=True)] == ["c", "a", "b"]
     assert (len(PROCESS_COLUMNS), len(TOPIC_COLUMNS)) == (10, 10)
-    assert [shown(cell) for cell in ("x", 3, 3.14)] == ["x", "3", "3.1"]
+    assert [cell_text(cell) for cell in ("x", 3, 3.14)] == ["x", "3", "3.1"]
 
 
 def test_a_sparkline_goes_from_zero_to_the_largest() -> None:
@@ -168,11 +167,11 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_log_of_the_newest_run_is_read_in_the_order_of_time(runs: Path) -> None:
     folder = run_folder()
     assert folder.name == "20260102T000000Z-red-2"
-    assert [entry["t"] for entry in read(folder, Wanted(), 100)] == [10, 20, 30]
-    assert [entry["t"] for entry in read(folder, Wanted(), 1)] == [30]
-    assert [e["t"] for e in read(folder, Wanted(process="driver"), 9)] == [10, 30]
-    assert [e["t"] for e in read(folder, Wanted(level="warning"), 9)] == [20, 30]
-    assert [e["t"] for e in read(folder, Wanted(since_ns=20), 9)] == [20, 30]
+    assert [entry["t"] for entry in read(folder, LogFilter(), 100)] == [10, 20, 30]
+    assert [entry["t"] for entry in read(folder, LogFilter(), 1)] == [30]
+    assert [e["t"] for e in read(folder, LogFilter(process="driver"), 9)] == [10, 30]
+    assert [e["t"] for e in read(folder, LogFilter(level="warning"), 9)] == [20, 30]
+    assert [e["t"] for e in read(folder, LogFilter(since_ns=20), 9)] == [20, 30]
     assert run_folder("demo") == runs / "20260101T000000Z-demo-1"
 
 
@@ -180,9 +179,9 @@ def test_what_is_not_there_to_be_read_is_answered_with_what_is(runs: Path) -> No
     with pytest.raises(UnknownName, match="no run 'blue'"):
         run_folder("blue")
     with pytest.raises(UnknownName, match="did you mean 'driver'"):
-        read(run_folder(), Wanted(process="drivr"), 9)
+        read(run_folder(), LogFilter(process="drivr"), 9)
     with pytest.raises(UnknownName, match="did you mean 'warning'"):
-        Wanted(level="warnin")
+        LogFilter(level="warnin")
     with pytest.raises(ConfigError, match="expected a time such as 90s, 10m, 2h or 1d"):
         ago_ns("soon", 0)
     assert ago_ns("10m", 10**12) == 400 * 10**9
@@ -199,8 +198,8 @@ def test_without_any_run_one_line_says_how_to_get_one(
 def test_a_record_from_the_bus_is_shown_like_one_from_a_file() -> None:
     told = as_line(example(LogRecord))
     assert (told["process"], told["reason"]) == ("decision", "obstacle ahead")
-    assert Wanted(process="decision").has(told)
-    assert not Wanted(level="error").has(told)
+    assert LogFilter(process="decision").has(told)
+    assert not LogFilter(level="error").has(told)
 
 
 @pytest.fixture

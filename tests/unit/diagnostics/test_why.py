@@ -17,8 +17,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.tasks import Task, TaskStatus
 from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE, STATE, TELEOP
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.diagnostics.why import LINKS, Verdict, judge
-from gigabrain_zenoh.diagnostics.why_facts import Facts, Watcher
+from gigabrain_zenoh.diagnostics.why import LINKS, ChainFacts, ChainWatcher, Verdict, judge
 from gigabrain_zenoh.gate.causes import estop
 from gigabrain_zenoh.runtime.services import NameClaim, publish_health
 from gigabrain_zenoh.testing.brain import RobotInMemory
@@ -29,7 +28,7 @@ Break = Callable[[RobotInMemory], Awaitable[None]]
 async def asked(robot: RobotInMemory, command: CmdVel | None = None) -> Verdict:
     """What `why` says of the next second and a half, in which somebody may send a command."""
     bus = Bus(robot.network.transport(), robot.clock, "why")
-    look = asyncio.ensure_future(Watcher(bus).look())
+    look = asyncio.ensure_future(ChainWatcher(bus).look())
     if command:
         robot.operator.publish(CMD_VEL, command)
     await robot.go(80)
@@ -68,7 +67,7 @@ async def test_a_robot_that_moves_is_said_to_move_with_figures_for_each_link(
 
 
 def test_without_a_router_nothing_else_is_judged() -> None:
-    verdict = judge(Facts(router="no router answers at tcp/127.0.0.1:1"))
+    verdict = judge(ChainFacts(router="no router answers at tcp/127.0.0.1:1"))
     assert [found.link for found in verdict.findings] == ["router"]
     assert verdict.exit_code == 10
     assert verdict.broken
@@ -292,19 +291,19 @@ OPEN = GateStatus(mode="enabled", commander="control")
 
 
 @pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Facts:
+def moving(tmp_path_factory: pytest.TempPathFactory) -> ChainFacts:
     return asyncio.run(facts_of(tmp_path_factory.mktemp("robot")))
 
 
 def standing(
-    moving: Facts,
+    moving: ChainFacts,
     tasks: TaskStatus | None,
     *,
     gate: GateStatus = OPEN,
     reason: str = "",
     wants: Velocity = STANDS,
     operator: bool = False,
-) -> Facts:
+) -> ChainFacts:
     """The robot that drove, now that it stands."""
     assert moving.state
     assert moving.intent
@@ -330,7 +329,7 @@ def standing(
     ],
 )
 def test_a_robot_that_has_nowhere_to_go_is_not_broken(
-    moving: Facts, tasks: TaskStatus, operator: bool, waits: str, act: str
+    moving: ChainFacts, tasks: TaskStatus, operator: bool, waits: str, act: str
 ) -> None:
     verdict = judge(standing(moving, tasks, operator=operator))
     assert (verdict.broken, verdict.exit_code, verdict.moves) == (None, 0, False)
@@ -355,7 +354,11 @@ def test_a_robot_that_has_nowhere_to_go_is_not_broken(
     ],
 )
 def test_a_gate_that_is_shut_comes_before_a_brain_that_waits(
-    moving: Facts, gate: GateStatus, text: str, steps: tuple[str, ...], tasks: TaskStatus | None
+    moving: ChainFacts,
+    gate: GateStatus,
+    text: str,
+    steps: tuple[str, ...],
+    tasks: TaskStatus | None,
 ) -> None:
     verdict = judge(standing(moving, tasks, gate=gate, reason="waiting: for whatever"))
     assert verdict.broken
@@ -364,7 +367,7 @@ def test_a_gate_that_is_shut_comes_before_a_brain_that_waits(
     assert "by itself" not in verdict.broken.remedy
 
 
-def test_a_brain_that_stands_although_it_has_a_goal_says_why(moving: Facts) -> None:
+def test_a_brain_that_stands_although_it_has_a_goal_says_why(moving: ChainFacts) -> None:
     reason = "waiting: it is not sure where in the map it is"
     verdict = judge(standing(moving, DRIVES, reason=reason))
     assert verdict.broken
@@ -372,7 +375,7 @@ def test_a_brain_that_stands_although_it_has_a_goal_says_why(moving: Facts) -> N
     assert verdict.broken.text == f"decision wants to stand: {reason}"
 
 
-def test_an_operator_who_keeps_the_body_from_a_goal_is_named(moving: Facts) -> None:
+def test_an_operator_who_keeps_the_body_from_a_goal_is_named(moving: ChainFacts) -> None:
     wants = Velocity(linear_x=0.2)
     verdict = judge(standing(moving, DRIVES, wants=wants, operator=True))
     assert verdict.broken
@@ -383,18 +386,18 @@ def test_an_operator_who_keeps_the_body_from_a_goal_is_named(moving: Facts) -> N
     assert silent.broken.text == "control sends zero although decision wants to move"
 
 
-def test_a_decision_that_is_starting_up_is_told_from_one_that_is_mute(moving: Facts) -> None:
+def test_a_decision_that_is_starting_up_is_told_from_one_that_is_mute(moving: ChainFacts) -> None:
     starting = replace(standing(moving, TaskStatus()), intent=None)
     assert judge(starting).waits
     assert judge(replace(starting, tasks=None)).exit_code == 15
 
 
-async def facts_of(folder: Path) -> Facts:
+async def facts_of(folder: Path) -> ChainFacts:
     """One look at a robot that drives."""
     async with RobotInMemory(folder) as robot:
         await robot.go(100)
         bus = Bus(robot.network.transport(), robot.clock, "why")
-        look = asyncio.ensure_future(Watcher(bus).look())
+        look = asyncio.ensure_future(ChainWatcher(bus).look())
         await robot.go(80)
         facts = await look
         await bus.close()

@@ -20,8 +20,8 @@ from gigabrain_drivers.lidars.rplidar import requests as rplidar_requests
 from gigabrain_drivers.links import link as links
 from gigabrain_drivers.links.wording import Spelling, Wording, of_command, whole
 from gigabrain_schemas.base import Velocity
-from gigabrain_zenoh.cli import driver_kit
-from gigabrain_zenoh.cli.driver_kit import trace
+from gigabrain_zenoh.cli import driver
+from gigabrain_zenoh.cli.driver import trace
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.conformance import kit
 from gigabrain_zenoh.qa.conformance.authoring import trace_line
@@ -188,7 +188,7 @@ def test_the_kit_tells_in_one_line_what_it_has_broken_on_purpose(
         return []
 
     monkeypatch.setattr(kit, "check", check)
-    assert driver_kit.test("mycustombot") == 0
+    assert driver.test("mycustombot") == 0
     assert capsys.readouterr().out.splitlines()[0] == (
         "what was broken on purpose, in its own words: the firmware reports: watchdog (2 times); "
         "the firmware reports: unplugged"

@@ -23,7 +23,7 @@ from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.loading import located
 from gigabrain_zenoh.decision.tasks import mission
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
-from gigabrain_zenoh.diagnostics import log_reading
+from gigabrain_zenoh.diagnostics import log_reader
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.qa.bench import slam_logs
@@ -89,7 +89,7 @@ def read_laser_log(path: Path) -> object:
 
 def read_run(path: Path) -> object:
     path.rename(path.with_name("driver.jsonl"))
-    return log_reading.read(path.parent, log_reading.Wanted(), 10)
+    return log_reader.read(path.parent, log_reader.LogFilter(), 10)
 
 
 def read_audit(path: Path) -> object:
@@ -317,4 +317,4 @@ def test_an_address_in_no_plain_file_is_a_problem_of_the_link(
 
 def test_a_folder_without_logs_is_said_to_hold_none(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="holds no logs; expected files such as decision"):
-        log_reading.run_folder(str(tmp_path))
+        log_reader.run_folder(str(tmp_path))

@@ -12,7 +12,7 @@ from typing import IO
 import pytest
 
 from gigabrain_zenoh import logs
-from gigabrain_zenoh.diagnostics.log_reading import Wanted, read
+from gigabrain_zenoh.diagnostics.log_reader import LogFilter, read
 
 log = logging.getLogger("a.module")
 PIPE_BYTES = 4096
@@ -48,6 +48,6 @@ def test_a_log_file_is_rotated_and_all_that_is_kept_is_read(
         sizes = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
         assert sorted(sizes) == ["driver.jsonl", "driver.jsonl.1", "driver.jsonl.2"]
         assert max(sizes.values()) <= 2000
-        texts = [str(line["text"]) for line in read(tmp_path, Wanted(process="driver"), 1000)]
+        texts = [str(line["text"]) for line in read(tmp_path, LogFilter(process="driver"), 1000)]
         assert texts == [f"line {i:03d}" for i in range(200 - len(texts), 200)]
         assert len(texts) > 40

@@ -8,7 +8,7 @@ from gigabrain_drivers.driver.round_trip import RoundTrip
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, SCAN
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.diagnostics.rates import Heard, median_ms
+from gigabrain_zenoh.diagnostics.topic_stats import ChainMonitor, median_ms
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host.bounded import NewestValues, percentile
 from gigabrain_zenoh.qa.bench.chain import Hop, Stopwatch, relay_roles
@@ -82,11 +82,11 @@ def test_work_is_timed_by_name_and_its_result_handed_on() -> None:
 
 
 def test_a_hop_lasts_from_its_first_message_of_a_tick_to_the_next_ones() -> None:
-    heard = Heard()
+    heard = ChainMonitor()
     for tick, left_ms in ((5, 100), (10, 200), (15, 300)):
-        heard.hear("robot/scan", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
+        heard.add("robot/scan", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
     for tick, left_ms in ((5, 101), (10, 203), (10, 220)):  # the last repeats what it rests on
-        heard.hear("robot/cmd_vel", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
+        heard.add("robot/cmd_vel", CmdVel(linear_x=0.0, basis=tick, stamp_ns=left_ms * MS))
     assert heard.between(SCAN, CMD_VEL) == 2.0
     assert not heard.complete
     assert median_ms({1: 0, 2: 0, 3: 0}, {2: 4 * MS, 3: 8 * MS, 4: MS}) == 6.0

@@ -13,7 +13,7 @@ from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import GateStatus, Pose, RobotState, Velocity
 from gigabrain_schemas.tasks import Goal
 from gigabrain_schemas.topics import STATE
-from gigabrain_zenoh.cli.bench_goals import _table
+from gigabrain_zenoh.cli.bench_navigation import _goals_table
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.errors import BodyLost, GigabrainError
 from gigabrain_zenoh.qa.bench import goals
@@ -150,5 +150,5 @@ def test_the_table_says_what_was_measured() -> None:
 def _text(result: GoalsResult) -> str:
     console = Console(width=80)
     with console.capture() as capture:
-        console.print(_table(result))
+        console.print(_goals_table(result))
     return capture.get()

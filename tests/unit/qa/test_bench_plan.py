@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gigabrain_zenoh.cli.bench_plan import _table, plan
+from gigabrain_zenoh.cli.bench import _plan_table, plan
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.bench.plan import PlanResult, measure_plan
 from gigabrain_zenoh.qa.bench.plan_maps import office, scattered
@@ -44,7 +44,7 @@ def test_a_path_that_is_dearer_is_not_ok(measured: tuple[PlanResult, Path]) -> N
 def test_published_figures_are_said_to_be_that(measured: tuple[PlanResult, Path]) -> None:
     console = Console(width=140)
     with console.capture() as said:
-        console.print(_table(measured[0]))
+        console.print(_plan_table(measured[0]))
     assert "published │ Nav2 NavFn, about 75 m" in said.get()
     assert "other machines" in said.get()
 

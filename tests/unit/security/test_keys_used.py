@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from gigabrain_zenoh.bus.zenoh.config import session_config
-from gigabrain_zenoh.cli.process import router
-from gigabrain_zenoh.cli.proxy import proxy
+from gigabrain_zenoh.cli.faults import proxy
+from gigabrain_zenoh.cli.processes import router
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.specs import process_specs

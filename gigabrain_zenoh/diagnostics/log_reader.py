@@ -1,4 +1,4 @@
-"""`gigabrain log`: what the processes of a run have written down, and what they say now."""
+"""Reads the logs of a run from its files, and those on the bus in the same form."""
 
 import re
 import time
@@ -15,24 +15,24 @@ from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.logs import FILE_BYTES, LEVELS
 
-LOGS = "*.jsonl*"  # driver.jsonl, and driver.jsonl.1 before it
-UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
+LOG_FILES = "*.jsonl*"  # driver.jsonl, and the older driver.jsonl.1
+UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86400}
 Line = Mapping[str, Any]
 
 
-class Wanted(msgspec.Struct, frozen=True, kw_only=True):
-    """Which lines."""
+class LogFilter(msgspec.Struct, frozen=True, kw_only=True):
+    """Which lines to show."""
 
-    process: str = ""  # all without
-    level: str = "debug"  # and above
+    process: str = ""  # empty for all
+    level: str = "debug"  # lowest
     since_ns: int = 0  # Unix time
 
     def __post_init__(self) -> None:
         if self.level not in LEVELS:
             raise unknown("log level", self.level, LEVELS)
 
-    def has(self, line: Line) -> bool:
-        """Whether a line is among them."""
+    def accepts(self, line: Line) -> bool:
+        """Return whether to show a line."""
         return (
             self.process in ("", line["process"])
             and LEVELS.index(line["level"]) >= LEVELS.index(self.level)
@@ -41,58 +41,58 @@ class Wanted(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def ago_ns(text: str, now_ns: int) -> int:
-    """Unix time of `90s`, `10m`, `2h` or `1d` ago. Raises ConfigError."""
+    """Return the Unix time of `90s`, `10m`, `2h` or `1d` ago [ns]. Raises ConfigError."""
     found = re.fullmatch(r"(\d+(?:\.\d+)?)([smhd])", text)
     if not found:
         raise ConfigError(f"--since {text}: expected a time such as 90s, 10m, 2h or 1d")
-    return now_ns - round(float(found[1]) * UNITS[found[2]] * 1e9)
+    return now_ns - round(float(found[1]) * UNITS_S[found[2]] * 1e9)
 
 
 def run_folder(name: str = "") -> Path:
-    """The folder of a run, by path or by part of its name; without one the newest.
+    """Return the folder of a run, by path or part of its name; the newest one without a name.
 
-    Raises ConfigError, and UnknownName.
+    Raises ConfigError and UnknownName.
     """
     if name and Path(name).is_dir():
-        if not any(Path(name).glob(LOGS)):
-            raise ConfigError(f"{name}: holds no logs; expected files such as decision.jsonl")
+        if not any(Path(name).glob(LOG_FILES)):
+            raise ConfigError(f"{name}: no logs; expected files such as decision.jsonl")
         return Path(name)
     base = state_dir() / "runs"
     runs = sorted((p for p in base.glob("*") if p.is_dir()), key=lambda p: p.name)
     if not runs:
-        raise ConfigError(f"no run has left a log in {base}; start one with `gigabrain demo`")
+        raise ConfigError(f"{base}: no logs of any run; start one with `gigabrain demo`")
     found = [run for run in runs if name in run.name]
     if not found:
         raise unknown("run", name, [run.name for run in runs[-5:]])
     return found[-1]
 
 
-def read(folder: Path, wanted: Wanted, newest: int) -> list[Line]:
-    """The newest lines of all processes of a run, oldest first. Raises ConfigError."""
-    files = sorted(folder.glob(LOGS))
+def read(folder: Path, wanted: LogFilter, newest: int) -> list[Line]:
+    """Return the newest lines of all processes of a run, oldest first. Raises ConfigError."""
+    files = sorted(folder.glob(LOG_FILES))
     names = {path.name.partition(".jsonl")[0] for path in files}
     if wanted.process and wanted.process not in names:
         raise unknown("log of a process", wanted.process, names)
     try:
-        lines = [line for path in files for line in _lines(path) if wanted.has(line)]
+        lines = [line for path in files for line in _lines(path) if wanted.accepts(line)]
     except OSError as error:
         raise ConfigError(f"cannot read {error.filename}: {error.strerror}") from None
     return sorted(lines, key=lambda line: int(line["t"]))[-newest:]
 
 
 def _lines(path: Path) -> Iterator[Line]:
-    """Every line that is whole: the last one of a process that died may not be."""
+    """Yield the complete lines; the last line of a process that died may be cut off."""
     with open_regular(path, 2 * FILE_BYTES) as file:
         for text in file:
             try:
                 line = msgspec.json.decode(text)
             except DECODE_ERRORS:
                 continue
-            if _whole(line):
+            if _is_complete(line):
                 yield line
 
 
-def _whole(line: object) -> bool:
+def _is_complete(line: object) -> bool:
     return (
         isinstance(line, dict)
         and isinstance(line.get("t"), int)
@@ -103,7 +103,7 @@ def _whole(line: object) -> bool:
 
 
 def as_line(record: LogRecord) -> Line:
-    """A record from the bus as one from a file."""
+    """Return a record from the bus in the form of a line from a file."""
     known = {
         "t": record.stamp_ns or time.time_ns(),
         "level": record.level,

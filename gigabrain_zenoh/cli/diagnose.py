@@ -1,0 +1,178 @@
+"""`gigabrain why`, `doctor` and `log`: what is wrong, and what to do about it."""
+
+import asyncio
+import time
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from gigabrain_zenoh.cli.options import LOCAL, JsonLines, Process, RobotAddress, print_line
+from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
+from gigabrain_zenoh import logs
+from gigabrain_zenoh.host.signals import run_async, stop_signals
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from gigabrain_schemas.safety import LogRecord
+    from gigabrain_zenoh.diagnostics.log_reader import Line, LogFilter
+    from gigabrain_zenoh.diagnostics.why import ChainFacts
+
+GRADES = {"ok": "ok  ", "hint": "hint", "bad": "BAD "}
+MAX_LINES = 1_000_000
+
+
+def why(*, at: RobotAddress = LOCAL, json: bool = False) -> int:
+    """Say why the robot does not move, and what to do about it.
+
+    Example: gigabrain why
+
+    It follows one command from link to link. Exit code 0 if no link is broken:
+    the robot moves, or waits, as for a goal. Otherwise the code of the broken
+    link: 10 router, 11 driver, 12 link to the body, 13 scan, 14 world,
+    15 intent, 16 control, 17 safety, 18 gate, 19 body.
+
+    Args:
+        json: Print one JSON object.
+    """
+    import msgspec
+
+    from gigabrain_zenoh.diagnostics.why import judge
+
+    verdict = judge(run_async(_chain_facts(at)))
+    broken, waits = verdict.broken, verdict.waits
+    if json:
+        summary = {
+            "broken": broken.link if broken else None,
+            "waits": waits.text if waits and not verdict.moves else None,
+            **msgspec.to_builtins(verdict),
+        }
+        print_line(msgspec.json.encode(summary).decode())
+        return verdict.exit_code
+    for one in verdict.findings:
+        word = "BROKEN" if not one.ok else "waits" if one.waits else "ok"
+        print_line(f"  {one.link:<8} {word:<6}  {one.text}")
+    for note in verdict.notes:
+        print_line(f"  note: {note}")
+    if broken:
+        moves = "It still moves, but not for long." if verdict.moves else "It does not move."
+        print_line(f"{moves} {broken.link}: {broken.text}.")
+        print_line(f"What to do: {broken.remedy}.")
+    elif waits and not verdict.moves:
+        print_line(f"It stands, and no link is broken: {waits.text}.")
+        print_line(f"What to do: {waits.remedy}.")
+    else:
+        print_line("It moves.")
+    return verdict.exit_code
+
+
+async def _chain_facts(at: RobotAddress) -> "ChainFacts":
+    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
+    from gigabrain_zenoh.diagnostics.why import ChainFacts, ChainWatcher
+    from gigabrain_zenoh.runtime.connect import joined
+
+    try:
+        async with joined(at.where(), CLIENT_NAME) as (bus, _):
+            return await ChainWatcher(bus).collect()
+    except Ambiguous:  # no link is broken: the robot is not chosen
+        raise
+    except BusError as error:
+        return ChainFacts(router=str(error))
+
+
+def doctor(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> int:
+    """Check this machine and the robot, and say what to fix.
+
+    Example: gigabrain doctor
+
+    Exit code 1 if anything is bad; hints do not count.
+    """
+    import msgspec
+
+    from gigabrain_zenoh.diagnostics.doctor import (
+        examine,
+        exit_code,
+        look_at_machine,
+        look_at_robot,
+    )
+
+    robot, keys = run_async(look_at_robot(at.where()))
+    results = examine(look_at_machine(keys), robot)
+    for one in results:
+        if json:
+            print_line(msgspec.json.encode(one).decode())
+            continue
+        print_line(f"{GRADES[one.grade]}  {one.about:<14} {one.text}")
+        if one.cure:
+            print_line(f"      {'':<14} -> {one.cure}")
+    return exit_code(results)
+
+
+def log(
+    run: str = "",
+    /,
+    *,
+    at: RobotAddress = LOCAL,
+    process: Process = "",
+    level: str = "debug",
+    since: str = "",
+    newest: Annotated[int, Parameter(alias="-n")] = 100,
+    follow: bool = False,
+    json: JsonLines = False,
+) -> int:
+    """Show the logs of all processes of a run on this machine, in order of time.
+
+    Example: gigabrain log --process driver --level warning --since 10m
+
+    With --follow it continues with new lines of all hosts, until Ctrl-C.
+
+    Args:
+        run: Folder of the run, or part of its name. Default: the newest run.
+        process: Name of one process. Default: all.
+        level: Lowest level: debug, info, warning, error or critical.
+        since: Maximum age: 90s, 10m, 2h, 1d.
+        newest: Number of lines.
+        follow: Continue with new lines, of level info and above.
+    """
+    from gigabrain_zenoh.diagnostics.log_reader import LogFilter, ago_ns, read, run_folder
+
+    if not 0 < newest <= MAX_LINES:
+        raise ConfigError(f"--newest: expected 1 to {MAX_LINES}, got {newest}")
+    if at.connect and not follow:
+        raise ConfigError(
+            "logs of a remote robot are on its host; use --follow to receive new lines"
+        )
+    since_ns = ago_ns(since, time.time_ns()) if since else 0
+    wanted = LogFilter(process=process, level=level, since_ns=since_ns)
+
+    def show(line: "Line") -> None:
+        print_line(logs.encode(line).decode() if json else logs.readable(line))
+
+    if not at.connect:
+        for line in read(run_folder(run), wanted, newest):
+            show(line)
+    if follow:
+        run_async(_follow(at, wanted, show))
+    return 0
+
+
+async def _follow(at: RobotAddress, wanted: "LogFilter", show: "Callable[[Line], None]") -> None:
+    from gigabrain_schemas.topics import LOG
+    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME, stop_on_broken_pipe
+    from gigabrain_zenoh.diagnostics.log_reader import as_line
+    from gigabrain_zenoh.runtime.connect import joined
+
+    async with joined(at.where(), CLIENT_NAME) as (bus, _):
+
+        def receive(_key: str, record: "LogRecord") -> None:
+            line = as_line(record)
+            if wanted.accepts(line):
+                show(line)
+
+        bus.subscribe(LOG, receive)
+        with stop_signals() as stop, stop_on_broken_pipe(stop):
+            stopped = asyncio.ensure_future(stop.wait())
+            await asyncio.wait((stopped, bus.failed), return_when=asyncio.FIRST_COMPLETED)
+            stopped.cancel()
+        if bus.failed.done():
+            bus.failed.result()  # raises, as where the reader of the pipe is gone

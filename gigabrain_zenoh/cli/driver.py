@@ -1,0 +1,194 @@
+"""`gigabrain driver test`, `new` and `trace`, and `emulate`: tools for authors of drivers."""
+
+import logging
+import os
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from gigabrain_zenoh.cli.options import (
+    Seed,
+    World,
+    check_finite,
+    check_positive,
+    checked,
+    print_line,
+)
+from gigabrain_zenoh.config.settings import EmulatorConfig, LinkName
+from gigabrain_zenoh.host.signals import run_async
+
+RobotName = Annotated[str, Parameter(help="Known robot, or path of a robot's YAML file.")]
+
+
+class _WarningCounter(logging.Handler):
+    """Counts the warnings of the driver under test, instead of printing them. Used as `with`."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.texts: Counter[str] = Counter()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts[record.getMessage()] += 1
+
+    def __enter__(self) -> Self:
+        logging.getLogger().addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger().removeHandler(self)
+
+    def __str__(self) -> str:
+        return "; ".join(
+            f"{text} ({times} times)" if times > 1 else text for text, times in self.texts.items()
+        )
+
+
+def test(
+    name: RobotName,
+    *,
+    link: Literal["sim", "emulated"] | None = None,  # noqa: PT028
+    repeat: Annotated[int, Parameter(validator=Number(gte=1))] = 1,  # noqa: PT028
+) -> int:
+    """Run the conformance checks on a driver. Exit code 1 if one fails.
+
+    Example: gigabrain driver test mycustombot --link emulated
+
+    A check that does not apply to a link is shown as skipped, with the reason.
+
+    Args:
+        link: Link to test over. Default: emulated where the robot has it, as it shows more.
+        repeat: Number of times to try each stop; the table shows the worst and the median.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from gigabrain_drivers.driver.catalog import links_of, load_robot
+    from gigabrain_zenoh.qa.conformance import kit
+    from gigabrain_zenoh.qa.judging import COLOURS
+
+    links = links_of(load_robot(name))
+    chosen: LinkName = link or ("emulated" if "emulated" in links else "sim")
+    table = Table(title=f"{name}, link {chosen}")
+    for title in ("check", "criterion", "measured", "verdict"):
+        table.add_column(title)
+    console = Console()
+    warnings = _WarningCounter()
+    place = tempfile.TemporaryDirectory(prefix="gigabrain-")
+    with warnings, place as folder, console.status("") as status:
+        results = run_async(kit.check(name, chosen, Path(folder), status.update, repeat))
+    for result in results:
+        colour = COLOURS[result.verdict]
+        table.add_row(*result[:-1], f"[{colour}]{result.verdict}[/]")
+    if warnings.texts:
+        console.print(f"warnings during the checks: {warnings}", markup=False, soft_wrap=True)
+    console.print(table)
+    return int(any(result.verdict == "FAILED" for result in results))
+
+
+def trace(
+    name: RobotName,
+    *,
+    link: Literal["emulated", "real"] = "emulated",
+    part: Literal["base", "scan"] = "base",
+    seconds: float = 2.0,
+    linear_x: float = 0.0,
+    linear_y: float = 0.0,
+    angular_z: float = 0.0,
+) -> int:
+    """Print the bytes on a robot's line in both directions, each frame with its meaning.
+
+    Example: gigabrain driver trace mycustombot --seconds 0.5 --linear-x 0.1
+
+    It runs the driver itself: on an emulator, or on the real port, which no
+    other process may have open. A real robot gets the command zero only.
+    A driver that runs already logs the same lines with
+    `gigabrain driver run NAME --link real --level debug`.
+
+    Exit code 1 if nothing was received.
+
+    Args:
+        link: Emulated or real line.
+        part: Line of the base, or of its lidar.
+        seconds: Duration [s].
+        linear_x: Command to an emulated robot, forward [m/s].
+        linear_y: Command to an emulated robot, to its left [m/s].
+        angular_z: Command to an emulated robot, counter-clockwise [rad/s].
+    """
+    check_positive(seconds=seconds)
+    speeds = {"linear_x": linear_x, "linear_y": linear_y, "angular_z": angular_z}
+    for option, speed in speeds.items():
+        check_finite(option, speed)
+    received = _print_trace(name, link, part, seconds, speeds)
+    if not received:
+        print("nothing was received", file=sys.stderr)
+    return int(not received)
+
+
+def _print_trace(
+    name: str, link: LinkName, part: str, seconds: float, speeds: dict[str, float]
+) -> bool:
+    """Print the bytes; return whether the robot sent any, or the reader closed the pipe."""
+    from gigabrain_schemas.base import Velocity
+    from gigabrain_zenoh.qa.conformance import authoring
+
+    with tempfile.TemporaryDirectory(prefix="gigabrain-") as folder:
+        tracing = authoring.trace_line(
+            name,
+            link,
+            Path(folder),
+            part=part,
+            seconds=seconds,
+            wanted=Velocity(**speeds),
+            say=print_line,
+        )
+        try:
+            return bool(run_async(tracing))
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return True
+
+
+def new(name: str, *, folder: Path = Path()) -> int:
+    """Create the package of a new driver, which passes `gigabrain driver test` as it is.
+
+    Example: gigabrain driver new myrobot
+
+    Existing files are not overwritten.
+
+    Args:
+        name: Name of the robot and its driver: lower-case letters, digits, underscores.
+        folder: Where to create the package's folder.
+    """
+    from gigabrain_zenoh.qa.conformance.authoring import write_package
+
+    path = write_package(name, folder)
+    print(f"{path}: edit robot.yaml and driver.py; README.md describes the next steps")
+    return 0
+
+
+def emulate(
+    name: RobotName, *, world: World = "arena", seed: Seed = 0, ports: Path | None = None
+) -> int:
+    """Emulate a robot's hardware on serial and TCP ports, with MuJoCo, until Ctrl-C.
+
+    Example: gigabrain emulate mycustombot --world house
+
+    In another terminal: gigabrain driver run mycustombot --link emulated
+
+    Type faults, one per line: `silence`, `bit_errors=0.001`, `scan unplugged`, `off`.
+
+    Args:
+        ports: Folder in which its ports appear.
+    """
+    from gigabrain_drivers.driver.catalog import ports_folder
+    from gigabrain_drivers.emulators.process import emulate as run
+
+    folder = ports or ports_folder(name)
+    values = {"body": name, "world": world, "seed": seed, "folder": str(folder.absolute())}
+    run_async(run(checked(values, EmulatorConfig), print_line))
+    return 0

@@ -1,0 +1,140 @@
+"""`gigabrain estop`, `release` and `enable`: requests to the gate; `audit`: their log."""
+
+import getpass
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from gigabrain_schemas.requests import GateReply
+from gigabrain_zenoh.cli.options import LOCAL, JsonLines, RobotAddress, Take, print_line
+from gigabrain_zenoh.client.estop import BY_HAND
+from gigabrain_zenoh.client.robot import Robot
+from gigabrain_zenoh.client.robot import connect as connect_robot
+from gigabrain_zenoh.errors import ConfigError, GigabrainError, NotConfirmed, unknown
+from gigabrain_zenoh.gate.gate import BRAIN
+from gigabrain_zenoh.host.signals import run_async
+
+if TYPE_CHECKING:
+    from gigabrain_schemas.audit import AuditRecord
+
+MAX_ENTRIES = 1000
+
+
+def estop(*, at: RobotAddress = LOCAL, reason: str = "") -> int:
+    """Stop the robot at once, and latch it.
+
+    Example: gigabrain estop --reason "a person is in the way"
+
+    Exit code 3 and NOT CONFIRMED if no robot has confirmed that it stands.
+    Then press the hardware e-stop or cut the power.
+
+    Args:
+        reason: Reason, for the audit log.
+    """
+    try:
+        return _ask(at, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False)
+    except NotConfirmed:
+        raise
+    except GigabrainError as error:  # anything that prevents the request
+        raise NotConfirmed(f"NOT CONFIRMED: {error}; {BY_HAND}") from None
+
+
+def release(*, at: RobotAddress = LOCAL) -> int:
+    """Release a latched robot. It moves only once it is enabled as well.
+
+    Example: gigabrain release
+    """
+    return _ask(at, lambda robot: robot.release())
+
+
+def enable(*, at: RobotAddress = LOCAL, take: Take = False) -> int:
+    """Let the robot's brain drive.
+
+    Example: gigabrain enable
+    """
+    return _ask(at, lambda robot: robot.enable(BRAIN, take=take))
+
+
+def _ask(
+    at: RobotAddress,
+    request: Callable[[Robot], Awaitable[GateReply]],
+    prefix: str = "",
+    *,
+    wait: bool = True,
+) -> int:
+    async def run() -> None:
+        source = f"{getpass.getuser()}-cli"
+        async with connect_robot(
+            at.connect, namespace=at.namespace, keys=at.folder, source=source, wait=wait
+        ) as robot:
+            start_s = time.perf_counter()
+            reply = await request(robot)
+            took_ms = (time.perf_counter() - start_s) * 1e3
+            print(f"{prefix}{reply.robot_type}: {reply.text} ({took_ms:.0f} ms)")
+
+    run_async(run())
+    return 0
+
+
+def audit(
+    robot: str = "",
+    /,
+    *,
+    at: RobotAddress = LOCAL,
+    newest: Annotated[int, Parameter(alias="-n")] = 20,
+    follow: bool = False,
+    json: JsonLines = False,
+) -> int:
+    """Show who did what to the robot: e-stops, releases, who drove, what stopped it.
+
+    Example: gigabrain audit --newest 50
+
+    Args:
+        robot: Folder or name of a robot that does not run. Default: the running robot.
+        newest: Number of entries.
+        follow: Continue with new entries, until Ctrl-C.
+    """
+    from gigabrain_zenoh.runtime.audit import as_json, read_audit, readable
+
+    if not 0 < newest <= MAX_ENTRIES:
+        raise ConfigError(f"--newest: expected 1 to {MAX_ENTRIES}, got {newest}")
+    to_text = audit.as_json if json else audit.readable
+    if not robot:
+        run_async(_print_live(at, newest, follow, to_text))
+        return 0
+    if follow or at.connect:
+        raise ConfigError(f"{robot!r} names a robot that does not run; leave out the name")
+    for record in audit.read_audit(_audit_folder(robot), newest):
+        print_line(to_text(record))
+    return 0
+
+
+async def _print_live(
+    at: RobotAddress, newest: int, follow: bool, to_text: "Callable[[AuditRecord], str]"
+) -> None:
+    """Print the log of a running robot, and with `follow` its new entries."""
+    async with connect_robot(
+        at.connect, namespace=at.namespace, keys=at.folder, wait=False
+    ) as robot:
+        new_entries = robot.topic("audit") if follow else None
+        for record in await robot.audit(newest):
+            print_line(to_text(record))
+        if new_entries:
+            async for record in new_entries:
+                print_line(to_text(record))
+
+
+def _audit_folder(robot: str) -> Path:
+    """Return the folder of a robot that holds its log. Raises UnknownName."""
+    from gigabrain_zenoh.host.run_folders import state_dir
+    from gigabrain_zenoh.runtime.audit import FOLDER
+
+    known = {path.parent.name: path.parent for path in (state_dir() / "robots").glob(f"*/{FOLDER}")}
+    if robot in known:
+        return known[robot]
+    if (Path(robot) / FOLDER).is_dir():
+        return Path(robot)
+    raise unknown("robot with an audit log", robot, known)

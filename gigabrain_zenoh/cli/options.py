@@ -1,0 +1,186 @@
+"""Options that several commands share: completion, checks of values, output to the terminal."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
+
+from cyclopts import App, ArgumentCollection, Parameter
+
+from gigabrain_zenoh.errors import ConfigError, GigabrainError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from gigabrain_schemas.requests import Description
+    from gigabrain_zenoh.runtime.connect import Where
+
+T = TypeVar("T")
+
+COMPLETION_TIMEOUT_S = 0.3  # a shell waits for the names
+PIPE_COLUMNS = 160  # width of tables where the output has none
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class RobotAddress:
+    """Which robot a command is for."""
+
+    connect: str | None = None
+    "Zenoh endpoint of the robot's router. Default: the only robot on this machine."
+    namespace: str = ""
+    "Namespace of the robot, where one router serves several robots."
+    keys: Path | None = None
+    "Folder of your identity, for a router that requires keys."
+
+    @property
+    def folder(self) -> str:
+        """Return the folder of the identity; empty for none."""
+        return str(self.keys) if self.keys else ""
+
+    def where(self) -> "Where":
+        """Return the address in the form that the tools take."""
+        from gigabrain_zenoh.runtime.connect import Where
+
+        return Where(connect=self.connect, namespace=self.namespace, keys=self.folder)
+
+
+LOCAL = RobotAddress()  # the only robot on this machine
+
+
+def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
+    """Print the script that completes commands, options and names in a shell.
+
+    Example: eval "$(gigabrain completion bash)"
+
+    Args:
+        shell: Shell to write the script for.
+    """
+    from gigabrain_zenoh.cli.app import make_app
+
+    print(make_app().generate_completion(shell=shell))
+
+
+def _live_topics(_: object) -> list[str]:
+    """Return the topics that a running robot publishes, or all known ones if none runs."""
+    from gigabrain_schemas.topics import TOPICS
+    from gigabrain_zenoh.diagnostics.topic_names import short, topic_of
+
+    published = {key for one in _live_processes() for key in one.publishes if topic_of(key)}
+    return sorted(map(short, published or {topic.key for topic in TOPICS}))
+
+
+def _live_process_names(_: object) -> list[str]:
+    return [one.process for one in _live_processes()]
+
+
+def _live_processes() -> list["Description"]:
+    """Return the processes that answer at once; empty on any error, since a shell waits."""
+    from gigabrain_zenoh.diagnostics.discovery import discover
+    from gigabrain_zenoh.host.signals import run_async
+    from gigabrain_zenoh.runtime.connect import Where, joined
+
+    async def ask() -> list["Description"]:
+        async with joined(Where(), "completion") as (bus, _):
+            return list((await discover(bus, COMPLETION_TIMEOUT_S)).values())
+
+    try:
+        return run_async(ask())
+    except GigabrainError:
+        return []
+
+
+Topic = Annotated[str, Parameter(completer=_live_topics)]
+Process = Annotated[str, Parameter(completer=_live_process_names)]
+TopicNames = Annotated[
+    list[str] | None,
+    Parameter(
+        consume_multiple=True,
+        help='Names such as scan, or key expressions such as "robot/image/*". Default: all.',
+    ),
+]
+Count = Annotated[int | None, Parameter(alias="-n")]
+Take = Annotated[bool, Parameter(help="Take over from whoever drives, the robot's brain included.")]
+JsonLines = Annotated[bool, Parameter(help="Print one JSON object per line.")]
+JsonFile = Annotated[Path | None, Parameter(help="Write the results as JSON to this file.")]
+Output = Annotated[Path | None, Parameter(alias="-o")]
+Body = Annotated[str, Parameter(help="Robot; see `gigabrain robots`.")]
+World = Annotated[str, Parameter(help="Simulated world; see `gigabrain worlds`.")]
+Seed = Annotated[int, Parameter(help="Random seed of the start pose and the sensor noise.")]
+KeepStuck = Annotated[
+    bool,
+    Parameter(
+        negative=(), help="Do not restart a process that makes no progress (for a debugger)."
+    ),
+]
+
+
+def checked(values: Mapping[str, object], type: type[T]) -> T:
+    """Return `values` as a `type`. Raises ConfigError, which names the option that does not fit."""
+    import msgspec
+
+    try:
+        return msgspec.convert(values, type)
+    except msgspec.ValidationError as error:
+        text, _, path = str(error).partition(" - at `$.")
+        name = path.rstrip("`").replace("_", "-")
+        raise ConfigError(f"--{name}: {text[0].lower()}{text[1:]}" if name else text) from None
+
+
+def check_finite(name: str, value: float) -> None:
+    """Raise ConfigError if the option `name` is not a finite number."""
+    if not math.isfinite(value):
+        shown = name.replace("_", "-")
+        raise ConfigError(f"--{shown}: expected a number, got {value:g}")
+
+
+def check_positive(**options: float | None) -> None:
+    """Raise ConfigError for the first option that is not above 0; None is an option not given."""
+    for name, value in options.items():
+        if value is not None and not 0 < value < 1e9:
+            shown = name.replace("_", "-")
+            raise ConfigError(f"--{shown}: expected a number above 0, got {value:g}")
+
+
+def refuse_fractions(_app: App, _command: tuple[str, ...], arguments: ArgumentCollection) -> None:
+    """Raise ConfigError for a fraction where an option is a whole number; cyclopts would round."""
+    for argument in arguments:
+        if _is_whole(argument.hint):
+            for token in argument.tokens:
+                if _is_fraction(token.value):
+                    got = f"expected a whole number, got {token.value}"
+                    raise ConfigError(f"{argument.name}: {got}")
+
+
+def _is_whole(hint: Any) -> bool:
+    """Return whether a type is int, or a union or a collection of int."""
+    return hint is int or any(_is_whole(part) for part in get_args(hint))
+
+
+def _is_fraction(text: str) -> bool:
+    try:
+        return not float(text).is_integer()
+    except ValueError:  # hexadecimal, or no number: cyclopts reports it
+        return False
+
+
+def print_line(line: str) -> None:
+    """Print a line and flush it, for pipes."""
+    print(line, flush=True)
+
+
+def print_progress(line: str) -> None:
+    """Print a line to stderr, so that stdout holds the result alone."""
+    import sys
+
+    print(line, file=sys.stderr, flush=True)
+
+
+def print_table(table: "Table") -> None:
+    """Print a table as wide as the terminal; in a pipe as wide as it needs."""
+    import sys
+
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS).print(table)

@@ -1,0 +1,224 @@
+"""Commands that run one process each, to start a robot by hand or on several hosts."""
+from gigabrain_zenoh.host import run_folders
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+from cyclopts import Parameter
+
+from gigabrain_zenoh import logs
+from gigabrain_zenoh.bus.zenoh.config import router_config, secured
+from gigabrain_zenoh.cli.options import Seed, World, checked, print_progress
+from gigabrain_zenoh.host.network import exposed, reached_at
+from gigabrain_zenoh.config.settings import ProcessConfig
+from gigabrain_zenoh.config.settings import (
+    ButtonConfig,
+    DecisionConfig,
+    DriverConfig,
+    Endpoint,
+    LinkName,
+    Resume,
+)
+from gigabrain_zenoh.decision import behaviours
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.launch.processes import run_process
+from gigabrain_zenoh.runtime.running import announced, find_endpoint
+from gigabrain_zenoh.security.identity_files import identity_in
+
+ROUTER = "tcp/127.0.0.1:7447"
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ProcessOptions:
+    """Where a process connects and logs."""
+
+    connect: str = ROUTER
+    "Zenoh endpoint of the router."
+    namespace: str = ""
+    "Namespace of the robot, where one router serves several robots."
+    keys: Path | None = None
+    "Folder of this host's identity, for a router that requires keys."
+    run_dir: Path | None = None
+    "Write a log file to this folder."
+    level: Literal["debug", "info", "warning", "error"] = "info"
+    "Lowest level to log."
+
+    @property
+    def folder(self) -> str:
+        """Return the folder of the identity; empty for none."""
+        return str(self.keys.expanduser().absolute()) if self.keys else ""
+
+    def run(self, name: str, settings: dict[str, Any], endpoint: Endpoint | None = None) -> int:
+        """Run the process `name` until a signal; return its exit code."""
+        found = endpoint or find_endpoint(self.connect, self.namespace, self.folder)
+        return run_process(
+            ProcessConfig(
+                name=name,
+                endpoint=found,
+                settings=settings,
+                run_dir=str(self.run_dir) if self.run_dir else None,
+                level=self.level,
+            )
+        )
+
+
+LOCAL = ProcessOptions()
+
+
+def router(
+    *,
+    listen: tuple[str, ...] = (ROUTER,),
+    fleet: tuple[str, ...] = (),
+    insecure: bool = False,
+    process: Annotated[ProcessOptions, Parameter(show=False)] = LOCAL,
+) -> int:
+    """Run the router that connects the other processes. Tools on this machine find it.
+
+    Example: gigabrain router --listen tcp/127.0.0.1:7447
+
+    Args:
+        listen: Zenoh endpoint to listen on; may be given again.
+        fleet: Namespace of a robot that it serves, where it has keys; may be given again.
+        insecure: Listen beyond loopback without keys: anybody on the network can then drive.
+    """
+    keys = process.folder
+    if keys:
+        identity_in(Path(keys))
+    namespace = process.namespace
+    endpoint = secured(Endpoint(listen=listen, namespace=namespace, keys=keys, fleet=fleet))
+    if not keys and not insecure:
+        _refuse_exposed(listen)
+    settings = router_config(endpoint, run_folders.state_dir() / "robots" / (namespace or "router"))
+    here = Endpoint(connect=(reached_at(listen[0]),), namespace=namespace, keys=keys)
+    with announced(namespace or "router", secured(here)):
+        return process.run("router", msgspec.to_builtins(settings), endpoint)
+
+
+def perception(*, process: ProcessOptions = LOCAL) -> int:
+    """Run perception: it turns scans into a model of the surroundings.
+
+    Example: gigabrain perception --connect tcp/192.168.1.10:7447
+    """
+    return process.run("perception", {})
+
+
+def decision(
+    *,
+    behaviour: str = "avoid",
+    set: tuple[str, ...] = (),
+    scripts: Path | None = None,
+    state_dir: Path | None = None,
+    process: ProcessOptions = LOCAL,
+) -> int:
+    """Run decision: it chooses what to do in these surroundings.
+
+    Example: gigabrain decision --set turn=clearer
+
+    Args:
+        behaviour: Behaviour that drives: `avoid` or `navigate`.
+        set: Setting of the behaviour, as NAME=VALUE; may be given again.
+        scripts: Folder of the programs that missions may run.
+        state_dir: Folder for the tasks, which survive a restart.
+    """
+    values = behaviours.parse_settings(set)
+    if scripts:
+        values["scripts"] = str(scripts.absolute())
+    settings = DecisionConfig(
+        behaviour=behaviour,
+        settings=values,
+        state_dir=_state_folder(state_dir, process.namespace or "decision"),
+    )
+    behaviours.check(settings)  # refuse a wrong name before connecting
+    return process.run("decision", msgspec.to_builtins(settings))
+
+
+def control(*, process: ProcessOptions = LOCAL) -> int:
+    """Run control: it turns intents into smooth commands.
+
+    Example: gigabrain control
+    """
+    return process.run("control", {})
+
+
+def safety(*, process: ProcessOptions = LOCAL) -> int:
+    """Run safety: it monitors all processes and limits the speed.
+
+    Example: gigabrain safety
+    """
+    return process.run("safety", {})
+
+
+def driver(
+    name: str,
+    *,
+    link: LinkName = "sim",
+    world: World = "arena",
+    seed: Seed = 0,
+    speed: float = 1.0,
+    resume: Resume = "manual",
+    ports: Path | None = None,
+    state_dir: Path | None = None,
+    process: ProcessOptions = LOCAL,
+) -> int:
+    """Run the driver of a robot.
+
+    Example: gigabrain driver run turtlebot3_waffle --world house --resume auto
+
+    Args:
+        name: Known robot, or path of a robot's YAML file.
+        link: How to reach the robot: simulated, emulated or real.
+        speed: Simulated over real time. At any speed but 1, time waits for the brain.
+        resume: Drive on after a stop whose cause has passed: by itself, or when enabled.
+        ports: Folder of the emulator's ports, for `--link emulated`.
+        state_dir: Folder for the cause of a latch, which survives a restart.
+    """
+    from gigabrain_drivers.driver.catalog import load_robot
+
+    values = {
+        "body": name,
+        "link": link,
+        "world": world,
+        "seed": seed,
+        "speed": speed,
+        "resume": resume,
+        "emulator": str(ports.absolute()) if ports else "",
+        "state_dir": _state_folder(state_dir, process.namespace or Path(name).stem),
+    }
+    settings = checked(values, DriverConfig)
+    load_robot(name)  # refuse a wrong name before connecting
+    return process.run("driver", msgspec.to_builtins(settings))
+
+
+def button(*, port: str, process: ProcessOptions = LOCAL) -> int:
+    """Run an e-stop button: a normally closed contact between TX and RX of a serial adapter.
+
+    Example: gigabrain button --port usb:0403:6001
+
+    Args:
+        port: Serial adapter: a path, or usb:VID:PID[:SERIAL].
+    """
+    from gigabrain_drivers.links.ports import absent
+
+    settings = checked({"port": port}, ButtonConfig)
+    if problem := absent(port):  # the process itself reports it only once a robot is there
+        print_progress(f"gigabrain: {problem} Waiting for it.")
+    return process.run("button", msgspec.to_builtins(settings))
+
+
+def _refuse_exposed(listen: tuple[str, ...]) -> None:
+    try:
+        address = exposed(listen)
+    except ValueError as error:
+        raise ConfigError(f"--listen: {error}") from None
+    if address:
+        raise ConfigError(
+            f"--listen: anybody on the network can reach {address}; "
+            "add --keys, use a loopback address, or add --insecure"
+        )
+
+
+def _state_folder(chosen: Path | None, name: str) -> str:
+    return str(chosen or run_folders.state_dir() / "robots" / name)

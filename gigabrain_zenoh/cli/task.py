@@ -1,0 +1,236 @@
+"""`gigabrain goto`, `explore`, `patrol`, `mission` and `task`: the tasks of a robot."""
+
+import asyncio
+import sys
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from gigabrain_schemas.tasks import TaskStatus
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, print_line
+from gigabrain_zenoh.errors import ConfigError, Refused
+from gigabrain_zenoh.host.signals import run_async
+
+if TYPE_CHECKING:
+    from gigabrain_zenoh.client.tasks import Tasks
+
+Coordinate = Annotated[float, Parameter(allow_leading_hyphen=True)]
+Mode = Annotated[
+    Literal["replace", "queue", "preempt"],
+    Parameter(help="Replace all tasks, append to the queue, or run first and then go on."),
+]
+Wait = Annotated[bool, Parameter(help="Wait for the end; Ctrl-C then cancels the task.")]
+TaskName = Annotated[str, Parameter(help="Name of the task. Default: the current one.")]
+TaskNameOrAll = Annotated[
+    str, Parameter(help="Name of the task, or `all`. Default: the current one.")
+]
+
+
+def goto(
+    x: Coordinate,
+    y: Coordinate,
+    yaw: Annotated[float | None, Parameter(allow_leading_hyphen=True)] = None,
+    /,
+    *,
+    mode: Mode = "replace",
+    wait: Wait = True,
+    at: RobotAddress = LOCAL,
+) -> int:
+    """Send the robot to a place in its map, and wait until it arrives.
+
+    Example: gigabrain goto 3.0 1.5 1.57
+
+    Exit code 0 on arrival.
+
+    Args:
+        x: In the map [m].
+        y: In the map [m].
+        yaw: Heading on arrival [rad]. Default: any.
+    """
+    return _send(at, lambda tasks: tasks.go_to(x, y, yaw, how=mode), wait)
+
+
+def explore(*, mode: Mode = "replace", wait: Wait = True, at: RobotAddress = LOCAL) -> int:
+    """Explore until the map is complete.
+
+    Example: gigabrain explore
+    """
+    return _send(at, lambda tasks: tasks.explore(how=mode), wait)
+
+
+def patrol(
+    file: Path,
+    /,
+    *,
+    loops: int | None = None,
+    mode: Mode = "replace",
+    wait: Wait = True,
+    at: RobotAddress = LOCAL,
+) -> int:
+    """Visit the places of a file in turn.
+
+    Example: gigabrain patrol round.yaml --loops 3
+
+    Args:
+        file: YAML file: `points: [[1, 2], [3, 0.5, 1.57]]`, or names of its `places`.
+        loops: Number of rounds. Default: no limit.
+    """
+    from gigabrain_zenoh.decision.tasks.mission import MAX_LOOPS, load_patrol, patrol_mission
+
+    if loops is not None and not 1 <= loops <= MAX_LOOPS:
+        raise ConfigError(f"--loops: expected 1 to {MAX_LOOPS}, got {loops}")
+    text = patrol_mission(load_patrol(file), loops)
+    return _send(at, lambda tasks: tasks.carry_out(text, how=mode, label=file.stem), wait)
+
+
+def mission(
+    file: Path,
+    /,
+    *,
+    check: bool = False,
+    mode: Mode = "replace",
+    wait: Wait = True,
+    at: RobotAddress = LOCAL,
+) -> int:
+    """Run a mission from a file.
+
+    Example: gigabrain mission evening.yaml
+
+    Args:
+        file: YAML file; docs/missions.md describes it.
+        check: Only check the file; no robot is needed.
+    """
+    from gigabrain_zenoh.decision.tasks.mission import load
+
+    load(file)  # refuse a wrong file before connecting
+    if check:
+        print_line(f"{file}: valid")
+        return 0
+    return _send(at, lambda tasks: tasks.carry_out(file, how=mode), wait)
+
+
+def list_(*, at: RobotAddress = LOCAL) -> int:
+    """List the current task, the queue and the last tasks.
+
+    Example: gigabrain task list
+    """
+
+    async def show(tasks: "Tasks") -> None:
+        status = await tasks.status()
+        rows = (*((status.current,) if status.current else ()), *status.queue, *status.done)
+        for one in rows:
+            print_line(f"{one.id:<12} {one.state:<10} {one.source:<14} {one.label}  {one.reason}")
+        if not rows:
+            print_line("no tasks")
+
+    return _with_tasks(at, show)
+
+
+def cancel(task: TaskNameOrAll = "", /, *, at: RobotAddress = LOCAL) -> int:
+    """Cancel the current task, or another one.
+
+    Example: gigabrain task cancel goal-7
+    """
+    return _with_tasks(at, lambda tasks: _print_reply(tasks.cancel(task)))
+
+
+def pause(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> int:
+    """Pause a task.
+
+    Example: gigabrain task pause
+    """
+    return _with_tasks(at, lambda tasks: _print_reply(tasks.pause(task)))
+
+
+def resume(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> int:
+    """Resume a paused task.
+
+    Example: gigabrain task resume
+    """
+    return _with_tasks(at, lambda tasks: _print_reply(tasks.resume(task)))
+
+
+async def _print_reply(reply: Awaitable[str]) -> None:
+    print_line(await reply)
+
+
+def _with_tasks(at: RobotAddress, do: "Callable[[Tasks], Awaitable[None]]") -> int:
+    import getpass
+
+    from gigabrain_zenoh.client.tasks import Tasks
+    from gigabrain_zenoh.runtime.connect import joined
+
+    async def run() -> None:
+        async with joined(at.where(), f"{getpass.getuser()}-cli") as (bus, _):
+            await do(Tasks(bus, at.folder, on_wait=print_line))
+
+    run_async(run())
+    return 0
+
+
+def _send(at: RobotAddress, send: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> int:
+    async def run(tasks: "Tasks") -> None:
+        from gigabrain_zenoh.decision.tasks.drive_command import describe_end
+
+        name = await send(tasks)
+        if not wait:
+            return print_line(f"{name}: accepted")
+        line = ProgressLine()
+        try:
+            ended = await tasks.result(name, lambda status: line.show(name, status))
+        except asyncio.CancelledError:  # Ctrl-C
+            line.clear()
+            await tasks.cancel(name)
+            print_line(f"{name}: cancelled")
+            raise
+        line.clear()
+        if ended.state != "succeeded":
+            raise Refused(describe_end(ended))
+        print_line(describe_end(ended))
+
+    return _with_tasks(at, run)
+
+
+class ProgressLine:
+    """Progress of a task, in one line of a terminal; in a pipe one line per step."""
+
+    def __init__(self) -> None:
+        self._terminal = sys.stdout.isatty()
+        self._step: str | None = None  # that was printed last
+
+    def show(self, name: str, status: TaskStatus) -> None:
+        """Show the progress of the task `name`."""
+        text = progress(name, status)
+        if self._terminal:
+            print(f"\r\x1b[K{text}", end="", flush=True)
+        elif status.doing != self._step:
+            self._step = status.doing
+            print_line(text)
+
+    def clear(self) -> None:
+        """Clear the line of the terminal."""
+        if self._terminal:
+            print("\r\x1b[K", end="", flush=True)
+
+
+def progress(name: str, status: TaskStatus) -> str:
+    """Return the progress of the task `name`, in a line."""
+    current = status.current
+    if current is None or current.id != name:
+        queued = [task.id for task in status.queue]
+        position = queued.index(name) + 1 if name in queued else 0
+        return f"{name}: waiting, {position} in the queue" if position else f"{name}: accepted"
+    if current.state == "paused":
+        return f"{name}: paused, {current.reason}"
+    if not status.doing:
+        return f"{name}: accepted, {current.reason}" if current.reason else f"{name}: accepted"
+    parts = [f"{name}: {status.doing}", f"{100 * status.progress:.0f} %"]
+    if status.distance_remaining is not None:
+        parts.append(f"{status.distance_remaining:.1f} m")
+    if status.eta is not None:
+        parts.append(f"{status.eta:.0f} s")
+    if current.reason != status.doing:
+        parts.append(current.reason)
+    return ", ".join(parts)

@@ -1,0 +1,155 @@
+"""Finds the processes of a robot, how they are doing, and which sends to which."""
+
+import asyncio
+from collections.abc import Iterable, Iterator, Mapping
+
+from msgspec import Struct, field
+from rich.table import Table
+
+from gigabrain_schemas.requests import DescribeRequest, Description
+from gigabrain_schemas.safety import Health
+from gigabrain_schemas.topics import DESCRIBE, HEALTH
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.diagnostics.topic_names import matches, short, topic_of
+from gigabrain_zenoh.errors import BodyLost, unknown
+
+DESCRIBE_TIMEOUT_S = 1.2
+HEALTH_WINDOW_S = 1.3  # health is published once a second
+
+
+class Flow(Struct, frozen=True, order=True):
+    """A key that one process sends to another."""
+
+    sender: str
+    key: str
+    receiver: str
+    hz: float = field(default=0.0)  # as the sender last reported
+
+
+class Processes(Struct, frozen=True):
+    """All processes of a robot, by name."""
+
+    described: Mapping[str, Description]
+    health: Mapping[str, Health]  # newest
+
+    def names(self) -> list[str]:
+        """Return all names, sorted."""
+        return sorted({*self.described, *self.health})
+
+
+async def discover(bus: Bus, timeout_s: float = DESCRIBE_TIMEOUT_S) -> dict[str, Description]:
+    """Return the description of each process that answers, by name."""
+    replies = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=timeout_s, name="*")
+    return {one.process: one for one in sorted(replies, key=lambda one: one.process)}
+
+
+async def find_processes(bus: Bus, seconds: float = HEALTH_WINDOW_S) -> Processes:
+    """Return all processes with their health. Raises BodyLost where there are none."""
+    health: dict[str, Health] = {}
+    close = bus.subscribe(HEALTH, lambda _key, newest: health.update({newest.process: newest}))
+    described, _ = await asyncio.gather(discover(bus), asyncio.sleep(seconds))
+    close()
+    if not described and not health:
+        raise BodyLost("the router answers, but no process of a robot does; start the robot")
+    return Processes(described, health)
+
+
+def senders(key: str, processes: Iterable[Description]) -> list[str]:
+    """Return the processes that have sent on `key`."""
+    return [one.process for one in processes if any(matches(key, sent) for sent in one.publishes)]
+
+
+def receivers(key: str, processes: Iterable[Description]) -> list[str]:
+    """Return the processes that subscribe to `key`."""
+    return [
+        one.process
+        for one in processes
+        if any(matches(wanted, key) or matches(key, wanted) for wanted in one.subscribes)
+    ]
+
+
+def flows(processes: Iterable[Description], health: Mapping[str, Health]) -> list[Flow]:
+    """Return every flow of messages, from senders to receivers.
+
+    A key that its sender reports at 0 Hz is no flow, unless its last value is kept for late
+    subscribers.
+    """
+    processes, found = tuple(processes), set()
+    for sender in processes:
+        rates = health[sender.process].sent_hz if sender.process in health else None
+        for key in sender.publishes:
+            hz = rates.get(key, 0.0) if rates is not None else 0.0
+            topic = topic_of(key)
+            if rates is not None and not hz and not (topic and topic.keep):
+                continue
+            for name in receivers(key, processes):
+                if name != sender.process:
+                    found.add(Flow(sender.process, key, name, hz))
+    return sorted(found)
+
+
+def process_table(processes: Processes) -> Table:
+    """Return a table with one row per process."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for name in ("process", "pid", "host", "up", "CPU", "memory", "rejected", "latency"):
+        left = name in ("process", "host", "latency")
+        table.add_column(name, justify="left" if left else "right")
+    for name in processes.names():
+        table.add_row(*_row(name, processes))
+    return table
+
+
+def _row(name: str, processes: Processes) -> tuple[str, ...]:
+    one, health = processes.described.get(name), processes.health.get(name)
+    place = one or health
+    assert place
+    if health is None:
+        return (name, str(place.pid), place.host, "-", "-", "-", "-", "reports no health")
+    return (
+        name,
+        str(place.pid),
+        place.host,
+        f"{health.uptime_s:.0f} s",
+        f"{health.cpu:.1%}",
+        f"{health.rss_bytes / 1e6:.0f} MB",
+        str(sum(health.rejected.values())),
+        "  ".join(f"{what} {value:.1f} ms" for what, value in health.latency_ms.items()),
+    )
+
+
+def describe(processes: Processes, name: str) -> Iterator[str]:
+    """Yield lines with all that is known of one process. Raises UnknownName."""
+    one, health = processes.described.get(name), processes.health.get(name)
+    if one is None and health is None:
+        raise unknown("process", name, processes.names())
+    if one is None:
+        yield f"{name}: reports its health, but does not answer"
+    else:
+        yield f"{name}: version {one.version}, pid {one.pid} on {one.host}"
+    if health:
+        memory = f"{health.rss_bytes / 1e6:.0f} MB"
+        yield f"  up {health.uptime_s:.0f} s, {health.cpu:.1%} of a core, {memory}"
+    yield from _rates("sends", one.publishes if one else (), health.sent_hz if health else {})
+    received_hz = health.received_hz if health else {}
+    yield from _rates("receives", one.subscribes if one else (), received_hz)
+    if health:
+        yield from (f"  problem: {one.text} ({one.remedy})" for one in health.problems)
+        yield from _values("rejected", health.rejected)
+        yield from _values("latency [ms]", health.latency_ms)
+        yield from _values("counters", health.counters)
+    if one:
+        yield from _values("report", one.report)
+
+
+def _rates(title: str, keys: tuple[str, ...], hz: Mapping[str, float]) -> Iterator[str]:
+    yield f"  {title}:"
+    for key in sorted({*keys, *hz}):
+        yield f"    {short(key):<20} {hz.get(key, 0.0):>6.1f} Hz"
+
+
+def _values(title: str, values: Mapping[str, object]) -> Iterator[str]:
+    if values:
+        yield f"  {title}:"
+    for name, value in values.items():
+        shown = f"{value:.6g}" if isinstance(value, float) else "-" if value is None else value
+        yield f"    {name:<28} {shown}"

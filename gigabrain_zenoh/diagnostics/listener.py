@@ -1,0 +1,129 @@
+"""Opens the topic that a name stands for, and receives its messages until nobody reads them."""
+
+import asyncio
+import os
+import stat
+from collections import deque
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from typing import Final
+
+from msgspec import Struct
+
+from gigabrain_schemas.requests import Description
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.diagnostics.discovery import discover
+from gigabrain_zenoh.diagnostics.topic_names import Target, no_topic, target
+from gigabrain_zenoh.diagnostics.topic_stats import TopicMonitor, monitored
+from gigabrain_zenoh.runtime.connect import Where, joined
+from gigabrain_zenoh.runtime.running import find_endpoint
+
+SNAPSHOT_S = 1.2  # long enough for topics of 1 Hz
+MAX_QUEUED = 256  # messages that wait to be shown; beyond it the oldest is dropped
+CLIENT_NAME = "tool"
+ALL_KEYS, ROBOT_KEYS = "**", "robot/**"
+STDOUT: Final = 1  # the descriptor; sys.stdout may be replaced
+
+
+class RawMessage(Struct, frozen=True):
+    """One message as it arrived."""
+
+    key: str
+    payload: bytes
+
+
+class Snapshot(Struct, frozen=True):
+    """What was on the bus during a short time."""
+
+    start_ns: int
+    monitor: TopicMonitor
+    processes: dict[str, Description]
+
+    @property
+    def live_keys(self) -> set[str]:
+        """Return the keys on which anything was sent."""
+        published = {key for one in self.processes.values() for key in one.publishes}
+        return published | set(self.monitor.streams())
+
+
+def widest_pattern(where: Where) -> str:
+    """Return the widest key expression allowed; with keys a router permits only the robot's."""
+    keys = find_endpoint(where.connect, where.namespace, where.keys).keys
+    return ROBOT_KEYS if keys else ALL_KEYS
+
+
+async def snapshot(bus: Bus, pattern: str = ALL_KEYS, seconds: float = SNAPSHOT_S) -> Snapshot:
+    """Count messages for `seconds`, and discover the processes meanwhile."""
+    with monitored(bus, pattern) as monitor:
+        start_ns = bus.clock.now_ns()
+        processes, _ = await asyncio.gather(discover(bus), asyncio.sleep(seconds))
+    return Snapshot(start_ns, monitor, processes)
+
+
+@asynccontextmanager
+async def open_topic(
+    where: Where, name: str, *, looks_on: bool = False
+) -> AsyncIterator[tuple[Bus, Target]]:
+    """Connect, and find the topic that `name` stands for. Raises BusError and UnknownName."""
+    async with joined(where, CLIENT_NAME, looks_on=looks_on) as (bus, _):
+        found = target(name)
+        if found is None:
+            live_keys = (await snapshot(bus, widest_pattern(where))).live_keys
+            found = target(name, live_keys)
+            if found is None:
+                raise no_topic(name, live_keys)
+        yield bus, found
+
+
+async def messages(bus: Bus, aim: Target) -> AsyncIterator[RawMessage | int]:
+    """Yield messages as they arrive, the kept value first; an int is a number of dropped ones."""
+    loop, arrived = asyncio.get_running_loop(), asyncio.Event()
+    queue: deque[RawMessage] = deque(maxlen=MAX_QUEUED)
+    dropped = 0
+
+    def append(message: RawMessage) -> None:
+        nonlocal dropped
+        dropped += len(queue) == MAX_QUEUED
+        queue.append(message)
+        arrived.set()
+
+    def receive(key: str, _encoding: str, payload: bytes) -> None:
+        loop.call_soon_threadsafe(append, RawMessage(key, payload))
+
+    close = bus.tap(aim.pattern, receive)
+    try:
+        if aim.topic and aim.topic.keep:
+            for payload in await bus.kept(aim.topic):
+                yield RawMessage(aim.topic.key, payload)
+        while True:
+            await arrived.wait()
+            arrived.clear()
+            if dropped:
+                count, dropped = dropped, 0
+                yield count
+            while queue:
+                yield queue.popleft()
+    finally:
+        close()
+
+
+@contextmanager
+def stop_on_broken_pipe(stop: asyncio.Event) -> Iterator[None]:
+    """Set `stop` as soon as the other end of the pipe on stdout is closed.
+
+    Otherwise `gigabrain log --follow | head -1` ends only with the next line, which may never come.
+    """
+    loop = asyncio.get_running_loop()
+    if not stat.S_ISFIFO(os.fstat(STDOUT).st_mode):
+        yield
+        return
+
+    def closed() -> None:
+        loop.remove_reader(STDOUT)
+        stop.set()
+
+    loop.add_reader(STDOUT, closed)  # the writing end is never readable: only closing wakes us
+    try:
+        yield
+    finally:
+        loop.remove_reader(STDOUT)

@@ -1,0 +1,260 @@
+"""`gigabrain topic`: lists topics, and prints and measures their messages."""
+
+import asyncio
+import sys
+from collections.abc import Callable, Coroutine, Iterator
+from types import UnionType
+from typing import Any, Literal
+
+import msgspec
+from msgspec import Struct
+from rich.table import Table
+
+from gigabrain_schemas.topics import TOPICS, Topic
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.diagnostics.discovery import discover, receivers, senders
+from gigabrain_zenoh.diagnostics.listener import RawMessage, Snapshot, messages, stop_on_broken_pipe
+from gigabrain_zenoh.diagnostics.message_text import as_json, in_a_line, lines, pick, read
+from gigabrain_zenoh.diagnostics.topic_names import Target, matches, short, topic_of
+from gigabrain_zenoh.diagnostics.topic_stats import StreamStats, monitored
+from gigabrain_zenoh.errors import BodyLost
+from gigabrain_zenoh.host.signals import stop_signals
+
+SILENCE_NOTICE_S = 2.0  # without a message, until the user gets a notice
+REPORT_PERIOD_S = 1.0
+Quantity = Literal["hz", "bw", "delay"]
+
+
+class TopicRow(Struct, frozen=True, kw_only=True):
+    """One key of `topic list`."""
+
+    key: str
+    type: str | None  # of the table; None for keys of other projects
+    hz: float
+    promised_hz: float | None
+    size: int | None  # [bytes], median
+    age_s: float | None  # of the newest message; None without one
+    senders: tuple[str, ...]
+    receivers: tuple[str, ...]
+
+
+def rows(found: Snapshot, now_ns: int, *, all_topics: bool = False) -> list[TopicRow]:
+    """Return every key with a sender or a receiver, and with `all_topics` the rest of the table."""
+    processes = tuple(found.processes.values())
+    stats, streams = found.monitor.stats(found.start_ns), found.monitor.streams()
+    keys = found.live_keys | {k for one in processes for k in one.subscribes if "*" not in k}
+    if all_topics:
+        keys |= {topic.key for topic in TOPICS if not topic.many}
+    made = []
+    for key in sorted(keys):
+        topic, one = topic_of(key), stats.get(key)
+        if topic is None and key not in streams:
+            continue  # a service, not a topic
+        made.append(
+            TopicRow(
+                key=key,
+                type=topic.type.__name__ if topic else None,
+                hz=round(one.hz, 2) if one else 0.0,
+                promised_hz=topic.hz if topic else None,
+                size=one.size if one else None,
+                age_s=streams[key].age_s(now_ns) if key in streams else None,
+                senders=tuple(senders(key, processes)),
+                receivers=tuple(receivers(key, processes)),
+            )
+        )
+    return made
+
+
+def topic_table(found: list[TopicRow]) -> Table:
+    """Return a table with one row per key."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for name in ("topic", "message", "Hz", "promised", "bytes", "age", "from", "to"):
+        left = name in ("topic", "message", "from", "to")
+        wraps = name in ("from", "to")
+        table.add_column(name, justify="left" if left else "right", no_wrap=not wraps)
+    for row in found:
+        table.add_row(
+            short(row.key),
+            row.type or "?",
+            f"{row.hz:.1f}" if row.hz else "-",
+            f"{row.promised_hz:g}" if row.promised_hz else "",
+            str(row.size) if row.size is not None else "-",
+            f"{row.age_s:.2f} s" if row.age_s is not None else "-",
+            ", ".join(row.senders) or "-",
+            ", ".join(row.receivers) or "-",
+        )
+    return table
+
+
+def describe(aim: Target, found: Snapshot, now_ns: int) -> Iterator[str]:
+    """Yield lines with all that is known of one topic."""
+    topic = aim.topic
+    yield aim.pattern
+    if topic:
+        kept = ", last value kept for late subscribers" if topic.keep else ""
+        yield f"  {topic.type.__name__}: {' '.join((topic.type.__doc__ or '').split())}"
+        yield f"  promised {topic.hz:g} Hz, stale after {topic.stale_after_ns / 1e9:g} s{kept}"
+        yield (
+            f"  priority {topic.priority}, {topic.congestion} when congested, "
+            f"at most {topic.max_bytes} bytes"
+        )
+    else:
+        yield "  not a topic of this project; shown raw"
+    for row in rows(found, now_ns, all_topics=True):
+        if matches(aim.pattern, row.key):
+            yield from _measured(row)
+    if topic:
+        yield "  fields:"
+        for one in msgspec.structs.fields(topic.type):
+            optional = "" if one.required else "  (optional)"
+            yield f"    {one.name}: {_type_name(one.type)}{optional}"
+
+
+def _measured(row: TopicRow) -> Iterator[str]:
+    rate = "no messages"
+    if row.age_s is not None:
+        rate = f"{row.hz:g} Hz, {row.size} bytes, {row.age_s:.2f} s ago"
+    yield f"  {row.key}: {rate}"
+    yield f"    from {', '.join(row.senders) or '-'} to {', '.join(row.receivers) or '-'}"
+
+
+def _type_name(kind: object) -> str:
+    """Return a type in short form, without bounds and modules."""
+    text = getattr(kind, "__name__", None)
+    if isinstance(kind, type) and text and not hasattr(kind, "__args__"):
+        return str(text)
+    origin, inner = getattr(kind, "__origin__", None), getattr(kind, "__args__", ())
+    if getattr(kind, "__metadata__", None):
+        return _type_name(origin)
+    if not inner:
+        return repr(kind)
+    names = ["None" if a is type(None) else _type_name(a) for a in inner if a is not Ellipsis]
+    if isinstance(kind, UnionType) or str(origin) == "typing.Union":
+        return " | ".join(names)
+    if str(origin) == "typing.Literal":
+        return " | ".join(map(repr, inner))
+    return f"{getattr(origin, '__name__', origin)}[{', '.join(names)}]"
+
+
+class EchoOptions(Struct, frozen=True, kw_only=True):
+    """What `topic echo` prints, and when it ends."""
+
+    json: bool = False
+    fields: tuple[str, ...] = ()
+    count: int | None = None  # messages until it ends
+    within_s: float | None = None  # limit for the first message; exit code 1 after it
+
+
+def message_lines(message: RawMessage, options: EchoOptions) -> Iterator[str]:
+    """Yield the lines of one message. Raises UnknownName for a field that it does not have."""
+    value = read(message.key, message.payload, whole=options.json)
+    if options.fields and "invalid" not in value:
+        value = pick(value, options.fields)
+    if options.json:
+        yield as_json({"key": message.key, **value})
+    elif options.fields:
+        yield "  ".join(f"{name}={in_a_line(inner)}" for name, inner in value.items())
+    else:
+        yield f"--- {message.key}"
+        yield from lines(value)
+
+
+async def echo(bus: Bus, aim: Target, options: EchoOptions, out: Callable[[str], None]) -> int:
+    """Print messages as they arrive. Raises BodyLost where the first one comes too late."""
+    left = options.count
+    first = asyncio.Event()
+
+    async def show() -> None:
+        nonlocal left
+        async for message in messages(bus, aim):
+            first.set()
+            if isinstance(message, int):
+                print(f"{message} messages dropped: too fast to show", file=sys.stderr, flush=True)
+                continue
+            for line in message_lines(message, options):
+                out(line)
+            left = None if left is None else left - 1
+            if left == 0:
+                return
+
+    return await _until_stopped(show(), _report_silence(bus, aim, first, options.within_s))
+
+
+async def measure(
+    bus: Bus, aim: Target, what: Quantity, count: int | None, out: Callable[[str], None]
+) -> int:
+    """Print one line per key and second, for `count` seconds with messages."""
+    first = asyncio.Event()
+
+    async def report() -> None:
+        left = count
+        with monitored(bus, aim.pattern) as monitor:
+            while left is None or left > 0:
+                since_ns = bus.clock.now_ns()
+                await asyncio.sleep(REPORT_PERIOD_S)
+                found = monitor.stats(since_ns)
+                for key, stats in found.items():
+                    first.set()
+                    missing = monitor.missing(key)
+                    lost = f"  {missing} missing" if missing else ""
+                    out(f"{key}  {stats_text(what, stats, aim.topic)}{lost}")
+                if not found and first.is_set():
+                    out(f"{aim.pattern}  no messages")
+                left = left if left is None or not found else left - 1
+
+    return await _until_stopped(report(), _report_silence(bus, aim, first, None))
+
+
+def stats_text(what: Quantity, stats: StreamStats, topic: Topic[Any] | None) -> str:
+    """Return one quantity of a stream, in a line."""
+    if what == "bw":
+        return f"{stats.bytes_s / 1e3:.1f} kB/s  {stats.size} bytes  {stats.count} messages"
+    if what == "delay":
+        if stats.delay_median_ms is None:
+            return "no time stamps"
+        return (
+            f"delay median {stats.delay_median_ms:.2f} ms  min {stats.delay_min_ms:.2f}  "
+            f"max {stats.delay_max_ms:.2f}"
+        )
+    promised = f"  promised {topic.hz:g}" if topic else ""
+    if stats.gap_max_ms is None:
+        return f"{stats.hz:.2f} Hz{promised}"
+    return (
+        f"{stats.hz:.2f} Hz{promised}  gap min {stats.gap_min_ms:.1f} ms  "
+        f"max {stats.gap_max_ms:.1f}  std {stats.gap_std_ms:.1f}"
+    )
+
+
+async def _report_silence(
+    bus: Bus, aim: Target, first: asyncio.Event, within_s: float | None
+) -> None:
+    """Print a notice if no message arrives. Raises BodyLost instead if there is a limit."""
+    try:
+        await asyncio.wait_for(first.wait(), within_s or SILENCE_NOTICE_S)
+    except TimeoutError:
+        processes = (await discover(bus)).values()
+        by = ", ".join(senders(aim.pattern, processes)) or "none"
+        to = ", ".join(receivers(aim.pattern, processes)) or "none"
+        text = f"no messages on {aim.pattern} (senders: {by}; receivers: {to})"
+        if within_s:
+            raise BodyLost(text) from None
+        print(f"{text}; waiting", file=sys.stderr, flush=True)
+        await first.wait()
+
+
+async def _until_stopped(work: Coroutine[Any, Any, None], watch: Coroutine[Any, Any, None]) -> int:
+    """Run both until `work` is done, either raises, a signal comes or stdout is closed."""
+    tasks = [asyncio.ensure_future(work), asyncio.ensure_future(watch)]
+    with stop_signals() as stop, stop_on_broken_pipe(stop):
+        stopped = asyncio.ensure_future(stop.wait())
+        pending = {*tasks, stopped}
+        while tasks[0] in pending and stopped in pending:
+            done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
+            if any(not task.cancelled() and task.exception() for task in done):
+                break
+    for task in (*tasks, stopped):
+        task.cancel()
+    for result in await asyncio.gather(*tasks, return_exceptions=True):
+        if isinstance(result, BaseException) and not isinstance(result, asyncio.CancelledError):
+            raise result
+    return 0
