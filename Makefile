@@ -34,7 +34,7 @@ $(INSTALLED): pyproject.toml
 
 # the kernels, compiled once
 $(WARM): $(INSTALLED)
-	@$(BIN)/gigabrain warm
+	@$(BIN)/gigabrain precompile
 	@touch $@
 
 demo: setup
@@ -134,7 +134,7 @@ recordings: setup
 	$(BIN)/python -m gigabrain_zenoh.qa.drives tests/recordings
 
 pictures: setup
-	$(BIN)/gigabrain view --png docs/pictures/waffle_in_house.png --world house --seed 1
+	$(BIN)/gigabrain render docs/pictures/waffle_in_house.png --world house --seed 1
 	$(BIN)/python -m tests.qa.pictures docs/pictures
 
 clean:

@@ -68,6 +68,15 @@ CLI_WORDS: tuple[Rename, ...] = (
     Rename("demo --turn", "--set", _TURNS),
     Rename("decision --turn", "--set", _TURNS),
     Rename("decision --begin", "--set", {"wait": "start=wait", "roam": "start=explore"}),
+    Rename("warm", "precompile"),
+    Rename("view", "render"),
+    Rename("render --png", "--file"),
+    Rename("goto --how", "--mode"),
+    Rename("explore --how", "--mode"),
+    Rename("patrol --how", "--mode"),
+    Rename("mission --how", "--mode"),
+    Rename("decision --remember", "--state-dir"),
+    Rename("driver run --remember", "--state-dir"),
 )
 
 _printed: set[str] = set()

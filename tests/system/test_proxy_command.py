@@ -21,7 +21,7 @@ async def test_the_command_spoils_a_line_as_it_is_told(
     home: Home, server: tuple[Server, int]
 ) -> None:
     command = home.start("proxy", f"tcp/127.0.0.1:{server[1]}", "--chaos", "down hole")
-    await until(lambda: "leads to" in command.out, "it listens")
+    await until(lambda: "forwards to" in command.out, "it listens")
     host, _, port = command.out.split()[0].rpartition(":")
     reader, writer = await asyncio.open_connection(host, int(port))
     writer.write(b"question")

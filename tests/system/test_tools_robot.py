@@ -87,7 +87,7 @@ async def test_foreign_keys_are_shown_raw_and_unknown_ones_answered_with_the_nea
     assert "no topic 'scna'; did you mean 'scan'?" in wrong.err
     silent = await demo.run("topic", "echo", "pose", "--within", "0.5")
     assert await silent.ended() == 1
-    assert "nothing comes on robot/pose (senders: nobody" in silent.err
+    assert "robot/pose (senders: none" in silent.err
 
 
 async def test_a_message_that_is_sent_arrives(demo: Home) -> None:
@@ -196,7 +196,7 @@ async def test_an_e_stop_is_named_with_the_way_out(demo: Home) -> None:
     assert await (await demo.run("release")).ended() == 0
     idle = await demo.run("why")
     assert await idle.ended() == 18
-    assert "it is idle: nobody has enabled it" in idle.out
+    assert "idle: not enabled yet" in idle.out
 
 
 async def test_the_doctor_finds_a_process_that_is_gone(demo: Home) -> None:

@@ -259,7 +259,7 @@ async def test_a_taken_port_is_said_in_one_line(home: Home) -> None:
         assert up.out.count(taken) == 1
 
 
-@pytest.mark.parametrize("where", ["state", "run", "run_dir", "remember"])
+@pytest.mark.parametrize("where", ["state", "run", "run_dir", "state-dir"])
 async def test_a_folder_that_cannot_be_written_is_said_in_one_line(home: Home, where: str) -> None:
     """A file stands where the folder should be, which stops root as well."""
     place = home.folder / where
@@ -269,9 +269,9 @@ async def test_a_folder_that_cannot_be_written_is_said_in_one_line(home: Home, w
         "state": ("up", str(home.deployment())),
         "run": (*AVOID, "--headless", "--seconds", "1"),
         "run_dir": ("perception", "--run-dir", str(place), *router),
-        "remember": ("driver", "run", "mock", "--remember", str(place)),
+        "state-dir": ("driver", "run", "mock", "--state-dir", str(place)),
     }
-    if where == "remember":
+    if where == "state-dir":
         listen = f"tcp/127.0.0.1:{free_port()}"
         home.start("router", "--listen", listen)
         commands[where] += ("--connect", listen)

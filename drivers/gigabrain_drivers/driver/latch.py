@@ -73,5 +73,5 @@ class LatchFile:
 def _unwritable(folder: Path, error: OSError) -> str:
     return (
         f"cannot write {folder}: {error.strerror}; make it writable, "
-        "or name another with --remember or XDG_STATE_HOME"
+        "or name another with --state-dir or XDG_STATE_HOME"
     )

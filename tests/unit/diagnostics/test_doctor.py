@@ -44,7 +44,7 @@ def health(name: str, **other: Any) -> Health:
 
 ROBOT = RobotFacts(
     router="tcp/127.0.0.1:7447",
-    there={name: replace(example(Description), process=name) for name in SENT},
+    described={name: replace(example(Description), process=name) for name in SENT},
     health={name: health(name) for name in SENT},
     lead_ms={"waffle": 0.4},
     pace=1.0,
@@ -70,15 +70,15 @@ def test_a_machine_and_a_robot_that_are_well_are_said_to_be() -> None:
         ({"libraries": {"eclipse-zenoh": "1.9.9"}}, "eclipse-zenoh", "1.9.9 is too old", ">=1.10"),
         (
             {"folders": (Folder(path="/v", writable=False, free_mb=9000),)},
-            "folder", "/v cannot be written", "XDG_STATE_HOME",
+            "folder", "cannot write to /v", "XDG_STATE_HOME",
         ),
         (
             {"folders": (Folder(path="/v", writable=True, free_mb=12),)},
-            "disk", "12 MB left", "delete old runs",
+            "disk", "12 MB free", "delete old runs",
         ),
         ({"ports": (PORT,)}, "serial", "/dev/ttyACM0", 'ATTRS{idVendor}=="0483"'),
         ({"ports": (PORT,)}, "serial", "0483:5740", "usermod -aG dialout"),
-        ({"multicast": True}, "multicast", "look for others", "reinstall"),
+        ({"multicast": True}, "multicast", "search for others", "reinstall"),
         ({"certificate": EXPIRED}, "keys", "expired on 2026-01-01", "gigabrain keys issue"),
         (
             {"certificate": Certificate(folder="keys/red", name="robot@red", days_left=12.0)},
@@ -97,15 +97,16 @@ def test_what_is_wrong_with_a_machine_is_found(
 
 def test_a_library_that_one_can_do_without_is_a_hint_and_no_fault() -> None:
     (one,) = found(machine=replace(MACHINE, libraries={"textual": None}))
-    assert (one.grade, one.cure) == ("hint", "pip install 'gigabrain-zenoh[view]', if you want it")
+    assert one.grade == "hint"
+    assert "pip install 'gigabrain-zenoh[view]'" in one.cure
     assert exit_code([one]) == 0
 
 
 @pytest.mark.parametrize("name", SENT)
 def test_a_process_that_is_gone_is_found(name: str) -> None:
-    rest = {key: one for key, one in ROBOT.there.items() if key != name}
+    rest = {key: one for key, one in ROBOT.described.items() if key != name}
     told = {key: one for key, one in ROBOT.health.items() if key != name}
-    (one,) = found(robot=replace(ROBOT, there=rest, health=told))
+    (one,) = found(robot=replace(ROBOT, described=rest, health=told))
     assert (one.about, one.text) == (name, "does not answer")
     assert one.cure == f"start it, or read its log: gigabrain log --process {name}"
 
@@ -113,7 +114,7 @@ def test_a_process_that_is_gone_is_found(name: str) -> None:
 @pytest.mark.parametrize(
     ("change", "about", "words"),
     [
-        ({"there": {**ROBOT.there, "safety": replace(ROBOT.there["safety"], version="9")}},
+        ({"described": {**ROBOT.described, "safety": replace(ROBOT.described["safety"], version="9")}},
          "versions", "the processes differ: 0.1.0, 9"),
         ({"health": {**ROBOT.health, "driver": health("driver", sent_hz={"robot/scan": 10.0})}},
          "robot/state", "0 Hz from driver, promised 50"),
@@ -144,15 +145,13 @@ def test_a_router_that_does_not_answer_is_found(port_open: bool, words: str) -> 
 
 def test_that_no_robot_runs_is_no_fault_of_the_machine() -> None:
     (one,) = found(robot=RobotFacts(problem="no robot runs here; start one"))
-    assert (one.grade, one.text, one.cure) == ("hint", "no robot runs here", "start one")
+    assert (one.grade, one.text) == ("hint", "no robot runs here; start one")
 
 
 def test_of_several_robots_one_is_to_be_chosen() -> None:
-    (one,) = found(
-        robot=RobotFacts(problem="several robots run here; choose one with --connect: a, b")
-    )
-    assert (one.grade, one.text) == ("hint", "several robots run here")
-    assert one.cure == "choose one with --connect: a, b"
+    problem = "several robots run here; choose one with --connect: a, b"
+    (one,) = found(robot=RobotFacts(problem=problem))
+    assert (one.grade, one.text) == ("hint", problem)
 
 
 def test_a_slow_simulation_is_no_slow_robot() -> None:

@@ -7,8 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from gigabrain_zenoh.diagnostics.plain_table import PlainTable
 from msgspec.structs import replace
+from rich.text import Text
+from textual.widgets import DataTable
 
 from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import Description, ParamReply, ParamRequest
@@ -29,15 +30,13 @@ from gigabrain_zenoh.diagnostics.log_reader import LogFilter, ago_ns, as_line, r
 from gigabrain_zenoh.diagnostics.top import (
     PROCESS_COLUMNS,
     TOPIC_COLUMNS,
-    History,
     Rows,
     cell_text,
-    process_cells,
+    cells,
     process_row,
     sorted_rows,
     sparkline,
     stream_row,
-    topic_cells,
 )
 from gigabrain_zenoh.diagnostics.top_app import TopApp
 from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
@@ -90,26 +89,23 @@ class Feed:
     def refresh(self) -> tuple[Rows, Rows]:
         calm = process_row(replace(example(Health), process="calm", cpu=0.01), 0.5)
         busy = process_row(replace(example(Health), process="busy", cpu=0.9), 9.0)
-        processes = {row.name: process_cells(row, History()) for row in (calm, busy)}
         scan = stream_row("robot/scan", None, 0.5, 0)
         pose = stream_row("robot/pose", None, 1.5, 3)
-        topics = {row.name: topic_cells(row, History()) for row in (scan, pose)}
-        return processes, topics
+        return (
+            {"calm": cells(calm), "busy": cells(busy)},
+            {"robot/scan": cells(scan), "robot/pose": cells(pose)},
+        )
 
 
-def column(table: PlainTable, index: int) -> list[str]:
-    return [row[index] for row in table.rows]
-
-
-def line_of(table: PlainTable, y: int) -> str:
-    return table.render_line(y).text.rstrip()
+def column(table: DataTable[Text], index: int) -> list[str]:
+    return [table.get_row_at(row)[index].plain for row in range(table.row_count)]
 
 
 async def test_top_shows_both_tables_and_sorts_them_by_keys() -> None:
-    app = TopApp(Feed(), "")
+    app = TopApp(Feed())
     async with app.run_test(size=(120, 40)) as pilot:
         processes, topics = (
-            app.query_one(f"#{name}", PlainTable) for name in ("processes", "topics")
+            app.query_one(f"#{name}", DataTable) for name in ("processes", "topics")
         )
         assert column(processes, 0) == ["busy", "calm"]
         assert column(processes, 1) == ["silent", "ok"]
@@ -120,14 +116,16 @@ async def test_top_shows_both_tables_and_sorts_them_by_keys() -> None:
         assert column(processes, 2) == ["90.0", "1.0"]
         await pilot.press("tab", "less_than_sign", "r")
         assert column(topics, 9) == ["3", "0"]
-        assert line_of(topics, 0).split()[:3] == ["topic", "Hz", "promised"]
-        assert line_of(topics, 1).startswith("pose   0.0")
-        await pilot.click("#topics", offset=(1, 0))
+        await pilot.pause()
+        shown = [topics.render_line(y).text for y in range(2)]
+        assert shown[0].split()[:3] == ["topic", "Hz", "promised"]
+        assert shown[1].split()[:2] == ["pose", "0.0"]
+        await pilot.click("#topics", offset=(2, 0))
         assert column(topics, 0) == ["scan", "pose"]
-        await pilot.click("#topics", offset=(1, 0))
+        await pilot.click("#topics", offset=(2, 0))
         assert column(topics, 0) == ["pose", "scan"]
         await pilot.press("space")
-        assert app.title == "gigabrain top (held)"
+        assert "paused" in app.title
         await pilot.press("q")
     assert app.return_code == 0
 
@@ -198,8 +196,8 @@ def test_without_any_run_one_line_says_how_to_get_one(
 def test_a_record_from_the_bus_is_shown_like_one_from_a_file() -> None:
     told = as_line(example(LogRecord))
     assert (told["process"], told["reason"]) == ("decision", "obstacle ahead")
-    assert LogFilter(process="decision").has(told)
-    assert not LogFilter(level="error").has(told)
+    assert LogFilter(process="decision").accepts(told)
+    assert not LogFilter(level="error").accepts(told)
 
 
 @pytest.fixture

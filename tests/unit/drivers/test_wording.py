@@ -190,6 +190,6 @@ def test_the_kit_tells_in_one_line_what_it_has_broken_on_purpose(
     monkeypatch.setattr(kit, "check", check)
     assert driver.test("mycustombot") == 0
     assert capsys.readouterr().out.splitlines()[0] == (
-        "what was broken on purpose, in its own words: the firmware reports: watchdog (2 times); "
+        "warnings during the checks: the firmware reports: watchdog (2 times); "
         "the firmware reports: unplugged"
     )

@@ -75,7 +75,7 @@ def test_it_says_what_is_in_it(whole: Path, capsys: pytest.CaptureFixture[str]) 
     assert call("bag", "info", str(whole), "--json") == 0
     assert json.loads(capsys.readouterr().out)["keys"][1]["hz"] == 50.0
     assert call("bag", "check", str(whole)) == 0
-    assert "whole, 600 messages in 9.981 s" in capsys.readouterr().out
+    assert "complete, 600 messages in 9.981 s" in capsys.readouterr().out
 
 
 def test_missing_messages_are_counted_and_make_the_check_fail(
@@ -152,7 +152,7 @@ def test_a_flipped_byte_costs_its_chunk_and_no_other(
     assert len(found.damages) == 1
     assert faults(found)
     assert call("bag", "check", str(path)) == 1
-    assert f"mend it with: gigabrain bag recover {path}\n" in capsys.readouterr().out
+    assert f"repair it with: gigabrain bag recover {path}\n" in capsys.readouterr().out
     call("bag", "convert", str(path), "--csv", str(tmp_path / "tables"))
     assert caplog.messages == [
         f"{path}: {found.damages[0].partition(': ')[2]}; mend it with: gigabrain bag recover {path}"
