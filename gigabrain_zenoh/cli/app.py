@@ -136,7 +136,7 @@ def make_app(chosen: "Sequence[str]" = ()) -> "App":
 def _version() -> str:
     from gigabrain_zenoh.plugins import package_version  # slow import, for --version alone
 
-    return package_version
+    return package_version()
 
 
 def main() -> None:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from gigabrain_zenoh import logs
 from gigabrain_zenoh.cli.options import LOCAL, JsonLines, Process, RobotAddress, print_line
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
-from gigabrain_zenoh import logs
 from gigabrain_zenoh.host.signals import run_async, stop_signals
 
 if TYPE_CHECKING:

@@ -15,12 +15,12 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from gigabrain_zenoh.cli.options import JsonFile, print_line, print_table
-from gigabrain_zenoh.host.network import is_loopback
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host import files
-from gigabrain_zenoh.host.terminal import typed_lines
+from gigabrain_zenoh.host.network import is_loopback
 from gigabrain_zenoh.host.signals import run_async
+from gigabrain_zenoh.host.terminal import typed_lines
 from gigabrain_zenoh.qa.proxy.chaos import (
     CALM,
     WAYS,

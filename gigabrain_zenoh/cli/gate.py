@@ -101,13 +101,13 @@ def audit(
 
     if not 0 < newest <= MAX_ENTRIES:
         raise ConfigError(f"--newest: expected 1 to {MAX_ENTRIES}, got {newest}")
-    to_text = audit.as_json if json else audit.readable
+    to_text = as_json if json else readable
     if not robot:
         run_async(_print_live(at, newest, follow, to_text))
         return 0
     if follow or at.connect:
         raise ConfigError(f"{robot!r} names a robot that does not run; leave out the name")
-    for record in audit.read_audit(_audit_folder(robot), newest):
+    for record in read_audit(_audit_folder(robot), newest):
         print_line(to_text(record))
     return 0
 

@@ -10,10 +10,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
-from gigabrain_zenoh.security.identity_files import INSTALL
-from gigabrain_zenoh.security.identity_files import CA_KEY, CERTIFICATE
-from gigabrain_zenoh.security.identity_files import generations_in
 from gigabrain_zenoh.security.acl import Role, common_name
+from gigabrain_zenoh.security.identity_files import CA_KEY, CERTIFICATE, INSTALL, generations_in
 
 EXPIRES_SOON_DAYS = 30
 FleetFolder = Annotated[

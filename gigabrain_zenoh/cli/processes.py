@@ -1,5 +1,4 @@
 """Commands that run one process each, to start a robot by hand or on several hosts."""
-from gigabrain_zenoh.host import run_folders
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,21 +7,21 @@ from typing import Annotated, Any, Literal
 import msgspec
 from cyclopts import Parameter
 
-from gigabrain_zenoh import logs
 from gigabrain_zenoh.bus.zenoh.config import router_config, secured
 from gigabrain_zenoh.cli.options import Seed, World, checked, print_progress
-from gigabrain_zenoh.host.network import exposed, reached_at
-from gigabrain_zenoh.config.settings import ProcessConfig
 from gigabrain_zenoh.config.settings import (
     ButtonConfig,
     DecisionConfig,
     DriverConfig,
     Endpoint,
     LinkName,
+    ProcessConfig,
     Resume,
 )
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host import run_folders
+from gigabrain_zenoh.host.network import exposed, reached_at
 from gigabrain_zenoh.launch.processes import run_process
 from gigabrain_zenoh.runtime.running import announced, find_endpoint
 from gigabrain_zenoh.security.identity_files import identity_in

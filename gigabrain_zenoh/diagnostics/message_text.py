@@ -1,5 +1,4 @@
 """Messages as text for people, and as JSON for programs."""
-from gigabrain_zenoh.host import terminal
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +16,7 @@ from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_zenoh.codec import DECODE_ERRORS, Codec
 from gigabrain_zenoh.diagnostics.topic_names import topic_of
 from gigabrain_zenoh.errors import unknown
-from gigabrain_zenoh import logs
+from gigabrain_zenoh.host import terminal
 from gigabrain_zenoh.recording.headers import is_json
 
 MAX_LISTED = 8  # numbers; longer lists are summarised

@@ -23,8 +23,8 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import Sampled
+from gigabrain_zenoh.diagnostics.discovery import discover, flows
 from gigabrain_zenoh.diagnostics.graph import chain
-from gigabrain_zenoh.diagnostics.discovery import flows, discover
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn
 from gigabrain_zenoh.ui.robot_view import RobotView
 

@@ -114,7 +114,7 @@ def test_a_process_that_is_gone_is_found(name: str) -> None:
 @pytest.mark.parametrize(
     ("change", "about", "words"),
     [
-        ({"described": {**ROBOT.described, "safety": replace(ROBOT.described["safety"], version="9")}},
+        ({"described": {**ROBOT.described, "safety": replace(example(Description), version="9")}},
          "versions", "the processes differ: 0.1.0, 9"),
         ({"health": {**ROBOT.health, "driver": health("driver", sent_hz={"robot/scan": 10.0})}},
          "robot/state", "0 Hz from driver, promised 50"),
