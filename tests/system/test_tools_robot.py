@@ -104,7 +104,8 @@ async def test_a_message_that_is_sent_arrives(demo: Home) -> None:
 async def test_a_velocity_asks_for_the_body_and_gives_it_back(demo: Home) -> None:
     refused = await demo.run("topic", "pub", "cmd_vel", "linear_x=0.1")
     assert await refused.ended() == 1
-    assert refused.err == "gigabrain: control drives; take it over with --take\n"
+    assert "control drives" in refused.err
+    assert "--take" in refused.err
     for _ in range(5):  # a process that is starved for 150 ms closes the gate meanwhile
         driven = await demo.run("topic", "pub", "cmd_vel", "linear_x=0.1", "--take")
         if re.fullmatch(r"driven for \d\.\d s; control drives\n", driven.out):
