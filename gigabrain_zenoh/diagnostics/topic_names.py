@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 from msgspec import Struct
 
-from gigabrain_schemas.topics import TOPICS, Topic
+from gigabrain_schemas.topics import TOPICS, Topic, current_key
 from gigabrain_zenoh.errors import UnknownName, unknown
 
 PREFIX = "robot/"
@@ -51,7 +51,7 @@ def target(name: str, live_keys: Iterable[str] = ()) -> Target | None:
 
     None where it is none of these.
     """
-    key = PREFIX + short(name)
+    key = current_key(PREFIX + short(name))
     for topic in TOPICS:
         if key == topic.key:
             return Target(topic.at("*"), topic)

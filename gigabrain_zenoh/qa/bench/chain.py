@@ -296,7 +296,9 @@ async def _take_turns(heard: ChainMonitor, bus: Bus, timed: Stopwatch) -> None:
                 timed(f"step {topic.key}", steps[topic.key])
 
 
-def _steps_at(tick: int, heard: ChainMonitor, loop: DecisionLoop) -> dict[str, Callable[[], object]]:
+def _steps_at(
+    tick: int, heard: ChainMonitor, loop: DecisionLoop
+) -> dict[str, Callable[[], object]]:
     """Return the work of each message's receiver in a tick."""
     body, scan = heard.get(BODY).description, heard.get(SCAN)
     state = replace(heard.get(STATE), tick=tick)

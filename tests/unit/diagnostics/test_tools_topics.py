@@ -92,6 +92,11 @@ def test_an_unknown_topic_is_answered_with_the_nearest_that_is_alive() -> None:
         assert "is a service, not a topic; use: gigabrain " in str(no_topic(service.key, ()))
 
 
+def test_an_old_name_of_a_topic_still_finds_it() -> None:
+    for old, new in (("granted", "request_log"), ("robot/heard/driver", "input_log/driver")):
+        assert target(old) == target(new) is not None
+
+
 def monitor_of(
     times_ms: list[float], size: int = 4, delay_ms: float = 3.0
 ) -> tuple[TopicMonitor, int]:
