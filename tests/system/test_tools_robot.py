@@ -136,14 +136,14 @@ async def test_processes_and_who_talks_to_whom_are_shown(demo: Home) -> None:
 async def test_the_log_tells_who_changed_a_parameter(demo: Home) -> None:
     follow = demo.start("log", "--follow", "--process", "decision", "--json", "-n", "1")
     await until(lambda: follow.out, "the log's past")
-    told = await printed(demo, "param", "set", "decision", "linear_speed", "0.15")
-    assert told == "decision: linear_speed is 0.15 now, it was 0.2\n"
-    assert await printed(demo, "param", "get", "decision", "linear_speed") == "0.15\n"
-    refused = await demo.run("param", "set", "decision", "linear_speed", "fast")
+    told = await printed(demo, "param", "set", "decision", "max_linear_speed", "0.15")
+    assert told == "decision: max_linear_speed is 0.15 now, it was 0.2\n"
+    assert await printed(demo, "param", "get", "decision", "max_linear_speed") == "0.15\n"
+    refused = await demo.run("param", "set", "decision", "max_linear_speed", "fast")
     assert await refused.ended() == 1
     assert "expected a number above 0" in refused.err
-    await printed(demo, "param", "set", "decision", "linear_speed", "0.2")
-    wanted = "linear_speed is 0.2 now, it was 0.15"
+    await printed(demo, "param", "set", "decision", "max_linear_speed", "0.2")
+    wanted = "max_linear_speed is 0.2 now, it was 0.15"
     await until(lambda: wanted in follow.out, "the change in the log")
     follow.send(signal.SIGINT)
     assert await follow.ended() == 0

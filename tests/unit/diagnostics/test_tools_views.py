@@ -232,8 +232,8 @@ async def test_parameters_are_listed_with_what_they_may_be(net: Net) -> None:
     running.cancel()
     assert {one.name: one.value for one in reply.params} == {
         "log_level": logging.getLevelName(logging.getLogger().level).lower(),
-        "linear_speed": "0.2",
-        "angular_speed": "0.5",
+        "max_linear_speed": "0.2",
+        "max_angular_speed": "0.5",
         "turn": "right",
     }
     assert all(one.expected for one in reply.params)
@@ -244,31 +244,35 @@ async def test_a_parameter_is_changed_and_that_is_logged(
 ) -> None:
     running = await thinking(net)
     assert (await told(net, "log_level", "info")).ok
-    reply = await told(net, "linear_speed", "0.15")
+    reply = await told(net, "max_linear_speed", "0.15")
     assert (await told(net, "turn", "clearer")).ok
     after = {one.name: one.value for one in (await told(net)).params}
     running.cancel()
-    assert (reply.ok, reply.text) == (True, "linear_speed is 0.15 now, it was 0.2")
-    assert (after["linear_speed"], after["turn"], after["angular_speed"]) == (
+    assert (reply.ok, reply.text) == (True, "max_linear_speed is 0.15 now, it was 0.2")
+    assert (after["max_linear_speed"], after["turn"], after["max_angular_speed"]) == (
         "0.15",
         "clearer",
         "0.5",
     )
-    assert "param by ann: linear_speed is 0.15 now, it was 0.2" in caplog.messages
+    assert "param by ann: max_linear_speed is 0.15 now, it was 0.2" in caplog.messages
 
 
 @pytest.mark.parametrize(
     ("name", "value", "complaint"),
     [
-        ("linear_speed", "nan", "linear_speed: expected a number above 0, up to 10 [m/s]"),
-        ("linear_speed", "inf", "linear_speed: expected a number above 0"),
-        ("linear_speed", "0", "linear_speed: expected a number above 0"),
-        ("linear_speed", "-1", "linear_speed: expected a number above 0"),
-        ("linear_speed", "11", "linear_speed: expected a number above 0"),
-        ("linear_speed", "", "linear_speed: expected a number above 0"),
+        ("max_linear_speed", "nan", "max_linear_speed: expected a number above 0, up to 10 [m/s]"),
+        ("max_linear_speed", "inf", "max_linear_speed: expected a number above 0"),
+        ("max_linear_speed", "0", "max_linear_speed: expected a number above 0"),
+        ("max_linear_speed", "-1", "max_linear_speed: expected a number above 0"),
+        ("max_linear_speed", "11", "max_linear_speed: expected a number above 0"),
+        ("max_linear_speed", "", "max_linear_speed: expected a number above 0"),
         ("turn", "lft", "turn: expected one of: right, left, clearer, got 'lft'"),
         ("log_level", "loud", "log_level: expected one of: debug, info, warning"),
-        ("linear_sped", "1", "no parameter 'linear_sped'; did you mean 'linear_speed'?"),
+        (
+            "max_linear_sped",
+            "1",
+            "no parameter 'max_linear_sped'; did you mean 'max_linear_speed'?",
+        ),
     ],
 )
 async def test_a_value_that_cannot_be_is_refused_with_what_was_expected(
