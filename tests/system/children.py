@@ -21,7 +21,7 @@ QUICK = Backoff(first_s=0.01, factor=2.0, longest_s=0.04)
 CHILD = f"""
 import json, os, signal, subprocess, sys, time
 sys.path.insert(0, {str(ROOT)!r})
-from gigabrain_zenoh.host import lifeline
+from gigabrain_zenoh.host import this_process as lifeline
 def say(event, **data):
     print(json.dumps({{"event": event, **data}}), file=sys.stderr, flush=True)
 def wait():

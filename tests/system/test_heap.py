@@ -8,7 +8,7 @@ import pytest
 MAPS = """
 import sys, threading
 import numpy as np
-from gigabrain_zenoh.host import heap
+from gigabrain_zenoh.host import this_process as heap
 
 if "mapped" in sys.argv:
     heap.map_large_blocks()

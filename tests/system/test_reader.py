@@ -7,11 +7,11 @@ import pytest
 
 QUIET = """
 import asyncio
-from gigabrain_zenoh.diagnostics.listener import ended_with_reader
+from gigabrain_zenoh.diagnostics.listener import stop_on_broken_pipe
 
 async def quiet():
     stop = asyncio.Event()
-    with ended_with_reader(stop):
+    with stop_on_broken_pipe(stop):
         print("one word and no more", end="", flush=True)
         await asyncio.wait_for(stop.wait(), float("{patience_s}"))
 

@@ -13,7 +13,7 @@ from gigabrain_zenoh.testing.processes import Home, endpoint_of
 NOBODY = 65534
 ALONE = f"""
 import os, sys
-from gigabrain_zenoh.host.scheduling import AUTOGROUP, go_first
+from gigabrain_zenoh.host.this_process import AUTOGROUP, go_first
 if "nobody" in sys.argv:
     os.setuid({NOBODY})
 go_first()
