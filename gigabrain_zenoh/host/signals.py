@@ -4,7 +4,6 @@ An entry point calls `interrupts.install` first, so this module imports nothing 
 a signal depends on the command's progress (see `reacting`). Only the first one counts.
 """
 
-import asyncio
 import contextlib
 import os
 import signal
@@ -14,7 +13,10 @@ import time
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    import asyncio  # heavy: imported where it is used
 
 HANGUP = getattr(signal, "SIGHUP", None)  # Windows has none
 SIGNALS = (signal.SIGINT, signal.SIGTERM, *([HANGUP] if HANGUP else ()))
@@ -150,11 +152,13 @@ T = TypeVar("T")
 
 
 @contextmanager
-def stop_signals(limit_s: float = LIMIT_S) -> Iterator[asyncio.Event]:
+def stop_signals(limit_s: float = LIMIT_S) -> "Iterator[asyncio.Event]":
     """Yield an event that the first SIGINT, SIGTERM or SIGHUP sets; further signals do nothing.
 
     A command that has not ended `limit_s` after the signal is terminated by force.
     """
+    import asyncio
+
     stop, loop = asyncio.Event(), asyncio.get_running_loop()
 
     def react() -> None:
@@ -172,6 +176,8 @@ def run_async(work: Coroutine[Any, Any, T]) -> T:
     and SIGHUP, and never interrupts asyncio's own code. It also receives SIGINT where a shell has
     set it to be ignored.
     """
+
+    import asyncio
 
     async def cancelled_by_signal() -> T:
         loop, task = asyncio.get_running_loop(), asyncio.current_task()

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_schemas.brain import Intent
-from gigabrain_zenoh.cli.demo import Drive
+from gigabrain_zenoh.cli.demo import RobotOptions
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError, UnknownName
@@ -116,10 +116,10 @@ async def test_one_that_needs_a_map_gets_the_navigator() -> None:
 
 
 def test_a_demonstration_uses_its_settings_and_its_needs() -> None:
-    spin = Drive(behaviour="spin").values()
+    spin = RobotOptions(behaviour="spin").values()
     assert spin["decision"] == {"behaviour": "spin", "settings": {"rate": 0.25}}
     assert "perception" not in spin
-    there = Drive(behaviour="there", set=("x=2.5",)).values()
+    there = RobotOptions(behaviour="there", set=("x=2.5",)).values()
     assert there["decision"] == {"behaviour": "there", "settings": {"x": 2.5, "y": 1.0}}
     assert there["perception"] == {"mapping": "slam"}
 

@@ -15,7 +15,8 @@ from gigabrain_zenoh.testing.zenoh import Ear, repeat
 from tests.system.keys import Site, make_fleet, raw, site
 
 SAYS = {
-    "brain": "world pose map intent task granted heard/perception health/perception log estop",
+    "brain": "world pose map intent task request_log input_log/perception health/perception log "
+    "estop",
     "operator": "teleop cmd_vel joint_cmd button log estop",
     "viewer": "",
 }

@@ -24,7 +24,7 @@ def test_the_worst_and_the_median_of_each_time_are_told() -> None:
 def test_one_failure_among_many_is_counted_and_named() -> None:
     found = [Finding(True, "fine", {"known": 1.0}), Finding(False, "still moving")]
     assert summary([*found, found[0]]) == (
-        "1 times not so: still moving; worst of 3: known after 1, median 1 ms"
+        "failed 1 times: still moving; worst of 3: known after 1, median 1 ms"
     )
 
 
@@ -37,7 +37,7 @@ def test_a_single_try_says_what_it_measured() -> None:
 async def test_only_the_stops_are_repeated(tmp_path: Path) -> None:
     told: list[str] = []
     results = await kit.check("mock", "sim", tmp_path, told.append, repeat=2)
-    assert [result for result in results if result.verdict == "fail"] == []
+    assert [result for result in results if result.verdict == "FAILED"] == []
     assert [text for text in told if "2 of 2" in text] == [
         "stops on silence, 2 of 2",
         "stops on SIGKILL, 2 of 2",

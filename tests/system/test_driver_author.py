@@ -35,8 +35,8 @@ async def test_a_new_driver_passes_the_kit_by_its_name(tmp_path: Path, site: Pat
     package = installed(folder, site)
     assert catalog.robot_files()["kit_probe"] == package / "robot.yaml"
     results = await kit.check("kit_probe", "sim", tmp_path / "kit", lambda result: None)
-    assert [result for result in results if result.verdict == "fail"] == []
-    assert sum(result.verdict == "pass" for result in results) == 11
+    assert [result for result in results if result.verdict == "FAILED"] == []
+    assert sum(result.verdict == "passed" for result in results) == 11
 
 
 def test_a_driver_that_cannot_be_imported_is_refused_in_one_line(
@@ -114,9 +114,9 @@ async def test_a_driver_that_raises_something_else_fails_and_the_kit_goes_on(
         results = await kit.run(subject, lambda result: None)
     verdicts = {result.check: result for result in results}
     assert len(results) == 16
-    assert verdicts["opens"].verdict == "fail"
+    assert verdicts["opens"].verdict == "FAILED"
     assert "KeyError" in verdicts["opens"].measured
-    assert verdicts["never raises"].verdict == "pass"
+    assert verdicts["never raises"].verdict == "passed"
 
 
 def test_the_kit_moves_no_real_body(tmp_path: Path) -> None:

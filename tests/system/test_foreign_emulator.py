@@ -58,7 +58,7 @@ async def test_a_packages_driver_drives_the_packages_emulator(package: Path) -> 
         async with DriverSession(subject) as session:
             await session.connected()
             session.wanted = Velocity(linear_x=0.2)
-            assert await session.until(lambda: subject.told(None)[0] == 0.2, 100) is not None
+            assert await session.until(lambda: subject.commanded(None)[0] == 0.2, 100) is not None
 
 
 def test_its_emulator_is_found_by_its_drivers_name(package: Path) -> None:

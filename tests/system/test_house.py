@@ -44,9 +44,9 @@ def add(path: Path, text: str) -> None:
             "safety trusts",
         ),
         ("mapping/slam.py", "def late():\n    import gigabrain_zenoh.bus.bus", "gate, geometry"),
-        ("host/heap.py", "from gigabrain_zenoh.bus.bus import Bus", "each room"),
+        ("host/files.py", "from gigabrain_zenoh.bus.bus import Bus", "each room"),
         (
-            "ui/seat.py",
+            "ui/robot_view.py",
             "from gigabrain_drivers.bodies.mock.driver import Mock",
             "only the commands",
         ),
