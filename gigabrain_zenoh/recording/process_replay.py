@@ -41,7 +41,7 @@ from gigabrain_zenoh.recording.message_tables import message_of, row
 from gigabrain_zenoh.runtime.deployment import deployment_path, load_deployment
 from gigabrain_zenoh.runtime.process import Node
 from gigabrain_zenoh.runtime.replay import Event, replay
-from gigabrain_zenoh.safety import host
+from gigabrain_zenoh.safety import health
 
 OUTPUTS: dict[str, tuple[Topic[Any], ...]] = {
     "perception": (WORLD, POSE, MAP),
@@ -147,7 +147,7 @@ def _by_id(outputs: Iterable[tuple[str, Message]]) -> dict[OutputId, Message]:
 def _without_computer(message: Message) -> Message:
     if not isinstance(message, SafetyState):
         return message
-    warnings = tuple(each for each in message.warnings if each.code not in host.CODES)
+    warnings = tuple(each for each in message.warnings if each.code not in health.HOST_CODES)
     return msgspec.structs.replace(message, warnings=warnings)
 
 

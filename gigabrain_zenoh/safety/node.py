@@ -1,32 +1,61 @@
 """The safety process: a verdict per scan and per second state, and at once when it changes."""
 
 import logging
+import shutil
+import threading
+from collections import deque
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
 
 from gigabrain_schemas.base import Cause, Message
-from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.body import Body, BodyDescription, RobotState
+from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.topics import SAFETY, STATE
-from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_schemas.sensors import Imu
+from gigabrain_schemas.topics import (
+    BODY,
+    CMD_VEL,
+    HEALTH,
+    IMAGE,
+    IMU,
+    INTENT,
+    LOG,
+    MAP,
+    POSE,
+    SAFETY,
+    SCAN,
+    STATE,
+    WORLD,
+    Topic,
+    command_topic,
+)
+from gigabrain_zenoh.bus.bus import Bus, Latest
+from gigabrain_zenoh.bus.freshness import LEAD_TICKS, PreviousTick
 from gigabrain_zenoh.gate.causes import in_words
-from gigabrain_zenoh.geometry.stopping import REPEAT_TICKS
+from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.geometry.stopping import REPEAT_TICKS, scan_limit_ns
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime.heartbeat import Progress
-from gigabrain_zenoh.safety.host import HostWatch, Look
-from gigabrain_zenoh.safety.senses import Senses
-from gigabrain_zenoh.safety.step import Memory, step
+from gigabrain_zenoh.safety.health import Host, horizontal
+from gigabrain_zenoh.safety.pipeline import SYSTEMS, Bases
+from gigabrain_zenoh.safety.step import Inputs, Memory, step
 
+HOST_PERIOD_NS = 1_000_000_000
+HOST_SAMPLES = 10  # of the CPU share, averaged over ten seconds
 log = logging.getLogger("gigabrain_zenoh.safety")
 
 
-async def run(bus: Bus, ready: Callable[[], None], look: Look | None = None) -> None:
-    """Judge until the process ends; `look` tells of the computer, this one unless it is given."""
+async def run(bus: Bus, ready: Callable[[], None], probe: "HostProbe | None" = None) -> None:
+    """Publish verdicts until the process ends; `probe` reads the computer's resources."""
     memory, said, said_tick = Memory(), SafetyState(verdict="stop"), 0
 
     def judge(_: Message) -> None:
         nonlocal memory, said, said_tick
-        body = senses.bodies.current
-        inputs = senses.inputs(body.description) if body else None
+        body = inputs_of.bodies.current
+        inputs = inputs_of.inputs(body.description) if body else None
         if body is None or inputs is None:
             return
         before, state = memory, inputs.state
@@ -39,9 +68,9 @@ async def run(bus: Bus, ready: Callable[[], None], look: Look | None = None) -> 
             said, said_tick = bus.publish(SAFETY, verdict, basis=basis), state.tick
 
     def came() -> tuple[object, ...]:
-        return (bus.arrived.get(STATE.key),) if senses.bodies.current else ()
+        return (bus.arrived.get(STATE.key),) if inputs_of.bodies.current else ()
 
-    senses = Senses(bus, judge, look or HostWatch(state_dir()).now)
+    inputs_of = InputCollector(bus, judge, probe or HostWatch(state_dir()).now)
     bus.progress = Progress(came, lambda: bus.sent[SAFETY.key])
     ready()
     await bus.failed
@@ -76,3 +105,167 @@ def _missing(causes: tuple[Cause, ...], known: tuple[Cause, ...]) -> tuple[Cause
 def _log(level: int, text: str, event: str, causes: tuple[Cause, ...]) -> None:
     data = {"event": event, "causes": ",".join(cause.code for cause in causes)}
     log.log(level, "%s", text, extra={"data": data})
+
+
+HostProbe = Callable[
+    [int], Host
+]  # what the computer has left at a time of the monotonic clock [ns]
+
+
+class HostWatch:
+    """HostProbes at the computer once a second at most; about 0.2 ms each time.
+
+    `folder` is on the disk that counts: with logs, maps and the latch. A disk may hang,
+    so it is asked in a thread; what it said last holds until it answers.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._disk_mb: float | None = None
+        self._asking: threading.Thread | None = None
+        self._next_ns = 0
+        self._busy: deque[float] = deque(
+            maxlen=HOST_SAMPLES
+        )  # [%] of all cores, since the look before
+        psutil.cpu_percent()  # from now on
+        self._host = Host()
+
+    def now(self, now_ns: int) -> Host:
+        """What it has left at this time of the monotonic clock."""
+        if now_ns >= self._next_ns:
+            self._next_ns = now_ns + HOST_PERIOD_NS
+            if self._asking is None or not self._asking.is_alive():
+                self._asking = threading.Thread(target=self._ask, name="disk", daemon=True)
+                self._asking.start()
+            self._busy.append(psutil.cpu_percent())
+            cpu = sum(self._busy) / HOST_SAMPLES if len(self._busy) == HOST_SAMPLES else None
+            memory = psutil.virtual_memory().percent
+            self._host = Host(disk_mb=self._disk_mb, cpu=cpu, memory=memory)
+        return self._host
+
+    def _ask(self) -> None:
+        self._disk_mb = _disk_mb(self._folder)
+
+
+def _disk_mb(folder: Path) -> float | None:
+    """Free space where the folder is, or will be once something is written."""
+    for place in (folder, *folder.parents):
+        try:
+            return shutil.disk_usage(place).free / 1e6
+        except FileNotFoundError:
+            continue
+        except OSError:
+            return None
+    return None
+
+
+# what nobody else listens to yet, so that what is bad on these keys is counted all the same
+OVERHEARD: tuple[Topic[Any], ...] = (IMAGE, POSE, MAP, HEALTH, LOG)
+MOST = 256  # what is kept between two states, however much is sent
+WORLD_MARGIN_NS = 50_000_000  # how much later than a scan its world may come
+
+
+class InputCollector:
+    """Keeps the newest of everything; `on_new` is called with each state and each scan."""
+
+    def __init__(self, bus: Bus, on_new: Callable[[Message], None], probe: HostProbe) -> None:
+        self._bus, self._probe = bus, probe
+        self._by_commander: dict[str, PreviousTick[CmdVel]] = {}
+        # age [ticks] and source; tick, and horizontal acceleration [m/s2]
+        self._echoes: deque[tuple[int, str]] = deque(maxlen=MOST)
+        self._shocks: deque[tuple[int, float]] = deque(maxlen=MOST)
+        self._commands = Latest(CMD_VEL, bus.clock, bus.time)  # the brain's
+        self._obeyed, self._end_hearing = CMD_VEL.key, _nothing
+        self.bodies = bus.latest(BODY, self._hear_body)
+        self._states = bus.latest(STATE, on_new)
+        self._scans = bus.latest(SCAN, on_new)
+        bus.subscribe(CMD_VEL, self._hear_command)
+        bus.subscribe(IMU, self._hear_imu)
+        for topic in OVERHEARD:
+            bus.subscribe(topic, lambda _key, _message: None)
+        self._worlds, self._intents = bus.latest(WORLD), bus.latest(INTENT)
+
+    def inputs(self, body: BodyDescription) -> Inputs | None:
+        """What safety goes by now.
+
+        None while there is no state, or while a scan has come of a tick whose state is on its way.
+        """
+        state = self._states.fresh()
+        if state is None or state.tick < self._bus.time.tick:
+            return None
+        commander = state.gate.commander
+        heard = self._by_commander.get(commander)
+        return Inputs(
+            state=state,
+            scan=self._scans.current,
+            scan_age_ns=self._scans.age_ns(),
+            silent=self._silent(body),
+            bases=self._bases(),
+            command=heard.at(state.boot, state.tick, STATE.stale_after_ns) if heard else None,
+            echo_ages=self._echo_ages(commander),
+            shock=self._shock(state),
+            host=self._probe(self._bus.clock.now_ns()),
+        )
+
+    def _silent(self, body: BodyDescription) -> tuple[str, ...]:
+        beat_ns = round(body.thresholds.heartbeat * 1e9)
+        limits_ns = (scan_limit_ns(body) + WORLD_MARGIN_NS, beat_ns, beat_ns)
+        systems: tuple[Latest[Any], ...] = (self._worlds, self._intents, self._commands)
+        return tuple(
+            name
+            for name, system, limit_ns in zip(SYSTEMS, systems, limits_ns, strict=True)
+            if not system.fresh(limit_ns)
+        )
+
+    def _bases(self) -> Bases:
+        def basis(of: Latest[Any]) -> int:
+            return of.current.basis if of.current else 0
+
+        return Bases(
+            scan=basis(self._scans),
+            world=basis(self._worlds),
+            intent=basis(self._intents),
+            command=basis(self._commands),
+        )
+
+    def _echo_ages(self, commander: str) -> tuple[int, ...]:
+        ages = tuple(age for age, source in self._echoes if source == commander)
+        self._echoes.clear()
+        return ages
+
+    def _shock(self, state: RobotState) -> float:
+        """The hardest before this tick; what comes with it may be quicker or slower than it."""
+        shock = max((value for tick, value in self._shocks if tick < state.tick), default=0.0)
+        later = [(tick, value) for tick, value in self._shocks if tick >= state.tick]
+        self._shocks = deque(later, maxlen=MOST)
+        return shock
+
+    def _hear_command(self, _key: str, command: CmdVel) -> None:
+        if command.source == BRAIN:
+            self._commands.take(command)
+        state = self._states.current
+        if state and command.source == state.gate.commander:
+            if command.source not in self._by_commander:  # who has driven before drives no more
+                self._by_commander = {command.source: PreviousTick()}
+            self._by_commander[command.source].receive(command)
+        if command.boot == self._bus.time.boot:
+            self._echoes.append((max(0, self._bus.time.tick - command.tick), command.source))
+
+    def _hear_imu(self, _key: str, imu: Imu) -> None:
+        time = self._bus.time
+        if imu.boot == time.boot and imu.tick <= time.tick + LEAD_TICKS:
+            self._shocks.append((imu.tick, horizontal(imu.linear_acceleration)))
+
+    def _hear_body(self, body: Body) -> None:
+        """Listen to what its driver obeys, besides the usual topic; to one such at a time."""
+        topic = command_topic(body.description)
+        if topic.key == self._obeyed:
+            return
+        self._end_hearing()
+        self._obeyed, self._end_hearing = topic.key, _nothing
+        if topic.key != CMD_VEL.key:
+            self._end_hearing = self._bus.subscribe(topic, self._hear_command)
+
+
+def _nothing() -> None:
+    """End what has never begun."""

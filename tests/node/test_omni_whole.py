@@ -24,7 +24,7 @@ from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.qa.in_memory_robot import InMemoryRobot, node_of
 from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.safety import node as safety
-from gigabrain_zenoh.safety.host import Host
+from gigabrain_zenoh.safety.health import Host
 from tests.unit.mapping.rooms import box, ranges
 from tests.unit.navigation.drives import OMNI, wall
 

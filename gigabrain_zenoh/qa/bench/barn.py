@@ -45,7 +45,7 @@ from gigabrain_zenoh.qa.bench.plant import HARD, IDEAL, JACKAL, LIDAR, MUJOCO, C
 from gigabrain_zenoh.qa.in_memory_robot import InMemoryRobot, node_of
 from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.safety import node as safety
-from gigabrain_zenoh.safety.host import Host
+from gigabrain_zenoh.safety.health import Host
 
 PLANTS = {"hard": HARD, "ideal": IDEAL, "mujoco": MUJOCO}
 

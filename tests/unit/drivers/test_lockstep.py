@@ -3,7 +3,7 @@ import asyncio
 from gigabrain_drivers.driver.lockstep import Lockstep
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_zenoh.safety.words import say
+from gigabrain_zenoh.safety.catalogue import cause
 
 
 def command(tick: int, basis: int, source: str = "control") -> CmdVel:
@@ -45,7 +45,7 @@ def test_a_verdict_that_misses_a_part_of_the_brain_does_not_count() -> None:
     steps = Lockstep()
     steps.begin(1, 1)
     steps.command(command(1, 1))
-    starting, missing = say("starting"), say("perception_silent")
+    starting, missing = cause("starting"), cause("perception_silent")
     steps.verdict(SafetyState(verdict="stop", basis=1, causes=(starting, missing)))
     assert not steps.complete
     steps.verdict(SafetyState(verdict="stop", basis=1, causes=(starting,)))

@@ -7,8 +7,8 @@ from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import BODY, HEALTH
 from gigabrain_zenoh.bus.input_log import MOST_KEYS, PublishedInputLogger
 from gigabrain_zenoh.host.bounded import put_newest
-from gigabrain_zenoh.safety.host import Host
-from gigabrain_zenoh.safety.senses import Senses
+from gigabrain_zenoh.safety.health import Host
+from gigabrain_zenoh.safety.node import InputCollector
 from gigabrain_zenoh.testing.bus import Net
 from gigabrain_zenoh.testing.samples import WAFFLE, body
 from gigabrain_zenoh.testing.waiting import settle
@@ -50,7 +50,7 @@ async def test_who_watches_keeps_the_health_of_64_processes() -> None:
 
 async def test_safety_listens_to_one_other_control_topic_at_a_time() -> None:
     net = Net()
-    Senses(net.one, lambda _: None, lambda _now: Host())
+    InputCollector(net.one, lambda _: None, lambda _now: Host())
     before = len(net.one.listens)
     for n in range(50):
         net.two.publish(BODY, body(replace(WAFFLE, control_topic=f"robot/cmd_{n}")))

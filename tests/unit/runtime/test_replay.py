@@ -23,14 +23,14 @@ from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.runtime.replay import Event, Node, record, replay
 from gigabrain_zenoh.safety import node as safety
-from gigabrain_zenoh.safety.host import Host
+from gigabrain_zenoh.safety.health import Host
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, body, round_room, scan, state
 
 SYSTEMS: dict[str, tuple[Node, str]] = {
     "perception": (functools.partial(perception.run, PerceptionConfig()), "robot/world"),
     "decision": (functools.partial(decision.run, DecisionConfig()), "robot/intent"),
     "control": (control.run, "robot/cmd_vel"),
-    "safety": (functools.partial(safety.run, look=lambda _: Host()), "robot/safety"),
+    "safety": (functools.partial(safety.run, probe=lambda _: Host()), "robot/safety"),
 }
 
 

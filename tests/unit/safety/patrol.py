@@ -17,7 +17,7 @@ from gigabrain_schemas.body import (
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import ImuData
-from gigabrain_zenoh.safety.host import Host
+from gigabrain_zenoh.safety.health import Host
 from gigabrain_zenoh.safety.step import Inputs, Memory, step
 from gigabrain_zenoh.testing.samples import DRIVING, WAFFLE, open_space, scan, state
 

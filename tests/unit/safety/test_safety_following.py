@@ -116,7 +116,7 @@ def test_short_moves_with_frozen_telemetry_add_up() -> None:
     while "telemetry_frozen" not in patrol.codes and moving < 100:
         told = AHEAD if patrol.tick % 40 < 8 else REST
         patrol.go(told=told, frozen=True)
-        moving += moves(patrol.memory.following.told)
+        moving += moves(patrol.memory.tracking.commanded)
     assert moving == 20
 
 
@@ -139,9 +139,9 @@ def test_a_body_whose_telemetry_is_known_to_be_frozen_is_never_told_to_move_agai
             enabled = wanted and patrol.verdict.verdict != "stop"
             patrol.go(told=told, gate=DRIVING if enabled else IDLE, frozen=True)
             found += found > 0 or "telemetry_frozen" in patrol.codes
-            moved += moves(patrol.memory.following.told)
+            moved += moves(patrol.memory.tracking.commanded)
             assert moved <= 35  # 0.4 s until it is found, and the ramp
-            assert found <= 15 or not moves(patrol.memory.following.told)  # the ramp is over
+            assert found <= 15 or not moves(patrol.memory.tracking.commanded)  # the ramp is over
 
 
 def moves(told: Velocity) -> bool:

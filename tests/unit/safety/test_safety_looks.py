@@ -11,7 +11,7 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.pose import PoseHistory
-from gigabrain_zenoh.safety import looks, zones
+from gigabrain_zenoh.safety import blind_spots
 from gigabrain_zenoh.safety.zones import Field, Motion
 from gigabrain_zenoh.testing.samples import DRIVING, LIDAR, WAFFLE, scan, state
 
@@ -66,9 +66,9 @@ class Walker:
         self.tick += round(STEP_S / 0.02)
         now = replace(state(self.tick), pose=self.pose, velocity=moves, gate=self.gate)
         self.history = self.history.then(now)
-        motion = Motion(measured=moves, told=moves, wanted=moves)
+        motion = Motion(measured=moves, commanded=moves, requested=moves)
         seen = seen or self.scan()
-        self.field = zones.look(BODY, self.field, seen, now, self.history, motion)
+        self.field = self.field.then(BODY, seen, now, self.history, motion)
 
     def scan(self) -> LaserScan:
         step = 2 * HALF / (BEAMS - 1)
@@ -78,7 +78,7 @@ class Walker:
     @property
     def back(self) -> float | None:
         """The speed that safety allows backwards [m/s]; None where nothing limits it."""
-        return zones.caps(BODY, self.field).backward
+        return self.field.caps(BODY).backward
 
     @property
     def behind(self) -> float | None:
@@ -152,24 +152,24 @@ def test_a_scan_whose_pose_is_not_known_any_more_counts_where_the_body_is_now() 
 
 def test_whoever_looks_all_round_remembers_nothing() -> None:
     body, now = WAFFLE, replace(state(5), gate=DRIVING)
-    motion = Motion(measured=REST, told=REST, wanted=REST)
+    motion = Motion(measured=REST, commanded=REST, requested=REST)
     values = np.full(360, 2.0)
     values[100] = 2.5
     seen = scan(values, 5)
-    field = zones.look(body, Field(), seen, now, PoseHistory().then(now), motion)
+    field = Field().then(body, seen, now, PoseHistory().then(now), motion)
     assert field.scans == 1
     assert field.past == ()
 
 
-def past(*scans: tuple[Pose, LaserScan]) -> looks.Looks:
+def past(*scans: tuple[Pose, LaserScan]) -> blind_spots.Views:
     """These looks, and one from the origin that looks at nothing that is asked for."""
     nothing = scan(np.full(2, np.nan), 99, angle_min=0.0, angle_increment=0.01)
     here = Pose(x=0.0, y=0.0, yaw=0.0), nothing
-    return tuple(looks.Look(*one) for one in (*scans, here))
+    return tuple(blind_spots.View(*one) for one in (*scans, here))
 
 
 def known(points: list[tuple[float, float]], *scans: tuple[Pose, LaserScan]) -> list[bool]:
-    found = looks.free(BODY, LIDAR, 0.1, past(*scans), np.array(points))
+    found = blind_spots.known_free(BODY, LIDAR, 0.1, past(*scans), np.array(points))
     return [bool(one) for one in found]
 
 
@@ -215,6 +215,6 @@ def test_beams_on_the_housing_and_unknown_ones_tell_nothing() -> None:
     assert known([(-0.5, 0.0), (-0.95, 0.0)], (pose, housing)) == [False, True]
     nothing = seen_from(pose)
     cannot_tell = replace(LIDAR, no_return="unknown")
-    found = looks.free(BODY, cannot_tell, 0.1, past(nothing), np.array([(-0.5, 0.0)]))
+    found = blind_spots.known_free(BODY, cannot_tell, 0.1, past(nothing), np.array([(-0.5, 0.0)]))
     assert known([(-0.5, 0.0)], nothing) == [True]
     assert not found.any()

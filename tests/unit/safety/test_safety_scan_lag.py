@@ -12,7 +12,7 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState, Thresholds
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.pose import PoseHistory
-from gigabrain_zenoh.safety.late import Late, look, slows, stops
+from gigabrain_zenoh.safety.latency import DataLatency
 from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, scan, state
 
 BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.25))
@@ -44,7 +44,7 @@ class Robot:
         self.period = round(1 / (body.lidar.rate_hz * TICK_S))
         self.tick, self.rate = 0, 0.0
         self.poses = [Pose(x=0.0, y=0.0, yaw=0.0)] * 100
-        self.history, self.late = PoseHistory(), Late()
+        self.history, self.late = PoseHistory(), DataLatency()
         self.scan: LaserScan | None = None
         self.chance, self.noise = random.Random(1), np.random.default_rng(1)
         self.world = room
@@ -62,8 +62,11 @@ class Robot:
                 self.scan = scan(seen + self.noise.normal(0.0, 0.01, 360), self.tick)
                 self.scan = replace(self.scan, basis=self.tick)
             self.history = self.history.then(now)
-            self.late = look(self.body, self.late, now, self.scan, self.history, 1)
-            found += [c.code for c in (*slows(self.body, self.late), *stops(self.body, self.late))]
+            self.late = self.late.then(self.body, now, self.scan, self.history, 1)
+            found += [
+                c.code
+                for c in (*self.late.slow_causes(self.body), *self.late.stop_causes(self.body))
+            ]
         return list(dict.fromkeys(found))
 
     def state(self, velocity: Velocity) -> RobotState:
@@ -109,10 +112,10 @@ def test_a_room_that_shows_no_turn_says_nothing(delay: int) -> None:
     robot = Robot(delay)
     robot.world = silo
     assert robot.drive(50, 1.0) == []
-    assert robot.late.scan_lag.ticks is None
+    assert robot.late.turns.ticks is None
 
 
 def test_who_drives_straight_on_learns_nothing() -> None:
     robot = Robot(5)
     assert robot.drive(200, 0.0, 0.2) == []
-    assert robot.late.scan_lag.ticks is None
+    assert robot.late.turns.ticks is None

@@ -10,8 +10,8 @@ import pytest
 from msgspec.structs import replace
 
 from gigabrain_schemas.body import Thresholds
-from gigabrain_zenoh.safety.attitude import tilt_deg
-from gigabrain_zenoh.safety.host import Host, HostWatch, warnings
+from gigabrain_zenoh.safety.health import Host, tilt_deg
+from gigabrain_zenoh.safety.node import HostWatch
 from gigabrain_zenoh.testing.waiting import until
 from tests.unit.safety.patrol import BODY, Patrol, imu
 
@@ -87,8 +87,8 @@ def test_a_host_without_room_is_a_warning_and_no_more() -> None:
     patrol.go(host=Host(disk_mb=499.0, cpu=95.1, memory=95.1))
     assert patrol.warnings == ["disk_low", "cpu_busy", "memory_low"]
     assert patrol.verdict.verdict == "ok"
-    assert warnings(Thresholds(), Host(disk_mb=500.0, cpu=95.0, memory=95.0)) == ()
-    assert warnings(Thresholds(), Host()) == ()
+    assert Host(disk_mb=500.0, cpu=95.0, memory=95.0).warnings(Thresholds()) == ()
+    assert Host().warnings(Thresholds()) == ()
 
 
 SECONDS = itertools.count(1000)

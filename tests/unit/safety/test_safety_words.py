@@ -8,7 +8,7 @@ from gigabrain_drivers.driver.latch import UNREADABLE
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh.gate import causes
-from gigabrain_zenoh.safety.words import CAUSES, WARNINGS, say
+from gigabrain_zenoh.safety.catalogue import CAUSES, WARNINGS, cause
 
 PAGE = Path(__file__).parents[3] / "docs" / "safety.md"
 OTHERS = (
@@ -31,15 +31,15 @@ def causes_told() -> list[list[str]]:
 
 
 def test_the_page_has_every_cause_with_its_sentence_and_its_remedy() -> None:
-    for cause in (*CAUSES.values(), *OTHERS):
-        latches = "yes" if cause.latching else ""
-        assert [f"`{cause.code}`", cause.text, cause.remedy, latches] in causes_told()
+    for one in (*CAUSES.values(), *OTHERS):
+        latches = "yes" if one.latching else ""
+        assert [f"`{one.code}`", one.text, one.remedy, latches] in causes_told()
     for warning in WARNINGS.values():
         assert [f"`{warning.code}`", warning.text, warning.remedy] in causes_told()
 
 
 def test_the_page_has_no_cause_that_there_is_not() -> None:
-    known = {cause.code for cause in (*CAUSES.values(), *WARNINGS.values(), *OTHERS)}
+    known = {one.code for one in (*CAUSES.values(), *WARNINGS.values(), *OTHERS)}
     assert {row[0].strip("`") for row in causes_told()} == known
 
 
@@ -50,13 +50,13 @@ def test_the_page_has_every_threshold_with_its_default() -> None:
 
 
 def test_every_cause_says_what_to_do_about_it() -> None:
-    for cause in (*CAUSES.values(), *WARNINGS.values(), *OTHERS):
-        assert cause.remedy
-        assert cause.text
+    for one in (*CAUSES.values(), *WARNINGS.values(), *OTHERS):
+        assert one.remedy
+        assert one.text
 
 
 def test_a_cause_may_be_said_with_figures() -> None:
-    assert say("battery_low", "battery at 14 %") == Cause(
+    assert cause("battery_low", "battery at 14 %") == Cause(
         code="battery_low", text="battery at 14 %", remedy="charge it soon"
     )
-    assert say("collision").latching
+    assert cause("collision").latching

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Thresholds
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.safety.unknown import SECTORS
+from gigabrain_zenoh.safety.blind_spots import SECTORS
 from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, open_space
 from tests.unit.safety.patrol import BODY, Patrol
 
@@ -83,7 +83,7 @@ def test_in_front_of_a_wall_it_does_not_flicker() -> None:
     patrol.go(60, told=AHEAD)
     for _ in range(60):
         values = near(0, 0.075 + 0.15 + rng.normal(0.0, 0.01))
-        obeyed = patrol.memory.following.told
+        obeyed = patrol.memory.tracking.commanded
         found.append(tuple(patrol.go(5, told=AHEAD, moves=obeyed, values=values)))
     closed = found.index(("zone_ahead",))
     assert set(found[closed:]) == {("zone_ahead",)}

@@ -28,7 +28,7 @@ from gigabrain_zenoh.qa.proxy.serial import in_front_of
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, reconfigured
 from gigabrain_zenoh.runtime.managed_process import ProcessSpec
-from gigabrain_zenoh.safety.following import WINDOW_TICKS
+from gigabrain_zenoh.safety.tracking_error import WINDOW_TICKS
 
 CHECKSUM = "*{crc16}"  # at the end of a command; docs/firmware_line.md has lines without one
 LINES, LONG_LINES = 20_000, 1_000_000

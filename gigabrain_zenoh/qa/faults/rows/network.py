@@ -33,7 +33,7 @@ from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import Deployment, with_free_port
-from gigabrain_zenoh.safety.round_trip import SLOWED
+from gigabrain_zenoh.safety.pipeline import HALF_SPEED
 from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.authority import issue, new_fleet
 
@@ -160,7 +160,7 @@ async def latency_jitter_loss(rig: Rig) -> Measured:
         probe, stopped, rate_hz = robot.probe, 0, 0.0
         for round_trip_ms in ROUND_TRIPS_MS:
             proxy.set(Chaos(delay_ms=round_trip_ms / 2))
-            await robot.drive(share=SLOWED)  # 100 ms and what this machine adds are too long
+            await robot.drive(share=HALF_SPEED)  # 100 ms and what this machine adds are too long
             start = probe.state
             await probe.ticks(DRIVE_TICKS)
             stopped += len(probe.stops(start))

@@ -22,8 +22,8 @@ def _zone(code: str, where: str) -> Cause:
 
 
 CAUSES: dict[str, Cause] = {
-    cause.code: cause
-    for cause in (
+    one.code: one
+    for one in (
         Cause(
             code="starting",
             text="safety has only just begun to look",
@@ -118,8 +118,8 @@ CAUSES: dict[str, Cause] = {
 }
 
 WARNINGS: dict[str, Cause] = {
-    cause.code: cause
-    for cause in (
+    one.code: one
+    for one in (
         Cause(code="battery_low", text="the battery is low", remedy="charge it soon"),
         Cause(
             code="battery_return",
@@ -148,7 +148,7 @@ WARNINGS: dict[str, Cause] = {
 }
 
 
-def say(code: str, text: str = "") -> Cause:
+def cause(code: str, text: str = "") -> Cause:
     """The cause or warning called `code`, with figures in its sentence where there are any."""
     known = CAUSES.get(code) or WARNINGS[code]
     return replace(known, text=text) if text else known

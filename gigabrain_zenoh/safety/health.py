@@ -1,0 +1,203 @@
+"""Monitors of the machine: battery, motors, attitude and bumpers, and the computer's resources."""
+
+import math
+import statistics
+
+from msgspec import Struct
+from msgspec.structs import replace
+
+from gigabrain_schemas.base import Cause
+from gigabrain_schemas.body import Battery, RobotState, Thresholds
+from gigabrain_schemas.sensors import Accelerations, Quaternion
+from gigabrain_zenoh.safety.catalogue import cause
+from gigabrain_zenoh.safety.debounce import lasting, ticks_of
+
+CONFIRM_STATES = 3  # in a row that measure something, before the body counts as measuring it
+MEDIAN_STATES = 25  # of charges; the median of 0.5 s ignores a sag of 0.2 s
+CLEAR_PERCENT, CLEAR_DEG_C = 2.0, 2.0  # hysteresis of the thresholds
+MIN_DEG_C, MAX_DEG_C = -40.0, 150.0  # beyond these a motor's sensor is faulty
+TILT_TICKS = 10  # 0.2 s, longer than a bump in the floor
+UNIT_TOLERANCE = 0.1  # of the length of an orientation quaternion
+HOST_CODES = ("disk_low", "cpu_busy", "memory_low")
+
+
+class Measured(Struct, frozen=True):
+    """Values that one state contained."""
+
+    charge: bool
+    volts: bool
+    motors: frozenset[str]  # with a temperature
+
+
+class Power(Struct, frozen=True, kw_only=True):
+    """Monitors battery and motors: low, hot, or no longer measured."""
+
+    charges: tuple[float, ...] = ()  # newest percentages [%]
+    low_ticks: tuple[int, int, int] = (0, 0, 0)  # below battery_warn, _return and _stop
+    warm_ticks: int = 0
+    hot_ticks: int = 0
+    measured: tuple[Measured, ...] = ()  # of the newest states
+    charged: bool = False  # the body measures its charge
+    volts: bool = False  # and its voltage
+    motors: frozenset[str] = frozenset()  # whose temperature the body measures
+    charge_missing_ticks: int = 0
+    motor_missing_ticks: int = 0
+
+    @property
+    def charge(self) -> float:
+        """The battery's charge without short sags [%]."""
+        return statistics.median(self.charges)
+
+    def then(self, limits: Thresholds, state: RobotState, elapsed: int) -> "Power":
+        """Return the monitor after one more state."""
+        battery = state.battery if _plausible(state.battery, self.volts) else None
+        charges = (*self.charges, battery.percentage) if battery and elapsed else self.charges
+        temperatures = _temperatures(state)
+        now = replace(self, charges=charges[-MEDIAN_STATES:])
+        if elapsed or not now.measured:
+            volts = battery is not None and battery.voltage > 0
+            now = now._confirmed(Measured(battery is not None, volts, frozenset(temperatures)))
+        lost = bool(now.motors - temperatures.keys())
+        hottest = max(temperatures.values(), default=MIN_DEG_C)
+        missing = now.charged and battery is None
+        return replace(
+            now,
+            low_ticks=now._low(limits, elapsed),
+            warm_ticks=_over(limits, now.warm_ticks, hottest, limits.motor_warn, elapsed),
+            hot_ticks=_over(limits, now.hot_ticks, hottest, limits.motor_stop, elapsed),
+            charge_missing_ticks=lasting(now.charge_missing_ticks, missing, elapsed),
+            motor_missing_ticks=lasting(now.motor_missing_ticks, lost, elapsed),
+        )
+
+    def causes(self, limits: Thresholds) -> tuple[Cause, ...]:
+        """Return why the body must stop."""
+        found = []
+        if self.low_ticks[2] >= ticks_of(limits.battery_sustain):
+            found.append(cause("battery_empty", f"battery at or below {limits.battery_stop:g} %"))
+        if self.hot_ticks >= ticks_of(limits.motor_sustain):
+            found.append(cause("motor_hot", f"a motor has {limits.motor_stop:g} °C or more"))
+        if self.charge_missing_ticks >= ticks_of(limits.missing_after):
+            found.append(cause("battery_unknown"))
+        if self.motor_missing_ticks >= ticks_of(limits.missing_after):
+            found.append(cause("motor_unknown"))
+        return tuple(found)
+
+    def warnings(self, limits: Thresholds, state: RobotState) -> tuple[Cause, ...]:
+        """Return what will become a cause if nobody acts."""
+        found = []
+        low = [ticks >= ticks_of(limits.battery_sustain) for ticks in self.low_ticks]
+        if low[1]:
+            text = f"battery at {self.charge:.0f} %; it comes to rest"
+            found.append(cause("battery_return", text))
+        elif low[0]:
+            found.append(cause("battery_low", f"battery at {self.charge:.0f} %"))
+        if self.warm_ticks >= ticks_of(limits.motor_sustain):
+            temperatures = _temperatures(state)
+            name = max(temperatures, key=temperatures.__getitem__, default="a motor")
+            found.append(cause("motor_warm", f"{name} has {temperatures.get(name, 0):.0f} °C"))
+        return tuple(found)
+
+    def _confirmed(self, now: Measured) -> "Power":
+        """Return what the body measures: only what CONFIRM_STATES states in a row contained."""
+        newest = (*self.measured, now)[-CONFIRM_STATES:]
+        power = replace(self, measured=newest)
+        if len(newest) < CONFIRM_STATES:
+            return power
+        motors = frozenset.intersection(*(one.motors for one in newest))
+        return replace(
+            power,
+            charged=power.charged or all(one.charge for one in newest),
+            volts=power.volts or all(one.volts for one in newest),
+            motors=power.motors if motors <= power.motors else power.motors | motors,
+        )
+
+    def _low(self, limits: Thresholds, elapsed: int) -> tuple[int, int, int]:
+        if not self.charges:
+            return self.low_ticks
+        charge, enough = self.charge, ticks_of(limits.battery_sustain)
+
+        def count(ticks: int, threshold: float) -> int:
+            clear = CLEAR_PERCENT if ticks >= enough else 0.0
+            return lasting(ticks, charge <= threshold + clear, elapsed)
+
+        warn, home, stop = self.low_ticks
+        return (
+            count(warn, limits.battery_warn),
+            count(home, limits.battery_return),
+            count(stop, limits.battery_stop),
+        )
+
+
+def _plausible(battery: Battery | None, volts: bool) -> bool:
+    """Return whether a battery is plausible: after it had a voltage, none is a fault."""
+    return battery is not None and (battery.voltage > 0 or not volts)
+
+
+def _temperatures(state: RobotState) -> dict[str, float]:
+    """Return the plausible temperatures by motor [deg C]."""
+    found = ((joint.name, joint.temperature) for joint in state.joints)
+    return {name: t for name, t in found if t is not None and MIN_DEG_C < t < MAX_DEG_C}
+
+
+def _over(limits: Thresholds, ticks: int, hottest: float, threshold: float, elapsed: int) -> int:
+    clear = CLEAR_DEG_C if ticks >= ticks_of(limits.motor_sustain) else 0.0
+    return lasting(ticks, hottest >= threshold - clear, elapsed)
+
+
+class Attitude(Struct, frozen=True, kw_only=True):
+    """Monitors tilt and shocks."""
+
+    tilted_ticks: int = 0
+    hit: bool = False  # in this state
+
+    def then(self, limits: Thresholds, state: RobotState, shock: float, elapsed: int) -> "Attitude":
+        """Return the monitor after one more state.
+
+        `shock` is the largest horizontal acceleration since the last state [m/s2].
+        """
+        tilt = tilt_deg(state.imu.orientation) if state.imu else None
+        if state.imu:
+            shock = max(shock, horizontal(state.imu.linear_acceleration))
+        tilted = tilt is not None and tilt > limits.tilt_stop
+        return Attitude(
+            tilted_ticks=lasting(self.tilted_ticks, tilted, elapsed),
+            hit=any(state.bumpers) or shock > limits.shock_stop,
+        )
+
+    @property
+    def causes(self) -> tuple[Cause, ...]:
+        """Why the body must stop, until a person releases it."""
+        found = [("tilted", self.tilted_ticks >= TILT_TICKS), ("collision", self.hit)]
+        return tuple(cause(code) for code, wrong in found if wrong)
+
+
+def tilt_deg(orientation: Quaternion) -> float | None:
+    """Return the angle between the body's z axis and the vertical [deg]; None if invalid."""
+    x, y, z, w = orientation
+    if abs(math.hypot(x, y, z, w) - 1.0) > UNIT_TOLERANCE:
+        return None
+    return math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y)))))
+
+
+def horizontal(acceleration: Accelerations) -> float:
+    """Return the acceleration across the body's z axis [m/s2]."""
+    return math.hypot(acceleration[0], acceleration[1])
+
+
+class Host(Struct, frozen=True, kw_only=True):
+    """Resources of the computer that safety runs on; None if unknown."""
+
+    disk_mb: float | None = None  # [MB] free
+    cpu: float | None = None  # [%] of all cores, used
+    memory: float | None = None  # [%] used
+
+    def warnings(self, limits: Thresholds) -> tuple[Cause, ...]:
+        """Return what will hurt if nobody acts; none of it stops the body."""
+        found = []
+        if self.disk_mb is not None and self.disk_mb < limits.disk_warn:
+            found.append(cause("disk_low", f"{self.disk_mb:.0f} MB left on the disk"))
+        if self.cpu is not None and self.cpu > limits.cpu_warn:
+            found.append(cause("cpu_busy"))
+        if self.memory is not None and self.memory > limits.memory_warn:
+            found.append(cause("memory_low"))
+        return tuple(found)

@@ -1,0 +1,307 @@
+"""Monitor of late sensor data, from the body and from its lidar.
+
+The driver's device stamps tell the latency, where it has them. Otherwise it is estimated: how late
+the measured speeds follow the commands, and the lidar's scans the body's turns. Neither needs
+stamps, but speeds that change. A robot whose data are late by its reaction time needs at half speed
+no more room than at full speed otherwise; later data stop it.
+"""
+
+import math
+from typing import Self
+
+import numpy as np
+from msgspec import Struct
+from msgspec.structs import replace
+from numpy.typing import NDArray
+
+from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.base import TICK_NS, Cause, Velocity
+from gigabrain_schemas.body import BodyDescription, RobotState
+from gigabrain_schemas.sensors import LaserScan
+from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.geometry.pose import PoseHistory
+from gigabrain_zenoh.safety.catalogue import cause
+from gigabrain_zenoh.safety.debounce import lasting, ticks_of
+
+Floats = NDArray[np.float64]
+Speeds = tuple[float, float, float]
+
+TICK_MS = TICK_NS / 1e6
+ROUND_MS = 10.0  # precision of texts
+DOUBT_TICKS = 250  # after a silence, unless the speeds show sooner whether data are late
+
+MAX_UNEXPLAINED = 0.1  # share of the squared changes that the best delay may leave
+REFUTED = 4.0  # a delay that leaves this many times more than the best is refuted
+CONFIRMATIONS = 3  # consistent estimates in a row, until the delay counts as known
+REST_TICKS = 50  # without motion commands, after which nothing is known
+
+SPEED_TICKS, MIN_SPEED_TICKS = 40, 20  # of measured speeds
+SPEED_DELAYS = 31  # candidates, a tick apart: 0 to 0.6 s
+MIN_SPEED_DELAYS = 15  # while there are fewer commands than the longest delay needs
+SPEED_SCALE = np.array([0.05, 0.05, 0.3])  # [m/s, m/s, rad/s], as tolerances of tracking_error
+MIN_SPEED_CHANGE = 2.0  # in units of that; smaller changes are noise
+SPEED_PERIOD_TICKS = 4  # between estimates
+
+TURN_TICKS = 60  # of scans
+TURN_DELAYS = 26  # candidates, a tick apart: 0 to 0.5 s
+MAX_RANGE_M = 5.0
+MAX_RANGE_DIFFERENCE_M = 0.5  # two beams that differ by more show different things
+MAX_TURN = math.radians(35.0)  # between two scans
+DISTINCT = 0.5  # largest mismatch of the best turn, as a share of the median turn's
+MIN_TURNS = 5
+MIN_TURN_CHANGE = math.radians(3.0)
+TURN_NOISE = math.radians(0.15)  # of a turn between two scans
+
+
+class DelayEstimate(Struct, frozen=True, kw_only=True):
+    """A delay that is known once several estimates in a row agree."""
+
+    ticks: int | None = None  # None while unknown
+    guess: int = 0  # the newest estimate,
+    guesses: int = 0  # and how many in a row were alike
+    rest_ticks: int = 0
+
+    def _at_rest(self, state: RobotState, elapsed: int) -> Self:
+        rest = self.rest_ticks + elapsed if state.sent == ZERO else 0
+        now = replace(self, rest_ticks=rest)
+        return replace(now, ticks=None, guesses=0) if rest > REST_TICKS else now
+
+    def _guessed(self, delay: int | None) -> Self:
+        if delay is None:
+            return self
+        guesses = self.guesses + 1 if abs(delay - self.guess) <= 1 else 1
+        known = delay if guesses >= CONFIRMATIONS else self.ticks
+        return replace(self, guess=delay, guesses=guesses, ticks=known)
+
+
+def _refutes_shorter(left: Floats, best: int) -> bool:
+    """Return whether the delays below `best` are refuted by what they leave unexplained."""
+    refuted = left > REFUTED * left[best]
+    return bool(refuted[: max(0, best - 2)].all())
+
+
+class SpeedDelay(DelayEstimate, frozen=True, kw_only=True):
+    """Delay of a body's measured speeds behind the commands, by cross-correlation.
+
+    Each candidate predicts the measured speeds of the last 0.8 s with a gain and an offset of its
+    own. The best one counts, if it explains them well and shorter ones do not.
+    """
+
+    commanded: tuple[Speeds, ...] = ()  # by tick, newest last
+    measured: tuple[Speeds, ...] = ()
+
+    def then(self, state: RobotState, elapsed: int) -> "SpeedDelay":
+        """Return the estimate after one more state, `elapsed` ticks after the last."""
+        if not elapsed:
+            return self
+        commanded = (*self.commanded, *(_speeds(state.sent),) * elapsed)
+        now = replace(self, commanded=commanded[-SPEED_TICKS - SPEED_DELAYS + 1 :])
+        if not state.link.connected:  # later data may be later than the earlier ones
+            rest = self.rest_ticks + elapsed if state.sent == ZERO else 0
+            return replace(now, measured=(), rest_ticks=rest)
+        measured = (*self.measured, *(_speeds(state.velocity),) * elapsed)[-SPEED_TICKS:]
+        now = replace(now, measured=measured)._at_rest(state, elapsed)
+        due = state.tick // SPEED_PERIOD_TICKS != (state.tick - elapsed) // SPEED_PERIOD_TICKS
+        return now._guessed(now._delay()) if due and now.rest_ticks <= REST_TICKS else now
+
+    def _delay(self) -> int | None:
+        if len(self.measured) < MIN_SPEED_TICKS:
+            return None
+        if len(self.commanded) < len(self.measured) + MIN_SPEED_DELAYS - 1:
+            return None
+        commanded = np.array(self.commanded) / SPEED_SCALE
+        measured = np.array(self.measured) / SPEED_SCALE
+        if float(np.ptp(measured, axis=0).max()) < MIN_SPEED_CHANGE:
+            return None
+        left, whole = _unexplained(commanded, measured)
+        best = int(np.argmin(left))
+        sure = left[best] <= MAX_UNEXPLAINED * whole and _refutes_shorter(left, best)
+        return best if sure else None
+
+
+def _speeds(of: Velocity) -> Speeds:
+    return of.linear_x, of.linear_y, of.angular_z
+
+
+def _unexplained(commanded: Floats, measured: Floats) -> tuple[Floats, float]:
+    """Return what each delay leaves of the squared speed changes, (delays,), and their sum."""
+    views = np.lib.stride_tricks.sliding_window_view(commanded, len(measured), axis=0)
+    views = views[::-1][:SPEED_DELAYS]
+    models = views - views.mean(axis=2, keepdims=True)  # (delays, axes, ticks)
+    changes = (measured - measured.mean(axis=0)).T  # (axes, ticks)
+    both = np.einsum("dat,at->da", models, changes)
+    size = np.maximum(np.einsum("dat,dat->da", models, models), 1e-9)
+    whole = np.einsum("at,at->a", changes, changes)
+    gains = np.clip(both / size, 0.5, 1.5)
+    left = np.maximum(whole - 2 * gains * both + gains * gains * size, 0.0).sum(axis=1)
+    return left + 1e-3 * len(measured), float(whole.sum())
+
+
+class TurnDelay(DelayEstimate, frozen=True, kw_only=True):
+    """Delay of a lidar's scans behind the odometry, by how both turn.
+
+    Two scans of a room show the turn between them. Each candidate tells the turn by odometry; the
+    one that fits the last 1.2 s best counts, if it fits well and shorter ones do not. This needs
+    turns that begin or end, walls, and a lidar that covers the full circle.
+    """
+
+    scan: LaserScan | None = None  # the newest
+    turns: tuple[tuple[int, int, float], ...] = ()  # from tick, to tick, angle [rad]
+
+    def then(
+        self, state: RobotState, scan: LaserScan | None, history: PoseHistory, elapsed: int
+    ) -> "TurnDelay":
+        """Return the estimate after one more state, and the newest scan once its tick has come."""
+        now, last = self._at_rest(state, elapsed), self.scan
+        if scan is None or scan.basis > state.tick or (last and scan.basis <= last.basis):
+            return now
+        turn = _turn(last, scan) if last else None
+        now = replace(now, scan=scan)
+        if last is None or turn is None:
+            return replace(now, turns=())
+        recent = (t for t in self.turns if t[0] > scan.basis - TURN_TICKS)
+        now = replace(now, turns=(*recent, (last.basis, scan.basis, turn)))
+        return now._guessed(_turn_delay(now.turns, history))
+
+
+def _turn(before: LaserScan, now: LaserScan) -> float | None:
+    """Return the lidar's turn between two scans [rad]; None if they do not show it."""
+    if before.angle_increment != now.angle_increment or len(before.ranges) != len(now.ranges):
+        return None
+    then, newest = _profile(before), _profile(now)
+    step, beams = abs(now.angle_increment), len(newest)
+    if not math.isclose(step * beams, math.tau, rel_tol=0.01):
+        return None
+    most = min(math.ceil(MAX_TURN / step), beams // 2 - 1)
+    around = np.concatenate([then[beams - most :], then, then[:most]])
+    apart = np.lib.stride_tricks.sliding_window_view(around, beams) - newest  # (shifts, beams)
+    limit = MAX_RANGE_DIFFERENCE_M * MAX_RANGE_DIFFERENCE_M
+    unlike = np.minimum(apart * apart, limit).mean(axis=1)
+    best = int(np.argmin(unlike))
+    if best in (0, 2 * most) or unlike[best] > DISTINCT * float(np.median(unlike)):
+        return None
+    left, middle, right = unlike[best - 1 : best + 2]
+    bend = left - 2 * middle + right
+    between = 0.5 * (left - right) / bend if bend > 0 else 0.0
+    return float((best - most + between) * now.angle_increment)
+
+
+def _profile(scan: LaserScan) -> Floats:
+    """Return the ranges (n,) [m], clipped to MAX_RANGE_M."""
+    values = ranges(scan).astype(np.float64)
+    return np.clip(np.nan_to_num(values, nan=MAX_RANGE_M, posinf=MAX_RANGE_M), 0.0, MAX_RANGE_M)
+
+
+def _turn_delay(turns: tuple[tuple[int, int, float], ...], history: PoseHistory) -> int | None:
+    if len(turns) < MIN_TURNS:
+        return None
+    begins, ends, seen = (np.array(part, dtype=np.float64) for part in zip(*turns, strict=True))
+    if float(np.ptp(seen)) < MIN_TURN_CHANGE or not history.ticks:
+        return None
+    known = np.array(history.ticks, dtype=np.float64)
+    if known[0] > begins[0] - TURN_DELAYS:
+        return None
+    yaws = np.unwrap(np.array([pose.yaw for pose in history.poses]))
+    back = np.arange(TURN_DELAYS, dtype=np.float64)[:, None]
+    turned = np.interp(ends - back, known, yaws) - np.interp(begins - back, known, yaws)
+    left = ((turned - seen) ** 2).sum(axis=1) + len(turns) * TURN_NOISE * TURN_NOISE
+    best = int(np.argmin(left))
+    sure = left[best] <= MAX_UNEXPLAINED * float(((seen - seen.mean()) ** 2).sum()) + (
+        len(turns) * TURN_NOISE * TURN_NOISE
+    )
+    return best if sure and _refutes_shorter(left, best) else None
+
+
+class DataLatency(Struct, frozen=True, kw_only=True):
+    """Monitors how late the data of body and lidar are."""
+
+    speeds: SpeedDelay = SpeedDelay()
+    turns: TurnDelay = TurnDelay()
+    body_ms: float = 0.0
+    lidar_ms: float = 0.0
+    body_ticks: int = 0  # for which the body's data have been late
+    lidar_ticks: int = 0
+    doubt_ms: float = 0.0  # the longest recent silence, by which data may have become late
+    doubt_ticks: int = 0  # for which that is unknown
+
+    def then(
+        self,
+        body: BodyDescription,
+        state: RobotState,
+        scan: LaserScan | None,
+        history: PoseHistory,
+        elapsed: int,
+    ) -> "DataLatency":
+        """Return the monitor after one more state, `elapsed` ticks after the last."""
+        limits = body.thresholds
+        late_ms = limits.late * 1e3
+        now = self._doubtful(state, late_ms, elapsed)
+        speeds = now.speeds.then(state, elapsed)
+        beyond_ms = (speeds.ticks or 0) * TICK_MS - limits.response * 1e3
+        body_ms = max(state.link.late_ms or 0.0, beyond_ms, 0.0)
+        if speeds.ticks is not None and body_ms < late_ms:
+            now = replace(now, doubt_ms=0.0, doubt_ticks=0)
+        turns = self.turns.then(state, scan, history, elapsed)
+        # a complete scan is half a turn old
+        age_ms = 500.0 / body.lidar.rate_hz if body.lidar else 0.0
+        behind_ms = (turns.ticks or 0) * TICK_MS - age_ms
+        lidar_ms = max(scan.late_ms if scan else 0.0, behind_ms, 0.0)
+        return replace(
+            now,
+            speeds=speeds,
+            turns=turns,
+            body_ms=body_ms,
+            lidar_ms=lidar_ms,
+            body_ticks=lasting(self.body_ticks, body_ms >= late_ms, elapsed),
+            lidar_ticks=lasting(self.lidar_ticks, lidar_ms >= late_ms, elapsed),
+        )
+
+    def late_ticks(self, body: BodyDescription) -> int:
+        """Return by how many ticks the body's data are late, once that is named as a cause.
+
+        A guess must not excuse a body that disobeys: one whose wheel is stuck looks late as well.
+        """
+        named = self.body_ticks >= ticks_of(body.thresholds.late_sustain)
+        return math.ceil(self.body_ms / TICK_MS) if named else 0
+
+    def stop_causes(self, body: BodyDescription) -> tuple[Cause, ...]:
+        """Return why the body must stop."""
+        limit_ms = body.thresholds.reaction_time * 1e3
+        return tuple(_cause(code, ms, "") for code, ms in self._late(body) if ms > limit_ms)
+
+    def slow_causes(self, body: BodyDescription) -> tuple[Cause, ...]:
+        """Return why the body must go at half speed."""
+        limit_ms = body.thresholds.reaction_time * 1e3
+        found = self._late(body)
+        late = tuple(_cause(code, ms, "; half speed") for code, ms in found if ms <= limit_ms)
+        if self.doubt_ticks and "body_late" not in dict(found):
+            text = f"the body was silent for {self.doubt_ms:.0f} ms, and may be late; half speed"
+            late = (cause("body_late", text), *late)
+        return late
+
+    def _doubtful(self, state: RobotState, late_ms: float, elapsed: int) -> "DataLatency":
+        """Forget the known latency after a silence, unless the device's clock tells it.
+
+        A line cannot become late without a silence of the same length. The body slows down, and its
+        change of speed shows whether the line is late.
+        """
+        silent_ms = state.link.age_ms
+        if silent_ms >= late_ms and state.link.late_ms is None:
+            longest_ms = max(silent_ms, self.doubt_ms)
+            speeds = replace(self.speeds, measured=(), ticks=None, guesses=0)
+            return replace(self, speeds=speeds, doubt_ms=longest_ms, doubt_ticks=DOUBT_TICKS)
+        left = max(0, self.doubt_ticks - elapsed)
+        return replace(self, doubt_ms=self.doubt_ms if left else 0.0, doubt_ticks=left)
+
+    def _late(self, body: BodyDescription) -> list[tuple[str, float]]:
+        sustain = ticks_of(body.thresholds.late_sustain)
+        each = (
+            ("body_late", self.body_ticks, self.body_ms),
+            ("lidar_late", self.lidar_ticks, self.lidar_ms),
+        )
+        return [(code, ms) for code, ticks, ms in each if ticks >= sustain]
+
+
+def _cause(code: str, ms: float, more: str) -> Cause:
+    rounded = ROUND_MS * round(ms / ROUND_MS)
+    return cause(code, f"{cause(code).text}, by {rounded:.0f} ms{more}")
