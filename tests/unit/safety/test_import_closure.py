@@ -1,0 +1,29 @@
+"""Safety and the gate see little of the code: what their pure steps import is counted."""
+
+import subprocess
+import sys
+
+import pytest
+
+COUNT = """
+import sys
+import {module}
+print(sum(name.startswith(("gigabrain_zenoh", "gigabrain_schemas")) for name in sys.modules))
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "most"), [("gigabrain_zenoh.safety.step", 30), ("gigabrain_zenoh.gate.gate", 13)]
+)
+def test_a_pure_step_imports_few_modules(module: str, most: int) -> None:
+    done = subprocess.run(
+        (
+            sys.executable,
+            "-c",
+            f"import sys; sys.path[:] = {sys.path!r}{COUNT.format(module=module)}",
+        ),
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) <= most
