@@ -17,7 +17,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.geometry.limits import limits_of, ramp
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
 from gigabrain_zenoh.qa.proxy.serial import LineProxy
-from gigabrain_zenoh.safety import lag
+from gigabrain_zenoh.safety.latency import SpeedDelay
 from gigabrain_zenoh.testing.line import EmulatedLine
 from gigabrain_zenoh.testing.waiting import until
 from tests.unit.drivers.lidars import LIDAR, Listener, emulated
@@ -45,7 +45,7 @@ class Swaying:
     """A base on a text line that is told one way and the other, and how late it follows."""
 
     def __init__(self, driver: LineDriver) -> None:
-        self.driver, self.lag = driver, lag.Lag()
+        self.driver, self.lag = driver, SpeedDelay()
 
     async def run(self) -> None:
         told, limits, begin = Velocity(), limits_of(self.driver.robot), asyncio.get_running_loop()
@@ -57,7 +57,7 @@ class Swaying:
             await asyncio.sleep(TICK_S)
             tick = round((begin.time() - start_s) / TICK_S)
             state = replace(await self.driver.read_state(), tick=tick, sent=sent)
-            self.lag, last = lag.look(self.lag, state, tick - last), tick
+            self.lag, last = self.lag.then(state, tick - last), tick
 
     def is_late(self, least: int, most: int) -> Callable[[], bool]:
         return lambda: self.lag.ticks is not None and least <= self.lag.ticks <= most
