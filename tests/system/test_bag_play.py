@@ -142,7 +142,7 @@ async def test_an_empty_bag_and_bad_options_are_refused_in_one_line(tmp_path: Pa
     ("option", "complaint"),
     [
         (("--rate", "0"), "--rate: expected a number from 0.01 to 100, got 0"),
-        (("--start", "nan"), "--start: expected seconds from 0 on, got nan"),
+        (("--start", "nan"), "--start: expected 0 or more seconds, got nan"),
         (("--remap", "a"), "--remap: expected old/key=new/key, got 'a'"),
     ],
 )

@@ -40,7 +40,7 @@ async def test_who_was_called_back_can_do_nothing_and_the_next_of_that_role_all(
 
 async def test_keys_are_called_back_by_command(own: Path, home: Home) -> None:
     said = await home.run("keys", "revoke", "operator", "--robot", "red", "--dir", str(own))
-    assert f"{own}/router/generations.json: copy it into that identity's folder" in said.out
+    assert f"{own}/router/generations.json: copy it to" in said.out
     assert said.out.endswith(f"gigabrain keys issue operator --robot red --dir {own}\n")
     listed = home.start("keys", "list", "--dir", str(own))
     assert await listed.ended() == 1
