@@ -119,7 +119,6 @@ fuzz: setup
 # what CI runs behind `make test`: the wheel in an empty environment
 ci-extra: $(INSTALLED)
 	$(BIN)/python -m tests.qa.wheel
-	$(PYTEST) -q -m ci_extra tests
 
 bench: setup
 	$(BIN)/gigabrain bench chain
