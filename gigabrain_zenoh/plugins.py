@@ -2,6 +2,7 @@
 
 import importlib
 from collections.abc import Mapping
+from functools import cache
 from importlib.metadata import entry_points
 from typing import Any
 
@@ -14,8 +15,9 @@ def find(path: str) -> Any:
     return getattr(importlib.import_module(module), name)
 
 
+@cache
 def package_version() -> str:
-    """Return the version of the installed package. Takes 25 ms."""
+    """Return the version of the installed package. The first call takes 25 ms."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
