@@ -78,7 +78,7 @@ class Bus:
         self.problems: tuple[Cause, ...] = ()  # what a node cannot do now, for its health
         self.latency_ms: dict[str, float] = {}  # what a node measures, for its health
         self.report: Callable[[], Mapping[str, float | int | str | None]] = dict
-        self.input_log = InputLogger()  # of what the node goes by
+        self.input_log = InputLogger()  # inputs that the node has used
         self.params = Params()  # what may be changed while the process runs
         self.arrived: dict[str, tuple[int, int]] = {}  # boot and tick of the newest, by key
         # whether work was done since the last call; a loop that turns, where a node says no more

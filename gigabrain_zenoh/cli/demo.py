@@ -76,7 +76,7 @@ class RobotOptions:
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions:
-    """What a demo shows and writes."""
+    """Display and output of a demo."""
 
     headless: bool = False
     "Print progress in one line instead of the live view."

@@ -101,7 +101,7 @@ TopicNames = Annotated[
     ),
 ]
 Count = Annotated[int | None, Parameter(alias="-n")]
-Take = Annotated[bool, Parameter(help="Take over from whoever drives, the robot's brain included.")]
+Take = Annotated[bool, Parameter(help="Take over from any commander, the robot's brain too.")]
 JsonLines = Annotated[bool, Parameter(help="Print one JSON object per line.")]
 JsonFile = Annotated[Path | None, Parameter(help="Write the results as JSON to this file.")]
 Output = Annotated[Path | None, Parameter(alias="-o")]

@@ -32,7 +32,7 @@ ROUTER = "tcp/127.0.0.1:7447"
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class ProcessOptions:
-    """Where a process connects and logs."""
+    """Connection and logging of a process."""
 
     connect: str = ROUTER
     "Zenoh endpoint of the router."

@@ -90,7 +90,7 @@ def one_of(values: Sequence[Any]) -> str:
 
 
 def got(node: Node) -> str:
-    """What the file holds, as it is written there."""
+    """Return the content of the file as it is written there."""
     if node.entries is not None:
         return "a mapping"
     if node.items is not None:

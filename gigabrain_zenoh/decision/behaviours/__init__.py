@@ -37,7 +37,7 @@ Drive = Callable[[DriveCommand | None], Step]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Inputs:
-    """What a behaviour knows at one scan."""
+    """Inputs of a behaviour at one scan."""
 
     world: WorldModel | None  # None while perception is silent
     pose: Pose  # in the odometry frame, at the same tick
