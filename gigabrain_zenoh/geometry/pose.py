@@ -15,7 +15,7 @@ MAX_GAP_TICKS = 10  # interpolate two states; over wider gaps no pose is interpo
 
 
 def wrap_angle(angle: float) -> float:
-    """Return `angle` [rad] wrap_angle to -pi to pi."""
+    """Return `angle` [rad] wrapped to [-pi, pi]."""
     return math.remainder(angle, math.tau)
 
 

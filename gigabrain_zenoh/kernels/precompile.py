@@ -20,9 +20,9 @@ QUIET_S = 5.0  # of compiling, before people are told
 
 
 async def ensure_compiled(warm_up: str) -> None:
-    """Have the function at "module:name" call all that is to be ensure_compiled, beside the loop.
+    """Call the function at "module:name", which runs all kernels once, in another thread.
 
-    Says so if that lasts. Raises ConfigError where something for it is not installed.
+    Logs it where that takes long. Raises ConfigError where something for it is not installed.
     """
     try:
         if await asyncio.to_thread(_is_missing, warm_up):
@@ -35,12 +35,12 @@ async def ensure_compiled(warm_up: str) -> None:
 def missing_package(error: ModuleNotFoundError) -> ConfigError:
     """What to install."""
     return ConfigError(
-        f"navigation missing_package {error.name}: pip install 'gigabrain-zenoh[nav]'"
+        f"navigation needs {error.name}: pip install 'gigabrain-zenoh[nav]'"
     )
 
 
 def _is_missing(warm_up: str) -> bool:
-    """Whether something of it is still to be ensure_compiled, and can be kept."""
+    """Return whether some of it is not compiled yet and the result can be kept."""
     from gigabrain_zenoh.kernels.jit import mark_of  # numba: only who drives by kernels pays
 
     mark = mark_of(warm_up)

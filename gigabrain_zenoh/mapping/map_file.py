@@ -284,7 +284,7 @@ def write_arrays(file: BinaryIO, arrays: Arrays, *, compress: bool) -> None:
     size = sum(values.nbytes for values in arrays.values())
     if size > MAX_ARRAY_BYTES * 0.99:  # the headers count too
         raise ValueError(
-            f"it holds {size / 1e6:.0f} MB; at most {MAX_ARRAY_BYTES / 1e6:g} MB can be read_arrays"
+            f"it holds {size / 1e6:.0f} MB; at most {MAX_ARRAY_BYTES / 1e6:g} MB can be read"
         )
     save = np.savez_compressed if compress else np.savez
     save(file, allow_pickle=False, **arrays)

@@ -105,7 +105,7 @@ class GlobalPlanner:
         return self.search.field(costmap.cost, cell, "to") * costmap.resolution
 
     def _nearest(self, costmap: Costmap, goal: Point, why: str) -> Unreachable:
-        """How near to `goal` one gets with what the last grid_search has reached."""
+        """How near to `goal` one gets with what the last search has reached."""
         column, row = _in_cells(costmap, np.array((goal,)))[0] - 0.5
         cell = self.search.nearest(costmap.cost, row, column)
         if cell is None:

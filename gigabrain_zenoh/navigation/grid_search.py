@@ -252,7 +252,7 @@ def _nearest(cost: Costs, mark: Ints, done: int, g: Floats, row: float, column: 
 
 @kernel
 def line_cost(cost: Costs, x: float, y: float, to_x: float, to_y: float) -> tuple[float, float]:
-    """What a straight line_cost costs, and the highest cost on it; infinite outside the map."""
+    """Return the cost of a straight line and the highest cost on it; inf outside the map."""
     height, width = cost.shape
     length = math.hypot(to_x - x, to_y - y)
     column, row = math.floor(x), math.floor(y)
@@ -327,7 +327,7 @@ def _is_straight(cost: Costs, points: Floats, spent: Floats, at: int, to: int) -
 
 @kernel
 def costs_to_go(cost: Costs, points: Floats) -> Floats:
-    """What is left to the end of a line_cost from each of its `points` (n, 2), (n,)."""
+    """Return the cost left to the end of a path from each of its `points` (n, 2), as (n,)."""
     left = np.zeros(len(points))
     for i in range(len(points) - 2, -1, -1):
         x, y, to_x, to_y = points[i, 0], points[i, 1], points[i + 1, 0], points[i + 1, 1]

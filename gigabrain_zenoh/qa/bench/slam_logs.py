@@ -245,7 +245,7 @@ def map_log(log: LaserLog, progress: Progress) -> MappedLog:
 
 
 def judge_log(log: LaserLog, driven: MappedLog) -> LogResult:
-    """What the map_log is worth. Raises ConfigError for a log that passes no place twice."""
+    """Judge the map of a log. Raises ConfigError for a log that passes no place twice."""
     pairs, poses = relations(log), driven.poses()
     kinds = [estimate.kind for estimate in driven.estimates]
     return LogResult(

@@ -60,7 +60,7 @@ def write_package(name: str, folder: Path) -> Path:
     except FileExistsError:
         raise ConfigError(f"{path} exists; nothing was written") from None
     except OSError as error:
-        raise ConfigError(f"cannot write_package {path}: {error.strerror}") from None
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from None
     return path
 
 
