@@ -34,9 +34,7 @@ async def ensure_compiled(warm_up: str) -> None:
 
 def missing_package(error: ModuleNotFoundError) -> ConfigError:
     """What to install."""
-    return ConfigError(
-        f"navigation needs {error.name}: pip install 'gigabrain-zenoh[nav]'"
-    )
+    return ConfigError(f"navigation needs {error.name}: pip install 'gigabrain-zenoh[nav]'")
 
 
 def _is_missing(warm_up: str) -> bool:
