@@ -1,7 +1,8 @@
 """Reads a bag from its first byte to its last, however it ended, and reports what is damaged.
 
-The library parses the records. Its readers end at the first damaged byte, return a message that was
-cut off as if it were whole, and allocate whatever size a chunk claims (400 MB for one of 13 kB).
+The library parses single records. Its readers end at the first damaged byte, return a message
+that was cut off as if it were whole, and allocate whatever size a chunk claims (400 MB for one of
+13 kB).
 The walk from record to record, and the limits, are therefore ours.
 """
 
@@ -10,17 +11,17 @@ import logging
 import mmap
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import IO, NamedTuple
 
 import lz4.frame
 import zstandard
-from mcap.exceptions import McapError
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import EndOfFile, McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from gigabrain_schemas.topics import current_key
@@ -33,13 +34,14 @@ log = logging.getLogger(__name__)
 RAW = "raw"  # kind of a channel that holds recorded messages
 MAGIC = MCAP0_MAGIC
 HEAD = struct.Struct("<BQ")  # opcode and length of a record
-READ_OPCODES = {
-    Opcode.SCHEMA,
-    Opcode.CHANNEL,
-    Opcode.MESSAGE,
-    Opcode.CHUNK,
-    Opcode.METADATA,
+RECORD_READERS: dict[int, Callable[[ReadDataStream], McapRecord]] = {
+    Opcode.SCHEMA: Schema.read,
+    Opcode.CHANNEL: Channel.read,
+    Opcode.CHUNK: Chunk.read,
+    Opcode.METADATA: Metadata.read,
+    Opcode.FOOTER: Footer.read,
 }
+MALFORMED = (McapError, struct.error, UnicodeDecodeError)
 FOOTER_BYTES = HEAD.size + 20
 ZSTD_NAME = b"\x04\x00\x00\x00zstd"
 BYTES_BEFORE_NAME = HEAD.size + 28  # from a chunk's opcode to the name of its compression
@@ -128,7 +130,7 @@ def samples(path: Path) -> Iterator[Sample]:
     yield from bag
     damage = bag.damages[0].text if bag.damages else "" if bag.finished else "the file is cut off"
     if damage:
-        log.warning("%s: %s; mend it with: gigabrain bag recover %s", path, damage, path)
+        log.warning("%s: %s; repair it with: gigabrain bag recover %s", path, damage, path)
 
 
 def check_magic(path: Path) -> None:
@@ -158,7 +160,7 @@ def _walk(data: mmap.mmap) -> Iterator[McapRecord | BagDamage | BagEnd]:
     at, end = len(MAGIC), len(data)
     summary = _summary(data)
     if summary:  # declares again what a damaged chunk may have declared
-        yield from (item for item in _parse(summary) if isinstance(item, Schema | Channel))
+        yield from (item for item in _parse(summary, at) if isinstance(item, Schema | Channel))
     while at < end:
         opcode, after = _head(data, at)
         whole = opcode > 0 and after <= end
@@ -167,8 +169,6 @@ def _walk(data: mmap.mmap) -> Iterator[McapRecord | BagDamage | BagEnd]:
             return
         if whole and after - at > MAX_RECORD_BYTES:
             yield BagDamage(at, f"a record of {(after - at) / 1e6:.0f} MB is skipped")
-        elif whole and opcode not in READ_OPCODES:
-            pass
         elif whole:
             yield from _unpacked(data[at:after], at)
         elif (chunk := _next_chunk(data, at + 1)) > 0:
@@ -207,7 +207,7 @@ def _summary(data: mmap.mmap) -> bytes | None:
     at = len(data) - len(MAGIC) - FOOTER_BYTES
     if at < len(MAGIC) or data[-len(MAGIC) :] != MAGIC:
         return None
-    footer = next(_parse(data[at:]), None)
+    footer = next(_parse(data[at : -len(MAGIC)], at), None)
     if not isinstance(footer, Footer) or not 0 < footer.summary_start <= at:
         return None
     if at - footer.summary_start > MAX_RECORD_BYTES:
@@ -219,27 +219,25 @@ def _summary(data: mmap.mmap) -> bytes | None:
 
 def _unpacked(record: bytes, at: int) -> Iterator[McapRecord | BagDamage]:
     """Parse one record; of a chunk yield everything inside, or nothing if its checksum is wrong."""
-    for item in _parse(record):
+    for item in _parse(record, at):
         if not isinstance(item, Chunk):
             yield item
             continue
         records, complete = _decompressed(item)
         crc = item.uncompressed_crc
         if complete and (not crc or zlib.crc32(records) == crc):
-            yield from _parse(records)
+            yield from _parse(records, at)
         else:
             yield BagDamage(at, f"a chunk of {len(record) - HEAD.size} bytes is damaged")
-        return
-    if record[0] == Opcode.CHUNK:
-        yield BagDamage(at, f"a chunk of {len(record) - HEAD.size} bytes is damaged")
 
 
 def _torn_chunk(record: bytes) -> Iterator[McapRecord]:
     """Parse the beginning of a chunk whose end was never written."""
-    with contextlib.suppress(McapError, struct.error, UnicodeDecodeError):
-        for item in StreamReader(BytesIO(record), skip_magic=True, emit_chunks=True).records:
-            if isinstance(item, Chunk):
-                yield from _parse(_decompressed(item)[0])
+    with contextlib.suppress(*MALFORMED):
+        chunk = Chunk.read(ReadDataStream(BytesIO(record[HEAD.size :])))
+        for item in _parse(_decompressed(chunk)[0], 0):
+            if not isinstance(item, BagDamage):
+                yield item
 
 
 def _decompressed(chunk: Chunk) -> tuple[bytes, bool]:
@@ -265,14 +263,30 @@ def _decompressor(chunk: Chunk) -> IO[bytes]:
     raise EOFError(f"unknown compression {chunk.compression!r}")
 
 
-def _parse(records: bytes) -> Iterator[McapRecord]:
-    """Parse all records that are whole, up to the first that is damaged."""
+def _parse(records: bytes, offset: int) -> Iterator[McapRecord | BagDamage]:
+    """Parse a row of records; report each malformed one as damage at `offset`, and go on."""
     at = 0
     while at + HEAD.size <= len(records):
-        after = at + HEAD.size + HEAD.unpack_from(records, at)[1]
-        if after > len(records):
-            break
-        at = after
-    reader = StreamReader(BytesIO(records[:at]), skip_magic=True, emit_chunks=True)
-    with contextlib.suppress(McapError, struct.error, UnicodeDecodeError):
-        yield from reader.records
+        opcode, length = HEAD.unpack_from(records, at)
+        content = records[at + HEAD.size : at + HEAD.size + length]
+        at += HEAD.size + length
+        try:
+            if at > len(records):
+                raise EndOfFile
+            stream = _StrictStream(BytesIO(content))
+            if opcode == Opcode.MESSAGE:
+                yield Message.read(stream, length)
+            elif read := RECORD_READERS.get(opcode):
+                yield read(stream)
+        except MALFORMED:
+            yield BagDamage(offset, f"a record of {len(content)} bytes is malformed")
+
+
+class _StrictStream(ReadDataStream):
+    """Content of one record. Raises EndOfFile where the library would return less than asked."""
+
+    def read(self, length: int) -> bytes:
+        data = super().read(length)
+        if len(data) < length:
+            raise EndOfFile
+        return data

@@ -1,19 +1,26 @@
 """Recordings on disk: written, read back, damaged, cut off, recovered."""
 
+import dataclasses
 import json
 import random
 import shutil
+import zlib
 from pathlib import Path
 
 import msgspec
 import pytest
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
 
 from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.bag_info import faults, read_info
-from gigabrain_zenoh.recording.bag_reader import ZSTD_NAME, Bag
+from gigabrain_zenoh.recording.bag_reader import HEAD, MAGIC, ZSTD_NAME, Bag
 from gigabrain_zenoh.recording.bag_recovery import is_unfinished, recover, recover_all
 from gigabrain_zenoh.recording.bag_writer import BagWriter
 from gigabrain_zenoh.recording.drawing import flat_schema
@@ -154,13 +161,54 @@ def test_a_flipped_byte_costs_its_chunk_and_no_other(
     assert call("bag", "check", str(path)) == 1
     assert f"repair it with: gigabrain bag recover {path}\n" in capsys.readouterr().out
     call("bag", "convert", str(path), "--csv", str(tmp_path / "tables"))
-    assert caplog.messages == [
-        f"{path}: {found.damages[0].partition(': ')[2]}; mend it with: gigabrain bag recover {path}"
-    ]
+    damage = found.damages[0].partition(": ")[2]
+    assert caplog.messages == [f"{path}: {damage}; repair it with: gigabrain bag recover {path}"]
     mended = tmp_path / "mended.mcap"
     assert recover(path, mended).messages == 588
     assert bags.seqs(mended) == bags.seqs(path)
     assert read_info(mended).finished
+
+
+def _record(kind: Opcode, content: bytes) -> bytes:
+    return HEAD.pack(kind, len(content)) + content
+
+
+@pytest.mark.parametrize(
+    "malformed",
+    [
+        _record(Opcode.MESSAGE, bytes(10)),  # shorter than its fixed fields
+        _record(Opcode.CHANNEL, bytes(4) + b"\xff" * 8),  # a topic longer than the record
+        _record(Opcode.SCHEMA, bytes(10) + b"\xff\0\0\0x"),  # likewise its data
+    ],
+    ids=["message", "channel", "schema"],
+)
+def test_a_malformed_record_costs_no_other_of_its_chunk(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], malformed: bytes
+) -> None:
+    source, path = tmp_path / "source.mcap", tmp_path / "malformed.mcap"
+    bags.write(source, bags.drive(4), flush_every=99)
+    with source.open("rb") as file:
+        records = StreamReader(file, emit_chunks=True).records
+        chunk = next(each for each in records if isinstance(each, Chunk))
+    content = zstandard.decompress(chunk.data, chunk.uncompressed_size)
+    last = content.rindex(HEAD.pack(Opcode.MESSAGE, len(bags.state(4)) + 22))
+    content = content[:last] + malformed + content[last:]
+    inside = RecordBuilder()
+    dataclasses.replace(
+        chunk,
+        data=content,
+        compression="",
+        uncompressed_size=len(content),
+        uncompressed_crc=zlib.crc32(content),
+    ).write(inside)
+    end = _record(Opcode.DATA_END, bytes(4)) + _record(Opcode.FOOTER, bytes(20))
+    path.write_bytes(MAGIC + inside.end() + end + MAGIC)
+    assert bags.seqs(path) == [1, 2, 3, 4]
+    found = read_info(path)
+    assert found.damages == (f"byte 8: a record of {len(malformed) - 9} bytes is malformed",)
+    call("bag", "check", str(path))
+    assert f"repair it with: gigabrain bag recover {path}\n" in capsys.readouterr().out
+    assert recover(path, tmp_path / "repaired.mcap").messages == 4
 
 
 def test_where_nothing_can_be_saved_that_is_said(
