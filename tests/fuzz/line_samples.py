@@ -4,12 +4,11 @@ from typing import Any
 
 from gigabrain_drivers.bodies.alpha import protocol as alpha
 from gigabrain_drivers.bodies.line.protocol import Template
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.legs.senses import Senses
 from gigabrain_drivers.lidars.ld import protocol as ld
-from gigabrain_drivers.lidars.lds import lds01 as lds01
-from gigabrain_drivers.lidars.lds import lds03 as lds03
+from gigabrain_drivers.lidars.lds import lds01, lds03
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
 from gigabrain_drivers.lidars.rplidar.scan_formats import dense_capsule, express_capsule, node
 
@@ -30,7 +29,7 @@ def state_of_alpha(**changes: Any) -> alpha.State:
 def samples(template: Template) -> dict[str, bytes]:
     """What each kind of device sends when all is well."""
     ranges = tuple(range(500, 512))
-    five = tuple(lds03.Sample(float(n), 500 + n, 80, False) for n in range(5))
+    five = tuple(lds03.Lds03Sample(float(n), 500 + n, 80, False) for n in range(5))
     nodes = [node(n * 10.0, 500.0, quality=20, begins=n % 36 == 0) for n in range(80)]
     dense = [dense_capsule(n * 40.0 % 360, (500,) * 40, begins=n == 0) for n in range(12)]
     express = [express_capsule(n * 40.0 % 360, (500,) * 32, begins=n == 0) for n in range(12)]
@@ -41,14 +40,18 @@ def samples(template: Template) -> dict[str, bytes]:
         ) + alpha.stop(4),
         "dynamixel": status + opencr.velocity(0.1, 0.2).frame + dynamixel.ping(opencr.ID),
         "ld": b"".join(
-            ld.encode(ld.Frame(3600, at % 36000, (at + 800) % 36000, ranges, (200,) * 12, at // 90))
+            ld.encode(
+                ld.LdFrame(3600, at % 36000, (at + 800) % 36000, ranges, (200,) * 12, at // 90)
+            )
             for at in range(0, 84 * 900, 900)
         ),
         "lds01": b"".join(
-            lds01.encode(lds01.Packet(n % 60, 300.0, (100,) * 6, (500,) * 6)) for n in range(122)
+            lds01.encode(lds01.Lds01Packet(n % 60, 300.0, (100,) * 6, (500,) * 6))
+            for n in range(122)
         ),
         "lds03": b"".join(
-            lds03.encode(lds03.Packet(n % 8 == 0, 10.0 * (n % 8 == 0), five)) for n in range(20)
+            lds03.encode(lds03.Lds03Packet(n % 8 == 0, 10.0 * (n % 8 == 0), five))
+            for n in range(20)
         ),
         "line": template.encode({"battery_voltage": 12.0, "wheel_left_position": 1.0}) * 3,
         "rplidar": rplidar.answer(rplidar.HEALTH, bytes(3))

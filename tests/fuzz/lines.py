@@ -12,7 +12,7 @@ from gigabrain_drivers.bodies.alpha import protocol as alpha
 from gigabrain_drivers.bodies.alpha.driver import AlphaDriver
 from gigabrain_drivers.bodies.line import protocol as line
 from gigabrain_drivers.bodies.line.driver import LineDriver
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrDriver
 from gigabrain_drivers.driver.catalog import load_link
@@ -21,10 +21,8 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.lidars import SCAN_SOURCES
 from gigabrain_drivers.lidars.base import source_class
 from gigabrain_drivers.lidars.ld import protocol as ld
-from gigabrain_drivers.lidars.lds import lds01 as lds01
-from gigabrain_drivers.lidars.lds import lds03 as lds03
+from gigabrain_drivers.lidars.lds import lds01, lds03
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
-from gigabrain_drivers.lidars.rplidar import requests as rplidar_requests
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import FakeClock
@@ -73,16 +71,14 @@ def line_again(values: dict[str, float]) -> bytes:
 PROTOCOLS = {
     "alpha": Protocol(alpha.Decoder, alpha.describe, 400, alpha.encode),
     "dynamixel": Protocol(dynamixel.Decoder, opencr.describe, 1100, dynamixel.encode),
-    "ld": Protocol(ld.Decoder, ld.describe, 47, ld.encode),
-    "lds01": Protocol(lds01.Decoder, lds01.describe, 44),
-    "lds03": Protocol(lds03.Decoder, lds03.describe, 800),
+    "ld": Protocol(ld.LdDecoder, ld.describe, 47, ld.encode),
+    "lds01": Protocol(lds01.Lds01Decoder, lds01.describe, 44),
+    "lds03": Protocol(lds03.Lds03Decoder, lds03.describe, 800),
     "line": Protocol(
         lambda: line.Decoder(CUSTOM.state_templates()), line.describe, 256, line_again, "_rest"
     ),
-    "rplidar": Protocol(rplidar.Decoder, rplidar.describe, 420),
-    "rplidar request": Protocol(
-        rplidar_requests.RequestDecoder, rplidar_requests.describe_request, 260
-    ),
+    "rplidar": Protocol(rplidar.RplidarDecoder, rplidar.describe, 420),
+    "rplidar request": Protocol(rplidar.RequestDecoder, rplidar.describe_request, 260),
 }
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3.board import is_opencr
 from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrDriver
 from gigabrain_drivers.bodies.turtlebot3.emulator import OpenCr

@@ -7,7 +7,7 @@ DEVICES = {
     "ld06": "gigabrain_drivers.lidars.ld.emulator:LdDevice",
     "ld19": "gigabrain_drivers.lidars.ld.emulator:LdDevice",
     "lds01": "gigabrain_drivers.lidars.lds.emulator:Lds01Device",
-    "lds02": "gigabrain_drivers.lidars.lds.emulator:Lds02Device",
+    "lds02": "gigabrain_drivers.lidars.ld.emulator:Lds02Device",
     "lds03": "gigabrain_drivers.lidars.lds.emulator:Lds03Device",
     "rplidar": "gigabrain_drivers.lidars.rplidar.emulator:RplidarDevice",
     "opencr": "gigabrain_drivers.bodies.turtlebot3.emulator:OpenCr",

@@ -4,8 +4,8 @@
 SCAN_SOURCES = {
     "ld06": "gigabrain_drivers.lidars.ld.source:Ld06",
     "ld19": "gigabrain_drivers.lidars.ld.source:Ld19",
-    "lds01": "gigabrain_drivers.lidars.lds.lds01_source:Lds01",
-    "lds02": "gigabrain_drivers.lidars.ld.lds02:Lds02",
-    "lds03": "gigabrain_drivers.lidars.lds.lds03_source:Lds03",
+    "lds01": "gigabrain_drivers.lidars.lds.lds01:Lds01",
+    "lds02": "gigabrain_drivers.lidars.ld.source:Lds02",
+    "lds03": "gigabrain_drivers.lidars.lds.lds03:Lds03",
     "rplidar": "gigabrain_drivers.lidars.rplidar.source:Rplidar",
 }

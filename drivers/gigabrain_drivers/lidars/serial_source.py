@@ -1,20 +1,37 @@
-"""A lidar on a serial port: what all of them share, whatever they say on it."""
+"""Lidars on a serial port: what they share, whatever their protocol."""
 
 import abc
 import asyncio
 import contextlib
 import logging
+import re
 from typing import Any, ClassVar
 
 import serial
 
-from gigabrain_drivers.lidars.base import ScanSource
-from gigabrain_drivers.lidars.strangers import who_sends
-from gigabrain_drivers.lidars.turn import Turn
+from gigabrain_drivers.lidars.base import ScanSource, Turn
+from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_schemas.body import Lidar, LinkHealth
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import Clock
+
+_LDS01 = re.compile(rb"\xfa[\xa0-\xdb].{40}\xfa[\xa0-\xdb]", re.DOTALL)
+_COIN_D4 = re.compile(rb"\xaa\x55.{8}", re.DOTALL)
+
+
+def who_sends(data: bytes) -> str:
+    """Which known lidar sends such bytes, or an empty text."""
+    if ld.LdDecoder().feed(data):
+        return "an LDROBOT lidar (ld06, ld19, lds02)"
+    if _LDS01.search(data):
+        return "an LDS-01"
+    if b"\xa5\x5a" in data:
+        return "an RPLIDAR"
+    if _COIN_D4.search(data):
+        return "an LDS-03 or a YDLIDAR"
+    return ""
+
 
 log = logging.getLogger(__name__)
 

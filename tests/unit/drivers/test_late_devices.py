@@ -25,7 +25,7 @@ def frame(number: int, time_ms: int) -> bytes:
     """Of 9 degrees."""
     start = number % FRAMES * 900
     return ld.encode(
-        ld.Frame(3600, start, (start + 825) % ld.TURN, (1000,) * 12, (200,) * 12, time_ms)
+        ld.LdFrame(3600, start, (start + 825) % ld.TURN, (1000,) * 12, (200,) * 12, time_ms)
     )
 
 

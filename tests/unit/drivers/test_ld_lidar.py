@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.lidars.base import Turn, scan_of
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.ld.emulator import LdDevice
 from gigabrain_drivers.lidars.ld.source import Ld19
-from gigabrain_drivers.lidars.turn import Turn, scan_of
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock, FakeClock

@@ -17,12 +17,12 @@ CAPTURED = bytes.fromhex(  # from a real D200 kit
 )
 
 
-def frames(draw: st.DrawFn) -> ld.Frame:
+def frames(draw: st.DrawFn) -> ld.LdFrame:
     speed = draw(st.integers(360, 0xFFFF))
     start = draw(st.integers(0, 35_999))
     width = draw(st.integers(0, min(35_999, speed * 12 * 100 // 2300)))
     points = draw(st.binary(min_size=36, max_size=36))
-    return ld.Frame(
+    return ld.LdFrame(
         speed,
         start,
         (start + width) % 36_000,
@@ -63,15 +63,15 @@ def test_a_frame_of_a_real_lidar_that_saw_nothing_decodes() -> None:
 
 
 def test_angles_go_on_through_a_full_turn() -> None:
-    frame = ld.Frame(3600, 35_800, 13, (0,) * 12, (0,) * 12, 0)
+    frame = ld.LdFrame(3600, 35_800, 13, (0,) * 12, (0,) * 12, 0)
 
     assert frame.angles()[0] == 358.0
     assert frame.angles()[11] == pytest.approx(360.13, abs=1e-9)
 
 
 @given(any_frame)
-def test_every_frame_comes_back_as_it_was(frame: ld.Frame) -> None:
-    assert ld.Decoder().feed(ld.encode(frame)) == [frame]
+def test_every_frame_comes_back_as_it_was(frame: ld.LdFrame) -> None:
+    assert ld.LdDecoder().feed(ld.encode(frame)) == [frame]
 
 
 @pytest.mark.parametrize("good", [MANUAL, CAPTURED])
@@ -84,7 +84,7 @@ def test_no_flip_of_one_bit_and_no_burst_within_a_byte_is_accepted(good: bytes) 
 
 
 @given(any_frame, st.integers(0, 47 * 8 - 1))
-def test_no_flip_of_one_bit_in_any_frame_is_accepted(frame: ld.Frame, bit: int) -> None:
+def test_no_flip_of_one_bit_in_any_frame_is_accepted(frame: ld.LdFrame, bit: int) -> None:
     damaged = bytearray(ld.encode(frame))
     damaged[bit // 8] ^= 1 << bit % 8
 
@@ -93,7 +93,7 @@ def test_no_flip_of_one_bit_in_any_frame_is_accepted(frame: ld.Frame, bit: int) 
 
 @given(any_frame, st.sets(st.integers(0, 47 * 8 - 1), min_size=2, max_size=2))
 def test_two_flipped_bits_pass_only_where_the_crc_repeats_255_bits_apart(
-    frame: ld.Frame, bits: set[int]
+    frame: ld.LdFrame, bits: set[int]
 ) -> None:
     damaged = bytearray(ld.encode(frame))
     for bit in bits:
@@ -122,7 +122,7 @@ def test_a_frame_that_no_lidar_can_mean_is_refused_though_its_crc_is_right(
 
 @given(st.lists(st.sampled_from([MANUAL, CAPTURED]), max_size=6), st.data())
 def test_it_does_not_matter_how_the_bytes_are_cut(parts: list[bytes], data: st.DataObject) -> None:
-    stream, decoder, found = b"".join(parts), ld.Decoder(), []
+    stream, decoder, found = b"".join(parts), ld.LdDecoder(), []
     while stream:
         size = data.draw(st.integers(1, len(stream)))
         found += decoder.feed(stream[:size])
@@ -134,7 +134,7 @@ def test_it_does_not_matter_how_the_bytes_are_cut(parts: list[bytes], data: st.D
 
 @given(st.binary(max_size=300))
 def test_a_frame_after_any_garbage_is_found_by_the_second_time_it_is_sent(garbage: bytes) -> None:
-    decoder = ld.Decoder()
+    decoder = ld.LdDecoder()
     decoder.feed(garbage)
 
     assert ld.decode(MANUAL) in decoder.feed(MANUAL + MANUAL)
@@ -142,14 +142,14 @@ def test_a_frame_after_any_garbage_is_found_by_the_second_time_it_is_sent(garbag
 
 @given(st.lists(st.binary(max_size=100), max_size=50))
 def test_what_is_kept_between_calls_stays_below_one_frame(pieces: list[bytes]) -> None:
-    decoder = ld.Decoder()
+    decoder = ld.LdDecoder()
     for piece in pieces:
         decoder.feed(piece)
         assert len(decoder._buffer) < 47
 
 
 def test_joining_a_stream_half_way_is_no_error_but_losing_step_is() -> None:
-    decoder = ld.Decoder()
+    decoder = ld.LdDecoder()
 
     assert len(decoder.feed(MANUAL[20:] + MANUAL)) == 1
     assert decoder.errors == 0
@@ -165,7 +165,7 @@ def test_a_lidar_that_sends_ec_in_place_of_2c_is_understood() -> None:
 
 def test_of_frames_with_a_tenth_of_a_percent_of_bytes_wrong_next_to_none_pass_as_others() -> None:
     chance = random.Random(3)
-    decoder, sent, wrong, whole = ld.Decoder(), ld.decode(MANUAL), 0, 0
+    decoder, sent, wrong, whole = ld.LdDecoder(), ld.decode(MANUAL), 0, 0
     for _ in range(50):
         stream = bytearray(MANUAL * 400)
         for at in range(len(stream)):

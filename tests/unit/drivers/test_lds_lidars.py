@@ -10,17 +10,12 @@ from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.emulators.base import Device
 from gigabrain_drivers.emulators.faults import NONE, Faults
 from gigabrain_drivers.lidars.ld import protocol as ld
-from gigabrain_drivers.lidars.ld.lds02 import Lds02, from_axis
-from gigabrain_drivers.lidars.lds import lds01 as lds01
-from gigabrain_drivers.lidars.lds import lds03 as lds03
-from gigabrain_drivers.lidars.lds.emulator import (
-    Lds01Device,
-    Lds02Device,
-    Lds03Device,
-    lens_distance,
-)
-from gigabrain_drivers.lidars.lds.lds01_source import Lds01
-from gigabrain_drivers.lidars.lds.lds03_source import Lds03, trusted
+from gigabrain_drivers.lidars.ld.emulator import Lds02Device, lens_distance
+from gigabrain_drivers.lidars.ld.source import Lds02, from_axis
+from gigabrain_drivers.lidars.lds import lds01, lds03
+from gigabrain_drivers.lidars.lds.emulator import Lds01Device, Lds03Device
+from gigabrain_drivers.lidars.lds.lds01 import Lds01
+from gigabrain_drivers.lidars.lds.lds03 import Lds03, trusted
 from gigabrain_drivers.lidars.serial_source import SerialSource
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import Lidar
@@ -55,9 +50,9 @@ def scans_of(source: SerialSource, clock: FakeClock, pieces: list[bytes]) -> lis
 
 
 def test_lds01s_last_sample_looks_ahead_and_the_ones_before_to_the_right() -> None:
-    def packet(number: int) -> lds01.Packet:
+    def packet(number: int) -> lds01.Lds01Packet:
         first = 6 * number
-        return lds01.Packet(number, 300.0, (9,) * 6, tuple(range(1000 + first, 1006 + first)))
+        return lds01.Lds01Packet(number, 300.0, (9,) * 6, tuple(range(1000 + first, 1006 + first)))
 
     clock = FakeClock()
     pieces = [
@@ -91,7 +86,7 @@ def test_the_emulated_lens_is_the_corrections_other_side(distance: float) -> Non
 
 
 def test_lds02_frames_are_ld_frames_with_the_correction() -> None:
-    frame = ld.Frame(3600, 0, 1100, (1000,) * 6 + (0,) * 6, (200,) * 12, 0)
+    frame = ld.LdFrame(3600, 0, 1100, (1000,) * 6 + (0,) * 6, (200,) * 12, 0)
     lidar = Lds02(options(), COARSE, FakeClock())
     angles, distances = lidar.place(*ld.points(ld.encode(frame)))
     assert angles[:2] == pytest.approx([-5.626, -4.626], abs=1e-3)
@@ -102,16 +97,16 @@ def test_lds02_frames_are_ld_frames_with_the_correction() -> None:
 @pytest.mark.parametrize(
     ("sample", "distance"),
     [
-        (lds03.Sample(0.0, 1000, 10, False), 1000.0),
-        (lds03.Sample(0.0, 0, 0, False), 0.0),
-        (lds03.Sample(0.0, 150, 66, False), 150.0),
-        (lds03.Sample(0.0, 150, 65, True), 150.0),
-        (lds03.Sample(0.0, 150, 65, False), math.nan),
-        (lds03.Sample(0.0, 151, 0, False), 151.0),
+        (lds03.Lds03Sample(0.0, 1000, 10, False), 1000.0),
+        (lds03.Lds03Sample(0.0, 0, 0, False), 0.0),
+        (lds03.Lds03Sample(0.0, 150, 66, False), 150.0),
+        (lds03.Lds03Sample(0.0, 150, 65, True), 150.0),
+        (lds03.Lds03Sample(0.0, 150, 65, False), math.nan),
+        (lds03.Lds03Sample(0.0, 151, 0, False), 151.0),
     ],
 )
 def test_lds03_samples_that_are_near_and_weak_are_not_trusted(
-    sample: lds03.Sample, distance: float
+    sample: lds03.Lds03Sample, distance: float
 ) -> None:
     assert trusted(sample) == pytest.approx(distance, nan_ok=True)
 

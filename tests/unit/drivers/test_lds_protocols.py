@@ -3,8 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.lidars.lds import lds01 as lds01
-from gigabrain_drivers.lidars.lds import lds03 as lds03
+from gigabrain_drivers.lidars.lds import lds01, lds03
 
 LDS01 = (
     "fa a0 b8 0b 01 00 e8 03 00 00 02 00 e9 03 00 00 03 00 ea 03 00 00 "
@@ -14,14 +13,14 @@ LDS03 = "aa 55 15 02 01 05 81 05 af 57 90 a1 0f 68 c9 0f"
 
 samples = st.integers(0, 0xFFFF)
 packets01 = st.builds(
-    lds01.Packet,
+    lds01.Lds01Packet,
     number=st.integers(0, 59),
     rpm=st.integers(0, 6000).map(lambda tenths: tenths / 10),
     intensities=st.tuples(*[samples] * 6),
     ranges=st.tuples(*[samples] * 6),
 )
 samples03 = st.builds(
-    lds03.Sample,
+    lds03.Lds03Sample,
     angle=st.just(0.0),
     distance=st.integers(0, 0x3FFF),
     quality=st.integers(0, 255),
@@ -29,19 +28,19 @@ samples03 = st.builds(
 )
 
 
-def turn01(begin: int = 0, count: int = 60) -> list[lds01.Packet]:
+def turn01(begin: int = 0, count: int = 60) -> list[lds01.Lds01Packet]:
     return [
-        lds01.Packet((begin + n) % 60, 300.0, (7,) * 6, tuple(range(1000, 1006)))
+        lds01.Lds01Packet((begin + n) % 60, 300.0, (7,) * 6, tuple(range(1000, 1006)))
         for n in range(count)
     ]
 
 
 def test_an_lds01_packet_is_six_degrees_of_the_turn() -> None:
     first = bytes.fromhex(LDS01) + b"??"  # the rule of its checksum is not known
-    decoder = lds01.Decoder()
+    decoder = lds01.Lds01Decoder()
     assert decoder.feed(first) == []
     assert decoder.feed(b"\xfa\xa1") == [
-        lds01.Packet(0, 300.0, (1, 2, 3, 4, 5, 6), (1000, 1001, 1002, 1003, 0, 3500))
+        lds01.Lds01Packet(0, 300.0, (1, 2, 3, 4, 5, 6), (1000, 1001, 1002, 1003, 0, 3500))
     ]
     assert decoder.errors == 0
 
@@ -51,16 +50,16 @@ def test_lds01_is_started_and_stopped_by_a_letter() -> None:
 
 
 @given(packets01)
-def test_lds01_packets_survive_the_wire(packet: lds01.Packet) -> None:
+def test_lds01_packets_survive_the_wire(packet: lds01.Lds01Packet) -> None:
     following = bytes([0xFA, 0xA0 + (packet.number + 1) % 60])
-    assert lds01.Decoder().feed(lds01.encode(packet) + following) == [packet]
+    assert lds01.Lds01Decoder().feed(lds01.encode(packet) + following) == [packet]
 
 
 @given(st.integers(0, 59), st.integers(1, 100))
 def test_lds01_packets_are_found_in_pieces_of_any_size(begin: int, size: int) -> None:
     sent = turn01(begin, 61)
     stream = b"".join(map(lds01.encode, sent))
-    decoder, found = lds01.Decoder(), []
+    decoder, found = lds01.Lds01Decoder(), []
     for at in range(0, len(stream), size):
         found += decoder.feed(stream[at : at + size])
     assert found == sent[:-1]
@@ -70,7 +69,7 @@ def test_lds01_packets_are_found_in_pieces_of_any_size(begin: int, size: int) ->
 @given(st.binary(max_size=300))
 def test_lds01_finds_its_step_again_behind_any_noise(noise: bytes) -> None:
     sent = turn01(5, 20)
-    decoder = lds01.Decoder()
+    decoder = lds01.Lds01Decoder()
     decoder.feed(noise)
     found = decoder.feed(b"".join(map(lds01.encode, sent)))
     assert found[-17:] == sent[2:-1]
@@ -79,13 +78,13 @@ def test_lds01_finds_its_step_again_behind_any_noise(noise: bytes) -> None:
 def test_an_lds01_packet_with_bytes_missing_is_thrown_away() -> None:
     frames = [lds01.encode(packet) for packet in turn01(0, 4)]
     frames[1] = frames[1][:-3]
-    decoder = lds01.Decoder()
+    decoder = lds01.Lds01Decoder()
     assert [packet.number for packet in decoder.feed(b"".join(frames))] == [0, 2]
     assert decoder.errors == 1
 
 
 def test_noise_takes_no_room_in_any_lidars_decoder() -> None:
-    one, three = lds01.Decoder(), lds03.Decoder()
+    one, three = lds01.Lds01Decoder(), lds03.Lds03Decoder()
     for _ in range(20):
         one.feed(b"\xfa\xa0" * 2000)
         three.feed(b"\xaa\x55\x00\xff\x01\x00\x01" * 500)
@@ -100,34 +99,37 @@ def test_lds03_commands_are_the_vendors() -> None:
 
 
 def test_an_lds03_packet_says_its_angles_itself() -> None:
-    decoder = lds03.Decoder()
-    expected = lds03.Packet(
+    decoder = lds03.Lds03Decoder()
+    expected = lds03.Lds03Packet(
         begins=True,
         rate=1.0,
-        samples=(lds03.Sample(10.0, 1000, 100, False), lds03.Sample(11.0, 1010, 90, False)),
+        samples=(
+            lds03.Lds03Sample(10.0, 1000, 100, False),
+            lds03.Lds03Sample(11.0, 1010, 90, False),
+        ),
     )
     assert decoder.feed(bytes.fromhex(LDS03)) == [expected]
     assert lds03.encode(expected).hex(" ") == LDS03
 
 
 def test_lds03_angles_go_on_across_zero() -> None:
-    two = (lds03.Sample(359.0, 500, 50, False), lds03.Sample(1.0, 500, 50, False))
-    three = (two[0], lds03.Sample(0.0, 500, 50, False), two[1])
-    (packet,) = lds03.Decoder().feed(lds03.encode(lds03.Packet(False, 0.0, three)))
+    two = (lds03.Lds03Sample(359.0, 500, 50, False), lds03.Lds03Sample(1.0, 500, 50, False))
+    three = (two[0], lds03.Lds03Sample(0.0, 500, 50, False), two[1])
+    (packet,) = lds03.Lds03Decoder().feed(lds03.encode(lds03.Lds03Packet(False, 0.0, three)))
     assert [sample.angle for sample in packet.samples] == [359.0, 0.0, 1.0]
 
 
 @given(st.lists(samples03, min_size=1, max_size=255), st.booleans())
-def test_lds03_samples_survive_the_wire(many: list[lds03.Sample], begins: bool) -> None:
-    packet = lds03.Packet(begins, 10.0 if begins else 0.0, tuple(many))
-    assert lds03.Decoder().feed(lds03.encode(packet)) == [packet]
+def test_lds03_samples_survive_the_wire(many: list[lds03.Lds03Sample], begins: bool) -> None:
+    packet = lds03.Lds03Packet(begins, 10.0 if begins else 0.0, tuple(many))
+    assert lds03.Lds03Decoder().feed(lds03.encode(packet)) == [packet]
 
 
 @given(st.binary(max_size=200), st.integers(1, 30))
 def test_lds03_finds_its_step_again_behind_any_noise(noise: bytes, size: int) -> None:
-    packet = lds03.Packet(True, 10.0, (lds03.Sample(0.0, 1234, 56, False),) * 20)
+    packet = lds03.Lds03Packet(True, 10.0, (lds03.Lds03Sample(0.0, 1234, 56, False),) * 20)
     stream = noise + bytes(1000) + lds03.encode(packet)
-    decoder, found = lds03.Decoder(), []
+    decoder, found = lds03.Lds03Decoder(), []
     for at in range(0, len(stream), size):
         found += decoder.feed(stream[at : at + size])
     assert found[-1:] == [packet]
@@ -137,4 +139,4 @@ def test_no_single_flipped_bit_passes_for_lds03_samples() -> None:
     for bit in range(16 * 8):
         frame = bytearray.fromhex(LDS03)
         frame[bit // 8] ^= 1 << bit % 8
-        assert lds03.Decoder().feed(bytes(frame)) == []
+        assert lds03.Lds03Decoder().feed(bytes(frame)) == []

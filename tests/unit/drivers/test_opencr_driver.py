@@ -5,7 +5,7 @@ import struct
 
 import pytest
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.bodies.turtlebot3.driver import imu_of
 from gigabrain_schemas.sensors import Imu

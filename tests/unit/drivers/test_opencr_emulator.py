@@ -11,7 +11,7 @@ from typing import Any
 import dynamixel_sdk
 import pytest
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrOptions
 from gigabrain_drivers.bodies.turtlebot3.dynamixel import Decoder, Packet

@@ -14,7 +14,7 @@ from gigabrain_drivers.lidars import serial_source
 from gigabrain_drivers.lidars.ld.emulator import LdDevice
 from gigabrain_drivers.lidars.ld.source import Ld19
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
-from gigabrain_drivers.lidars.rplidar import startup as rplidar_start
+from gigabrain_drivers.lidars.rplidar import source as rplidar_source
 from gigabrain_drivers.lidars.rplidar.emulator import RplidarDevice
 from gigabrain_drivers.lidars.rplidar.protocol import DENSE, EXPRESS, STANDARD, Health
 from gigabrain_drivers.lidars.rplidar.source import Rplidar, RplidarOptions
@@ -35,7 +35,7 @@ def listen(its: RplidarOptions) -> Listener:
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial_source, "PATIENCE_NS", 600_000_000)
-    monkeypatch.setattr(rplidar_start, "RESET_S", 0.2)
+    monkeypatch.setattr(rplidar_source, "RESET_S", 0.2)
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
-from gigabrain_drivers.lidars.rplidar.protocol import Answer, Decoder, Info
-from gigabrain_drivers.lidars.rplidar.requests import Request, RequestDecoder
+from gigabrain_drivers.lidars.rplidar.protocol import (
+    Answer,
+    Info,
+    Request,
+    RequestDecoder,
+    RplidarDecoder,
+)
 from gigabrain_drivers.lidars.rplidar.scan_formats import (
     Dense,
     Express,
@@ -46,7 +51,7 @@ def test_bytes_are_those_of_the_vendors_document(made: bytes, expected: str) -> 
 
 
 def test_the_documents_node_is_a_sample_at_ten_degrees_and_two_metres_that_begins_a_turn() -> None:
-    assert Decoder().feed(STANDARD + bytes.fromhex("3d0105401f")) == [
+    assert RplidarDecoder().feed(STANDARD + bytes.fromhex("3d0105401f")) == [
         Samples((10.0,), (2000.0,), 0)
     ]
 
@@ -54,7 +59,7 @@ def test_the_documents_node_is_a_sample_at_ten_degrees_and_two_metres_that_begin
 def test_info_and_health_come_back_as_they_were_and_as_other_clients_read_them() -> None:
     health = rplidar.Health(1, 0x0102)
     wire = rplidar.answer(rplidar.INFO, INFO.pack()) + rplidar.answer(rplidar.HEALTH, health.pack())
-    first, second = Decoder().feed(wire)
+    first, second = RplidarDecoder().feed(wire)
 
     assert isinstance(first, Answer)
     assert isinstance(second, Answer)

@@ -4,20 +4,19 @@ import pytest
 
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
 from gigabrain_drivers.lidars.rplidar.emulator import RplidarDevice
-from gigabrain_drivers.lidars.rplidar.protocol import EXPRESS, STANDARD, Decoder, Info
-from gigabrain_drivers.lidars.rplidar.source import RplidarOptions
-from gigabrain_drivers.lidars.rplidar.startup import Trouble, choose
+from gigabrain_drivers.lidars.rplidar.protocol import EXPRESS, STANDARD, Info, RplidarDecoder
+from gigabrain_drivers.lidars.rplidar.source import RplidarOptions, Trouble, choose
 from tests.unit.drivers.lidars import Wire, run_for, waffle
 
 
-def decoded(model: Any, request: bytes, seconds: float) -> tuple[bytes, Decoder, int]:
+def decoded(model: Any, request: bytes, seconds: float) -> tuple[bytes, RplidarDecoder, int]:
     body, wire = waffle(), Wire()
     device = RplidarDevice(body, RplidarOptions(driver="rplidar", model=model), wire)
     device.reset()
     wire.sent.clear()
     device.feed(request)
     run_for(body, device, seconds)
-    decoder = Decoder()
+    decoder = RplidarDecoder()
     found = decoder.feed(b"".join(wire.sent))
     return wire.sent[0], decoder, len(found)
 

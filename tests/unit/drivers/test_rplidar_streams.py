@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
-from gigabrain_drivers.lidars.rplidar.protocol import Answer, Decoder, Info
-from gigabrain_drivers.lidars.rplidar.requests import RequestDecoder
+from gigabrain_drivers.lidars.rplidar.protocol import Answer, Info, RequestDecoder, RplidarDecoder
 from gigabrain_drivers.lidars.rplidar.scan_formats import Dense, Samples, dense_capsule, node
 
 STANDARD = bytes.fromhex("a55a0500004081")
@@ -36,7 +35,7 @@ def samples(found: list[Answer | Samples]) -> list[tuple[float, float]]:
 
 @given(st.data())
 def test_a_dense_stream_decodes_the_same_however_it_is_cut(data: st.DataObject) -> None:
-    stream, decoder, found = DENSE + dense_turns(2), Decoder(), list[Answer | Samples]()
+    stream, decoder, found = DENSE + dense_turns(2), RplidarDecoder(), list[Answer | Samples]()
     while stream:
         size = data.draw(st.integers(1, 400))
         found += decoder.feed(stream[:size])
@@ -65,7 +64,7 @@ def test_a_turn_begins_at_the_sample_that_passes_zero() -> None:
 def test_bytes_lost_from_a_dense_stream_never_bend_an_angle(lost: int) -> None:
     stream = DENSE + dense_turns(3)
     cut = len(DENSE) + 84 * 12 + 10
-    points = samples(Decoder().feed(stream[:cut] + stream[cut + lost :]))
+    points = samples(RplidarDecoder().feed(stream[:cut] + stream[cut + lost :]))
 
     assert all(distance == 1000 + 10 * angle for angle, distance in points)
     assert len(points) >= 40 * 26 - 40 * 5
@@ -74,7 +73,7 @@ def test_bytes_lost_from_a_dense_stream_never_bend_an_angle(lost: int) -> None:
 def test_a_lost_capsule_is_noticed_though_every_checksum_is_right() -> None:
     stream = DENSE + dense_turns(2)
     cut = len(DENSE) + 84 * 5
-    decoder = Decoder()
+    decoder = RplidarDecoder()
     points = samples(decoder.feed(stream[:cut] + stream[cut + 84 :]))
 
     assert all(distance == 1000 + 10 * angle for angle, distance in points)
@@ -91,7 +90,7 @@ def standard_turns(turns: int) -> bytes:
 @given(st.integers(40, 1700), st.integers(1, 60))
 def test_a_standard_stream_finds_its_step_again_after_lost_bytes(at: int, lost: int) -> None:
     stream = standard_turns(2)
-    decoder = Decoder()
+    decoder = RplidarDecoder()
     points = samples(decoder.feed(STANDARD + stream[:at] + stream[at + lost :]))
 
     assert all(distance == 1000 + 10 * angle for angle, distance in points[: at // 5])
@@ -102,7 +101,7 @@ def test_a_standard_stream_finds_its_step_again_after_lost_bytes(at: int, lost: 
 
 def test_a_turn_is_seen_to_end_though_the_node_that_says_so_was_lost() -> None:
     stream = standard_turns(3)
-    found = Decoder().feed(STANDARD + stream[: 360 * 5] + stream[361 * 5 :])
+    found = RplidarDecoder().feed(STANDARD + stream[: 360 * 5] + stream[361 * 5 :])
     begins = [n for n, item in enumerate(found) if isinstance(item, Samples) and item.turn_at == 0]
 
     assert begins == [0, 400, 719]  # 400 degrees on, where it was lost
@@ -110,7 +109,7 @@ def test_a_turn_is_seen_to_end_though_the_node_that_says_so_was_lost() -> None:
 
 @given(st.binary(max_size=200))
 def test_a_descriptor_is_found_after_any_garbage(garbage: bytes) -> None:
-    decoder = Decoder()
+    decoder = RplidarDecoder()
     decoder.feed(garbage)
     decoder.clear()
 
@@ -123,7 +122,7 @@ def test_a_descriptor_is_found_after_any_garbage(garbage: bytes) -> None:
 def test_what_the_decoders_keep_is_bounded_and_nothing_raises(
     pieces: list[bytes], first: bytes
 ) -> None:
-    decoder, requests = Decoder(), RequestDecoder()
+    decoder, requests = RplidarDecoder(), RequestDecoder()
     decoder.feed(first)
     for piece in pieces:
         decoder.feed(piece)
@@ -147,7 +146,7 @@ def test_a_tenth_of_a_percent_of_wrong_bytes_bends_next_to_no_dense_sample() -> 
     for at in range(len(stream)):
         if chance.random() < 0.001:
             stream[at] ^= chance.randrange(1, 256)
-    points = samples(Decoder().feed(DENSE + bytes(stream)))
+    points = samples(RplidarDecoder().feed(DENSE + bytes(stream)))
     wrong = sum(abs(distance - 1000 - 10 * (angle % 360)) > 1 for angle, distance in points)
 
     assert len(points) > 0.8 * 144_000

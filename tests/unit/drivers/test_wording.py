@@ -11,12 +11,11 @@ import pytest
 from gigabrain_drivers.bodies.alpha import protocol as alpha
 from gigabrain_drivers.bodies.line.fields import COMMAND
 from gigabrain_drivers.bodies.line.protocol import Decoder, Template, describe
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.lidars.ld import protocol as ld
-from gigabrain_drivers.lidars.lds import lds01 as lds01
-from gigabrain_drivers.lidars.lds import lds03 as lds03
-from gigabrain_drivers.lidars.rplidar import requests as rplidar_requests
+from gigabrain_drivers.lidars.lds import lds01, lds03
+from gigabrain_drivers.lidars.rplidar import protocol as rplidar
 from gigabrain_drivers.links import link as links
 from gigabrain_drivers.links.wording import Spelling, Wording, of_command, whole
 from gigabrain_schemas.base import Velocity
@@ -55,7 +54,7 @@ FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [
         "status: model 0x5000, firmware 5",
     ),
     (
-        ld.Decoder().feed,
+        ld.LdDecoder().feed,
         ld.describe,
         "54 2c 68 08 ab 7e e0 00 e4 dc 00 e2 d9 00 e5 d5 00 e3 d3 00 e4 d0 00 e9 cd 00 e4 ca 00 e2 "
         "c7 00 e9 c5 00 e5 c2 00 e5 c0 00 e5 be 82 3a 1a 50",
@@ -64,14 +63,14 @@ FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [
     (whole, lds01.describe_command, "62", "start"),
     (lds03.CommandDecoder().feed, lds03.describe_command, "aa 55 f5 0a", "stop"),
     (
-        lds03.Decoder().feed,
+        lds03.Lds03Decoder().feed,
         lds03.describe,
         "aa 55 15 02 01 05 81 05 af 57 90 a1 0f 68 c9 0f",
         "a turn begins at 1.0 Hz, 2 samples from 10.00 deg, 1000 mm to 11.00 deg, 1010 mm",
     ),
     (
-        rplidar_requests.RequestDecoder().feed,
-        rplidar_requests.describe_request,
+        rplidar.RequestDecoder().feed,
+        rplidar.describe_request,
         "a5 82 05 00 00 00 00 00 22",
         "express scan 00 00 00 00 00",
     ),

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import serial
 from msgspec.structs import replace
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.bodies.turtlebot3.protocol import Readings
 from gigabrain_drivers.links.link import Link

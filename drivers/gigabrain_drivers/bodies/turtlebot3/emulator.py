@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.bodies.turtlebot3.control_table import ControlTable
 from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrOptions

@@ -8,7 +8,7 @@ import math
 import struct
 from typing import NamedTuple
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel as dynamixel
+from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 
 ID = 200
 MODEL = 0x5000  # of the board; which TurtleBot3 it is stands at MODEL_INFO

@@ -1,5 +1,7 @@
 """An LDROBOT lidar: turns and sends from the moment it has power, and listens to nobody."""
 
+import math
+from collections import deque
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -10,6 +12,10 @@ from gigabrain_drivers.emulators.sweep import Sample, Sweep
 from gigabrain_drivers.lidars.ld import protocol as ld
 
 LEAST_VOLTS = 0.5  # below its 5 V by more than this, the motor does not keep its speed
+LENS_X, LENS_Y, SLANT = 5.9, -20.14, 0.11923  # [mm], [mm], of LDS-02's beam beside the axis
+FINE = 4  # rays for each of its samples
+BEHIND = 3.0  # [deg] behind the newest ray, as the beam's slant needs rays on both sides
+KEPT = 60  # rays, 23 degrees
 
 
 class LdDevice(Device):
@@ -47,9 +53,9 @@ class LdDevice(Device):
         """A sample as this model sends it, before any correction by the host."""
         return sample
 
-    def _frame(self, samples: list[Sample]) -> ld.Frame:
+    def _frame(self, samples: list[Sample]) -> ld.LdFrame:
         distances = tuple(min(0xFFFF, round(sample.distance)) for sample in samples)
-        return ld.Frame(
+        return ld.LdFrame(
             speed=round(360 * self._turn_hz),
             start=round(samples[0].angle * 100) % ld.TURN,
             end=round(samples[-1].angle * 100) % ld.TURN,
@@ -57,3 +63,49 @@ class LdDevice(Device):
             confidences=tuple(200 if distance else 0 for distance in distances),
             time_ms=self.body.clock_ns // 1_000_000 % ld.CLOCK_MS,
         )
+
+
+class Lds02Device(LdDevice):
+    """Sends LD frames of what its lens sees, which stands beside the axis and looks across."""
+
+    baud = 115_200
+    samples_hz = 2300
+    reach = 0.16, 8.0
+
+    def reset(self) -> None:
+        """It starts to turn."""
+        self._rays = deque[Sample](maxlen=KEPT)
+        self._frame_of: list[Sample] = []
+        self._sweep.start(self.samples_hz * FINE, self._turn_hz)
+
+    def step(self, now_ns: int) -> None:
+        """All whole frames that were measured meanwhile."""
+        while rays := self._sweep.take(FINE):
+            self._rays += rays
+            if len(self._rays) == KEPT:
+                self._frame_of.append(self._by_the_lens((rays[-1].angle - BEHIND) % 360))
+            if len(self._frame_of) == ld.POINTS:
+                frame, self._frame_of = self._frame(self._frame_of), []
+                if self.sag_volts <= LEAST_VOLTS:
+                    self.wire.write(ld.encode(frame))
+
+    def _by_the_lens(self, angle: float) -> Sample:
+        """What the lens measures when the lidar says `angle` [deg]."""
+        distance, seen_at = 0.0, angle
+        for _ in range(4):  # where it looks depends on how far it sees; this settles quickly
+            distance = self._ray(seen_at).distance
+            raw = lens_distance(distance) if distance else 1e6
+            seen_at = angle - math.degrees(math.atan2(SLANT * raw + LENS_Y, raw + LENS_X))
+        return Sample(angle, lens_distance(distance) if distance else 0.0)
+
+    def _ray(self, angle: float) -> Sample:
+        """The ray that was cast nearest to `angle` [deg]."""
+        step = 360 * self._turn_hz / self.samples_hz / FINE
+        back = (self._rays[-1].angle - angle) % 360
+        return self._rays[-1 - min(round(back / step), KEPT - 1)]
+
+
+def lens_distance(distance: float) -> float:
+    """What LDS-02's lens measures of something `distance` [mm] from the axis."""
+    a, b = 1 + SLANT**2, LENS_X + SLANT * LENS_Y
+    return (math.sqrt(max(b * b - a * (LENS_X**2 + LENS_Y**2 - distance**2), 0.0)) - b) / a

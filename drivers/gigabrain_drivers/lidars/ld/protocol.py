@@ -47,7 +47,7 @@ def crc8(data: bytes) -> int:
     return crc
 
 
-class Frame(NamedTuple):
+class LdFrame(NamedTuple):
     """Twelve measurements in the units of the wire."""
 
     speed: int  # [deg/s]
@@ -63,7 +63,7 @@ class Frame(NamedTuple):
         return tuple([(start + n * step) / 100 for n in range(POINTS)])
 
 
-def encode(frame: Frame) -> bytes:
+def encode(frame: LdFrame) -> bytes:
     """The 47 bytes of `frame`."""
     points = [
         part for pair in zip(frame.distances, frame.confidences, strict=True) for part in pair
@@ -73,7 +73,7 @@ def encode(frame: Frame) -> bytes:
     return head + bytes([crc8(head)])
 
 
-class Raw(NamedTuple):
+class RawFrame(NamedTuple):
     """A frame as it came, and where it starts and ends."""
 
     start: int  # [0.01 deg], clockwise
@@ -82,7 +82,7 @@ class Raw(NamedTuple):
     data: bytes  # (47,)
 
 
-def whole(data: bytes) -> Raw | None:
+def whole(data: bytes) -> RawFrame | None:
     """The frame in exactly 47 bytes, or None when they cannot be one.
 
     CRC-8 lets one in 256 heavily damaged frames through, so what a turning lidar cannot say is
@@ -97,17 +97,17 @@ def whole(data: bytes) -> Raw | None:
     widest = SLACK * speed * 100 * POINTS / LEAST_SAMPLES_HZ
     if version not in VERSIONS or max(start, end) >= TURN or (end - start) % TURN > widest:
         return None
-    return Raw(start, end, time_ms, data)
+    return RawFrame(start, end, time_ms, data)
 
 
-def decode(data: bytes) -> Frame | None:
+def decode(data: bytes) -> LdFrame | None:
     """The same, with all that it says."""
     if whole(data) is None:
         return None
     fields = _LAYOUT.unpack(data)
     _, _, speed, start = fields[:4]
     end, time_ms = fields[-3:-1]
-    return Frame(speed, start, end, fields[4:-3:2], fields[5:-3:2], time_ms)
+    return LdFrame(speed, start, end, fields[4:-3:2], fields[5:-3:2], time_ms)
 
 
 def points(frames: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -123,7 +123,7 @@ def points(frames: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return angles.ravel(), found["points"]["distance"].ravel().astype(np.float64)
 
 
-def describe(frame: Frame) -> str:
+def describe(frame: LdFrame) -> str:
     """A frame in words."""
     seen = [distance for distance in frame.distances if distance]
     span = f"{min(seen)} to {max(seen)} mm" if seen else "no return"
@@ -133,7 +133,7 @@ def describe(frame: Frame) -> str:
     )
 
 
-class Decoder:
+class LdDecoder:
     """Finds the frames in a stream of bytes, whatever else is in it."""
 
     def __init__(self) -> None:
@@ -141,13 +141,13 @@ class Decoder:
         self._in_step = False  # whether the last bytes were a frame; joining half way is no error
         self.errors = 0  # how often a frame was thrown away
 
-    def feed(self, data: bytes) -> list[Frame]:
+    def feed(self, data: bytes) -> list[LdFrame]:
         """The frames that `data` completes. Fewer than 47 bytes are kept for the next call."""
         return [frame for raw in self.cut(data) if (frame := decode(raw.data))]
 
-    def cut(self, data: bytes) -> list[Raw]:
+    def cut(self, data: bytes) -> list[RawFrame]:
         """The same, as they came."""
-        buffer, frames, at = self._buffer, list[Raw](), 0
+        buffer, frames, at = self._buffer, list[RawFrame](), 0
         buffer += data
         while (found := self._find(at)) >= 0:
             if found > at:

@@ -8,9 +8,9 @@ import numpy as np
 import serial
 from msgspec.structs import replace
 
+from gigabrain_drivers.lidars.base import Gathered, Samples
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.serial_source import SerialSource
-from gigabrain_drivers.lidars.turn import Gathered, Samples
 from gigabrain_drivers.links.device_clock import DeviceClock
 from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_schemas.body import Lidar
@@ -61,8 +61,8 @@ class Ld(SerialSource):
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         super().__init__(options, lidar, clock, self.rate_baud)
-        self.link.wording = Wording(received=Spelling(ld.Decoder().feed, ld.describe))
-        self._decoder = ld.Decoder()
+        self.link.wording = Wording(received=Spelling(ld.LdDecoder().feed, ld.describe))
+        self._decoder = ld.LdDecoder()
         self._frames = Frames(lidar, self.place)
         self._stamps = DeviceClock(ld.CLOCK_MS)
         self._last: int | None = None  # [0.01 deg], of the newest sample
@@ -96,7 +96,7 @@ class Ld(SerialSource):
 
     def probe(self, port: serial.Serial) -> bool:
         """Whether frames come from this port."""
-        return len(ld.Decoder().feed(port.read(PROBE_BYTES))) >= PROBE_FRAMES
+        return len(ld.LdDecoder().feed(port.read(PROBE_BYTES))) >= PROBE_FRAMES
 
 
 class Ld06(Ld):
@@ -111,7 +111,7 @@ class Ld19(Ld):
     name, rate_baud = "LD19", 230_400
 
 
-def turn_start(raw: ld.Raw, last: int | None) -> int | None:
+def turn_start(raw: ld.RawFrame, last: int | None) -> int | None:
     """Index of the first point of a frame that is in another turn than `last` [0.01 deg]."""
     if last is not None and raw.start < last - ld.TURN // 2:
         return 0
@@ -119,3 +119,29 @@ def turn_start(raw: ld.Raw, last: int | None) -> int | None:
         return None
     step = (raw.end - raw.start) % ld.TURN / (ld.POINTS - 1)
     return min(math.ceil((ld.TURN - raw.start) / step), ld.POINTS - 1)
+
+
+OFFSET_X, OFFSET_Y = 5.9, -20.14  # [mm], of the lens
+SLANT = 0.11923  # of the beam against the direction that the lidar tells
+
+
+class Lds02(Ld):
+    """Starts with its power. It measures from its lens, which goes round the axis."""
+
+    name, rate_baud = "LDS-02", 115_200
+    samples_hz = 2300.0
+
+    def place(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
+        """Both seen from the axis."""
+        return from_axis(angles, distances)
+
+
+def from_axis(angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
+    """Measurements (n,) from the lens ([deg] clockwise, [mm]) as they are seen from the axis.
+
+    Source: the vendor's ld08_driver, `SlTransform`. No return (0 mm) stays where it is.
+    """
+    x, y = distances + OFFSET_X, SLANT * distances + OFFSET_Y
+    seen = distances != 0
+    turned = angles - np.degrees(np.arctan2(y, x))
+    return np.where(seen, turned, angles), np.where(seen, np.hypot(x, y), distances)

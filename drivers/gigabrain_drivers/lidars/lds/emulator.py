@@ -1,7 +1,5 @@
-"""The lidars of TurtleBot3: LDS-01 and LDS-03, which are told to turn, and LDS-02."""
+"""LDS-01 and LDS-03, which turn and stop on command."""
 
-import math
-from collections import deque
 from pathlib import Path
 from typing import Any
 
@@ -9,21 +7,14 @@ from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.emulators.sweep import Sample, Sweep
-from gigabrain_drivers.lidars.ld import protocol as ld
-from gigabrain_drivers.lidars.ld.emulator import LEAST_VOLTS, LdDevice
-from gigabrain_drivers.lidars.lds import lds01 as lds01
-from gigabrain_drivers.lidars.lds import lds03 as lds03
+from gigabrain_drivers.lidars.ld.emulator import LEAST_VOLTS
+from gigabrain_drivers.lidars.lds import lds01, lds03
 
 LDS01_HZ = 5.0  # turns
 LDS03_HZ, LDS03_SAMPLES_HZ = 10.0, 4000.0
 LDS03_POINTS = 20  # in a packet, at most
 INTENSITY, QUALITY = 1000, 60
 LONGEST_COMMAND = 4
-
-LENS_X, LENS_Y, SLANT = 5.9, -20.14, 0.11923  # [mm], [mm], of LDS-02's beam beside the axis
-FINE = 4  # rays for each of its samples
-BEHIND = 3.0  # [deg] behind the newest ray, as the beam's slant needs rays on both sides
-KEPT = 60  # rays, 23 degrees
 
 
 class Lds01Device(Device):
@@ -61,46 +52,6 @@ class Lds01Device(Device):
             if len(samples) == lds01.SAMPLES and self.sag_volts <= LEAST_VOLTS:
                 number = first // lds01.SAMPLES % lds01.PACKETS
                 self.wire.write(lds01.encode(_lds01_packet(number, samples)))
-
-
-class Lds02Device(LdDevice):
-    """Sends LD frames of what its lens sees, which stands beside the axis and looks across."""
-
-    baud = 115_200
-    samples_hz = 2300
-    reach = 0.16, 8.0
-
-    def reset(self) -> None:
-        """It starts to turn."""
-        self._rays = deque[Sample](maxlen=KEPT)
-        self._frame_of: list[Sample] = []
-        self._sweep.start(self.samples_hz * FINE, self._turn_hz)
-
-    def step(self, now_ns: int) -> None:
-        """All whole frames that were measured meanwhile."""
-        while rays := self._sweep.take(FINE):
-            self._rays += rays
-            if len(self._rays) == KEPT:
-                self._frame_of.append(self._by_the_lens((rays[-1].angle - BEHIND) % 360))
-            if len(self._frame_of) == ld.POINTS:
-                frame, self._frame_of = self._frame(self._frame_of), []
-                if self.sag_volts <= LEAST_VOLTS:
-                    self.wire.write(ld.encode(frame))
-
-    def _by_the_lens(self, angle: float) -> Sample:
-        """What the lens measures when the lidar says `angle` [deg]."""
-        distance, seen_at = 0.0, angle
-        for _ in range(4):  # where it looks depends on how far it sees; this settles quickly
-            distance = self._ray(seen_at).distance
-            raw = lens_distance(distance) if distance else 1e6
-            seen_at = angle - math.degrees(math.atan2(SLANT * raw + LENS_Y, raw + LENS_X))
-        return Sample(angle, lens_distance(distance) if distance else 0.0)
-
-    def _ray(self, angle: float) -> Sample:
-        """The ray that was cast nearest to `angle` [deg]."""
-        step = 360 * self._turn_hz / self.samples_hz / FINE
-        back = (self._rays[-1].angle - angle) % 360
-        return self._rays[-1 - min(round(back / step), KEPT - 1)]
 
 
 class Lds03Device(Device):
@@ -146,7 +97,7 @@ class Lds03Device(Device):
 
     def _send(self) -> None:
         points, self._waiting = self._waiting, []
-        packet = lds03.Packet(
+        packet = lds03.Lds03Packet(
             begins=self._begins,
             rate=LDS03_HZ if self._begins else 0.0,
             samples=tuple(_lds03_sample(point) for point in points),
@@ -155,18 +106,12 @@ class Lds03Device(Device):
             self.wire.write(lds03.encode(packet))
 
 
-def lens_distance(distance: float) -> float:
-    """What LDS-02's lens measures of something `distance` [mm] from the axis."""
-    a, b = 1 + SLANT**2, LENS_X + SLANT * LENS_Y
-    return (math.sqrt(max(b * b - a * (LENS_X**2 + LENS_Y**2 - distance**2), 0.0)) - b) / a
-
-
-def _lds01_packet(number: int, samples: list[Sample]) -> lds01.Packet:
+def _lds01_packet(number: int, samples: list[Sample]) -> lds01.Lds01Packet:
     ranges = tuple(round(sample.distance) for sample in samples)
     intensities = tuple(INTENSITY if distance else 0 for distance in ranges)
-    return lds01.Packet(number, LDS01_HZ * 60, intensities, ranges)
+    return lds01.Lds01Packet(number, LDS01_HZ * 60, intensities, ranges)
 
 
-def _lds03_sample(point: Sample) -> lds03.Sample:
+def _lds03_sample(point: Sample) -> lds03.Lds03Sample:
     distance = round(point.distance)
-    return lds03.Sample(point.angle, distance, QUALITY if distance else 0, reflective=False)
+    return lds03.Lds03Sample(point.angle, distance, QUALITY if distance else 0, reflective=False)

@@ -5,9 +5,15 @@ published; so a packet is known by its structure, and counts when the next one f
 """
 
 import struct
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import serial
+
+from gigabrain_drivers.lidars.serial_source import SerialSource
 from gigabrain_drivers.links.frames import FrameDecoder
+from gigabrain_drivers.links.wording import Spelling, Wording, whole
+from gigabrain_schemas.body import Lidar
+from gigabrain_zenoh.clock import Clock
 
 BAUD = 230_400
 START, STOP = b"b", b"e"
@@ -18,7 +24,7 @@ NO_RETURN = 0  # [mm]
 _SYNC, _FIRST = 0xFA, 0xA0
 
 
-class Packet(NamedTuple):
+class Lds01Packet(NamedTuple):
     """Six of a turn's 360 samples; sample `6 * number + i` looks that many degrees clockwise."""
 
     number: int  # 0-59
@@ -27,7 +33,7 @@ class Packet(NamedTuple):
     ranges: tuple[int, ...]  # [mm], 0 where there was no return
 
 
-def encode(packet: Packet) -> bytes:
+def encode(packet: Lds01Packet) -> bytes:
     """The bytes of a packet; the checksum is the one that other drivers report, unverified."""
     frame = struct.pack("<BBH", _SYNC, _FIRST + packet.number, round(packet.rpm * 10))
     for intensity, distance in zip(packet.intensities, packet.ranges, strict=True):
@@ -35,7 +41,7 @@ def encode(packet: Packet) -> bytes:
     return frame + bytes([0xFF - sum(frame) & 0xFF]) * 2
 
 
-def describe(packet: Packet) -> str:
+def describe(packet: Lds01Packet) -> str:
     """A packet in words."""
     first = packet.number * SAMPLES
     return (
@@ -49,7 +55,7 @@ def describe_command(command: bytes) -> str:
     return {START: "start", STOP: "stop"}.get(command, "unknown command")
 
 
-class Decoder(FrameDecoder[Packet]):
+class Lds01Decoder(FrameDecoder[Lds01Packet]):
     """Finds packets in whatever comes in; each waits for the header of the next."""
 
     HEADER = bytes([_SYNC])
@@ -61,10 +67,77 @@ class Decoder(FrameDecoder[Packet]):
         follows = buffer[SIZE] == _SYNC and buffer[SIZE + 1] == _FIRST + (number + 1) % PACKETS
         return SIZE if 0 <= number < PACKETS and follows else 0
 
-    def _frame(self, data: bytes) -> Packet:
+    def _frame(self, data: bytes) -> Lds01Packet:
         return _packet(data)
 
 
-def _packet(frame: bytes) -> Packet:
+def _packet(frame: bytes) -> Lds01Packet:
     values = struct.unpack("<BBH" + "HHH" * SAMPLES + "H", frame)
-    return Packet(values[1] - _FIRST, values[2] / 10, values[3:-1:3], values[4:-1:3])
+    return Lds01Packet(values[1] - _FIRST, values[2] / 10, values[3:-1:3], values[4:-1:3])
+
+
+PROBE_BYTES = 600  # fourteen packets
+PROBE_PACKETS = 3
+RESTART_NS = 1_000_000_000  # without a packet, until it is started again
+LAST_WORD_NS = 20_000_000  # until a command has left the port
+
+
+class Lds01(SerialSource):
+    """Turns from its start command to its stop command."""
+
+    name = "LDS-01"
+    samples_hz, turns_hz = 1800.0, 5.0  # 300 rpm; it takes no speed
+
+    def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
+        super().__init__(options, lidar, clock, BAUD)
+        self.link.wording = Wording(
+            Spelling(whole, describe_command), Spelling(Lds01Decoder().feed, describe)
+        )
+        self._decoder = Lds01Decoder()
+        self._last: int | None = None  # number of the newest packet
+        self._told_ns = 0  # when it was last told to start, or last seen to turn
+
+    def connected(self) -> None:
+        """Start it."""
+        self._decoder.clear()
+        self._last = None
+        self._start()
+
+    def received(self, data: bytes) -> None:
+        """Packets, or parts of them."""
+        now_ns = self.clock.now_ns()
+        for packet in self._decoder.feed(data):
+            turn_at = 0 if self._last is not None and packet.number <= self._last else None
+            self._last, self._told_ns = packet.number, now_ns
+            first = packet.number * SAMPLES + 1  # the vendor's driver puts sample 0 at 359
+            angles = range(first, first + SAMPLES)
+            self.finished(self.turn.clockwise(angles, packet.ranges, turn_at, now_ns))
+        self.link.errors = self._decoder.errors
+
+    def look(self, now_ns: int) -> None:
+        """Start it again where it does not turn: it may have had no power before."""
+        super().look(now_ns)
+        if now_ns - self._told_ns > RESTART_NS:
+            self._start()
+
+    def understands(self) -> bool:
+        """Whether packets come."""
+        return self._last is not None
+
+    def probe(self, port: serial.Serial) -> bool:
+        """Whether packets come from this port once it is told to start."""
+        port.write(START)
+        found = len(Lds01Decoder().feed(port.read(PROBE_BYTES))) >= PROBE_PACKETS
+        if not found:
+            port.write(STOP)
+        return found
+
+    async def close(self) -> None:
+        """Stop it, and free the port."""
+        if self.link.write(STOP):
+            await self.clock.sleep_ns(LAST_WORD_NS)
+        await super().close()
+
+    def _start(self) -> None:
+        self._told_ns = self.clock.now_ns()
+        self.link.write(START)

@@ -3,12 +3,19 @@
 Source: the vendor's driver coin_d4_driver.
 """
 
+import math
 import operator
 import struct
 from functools import reduce
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import serial
+
+from gigabrain_drivers.lidars.serial_source import SerialSource
 from gigabrain_drivers.links.frames import FrameDecoder
+from gigabrain_drivers.links.wording import Spelling, Wording
+from gigabrain_schemas.body import Lidar
+from gigabrain_zenoh.clock import Clock
 
 BAUD = 230_400
 
@@ -25,7 +32,7 @@ def command(code: int) -> bytes:
 START, STOP = command(0xF0), command(0xF5)
 
 
-class Sample(NamedTuple):
+class Lds03Sample(NamedTuple):
     """One measurement."""
 
     angle: float  # [deg], clockwise, 0 up to 360
@@ -34,15 +41,15 @@ class Sample(NamedTuple):
     reflective: bool  # of a mirror-like surface
 
 
-class Packet(NamedTuple):
+class Lds03Packet(NamedTuple):
     """Samples in a row; `begins` a turn when the angle passes 0."""
 
     begins: bool
     rate: float  # [Hz] of turns; only told where a turn begins, else 0
-    samples: tuple[Sample, ...]
+    samples: tuple[Lds03Sample, ...]
 
 
-def encode(packet: Packet) -> bytes:
+def encode(packet: Lds03Packet) -> bytes:
     """The bytes of a packet of at least one sample; angles in between are spread evenly."""
     first, last = packet.samples[0].angle, packet.samples[-1].angle
     kind = packet.begins | round(packet.rate * 10) << 1
@@ -51,7 +58,7 @@ def encode(packet: Packet) -> bytes:
     return _HEADER + head + struct.pack("<H", _check(head, body)) + body
 
 
-def describe(packet: Packet) -> str:
+def describe(packet: Lds03Packet) -> str:
     """A packet in words."""
     first, last = packet.samples[0], packet.samples[-1]
     turn = f"a turn begins at {packet.rate:.1f} Hz, " if packet.begins else ""
@@ -82,7 +89,7 @@ def describe_command(command: bytes) -> str:
     return {START: "start", STOP: "stop"}.get(command, "unknown command")
 
 
-class Decoder(FrameDecoder[Packet]):
+class Lds03Decoder(FrameDecoder[Lds03Packet]):
     """Finds packets in whatever comes in."""
 
     HEADER = _HEADER
@@ -93,7 +100,7 @@ class Decoder(FrameDecoder[Packet]):
         count = buffer[3]
         return _PREFIX + 3 * count if count and buffer[4] & buffer[6] & 1 else 0
 
-    def _frame(self, data: bytes) -> Packet | None:
+    def _frame(self, data: bytes) -> Lds03Packet | None:
         right = _check(data[2:8], data[_PREFIX:]) == int.from_bytes(data[8:10], "little")
         return _packet(data) if right else None
 
@@ -113,7 +120,7 @@ def _angle(degrees: float) -> int:
     return round(degrees % _TURN * 64) << 1 | 1
 
 
-def _sample(sample: Sample) -> bytes:
+def _sample(sample: Lds03Sample) -> bytes:
     """`0bQQQQQQ0R 0bDDDDDDQQ 0bDDDDDDDD`, the lowest bits of quality and distance first."""
     return bytes(
         [
@@ -124,14 +131,14 @@ def _sample(sample: Sample) -> bytes:
     )
 
 
-def _packet(frame: bytes) -> Packet:
+def _packet(frame: bytes) -> Lds03Packet:
     kind, count, first, last = struct.unpack_from("<BBHH", frame, 2)
     start, end = (first >> 1) / 64, (last >> 1) / 64
     step = (end - start) % _TURN / (count - 1) if count > 1 else 0.0
     samples = []
     for i, (low, middle, high) in enumerate(struct.iter_unpack("BBB", frame[_PREFIX:])):
         samples.append(
-            Sample(
+            Lds03Sample(
                 angle=(start + i * step) % _TURN,
                 distance=high << 6 | middle >> 2,
                 quality=(middle & 3) << 6 | low >> 2,
@@ -139,4 +146,94 @@ def _packet(frame: bytes) -> Packet:
             )
         )
     begins = bool(kind & 1)
-    return Packet(begins, (kind >> 1) / 10 if begins else 0.0, tuple(samples))
+    return Lds03Packet(begins, (kind >> 1) / 10 if begins else 0.0, tuple(samples))
+
+
+PROBE_BYTES = 600
+DTR_NS = 100_000_000  # after opening, until the terminal-ready line is cleared
+START_NS = 1_000_000_000  # after opening, until it listens
+RESTART_NS = 3_000_000_000  # without a packet, until it is stopped and started
+LAST_WORD_NS = 20_000_000  # until a command has left the port
+NEAR_MM, WEAK = 150, 65  # up to here, a sample this weak is a reflection of the housing
+MIRROR_QUALITY = 255
+
+
+class Lds03(SerialSource):
+    """Turns from its start command to its stop command."""
+
+    name = "LDS-03"
+    samples_hz = 4000.0
+
+    def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
+        super().__init__(options, lidar, clock, BAUD)
+        self.link.wording = Wording(
+            Spelling(CommandDecoder().feed, describe_command),
+            Spelling(Lds03Decoder().feed, describe),
+        )
+        self._decoder = Lds03Decoder()
+        self._cleared = self._started = self._understood = False
+        self._told_ns = 0  # when it was last told something, or last seen to turn
+
+    def connected(self) -> None:
+        """Leave it alone for a second; then it is started by `look`."""
+        self._decoder.clear()
+        self._cleared = self._started = self._understood = False
+        self._told_ns = self.clock.now_ns()
+
+    def received(self, data: bytes) -> None:
+        """Packets, or parts of them."""
+        now_ns = self.clock.now_ns()
+        for packet in self._decoder.feed(data):
+            self._understood, self._told_ns = True, now_ns
+            angles = [sample.angle for sample in packet.samples]
+            distances = [trusted(sample) for sample in packet.samples]
+            turn_at = 0 if packet.begins else None
+            self.finished(self.turn.clockwise(angles, distances, turn_at, now_ns))
+        self.link.errors = self._decoder.errors
+
+    def look(self, now_ns: int) -> None:
+        """Start it when it is ready for that, and once more where it does not turn."""
+        super().look(now_ns)
+        since = now_ns - self._told_ns
+        if not self._cleared and since >= DTR_NS:
+            self.link.set_dtr(False)
+            self._cleared = True
+        if not self._started and since >= START_NS:
+            self._tell(START)
+            self._started = True
+        elif self._started and since >= RESTART_NS:
+            self._tell(STOP)
+            self._tell(START)
+
+    def understands(self) -> bool:
+        """Whether packets come."""
+        return self._understood
+
+    def probe(self, port: serial.Serial) -> bool:
+        """Whether packets come from this port once it is told to start."""
+        port.write(START)
+        found = bool(Lds03Decoder().feed(port.read(PROBE_BYTES)))
+        if not found:
+            port.write(STOP)
+        return found
+
+    async def close(self) -> None:
+        """Stop it, and free the port."""
+        if self.link.write(STOP):
+            await self.clock.sleep_ns(LAST_WORD_NS)
+        await super().close()
+
+    def _tell(self, command: bytes) -> None:
+        self._told_ns = self.clock.now_ns()
+        self.link.write(command)
+
+
+def trusted(sample: Lds03Sample) -> float:
+    """The distance [mm] of a sample, nan where it is too near and too weak to be believed.
+
+    Source: the vendor's coin_d4_driver.
+    """
+    quality = MIRROR_QUALITY if sample.reflective else sample.quality
+    if 0 < sample.distance <= NEAR_MM and quality <= WEAK:
+        return math.nan
+    return float(sample.distance)

@@ -7,16 +7,22 @@ from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
 from gigabrain_drivers.emulators.pty import Pty
 from gigabrain_drivers.emulators.sweep import Sample, Sweep
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
-from gigabrain_drivers.lidars.rplidar.protocol import DENSE, EXPRESS, STANDARD, Health, Info
-from gigabrain_drivers.lidars.rplidar.requests import Request, RequestDecoder
+from gigabrain_drivers.lidars.rplidar.protocol import (
+    DENSE,
+    EXPRESS,
+    STANDARD,
+    Health,
+    Info,
+    Request,
+    RequestDecoder,
+)
 from gigabrain_drivers.lidars.rplidar.scan_formats import (
     FORMATS,
     dense_capsule,
     express_capsule,
     node,
 )
-from gigabrain_drivers.lidars.rplidar.source import RplidarOptions
-from gigabrain_drivers.lidars.rplidar.startup import MODELS
+from gigabrain_drivers.lidars.rplidar.source import MODELS, RplidarOptions
 
 SAMPLES = {STANDARD: 1, EXPRESS: 32, DENSE: 40}  # in a block
 QUALITY = 47  # of a standard node that saw something

@@ -105,7 +105,7 @@ class Answer(NamedTuple):
     data: bytes
 
 
-class Decoder:
+class RplidarDecoder:
     """The host's side: answers and samples out of a stream of bytes. Keeps less than 200 bytes."""
 
     def __init__(self) -> None:
@@ -204,3 +204,60 @@ def describe(item: "Answer | Samples") -> str:
     if item.kind == HEALTH:
         return f"health: status {Health.read(item.data).status}"
     return f"answer of type {item.kind:#04x}, {len(item.data)} bytes"
+
+
+REQUESTS = {
+    STOP: "stop", RESET: "reset",
+    SCAN: "scan", FORCE_SCAN: "force scan", EXPRESS_SCAN: "express scan",
+    GET_INFO: "get info", GET_HEALTH: "get health",
+    GET_SAMPLERATE: "get sample rate", GET_BOARD: "get board",
+    GET_CONF: "get setting", SET_SPEED: "set speed", SET_PWM: "set motor",
+}  # fmt: skip
+_BEFORE_CHECKSUM = 3  # bytes of a request with a payload before the payload
+
+
+class Request(NamedTuple):
+    """What a host asks for."""
+
+    command: int
+    payload: bytes = b""
+
+
+def describe_request(request: Request) -> str:
+    """What a host asks for, in words."""
+    name = REQUESTS.get(request.command, f"request {request.command:#04x}")
+    return f"{name} {request.payload.hex(' ')}".strip()
+
+
+class RequestDecoder:
+    """The lidar's side: requests out of a stream of bytes. Keeps less than 260 bytes."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self.errors = 0
+
+    def feed(self, data: bytes) -> list[Request]:
+        """The requests that `data` completes."""
+        buffer, found = self._buffer, list[Request]()
+        buffer += data
+        while True:
+            self._skip()
+            if len(buffer) < 2:
+                return found
+            if buffer[1] < 0x80:
+                found.append(Request(buffer[1]))
+                del buffer[:2]
+                continue
+            if len(buffer) < _BEFORE_CHECKSUM or len(buffer) < buffer[2] + 4:
+                return found
+            whole = bytes(buffer[: buffer[2] + 4])
+            if xor(whole) == 0:
+                found.append(Request(whole[1], whole[_BEFORE_CHECKSUM:-1]))
+                del buffer[: len(whole)]
+            else:
+                self.errors += 1
+                del buffer[:1]
+
+    def _skip(self) -> None:
+        at = self._buffer.find(0xA5)
+        del self._buffer[: at if at >= 0 else len(self._buffer)]

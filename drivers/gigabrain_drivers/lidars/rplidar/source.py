@@ -1,18 +1,22 @@
-"""Slamtec's RPLIDARs: asked who they are, spun up and told to scan; again whenever silent."""
+"""Slamtec's RPLIDARs: identified, spun up and told to scan; started again whenever silent."""
 
 import asyncio
 import logging
 import time
-from typing import Literal
+from typing import Literal, NamedTuple, Protocol
 
 import serial
 
 from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
-from gigabrain_drivers.lidars.rplidar.protocol import Answer, Info
-from gigabrain_drivers.lidars.rplidar.requests import RequestDecoder, describe_request
-from gigabrain_drivers.lidars.rplidar.scan_formats import Samples
-from gigabrain_drivers.lidars.rplidar.startup import BAUDS, FAMILIES, MODELS, STOP_S, Trouble, start
+from gigabrain_drivers.lidars.rplidar.protocol import (
+    Answer,
+    Health,
+    Info,
+    RequestDecoder,
+    describe_request,
+)
+from gigabrain_drivers.lidars.rplidar.scan_formats import FORMATS, Samples
 from gigabrain_drivers.lidars.serial_source import LOOK_NS, SerialSource
 from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_schemas.body import Lidar
@@ -25,16 +29,152 @@ SPIN_UP_NS = 4_000_000_000  # from the request to scan to the first sample
 INFO_BYTES = 27  # its descriptor and itself
 SILENT_NS = 1_000_000_000  # then it is started again
 PWM = 660  # of 1023, the vendor's usual motor power
+STOP_S = 0.1  # the vendor waits so long after a stop
+RESET_S = 2.0
+PWM_FAMILIES = range(2, 6)  # which may sit on a board that powers the motor
+CONF_FIRMWARE = (1, 24)  # from here on it can be asked for its scan modes; C1 and later always
+CONF_FAMILY = 4
+EXPRESS_FIRMWARE = (1, 17)  # from here on it has the express mode
 
-Model = Literal["auto", "a1", "a2m8", "a2m12", "a3", "c1", "s1", "s2", "s3"]
+
+ModelName = Literal["auto", "a1", "a2m8", "a2m12", "a3", "c1", "s1", "s2", "s3"]
 ScanMode = Literal["auto", "standard", "express", "dense"]
 
 
 class RplidarOptions(ScanOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The RPLIDAR's part of a robot's file."""
 
-    model: Model = "auto"  # says the baud rate; auto tries one after the other
+    model: ModelName = "auto"  # says the baud rate; auto tries one after the other
     scan_mode: ScanMode = "auto"  # the lidar's own choice, where it is one of the other three
+
+
+class Trouble(Exception):
+    """Why it does not scan, in one line for people."""
+
+
+class ModelFigures(NamedTuple):
+    """What a model's name says of it."""
+
+    baud: int
+    family: int  # high nibble of the model that it reports
+
+
+MODELS = {
+    "a1": ModelFigures(115_200, 1),
+    "a2m8": ModelFigures(115_200, 2),
+    "a2m12": ModelFigures(256_000, 2),
+    "a3": ModelFigures(256_000, 3),
+    "c1": ModelFigures(460_800, 4),
+    "s1": ModelFigures(256_000, 6),
+    "s2": ModelFigures(1_000_000, 7),
+    "s3": ModelFigures(1_000_000, 8),
+}
+BAUDS = (115_200, 460_800, 1_000_000, 256_000)
+FAMILIES = {1: "A1", 2: "A2", 3: "A3", 4: "C1", 6: "S1", 7: "S2", 8: "S3"}
+KINDS = {"standard": rplidar.STANDARD, "express": rplidar.EXPRESS, "dense": rplidar.DENSE}
+
+
+class Line(Protocol):
+    """What the start-up needs of whoever has the port."""
+
+    def send(self, data: bytes) -> None:
+        """To the lidar."""
+
+    async def ask(self, request: bytes, kind: int) -> bytes:
+        """The single answer to a request. Raises Trouble."""
+
+    def motor(self, *, on: bool) -> None:
+        """Let it turn, or stop."""
+
+    def known(self, info: Info, *, pwm: bool) -> None:
+        """It has said who it is, and whether a board powers its motor."""
+
+
+async def start(line: Line, scan_mode: str) -> None:
+    """From any state to a stream of samples, in the order of the vendor's SDK. Raises Trouble."""
+    await _stop(line)
+    info = Info.read(await line.ask(rplidar.request(rplidar.GET_INFO), rplidar.INFO))
+    line.known(info, pwm=await _on_board(line, info))
+    await _check_health(line)
+    line.motor(on=True)
+    await _stop(line)
+    kind, mode = await choose(line, info, scan_mode)
+    if kind == rplidar.STANDARD:
+        line.send(rplidar.request(rplidar.SCAN))
+    else:
+        line.send(rplidar.express_request(mode))
+
+
+async def choose(line: Line, info: Info, scan_mode: str) -> tuple[int, int]:
+    """The answer type and number of the scan mode to use. Raises Trouble.
+
+    `auto` is the lidar's typical mode, or the fastest of those that are understood here.
+    """
+    if info.firmware < CONF_FIRMWARE and info.model >> 4 < CONF_FAMILY:
+        return _old_mode(info, scan_mode), 0
+    wanted = set(FORMATS) if scan_mode == "auto" else {KINDS[scan_mode]}
+    typical = _number(await _conf(line, rplidar.MODE_TYPICAL))
+    kind = await _kind(line, typical)
+    if kind in wanted:
+        return kind, typical
+    fitting = []
+    for mode in range(_number(await _conf(line, rplidar.MODE_COUNT))):
+        if (kind := await _kind(line, mode)) in wanted:
+            period = _number(await _conf(line, rplidar.MODE_MICROSECONDS, mode))
+            fitting.append((period, kind, mode))
+    if not fitting:
+        raise Trouble(f"this RPLIDAR has no scan_mode {scan_mode!r} that is understood here")
+    return min(fitting)[1:]
+
+
+def _old_mode(info: Info, scan_mode: str) -> int:
+    """The answer type of firmware that cannot be asked for its modes."""
+    has = {"standard": rplidar.STANDARD}
+    if info.firmware >= EXPRESS_FIRMWARE:
+        has |= {"auto": rplidar.EXPRESS, "express": rplidar.EXPRESS}
+    if scan_mode not in {*has, "auto"}:
+        version = ".".join(map(str, info.firmware))
+        raise Trouble(f"this RPLIDAR's firmware {version} has no scan_mode {scan_mode!r}")
+    return has.get(scan_mode, rplidar.STANDARD)
+
+
+async def _stop(line: Line) -> None:
+    line.send(rplidar.request(rplidar.STOP))
+    await asyncio.sleep(STOP_S)
+
+
+async def _on_board(line: Line, info: Info) -> bool:
+    if info.model >> 4 not in PWM_FAMILIES:
+        return False
+    try:
+        flags = await line.ask(rplidar.request(rplidar.GET_BOARD, bytes(4)), rplidar.BOARD)
+    except Trouble:  # there is nobody to answer where there is no board
+        return False
+    return bool(flags[0] & 1)
+
+
+async def _check_health(line: Line) -> None:
+    health = Health.read(await line.ask(rplidar.request(rplidar.GET_HEALTH), rplidar.HEALTH))
+    if health.status == 2:
+        line.send(rplidar.request(rplidar.RESET))
+        await asyncio.sleep(RESET_S)
+        raise Trouble(f"the RPLIDAR has stopped to protect itself, code {health.code}; was reset")
+
+
+async def _kind(line: Line, mode: int) -> int:
+    return (await _conf(line, rplidar.MODE_ANSWER, mode))[0]
+
+
+async def _conf(line: Line, key: int, mode: int | None = None) -> bytes:
+    """The value of a setting, at least one byte. Raises Trouble."""
+    data = await line.ask(rplidar.conf_request(key, mode), rplidar.CONF)
+    if int.from_bytes(data[:4], "little") != key or len(data) < 5:
+        raise Trouble(f"the RPLIDAR does not say its setting 0x{key:02x}")
+    return data[4:]
+
+
+def _number(data: bytes) -> int:
+    return int.from_bytes(data, "little")
 
 
 class Rplidar(SerialSource):
@@ -54,9 +194,9 @@ class Rplidar(SerialSource):
         self.link.on_lost = self._lost
         self.link.wording = Wording(
             Spelling(RequestDecoder().feed, describe_request),
-            Spelling(rplidar.Decoder().feed, rplidar.describe),
+            Spelling(rplidar.RplidarDecoder().feed, rplidar.describe),
         )
-        self._decoder = rplidar.Decoder()
+        self._decoder = rplidar.RplidarDecoder()
         self._connected = asyncio.Event()
         self._asked: tuple[int, asyncio.Future[bytes]] | None = None
         self._understood = False
@@ -217,5 +357,5 @@ def answers(port: serial.Serial) -> bool:
     time.sleep(STOP_S)
     port.reset_input_buffer()
     port.write(rplidar.request(rplidar.GET_INFO))
-    found = rplidar.Decoder().feed(port.read(INFO_BYTES))
+    found = rplidar.RplidarDecoder().feed(port.read(INFO_BYTES))
     return any(isinstance(item, Answer) for item in found)
