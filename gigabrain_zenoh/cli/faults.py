@@ -35,8 +35,8 @@ from gigabrain_zenoh.qa.proxy.tcp import Address, TcpProxy
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.qa.faults.fault import FaultResult, FaultRow, FaultRun
     from gigabrain_zenoh.qa.faults.rig.rig import Options
+    from gigabrain_zenoh.qa.judging import FaultResult, FaultRow, FaultRun
 
 ENDPOINT = re.compile(r"(?:(?:tcp|tls|ws)/)?(?P<host>\[[^\]]+\]|[^/:\[\]]+):(?P<port>\d+)")
 
@@ -168,8 +168,7 @@ def _table(results: "Sequence[FaultResult]", chosen: "Sequence[FaultRow]") -> "T
     from rich.markup import escape
     from rich.table import Table
 
-    from gigabrain_zenoh.qa.faults.fault import in_words
-    from gigabrain_zenoh.qa.judging import COLOURS
+    from gigabrain_zenoh.qa.judging import COLOURS, in_words
 
     rows = {fault.number: fault for fault in chosen}
     passed = sum(result.verdict == "passed" for result in results)

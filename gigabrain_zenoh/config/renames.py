@@ -79,6 +79,15 @@ CLI_WORDS: tuple[Rename, ...] = (
     Rename("driver run --remember", "--state-dir"),
 )
 
+FAULT_NAMES: tuple[Rename, ...] = (
+    Rename("one-part-of-decision-hangs", "decision-loop-hangs"),
+    Rename("cpu-hogs", "busy-machine"),
+    Rename("goal-goes-on", "goal-recovery"),
+    Rename("map-goes-on", "map-recovery"),
+    Rename("frozen-for-ever", "frozen-until-restarted"),
+    Rename("one-message", "extreme-messages"),
+)
+
 _printed: set[str] = set()
 
 
@@ -110,6 +119,15 @@ def renamed_settings(
             inner = inner.setdefault(key, {})
         inner[new] = rename.values.get(value, value) if isinstance(value, str) else value
     return result
+
+
+def renamed_word(word: str, table: Sequence[Rename]) -> str:
+    """Return the current form of a word; print a notice if it is an old one."""
+    for rename in table:
+        if rename.old == word:
+            _notice("", word, rename.new)
+            return rename.new
+    return word
 
 
 def renamed_arguments(arguments: Iterable[str], table: Sequence[Rename] = CLI_WORDS) -> list[str]:

@@ -19,7 +19,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.geometry.limits import limits_of, ramp
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, WAFFLE, body, scan, state
 
 Q = TypeVar("Q", bound=Message)

@@ -9,7 +9,7 @@ import pytest
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE
-from gigabrain_zenoh.testing.brain import RobotInMemory, ticks_until, travelled
+from gigabrain_zenoh.testing.in_memory import RobotInMemory, ticks_until, travelled
 
 # after how many ticks the body brakes, and how far it may go until it stands still [m]
 SILENCES = [

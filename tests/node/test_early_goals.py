@@ -16,7 +16,7 @@ from gigabrain_zenoh.decision import goal_server
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)

@@ -12,7 +12,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE, TOPICS, Service
 from gigabrain_zenoh.config.settings import Resume
 from gigabrain_zenoh.qa.faults.rig.hostile import codec_of, hostile_payloads, hostile_values
-from gigabrain_zenoh.testing.brain import RobotInMemory
+from gigabrain_zenoh.testing.in_memory import RobotInMemory
 
 TICKS = 200
 PER_TICK = 100  # 20000 payloads in all

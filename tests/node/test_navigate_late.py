@@ -14,7 +14,7 @@ from gigabrain_zenoh.decision import route_schedule
 from gigabrain_zenoh.decision.behaviours import NavigationConfig
 from gigabrain_zenoh.decision.navigator import Navigator
 from gigabrain_zenoh.decision.route import Route, RoutePlanner, RouteRequest
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import BOOT, state
 from tests.node.plane import ROOM, Plane, as_map, drawn
 

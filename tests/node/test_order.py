@@ -25,7 +25,7 @@ from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.config.settings import DriverConfig, PerceptionConfig
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.runtime.replay import Node
-from gigabrain_zenoh.testing.brain import BRAIN
+from gigabrain_zenoh.testing.in_memory import BRAIN
 from gigabrain_zenoh.testing.samples import round_room
 
 BOLD = PerceptionConfig(ahead=0.3, corridor=0.05, turning_room=0.0)  # as close as safety allows

@@ -22,7 +22,7 @@ from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.navigation.local_planner import Goal, LocalPlanner
 from gigabrain_zenoh.runtime.deployment import load_deployment
 from gigabrain_zenoh.runtime.services import LOG_LEVEL, serve_params
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import state
 from tests.node.plane import Plane, drawn
 from tests.unit.navigation.drives import QUICK, WAFFLE, Drive, wall

@@ -44,7 +44,7 @@ from gigabrain_zenoh.recording.process_replay import (
 from gigabrain_zenoh.recording.recorder import Recorder
 from gigabrain_zenoh.runtime.replay import ASKED, Event, record, replay
 from gigabrain_zenoh.runtime.services import serve_params
-from gigabrain_zenoh.testing.brain import BRAIN, RobotInMemory
+from gigabrain_zenoh.testing.in_memory import BRAIN, RobotInMemory
 from tests.node.plane import ROOM, Plane, drawn
 from tests.unit.recording import bags
 

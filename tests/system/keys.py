@@ -12,7 +12,7 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.authority import issue, new_fleet
-from gigabrain_zenoh.testing.zenoh import free_endpoint
+from gigabrain_zenoh.testing.processes import free_endpoint
 
 OF_RED: tuple[Role, ...] = ("robot", "brain", "operator", "viewer")
 

@@ -10,8 +10,8 @@ import zenoh
 from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TOPICS
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.security.authority import issue
+from gigabrain_zenoh.testing.processes import Ear, repeat
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.testing.zenoh import Ear, repeat
 from tests.system.keys import Site, make_fleet, raw, site
 
 SAYS = {

@@ -17,10 +17,9 @@ from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.recording.bag_reader import Bag
 from gigabrain_zenoh.recording.bag_writer import BagWriter
 from gigabrain_zenoh.recording.player import Player, PlayOptions, check_nobody_drives
-from gigabrain_zenoh.testing.brain import RobotInMemory
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net, RobotInMemory
+from gigabrain_zenoh.testing.processes import repeat, robot
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.testing.zenoh import repeat, robot
 from tests.unit.recording import bags
 
 pytestmark = pytest.mark.system

@@ -12,8 +12,8 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
+from gigabrain_zenoh.testing.processes import Ear, repeat, robot
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.testing.zenoh import Ear, repeat, robot
 from tests.system.server import Server, serving
 
 LONG = bytes(range(256)) * 400  # more than is read at once

@@ -20,7 +20,7 @@ from gigabrain_zenoh.launch import demo as demo_module
 from gigabrain_zenoh.launch.demo import Demo, DemoOptions, newest_fault
 from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.runtime.deployment import ROBOT, Deployment
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.processes import AVOID, Command, Home, robot_of
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.live_view import doing

@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from gigabrain_zenoh.qa.faults.fault import FaultResult, FaultRow
 from gigabrain_zenoh.qa.faults.rig.rig import Options
 from gigabrain_zenoh.qa.faults.suite import FAULTS, run_suite
+from gigabrain_zenoh.qa.judging import FaultResult, FaultRow
 
 pytestmark = pytest.mark.alone
 

@@ -11,8 +11,8 @@ from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime import connect
 from gigabrain_zenoh.runtime.connect import join, unknown_host
+from gigabrain_zenoh.testing.processes import free_endpoint, under_way
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.testing.zenoh import free_endpoint, under_way
 
 NOBODY = "nobody here knows a host {!r}; waiting for its name (is it spelt right?)"
 

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_zenoh.security.authority import issue, revoke
-from gigabrain_zenoh.testing.processes import Home
-from gigabrain_zenoh.testing.zenoh import Ear, repeat
+from gigabrain_zenoh.testing.processes import Ear, Home, repeat
 from tests.system.keys import site
 from tests.system.test_acl import answer, ask, asked_until_answered
 

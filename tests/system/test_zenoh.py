@@ -25,8 +25,8 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh import transport as zenoh_transport
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.testing.processes import Ear, ZenohNetwork, repeat, robot
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.testing.zenoh import Ear, ZenohNetwork, repeat, robot
 
 REPLY = GateReply(ok=True, text="stopped", robot_type="mock", gate=GateStatus())
 

@@ -13,8 +13,7 @@ from gigabrain_schemas.topics import SCAN, TELEOP
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
-from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.testing.zenoh import (
+from gigabrain_zenoh.testing.processes import (
     Ear,
     free_endpoint,
     repeat,
@@ -22,6 +21,7 @@ from gigabrain_zenoh.testing.zenoh import (
     router_process,
     under_way,
 )
+from gigabrain_zenoh.testing.waiting import until
 
 pytestmark = pytest.mark.alone
 

@@ -8,8 +8,8 @@ from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import DESCRIBE, HEALTH, TELEOP
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.testing.processes import Ear, ZenohNetwork, repeat, robot
 from gigabrain_zenoh.testing.waiting import until
-from gigabrain_zenoh.testing.zenoh import Ear, ZenohNetwork, repeat, robot
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.testing.zenoh import ZenohNetwork, robot
+from gigabrain_zenoh.testing.processes import ZenohNetwork, robot
 
 
 @pytest.fixture

@@ -40,8 +40,17 @@ from gigabrain_zenoh.navigation.local_planner import (
 )
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.perception.obstacle_tracker import Surroundings
-from gigabrain_zenoh.qa.bench.barn_course import BarnCourse, BarnTrial, BarnWorld
-from gigabrain_zenoh.qa.bench.plant import HARD, IDEAL, JACKAL, LIDAR, MUJOCO, Conditions
+from gigabrain_zenoh.qa.bench.barn_course import (
+    HARD,
+    IDEAL,
+    JACKAL,
+    LIDAR,
+    MUJOCO,
+    BarnCourse,
+    BarnTrial,
+    BarnWorld,
+    Conditions,
+)
 from gigabrain_zenoh.qa.in_memory_robot import InMemoryRobot, node_of
 from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.safety import node as safety

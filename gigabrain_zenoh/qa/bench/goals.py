@@ -26,7 +26,7 @@ from gigabrain_zenoh.geometry.pose import compose, inverse, wrap_angle
 from gigabrain_zenoh.navigation.costmap import costmap, inflation
 from gigabrain_zenoh.navigation.global_planner import Point, warm_up
 from gigabrain_zenoh.navigation.grid_search import GridSearch
-from gigabrain_zenoh.qa.bench.growth import GrowthSampler, MapGrowth
+from gigabrain_zenoh.qa.bench.slam_world import GrowthSampler, MapGrowth
 from gigabrain_zenoh.qa.robot_under_test import (
     LOOPBACK,
     ProcessGroup,

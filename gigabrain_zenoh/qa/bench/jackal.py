@@ -21,7 +21,7 @@ from gigabrain_drivers.sim.world import World
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
 from gigabrain_schemas.body import Lidar as LidarDescription
 from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.qa.bench.plant import FIELD_OF_VIEW_RAD, Conditions, clearance
+from gigabrain_zenoh.qa.bench.barn_course import FIELD_OF_VIEW_RAD, Conditions, clearance
 
 Floats = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Self
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host import this_process
-from gigabrain_zenoh.qa.conformance import driver_checks, gate_checks, line_checks
+from gigabrain_zenoh.qa.conformance import driver_checks, gate_checks
 from gigabrain_zenoh.qa.conformance.gated_driver import GatedDriver
 from gigabrain_zenoh.qa.conformance.robot import CheckedRobot
 from gigabrain_zenoh.qa.judging import CheckResult, Failed, Finding, Skipped, summary
@@ -50,7 +50,7 @@ ALONE = (
     Check(
         "stops when it is killed",
         "motors at zero {promise} + 100",
-        line_checks.driver_killed,
+        gate_checks.driver_killed,
         with_peer=True,
         repeated=True,
     ),
@@ -69,21 +69,21 @@ GATED = (
     Check(
         "stops unplugged",
         f"reported in 100 ms, {CUT}",
-        line_checks.unplugged,
+        gate_checks.unplugged,
         with_peer=True,
         repeated=True,
     ),
     Check(
         "stops on a frozen peer",
         f"reported in 250 ms, {CUT}",
-        line_checks.frozen,
+        gate_checks.frozen,
         with_peer=True,
         repeated=True,
     ),
     Check(
         "reconnects",
         "by itself in 5 s; still until enabled, then drives",
-        line_checks.reconnects,
+        gate_checks.reconnects,
         with_peer=True,
     ),
     Check("command to byte", "p50 at most 1 ms", gate_checks.latency),

@@ -9,6 +9,8 @@ later than it brakes it is at zero. No run that counts may exceed a limit.
 import asyncio
 import contextlib
 import gc
+import importlib
+import pkgutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -17,29 +19,21 @@ from typing import get_args
 import msgspec
 from msgspec import Struct
 
+from gigabrain_zenoh.config.renames import FAULT_NAMES, renamed_word
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, unknown
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.files import read_bounded
-from gigabrain_zenoh.qa.faults.fault import FaultResult, FaultRow, FaultRun, Stage, conclude, judge
+from gigabrain_zenoh.qa.faults import rows as row_modules
 from gigabrain_zenoh.qa.faults.rig.rig import Options, Rig
-from gigabrain_zenoh.qa.faults.rows import (
-    body_line,
-    clocks,
-    deaths,
-    estop,
-    extreme_messages,
-    goal_recovery,
-    load,
-    network,
-    obstacles,
-    other_clients,
-    processes,
-    reversals,
-    security,
-    sensors,
-    values,
+from gigabrain_zenoh.qa.judging import (
+    FaultResult,
+    FaultRow,
+    FaultRun,
+    Skipped,
+    Stage,
+    conclude,
+    judge,
 )
-from gigabrain_zenoh.qa.judging import Skipped
 
 MAX_DISTURBED = 3  # disturbed runs for each that counts, passed or failed
 LIMIT_S = 300.0  # for one run of one test in its short form
@@ -47,40 +41,32 @@ STAGES = get_args(Stage)
 POLL_S = 0.1
 DISTURBED_MS = 30.0  # of 100: a tick and a half in which a part of the robot could not run
 MAX_FILE_BYTES = 100_000_000
-# names before 0.2.0; accepted for one release
-OLD_NAMES = {
-    "one-part-of-decision-hangs": "decision-loop-hangs",
-    "cpu-hogs": "busy-machine",
-    "goal-goes-on": "goal-recovery",
-    "map-goes-on": "map-recovery",
-    "frozen-for-ever": "frozen-until-restarted",
-    "one-message": "extreme-messages",
-}
 
 RowBegun = Callable[[FaultRow], None]
 RunEnded = Callable[[FaultRow, FaultRun], None]
 EarlierRuns = Mapping[int, Sequence[FaultRun]]
 
 
-MODULES = (
-    body_line, clocks, deaths, estop, extreme_messages, goal_recovery, load, network, obstacles,
-    other_clients, processes, reversals, security, sensors, values,
-)  # fmt: skip
-FAULTS: tuple[FaultRow, ...] = tuple(
-    sorted((row for one in MODULES for row in one.ROWS), key=lambda row: row.number)
-)
+def _all_rows() -> Iterator[FaultRow]:
+    """Yield the rows of all modules in the package `rows`."""
+    for found in pkgutil.iter_modules(row_modules.__path__, f"{row_modules.__name__}."):
+        module = importlib.import_module(found.name)
+        yield from (row for row in vars(module).values() if isinstance(row, FaultRow))
+
+
+FAULTS: tuple[FaultRow, ...] = tuple(sorted(_all_rows(), key=lambda row: row.number))
 
 
 def choose(wanted: Iterable[str]) -> tuple[FaultRow, ...]:
-    """Return the rows with these numbers or names, in order; all without any.
+    """Return the rows with these numbers or names, in order; all rows if `wanted` is empty.
 
-    Raises UnknownName.
+    An old name prints a notice. Raises UnknownName.
     """
     names = {row.name: row for row in FAULTS}
     numbers = {str(row.number): row for row in FAULTS}
     chosen = set()
     for text in wanted:
-        found = numbers.get(text) or names.get(OLD_NAMES.get(text, text))
+        found = numbers.get(text) or names.get(renamed_word(text, FAULT_NAMES))
         if not found:
             raise unknown(f"fault (a name, or a number from 1 to {len(FAULTS)})", text, names)
         chosen.add(found.number)

@@ -25,7 +25,7 @@ from gigabrain_schemas.topics import (
     WORLD,
     Topic,
 )
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
 
 SECOND_NS = 1_000_000_000

@@ -12,7 +12,7 @@ from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.freshness import PreviousTick, RobotTime
 from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.errors import ClockLost
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import BOOT, open_space, scan, state
 
 SECOND_NS = 1_000_000_000

@@ -14,7 +14,7 @@ from gigabrain_schemas.requests import (
 )
 from gigabrain_schemas.topics import DESCRIBE, ESTOP, RELEASE
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 
 REPLY = GateReply(ok=True, text="stopped", robot_type="mock", gate=GateStatus())
 

@@ -11,7 +11,7 @@ from gigabrain_schemas.requests import EstopRequest, GateReply
 from gigabrain_schemas.topics import ESTOP
 from gigabrain_zenoh.client.estop import press
 from gigabrain_zenoh.errors import NotConfirmed, Refused
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 
 LATCHED = GateReply(ok=True, text="stopped", robot_type="mock", gate=GateStatus(mode="latched"))
 OPEN = GateReply(ok=True, text="what?", robot_type="mock", gate=GateStatus(mode="enabled"))

@@ -12,7 +12,7 @@ from gigabrain_schemas.topics import GOAL
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.decision.tasks.drive_command import Outcome
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import until
 from tests.unit.decision.sites import Site
 

@@ -14,7 +14,7 @@ from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.control.node import EarlierCaps
 from gigabrain_zenoh.control.teleop import Teleop
 from gigabrain_zenoh.geometry.limits import NO_CAPS
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, WAFFLE, body, state
 
 MS = 1_000_000

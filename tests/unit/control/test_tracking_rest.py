@@ -13,7 +13,7 @@ from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.control.node import Inputs, step
 from gigabrain_zenoh.control.tracking import predicted
 from gigabrain_zenoh.geometry.pose import compose
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import body, state
 from tests.unit.control.tracking import SLOW, Course, Plant, errors, ess, relocated
 

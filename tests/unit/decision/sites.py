@@ -26,7 +26,7 @@ from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand, Outcome
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import BOOT, state
 from gigabrain_zenoh.testing.waiting import settle
 

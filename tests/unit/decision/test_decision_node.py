@@ -13,7 +13,7 @@ from gigabrain_schemas.topics import BODY, INTENT, SAFETY, STATE, WORLD
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import UnknownName
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, body, state
 
 CONFIG = DecisionConfig()

@@ -41,7 +41,7 @@ from gigabrain_zenoh.diagnostics.topics import (
 )
 from gigabrain_zenoh.errors import BodyLost, ConfigError, UnknownName
 from gigabrain_zenoh.runtime.services import NameClaim, publish_health
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
 
 SCAN_BYTES = codec.encode(example(LaserScan))

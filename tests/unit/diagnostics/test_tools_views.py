@@ -41,7 +41,7 @@ from gigabrain_zenoh.diagnostics.top import (
 from gigabrain_zenoh.diagnostics.top_app import TopApp
 from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
 from gigabrain_zenoh.runtime.services import serve_params
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 
 FLOWS = [
     Flow("control", "robot/cmd_vel", "driver", 50.0),

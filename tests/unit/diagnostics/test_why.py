@@ -20,7 +20,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.diagnostics.why import LINKS, ChainFacts, ChainWatcher, Verdict, judge
 from gigabrain_zenoh.gate.causes import estop
 from gigabrain_zenoh.runtime.services import NameClaim, publish_health
-from gigabrain_zenoh.testing.brain import RobotInMemory
+from gigabrain_zenoh.testing.in_memory import RobotInMemory
 
 Break = Callable[[RobotInMemory], Awaitable[None]]
 

@@ -23,8 +23,7 @@ from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.launch.specs import process_specs
 from gigabrain_zenoh.runtime.deployment import Deployment
-from gigabrain_zenoh.testing.brain import RobotInMemory
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net, RobotInMemory
 
 MS = 1_000_000
 OPEN = "the contact is open, or its wire is broken"

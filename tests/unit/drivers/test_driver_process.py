@@ -17,7 +17,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.config.settings import DriverConfig
-from gigabrain_zenoh.testing.brain import RobotInMemory
+from gigabrain_zenoh.testing.in_memory import RobotInMemory
 
 
 class HeldUp(MockBody):

@@ -14,7 +14,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import AUDIT, CMD_VEL, ENABLE, ESTOP, ESTOP_SAID, RELEASE
 from gigabrain_zenoh.runtime.audit import read_audit
-from gigabrain_zenoh.testing.brain import RobotInMemory
+from gigabrain_zenoh.testing.in_memory import RobotInMemory
 from gigabrain_zenoh.testing.samples import TICK_NS
 
 

@@ -14,7 +14,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState, SafeState
 from gigabrain_zenoh.config.settings import DriverConfig
 from gigabrain_zenoh.errors import BodyLost, ConfigError
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 
 
 class Arm(MockBody):

@@ -17,7 +17,7 @@ from gigabrain_drivers.kinematics import Twist, base_of
 from gigabrain_drivers.legs.gait import WALKER
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
-from gigabrain_zenoh.qa.faults.rows.reversals import commanded_over, let_through, over
+from gigabrain_zenoh.qa.faults.rows.commands import commanded_over, let_through, over
 from gigabrain_zenoh.qa.judging import Failed
 from gigabrain_zenoh.testing.samples import DRIVING, state
 

@@ -9,7 +9,7 @@ from gigabrain_zenoh.bus.input_log import MOST_KEYS, PublishedInputLogger
 from gigabrain_zenoh.host.bounded import put_newest
 from gigabrain_zenoh.safety.health import Host
 from gigabrain_zenoh.safety.node import InputCollector
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import WAFFLE, body
 from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page.frames import PageView

@@ -23,8 +23,7 @@ from gigabrain_zenoh.navigation.local_planner import (
 from gigabrain_zenoh.navigation.motion_model import AWAY, CLOSE, COSINE, LANES, STATE, X, model_of
 from gigabrain_zenoh.navigation.mppi import Sampler
 from gigabrain_zenoh.qa.bench.barn import drive_functions
-from gigabrain_zenoh.qa.bench.barn_course import BarnWorld, MovingDisc
-from gigabrain_zenoh.qa.bench.plant import HARD, JACKAL
+from gigabrain_zenoh.qa.bench.barn_course import HARD, JACKAL, BarnWorld, MovingDisc
 from tests.unit.navigation.drives import OMNI, WAFFLE, wall
 
 NOTHING = np.empty((0, 2))

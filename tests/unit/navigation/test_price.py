@@ -21,7 +21,7 @@ from gigabrain_zenoh.navigation.motion_model import (
     model_of,
     simulate,
 )
-from gigabrain_zenoh.qa.bench.plant import JACKAL
+from gigabrain_zenoh.qa.bench.barn_course import JACKAL
 
 STEPS, DT, BLOCKS = 30, 0.05, 25
 NOBODY = np.empty((0, 6))

@@ -22,8 +22,7 @@ from gigabrain_zenoh.navigation.local_planner import (
     PlanRequest,
 )
 from gigabrain_zenoh.qa.bench.barn import drive_functions
-from gigabrain_zenoh.qa.bench.barn_course import BarnWorld, MovingDisc
-from gigabrain_zenoh.qa.bench.plant import HARD, JACKAL
+from gigabrain_zenoh.qa.bench.barn_course import HARD, JACKAL, BarnWorld, MovingDisc
 
 NOTHING = np.empty((0, 2))
 NOBODY = np.empty((0, 6))

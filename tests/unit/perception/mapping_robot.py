@@ -10,7 +10,7 @@ from gigabrain_schemas.topics import BODY, MAP_SAVE, SCAN, STATE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import body, scan, state
 from tests.unit.mapping.houses import HOUSE, Rooms, at
 

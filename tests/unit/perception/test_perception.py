@@ -17,7 +17,7 @@ from gigabrain_schemas.topics import BODY, SCAN, WORLD
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.perception.node import step
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import BOOT, LIDAR, WAFFLE, body, open_space, scan
 
 NAN, INF = math.nan, math.inf

@@ -11,7 +11,7 @@ from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.geometry.placed_scans import PlacedScans
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import body, open_space, scan, state
 
 MAPPING = PerceptionConfig(mapping="slam")

@@ -11,9 +11,19 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.bench import barn
 from gigabrain_zenoh.qa.bench.barn import drive_functions
-from gigabrain_zenoh.qa.bench.barn_course import BarnWorld, MovingDisc, choose_worlds, read_worlds
+from gigabrain_zenoh.qa.bench.barn_course import (
+    HARD,
+    IDEAL,
+    LIDAR,
+    MUJOCO,
+    BarnWorld,
+    Conditions,
+    KinematicJackal,
+    MovingDisc,
+    choose_worlds,
+    read_worlds,
+)
 from gigabrain_zenoh.qa.bench.jackal import MujocoJackal
-from gigabrain_zenoh.qa.bench.plant import HARD, IDEAL, LIDAR, MUJOCO, Conditions, KinematicJackal
 
 NONE = np.empty((0, 3))
 QUICK = 128  # plans per cycle

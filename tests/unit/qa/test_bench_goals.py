@@ -26,9 +26,9 @@ from gigabrain_zenoh.qa.bench.goals import (
     missed_by,
     with_capacity,
 )
-from gigabrain_zenoh.qa.bench.growth import MapGrowth
+from gigabrain_zenoh.qa.bench.slam_world import MapGrowth
 from gigabrain_zenoh.qa.robot_under_test import ProcessGroup
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
 
 AT = Pose(x=0.0, y=0.0, yaw=0.0)

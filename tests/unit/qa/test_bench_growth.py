@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.qa.bench.growth import GrowthSampler
+from gigabrain_zenoh.qa.bench.slam_world import GrowthSampler
 from tests.unit.navigation.grids import grid_of
 
 

@@ -8,8 +8,7 @@ from rich.console import Console
 
 from gigabrain_zenoh.cli.bench import _plan_table, plan
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.qa.bench.plan import PlanResult, measure_plan
-from gigabrain_zenoh.qa.bench.plan_maps import office, scattered
+from gigabrain_zenoh.qa.bench.plan import PlanResult, measure_plan, office, scattered
 
 
 @pytest.fixture(scope="module")

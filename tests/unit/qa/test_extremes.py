@@ -7,14 +7,15 @@ import pytest
 
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, ESTOP, MAP, SCAN, SERVICES, TOPICS
-from gigabrain_zenoh.qa.faults.rig.extremes import (
+from gigabrain_zenoh.qa.faults.rig.hostile import (
     KNOWN,
     all_extremes,
+    as_map,
     chosen_extremes,
     decodes,
+    leaves,
     message_of,
 )
-from gigabrain_zenoh.qa.faults.rig.hostile import as_map, leaves
 from gigabrain_zenoh.qa.faults.rows import extreme_messages
 from gigabrain_zenoh.qa.faults.rows.extreme_messages import MessageEffect, figures
 

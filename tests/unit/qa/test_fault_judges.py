@@ -20,9 +20,9 @@ from gigabrain_zenoh.qa.faults.rig.rig import first_slower, first_zero
 from gigabrain_zenoh.qa.faults.rows import clocks, estop
 from gigabrain_zenoh.qa.faults.rows.body_line import first_disobeyed
 from gigabrain_zenoh.qa.faults.rows.clocks import OtherHost, age_error_ms
+from gigabrain_zenoh.qa.faults.rows.commands import steps_in_window
 from gigabrain_zenoh.qa.faults.rows.estop import PressLog
 from gigabrain_zenoh.qa.faults.rows.load import slope_mb_per_h
-from gigabrain_zenoh.qa.faults.rows.reversals import steps_in_window
 from gigabrain_zenoh.qa.probe import Probe
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, body, state

@@ -15,10 +15,9 @@ from gigabrain_schemas.topics import INTENT, WORLD
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
+from gigabrain_zenoh.config.renames import FAULT_NAMES
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.host import this_process
-from gigabrain_zenoh.qa.faults import suite
-from gigabrain_zenoh.qa.faults.fault import FaultResult, FaultRow, FaultRun, judge, worst_of
 from gigabrain_zenoh.qa.faults.rig.broken_process import HangingBus
 from gigabrain_zenoh.qa.faults.rig.rig import Options, Rig, deployment_of
 from gigabrain_zenoh.qa.faults.rows.processes import decision_killed
@@ -31,13 +30,22 @@ from gigabrain_zenoh.qa.faults.suite import (
     failed,
     run_suite,
 )
-from gigabrain_zenoh.qa.judging import Failed, Figure, Skipped
+from gigabrain_zenoh.qa.judging import (
+    Failed,
+    FaultResult,
+    FaultRow,
+    FaultRun,
+    Figure,
+    Skipped,
+    judge,
+    worst_of,
+)
 from gigabrain_zenoh.testing.waiting import settle
 
 BRAKES, TRAVEL = Figure("brakes after", "ms"), Figure("travel", "m")
 LOST = Figure("lost")
 LIMITS = (BRAKES.at_most(120), TRAVEL.at_most(0.1))
-FAULT = FaultRow(1, decision_killed, "", LIMITS)
+FAULT = FaultRow(1, decision_killed.test, "", LIMITS)
 
 
 def test_every_row_has_a_number_and_a_name_of_its_own() -> None:
@@ -101,13 +109,15 @@ def test_tests_are_chosen_by_name_or_number() -> None:
         choose(["decision-kiled"])
 
 
-def test_a_fault_is_found_by_its_name_of_before_for_one_release() -> None:
-    assert [choose([old])[0].name for old in suite.OLD_NAMES] == list(suite.OLD_NAMES.values())
+def test_an_old_name_of_a_fault_prints_a_notice(capsys: pytest.CaptureFixture[str]) -> None:
+    for rename in FAULT_NAMES:
+        assert choose([rename.old])[0].name == rename.new
+        assert f"'{rename.old}' is now '{rename.new}'" in capsys.readouterr().err
 
 
 def test_a_row_holds_its_test_and_takes_its_name_from_it() -> None:
     assert (FAULT.test, FAULT.name, FAULT.group) == (
-        decision_killed,
+        decision_killed.test,
         "decision-killed",
         "processes",
     )

@@ -21,7 +21,7 @@ from gigabrain_zenoh.qa.faults.rig.broken_process import (
     skewed_clocks,
     tampering_bus,
 )
-from gigabrain_zenoh.qa.faults.rows.obstacles import nothing
+from gigabrain_zenoh.qa.faults.rows.sensors import nothing
 from gigabrain_zenoh.qa.simulated_drives import SafetyTrack
 
 SECOND_NS = 1_000_000_000

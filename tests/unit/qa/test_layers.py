@@ -18,7 +18,7 @@ ONLY_IN = {
         "gigabrain_zenoh/bus/zenoh/session.py",
         "gigabrain_zenoh/bus/zenoh/transport.py",
         "gigabrain_zenoh/qa/bench/relay.py",
-        "gigabrain_zenoh/testing/zenoh.py",
+        "gigabrain_zenoh/testing/processes.py",
     ),
     "mujoco": ("drivers/gigabrain_drivers/sim/", "gigabrain_zenoh/qa/bench/jackal.py"),
 }

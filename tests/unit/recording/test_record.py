@@ -19,7 +19,7 @@ from gigabrain_zenoh.recording.bag_reader import Bag
 from gigabrain_zenoh.recording.bag_writer import BagWriter
 from gigabrain_zenoh.recording.node import key_filter, listening, run
 from gigabrain_zenoh.recording.recorder import MAX_CHANNELS, OTHER_KEYS, Intake, Recorder
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import until
 from tests.unit.recording import bags
 from tests.unit.recording.bags import QUICK, kept

@@ -23,7 +23,7 @@ from gigabrain_zenoh.runtime.managed_process import (
     ProcessSpec,
     Shared,
 )
-from gigabrain_zenoh.testing.brain import BRAIN, RobotInMemory
+from gigabrain_zenoh.testing.in_memory import BRAIN, RobotInMemory
 
 SECOND_TICKS = 50
 

@@ -30,7 +30,7 @@ from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.safety.step import Inputs, step
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import body, open_space, scan, state
 from tests.unit.gate.rig import driving
 from tests.unit.safety.patrol import BODY, Patrol

@@ -10,7 +10,7 @@ from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, SCAN, STATE, WORLD
 from gigabrain_zenoh.safety import node as safety
-from gigabrain_zenoh.testing.bus import NodeBench
+from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, body, open_space, scan, state
 
 ALL = ("perception", "decision", "control")

@@ -17,7 +17,7 @@ from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.runtime.deployment import Deployment
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page.access import Access, check, tokens
 from gigabrain_zenoh.ui.page.frames import Ask, GoalRequest, PageView

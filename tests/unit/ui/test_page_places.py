@@ -9,7 +9,7 @@ import pytest
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gigabrain_zenoh.config.settings import PageConfig
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, tokens

@@ -9,7 +9,7 @@ from gigabrain_schemas.body import GateMode, GateStatus, RobotState
 from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import DESCRIBE, SAFETY, STATE
-from gigabrain_zenoh.testing.bus import Net
+from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.ui.run_report import RunMonitor
 
 

@@ -7,18 +7,39 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
+
+from msgspec import structs
 
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.emulators.emulator import wire_of
+from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_zenoh.config.settings import DecisionConfig, LinkName, PerceptionConfig, Resume
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.topics import Topic
+from gigabrain_zenoh import codec
+from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
+from gigabrain_zenoh.config.settings import (
+    DecisionConfig,
+    Endpoint,
+    LinkName,
+    PerceptionConfig,
+    ProcessConfig,
+    Resume,
+)
 from gigabrain_zenoh.decision.behaviours import load, needs_map
-from gigabrain_zenoh.qa.faults.fault import Stage
-from gigabrain_zenoh.qa.judging import Failed, Figure, Skipped
+from gigabrain_zenoh.qa.judging import Failed, Figure, Skipped, Stage
 from gigabrain_zenoh.qa.probe import TICK_MS, Probe, at_rest, until
-from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, NEVER_GIVE_UP, Change, RobotUnderTest
-from gigabrain_zenoh.runtime.deployment import Deployment
+from gigabrain_zenoh.qa.proxy.chaos import Chaos
+from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
+from gigabrain_zenoh.qa.robot_under_test import (
+    LOOPBACK,
+    NEVER_GIVE_UP,
+    Change,
+    RobotUnderTest,
+    reconfigured,
+)
+from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import Backoff, ProcessSpec
 
 BROKEN_PROCESS = (sys.executable, "-P", "-m", "gigabrain_zenoh.qa.faults.rig.broken_process")
@@ -37,9 +58,19 @@ BRAKES, ZERO = Figure("brakes after", "ms"), Figure("zero after", "ms")
 TRAVEL = Figure("travel", "m")
 MOVED_AGAIN = Figure("moved again", "m")  # before a person has enabled it again
 STALE = Figure("stale commands executed")  # they rest on data older than 250 ms
+MOTORS_ZERO = Figure("motors zero after", "ms")
+DEATHS = Figure("deaths")
+STOPS = Figure("unexplained stops")
+MEMORY_GROWN = Figure("memory grown", "MB")
+PERIOD_ADDED = Figure("control period p99 above calm", "ms")
+DRIVES_AGAIN = Figure("drives again after", "s")
+DRIVES_AGAIN_WALL = Figure("drives again after", "s", wall=True)
 STOPS_IN_TIME = (BRAKES.at_most(120), ZERO.at_most(480), TRAVEL.at_most(0.1))
 STAYS_STILL = MOVED_AGAIN.at_most(0.005)
 NONE_STALE = STALE.at_most(0)
+
+
+HOLE = Chaos(hole=True)
 
 
 @dataclass(frozen=True)
@@ -245,3 +276,72 @@ def first_zero(probe: Probe, start: RobotState, begin: int) -> int:
     """Return the tick since `begin` from which the body is measured at rest."""
     moving = [s.tick for s in probe.since(start) if s.tick > begin and not at_rest(s)]
     return (moving[-1] if moving else begin) + 1
+
+
+@asynccontextmanager
+async def behind_proxy(
+    rig: Rig, *names: str, resume: Resume = "manual"
+) -> AsyncIterator[tuple[RobotUnderTest, TcpProxy]]:
+    """Boot a robot whose named processes reach the others through a proxy."""
+    await rig.give_up()
+    deployment = with_free_port(deployment_of(rig.options, "sim", resume))
+    async with TcpProxy(address_of(client_endpoint(deployment))) as proxy:
+
+        def through(config: ProcessConfig) -> ProcessConfig:
+            endpoint = structs.replace(config.endpoint, connect=(proxy.endpoint,))
+            return structs.replace(config, endpoint=endpoint)
+
+        def change(specs: list[ProcessSpec]) -> list[ProcessSpec]:
+            return [reconfigured(s, through) if s.name in names else s for s in specs]
+
+        async with rig.new(deployment, change) as robot:
+            await robot.settle()
+            yield robot, proxy
+            proxy.set()
+            await robot.check()
+
+
+@asynccontextmanager
+async def proxy_to(robot: RobotUnderTest) -> AsyncIterator[tuple[TcpProxy, Endpoint]]:
+    """Put a proxy before a robot's router; yields it and the endpoint of clients behind it."""
+    endpoint = client_endpoint(robot.deployment)
+    async with TcpProxy(address_of(endpoint)) as proxy:
+        yield proxy, structs.replace(endpoint, connect=(proxy.endpoint,))
+
+
+def address_of(endpoint: Endpoint) -> tuple[str, int]:
+    """Return (host, port) of the router."""
+    host, _, port = endpoint.connect[0].partition("/")[2].rpartition(":")
+    return host.strip("[]"), int(port)
+
+
+class Forger:
+    """Sends messages with whatever header they have, and bytes that are no message."""
+
+    def __init__(self, transport: ZenohTransport) -> None:
+        self._transport = transport
+
+    def send(self, topic: Topic[Any], message: Message) -> None:
+        """Send a message with the header that it has."""
+        self.send_bytes(topic, codec.encode(message), codec.encoding_of(topic.type))
+
+    def send_bytes(self, topic: Topic[Any], payload: bytes, encoding: str = "") -> None:
+        """Send any bytes."""
+        self._transport.publish(topic, topic.at("forger"), payload, encoding)
+
+
+@asynccontextmanager
+async def forging(endpoint: Endpoint) -> AsyncIterator[Forger]:
+    """Open a forger with its own session."""
+    transport = await ZenohTransport.open(endpoint)
+    try:
+        yield Forger(transport)
+    finally:
+        await transport.close()
+
+
+def forged_command(probe: Probe, linear_x: float, seq: int, **fields: Any) -> CmdVel:
+    """Return a command with the newest boot, tick and basis; `source` is the probe's own name."""
+    time = probe.bus.time
+    header = {"source": probe.bus.process, "boot": time.boot, "tick": time.tick, "basis": time.tick}
+    return CmdVel(linear_x=linear_x, seq=seq, **{**header, **fields})

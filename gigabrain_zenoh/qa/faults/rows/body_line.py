@@ -13,15 +13,16 @@ from gigabrain_drivers.bodies.line.fields import COMMAND
 from gigabrain_drivers.bodies.line.protocol import Decoder, Template
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.config.settings import ProcessConfig
-from gigabrain_zenoh.qa.faults.fault import FaultRow
 from gigabrain_zenoh.qa.faults.rig.rig import (
+    DEATHS,
+    MOTORS_ZERO,
     MOVED_AGAIN,
     RESTED_TICKS,
     STAYS_STILL,
     Rig,
     deployment_of,
 )
-from gigabrain_zenoh.qa.judging import Failed, Figure, Measured
+from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import TICK_MS, until
 from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.serial import in_front_of
@@ -44,9 +45,7 @@ PLACES, STRAIGHT_TICKS = 5, 30  # places to try, and how long the command there 
 RUNAWAY = 0.12  # [m/s]
 
 REPORTED = Figure("reported after", "ms")
-MOTORS_ZERO = Figure("motors zero after", "ms")
 BACK = Figure("back after", "s")
-DEATHS = Figure("deaths")
 WRONG_COMMANDS = Figure("wrong commands per million")
 LINES_LOST = Figure("lines lost after garbage")
 OLD_OBEYED = Figure("old commands obeyed")
@@ -56,6 +55,15 @@ RUNAWAY_LATCHED = Figure("runaway latched after", "ms")
 STUCK_NOTICED = Figure("stuck wheel noticed after", "ms")
 
 
+@fault_row(
+    12,
+    "serial",
+    REPORTED.at_most(100),
+    MOTORS_ZERO.at_most(150),
+    BACK.at_most(2),
+    STAYS_STILL,
+    DEATHS.at_most(0),
+)
 async def serial_unplugged(rig: Rig) -> Measured:
     """Unplug the adapter while it drives, and plug it in again."""
     robot = await rig.robot("serial")
@@ -75,6 +83,7 @@ async def serial_unplugged(rig: Rig) -> Measured:
     }
 
 
+@fault_row(13, "serial", WRONG_COMMANDS.at_most(0), LINES_LOST.at_most(2), DEATHS.at_most(0))
 async def serial_noise(rig: Rig) -> Measured:
     """Flip bits on the line: the driver survives, and the checksum keeps commands right."""
     robot = await rig.robot("serial")
@@ -136,6 +145,7 @@ def lost_after_garbage(checksum: str, times: int, seed: int = 0) -> int:
     return worst
 
 
+@fault_row(14, "tcp", REPORTED.at_most(250), OLD_OBEYED.at_most(0), STAYS_STILL)
 async def tcp_frozen(rig: Rig) -> Measured:
     """Freeze the body's server with its connection open, and thaw it."""
     robot = await rig.robot("tcp")
@@ -150,6 +160,15 @@ async def tcp_frozen(rig: Rig) -> Measured:
     }
 
 
+@fault_row(
+    15,
+    "tcp",
+    SAFE["RST"].at_most(100),
+    SAFE["FIN"].at_most(100),
+    SAFE["half-open"].at_most(250),
+    BACK.at_most(1),
+    STAYS_STILL,
+)
 async def tcp_cut(rig: Rig) -> Measured:
     """End the connection with RST, with FIN, or leave it open while nothing comes through."""
     await rig.give_up()
@@ -218,6 +237,7 @@ async def _cut(
     return Cut((shut - last) * TICK_MS, (back - healed) * TICK_MS / 1e3, again_m)
 
 
+@fault_row(16, "serial", NOTICED.at_most(500))
 async def telemetry_frozen(rig: Rig) -> Measured:
     """Have the body report the same values over and over."""
     robot = await rig.robot("serial")
@@ -231,6 +251,7 @@ async def telemetry_frozen(rig: Rig) -> Measured:
     return {NOTICED: (states[-1].tick - frozen) * TICK_MS}
 
 
+@fault_row(17, "serial", RUNAWAY_LATCHED.at_most(500), STUCK_NOTICED.at_most(500))
 async def motors_disobey(rig: Rig) -> Measured:
     """Block a wheel, and then have wheels turn at command zero."""
     robot = await rig.robot("serial")
@@ -312,32 +333,3 @@ async def _mended(robot: RobotUnderTest) -> tuple[float, dict[str, Any]]:
     if probe.state.gate.mode == "enabled":
         raise Failed("the gate has opened by itself")
     return back_s, await robot.truth()
-
-
-ROWS = (
-    FaultRow(
-        12, serial_unplugged, "serial",
-        (
-            REPORTED.at_most(100), MOTORS_ZERO.at_most(150), BACK.at_most(2), STAYS_STILL,
-            DEATHS.at_most(0),
-        ),
-    ),
-    FaultRow(
-        13, serial_noise, "serial",
-        (WRONG_COMMANDS.at_most(0), LINES_LOST.at_most(2), DEATHS.at_most(0)),
-    ),
-    FaultRow(
-        14, tcp_frozen, "tcp", (REPORTED.at_most(250), OLD_OBEYED.at_most(0), STAYS_STILL),
-    ),
-    FaultRow(
-        15, tcp_cut, "tcp",
-        (
-            SAFE["RST"].at_most(100), SAFE["FIN"].at_most(100), SAFE["half-open"].at_most(250),
-            BACK.at_most(1), STAYS_STILL,
-        ),
-    ),
-    FaultRow(16, telemetry_frozen, "serial", (NOTICED.at_most(500),)),
-    FaultRow(
-        17, motors_disobey, "serial", (RUNAWAY_LATCHED.at_most(500), STUCK_NOTICED.at_most(500)),
-    ),
-)  # fmt: skip

@@ -9,12 +9,19 @@ from gigabrain_schemas.topics import CMD_VEL, STATE
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.gate import gate
-from gigabrain_zenoh.qa.faults.fault import FaultRow
-from gigabrain_zenoh.qa.faults.rig.bad_network import forged_command, forging
 from gigabrain_zenoh.qa.faults.rig.broken_process import Shift, drift, other_host
 from gigabrain_zenoh.qa.faults.rig.hostile import OpenGate
-from gigabrain_zenoh.qa.faults.rig.rig import Rig, broken, deployment_of, next_step, tampered
-from gigabrain_zenoh.qa.judging import Failed, Figure, Measured
+from gigabrain_zenoh.qa.faults.rig.rig import (
+    STOPS,
+    Rig,
+    broken,
+    deployment_of,
+    forged_command,
+    forging,
+    next_step,
+    tampered,
+)
+from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import NODES, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import client_endpoint
@@ -32,12 +39,12 @@ HOUR_NS = 3_600_000_000_000
 SEQUENCES, LONG_SEQUENCES = 20_000, 1_000_000
 EDGES = (0, 1, 2**15, 2**16, 2**31, 2**32, 2**53, 2**63 - 3)  # where counters wrap
 
-STOPS = Figure("unexplained stops")
 TAKEN_AS_FRESH = Figure("taken as fresh")
 AGE_ERROR = Figure("tick age error", "ms")
 FALSELY_ACCEPTED = Figure("falsely accepted")
 
 
+@fault_row(33, "", STOPS.at_most(0))
 async def wall_clock_jumps(rig: Rig) -> Measured:
     """Give all processes wall clocks that jump by hours and years, each at times of its own."""
     ticks = LONG_JUMP_TICKS if rig.long else JUMP_TICKS
@@ -64,6 +71,7 @@ async def _stops_within(robot: RobotUnderTest, ticks: int) -> int:
     return len(robot.probe.stops(start))
 
 
+@fault_row(34, "", TAKEN_AS_FRESH.at_most(0))
 async def stamps_of_other_times(rig: Rig) -> Measured:
     """Send scans and commands of a second ago or ahead, and scans with stamps of other years.
 
@@ -121,6 +129,7 @@ def _command(robot: RobotUnderTest, speed: float, offset: int) -> CmdVel:
     return forged_command(robot.probe, speed, seq, tick=tick + offset, stamp_ns=stamp_ns)
 
 
+@fault_row(35, "", STOPS.at_most(0), AGE_ERROR.at_most(1))
 async def hosts_with_other_clocks(rig: Rig) -> Measured:
     """Run the brain on a clock that is five seconds ahead and 200 ppm too fast."""
     ticks = LONG_APART_TICKS if rig.long else APART_TICKS
@@ -169,6 +178,7 @@ async def age_error_ms(bus: Bus, clock: Clock, looks: int) -> float:
     return worst_ns / 1e6
 
 
+@fault_row(36, "", FALSELY_ACCEPTED.at_most(0))
 async def counters_wrap(rig: Rig) -> Measured:
     """Feed the gate sequence numbers, boots and ticks about the edges of 16, 32 and 63 bits.
 
@@ -214,11 +224,3 @@ def _near_an_edge(opened: OpenGate, chance: random.Random, highest: int) -> CmdV
         tick=tick,
         seq=max(0, seq),
     )
-
-
-ROWS = (
-    FaultRow(33, wall_clock_jumps, "", (STOPS.at_most(0),)),
-    FaultRow(34, stamps_of_other_times, "", (TAKEN_AS_FRESH.at_most(0),)),
-    FaultRow(35, hosts_with_other_clocks, "", (STOPS.at_most(0), AGE_ERROR.at_most(1))),
-    FaultRow(36, counters_wrap, "", (FALSELY_ACCEPTED.at_most(0),)),
-)

@@ -15,9 +15,8 @@ from gigabrain_schemas.requests import EstopRequest, ReleaseRequest
 from gigabrain_schemas.topics import CMD_VEL, ESTOP, RELEASE, TELEOP, Topic
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.errors import GigabrainError, Refused
-from gigabrain_zenoh.qa.faults.fault import FaultRow
 from gigabrain_zenoh.qa.faults.rig.rig import TRAVEL, Rig
-from gigabrain_zenoh.qa.judging import Failed, Figure, Measured
+from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import TICK_MS, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import client_endpoint
@@ -91,6 +90,18 @@ def _p99(times_ms: list[float]) -> float:
     return sorted(times_ms)[-1 - len(times_ms) // 100]
 
 
+@fault_row(
+    43,
+    "sim",
+    UNLATCHED.at_most(0),
+    LATCHED.at_most(100),
+    ANSWER_P99.at_most(50),
+    ANSWER.at_most(100),
+    ZERO_P99.at_most(50),
+    ZERO_MAX.at_most(100),
+    TRAVEL.at_most(0.06),
+    FROZEN_CONFIRMED.at_most(0),
+)
 async def e_stop_pressed(rig: Rig) -> Measured:
     """Press while it drives, stops, stands and is latched; from client, foreign client and CLI."""
     robot = await rig.robot("sim")
@@ -194,6 +205,9 @@ async def _publishing(
         task.cancel()
 
 
+@fault_row(
+    44, "sim", WRONGLY_RELEASED.at_most(0), MOVED_LATCHED.at_most(0.005), FIRST_SPEED.at_most(0.02)
+)
 async def release_and_re_enable(rig: Rig) -> Measured:
     """Release too early, with an old generation, twice at once; enable with a joystick held."""
     robot = await rig.robot("sim")
@@ -241,19 +255,3 @@ async def _first_speed(robot: RobotUnderTest) -> float:
     states = list(enabled)[::-1]
     first = [s for s in states if s.tick - states[0].tick <= CALM_TICKS]
     return max(abs(state.velocity.linear_x) for state in first)
-
-
-ROWS = (
-    FaultRow(
-        43, e_stop_pressed, "sim",
-        (
-            UNLATCHED.at_most(0), LATCHED.at_most(100), ANSWER_P99.at_most(50), ANSWER.at_most(100),
-            ZERO_P99.at_most(50), ZERO_MAX.at_most(100), TRAVEL.at_most(0.06),
-            FROZEN_CONFIRMED.at_most(0),
-        ),
-    ),
-    FaultRow(
-        44, release_and_re_enable, "sim",
-        (WRONGLY_RELEASED.at_most(0), MOVED_LATCHED.at_most(0.005), FIRST_SPEED.at_most(0.02)),
-    ),
-)  # fmt: skip

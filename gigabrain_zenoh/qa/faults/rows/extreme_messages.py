@@ -40,16 +40,15 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.host.files import read_bounded
-from gigabrain_zenoh.qa.faults.fault import FaultRow
-from gigabrain_zenoh.qa.faults.rig.extremes import ExtremeMessage, all_extremes, chosen_extremes
-from gigabrain_zenoh.qa.faults.rig.rig import Options, Rig
+from gigabrain_zenoh.qa.faults.rig.hostile import ExtremeMessage, all_extremes, chosen_extremes
+from gigabrain_zenoh.qa.faults.rig.rig import DRIVES_AGAIN_WALL, MEMORY_GROWN, Options, Rig
 from gigabrain_zenoh.qa.faults.rows.goal_recovery import (
     PLACES,
     in_map,
     needs_navigation,
     waiting_robot,
 )
-from gigabrain_zenoh.qa.judging import Failed, Figure, Measured
+from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import moving, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, rss_mb
 from gigabrain_zenoh.runtime.deployment import client_endpoint
@@ -70,8 +69,6 @@ MAX_FILE_BYTES = 100_000_000
 BATCH = 100  # messages to one robot; then a new one begins
 
 UNRESPONSIVE = Figure("unresponsive processes")
-MEMORY_GROWN = Figure("memory grown", "MB")
-DRIVES_AGAIN = Figure("drives again after", "s", wall=True)
 AGAIN_AFTER_DEATH = Figure("after a death", "s", wall=True)
 
 
@@ -101,6 +98,16 @@ class MessageEffect(Struct, frozen=True, kw_only=True):
         return "; ".join(found)
 
 
+@fault_row(
+    49,
+    "",
+    UNRESPONSIVE.at_most(0),
+    MEMORY_GROWN.at_most(GROWN_MB),
+    DRIVES_AGAIN_WALL.at_most(AGAIN_S),
+    AGAIN_AFTER_DEATH.at_most(AGAIN_AFTER_DEATH_S),
+    needs=("nav",),
+    loads=True,
+)
 async def extreme_messages(rig: Rig) -> Measured:
     """Send a fixed set of extremes, one after the other, to a robot that drives between goals."""
     needs_navigation()
@@ -120,7 +127,7 @@ def figures(effects: Sequence[MessageEffect]) -> dict[Figure, float]:
     return {
         UNRESPONSIVE: sum(bool(one.silent) for one in effects),
         MEMORY_GROWN: max((one.grown_mb for one in effects), default=0.0),
-        DRIVES_AGAIN: max(calm, default=0.0),
+        DRIVES_AGAIN_WALL: max(calm, default=0.0),
         AGAIN_AFTER_DEATH: max(after_death, default=0.0),
     }
 
@@ -289,19 +296,6 @@ def _held_mb(pid: int) -> float:
         return rss_mb(pid)
     except Failed:
         return math.nan
-
-
-ROWS = (
-    FaultRow(
-        49, extreme_messages, "",
-        (
-            UNRESPONSIVE.at_most(0), MEMORY_GROWN.at_most(GROWN_MB), DRIVES_AGAIN.at_most(AGAIN_S),
-            AGAIN_AFTER_DEATH.at_most(AGAIN_AFTER_DEATH_S),
-        ),
-        needs=("nav",),
-        loads=True,
-    ),
-)  # fmt: skip
 
 
 def main(words: list[str]) -> int:

@@ -14,9 +14,8 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.topics import POSE
 from gigabrain_zenoh.client.tasks import Tasks
-from gigabrain_zenoh.qa.faults.fault import FaultRow
-from gigabrain_zenoh.qa.faults.rig.rig import TRAVEL, Options, Rig, deployment_of
-from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, worse_of
+from gigabrain_zenoh.qa.faults.rig.rig import DRIVES_AGAIN, TRAVEL, Options, Rig, deployment_of
+from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, fault_row, worse_of
 from gigabrain_zenoh.qa.probe import TICK_MS, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import Deployment
@@ -36,9 +35,18 @@ GIVEN_UP = Figure("given up")
 OFF_GOAL = Figure("off its goal", "m")
 MAPPING_LOST = Figure("mapping lost", "s")
 FOUND = Figure("found after", "s")
-DRIVES_AGAIN = Figure("drives again after", "s")
 
 
+@fault_row(
+    46,
+    "",
+    TRAVEL.at_most(0.15),
+    MOVED_WITHOUT.at_most(0.005),
+    GOES_ON.at_most(5),
+    GIVEN_UP.at_most(0),
+    OFF_GOAL.at_most(0.2),
+    needs=("nav",),
+)
 async def goal_recovery(rig: Rig) -> Measured:
     """Kill decision, then perception: the robot stops, and then goes on to its goal by itself."""
     needs_navigation()
@@ -58,6 +66,9 @@ async def goal_recovery(rig: Rig) -> Measured:
     return {**worst, GIVEN_UP: float(ended.state != "succeeded"), OFF_GOAL: off_m}
 
 
+@fault_row(
+    47, "", MAPPING_LOST.at_most(10), FOUND.at_most(5), DRIVES_AGAIN.at_most(10), needs=("nav",)
+)
 async def map_recovery(rig: Rig) -> Measured:
     """Kill perception while the robot explores: the map made so far must be restored."""
     needs_navigation()
@@ -153,20 +164,3 @@ def in_map(truth: Mapping[str, Any], place: tuple[float, float]) -> tuple[float,
     x, y = place[0] - truth["true_x"], place[1] - truth["true_y"]
     cosine, sine = math.cos(truth["true_yaw"]), math.sin(truth["true_yaw"])
     return cosine * x + sine * y, cosine * y - sine * x
-
-
-ROWS = (
-    FaultRow(
-        46, goal_recovery, "",
-        (
-            TRAVEL.at_most(0.15), MOVED_WITHOUT.at_most(0.005), GOES_ON.at_most(5),
-            GIVEN_UP.at_most(0), OFF_GOAL.at_most(0.2),
-        ),
-        needs=("nav",),
-    ),
-    FaultRow(
-        47, map_recovery, "",
-        (MAPPING_LOST.at_most(10), FOUND.at_most(5), DRIVES_AGAIN.at_most(10)),
-        needs=("nav",),
-    ),
-)  # fmt: skip

@@ -19,11 +19,10 @@ from gigabrain_schemas.topics import AUDIT_LOG, CMD_VEL, SAFETY, SCAN, STATE, WO
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.host.bounded import percentile
-from gigabrain_zenoh.qa.faults.fault import FaultRow
 from gigabrain_zenoh.qa.faults.rig import cpu_load
-from gigabrain_zenoh.qa.faults.rig.rig import BRAKES, ZERO, Rig, Stop, stop_by
+from gigabrain_zenoh.qa.faults.rig.rig import BRAKES, MEMORY_GROWN, STOPS, ZERO, Rig, Stop, stop_by
 from gigabrain_zenoh.qa.faults.rows.estop import LATCHED, ZERO_P99, PressLog
-from gigabrain_zenoh.qa.judging import Failed, Figure, Measured
+from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, open_files, rss_mb
 from gigabrain_zenoh.recording.headers import SequenceGaps, header_of
@@ -56,10 +55,8 @@ RECORD = (
 TICK_LATE = Figure("gate tick late p99.9", "ms", wall=True)
 MISSED_ESTOPS = Figure("missed e-stops")
 DRIVER_CPU = Figure("cpu of the driver", "%", wall=True)
-MEMORY_GROWN = Figure("memory grown", "MB")
 ESTOP_P99 = Figure("e-stop p99", "ms", wall=True)
 UNNAMED = Figure("flooder missing in the audit log")
-STOPS = Figure("unexplained stops")
 FILES_GROWN = Figure("open files grown")
 LOST = Figure("messages lost")
 GROWS = {name: Figure(f"{name} grows", "MB/h", long=True) for name in SURVIVORS}
@@ -89,6 +86,15 @@ class TickLateness:
         return percentile(sorted(self._late_ms), 0.999) or float("nan")
 
 
+@fault_row(
+    37,
+    "sim",
+    TICK_LATE.at_most(40),
+    BRAKES.at_most(250),
+    ZERO.at_most(610),
+    MISSED_ESTOPS.at_most(0),
+    loads=True,
+)
 async def busy_machine(rig: Rig) -> Measured:
     """Run four busy processes per core, and others that fill memory, make garbage and parse."""
     robot = await rig.robot("sim")
@@ -130,6 +136,16 @@ async def _missed(robot: RobotUnderTest, count: int) -> int:
     return missed
 
 
+@fault_row(
+    38,
+    "sim",
+    DRIVER_CPU.at_most(50),
+    MEMORY_GROWN.at_most(50),
+    LATCHED.at_most(100),
+    ESTOP_P99.at_most(50),
+    UNNAMED.at_most(0),
+    loads=True,
+)
 async def flood(rig: Rig) -> Measured:
     """Send 2 kHz of commands, queries and 1 MB messages; 10 kHz and 10 MB in the long form."""
     robot = await rig.robot("sim")
@@ -180,6 +196,14 @@ async def _in_audit_log(robot: RobotUnderTest, source: str) -> bool:
     return any(record.what == "refused" and record.source == source for record in records)
 
 
+@fault_row(
+    39,
+    "sim",
+    STOPS.at_most(0),
+    FILES_GROWN.at_most(0),
+    LOST.at_most(0),
+    *(figure.at_most(1) for figure in GROWS.values()),
+)
 async def soak(rig: Rig) -> Measured:
     """Drive for twenty seconds; in the long form for 70 min with deaths, e-stops and viewers."""
     robot = await rig.robot("sim")
@@ -282,29 +306,3 @@ class SoakEvents:
         if await process.wait():
             raise Failed(f"gigabrain record ended with {process.returncode}")
         file.unlink()
-
-
-ROWS = (
-    FaultRow(
-        37, busy_machine, "sim",
-        (
-            TICK_LATE.at_most(40), BRAKES.at_most(250), ZERO.at_most(610), MISSED_ESTOPS.at_most(0),
-        ),
-        loads=True,
-    ),
-    FaultRow(
-        38, flood, "sim",
-        (
-            DRIVER_CPU.at_most(50), MEMORY_GROWN.at_most(50), LATCHED.at_most(100),
-            ESTOP_P99.at_most(50), UNNAMED.at_most(0),
-        ),
-        loads=True,
-    ),
-    FaultRow(
-        39, soak, "sim",
-        (
-            STOPS.at_most(0), FILES_GROWN.at_most(0), LOST.at_most(0),
-            *(figure.at_most(1) for figure in GROWS.values()),
-        ),
-    ),
-)  # fmt: skip

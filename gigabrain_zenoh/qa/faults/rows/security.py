@@ -28,11 +28,16 @@ from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host.posix import resource
-from gigabrain_zenoh.qa.faults.fault import FaultRow
-from gigabrain_zenoh.qa.faults.rig.bad_network import address_of, forged_command, forging
-from gigabrain_zenoh.qa.faults.rig.rig import Rig, deployment_of
+from gigabrain_zenoh.qa.faults.rig.rig import (
+    PERIOD_ADDED,
+    Rig,
+    address_of,
+    deployment_of,
+    forged_command,
+    forging,
+)
 from gigabrain_zenoh.qa.faults.rows.network import make_fleet
-from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped
+from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, fault_row
 from gigabrain_zenoh.qa.probe import moving, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import client_endpoint
@@ -61,11 +66,18 @@ DENIALS_UNSEEN = Figure("denials missing in the audit log")
 OPEN_PORTS = Figure("open ports besides the router")
 ACCEPTED = Figure("accepted")
 REFUSED_ESTOPS = Figure("e-stops refused after it")
-PERIOD_ADDED = Figure("control period p99 above calm", "ms")
 CONNECTS = Figure("operator connects after", "s", wall=True)
 ROUTER_DEATHS = Figure("router deaths")
 
 
+@fault_row(
+    40,
+    "",
+    WHEELS_MOVED.at_most(0),
+    DENIALS_UNSEEN.at_most(0),
+    OPEN_PORTS.at_most(0),
+    needs=("keys",),
+)
 async def unauthorised_publisher(rig: Rig) -> Measured:
     """Forge commands as a viewer and as a brain, and knock twice without the right keys.
 
@@ -152,6 +164,7 @@ def _open_ports(robot: RobotUnderTest) -> set[int]:
     return found
 
 
+@fault_row(41, "sim", ACCEPTED.at_most(0), REFUSED_ESTOPS.at_most(0))
 async def replayed_traffic(rig: Rig) -> Measured:
     """Record all traffic while an operator drives; send it again at once, and after a restart."""
     robot = await rig.robot("sim")
@@ -223,6 +236,9 @@ async def _refused_estops(robot: RobotUnderTest, endpoint: Endpoint) -> int:
     return refused
 
 
+@fault_row(
+    42, "sim", PERIOD_ADDED.at_most(20), CONNECTS.at_most(5), ROUTER_DEATHS.at_most(0), loads=True
+)
 async def idle_and_random_connections(rig: Rig) -> Measured:
     """Open idle sockets to the router's port, and send it noise and other protocols."""
     robot = await rig.robot("sim")
@@ -282,18 +298,3 @@ async def _call(host: str, port: int, payload: bytes) -> None:
             async with asyncio.timeout(1.0):
                 await loop.sock_connect(one, (host, port))
                 await loop.sock_sendall(one, payload)
-
-
-ROWS = (
-    FaultRow(
-        40, unauthorised_publisher, "",
-        (WHEELS_MOVED.at_most(0), DENIALS_UNSEEN.at_most(0), OPEN_PORTS.at_most(0)),
-        needs=("keys",),
-    ),
-    FaultRow(41, replayed_traffic, "sim", (ACCEPTED.at_most(0), REFUSED_ESTOPS.at_most(0))),
-    FaultRow(
-        42, idle_and_random_connections, "sim",
-        (PERIOD_ADDED.at_most(20), CONNECTS.at_most(5), ROUTER_DEATHS.at_most(0)),
-        loads=True,
-    ),
-)  # fmt: skip

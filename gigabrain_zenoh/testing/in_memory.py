@@ -1,4 +1,4 @@
-"""A whole robot in memory: a mock body, its driver process and the brain, in fake time."""
+"""Buses, single nodes and a whole robot in memory, on a clock that the test moves."""
 
 import asyncio
 import functools
@@ -6,35 +6,119 @@ import math
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeVar
+
+import msgspec
 
 from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.topics import STATE
+from gigabrain_schemas.topics import STATE, Topic
+from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.input_log import InputLogger
 from gigabrain_zenoh.bus.transport import Close, LocalNetwork, LocalTransport, OnSample
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.config.settings import DecisionConfig, DriverConfig, PerceptionConfig, Resume
 from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.host.threads import Job, done
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.runtime.process import MakeBus
 from gigabrain_zenoh.runtime.replay import Node
 from gigabrain_zenoh.safety import node as safety
 from gigabrain_zenoh.testing.samples import TICK_NS
+from gigabrain_zenoh.testing.waiting import PATIENCE_S
+
+M = TypeVar("M", bound=Message)
+
 
 DECISION = DecisionConfig(settings={"max_linear_speed": 0.26})
 BRAIN: dict[str, Node] = {
     "perception": functools.partial(perception.run, PerceptionConfig()),
-    "decision": functools.partial(
-        decision.run, DecisionConfig(settings={"max_linear_speed": 0.26})
-    ),
+    "decision": functools.partial(decision.run, DECISION),
     "control": control.run,
     "safety": safety.run,
 }
+
+
+class PatientJournal(InputLogger):
+    """Waits for a node's background work, however slow the machine is.
+
+    For tests that compare results.
+    """
+
+    def in_time(self, job: Job, patience_s: float) -> bool:
+        """Wait for `job`, whatever patience the node has."""
+        return done(job, PATIENCE_S)
+
+
+class Net:
+    """The buses of two processes on one network and one clock."""
+
+    def __init__(self) -> None:
+        self.network, self.clock = LocalNetwork(), FakeClock()
+        self.one, self.two = self.bus("one"), self.bus("two")
+
+    def bus(self, process: str) -> Bus:
+        """Return the bus of one more process."""
+        return Bus(self.network.transport(), self.clock, process)
+
+
+class NodeBench:
+    """One node alone on a network: `async with NodeBench(node) as bench:`."""
+
+    def __init__(self, node: Node) -> None:
+        self.clock, self.network = FakeClock(), LocalNetwork()
+        self._node, self._read = node, 0
+        self._ready = asyncio.Event()
+
+    async def __aenter__(self) -> Self:
+        self.bus = Bus(self.network.transport(), self.clock, "node")
+        self.bus.input_log = PatientJournal()
+        self._running = asyncio.ensure_future(self._node(self.bus, self._ready.set))
+        await self.clock.advance(0)
+        return self
+
+    async def ready(self) -> None:
+        """Wait until the node is ready; some compile first."""
+        waiting = asyncio.ensure_future(self._ready.wait())
+        await asyncio.wait((waiting, self._running), return_when=asyncio.FIRST_COMPLETED)
+        waiting.cancel()
+        if self._running.done():
+            self._running.result()
+
+    async def restart(self) -> None:
+        """End the node, and start it again."""
+        await self._end()
+        self._ready.clear()
+        await self.__aenter__()
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._end()
+
+    async def _end(self) -> None:
+        self._running.cancel()
+        result = (await asyncio.gather(self._running, return_exceptions=True))[0]
+        await self.bus.close()
+        assert isinstance(result, asyncio.CancelledError), result
+
+    def send(self, topic: Topic[M], message: M) -> None:
+        """Deliver `message` to the node with the header it has."""
+        self.network.deliver(topic.at(), codec.encode(message))
+
+    def sent(self, topic: Topic[M]) -> list[M]:
+        """Return what the node has published on `topic` since the last call.
+
+        What it has published on other topics meanwhile is dropped.
+        """
+        new = self.network.sent[self._read :]
+        self._read = len(self.network.sent)
+        decode = msgspec.msgpack.Decoder(topic.type).decode
+        return [decode(payload) for key, payload in new if key == topic.key]
 
 
 class FreezableTransport(LocalTransport):
