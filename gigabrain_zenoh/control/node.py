@@ -6,7 +6,7 @@ from collections.abc import Callable
 import msgspec
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import TICK_NS, Message, Velocity
+from gigabrain_schemas.base import TICK_S, Message, Velocity
 from gigabrain_schemas.body import BodyDescription, ControlGains, RobotState
 from gigabrain_schemas.brain import CmdVel, Intent
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
@@ -22,7 +22,6 @@ from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 
-TICK_S = TICK_NS / 1e9
 LONGEST_STEP_TICKS = 5  # after a gap the ramp goes on as if no more than this had passed
 STEADY_TICKS = 10  # the measured speed has caught up with a constant setpoint by then
 SLOW_LINEAR, SLOW_ANGULAR = 0.05, 0.1  # [m/s], [rad/s]; below, encoders say little

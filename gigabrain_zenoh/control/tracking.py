@@ -7,13 +7,12 @@ Luca, Oriolo and Samson (1998, equation 4.73). For bodies that can, it is propor
 import math
 from bisect import bisect_right
 
-from gigabrain_schemas.base import TICK_NS, Pose, Velocity
+from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, Intent, TrajectoryPoint
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import compose, interpolate, relative
 
-TICK_S = TICK_NS / 1e9
 LONGEST_DELAY_TICKS = 15
 FARTHEST_OFF_M, FARTHEST_OFF_RAD = 0.3, 0.8  # beyond these, it is not driving this trajectory
 DAMPING, STIFFNESS = 0.7, 10.0  # feedback parameters, the second in [1/m2]

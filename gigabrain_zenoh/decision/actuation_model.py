@@ -8,21 +8,18 @@ constant command carries no information about the response, so nothing is learnt
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_S, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import ActuationModel, CmdVel
 from gigabrain_zenoh.bus.freshness import LEAD_TICKS
 from gigabrain_zenoh.gate.state import BRAIN
 
-Floats = NDArray[np.float64]
-
-TICK_S = TICK_NS / 1e9
 PRIOR = ActuationModel(delay=0.04, lag=0.06)  # used until enough has been learnt
 DELAYS = 16  # candidates, a tick apart: 0 to 0.3 s
 DELAYS_S = TICK_S * np.arange(DELAYS)
-LAGS_S = 0.02 * np.arange(26)  # candidates: 0 to 0.5 s
+LAGS_S = TICK_S * np.arange(26)  # candidates: 0 to 0.5 s
 LATE_TICKS = 5  # how late a tick's messages may arrive without affecting the result
 SILENT_TICKS = 5  # after this long without a command, the gate stops the body
 EXCITED_TICKS = 30  # how long a change of the command is informative

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import Message
+from gigabrain_schemas.base import TICK_S, Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.safety import SafetyState
@@ -99,7 +99,7 @@ class TaskServer:
         """Advance the queue, with the world of tick `basis`; return the next command."""
         self._waits = ""
         same_boot = state.boot == self._boot
-        seconds = max(0, state.tick - self._tick) * 0.02 if same_boot else 0.0
+        seconds = max(0, state.tick - self._tick) * TICK_S if same_boot else 0.0
         self._boot, self._tick, self._basis = state.boot, state.tick, basis
         if not same_boot:
             self._queue.restart(state.boot)

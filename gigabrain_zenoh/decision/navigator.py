@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gigabrain_schemas.arrays import hits
-from gigabrain_schemas.base import TICK_NS, Pose, Velocity
+from gigabrain_schemas.arrays import Floats, hits
+from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
@@ -18,8 +18,8 @@ from gigabrain_schemas.tasks import MOST_POINTS, Goal
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.behaviours import NavigationConfig, Step
 from gigabrain_zenoh.decision.context import ContextSource, NavigationContext
-from gigabrain_zenoh.decision.route import Floats, PathCheck, Route, RouteFeedback, RoutePlanner
-from gigabrain_zenoh.decision.route_schedule import RouteSchedule, transformed
+from gigabrain_zenoh.decision.route import PathCheck, Route, RouteFeedback, RoutePlanner
+from gigabrain_zenoh.decision.route_schedule import RouteSchedule
 from gigabrain_zenoh.decision.tasks.drive_command import (
     DriveCommand,
     Idle,
@@ -30,10 +30,10 @@ from gigabrain_zenoh.decision.tasks.drive_command import (
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import compose, inverse
+from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.navigation import global_planner, local_planner
 from gigabrain_zenoh.navigation.global_planner import Unreachable
 
-TICK_S = TICK_NS / 1e9
 MAX_SCAN_AGE_TICKS = 10  # of a scan to drive by
 NO_ROUTE = Idle("waiting", "waiting: for a way through the map")
 
@@ -190,7 +190,7 @@ class Navigator:
                 x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw
             ),
             hits=hits(context.world).astype(np.float64),
-            path=transformed(to_odom, points),
+            path=transform(from_pose(to_odom), points),
             obstacles=context.world.obstacles,
             response=context.actuation,
             sent=context.sent,

@@ -6,9 +6,8 @@ from typing import Any, Literal
 
 import numpy as np
 from msgspec import structs
-from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import cells
+from gigabrain_schemas.arrays import Floats, cells
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import OccupancyGrid
@@ -32,8 +31,6 @@ NEAR_GOAL_M = 0.25  # good enough for a goal that was free when it was requested
 OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal
 GOAL_MARGIN_M = 2.0  # of unknown space around a goal outside the map
 MAX_ENLARGED_CELLS = 4_000_000
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,7 +1,5 @@
 """When to plan a route, and where: in the loop, or for large maps in a worker thread."""
 
-import math
-
 import numpy as np
 
 from gigabrain_schemas.arrays import hits
@@ -10,13 +8,13 @@ from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.decision.context import NavigationContext
 from gigabrain_zenoh.decision.route import (
-    Floats,
     Route,
     RouteFeedback,
     RoutePlanner,
     RouteRequest,
 )
 from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand
+from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.host.threads import ScheduledWorker, Take
 from gigabrain_zenoh.navigation.costmap import Unknown
 
@@ -81,7 +79,7 @@ class RouteSchedule:
             grid=grid,
             body=context.body,
             feedback=feedback,
-            seen=transformed(here, hits(context.world).astype(np.float64)),
+            seen=transform(from_pose(here), hits(context.world).astype(np.float64)),
             held_ticks=self._held_ticks,
             slowed_by=context.slowed_by,
         )
@@ -117,11 +115,3 @@ class RouteSchedule:
         if self._feedback and self._feedback.arrived and self._feedback.version == route.version:
             return True
         return grid is not known or not 0 <= tick - before < REPLAN_TICKS
-
-
-def transformed(frame: Pose, points: Floats) -> Floats:
-    """Return `points` (n, 2), given in `frame`, in the parent frame."""
-    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
-    turned: Floats = points @ np.array(((cosine, sine), (-sine, cosine)))
-    there: Floats = turned + np.array((frame.x, frame.y))
-    return there

@@ -16,6 +16,7 @@ from typing import Any, Literal
 from msgspec import Struct
 from serial.tools import list_ports
 
+from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.requests import Description
 from gigabrain_schemas.safety import Health
@@ -407,4 +408,4 @@ def _pace(states: list[RobotState]) -> float | None:
         return None
     seconds = (same_boot[-1].stamp_ns - same_boot[0].stamp_ns) / 1e9
     ticks = same_boot[-1].tick - same_boot[0].tick
-    return ticks * 0.02 / seconds if seconds > 0 else None
+    return ticks * TICK_S / seconds if seconds > 0 else None

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from gigabrain_schemas.base import Message
+from gigabrain_schemas.base import TICK_S, Message
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, Topic
 from gigabrain_zenoh.bus.bus import Bus
@@ -139,7 +139,7 @@ async def hold_velocity(robot: Robot, command: CmdVel, seconds: float | None, *,
     finally:
         await robot.stop()
     ticks = (await robot.read_state()).tick - start_tick
-    return f"driven for {ticks * 0.02:.1f} s; {await _give_back(robot, before.commander)}"
+    return f"driven for {ticks * TICK_S:.1f} s; {await _give_back(robot, before.commander)}"
 
 
 async def _send_velocity(robot: Robot, command: CmdVel, seconds: float | None) -> None:

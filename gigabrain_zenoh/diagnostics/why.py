@@ -32,7 +32,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.diagnostics.discovery import discover
 from gigabrain_zenoh.diagnostics.topic_stats import HOPS, ChainMonitor, monitor_chain
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO
+from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, at_rest
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 
 Link = Literal[
@@ -42,7 +42,6 @@ LINKS: tuple[Link, ...] = get_args(Link)
 FIRST_CODE = 10  # exit code for a broken router; each further link has the next code
 WINDOW_S = 1.5
 SILENT_NS = 500_000_000  # wall time: also for a simulation that runs slowly
-AT_REST_LINEAR, AT_REST_ANGULAR = 0.01, 0.05  # [m/s], [rad/s]
 # the watcher and the monitor both subscribe to these, so `Bus.received` counts them twice
 COUNTED_TWICE = frozenset(topic.key for topic in (*HOPS, STATE, BODY))
 
@@ -216,7 +215,7 @@ def _intent(facts: ChainFacts) -> LinkStatus:
 
 def _wants_to_move(facts: ChainFacts) -> bool:
     twist = facts.intent.twist if facts.intent else None
-    return twist is not None and not _at_rest(twist)
+    return twist is not None and not at_rest(twist)
 
 
 def _idle(tasks: TaskStatus | None) -> LinkStatus | None:
@@ -241,7 +240,7 @@ def _control(facts: ChainFacts) -> LinkStatus:
     if command is None:
         return _silent(facts, "control", "control", "command")
     gate = facts.state.gate if facts.state else None
-    still = gate is not None and gate.mode == "enabled" and _at_rest(facts.fastest)
+    still = gate is not None and gate.mode == "enabled" and at_rest(facts.fastest)
     if still and command.operator:
         text = "an operator holds the robot still"
         remedy = "let the brain drive with `gigabrain enable`"
@@ -251,7 +250,7 @@ def _control(facts: ChainFacts) -> LinkStatus:
     free = facts.safety is not None and facts.safety.verdict != "stop"
     caps = facts.safety.caps if facts.safety else NO_CAPS
     wanted = intent.twist if intent and intent.twist else ZERO
-    if still and free and not _at_rest(wanted) and not _capped_to_rest(wanted, caps):
+    if still and free and not at_rest(wanted) and not _capped_to_rest(wanted, caps):
         remedy = "read its log with `gigabrain log --process control`"
         return _broken("control", "control sends zero, while decision wants to move", remedy)
     operator = "an operator drives: " if command.operator else ""
@@ -288,7 +287,7 @@ def _gate(facts: ChainFacts) -> LinkStatus:
         act = "enable it with `gigabrain enable`"
         text = f"{gate.mode}: {text or 'not enabled yet'}"
         return _broken("gate", text, f"{remedy}; {act}" if remedy else act)
-    if _at_rest(facts.fastest) and gate.commander != BRAIN:
+    if at_rest(facts.fastest) and gate.commander != BRAIN:
         remedy = "let it drive, or take the robot back with `gigabrain enable --take`"
         return _broken("gate", f"{gate.commander} has control, and stands still", remedy)
     return _ok("gate", f"open for {gate.commander}")
@@ -300,11 +299,11 @@ def _body(facts: ChainFacts) -> LinkStatus:
     if not facts.state.link.connected:
         return _broken("body", "its speed is unknown", "repair its link first")
     speed = f"{now.linear_x:+.2f} m/s {now.angular_z:+.2f} rad/s"
-    if _at_rest(now) and not _at_rest(commanded):
+    if at_rest(now) and not at_rest(commanded):
         wanted = f"{commanded.linear_x:+.2f} m/s {commanded.angular_z:+.2f} rad/s"
         remedy = "check whether it is blocked, its motors, and their power"
         return _broken("body", f"it stands, while the command is {wanted}", remedy)
-    if _at_rest(now):
+    if at_rest(now):
         return _waits("body", "it stands, as commanded", "send it a command or a goal")
     return _ok("body", f"it moves: {speed}")
 
@@ -335,11 +334,6 @@ def _notes(facts: ChainFacts) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _at_rest(velocity: Velocity) -> bool:
-    linear = max(abs(velocity.linear_x), abs(velocity.linear_y))
-    return linear < AT_REST_LINEAR and abs(velocity.angular_z) < AT_REST_ANGULAR
-
-
 def _capped_to_rest(wanted: Velocity, caps: SpeedCaps) -> bool:
     """Return whether the caps of safety leave nothing of a wanted motion."""
     axes = (
@@ -352,7 +346,7 @@ def _capped_to_rest(wanted: Velocity, caps: SpeedCaps) -> bool:
         cap = positive if value > 0 else negative
         capped.append(value if cap is None else max(-cap, min(cap, value)))
     x, y, turn = capped
-    return not _at_rest(wanted) and _at_rest(Velocity(linear_x=x, linear_y=y, angular_z=turn))
+    return not at_rest(wanted) and at_rest(Velocity(linear_x=x, linear_y=y, angular_z=turn))
 
 
 def _lower(side: float | None, caps: SpeedCaps) -> float | None:

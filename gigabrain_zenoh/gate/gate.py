@@ -9,7 +9,7 @@ of an echoed tick is bounded by both.
 
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import TICK_NS, Cause, Velocity
+from gigabrain_schemas.base import TICK_S, Cause, Velocity
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate.state import (
@@ -27,13 +27,12 @@ from gigabrain_zenoh.gate.state import (
     Safety,
     Tick,
     age_ns,
-    at_rest,
     is_finite,
     refusal,
     status,
     stop_reasons,
 )
-from gigabrain_zenoh.geometry.limits import ZERO, clamp, ramp, slowed
+from gigabrain_zenoh.geometry.limits import ZERO, at_rest, clamp, ramp, slowed
 
 STILL_TICKS = 25  # 0.5 s at rest before a release
 
@@ -95,7 +94,6 @@ __all__ = [
     "status",
     "step",
 ]
-TICK_S = TICK_NS / 1e9
 STOPPING_TICKS = 15  # 300 ms, then idle
 CALM_TICKS = 5  # 100 ms at zero after an enable, however hard somebody holds a joystick
 HEALTHY_TICKS = 25  # 0.5 s without a cause before an automatic resume

@@ -125,7 +125,6 @@ def status(state: GateState) -> GateStatus:
 ECHO_NS = 150_000_000  # commands and verdicts must echo a tick that was issued this recently
 ISSUED_TICKS = 16  # ticks whose wall time is remembered; an echo is accepted for 7
 SILENCE_TICKS = 5  # 100 ms without a good command
-STILL_LINEAR, STILL_ANGULAR = 0.01, 0.05  # [m/s], [rad/s]
 
 
 def age_ns(state: GateState, tick: int, wall_ns: int | None) -> int:
@@ -135,15 +134,6 @@ def age_ns(state: GateState, tick: int, wall_ns: int | None) -> int:
     if wall_ns is not None and 0 <= back < len(state.issued_ns):
         age = max(age, wall_ns - state.issued_ns[-1 - back])
     return age
-
-
-def at_rest(measured: Velocity) -> bool:
-    """Whether the body stands still; what is not a number does not."""
-    return (
-        abs(measured.linear_x) < STILL_LINEAR
-        and abs(measured.linear_y) < STILL_LINEAR
-        and abs(measured.angular_z) < STILL_ANGULAR
-    )
 
 
 def is_finite(command: CmdVel) -> bool:

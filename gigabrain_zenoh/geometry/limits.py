@@ -10,6 +10,7 @@ from gigabrain_schemas.safety import SpeedCaps
 
 ZERO = Velocity()
 NO_CAPS = SpeedCaps()
+AT_REST_SPEED, AT_REST_YAW_RATE = 0.01, 0.05  # [m/s], [rad/s], of a body that stands still
 
 
 class Limits(msgspec.Struct, frozen=True, kw_only=True):
@@ -36,6 +37,15 @@ def limits_of(body: BodyDescription) -> Limits:
         angular_acceleration=body.max_angular_acceleration,
         rim_speed=rim_speed(body),
         half_track=body.wheel_separation / 2 if body.drive_type == "differential" else 0.0,
+    )
+
+
+def at_rest(measured: Velocity) -> bool:
+    """Return whether a body stands still; False where a speed is NaN."""
+    return (
+        abs(measured.linear_x) < AT_REST_SPEED
+        and abs(measured.linear_y) < AT_REST_SPEED
+        and abs(measured.angular_z) < AT_REST_YAW_RATE
     )
 
 

@@ -1,12 +1,17 @@
-"""Planar poses without numpy (compose, invert, interpolate), and the history of odometry poses."""
+"""Planar poses without numpy, the history of odometry poses, and the pose of each scan.
+
+For arrays of poses see `se2`.
+"""
 
 import math
 from bisect import bisect_left
+from collections.abc import Callable
 
 from msgspec import Struct
 
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.sensors import LaserScan
 
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
 
@@ -19,25 +24,29 @@ def wrap_angle(angle: float) -> float:
     return math.remainder(angle, math.tau)
 
 
+def to_parent(frame: Pose, x: float, y: float) -> tuple[float, float]:
+    """Transform a point from `frame` to the parent frame, in which `frame` itself is given."""
+    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
+    return frame.x + cosine * x - sine * y, frame.y + sine * x + cosine * y
+
+
+def to_frame(frame: Pose, x: float, y: float) -> tuple[float, float]:
+    """Transform a point from the parent frame to `frame`. Inverse of `to_parent`."""
+    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
+    dx, dy = x - frame.x, y - frame.y
+    return cosine * dx + sine * dy, cosine * dy - sine * dx
+
+
 def compose(frame: Pose, pose: Pose) -> Pose:
     """Transform `pose` from `frame` to the parent frame, in which `frame` itself is given."""
-    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
-    return Pose(
-        x=frame.x + cosine * pose.x - sine * pose.y,
-        y=frame.y + sine * pose.x + cosine * pose.y,
-        yaw=wrap_angle(frame.yaw + pose.yaw),
-    )
+    x, y = to_parent(frame, pose.x, pose.y)
+    return Pose(x=x, y=y, yaw=wrap_angle(frame.yaw + pose.yaw))
 
 
 def relative(frame: Pose, pose: Pose) -> Pose:
     """Return `pose` relative to `frame`, both given in the same frame. Inverse of `compose`."""
-    cosine, sine = math.cos(frame.yaw), math.sin(frame.yaw)
-    dx, dy = pose.x - frame.x, pose.y - frame.y
-    return Pose(
-        x=cosine * dx + sine * dy,
-        y=cosine * dy - sine * dx,
-        yaw=wrap_angle(pose.yaw - frame.yaw),
-    )
+    x, y = to_frame(frame, pose.x, pose.y)
+    return Pose(x=x, y=y, yaw=wrap_angle(pose.yaw - frame.yaw))
 
 
 def inverse(pose: Pose) -> Pose:
@@ -93,3 +102,40 @@ class PoseHistory(Struct, frozen=True):
     def newest_tick(self) -> int:
         """Return the tick of the newest state; 0 before the first state."""
         return self.ticks[-1] if self.ticks else 0
+
+
+class PlacedScans:
+    """Calls `on_scan(scan, pose)` for each scan; the pose is None where states are missing.
+
+    A scan that arrives before the state of its tick waits for it, so that the outcome does not
+    depend on which message came first. If the next scan comes first, it goes to `on_missed`.
+    """
+
+    def __init__(
+        self,
+        on_scan: Callable[[LaserScan, Pose | None], None],
+        on_missed: Callable[[LaserScan], None],
+    ) -> None:
+        self._on_scan, self._on_missed = on_scan, on_missed
+        self._waiting: LaserScan | None = None
+        self.history = PoseHistory()
+
+    def state(self, state: RobotState) -> None:
+        """Add a robot state; process the waiting scan if its tick has been reached."""
+        self.history = self.history.then(state)
+        if self._waiting:
+            self._place(self._waiting)
+
+    def scan(self, scan: LaserScan) -> None:
+        """Process a scan, or keep it until the state of its tick arrives."""
+        if self._waiting:
+            self._on_missed(self._waiting)
+        self._place(scan)
+
+    def _place(self, scan: LaserScan) -> None:
+        """Hand a scan on if its tick has been reached; otherwise keep it waiting."""
+        here = self.history
+        self._waiting = scan
+        if scan.boot == here.boot and scan.basis <= here.newest_tick:
+            self._waiting = None
+            self._on_scan(scan, here.at(scan.boot, scan.basis))

@@ -6,11 +6,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.arrays import Floats, ranges
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
-
-Floats = NDArray[np.float64]
 
 EDGE = 1e-9  # [rad], [m], tolerance, so that rounding does not decide at an edge
 STUCK_BEAMS = 8  # from this many beams on, exactly equal ranges mean a stuck lidar

@@ -3,10 +3,16 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import Pose
 
 IDENTITY: Floats = np.zeros(3)
 IDENTITY.flags.writeable = False
+
+
+def from_pose(pose: Pose) -> Floats:
+    """Return `pose` as an array (3,)."""
+    return np.array((pose.x, pose.y, pose.yaw))
 
 
 def wrap(angle: Floats) -> Floats:

@@ -8,9 +8,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from gigabrain_schemas.arrays import Floats
+
 Corners = tuple[tuple[float, float], ...]
 
 STEP = 0.02  # [m], how far any part of the body moves between two checks

@@ -11,6 +11,7 @@ from typing import Any
 
 from msgspec import Struct
 
+from gigabrain_schemas.base import TICK_S
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
@@ -261,7 +262,7 @@ class Demo:
         """A line of somebody's log."""
         event, level = record.get("event"), record.get("level")
         if event == "decision":
-            decided = round(record["tick"] * 0.02, 2), str(record["reason"])
+            decided = round(record["tick"] * TICK_S, 2), str(record["reason"])
             if self._decisions and self._decisions[-1][0] == decided[0]:
                 self._decisions.pop()  # the last word of a tick counts
             self._decisions.append(decided)

@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Cause, Count, Finite
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.geometry.se2 import Floats
 from gigabrain_zenoh.host.files import make_folder, replacing
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.map_file import Arrays

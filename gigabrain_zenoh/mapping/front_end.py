@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import (
-    Floats,
     between,
     compose,
     inverse_of,

@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.geometry.se2 import Floats, compose, inverse, wrap
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import compose, inverse, wrap
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.mapping.keyframes import Points
 from gigabrain_zenoh.mapping.likelihood_field import (

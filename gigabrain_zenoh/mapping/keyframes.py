@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
 
 Points = NDArray[np.float32]
@@ -149,7 +149,7 @@ def _bin(x: float, y: float) -> int:
 
 
 @kernel
-def _ends(scan: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _ends(scan: Points) -> tuple[Floats, Floats]:
     """How far the beams about each bearing have reached, at least and at most."""
     low, high = np.full(BINS, np.inf), np.full(BINS, -np.inf)
     for x, y in scan:
@@ -161,9 +161,7 @@ def _ends(scan: Points) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @kernel
-def _look(
-    shown: Points, low: NDArray[np.float64], high: NDArray[np.float64], pose: Floats
-) -> tuple[int, int]:
+def _look(shown: Points, low: Floats, high: Floats, pose: Floats) -> tuple[int, int]:
     """How many points beams have passed through, and how many they have hit."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     through = hit = 0
@@ -277,7 +275,7 @@ def thaw_edges(name: str, arrays: Arrays) -> list[Edge]:
     return [Edge(int(first), int(second), r, c, bool(d)) for (first, second), r, c, d in rows]
 
 
-def shaped(arrays: Arrays, name: str, *shape: int) -> NDArray[np.float64]:
+def shaped(arrays: Arrays, name: str, *shape: int) -> Floats:
     """One of the arrays; KeyError without it, ValueError if it is of another shape."""
     values = arrays[name].astype(np.float64)
     if values.shape != shape:

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.geometry.se2 import Floats, inverse, transform
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import inverse, transform
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.mapping.keyframes import Points
 from gigabrain_zenoh.mapping.scan_matching import solved
@@ -244,9 +245,7 @@ def matches_itself(field: LikelihoodField, move: Floats) -> bool:
     return bool(np.linalg.eigvalsh(np.cov(same.T))[0] > MIN_SPREAD_M**2)
 
 
-def _compared(
-    field: LikelihoodField, points: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], int]:
+def _compared(field: LikelihoodField, points: Floats) -> tuple[Floats, int]:
     """The points (n, 2) that lie on walls, and how many lie amid free ground."""
     columns, rows = np.floor((points - field.origin) / field.cell).astype(np.intp).T
     height, width = field.distance.shape

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
 from gigabrain_zenoh.mapping.keyframes import Points, Scan
 

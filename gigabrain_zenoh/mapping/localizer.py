@@ -9,7 +9,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose, inverse, turned
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import IDENTITY, between, compose, inverse, turned
 from gigabrain_zenoh.host.threads import ScheduledWorker, Take
 from gigabrain_zenoh.mapping.global_localization import FEWEST_POINTS, Candidate, apart, search
 from gigabrain_zenoh.mapping.keyframes import View

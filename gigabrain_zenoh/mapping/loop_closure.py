@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import (
     IDENTITY,
-    Floats,
     between,
     compose,
     inverse,

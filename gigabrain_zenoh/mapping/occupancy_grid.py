@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.brain import OccupancyGrid
-from gigabrain_zenoh.geometry.se2 import Floats, between, compose, transform
+from gigabrain_zenoh.geometry.se2 import between, compose, transform
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.mapping.keyframes import REACH_M, Points, View, split
 

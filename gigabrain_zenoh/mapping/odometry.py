@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import BodyDescription, RobotState
-from gigabrain_zenoh.geometry.se2 import Floats, between, compose
+from gigabrain_zenoh.geometry.se2 import between, compose, from_pose
 
 KEPT = 250  # states, so 5 s
 GAP_TICKS = 25  # no pose is made up between states that lie farther apart,
@@ -62,7 +63,7 @@ class Fusion:
 
     def add(self, state: RobotState, body: BodyDescription) -> None:
         """Take one state; one that is not newer than the last is left out."""
-        pose = np.array((state.pose.x, state.pose.y, state.pose.yaw))
+        pose = from_pose(state.pose)
         last = self.newest
         if last is None:
             self._rate = self._turn_rate(state)

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from gigabrain_zenoh.geometry.se2 import Floats, between, compose
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.mapping.keyframes import Edge
 
 ANCHOR = 1e-3  # [m] and [rad], how firmly the first pose is held

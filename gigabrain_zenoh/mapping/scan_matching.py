@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.geometry.se2 import Floats
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
 from gigabrain_zenoh.mapping.keyframes import Points, thinned
 from gigabrain_zenoh.mapping.local_map import BLOCK, BUCKET, Buckets, Bytes, Image

@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose, inverse, turned, wrap
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import IDENTITY, between, compose, inverse, turned, wrap
 from gigabrain_zenoh.mapping.front_end import FrontEnd, Kind, Match
 from gigabrain_zenoh.mapping.keyframes import (
     Arrays,

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose, wrap
+from gigabrain_zenoh.geometry.se2 import IDENTITY, between, compose, wrap
 from gigabrain_zenoh.host.threads import PATIENCE_S, InTime, ScheduledWorker, Take, done
 from gigabrain_zenoh.mapping.keyframes import Scan, View, shaped
 from gigabrain_zenoh.mapping.likelihood_field import field_of

@@ -4,10 +4,11 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.errors import Refused
-from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats
+from gigabrain_zenoh.geometry.se2 import IDENTITY
 from gigabrain_zenoh.host.threads import PATIENCE_S, InTime, ScheduledWorker, done
 from gigabrain_zenoh.mapping.global_localization import search
 from gigabrain_zenoh.mapping.keyframes import Scan, View

@@ -7,9 +7,7 @@ first, for all lanes at once, and decide whether to look.
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, lean_kernel
 from gigabrain_zenoh.navigation.footprint import (
     ROOM,
@@ -40,7 +38,6 @@ from gigabrain_zenoh.navigation.motion_model import (
     Y,
 )
 
-Floats = NDArray[np.float64]
 SECOND = 8.0  # what a second costs
 LOOK_AHEAD = 0.25  # [m], from where the last pose's heading is judged
 NEAR_GOAL = 0.2  # [m], nearer the field is too coarse

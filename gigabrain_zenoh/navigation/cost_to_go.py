@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.footprint import Grid, between
 
@@ -22,7 +23,6 @@ DIAGONAL = math.sqrt(2.0)
 HALVINGS = 5  # of an exponent, for the first terms of its series to do
 SECOND, THIRD, FOURTH = np.float32(1 / 2), np.float32(1 / 6), np.float32(1 / 24)
 
-Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Units = NDArray[np.int32]
 

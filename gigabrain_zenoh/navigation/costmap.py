@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.arrays import cells as cells_of
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import OccupancyGrid
@@ -135,9 +136,7 @@ class Costmap:
             return None
         return int(row), int(column)
 
-    def points(
-        self, rows: NDArray[np.integer], columns: NDArray[np.integer]
-    ) -> NDArray[np.float64]:
+    def points(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> Floats:
         """The centres of cells (n,) in metres, (n, 2)."""
         x = self.origin_x + (columns + 0.5) * self.resolution
         y = self.origin_y + (rows + 0.5) * self.resolution

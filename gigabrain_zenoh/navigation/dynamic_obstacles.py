@@ -8,8 +8,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.cost import Weights
@@ -17,7 +17,6 @@ from gigabrain_zenoh.navigation.cost_to_go import FARTHEST, UNIT, Ways, seed, sw
 from gigabrain_zenoh.navigation.footprint import Grid
 from gigabrain_zenoh.navigation.motion_model import MotionModel
 
-Floats = NDArray[np.float64]
 QUICK_BODY_SPEED = 1.0  # [m/s], a body that can go faster is quick
 QUICK_OBSTACLE_SPEED = 0.3  # [m/s]
 HORIZON_S = 2.0  # of its plans

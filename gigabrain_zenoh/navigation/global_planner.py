@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.navigation.costmap import LETHAL, OCCUPIED_PERCENT, Costmap, Inflation
 from gigabrain_zenoh.navigation.costmap import costmap as make_costmap
 from gigabrain_zenoh.navigation.grid_search import (
-    Floats,
     GridSearch,
     costs_to_go,
     is_free,

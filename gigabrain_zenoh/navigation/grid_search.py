@@ -12,6 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, kernel
 from gigabrain_zenoh.navigation.costmap import LETHAL, Costs
 
@@ -40,7 +41,6 @@ LAST_RUN = np.iinfo(np.int32).max // RUN_STRIDE - 1  # the marks hold no greater
 NOWHERE = -1
 OUT_OF_ENTRIES = -1  # no room for more entries
 NO_TARGET = (NOWHERE, NOWHERE)
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 Cell = tuple[int, int]  # row, column
 Direction = Literal["from", "to"]

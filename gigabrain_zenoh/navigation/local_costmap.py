@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.footprint import FAR, Grid
@@ -28,7 +29,6 @@ CELL_M = 0.025
 BEARING_BINS = 720  # of the bearings round the lidar
 MARK_LEVEL = 2  # of a cell that was just hit; each beam that passes takes one
 BEYOND_M = 0.1  # [m], how far past a cell a beam must go to have passed it
-Floats = NDArray[np.float64]
 
 DISC_MARGIN_M = 0.1  # [m], hits so near a moving thing are its own
 LATE_TICKS = 10  # so much longer than it seems a disc may have been over a cell

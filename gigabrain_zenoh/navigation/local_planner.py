@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta, Struct, structs
-from numpy.typing import NDArray
 
-from gigabrain_schemas.base import TICK_NS, Pose, Positive, Velocity
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_S, Pose, Positive, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, Obstacle, TrajectoryPoint
 from gigabrain_zenoh.navigation import dynamic_obstacles
@@ -25,7 +25,6 @@ from gigabrain_zenoh.navigation.motion_model import (
 )
 from gigabrain_zenoh.navigation.mppi import SampledPlan, Sampler, past_of, step_of
 
-Floats = NDArray[np.float64]
 PlanKind = Literal["going", "going round", "waiting", "backing out", "turning in place", "arrived"]
 
 SOON_S = 1.0  # what the body does within this time is what it is said to do
@@ -34,7 +33,6 @@ NAMED_WITHIN_M = 1.5  # [m], what moves within this is named
 AT_GOAL_M = 0.2  # [m], so little is left where only standing and turning are
 DETOUR_M = 0.15  # [m], so far off the straight way is round something
 
-TICK_S = TICK_NS / 1e9
 MOVING_SPEED = 0.15  # [m/s], slower things are part of the grid
 MOVING_SIGMAS = 3.0  # standard deviations of its velocity that a thing must be faster than to move
 DEFAULT_SPEED_SIGMA = 0.05  # [m/s], standard deviation of a velocity that comes without

@@ -6,9 +6,7 @@ The body answers a command after its delay, then as a first-order lag.
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.geometry.limits import limits_of
 from gigabrain_zenoh.kernels.jit import lean_kernel
@@ -18,7 +16,6 @@ ACCELERATION_RESERVE = (
 )
 MAX_REVERSE_SPEED = 0.4  # [m/s], no faster backwards: the lidar may not see there
 
-Floats = NDArray[np.float64]
 LANES = 8  # plans at a time
 X, Y, YAW, VX, VY, W = range(0, 6 * LANES, LANES)  # where the lanes of each begin in a state:
 COSINE, SINE, MOVED = range(6 * LANES, 9 * LANES, LANES)  # its pose, velocity, and the way [m] that

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, kernel, lean_kernel
 from gigabrain_zenoh.navigation.cost import Scene, Weights, look_round, price, rooms_of
 from gigabrain_zenoh.navigation.footprint import Outline
@@ -21,7 +22,6 @@ from gigabrain_zenoh.navigation.motion_model import (
     simulate,
 )
 
-Floats = NDArray[np.float64]
 NOISE_KEPT, NOISE_FRESH = 0.85, 0.53  # of the noise from step to step
 NOISE_SHARE, TURN_NOISE_SHARE = 0.175, 0.3  # of the noise, as a share of the largest speeds
 SIMPLE_EVERY = 4  # every so manieth plan is one twist and then another, and no noise

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.arrays import Floats, ranges
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import Body, Lidar, RobotState
 from gigabrain_schemas.brain import OccupancyGrid, PoseInMap
@@ -22,7 +22,6 @@ from gigabrain_zenoh.bus.input_log import log_accepted
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.geometry.scan import beams, hits
-from gigabrain_zenoh.geometry.se2 import Floats
 from gigabrain_zenoh.host.bounded import NewestValues
 from gigabrain_zenoh.host.threads import InTime, done
 from gigabrain_zenoh.mapping import map_file

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import hits_bytes, ranges
+from gigabrain_schemas.arrays import Floats, hits_bytes, ranges
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Body, BodyDescription, RobotState
 from gigabrain_schemas.brain import WorldModel
@@ -17,8 +17,8 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.config.settings import PerceptionConfig
-from gigabrain_zenoh.geometry.placed_scans import PlacedScans
-from gigabrain_zenoh.geometry.scan import EDGE, Floats, blind_ahead, hits, scan_problem
+from gigabrain_zenoh.geometry.pose import PlacedScans
+from gigabrain_zenoh.geometry.scan import EDGE, blind_ahead, hits, scan_problem
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
 from gigabrain_zenoh.perception.obstacle_tracker import Surroundings
 from gigabrain_zenoh.runtime.heartbeat import Progress

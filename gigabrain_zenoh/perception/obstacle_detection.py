@@ -13,11 +13,11 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from gigabrain_schemas.base import TICK_NS, Pose
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_S, Pose
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.geometry.pose import compose
 
-Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 S = TypeVar("S", bound=np.generic)
@@ -51,7 +51,6 @@ MIDDLE_OFFSET_RADII = 0.7  # radii, so far behind the middle of its hits the mid
 MAX_ARC_NOISE_M = 0.08  # standard deviation of its place
 MIN_RIM_SHARE = 0.9  # share of the hits
 
-TICK_S = TICK_NS / 1e9
 MOTION_M = 0.4  # or by something quick, since it has gone so far
 COMPARED_S = 0.5  # what was seen so long ago is compared
 KEPT_SCANS = 32  # scans

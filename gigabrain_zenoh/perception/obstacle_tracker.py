@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from gigabrain_schemas import arrays
-from gigabrain_schemas.base import TICK_NS, Pose
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_S, Pose
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle, WorldModel
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.geometry.pose import compose
+from gigabrain_zenoh.geometry.pose import compose, to_parent
 from gigabrain_zenoh.perception.obstacle_detection import (
     Cluster,
     FreeSpace,
@@ -42,8 +42,6 @@ QUICK_SPEED = 0.5  # [m/s]
 MOVING_SIGMAS = 2.5  # standard deviations that a speed must be off zero
 STANDING_SPEED, STANDING_S = 0.12, 0.6  # slower for so long, it stands
 
-Floats = NDArray[np.float64]
-TICK_S = TICK_NS / 1e9
 GATE_SIGMAS = 4.0  # standard deviations; what is farther from where a thing should be is another
 MAX_JUMP_M = 0.6
 PARTIAL_NOISE_FACTOR = 4.0  # times as far off may be what is partly hidden
@@ -324,8 +322,7 @@ def _place(cluster: Cluster, lidar: Lidar, pose: Pose, radius: float) -> tuple[f
     distance = cluster.near + radius
     ahead = lidar.x + distance * math.cos(cluster.bearing)
     left = lidar.y + distance * math.sin(cluster.bearing)
-    cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
-    return pose.x + cosine * ahead - sine * left, pose.y + sine * ahead + cosine * left
+    return to_parent(pose, ahead, left)
 
 
 class Surroundings:

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
-from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.body import Body, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import DescribeRequest, Description, EnableRequest
@@ -35,7 +35,6 @@ from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.qa.judging import Failed
 
-TICK_MS = TICK_NS / 1e6
 PATIENCE_S = 60.0  # far more than anything here takes on a busy machine
 POLL_S = 0.01
 AT_REST = 0.005  # [m/s], [rad/s]

@@ -22,6 +22,7 @@ from gigabrain_schemas.safety import LogRecord
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import CMD_VEL, INTENT, SAFETY, STATE, WORLD, Topic
+from gigabrain_zenoh.geometry.pose import to_frame
 
 MAP, ODOM, BASE = "map", "odom", "base_link"
 LIDAR = "base_scan"  # as LaserScan has it
@@ -262,9 +263,8 @@ def _speed(one: Obstacle) -> float:
 def _wall(world: WorldModel, one: Obstacle, odometry: Pose) -> fox.SceneEntity:
     """Draw lines along the points that beams hit."""
     hits = arrays.hits(world)
-    dx, dy = one.x - odometry.x, one.y - odometry.y
-    c, s = math.cos(odometry.yaw), math.sin(odometry.yaw)
-    off = np.hypot(hits[:, 0] - (c * dx + s * dy), hits[:, 1] - (c * dy - s * dx))
+    x, y = to_frame(odometry, one.x, one.y)
+    off = np.hypot(hits[:, 0] - x, hits[:, 1] - y)
     near = hits[off < one.radius + MAX_POINT_GAP_M]
     joined = np.hypot(*np.diff(near, axis=0).T) < MAX_POINT_GAP_M
     ends = np.hstack((near[:-1], near[1:]))[joined].reshape(-1, 2).tolist()

@@ -13,12 +13,12 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.arrays import Floats, ranges
 from gigabrain_schemas.base import TICK_NS, Pose
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.pose import relative
-from gigabrain_zenoh.geometry.scan import Floats
+from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.geometry.sweep import depth, edges, radius
 
 SECTORS = 36
@@ -158,9 +158,7 @@ def known_free(
     for view in reversed(views[:-1]):
         if not asked.size:
             break
-        here = relative(view.pose, views[-1].pose)
-        cosine, sine = math.cos(here.yaw), math.sin(here.yaw)
-        placed = points[asked] @ np.array([[cosine, sine], [-sine, cosine]]) + (here.x, here.y)
+        placed = transform(from_pose(relative(view.pose, views[-1].pose)), points[asked])
         stood = depth(hull, placed) < 0
         through, hit = _seen(lidar, housing_m, view.scan, placed)
         found[asked[stood | (through & ~hit)]] = True

@@ -12,10 +12,9 @@ from typing import Self
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import ranges
-from gigabrain_schemas.base import TICK_NS, Cause, Velocity
+from gigabrain_schemas.arrays import Floats, ranges
+from gigabrain_schemas.base import TICK_MS, Cause, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.limits import ZERO
@@ -23,10 +22,8 @@ from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.safety.catalogue import cause
 from gigabrain_zenoh.safety.debounce import lasting, ticks_of
 
-Floats = NDArray[np.float64]
 Speeds = tuple[float, float, float]
 
-TICK_MS = TICK_NS / 1e6
 ROUND_MS = 10.0  # precision of texts
 DOUBT_TICKS = 250  # after a silence, unless the speeds show sooner whether data are late
 

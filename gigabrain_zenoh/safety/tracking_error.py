@@ -8,7 +8,7 @@ outputs, within a tolerance.
 from msgspec import Struct
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import TICK_NS, Cause, Pose, Velocity
+from gigabrain_schemas.base import TICK_S, Cause, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SpeedCaps
@@ -20,7 +20,6 @@ from gigabrain_zenoh.safety.debounce import lasting, ticks_of
 WINDOW_TICKS = 15  # 0.3 s for the line to the body and back, and for its motors
 MAX_LATE_TICKS = 30  # added to that where data are known to be late
 WATCH_TICKS = 100  # after it was last enabled; later a person may push it
-TICK_S = TICK_NS / 1e9
 
 Axes = tuple[float, float, float]
 Bands = tuple[Axes, ...]  # least, greatest, tolerance; per axis

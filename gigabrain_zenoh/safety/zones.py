@@ -6,13 +6,13 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from gigabrain_schemas.arrays import ranges
+from gigabrain_schemas.arrays import Floats, ranges
 from gigabrain_schemas.base import TICK_NS, Cause, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.pose import PoseHistory
-from gigabrain_zenoh.geometry.scan import Floats, blind_ahead, hits, scan_problem
+from gigabrain_zenoh.geometry.scan import blind_ahead, hits, scan_problem
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.geometry.sweep import arc, straight, turning
 from gigabrain_zenoh.safety import blind_spots

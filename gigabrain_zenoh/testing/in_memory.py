@@ -14,7 +14,7 @@ from gigabrain_drivers.bodies.mock.driver import MockBody, MockOptions
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_drivers.driver.robot import RobotFile, Run
-from gigabrain_schemas.base import Message
+from gigabrain_schemas.base import TICK_S, Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.topics import STATE, Topic
 from gigabrain_zenoh import codec
@@ -259,4 +259,4 @@ def ticks_until(speeds: list[float], reached: Callable[[float], bool]) -> int:
 
 def travelled(speeds: list[float]) -> float:
     """Return the way driven with these speeds [m]."""
-    return math.fsum(speeds) * 0.02
+    return math.fsum(speeds) * TICK_S

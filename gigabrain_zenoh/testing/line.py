@@ -17,7 +17,7 @@ from gigabrain_drivers.emulators.station import Station
 from gigabrain_drivers.kinematics import Twist, base_of
 from gigabrain_drivers.odometry import advanced
 from gigabrain_drivers.sim.physics import Charge, ImuSample, Odometry, Wheel
-from gigabrain_schemas.base import Pose
+from gigabrain_schemas.base import TICK_S, Pose
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.testing.waiting import PATIENCE_S, until
@@ -141,7 +141,7 @@ class EmulatedLine:
 
     async def drive(self, seconds: float, linear_x: float, angular_z: float = 0.0) -> None:
         """Command as the driver's process does: every 20 ms."""
-        for _ in range(math.ceil(seconds / 0.02)):
+        for _ in range(math.ceil(seconds / TICK_S)):
             await self.driver.set_base_velocity(linear_x, 0.0, angular_z)
             await asyncio.sleep(0.02)
 

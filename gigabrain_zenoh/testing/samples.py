@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import ranges_bytes
+from gigabrain_schemas.arrays import Floats, ranges_bytes
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import (
     Battery,
@@ -95,8 +95,8 @@ def open_space(**hits_at_degrees: float) -> NDArray[np.float32]:
     return values
 
 
-def round_room(radius: float, x: float, y: float, yaw: float) -> NDArray[np.float64]:
+def round_room(radius: float, x: float, y: float, yaw: float) -> Floats:
     """Return 360 ranges from (x, y, yaw) in a round room: |p + d u| = radius, solved for d."""
     angles = yaw + np.radians(np.arange(360.0))
-    along: NDArray[np.float64] = x * np.cos(angles) + y * np.sin(angles)
+    along: Floats = x * np.cos(angles) + y * np.sin(angles)
     return np.sqrt(along**2 + radius**2 - x**2 - y**2) - along

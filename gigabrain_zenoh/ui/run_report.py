@@ -7,6 +7,7 @@ from typing import Any
 
 from msgspec import Struct
 
+from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.requests import DescribeRequest, Description
@@ -65,7 +66,7 @@ class RunMonitor:
     @property
     def seconds(self) -> float:
         """Return the robot's time since its driver started [s]."""
-        return self._bus.time.tick * 0.02
+        return self._bus.time.tick * TICK_S
 
     @property
     def mapped_m2(self) -> float | None:

@@ -6,6 +6,8 @@ from numpy.typing import NDArray
 from gigabrain_schemas.brain import OccupancyGrid, WorldModel
 from gigabrain_schemas.sensors import Image, LaserScan
 
+Floats = NDArray[np.float64]
+
 FARTHEST_HIT = 1000.0  # [m]
 DTYPES = {"mono8": "u1", "rgb8": "u1", "bgr8": "u1", "depth16": "<u2", "depth32f": "<f4"}
 

@@ -33,6 +33,7 @@ Text = Annotated[str, Meta(max_length=500)]
 Key = Annotated[str, Meta(max_length=256)]  # on the bus, or the name of a figure
 
 TICK_NS = 20_000_000  # one tick of the robot's clock is 20 ms of the body's own time
+TICK_S, TICK_MS = TICK_NS / 1e9, TICK_NS / 1e6
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

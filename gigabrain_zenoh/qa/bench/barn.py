@@ -15,7 +15,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import hits
-from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_schemas.base import TICK_S, Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
 from gigabrain_schemas.brain import CmdVel, Intent, PoseInMap, WorldModel
 from gigabrain_schemas.sensors import LaserScan
@@ -205,7 +205,6 @@ def _known(place: PoseInMap | None) -> bool:
     return place is not None and place.localized
 
 
-TICK_S = TICK_NS / 1e9
 BOOT = 1
 SENT_TICKS = 30  # of commands, that planning looks back on
 DRIVING = GateStatus(mode="enabled", commander=BRAIN, enables=1)

@@ -13,18 +13,16 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from gigabrain_schemas.arrays import ranges_bytes
-from gigabrain_schemas.base import TICK_NS, Pose, Velocity
+from gigabrain_schemas.arrays import Floats, ranges_bytes
+from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Lidar, RobotState, Thresholds
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.geometry.pose import to_frame
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.local_planner import Goal
 
-Floats = NDArray[np.float64]
-
-TICK_S = TICK_NS / 1e9
 SUBSTEPS = 4  # of a tick
 ACCELERATION, ANGULAR_ACCELERATION = 5.0, 20.0  # [m/s2], [rad/s2], what the floor takes
 LENGTH_M, WIDTH_M = 0.458, 0.416  # [m], of chassis and wheels
@@ -328,9 +326,8 @@ class BarnCourse:
     def goal(self) -> Goal:
         """As the robot knows it: where its odometry begins, there is its origin."""
         x, y, yaw = self._world.start
-        dx, dy = self._world.goal[0] - x, self._world.goal[1] - y
-        cosine, sine = math.cos(yaw), math.sin(yaw)
-        return Goal(x=cosine * dx + sine * dy, y=cosine * dy - sine * dx)
+        goal_x, goal_y = to_frame(Pose(x=x, y=y, yaw=yaw), *self._world.goal)
+        return Goal(x=goal_x, y=goal_y)
 
     def look(self) -> None:
         """A tick begins: judge how it stands."""

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 from msgspec import Struct
 
-from gigabrain_schemas.base import TICK_NS
+from gigabrain_schemas.base import TICK_S
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import Health
@@ -27,7 +27,6 @@ BODY = ("emulator", "driver")  # the processes that are exchanged; the others st
 POLL_S = 0.05
 START_S = 60.0  # until a body is enabled, on a busy machine
 STALL_S = 20.0
-TICK_S = TICK_NS / 1e9
 MOTION = (("linear_x", 0.05), ("angular_z", 0.2))  # least speed that counts as motion
 
 

@@ -18,14 +18,12 @@ from gigabrain_drivers.sim.geometry import Pose as Place
 from gigabrain_drivers.sim.lidar import Lidar
 from gigabrain_drivers.sim.scene import ROBOT, compile_scene
 from gigabrain_drivers.sim.world import World
-from gigabrain_schemas.base import TICK_NS, Pose, Velocity
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import Lidar as LidarDescription
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.qa.bench.barn_course import FIELD_OF_VIEW_RAD, Conditions, clearance
 
-Floats = NDArray[np.float64]
-
-TICK_S = TICK_NS / 1e9
 SUBSTEPS = 4  # of a tick: as often the motors are told something new
 PHYSICS_STEPS = 4  # in 10 ms: two for each time that the motors are told
 WHEEL_RADIUS_M, TRACK_M = 0.098, 0.37559  # [m]

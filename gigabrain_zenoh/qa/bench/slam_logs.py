@@ -16,8 +16,9 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.geometry.se2 import Floats, between, compose, inverse, transform
+from gigabrain_zenoh.geometry.se2 import between, compose, inverse, transform
 from gigabrain_zenoh.host.posix import resource
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.mapping.keyframes import Scan, from_beams
@@ -138,21 +139,19 @@ def crispness(log: LaserLog, poses: Floats) -> float:
     return float(np.mean(ours / reference))
 
 
-def hits(log: LaserLog, at: int) -> NDArray[np.float64]:
+def hits(log: LaserLog, at: int) -> Floats:
     """Return the hits of one scan (n, 2) in the body's frame [m], of the ranges that count."""
     points = log.scan(at).points.astype(np.float64)
     away = np.hypot(*points.T)
     return np.asarray(points[(away > NEAREST) & (away < FARTHEST)])
 
 
-def cells_filled(
-    bodies: list[NDArray[np.float64]], poses: Floats, turns: Floats
-) -> NDArray[np.float64]:
+def cells_filled(bodies: list[Floats], poses: Floats, turns: Floats) -> Floats:
     """Return how many cells the scans fill at `poses` (n, 3), for each turn [rad] of the grid."""
     return np.array([_filled(bodies, compose(np.array((0, 0, turn)), poses)) for turn in turns])
 
 
-def _filled(bodies: list[NDArray[np.float64]], poses: Floats) -> float:
+def _filled(bodies: list[Floats], poses: Floats) -> float:
     each = np.array([len(body) for body in bodies])
     points = np.concatenate(bodies)
     x, y, yaw = np.repeat(poses, each, axis=0).T

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from msgspec import Struct
 
-from gigabrain_schemas.arrays import cells
+from gigabrain_schemas.arrays import Floats, cells
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.geometry.se2 import Floats, between, compose, inverse
+from gigabrain_zenoh.geometry.se2 import between, compose, inverse
 from gigabrain_zenoh.mapping.likelihood_field import OCCUPIED
 from gigabrain_zenoh.mapping.odometry import Fusion, Moment, way
 from gigabrain_zenoh.mapping.slam_map import GrowingMap

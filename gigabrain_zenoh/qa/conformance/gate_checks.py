@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_schemas.base import TICK_MS, TICK_NS, TICK_S, Velocity
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.host import this_process
@@ -21,7 +21,6 @@ from gigabrain_zenoh.qa.judging import Failed, Finding
 
 SILENCE_TICKS = 7  # ticks: 100 ms without a command, told in the next tick
 AT_ONCE_TICKS = 2
-TICK_MS = TICK_NS / 1e6
 DISORDER_TICKS = 35
 LATE_TICKS = 100  # for which a body that still moves is watched, to say how late it is
 COMMANDER = "import time\nwhile True:\n print(flush=True)\n time.sleep(0.02)\n"
@@ -187,7 +186,7 @@ async def reports(gated: GatedDriver) -> Finding:
     good = late_ms == 0
     text = f"{states} in {ticks} ticks, at most {oldest:.0f} ms old"
     if lidar and gated.scan:
-        rate = scans / (ticks * 0.02)
+        rate = scans / (ticks * TICK_S)
         beams = len(gated.scan.ranges) // 4
         good = good and abs(rate / lidar.rate_hz - 1) <= SCAN_SLACK and beams == lidar.beams
         missing = 1 - rate / ((1 - SCAN_SLACK) * lidar.rate_hz)  # of the time
@@ -213,7 +212,7 @@ async def latency(gated: GatedDriver) -> Finding:
             asked_ns = 0
 
     wanted = await gated.drive()
-    step = 0.02 * min(gated.robot.max_linear_acceleration, gated.robot.max_linear_deceleration)
+    step = TICK_S * min(gated.robot.max_linear_acceleration, gated.robot.max_linear_deceleration)
     gated.wanted, link.trace = None, trace
     try:
         for i in range(SAMPLES):

@@ -8,7 +8,7 @@ import msgspec
 
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.process import DriverProcess
-from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.base import TICK_S, Message, Velocity
 from gigabrain_schemas.body import Joint, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, ReleaseRequest
@@ -261,6 +261,6 @@ def stop_ticks(gated: GatedDriver, reaction: int) -> int:
 
     What walks has to end its step, and to settle.
     """
-    ramp = gated.speed / gated.robot.max_linear_deceleration / 0.02
+    ramp = gated.speed / gated.robot.max_linear_deceleration / TICK_S
     own = STEP_TICKS if gated.robot.drive_type == "quadruped" else SETTLE_TICKS
     return reaction + round(ramp + 0.5) + own

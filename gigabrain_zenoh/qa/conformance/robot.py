@@ -19,8 +19,7 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.gate.state import at_rest
-from gigabrain_zenoh.geometry.limits import ZERO
+from gigabrain_zenoh.geometry.limits import ZERO, at_rest
 from gigabrain_zenoh.qa.judging import Failed, Skipped
 
 LOOK_S = 0.004

@@ -12,7 +12,7 @@ from gigabrain_drivers.bodies.line.driver import LineDriver
 from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.lidars.ld.emulator import LdDevice
 from gigabrain_drivers.lidars.ld.source import Ld19
-from gigabrain_schemas.base import Velocity
+from gigabrain_schemas.base import TICK_S, Velocity
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.geometry.limits import limits_of, ramp
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
@@ -21,8 +21,6 @@ from gigabrain_zenoh.safety.latency import SpeedDelay
 from gigabrain_zenoh.testing.line import EmulatedLine
 from gigabrain_zenoh.testing.waiting import until
 from tests.unit.drivers.lidars import LIDAR, Listener, emulated
-
-TICK_S = 0.02
 
 
 async def test_an_emulated_ld19_behind_a_late_line_says_so(tmp_path: Path) -> None:

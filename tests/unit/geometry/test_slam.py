@@ -6,7 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between, compose
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import IDENTITY, between, compose
 from gigabrain_zenoh.mapping.front_end import FEW
 from gigabrain_zenoh.mapping.keyframes import Scan
 from gigabrain_zenoh.mapping.slam import Estimate, Slam

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import IDENTITY, between
 from gigabrain_zenoh.mapping.keyframes import Scan, seen_through
 from gigabrain_zenoh.mapping.slam import Slam
 from tests.unit.mapping.rooms import Lidar, box, drifting, line

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, compose
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import IDENTITY, compose
 from gigabrain_zenoh.mapping.keyframes import Scan, View
 from gigabrain_zenoh.mapping.localizer import Place
 from gigabrain_zenoh.mapping.map_file import SavedMap

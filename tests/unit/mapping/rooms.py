@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_zenoh.geometry.se2 import Floats, compose
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import compose
 from gigabrain_zenoh.mapping.keyframes import Scan, from_beams
 
 Walls = Floats  # (n, 4): x and y of both ends [m]

@@ -8,7 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.geometry.se2 import Floats, between, compose
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.mapping import pose_graph
 from gigabrain_zenoh.mapping.keyframes import Edge
 from gigabrain_zenoh.mapping.pose_graph import Graph

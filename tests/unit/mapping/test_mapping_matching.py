@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import IDENTITY
 from gigabrain_zenoh.mapping.keyframes import Scan, from_beams
 from gigabrain_zenoh.mapping.local_map import LocalMap, build
 from gigabrain_zenoh.mapping.scan_matching import Window, icp, search

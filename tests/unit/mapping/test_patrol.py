@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.geometry.se2 import IDENTITY, Floats, between
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import IDENTITY, between
 from gigabrain_zenoh.mapping.keyframes import Edge, Keyframe, Scan, View
 from gigabrain_zenoh.mapping.map_file import SavedMap
 from gigabrain_zenoh.mapping.occupancy_grid import Sweeps

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from gigabrain_zenoh.geometry.se2 import Floats, between, compose
+from gigabrain_schemas.arrays import Floats
+from gigabrain_zenoh.geometry.se2 import between, compose
 from gigabrain_zenoh.mapping.keyframes import Edge, Keyframe
 from gigabrain_zenoh.mapping.loop_closure import PlaceSearch
 from gigabrain_zenoh.mapping.pose_graph import Drift, Rates

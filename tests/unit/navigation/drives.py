@@ -5,9 +5,9 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.arrays import Floats
+from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.brain import ActuationModel, Obstacle
 from gigabrain_zenoh.geometry.sweep import depth, edges
@@ -21,9 +21,6 @@ from gigabrain_zenoh.navigation.local_planner import (
 )
 from gigabrain_zenoh.navigation.motion_model import lag_of, lagged_step
 
-Floats = NDArray[np.float64]
-
-TICK_S = 0.02
 WAFFLE = BodyDescription(
     robot_type="waffle",
     drive_type="differential",

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.cost import Scene, Weights, look_round, price, rooms_of
 from gigabrain_zenoh.navigation.dynamic_obstacles import WEIGHTS
@@ -13,7 +14,6 @@ from gigabrain_zenoh.navigation.footprint import Grid, Outline, outline_of
 from gigabrain_zenoh.navigation.motion_model import (
     LANES,
     STATE,
-    Floats,
     InitialState,
     MotionModel,
     lag_of,

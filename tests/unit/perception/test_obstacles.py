@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.brain import Obstacle
@@ -14,7 +14,6 @@ from gigabrain_zenoh.perception.obstacle_tracker import MAX_OBSTACLES, ObstacleT
 
 Disc = tuple[float, float, float]  # x, y, radius [m]
 Wall = tuple[float, float, float, float]  # from x, y to x, y [m]
-Floats = NDArray[np.float64]
 
 ROOM: tuple[Wall, ...] = ((-4, -3, 4, -3), (4, -3, 4, 3), (4, 3, -4, 3), (-4, 3, -4, -3))
 WIDE = Lidar(beams=360, rate_hz=10, range_min=0.1, range_max=12.0)

@@ -9,7 +9,7 @@ from gigabrain_schemas.base import Pose
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import BODY, SCAN, STATE, WORLD
 from gigabrain_zenoh.config.settings import PerceptionConfig
-from gigabrain_zenoh.geometry.placed_scans import PlacedScans
+from gigabrain_zenoh.geometry.pose import PlacedScans
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import body, open_space, scan, state

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.geometry.se2 import Floats, compose
+from gigabrain_zenoh.geometry.se2 import compose
 from gigabrain_zenoh.qa.bench.slam_logs import (
     LaserLog,
     crispness,

@@ -8,7 +8,7 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from gigabrain_schemas.base import Pose, Velocity
+from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState, Thresholds
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.pose import PoseHistory
@@ -17,7 +17,6 @@ from gigabrain_zenoh.testing.samples import LIDAR, WAFFLE, scan, state
 
 BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.25))
 SLOW_LIDAR = replace(WAFFLE, lidar=replace(LIDAR, rate_hz=5.0), thresholds=BODY.thresholds)
-TICK_S = 0.02
 ANGLES = np.radians(np.arange(360.0))
 
 

@@ -13,7 +13,7 @@ from msgspec import structs
 
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.emulators.emulator import wire_of
-from gigabrain_schemas.base import Message
+from gigabrain_schemas.base import TICK_MS, Message
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import Topic
@@ -29,7 +29,7 @@ from gigabrain_zenoh.config.settings import (
 )
 from gigabrain_zenoh.decision.behaviours import load, needs_map
 from gigabrain_zenoh.qa.judging import Failed, Figure, Skipped, Stage
-from gigabrain_zenoh.qa.probe import TICK_MS, Probe, at_rest, until
+from gigabrain_zenoh.qa.probe import Probe, at_rest, until
 from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
 from gigabrain_zenoh.qa.robot_under_test import (

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from gigabrain_drivers.bodies.line.fields import COMMAND
 from gigabrain_drivers.bodies.line.protocol import Decoder, Template
+from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.config.settings import ProcessConfig
 from gigabrain_zenoh.qa.faults.rig.rig import (
@@ -23,7 +24,7 @@ from gigabrain_zenoh.qa.faults.rig.rig import (
     deployment_of,
 )
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
-from gigabrain_zenoh.qa.probe import TICK_MS, until
+from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.serial import in_front_of
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy

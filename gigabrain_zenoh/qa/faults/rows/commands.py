@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_schemas.base import TICK_MS, TICK_NS, TICK_S, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.sensors import LaserScan
@@ -32,7 +32,7 @@ from gigabrain_zenoh.qa.faults.rig.rig import (
     forging,
 )
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
-from gigabrain_zenoh.qa.probe import TICK_MS, Probe, until
+from gigabrain_zenoh.qa.probe import Probe, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import client_endpoint
 from gigabrain_zenoh.safety.step import Inputs, Memory, step
@@ -46,7 +46,6 @@ SPEEDS = (math.nan, math.inf, -math.inf)
 LOCKSTEP = 2.0  # of real time
 LOCKSTEP_TIMEOUT_S = 30.0
 ROUNDING = 1e-9
-TICK_S = TICK_NS / 1e9
 AXES = ("linear_x", "linear_y", "angular_z")
 COMMAND = codec_of(CmdVel)
 

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
-from gigabrain_schemas.base import Message
+from gigabrain_schemas.base import TICK_MS, Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel, Twist
 from gigabrain_schemas.requests import EstopRequest, ReleaseRequest
@@ -17,7 +17,7 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.errors import GigabrainError, Refused
 from gigabrain_zenoh.qa.faults.rig.rig import TRAVEL, Rig
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
-from gigabrain_zenoh.qa.probe import TICK_MS, until
+from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import client_endpoint
 

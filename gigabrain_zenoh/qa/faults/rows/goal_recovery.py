@@ -10,13 +10,15 @@ from typing import Any
 
 import msgspec
 
+from gigabrain_schemas.base import TICK_MS, Pose
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import PoseInMap
 from gigabrain_schemas.topics import POSE
 from gigabrain_zenoh.client.tasks import Tasks
+from gigabrain_zenoh.geometry.pose import to_frame
 from gigabrain_zenoh.qa.faults.rig.rig import DRIVES_AGAIN, TRAVEL, Options, Rig, deployment_of
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, fault_row, worse_of
-from gigabrain_zenoh.qa.probe import TICK_MS, until
+from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import Deployment
 
@@ -161,6 +163,5 @@ def _distance(truth: Mapping[str, Any], place: tuple[float, float]) -> float:
 
 def in_map(truth: Mapping[str, Any], place: tuple[float, float]) -> tuple[float, float]:
     """Return a place of the world in the map, whose origin is where the body now is."""
-    x, y = place[0] - truth["true_x"], place[1] - truth["true_y"]
-    cosine, sine = math.cos(truth["true_yaw"]), math.sin(truth["true_yaw"])
-    return cosine * x + sine * y, cosine * y - sine * x
+    body = Pose(x=truth["true_x"], y=truth["true_y"], yaw=truth["true_yaw"])
+    return to_frame(body, *place)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import msgspec
 
+from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Twist
 from gigabrain_schemas.sensors import Image
@@ -42,7 +43,7 @@ from gigabrain_zenoh.qa.faults.rig.rig import (
     stop_by,
 )
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
-from gigabrain_zenoh.qa.probe import PATIENCE_S, TICK_MS, until
+from gigabrain_zenoh.qa.probe import PATIENCE_S, until
 from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest

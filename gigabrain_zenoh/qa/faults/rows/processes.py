@@ -7,6 +7,7 @@ import signal
 import time
 from typing import Any
 
+from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.topics import CMD_VEL
 from gigabrain_zenoh.qa.faults.rig.rig import (
     BRAKES,
@@ -30,7 +31,7 @@ from gigabrain_zenoh.qa.faults.rig.rig import (
     stop_by,
 )
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, Stage, fault_row, worse_of
-from gigabrain_zenoh.qa.probe import TICK_MS, moving, until
+from gigabrain_zenoh.qa.probe import moving, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import client_endpoint
 from gigabrain_zenoh.runtime.managed_process import Backoff

@@ -10,14 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from gigabrain_schemas.arrays import ranges_bytes
-from gigabrain_schemas.base import TICK_NS, Velocity
+from gigabrain_schemas.arrays import Floats, ranges_bytes
+from gigabrain_schemas.base import TICK_NS, TICK_S, Velocity
 from gigabrain_schemas.body import Battery, BodyDescription, Joint, RobotState
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import PerceptionConfig
-from gigabrain_zenoh.geometry.scan import Floats
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.qa.faults.rig.hostile import as_map, codec_of
@@ -54,7 +53,6 @@ GAP_M = 0.03
 HOLD_TICKS = 100
 CORRIDOR_M, NEAR_END_M = 40.0, 36.0
 CORRIDOR_TICKS, LONG_CORRIDOR_TICKS = 1500, 30_000  # half a minute, ten
-TICK_S = 0.02
 CONTACTS = Figure("contacts")
 GAP_MISSING = Figure("missing to a gap of 3 cm", "m")
 FALSE_STOPS = Figure("false stops", "%")
@@ -204,7 +202,7 @@ def codes_after(body: BodyDescription, readings: list[PowerReading]) -> set[str]
 
 def wrong_ramp(body: BodyDescription) -> int:
     """Drain a battery by 1 % a second; count codes that come too early, too late, or never."""
-    wrong, late = 0, body.thresholds.battery_sustain + SLACK_TICKS * 0.02
+    wrong, late = 0, body.thresholds.battery_sustain + SLACK_TICKS * TICK_S
     for code, level in _battery_levels(body):
         for percentage, expected in ((level, False), (level - late, True)):
             ticks = round((FULL / 4 - percentage) * 50)
