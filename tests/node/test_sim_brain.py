@@ -38,7 +38,13 @@ def make(speed: float = 100.0, seconds: float | None = None, **options: float) -
 async def drive(driver: MujocoDriver, folder: Path) -> tuple[LocalNetwork, list[float]]:
     """Let the whole brain drive until the simulation ends; the true speed at each state."""
     network, speeds = LocalNetwork(), list[float]()
-    config = DriverConfig(body=WAFFLE, speed=driver.run.speed, resume="auto", state_dir=str(folder))
+    config = DriverConfig(
+        body=WAFFLE,
+        speed=driver.run.speed,
+        resume="auto",
+        state_dir=str(folder),
+        lockstep_timeout_s=10.0,
+    )
 
     def bus() -> Bus:
         return Bus(network.transport(), Clock())
@@ -57,6 +63,7 @@ async def drive(driver: MujocoDriver, folder: Path) -> tuple[LocalNetwork, list[
     tasks.append(asyncio.ensure_future(process.run(lambda: None)))
     while not driver.finished:
         await asyncio.sleep(0.01)
+        assert process.report()["lockstep_timeouts"] == 0  # each tick was answered
         for task in tasks:
             if task.done():
                 task.result()

@@ -168,17 +168,22 @@ class DriverProcess:
         The first one waits until the whole brain has answered a scan, so that runs can be repeated.
         """
         if self._gate.tick > 1:
-            self._announce(state)
-            lockstep.begin(self._gate.tick, self._round_trip.scan_tick)
+            self._begin(lockstep, state)
             await lockstep.answered()
             return
         scan, answered = await self._newest_scan(), False
         while not answered:
             if scan:
                 self._sensors.append((SCAN, scan))
-            self._announce(state)
-            lockstep.begin(self._gate.tick, self._round_trip.scan_tick)
+            self._begin(lockstep, state)
             answered = await lockstep.wait(REPEAT_S)
+
+    def _begin(self, lockstep: Lockstep, state: RobotState) -> None:
+        """Announce the tick; on a network in memory the answers come before this returns."""
+        tick = self._gate.tick
+        with_scan = any(topic is SCAN for topic, _ in self._sensors)
+        lockstep.begin(tick, tick if with_scan else self._round_trip.scan_tick)
+        self._announce(state)
 
     async def _newest_scan(self) -> Message | None:
         return await self._driver.get_sensor_data("scan") if self._robot.lidar else None
