@@ -34,7 +34,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.limits import limits_of
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.safety.step import Inputs, Memory, step
+from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 
 BOOT, COMMANDER = 1, "blind"
 VERDICT_DELAY_TICKS = 2  # until a verdict of safety reaches the gate, as over a network
@@ -84,7 +84,7 @@ class SafetyTrack(_SimulatedBody):
         self.gate = gate.GateState(boot=BOOT)
         self.verdict = SafetyState(verdict="stop")
         self.sees: Sight = np.copy
-        self._memory, self._scan = Memory(), BLANK_SCAN
+        self._memory, self._scan = SafetyMemory(), BLANK_SCAN
         self._delayed: deque[SafetyState] = deque()
         self._asked = CmdVel(linear_x=0.0, source=COMMANDER)
         self.run(50)
@@ -116,7 +116,7 @@ class SafetyTrack(_SimulatedBody):
         """Run safety's step, and hand a verdict of two ticks ago to the gate."""
         tick = self.gate.tick
         seen = self._scan if self._scan.basis else None
-        inputs = Inputs(
+        inputs = SafetyInputs(
             state=replace(self.state(tick), gate=gate.status(self.gate)),
             scan=seen,
             scan_age_ns=(tick - seen.basis) * TICK_NS if seen else None,

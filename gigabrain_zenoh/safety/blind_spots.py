@@ -36,14 +36,14 @@ ANGLE_EPSILON_RAD = 1e-9
 Ranges = tuple[float, ...]  # (SECTORS,) [m], counter-clockwise from yaw 0
 
 
-class View(Struct, frozen=True):
+class PastView(Struct, frozen=True):
     """A scan, and the odometry pose of the body at that time."""
 
     pose: Pose
     scan: LaserScan
 
 
-Views = tuple[View, ...]  # oldest first; the last one is from the present pose
+PastViews = tuple[PastView, ...]  # oldest first; the last one is from the present pose
 
 
 def update(
@@ -93,7 +93,7 @@ def obstacles(
     nearest: Ranges,
     unknown: tuple[int, ...],
     housing_m: float,
-    past: Views,
+    past: PastViews,
 ) -> Floats:
     """Return points (n, 2) [m] in the body's frame that stand for the `unknown` sectors.
 
@@ -123,7 +123,7 @@ def obstacles(
     return found
 
 
-def remember(views: Views, body: BodyDescription, pose: Pose, scan: LaserScan) -> Views:
+def remember(views: PastViews, body: BodyDescription, pose: Pose, scan: LaserScan) -> PastViews:
     """Return the views with a new one at `pose`; none if the scan covers the full circle."""
     if abs(scan.angle_increment) * len(ranges(scan)) > math.tau - MIN_GAP_RAD:
         return ()
@@ -136,7 +136,7 @@ def remember(views: Views, body: BodyDescription, pose: Pose, scan: LaserScan) -
         for view in views
         if scan.basis - view.scan.basis <= MAX_AGE_TICKS and _cell(view.pose, outer) != here
     )
-    return (*kept, View(pose, scan))[-MAX_VIEWS:]
+    return (*kept, PastView(pose, scan))[-MAX_VIEWS:]
 
 
 def _distance(a: Pose, b: Pose, outer: float) -> float:
@@ -150,7 +150,7 @@ def _cell(pose: Pose, outer: float) -> tuple[int, ...]:
 
 
 def known_free(
-    body: BodyDescription, lidar: Lidar, housing_m: float, views: Views, points: Floats
+    body: BodyDescription, lidar: Lidar, housing_m: float, views: PastViews, points: Floats
 ) -> NDArray[np.bool_]:
     """Return which of `points` (n, 2) [m], in the body's present frame, are known to be free."""
     found, asked = np.zeros(len(points), bool), np.arange(len(points))

@@ -1,154 +1,122 @@
-"""What safety can find: a code for programs, a sentence and advice for people."""
+"""Causes and warnings that safety can find, and for how long a fault must last to count."""
+
+import math
 
 from msgspec.structs import replace
 
-from gigabrain_schemas.base import Cause
+from gigabrain_schemas.base import TICK_NS, Cause
 
-LIDAR = "look at the lidar's power and cable"
-MAKE_ROOM = "turn or back away, or clear the way"
-AGAIN = "then release the robot"
+MAX_STEP_TICKS = 5  # a sample after a longer gap counts for no more than this
 
 
-def _silent(name: str) -> Cause:
-    return Cause(
-        code=f"{name}_silent",
-        text=f"{name} is silent",
-        remedy=f"start {name}, or read its log to see why it is silent",
-    )
+def _causes(*rows: tuple[str, str, str], latching: bool = False) -> dict[str, Cause]:
+    """Return causes by code; a row has the code, the text and the remedy."""
+    return {
+        code: Cause(code=code, text=text, remedy=remedy, latching=latching)
+        for code, text, remedy in rows
+    }
 
 
-def _zone(code: str, where: str) -> Cause:
-    return Cause(code=f"zone_{code}", text=f"obstacle {where}", remedy=MAKE_ROOM)
+_CHECK_LIDAR = "check the lidar's power and cable"
+_MAKE_ROOM = "turn or back away, or clear the way"
+_CLOSE_PROGRAMS = "close programs that need not run on it"
 
+CAUSES = _causes(
+    ("starting", "safety is starting", "wait for the second scan"),
+    ("scan_lost", "no scan for too long", _CHECK_LIDAR),
+    (
+        "scan_blind",
+        "the scan is not plausible",
+        "clean and uncover the lidar, or move the robot to where it sees walls",
+    ),
+    *(
+        (f"{name}_silent", f"{name} is silent", f"start {name}, or read its log")
+        for name in ("perception", "decision", "control")
+    ),
+    (
+        "battery_unknown",
+        "the battery's charge is no longer measured",
+        "check the battery's sensor and its cable",
+    ),
+    (
+        "motor_unknown",
+        "a motor's temperature is no longer measured",
+        "check that motor and its cable",
+    ),
+    (
+        "not_following",
+        "the body moves less than commanded",
+        "check whether something holds it; check its motors and encoders",
+    ),
+    (
+        "stuck",
+        "the body does not move although it is commanded to",
+        "find what holds it, and free it",
+    ),
+    (
+        "telemetry_frozen",
+        "the body repeats the same values although it should move",
+        "check its link, then restart its controller or push it until a value changes",
+    ),
+    (
+        "round_trip",
+        "commands take too long; half speed",
+        "move the operator nearer, or relieve the network or the computer",
+    ),
+    (
+        "body_late",
+        "the body's data are late",
+        "check its cable, its network and the computer's load",
+    ),
+    (
+        "lidar_late",
+        "the lidar's data are late",
+        "check its cable, its adapter and the computer's load",
+    ),
+    ("zone_ahead", "obstacle ahead of the body", _MAKE_ROOM),
+    ("zone_behind", "obstacle behind the body", _MAKE_ROOM),
+    ("zone_left", "obstacle to the left of the body", _MAKE_ROOM),
+    ("zone_right", "obstacle to the right of the body", _MAKE_ROOM),
+    ("zone_turn_left", "obstacle where the body would turn left", _MAKE_ROOM),
+    ("zone_turn_right", "obstacle where the body would turn right", _MAKE_ROOM),
+) | _causes(
+    ("battery_empty", "the battery is empty", "charge it, then release the robot"),
+    ("motor_hot", "a motor is too hot", "let it cool, then release the robot"),
+    (
+        "runaway",
+        "the body moves or turns more than commanded",
+        "cut its power if it still moves; check motors and encoders, then release the robot",
+    ),
+    ("tilted", "the body is tilted too far", "set it upright, then release the robot"),
+    (
+        "collision",
+        "the body has hit something",
+        "find what it has hit, free it, then release the robot",
+    ),
+    latching=True,
+)
 
-CAUSES: dict[str, Cause] = {
-    one.code: one
-    for one in (
-        Cause(
-            code="starting",
-            text="safety has only just begun to look",
-            remedy="wait for the second scan",
-        ),
-        Cause(code="scan_lost", text="no scan has come for too long", remedy=LIDAR),
-        Cause(
-            code="scan_blind",
-            text="the scan cannot be believed",
-            remedy="clean and uncover the lidar, or move the robot to where it sees walls",
-        ),
-        _silent("perception"),
-        _silent("decision"),
-        _silent("control"),
-        Cause(
-            code="battery_empty",
-            text="the battery is empty",
-            remedy=f"charge it, {AGAIN}",
-            latching=True,
-        ),
-        Cause(
-            code="battery_unknown",
-            text="the battery's charge is no longer measured",
-            remedy="look at the battery's sensor and its cable",
-        ),
-        Cause(
-            code="motor_hot",
-            text="a motor is too hot",
-            remedy=f"let it cool, {AGAIN}",
-            latching=True,
-        ),
-        Cause(
-            code="motor_unknown",
-            text="a motor's temperature is no longer measured",
-            remedy="look at that motor and its cable",
-        ),
-        Cause(
-            code="runaway",
-            text="the body moves or turns more than it was told",
-            remedy=f"cut its power if it still moves, look at motors and encoders, {AGAIN}",
-            latching=True,
-        ),
-        Cause(
-            code="not_following",
-            text="the body moves less than it was told",
-            remedy="look whether something holds it, at its motors and its encoders",
-        ),
-        Cause(
-            code="stuck",
-            text="the body does not move although it was told to",
-            remedy="see what holds it, and free it",
-        ),
-        Cause(
-            code="telemetry_frozen",
-            text="the body repeats the same values although it should move",
-            remedy="look at its link, then restart its controller or push it until a value changes",
-        ),
-        Cause(
-            code="tilted",
-            text="the body is tilted too far",
-            remedy=f"set it upright, {AGAIN}",
-            latching=True,
-        ),
-        Cause(
-            code="collision",
-            text="the body has hit something",
-            remedy=f"see what it has hit, free it, {AGAIN}",
-            latching=True,
-        ),
-        Cause(
-            code="round_trip",
-            text="commands take too long; half speed",
-            remedy="bring whoever drives nearer, or relieve the network or the computer",
-        ),
-        Cause(
-            code="body_late",
-            text="what the body reports is late",
-            remedy="look at its cable, its network and how busy the computer is",
-        ),
-        Cause(
-            code="lidar_late",
-            text="what the lidar reports is late",
-            remedy="look at its cable, its adapter and how busy the computer is",
-        ),
-        _zone("ahead", "ahead of the body"),
-        _zone("behind", "behind the body"),
-        _zone("left", "to the left of the body"),
-        _zone("right", "to the right of the body"),
-        _zone("turn_left", "where the body would turn left"),
-        _zone("turn_right", "where the body would turn right"),
-    )
-}
-
-WARNINGS: dict[str, Cause] = {
-    one.code: one
-    for one in (
-        Cause(code="battery_low", text="the battery is low", remedy="charge it soon"),
-        Cause(
-            code="battery_return",
-            text="the battery is nearly empty; the robot comes to rest",
-            remedy="charge it now",
-        ),
-        Cause(
-            code="motor_warm", text="a motor is warm", remedy="drive more gently, or let it rest"
-        ),
-        Cause(
-            code="disk_low",
-            text="the disk is nearly full",
-            remedy="delete old recordings and logs",
-        ),
-        Cause(
-            code="cpu_busy",
-            text="the computer has no time to spare",
-            remedy="end what need not run on it",
-        ),
-        Cause(
-            code="memory_low",
-            text="the computer's memory is nearly full",
-            remedy="end what need not run on it",
-        ),
-    )
-}
+WARNINGS = _causes(
+    ("battery_low", "the battery is low", "charge it soon"),
+    ("battery_return", "the battery is nearly empty; the robot comes to rest", "charge it now"),
+    ("motor_warm", "a motor is warm", "drive more gently, or let it rest"),
+    ("disk_low", "the disk is nearly full", "delete old recordings and logs"),
+    ("cpu_busy", "the computer is overloaded", _CLOSE_PROGRAMS),
+    ("memory_low", "the computer's memory is nearly full", _CLOSE_PROGRAMS),
+)
 
 
 def cause(code: str, text: str = "") -> Cause:
-    """The cause or warning called `code`, with figures in its sentence where there are any."""
+    """Return the cause or warning `code`; `text`, for example with figures, replaces its own."""
     known = CAUSES.get(code) or WARNINGS[code]
     return replace(known, text=text) if text else known
+
+
+def ticks_of(seconds: float) -> int:
+    """Return the whole ticks that last at least `seconds`."""
+    return math.ceil(seconds * 1e9 / TICK_NS - 1e-9)
+
+
+def lasting(ticks: int, wrong: bool, elapsed: int) -> int:
+    """Return the count of ticks for which a fault has lasted without a break."""
+    return ticks + elapsed if wrong else 0

@@ -1,16 +1,22 @@
-"""Monitors of the machine: battery, motors, attitude and bumpers, and the computer's resources."""
+"""Monitors of the body, of the computer, and of the brain's processes.
+
+Each process must answer the one before it: a world per scan, an intent per world, a command per
+intent. A process that only repeats itself counts as silent.
+"""
 
 import math
 import statistics
 
 from msgspec import Struct
-from msgspec.structs import replace
+from msgspec.structs import astuple, replace
 
-from gigabrain_schemas.base import Cause
-from gigabrain_schemas.body import Battery, RobotState, Thresholds
+from gigabrain_schemas.base import TICK_NS, Cause
+from gigabrain_schemas.body import Battery, BodyDescription, RobotState, Thresholds
+from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import Accelerations, Quaternion
-from gigabrain_zenoh.safety.catalogue import cause
-from gigabrain_zenoh.safety.debounce import lasting, ticks_of
+from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.host.bounded import percentile
+from gigabrain_zenoh.safety.catalogue import cause, lasting, ticks_of
 
 CONFIRM_STATES = 3  # in a row that measure something, before the body counts as measuring it
 MEDIAN_STATES = 25  # of charges; the median of 0.5 s ignores a sag of 0.2 s
@@ -18,7 +24,11 @@ CLEAR_PERCENT, CLEAR_DEG_C = 2.0, 2.0  # hysteresis of the thresholds
 MIN_DEG_C, MAX_DEG_C = -40.0, 150.0  # beyond these a motor's sensor is faulty
 TILT_TICKS = 10  # 0.2 s, longer than a bump in the floor
 UNIT_TOLERANCE = 0.1  # of the length of an orientation quaternion
-HOST_CODES = ("disk_low", "cpu_busy", "memory_low")
+SYSTEMS = ("perception", "decision", "control")
+MAX_AGES = 100  # of the newest commands, two seconds
+AGE_PERCENTILE = 0.99
+HALF_SPEED = 0.5
+HOST_CODES = ("disk_low", "cpu_busy", "memory_low")  # depend on the computer, not on messages
 
 
 class Measured(Struct, frozen=True):
@@ -201,3 +211,85 @@ class Host(Struct, frozen=True, kw_only=True):
         if self.memory is not None and self.memory > limits.memory_warn:
             found.append(cause("memory_low"))
         return tuple(found)
+
+
+class Bases(Struct, frozen=True, kw_only=True):
+    """Ticks of the sensor data that the newest messages rest on; 0 for none."""
+
+    scan: int = 0
+    world: int = 0
+    intent: int = 0
+    command: int = 0
+
+
+class PipelineProgress(Struct, frozen=True, kw_only=True):
+    """Monitors whether each system answers the one before it."""
+
+    bases: Bases = Bases()
+    behind_ticks: tuple[int, int, int] = (0, 0, 0)  # since the last progress of each system
+
+    def then(self, bases: Bases, elapsed: int) -> "PipelineProgress":
+        """Return the monitor after one more state."""
+        now, last = astuple(bases), astuple(self.bases)
+        perception, decision, control = (
+            lasting(ticks, now[i + 1] < now[i] and now[i + 1] == last[i + 1], elapsed)
+            for i, ticks in enumerate(self.behind_ticks)
+        )
+        return PipelineProgress(bases=bases, behind_ticks=(perception, decision, control))
+
+    def causes(
+        self, limits: Thresholds, state: RobotState, silent: tuple[str, ...], *, first: bool
+    ) -> tuple[Cause, ...]:
+        """Return why the body must stop; `silent` names the systems without fresh messages.
+
+        The brain matters only while it drives, or may drive next. If nobody drives and all three
+        systems are silent, there is no brain, and a script need not wait for one. With the `first`
+        scan that cannot be known yet.
+        """
+        commander = state.gate.commander
+        brainless = not commander and len(silent) == len(SYSTEMS) and not first
+        if commander not in ("", BRAIN) or brainless:
+            return ()
+        found = [cause(f"{name}_silent") for name in silent]
+        for name, ticks in zip(SYSTEMS, self.behind_ticks, strict=True):
+            if name not in silent and ticks >= ticks_of(limits.heartbeat):
+                found.append(cause(f"{name}_silent", f"{name} does not react to new data"))
+        return tuple(found)
+
+
+class RoundTrip(Struct, frozen=True, kw_only=True):
+    """Monitors the age of commands: from the tick that they echo to their arrival."""
+
+    ages: tuple[int, ...] = ()  # of the newest commands [ticks]
+    late_ticks: int = 0
+
+    def then(self, limits: Thresholds, ages: tuple[int, ...], elapsed: int) -> "RoundTrip":
+        """Return the monitor after one more state, with the ages of new commands [ticks]."""
+        newest = (*self.ages, *ages)[-MAX_AGES:]
+        slowest = percentile(sorted(newest), AGE_PERCENTILE) or 0
+        late = slowest * TICK_NS > limits.round_trip * 1e9
+        return RoundTrip(ages=newest, late_ticks=lasting(self.late_ticks, late, elapsed))
+
+    def causes(self, limits: Thresholds) -> tuple[Cause, ...]:
+        """Return why the body must go at half speed."""
+        if self.late_ticks < ticks_of(limits.round_trip_sustain):
+            return ()
+        text = f"commands take more than {limits.round_trip * 1e3:.0f} ms"
+        return (cause("round_trip", text),)
+
+
+def halved(body: BodyDescription, caps: SpeedCaps) -> SpeedCaps:
+    """Return `caps`, limited to half the body's speed in each direction."""
+
+    def least(cap: float | None, most: float) -> float:
+        return HALF_SPEED * most if cap is None else min(cap, HALF_SPEED * most)
+
+    return SpeedCaps(
+        forward=least(caps.forward, body.max_linear_speed),
+        backward=least(caps.backward, body.max_linear_speed),
+        left=least(caps.left, body.max_lateral_speed),
+        right=least(caps.right, body.max_lateral_speed),
+        rotation=least(caps.rotation, body.max_angular_speed),
+        turn_left=caps.turn_left,
+        turn_right=caps.turn_right,
+    )

@@ -19,8 +19,7 @@ from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import PoseHistory
-from gigabrain_zenoh.safety.catalogue import cause
-from gigabrain_zenoh.safety.debounce import lasting, ticks_of
+from gigabrain_zenoh.safety.catalogue import cause, lasting, ticks_of
 
 Speeds = tuple[float, float, float]
 

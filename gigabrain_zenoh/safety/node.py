@@ -1,4 +1,4 @@
-"""The safety process: a verdict per scan and per second state, and at once when it changes."""
+"""Safety node: a verdict per scan and per second state, and at once when it changes."""
 
 import logging
 import shutil
@@ -39,9 +39,8 @@ from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.stopping import REPEAT_TICKS, scan_limit_ns
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime.heartbeat import Progress
-from gigabrain_zenoh.safety.health import Host, horizontal
-from gigabrain_zenoh.safety.pipeline import SYSTEMS, Bases
-from gigabrain_zenoh.safety.step import Inputs, Memory, step
+from gigabrain_zenoh.safety.health import SYSTEMS, Bases, Host, horizontal
+from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 
 HOST_PERIOD_NS = 1_000_000_000
 HOST_SAMPLES = 10  # of the CPU share, averaged over ten seconds
@@ -50,28 +49,28 @@ log = logging.getLogger("gigabrain_zenoh.safety")
 
 async def run(bus: Bus, ready: Callable[[], None], probe: "HostProbe | None" = None) -> None:
     """Publish verdicts until the process ends; `probe` reads the computer's resources."""
-    memory, said, said_tick = Memory(), SafetyState(verdict="stop"), 0
+    memory, last, last_tick = SafetyMemory(), SafetyState(verdict="stop"), 0
 
     def judge(_: Message) -> None:
-        nonlocal memory, said, said_tick
-        body = inputs_of.bodies.current
-        inputs = inputs_of.inputs(body.description) if body else None
+        nonlocal memory, last, last_tick
+        body = collector.bodies.current
+        inputs = collector.inputs(body.description) if body else None
         if body is None or inputs is None:
             return
         before, state = memory, inputs.state
         memory, verdict = step(body.description, memory, inputs)
-        due = state.tick - said_tick >= REPEAT_TICKS or state.boot != before.boot
+        due = state.tick - last_tick >= REPEAT_TICKS or state.boot != before.boot
         new = memory.field.basis != before.field.basis
-        if due or new or _differs(verdict, said):
-            _tell(state, said, verdict)
+        if due or new or _differs(verdict, last):
+            _log_changes(state, last, verdict)
             basis = memory.field.basis
-            said, said_tick = bus.publish(SAFETY, verdict, basis=basis), state.tick
+            last, last_tick = bus.publish(SAFETY, verdict, basis=basis), state.tick
 
-    def came() -> tuple[object, ...]:
-        return (bus.arrived.get(STATE.key),) if inputs_of.bodies.current else ()
+    def received() -> tuple[object, ...]:
+        return (bus.arrived.get(STATE.key),) if collector.bodies.current else ()
 
-    inputs_of = InputCollector(bus, judge, probe or HostWatch(state_dir()).now)
-    bus.progress = Progress(came, lambda: bus.sent[SAFETY.key])
+    collector = InputCollector(bus, judge, probe or HostMonitor(state_dir()).read)
+    bus.progress = Progress(received, lambda: bus.sent[SAFETY.key])
     ready()
     await bus.failed
 
@@ -80,11 +79,8 @@ def _differs(now: SafetyState, before: SafetyState) -> bool:
     return (now.causes, now.caps) != (before.causes, before.caps)
 
 
-def _tell(state: RobotState, before: SafetyState, now: SafetyState) -> None:
-    """Log each cause and warning once when it begins and once when it ends.
-
-    Not while all is starting.
-    """
+def _log_changes(state: RobotState, before: SafetyState, now: SafetyState) -> None:
+    """Log causes and warnings that begin or end, from the first enable on."""
     if not state.gate.enables:
         return
     level = logging.WARNING if now.verdict == "stop" else logging.INFO
@@ -107,48 +103,44 @@ def _log(level: int, text: str, event: str, causes: tuple[Cause, ...]) -> None:
     log.log(level, "%s", text, extra={"data": data})
 
 
-HostProbe = Callable[
-    [int], Host
-]  # what the computer has left at a time of the monotonic clock [ns]
+HostProbe = Callable[[int], Host]  # takes the monotonic time [ns]
 
 
-class HostWatch:
-    """HostProbes at the computer once a second at most; about 0.2 ms each time.
+class HostMonitor:
+    """Reads the computer's resources once a second at most, in about 0.2 ms.
 
-    `folder` is on the disk that counts: with logs, maps and the latch. A disk may hang,
-    so it is asked in a thread; what it said last holds until it answers.
+    `folder` is on the disk with logs, maps and the latch. A disk may hang, so it is read in a
+    thread; the last value stays until the next one arrives.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._disk_mb: float | None = None
-        self._asking: threading.Thread | None = None
+        self._reader: threading.Thread | None = None
         self._next_ns = 0
-        self._busy: deque[float] = deque(
-            maxlen=HOST_SAMPLES
-        )  # [%] of all cores, since the look before
-        psutil.cpu_percent()  # from now on
+        self._busy: deque[float] = deque(maxlen=HOST_SAMPLES)  # [%] of all cores, one a second
+        psutil.cpu_percent()  # starts its first interval
         self._host = Host()
 
-    def now(self, now_ns: int) -> Host:
-        """What it has left at this time of the monotonic clock."""
+    def read(self, now_ns: int) -> Host:
+        """Return the resources at monotonic time `now_ns`, at most a second old."""
         if now_ns >= self._next_ns:
             self._next_ns = now_ns + HOST_PERIOD_NS
-            if self._asking is None or not self._asking.is_alive():
-                self._asking = threading.Thread(target=self._ask, name="disk", daemon=True)
-                self._asking.start()
+            if self._reader is None or not self._reader.is_alive():
+                self._reader = threading.Thread(target=self._read_disk, name="disk", daemon=True)
+                self._reader.start()
             self._busy.append(psutil.cpu_percent())
             cpu = sum(self._busy) / HOST_SAMPLES if len(self._busy) == HOST_SAMPLES else None
             memory = psutil.virtual_memory().percent
             self._host = Host(disk_mb=self._disk_mb, cpu=cpu, memory=memory)
         return self._host
 
-    def _ask(self) -> None:
-        self._disk_mb = _disk_mb(self._folder)
+    def _read_disk(self) -> None:
+        self._disk_mb = _free_mb(self._folder)
 
 
-def _disk_mb(folder: Path) -> float | None:
-    """Free space where the folder is, or will be once something is written."""
+def _free_mb(folder: Path) -> float | None:
+    """Return the free space [MB] on the disk of a folder that may not exist yet."""
     for place in (folder, *folder.parents):
         try:
             return shutil.disk_usage(place).free / 1e6
@@ -159,49 +151,51 @@ def _disk_mb(folder: Path) -> float | None:
     return None
 
 
-# what nobody else listens to yet, so that what is bad on these keys is counted all the same
-OVERHEARD: tuple[Topic[Any], ...] = (IMAGE, POSE, MAP, HEALTH, LOG)
-MOST = 256  # what is kept between two states, however much is sent
-WORLD_MARGIN_NS = 50_000_000  # how much later than a scan its world may come
+# subscribed only so that invalid messages on topics without another subscriber are counted
+COUNTED_TOPICS: tuple[Topic[Any], ...] = (IMAGE, POSE, MAP, HEALTH, LOG)
+MAX_KEPT = 256  # messages between two states
+WORLD_MARGIN_NS = 50_000_000  # added to the limit for scans: a world comes after its scan
 
 
 class InputCollector:
-    """Keeps the newest of everything; `on_new` is called with each state and each scan."""
+    """Keeps the newest messages; calls `on_new` with each state and each scan."""
 
     def __init__(self, bus: Bus, on_new: Callable[[Message], None], probe: HostProbe) -> None:
         self._bus, self._probe = bus, probe
         self._by_commander: dict[str, PreviousTick[CmdVel]] = {}
         # age [ticks] and source; tick, and horizontal acceleration [m/s2]
-        self._echoes: deque[tuple[int, str]] = deque(maxlen=MOST)
-        self._shocks: deque[tuple[int, float]] = deque(maxlen=MOST)
+        self._echoes: deque[tuple[int, str]] = deque(maxlen=MAX_KEPT)
+        self._shocks: deque[tuple[int, float]] = deque(maxlen=MAX_KEPT)
         self._commands = Latest(CMD_VEL, bus.clock, bus.time)  # the brain's
-        self._obeyed, self._end_hearing = CMD_VEL.key, _nothing
-        self.bodies = bus.latest(BODY, self._hear_body)
+        self._command_key, self._unsubscribe = CMD_VEL.key, _nothing
+        self.bodies = bus.latest(BODY, self._on_body)
         self._states = bus.latest(STATE, on_new)
         self._scans = bus.latest(SCAN, on_new)
-        bus.subscribe(CMD_VEL, self._hear_command)
-        bus.subscribe(IMU, self._hear_imu)
-        for topic in OVERHEARD:
+        bus.subscribe(CMD_VEL, self._on_command)
+        bus.subscribe(IMU, self._on_imu)
+        for topic in COUNTED_TOPICS:
             bus.subscribe(topic, lambda _key, _message: None)
         self._worlds, self._intents = bus.latest(WORLD), bus.latest(INTENT)
 
-    def inputs(self, body: BodyDescription) -> Inputs | None:
-        """What safety goes by now.
+    def inputs(self, body: BodyDescription) -> SafetyInputs | None:
+        """Return the present inputs; None without a state.
 
-        None while there is no state, or while a scan has come of a tick whose state is on its way.
+        None too after a scan of a tick whose state has not arrived yet.
         """
         state = self._states.fresh()
         if state is None or state.tick < self._bus.time.tick:
             return None
         commander = state.gate.commander
-        heard = self._by_commander.get(commander)
-        return Inputs(
+        received = self._by_commander.get(commander)
+        return SafetyInputs(
             state=state,
             scan=self._scans.current,
             scan_age_ns=self._scans.age_ns(),
             silent=self._silent(body),
             bases=self._bases(),
-            command=heard.at(state.boot, state.tick, STATE.stale_after_ns) if heard else None,
+            command=(
+                received.at(state.boot, state.tick, STATE.stale_after_ns) if received else None
+            ),
             echo_ages=self._echo_ages(commander),
             shock=self._shock(state),
             host=self._probe(self._bus.clock.now_ns()),
@@ -234,38 +228,41 @@ class InputCollector:
         return ages
 
     def _shock(self, state: RobotState) -> float:
-        """The hardest before this tick; what comes with it may be quicker or slower than it."""
+        """Return the hardest shock before this tick; keep later ones for the next call.
+
+        A message of the same tick may arrive before or after the state.
+        """
         shock = max((value for tick, value in self._shocks if tick < state.tick), default=0.0)
         later = [(tick, value) for tick, value in self._shocks if tick >= state.tick]
-        self._shocks = deque(later, maxlen=MOST)
+        self._shocks = deque(later, maxlen=MAX_KEPT)
         return shock
 
-    def _hear_command(self, _key: str, command: CmdVel) -> None:
+    def _on_command(self, _key: str, command: CmdVel) -> None:
         if command.source == BRAIN:
             self._commands.take(command)
         state = self._states.current
         if state and command.source == state.gate.commander:
-            if command.source not in self._by_commander:  # who has driven before drives no more
+            if command.source not in self._by_commander:  # forget the last commander
                 self._by_commander = {command.source: PreviousTick()}
             self._by_commander[command.source].receive(command)
         if command.boot == self._bus.time.boot:
             self._echoes.append((max(0, self._bus.time.tick - command.tick), command.source))
 
-    def _hear_imu(self, _key: str, imu: Imu) -> None:
+    def _on_imu(self, _key: str, imu: Imu) -> None:
         time = self._bus.time
         if imu.boot == time.boot and imu.tick <= time.tick + LEAD_TICKS:
             self._shocks.append((imu.tick, horizontal(imu.linear_acceleration)))
 
-    def _hear_body(self, body: Body) -> None:
-        """Listen to what its driver obeys, besides the usual topic; to one such at a time."""
+    def _on_body(self, body: Body) -> None:
+        """Subscribe to the topic that the body's driver obeys, if it is not the usual one."""
         topic = command_topic(body.description)
-        if topic.key == self._obeyed:
+        if topic.key == self._command_key:
             return
-        self._end_hearing()
-        self._obeyed, self._end_hearing = topic.key, _nothing
+        self._unsubscribe()
+        self._command_key, self._unsubscribe = topic.key, _nothing
         if topic.key != CMD_VEL.key:
-            self._end_hearing = self._bus.subscribe(topic, self._hear_command)
+            self._unsubscribe = self._bus.subscribe(topic, self._on_command)
 
 
 def _nothing() -> None:
-    """End what has never begun."""
+    """Stand for an unsubscribe function where there is no subscription."""

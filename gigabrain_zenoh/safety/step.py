@@ -1,4 +1,4 @@
-"""One verdict of all monitors. A pure function; their state is in Memory."""
+"""One verdict of all monitors. A pure function; their state is in SafetyMemory."""
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -11,19 +11,25 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO
 from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
-from gigabrain_zenoh.safety.catalogue import cause
-from gigabrain_zenoh.safety.debounce import MAX_STEP_TICKS
-from gigabrain_zenoh.safety.health import Attitude, Host, Power
+from gigabrain_zenoh.safety.catalogue import MAX_STEP_TICKS, cause
+from gigabrain_zenoh.safety.health import (
+    Attitude,
+    Bases,
+    Host,
+    PipelineProgress,
+    Power,
+    RoundTrip,
+    halved,
+)
 from gigabrain_zenoh.safety.latency import DataLatency
-from gigabrain_zenoh.safety.pipeline import Bases, Progress, RoundTrip, halved
 from gigabrain_zenoh.safety.tracking_error import TrackingError, requested
-from gigabrain_zenoh.safety.zones import Field, Motion
+from gigabrain_zenoh.safety.zones import Motion, ProtectiveField
 
 SCANS_TO_START = 2  # by the second, the answer to the first has arrived, however slow
 
 
-class Inputs(Struct, frozen=True, kw_only=True):
-    """Inputs of one verdict."""
+class SafetyInputs(Struct, frozen=True, kw_only=True):
+    """SafetyInputs of one verdict."""
 
     state: RobotState
     scan: LaserScan | None = None  # newest of this boot, however old
@@ -36,7 +42,7 @@ class Inputs(Struct, frozen=True, kw_only=True):
     host: Host = Host()
 
 
-class Memory(Struct, frozen=True, kw_only=True):
+class SafetyMemory(Struct, frozen=True, kw_only=True):
     """State from tick to tick."""
 
     boot: int = 0
@@ -47,16 +53,18 @@ class Memory(Struct, frozen=True, kw_only=True):
     tracking: TrackingError = TrackingError()
     round_trip: RoundTrip = RoundTrip()
     latency: DataLatency = DataLatency()
-    progress: Progress = Progress()
+    progress: PipelineProgress = PipelineProgress()
     history: PoseHistory = PoseHistory()
-    field: Field = Field()
+    field: ProtectiveField = ProtectiveField()
 
 
-def step(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Memory, SafetyState]:
+def step(
+    body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs
+) -> tuple[SafetyMemory, SafetyState]:
     """Return the verdict. Repeated within a tick, it changes only by new inputs."""
     state, limits = inputs.state, body.thresholds
     if state.boot != memory.boot:  # the driver has restarted
-        memory = Memory(boot=state.boot, tick=state.tick, tracking=TrackingError.start(state))
+        memory = SafetyMemory(boot=state.boot, tick=state.tick, tracking=TrackingError.start(state))
     memory = _observe(body, memory, inputs)
     stop = _stop_causes(body, memory, inputs)
     slow = (*memory.round_trip.causes(limits), *memory.latency.slow_causes(body))
@@ -72,7 +80,7 @@ def step(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Memory,
     return replace(memory, caps=caps), verdict
 
 
-def _observe(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
+def _observe(body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs) -> SafetyMemory:
     """Update every monitor."""
     state, limits, command = inputs.state, body.thresholds, inputs.command
     elapsed = min(max(0, state.tick - memory.tick), MAX_STEP_TICKS)
@@ -86,7 +94,7 @@ def _observe(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
         commanded=tracking.commanded,
         requested=requested(wanted) if wanted else ZERO,
     )
-    return Memory(
+    return SafetyMemory(
         boot=memory.boot,
         tick=state.tick,
         caps=memory.caps,
@@ -101,7 +109,9 @@ def _observe(body: BodyDescription, memory: Memory, inputs: Inputs) -> Memory:
     )
 
 
-def _stop_causes(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause, ...]:
+def _stop_causes(
+    body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs
+) -> tuple[Cause, ...]:
     limits, state, scans = body.thresholds, inputs.state, memory.field.scans
     first = 0 < scans < SCANS_TO_START
     return (
@@ -115,7 +125,9 @@ def _stop_causes(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple
     )
 
 
-def _scan_causes(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple[Cause, ...]:
+def _scan_causes(
+    body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs
+) -> tuple[Cause, ...]:
     """Require a recent, plausible scan, by its arrival and by its own tick.
 
     A scan with a future tick is ignored, and does not hide that none has come.
@@ -132,7 +144,7 @@ def _scan_causes(body: BodyDescription, memory: Memory, inputs: Inputs) -> tuple
     return (cause("scan_blind", field.problem),) if field.problem else ()
 
 
-def _future_scan(inputs: Inputs) -> str:
+def _future_scan(inputs: SafetyInputs) -> str:
     scan, tick = inputs.scan, inputs.state.tick
     if scan is None or scan.basis <= tick:
         return ""

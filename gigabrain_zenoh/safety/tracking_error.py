@@ -14,8 +14,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import ImuData
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of, ramp
-from gigabrain_zenoh.safety.catalogue import cause
-from gigabrain_zenoh.safety.debounce import lasting, ticks_of
+from gigabrain_zenoh.safety.catalogue import cause, lasting, ticks_of
 
 WINDOW_TICKS = 15  # 0.3 s for the line to the body and back, and for its motors
 MAX_LATE_TICKS = 30  # added to that where data are known to be late

@@ -47,7 +47,7 @@ class Motion(Struct, frozen=True, kw_only=True):
         return max(0.0, _speed(self.measured, direction), _speed(self.commanded, direction))
 
 
-class Field(Struct, frozen=True, kw_only=True):
+class ProtectiveField(Struct, frozen=True, kw_only=True):
     """The newest scan's free distances, and the directions in which the body has stopped."""
 
     scans: int = 0  # processed so far
@@ -56,7 +56,7 @@ class Field(Struct, frozen=True, kw_only=True):
     free: Free = {}
     stopped: frozenset[str] = frozenset()
     sectors: blind_spots.Ranges = ()
-    past: blind_spots.Views = ()
+    past: blind_spots.PastViews = ()
 
     def then(
         self,
@@ -65,7 +65,7 @@ class Field(Struct, frozen=True, kw_only=True):
         state: RobotState,
         history: PoseHistory,
         motion: Motion,
-    ) -> "Field":
+    ) -> "ProtectiveField":
         """Return the field after a new scan, once the state of its tick has come.
 
         Zones depend on the speed at that tick. Until the next scan the speed caps keep the body

@@ -18,7 +18,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import ImuData
 from gigabrain_zenoh.safety.health import Host
-from gigabrain_zenoh.safety.step import Inputs, Memory, step
+from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 from gigabrain_zenoh.testing.samples import DRIVING, WAFFLE, open_space, scan, state
 
 BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.32))
@@ -40,7 +40,7 @@ class Patrol:
     def __init__(
         self, body: BodyDescription = BODY, values: NDArray[np.floating] | None = None
     ) -> None:
-        self.body, self.memory = body, Memory()
+        self.body, self.memory = body, SafetyMemory()
         self.tick, self.pose = 0, Pose(x=0.0, y=0.0, yaw=0.0)
         self.verdict = SafetyState(verdict="stop")
         self.state = state(0)
@@ -87,7 +87,7 @@ class Patrol:
             )
             seen = self.tick - self.tick % 5
             looked = scan(open_space() if values is None else values, seen)
-            inputs = Inputs(
+            inputs = SafetyInputs(
                 state=self.state,
                 scan=replace(looked, late_ms=scan_late_ms) if seen else None,
                 scan_age_ns=0,

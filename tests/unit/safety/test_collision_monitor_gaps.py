@@ -29,7 +29,7 @@ from gigabrain_schemas.topics import (
 from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.safety import node as safety
-from gigabrain_zenoh.safety.step import Inputs, step
+from gigabrain_zenoh.safety.step import SafetyInputs, step
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import body, open_space, scan, state
 from tests.unit.gate.rig import driving
@@ -80,7 +80,7 @@ def test_c_scans_of_ticks_to_come_do_not_hide_that_none_is_true() -> None:
     memory, found = Patrol().memory, []  # it has seen those of the ticks 5 and 10
     for tick in range(11, 41):
         future = scan(open_space(), tick + 1000)
-        inputs = Inputs(state=state(tick), scan=future, scan_age_ns=0)
+        inputs = SafetyInputs(state=state(tick), scan=future, scan_age_ns=0)
         memory, verdict = step(BODY, memory, inputs)
         found.append((tick, [cause.code for cause in verdict.causes]))
     assert [tick for tick, causes in found if "scan_lost" in causes] == list(range(23, 41))

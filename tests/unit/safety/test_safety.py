@@ -9,8 +9,8 @@ from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.gate.causes import BRAIN_SILENT
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
-from gigabrain_zenoh.safety.step import Inputs, Memory, step
-from gigabrain_zenoh.safety.zones import Field
+from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
+from gigabrain_zenoh.safety.zones import ProtectiveField
 from gigabrain_zenoh.testing.samples import DRIVING, LIDAR, WAFFLE, open_space, scan, state
 from tests.unit.gate.rig import plain
 
@@ -19,9 +19,9 @@ BODY = replace(WAFFLE, thresholds=Thresholds(reaction_time=0.32, stop_margin=0.0
 ALL = ("perception", "decision", "control")
 
 
-def begun(boot: int = 7) -> Memory:
+def begun(boot: int = 7) -> SafetyMemory:
     """It has looked at one scan already."""
-    return Memory(boot=boot, field=Field(scans=1))
+    return SafetyMemory(boot=boot, field=ProtectiveField(scans=1))
 
 
 def judge(
@@ -30,12 +30,12 @@ def judge(
     seen: LaserScan | None = None,
     age_ms: float | None = 0,
     silent: tuple[str, ...] = (),
-    memory: Memory | None = None,
+    memory: SafetyMemory | None = None,
     body: BodyDescription = BODY,
 ) -> SafetyState:
     """The verdict on one moment."""
     now = at or state(1)
-    inputs = Inputs(
+    inputs = SafetyInputs(
         state=now,
         scan=seen or scan(open_space()),
         scan_age_ns=None if age_ms is None else round(age_ms * MS),
@@ -65,10 +65,10 @@ class Watch:
         if behind is not None:
             values[180] = 0.200 + behind
         return self._judge(
-            Inputs(state=state(self.tick, v=v), scan=scan(values, self.tick), scan_age_ns=0)
+            SafetyInputs(state=state(self.tick, v=v), scan=scan(values, self.tick), scan_age_ns=0)
         )
 
-    def _judge(self, inputs: Inputs) -> SafetyState:
+    def _judge(self, inputs: SafetyInputs) -> SafetyState:
         self.memory, verdict = step(BODY, self.memory, inputs)
         return verdict
 
@@ -183,10 +183,12 @@ def test_a_zone_goes_by_the_speed_towards_it() -> None:
 
 def test_a_scan_waits_for_the_state_of_its_tick() -> None:
     near = open_space(deg_0=0.2)
-    memory, verdict = step(BODY, begun(), Inputs(state=state(4), scan=scan(near, 5), scan_age_ns=0))
+    memory, verdict = step(
+        BODY, begun(), SafetyInputs(state=state(4), scan=scan(near, 5), scan_age_ns=0)
+    )
     assert (memory.field.basis, memory.field.free, codes(verdict)) == (0, {}, ["starting"])
     memory, verdict = step(
-        BODY, memory, Inputs(state=state(5, v=0.2), scan=scan(near, 5), scan_age_ns=0)
+        BODY, memory, SafetyInputs(state=state(5, v=0.2), scan=scan(near, 5), scan_age_ns=0)
     )
     assert memory.field.basis == 5
     assert codes(verdict) == ["zone_ahead"]
@@ -194,8 +196,10 @@ def test_a_scan_waits_for_the_state_of_its_tick() -> None:
 
 def test_a_scan_is_judged_once_by_the_speed_of_its_own_time() -> None:
     seen = scan(open_space(deg_0=0.255), 1)  # 0.18 m free
-    memory, first = step(BODY, begun(), Inputs(state=state(1, v=0.2), scan=seen, scan_age_ns=0))
-    _, later = step(BODY, memory, Inputs(state=state(3, v=0.26), scan=seen, scan_age_ns=0))
+    memory, first = step(
+        BODY, begun(), SafetyInputs(state=state(1, v=0.2), scan=seen, scan_age_ns=0)
+    )
+    _, later = step(BODY, memory, SafetyInputs(state=state(3, v=0.26), scan=seen, scan_age_ns=0))
     assert codes(first) == codes(later) == []
     assert first.caps == later.caps  # which keep it from becoming faster than the zone allows
 
@@ -204,7 +208,7 @@ def test_a_blind_scan_says_nothing_of_the_room_ahead() -> None:
     watch = Watch()
     watch.sees(ahead=0.1, v=0.2)
     watch.tick += 1
-    inputs = Inputs(
+    inputs = SafetyInputs(
         state=state(watch.tick), scan=scan(np.full(360, np.nan), watch.tick), scan_age_ns=0
     )
     memory, verdict = step(BODY, watch.memory, inputs)
@@ -216,30 +220,30 @@ def test_a_new_start_of_the_driver_is_judged_afresh() -> None:
     watch = Watch()
     watch.sees(ahead=0.1, v=0.2)
     now = state(1, boot=8, battery=1.0)
-    memory, verdict = step(BODY, watch.memory, Inputs(state=now, scan_age_ns=None))
-    assert (memory.boot, memory.tick, memory.field) == (8, 1, Field())
+    memory, verdict = step(BODY, watch.memory, SafetyInputs(state=now, scan_age_ns=None))
+    assert (memory.boot, memory.tick, memory.field) == (8, 1, ProtectiveField())
     assert codes(verdict)[:2] == ["scan_lost", "starting"]
 
 
 def test_nothing_moves_before_the_second_scan() -> None:
-    memory, found = Memory(), []
+    memory, found = SafetyMemory(), []
     for tick in (1, 2, 5, 6):
         seen = scan(open_space(), 5 if tick >= 5 else 1)
-        inputs = Inputs(state=state(tick), scan=seen, scan_age_ns=0)
+        inputs = SafetyInputs(state=state(tick), scan=seen, scan_age_ns=0)
         memory, verdict = step(BODY, memory, inputs)
         found.append(codes(verdict))
     assert found == [["starting"], ["starting"], [], []]
     bare = replace(BODY, lidar=None)
-    assert step(bare, Memory(), Inputs(state=state(1)))[1] == SafetyState(verdict="ok")
+    assert step(bare, SafetyMemory(), SafetyInputs(state=state(1)))[1] == SafetyState(verdict="ok")
 
 
 def test_with_the_first_scan_it_is_told_who_has_not_been_heard_yet() -> None:
     """Later it is known whether there is a brain at all, which a script need not wait for."""
-    everybody, memory, found = ("perception", "decision", "control"), Memory(), []
+    everybody, memory, found = ("perception", "decision", "control"), SafetyMemory(), []
     for tick, basis in ((1, 0), (2, 2), (5, 2), (7, 7)):
         seen = scan(open_space(), basis) if basis else None
         now = state(tick, gate=GateStatus(mode="idle"))
-        inputs = Inputs(state=now, scan=seen, scan_age_ns=0, silent=everybody)
+        inputs = SafetyInputs(state=now, scan=seen, scan_age_ns=0, silent=everybody)
         memory, verdict = step(BODY, memory, inputs)
         found.append([code for code in codes(verdict) if code in BRAIN_SILENT])
     all_silent = [f"{name}_silent" for name in everybody]
@@ -249,7 +253,7 @@ def test_with_the_first_scan_it_is_told_who_has_not_been_heard_yet() -> None:
 def test_several_causes_stand_side_by_side() -> None:
     watch = Watch()
     watch.sees(ahead=0.05)
-    inputs = Inputs(
+    inputs = SafetyInputs(
         state=state(watch.tick + 1, gate=DRIVING), scan_age_ns=300 * MS, silent=("control",)
     )
     _, verdict = step(BODY, watch.memory, inputs)

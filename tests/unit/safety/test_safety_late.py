@@ -65,7 +65,7 @@ def test_a_lidar_whose_stamps_show_that_it_is_100_ms_late_is_named_and_halves_th
     assert patrol.ticks_until("lidar_late", 50, scan_late_ms=100.0) == 10
     assert patrol.verdict.verdict == "slow"
     assert patrol.verdict.caps.forward == 0.13
-    text = "what the lidar reports is late, by 100 ms; half speed"
+    text = "the lidar's data are late, by 100 ms; half speed"
     assert [cause.text for cause in patrol.verdict.causes] == [text]
     assert patrol.go() == []
 
@@ -98,7 +98,7 @@ def test_a_line_without_stamps_that_is_100_ms_late_is_named_within_a_second_of_m
     for to in (FAST, TURN):
         body = Follower(delay=8)
         assert body.drive(50, to) == ["body_late"]
-        assert body.texts == ["what the body reports is late, by 100 ms; half speed"]
+        assert body.texts == ["the body's data are late, by 100 ms; half speed"]
 
 
 def test_one_that_becomes_late_on_the_way_is_named_within_a_second_of_a_change_of_speed() -> None:
@@ -120,7 +120,7 @@ def test_one_that_becomes_late_while_it_goes_on_alike_is_doubted_for_its_silence
     assert body.texts == ["the body was silent for 90 ms, and may be late; half speed"]
     body.delay = 8
     assert body.drive(50, FAST) == ["body_late"]
-    assert body.texts == ["what the body reports is late, by 100 ms; half speed"]
+    assert body.texts == ["the body's data are late, by 100 ms; half speed"]
 
 
 def test_what_was_measured_before_a_silence_says_nothing_of_the_time_after_it() -> None:
@@ -132,7 +132,7 @@ def test_what_was_measured_before_a_silence_says_nothing_of_the_time_after_it() 
     body.delay = 8
     for _ in range(100):
         assert body.drive(1, FAST) == ["body_late"]
-    assert body.texts == ["what the body reports is late, by 100 ms; half speed"]
+    assert body.texts == ["the body's data are late, by 100 ms; half speed"]
 
 
 def test_one_that_is_slower_than_that_is_doubted_for_five_seconds() -> None:

@@ -12,7 +12,7 @@ from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.pose import PoseHistory
 from gigabrain_zenoh.safety import blind_spots
-from gigabrain_zenoh.safety.zones import Field, Motion
+from gigabrain_zenoh.safety.zones import Motion, ProtectiveField
 from gigabrain_zenoh.testing.samples import DRIVING, LIDAR, WAFFLE, scan, state
 
 BEAMS = 271  # a degree apart, from right behind on the right to right behind on the left
@@ -44,7 +44,7 @@ class Walker:
 
     def __init__(self, *posts: Post) -> None:
         self.posts, self.pose, self.tick = posts, Pose(x=0.0, y=0.0, yaw=0.0), 0
-        self.field, self.history, self.gate = Field(), PoseHistory(), DRIVING
+        self.field, self.history, self.gate = ProtectiveField(), PoseHistory(), DRIVING
         self.wait(0.2)
 
     def go(self, seconds: float, moves: Velocity) -> "Walker":
@@ -156,16 +156,16 @@ def test_whoever_looks_all_round_remembers_nothing() -> None:
     values = np.full(360, 2.0)
     values[100] = 2.5
     seen = scan(values, 5)
-    field = Field().then(body, seen, now, PoseHistory().then(now), motion)
+    field = ProtectiveField().then(body, seen, now, PoseHistory().then(now), motion)
     assert field.scans == 1
     assert field.past == ()
 
 
-def past(*scans: tuple[Pose, LaserScan]) -> blind_spots.Views:
+def past(*scans: tuple[Pose, LaserScan]) -> blind_spots.PastViews:
     """These looks, and one from the origin that looks at nothing that is asked for."""
     nothing = scan(np.full(2, np.nan), 99, angle_min=0.0, angle_increment=0.01)
     here = Pose(x=0.0, y=0.0, yaw=0.0), nothing
-    return tuple(blind_spots.View(*one) for one in (*scans, here))
+    return tuple(blind_spots.PastView(*one) for one in (*scans, here))
 
 
 def known(points: list[tuple[float, float]], *scans: tuple[Pose, LaserScan]) -> list[bool]:

@@ -191,7 +191,7 @@ async def test_a_cause_is_logged_once_when_it_begins_and_once_when_it_ends(
         await chain.go(50, alive=("perception", "control"))
         await chain.go(20)
     assert caplog.messages == [
-        "stop: decision is silent (start decision, or read its log to see why it is silent)",
+        "stop: decision is silent (start decision, or read its log)",
         "over: decision is silent",
     ]
 

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh.safety.health import Host, tilt_deg
-from gigabrain_zenoh.safety.node import HostWatch
+from gigabrain_zenoh.safety.node import HostMonitor
 from gigabrain_zenoh.testing.waiting import until
 from tests.unit.safety.patrol import BODY, Patrol, imu
 
@@ -94,9 +94,9 @@ def test_a_host_without_room_is_a_warning_and_no_more() -> None:
 SECONDS = itertools.count(1000)
 
 
-def disk_mb(watch: HostWatch) -> float:
+def disk_mb(watch: HostMonitor) -> float:
     """What it says a second later."""
-    return watch.now(next(SECONDS) * 1_100_000_000).disk_mb or 0.0
+    return watch.read(next(SECONDS) * 1_100_000_000).disk_mb or 0.0
 
 
 async def test_a_disk_that_hangs_holds_up_nothing(
@@ -112,9 +112,9 @@ async def test_a_disk_that_hangs_holds_up_nothing(
         return Usage(free=5_000_000)
 
     monkeypatch.setattr("shutil.disk_usage", disk_usage)
-    watch = HostWatch(tmp_path)
+    watch = HostMonitor(tmp_path)
     for second in range(5):
-        assert watch.now(second * 1_100_000_000).disk_mb is None
+        assert watch.read(second * 1_100_000_000).disk_mb is None
     assert asked == [tmp_path]
     hangs.set()
     assert answers.wait(60)
@@ -124,16 +124,16 @@ async def test_a_disk_that_hangs_holds_up_nothing(
 async def test_the_disk_of_a_folder_to_come_is_that_of_its_parent(
     tmp_path: Path,
 ) -> None:
-    watch = HostWatch(tmp_path / "gigabrain" / "runs")
+    watch = HostMonitor(tmp_path / "gigabrain" / "runs")
     await until(lambda: disk_mb(watch) > 0, "the disk's answer")
 
 
 def test_the_host_is_looked_at_once_a_second(tmp_path: Path) -> None:
-    watch = HostWatch(tmp_path)
-    first = watch.now(1)
-    assert watch.now(900_000_000) is first
+    watch = HostMonitor(tmp_path)
+    first = watch.read(1)
+    assert watch.read(900_000_000) is first
     assert first.disk_mb is None or first.disk_mb > 0
     assert first.memory is None or 0 < first.memory <= 100
     for second in range(1, 12):
-        last = watch.now(second * 1_100_000_000)
+        last = watch.read(second * 1_100_000_000)
     assert last.cpu is None or 0 <= last.cpu <= 100

@@ -35,7 +35,7 @@ from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import Probe, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import client_endpoint
-from gigabrain_zenoh.safety.step import Inputs, Memory, step
+from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 
 COMMANDS, LONG_COMMANDS = 20_000, 1_000_000
 HELD_TICKS = 15  # for which one value is repeated: a body gains its full speed within them
@@ -134,7 +134,7 @@ def _axes(of: Velocity) -> tuple[float, float, float]:
 
 def sensed(body: BodyDescription, count: int) -> None:
     """Feed hostile scans and states to their readers. Raises Failed for what breaks one."""
-    config, memory = PerceptionConfig(), Memory()
+    config, memory = PerceptionConfig(), SafetyMemory()
     scans, states = codec_of(LaserScan), codec_of(RobotState)
     state: RobotState | None = None
     scan: LaserScan | None = None
@@ -149,7 +149,7 @@ def sensed(body: BodyDescription, count: int) -> None:
             continue
         try:
             perception.step(config, body, scan)
-            inputs = Inputs(state=state, scan=scan, scan_age_ns=0)
+            inputs = SafetyInputs(state=state, scan=scan, scan_age_ns=0)
             memory, verdict = step(body, memory, inputs)
             codec_of(type(verdict)).decode(msgspec.msgpack.encode(verdict))
         except (ArithmeticError, LookupError, TypeError, ValueError) as error:

@@ -48,7 +48,7 @@ from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
-from gigabrain_zenoh.safety.pipeline import HALF_SPEED
+from gigabrain_zenoh.safety.health import HALF_SPEED
 from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.authority import issue, new_fleet
 

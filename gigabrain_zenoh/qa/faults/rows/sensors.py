@@ -24,7 +24,7 @@ from gigabrain_zenoh.qa.faults.rig.rig import BRAKES, ZERO, Rig, Stop, next_step
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.simulated_drives import Ranges, SafetyTrack
-from gigabrain_zenoh.safety.step import Inputs, Memory, step
+from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 
 KINDS = ("nan", "half", "crooked")
 LONG_KINDS = ("nan", "half", "crooked", "minus-inf", "zero", "most", "short")
@@ -111,12 +111,14 @@ def _check_noticed(body: BodyDescription, name: str, values: Floats) -> None:
     )
     if perception.step(PerceptionConfig(), body, blind).scan_ok:
         raise Failed(f"perception accepts a scan of all {name}")
-    example, memory = EXAMPLES[RobotState.__name__], Memory()
+    example, memory = EXAMPLES[RobotState.__name__], SafetyMemory()
     assert isinstance(example, RobotState)
     for tick in range(5, 25, 5):
         state = replace(example, boot=1, tick=tick, basis=tick)
         scan = replace(blind, boot=1, tick=tick, basis=tick)
-        memory, verdict = step(body, memory, Inputs(state=state, scan=scan, scan_age_ns=TICK_NS))
+        memory, verdict = step(
+            body, memory, SafetyInputs(state=state, scan=scan, scan_age_ns=TICK_NS)
+        )
     if "scan_blind" not in {cause.code for cause in verdict.causes}:
         raise Failed(f"safety accepts a scan of all {name}")
 
@@ -187,7 +189,7 @@ def _battery_levels(body: BodyDescription) -> tuple[tuple[str, float], ...]:
 
 def codes_after(body: BodyDescription, readings: list[PowerReading]) -> set[str]:
     """Return the codes of safety's causes and warnings at the end."""
-    memory = Memory()
+    memory = SafetyMemory()
     example = EXAMPLES[RobotState.__name__]
     assert isinstance(example, RobotState)
     for tick, (battery, temperature) in enumerate(readings, 1):
@@ -196,7 +198,7 @@ def codes_after(body: BodyDescription, readings: list[PowerReading]) -> set[str]
             example, velocity=Velocity(), battery=battery, joints=(wheel,), imu=None, bumpers=(),
             boot=1, tick=tick, basis=tick,
         )  # fmt: skip
-        memory, verdict = step(body, memory, Inputs(state=state))
+        memory, verdict = step(body, memory, SafetyInputs(state=state))
     return {cause.code for cause in (*verdict.causes, *verdict.warnings)}
 
 
