@@ -8,76 +8,73 @@ import math
 from bisect import bisect_right
 
 from gigabrain_schemas.base import TICK_S, Pose, Velocity
-from gigabrain_schemas.body import BodyDescription
+from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import ActuationModel, Intent, TrajectoryPoint
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import compose, interpolate, relative
 
 LONGEST_DELAY_TICKS = 15
-FARTHEST_OFF_M, FARTHEST_OFF_RAD = 0.3, 0.8  # beyond these, it is not driving this trajectory
+MAX_ERROR_M, MAX_ERROR_RAD = 0.3, 0.8  # farther off, the body does not follow the trajectory
 DAMPING, STIFFNESS = 0.7, 10.0  # feedback parameters, the second in [1/m2]
-SLOWEST, QUICKEST = 0.8, 2.5  # [1/s], bounds of the feedback's bandwidth
+MIN_BANDWIDTH, MAX_BANDWIDTH = 0.8, 2.5  # [1/s], of the feedback
 LATERAL_GAIN = 1.5  # [1/s], feedback for bodies that can move sideways
-SHORTEST_LAG_S, LONGEST_LAG_S = 1e-3, 0.5
-MOST_GAIN = 2.0  # largest factor by which turn rates are increased or reduced
+MIN_LAG_S, MAX_LAG_S = 1e-3, 0.5
+MAX_GAIN = 2.0  # largest factor by which turn rates are increased or reduced
 
 
-def wanted(
+def track(
     body: BodyDescription,
     intent: Intent,
-    tick: int,
+    state: RobotState,
     start: Pose,
-    here: Pose,
-    velocity: Velocity,
-    told: tuple[Velocity, ...],
+    sent: tuple[Velocity, ...],
 ) -> Velocity | None:
-    """Return the command at `tick` that tracks the trajectory; None when it is too far off.
+    """Return the command that tracks the intent's trajectory; None if the body is too far off.
 
-    The odometry poses `start` and `here` are at the intent's basis and now; `velocity` is measured.
-    The commands of the previous ticks are in `told`, newest last. After the end of the trajectory,
-    the command is zero.
+    `start` is the odometry pose at the intent's basis, `sent` the commands of the previous ticks,
+    newest last. After the end of the trajectory the command is zero.
     """
     late = min(round(intent.response.delay / TICK_S), LONGEST_DELAY_TICKS)
-    t = (tick - intent.basis + late) * TICK_S
+    t = (state.tick - intent.basis + late) * TICK_S
     points = intent.trajectory
     i = bisect_right(points, t, key=lambda point: point.t)
     if i == len(points):
         return ZERO
     before, after = points[max(i - 1, 0)], points[i]
     on_it = interpolate(_pose(before), _pose(after), _share(before, after, t))
-    error = relative(predicted(here, velocity, told, late, intent.response), compose(start, on_it))
-    if math.hypot(error.x, error.y) > FARTHEST_OFF_M or abs(error.yaw) > FARTHEST_OFF_RAD:
+    here = predict(state.pose, state.velocity, sent, late, intent.response)
+    error = relative(here, compose(start, on_it))
+    if math.hypot(error.x, error.y) > MAX_ERROR_M or abs(error.yaw) > MAX_ERROR_RAD:
         return None
     planned = _without_lag(before, after, intent.response)
     if body.max_lateral_speed > 0 and body.drive_type != "ackermann":
         return _holonomic(planned, error)
-    return _tightest(body, _unicycle(planned, error))
+    return _within_turning_circle(body, _unicycle(planned, error))
 
 
-def undone(turn_gain: float) -> float:
-    """Return the factor for turn rates that undoes the body's `turn_gain`, within MOST_GAIN."""
-    return max(1.0 / MOST_GAIN, min(MOST_GAIN, 1.0 / turn_gain))
+def turn_correction(turn_gain: float) -> float:
+    """Return the factor for turn rates that compensates `turn_gain`, within MAX_GAIN."""
+    return max(1.0 / MAX_GAIN, min(MAX_GAIN, 1.0 / turn_gain))
 
 
-def predicted(
-    here: Pose, velocity: Velocity, told: tuple[Velocity, ...], ticks: int, response: ActuationModel
+def predict(
+    here: Pose, velocity: Velocity, sent: tuple[Velocity, ...], ticks: int, response: ActuationModel
 ) -> Pose:
-    """Predict the body's pose after `ticks` ticks, from the commands already sent (`told`)."""
+    """Return the body's pose after `ticks` ticks of the commands already `sent`."""
     follows = 1.0 - math.exp(-TICK_S / _lag(response))
     vx, vy, w = velocity.linear_x, velocity.linear_y, velocity.angular_z
     pose = here
-    for command in told[-ticks:] if ticks else ():
+    for command in sent[-ticks:] if ticks else ():
         vx += follows * (command.linear_x - vx)
         vy += follows * (command.linear_y - vy)
         w += follows * (command.angular_z - w)
         middle = Pose(x=pose.x, y=pose.y, yaw=pose.yaw + w * TICK_S / 2)
-        gone = compose(middle, Pose(x=vx * TICK_S, y=vy * TICK_S, yaw=w * TICK_S / 2))
-        pose = gone
+        pose = compose(middle, Pose(x=vx * TICK_S, y=vy * TICK_S, yaw=w * TICK_S / 2))
     return pose
 
 
 def _lag(response: ActuationModel) -> float:
-    return max(SHORTEST_LAG_S, min(LONGEST_LAG_S, response.lag))
+    return max(MIN_LAG_S, min(MAX_LAG_S, response.lag))
 
 
 def _pose(point: TrajectoryPoint) -> Pose:
@@ -103,7 +100,7 @@ def _without_lag(
 
 def _unicycle(planned: Velocity, error: Pose) -> Velocity:
     v, w = planned.linear_x, planned.angular_z
-    bandwidth = min(max(math.sqrt(w * w + STIFFNESS * v * v), SLOWEST), QUICKEST)
+    bandwidth = min(max(math.sqrt(w * w + STIFFNESS * v * v), MIN_BANDWIDTH), MAX_BANDWIDTH)
     along = 2 * DAMPING * bandwidth
     across = min(STIFFNESS * abs(v), bandwidth * bandwidth / max(abs(v), 1e-6))
     straight = math.sin(error.yaw) / error.yaw if abs(error.yaw) > 1e-6 else 1.0
@@ -123,7 +120,7 @@ def _holonomic(planned: Velocity, error: Pose) -> Velocity:
     )
 
 
-def _tightest(body: BodyDescription, wish: Velocity) -> Velocity:
+def _within_turning_circle(body: BodyDescription, wish: Velocity) -> Velocity:
     """Limit a car's turn rate to its tightest curve: full speed with the largest yaw rate."""
     if body.drive_type != "ackermann":
         return wish

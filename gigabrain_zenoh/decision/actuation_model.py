@@ -15,6 +15,7 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import ActuationModel, CmdVel
 from gigabrain_zenoh.bus.freshness import LEAD_TICKS
 from gigabrain_zenoh.gate.state import BRAIN
+from gigabrain_zenoh.geometry.pose import velocity_of
 
 PRIOR = ActuationModel(delay=0.04, lag=0.06)  # used until enough has been learnt
 DELAYS = 16  # candidates, a tick apart: 0 to 0.3 s
@@ -190,10 +191,3 @@ class ActuationEstimator:
             lag=float((likely * LAGS_S).sum()),
             turn_gain=float((likely * z.gains()).sum()) if known else self._prior.turn_gain,
         )
-
-
-def velocity_of(command: CmdVel) -> Velocity:
-    """Return the velocity that `command` requests."""
-    return Velocity(
-        linear_x=command.linear_x, linear_y=command.linear_y, angular_z=command.angular_z
-    )

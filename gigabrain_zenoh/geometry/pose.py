@@ -9,8 +9,9 @@ from collections.abc import Callable
 
 from msgspec import Struct
 
-from gigabrain_schemas.base import Pose
+from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import RobotState
+from gigabrain_schemas.brain import CmdVel, Twist
 from gigabrain_schemas.sensors import LaserScan
 
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
@@ -61,6 +62,18 @@ def interpolate(before: Pose, after: Pose, share: float) -> Pose:
         y=before.y + share * (after.y - before.y),
         yaw=wrap_angle(before.yaw + share * wrap_angle(after.yaw - before.yaw)),
     )
+
+
+def velocity_of(message: CmdVel | Twist) -> Velocity:
+    """Return the velocity that a command requests."""
+    return Velocity(
+        linear_x=message.linear_x, linear_y=message.linear_y, angular_z=message.angular_z
+    )
+
+
+def axes(velocity: Velocity) -> tuple[float, float, float]:
+    """Return a velocity as a tuple [m/s, m/s, rad/s]."""
+    return velocity.linear_x, velocity.linear_y, velocity.angular_z
 
 
 class PoseHistory(Struct, frozen=True):

@@ -14,11 +14,11 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from gigabrain_schemas.arrays import Floats, ranges
-from gigabrain_schemas.base import TICK_MS, Cause, Velocity
+from gigabrain_schemas.base import TICK_MS, Cause
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.geometry.pose import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory, axes
 from gigabrain_zenoh.safety.catalogue import cause, lasting, ticks_of
 
 Speeds = tuple[float, float, float]
@@ -90,12 +90,12 @@ class SpeedDelay(DelayEstimate, frozen=True, kw_only=True):
         """Return the estimate after one more state, `elapsed` ticks after the last."""
         if not elapsed:
             return self
-        commanded = (*self.commanded, *(_speeds(state.sent),) * elapsed)
+        commanded = (*self.commanded, *(axes(state.sent),) * elapsed)
         now = replace(self, commanded=commanded[-SPEED_TICKS - SPEED_DELAYS + 1 :])
         if not state.link.connected:  # later data may be later than the earlier ones
             rest = self.rest_ticks + elapsed if state.sent == ZERO else 0
             return replace(now, measured=(), rest_ticks=rest)
-        measured = (*self.measured, *(_speeds(state.velocity),) * elapsed)[-SPEED_TICKS:]
+        measured = (*self.measured, *(axes(state.velocity),) * elapsed)[-SPEED_TICKS:]
         now = replace(now, measured=measured)._at_rest(state, elapsed)
         due = state.tick // SPEED_PERIOD_TICKS != (state.tick - elapsed) // SPEED_PERIOD_TICKS
         return now._guessed(now._delay()) if due and now.rest_ticks <= REST_TICKS else now
@@ -113,10 +113,6 @@ class SpeedDelay(DelayEstimate, frozen=True, kw_only=True):
         best = int(np.argmin(left))
         sure = left[best] <= MAX_UNEXPLAINED * whole and _refutes_shorter(left, best)
         return best if sure else None
-
-
-def _speeds(of: Velocity) -> Speeds:
-    return of.linear_x, of.linear_y, of.angular_z
 
 
 def _unexplained(commanded: Floats, measured: Floats) -> tuple[Floats, float]:

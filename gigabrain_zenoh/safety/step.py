@@ -9,7 +9,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO
-from gigabrain_zenoh.geometry.pose import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory, velocity_of
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.safety.catalogue import MAX_STEP_TICKS, cause
 from gigabrain_zenoh.safety.health import (
@@ -22,7 +22,7 @@ from gigabrain_zenoh.safety.health import (
     halved,
 )
 from gigabrain_zenoh.safety.latency import DataLatency
-from gigabrain_zenoh.safety.tracking_error import TrackingError, requested
+from gigabrain_zenoh.safety.tracking_error import TrackingError
 from gigabrain_zenoh.safety.zones import Motion, ProtectiveField
 
 SCANS_TO_START = 2  # by the second, the answer to the first has arrived, however slow
@@ -92,7 +92,7 @@ def _observe(body: BodyDescription, memory: SafetyMemory, inputs: SafetyInputs) 
     motion = Motion(
         measured=state.velocity,
         commanded=tracking.commanded,
-        requested=requested(wanted) if wanted else ZERO,
+        requested=velocity_of(wanted) if wanted else ZERO,
     )
     return SafetyMemory(
         boot=memory.boot,

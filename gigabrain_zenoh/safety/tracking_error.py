@@ -14,6 +14,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import ImuData
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of, ramp
+from gigabrain_zenoh.geometry.pose import axes, velocity_of
 from gigabrain_zenoh.safety.catalogue import cause, lasting, ticks_of
 
 WINDOW_TICKS = 15  # 0.3 s for the line to the body and back, and for its motors
@@ -100,19 +101,7 @@ def _target(
     gate = state.gate
     if gate.mode != "enabled" or command is None or command.source != gate.commander:
         return ZERO
-    return clamp(requested(command), limits_of(body), caps)
-
-
-def requested(command: CmdVel) -> Velocity:
-    """Return the velocity that a command requests."""
-    return Velocity(
-        linear_x=command.linear_x, linear_y=command.linear_y, angular_z=command.angular_z
-    )
-
-
-def axes(of: Velocity) -> Axes:
-    """Return a velocity as a tuple."""
-    return of.linear_x, of.linear_y, of.angular_z
+    return clamp(velocity_of(command), limits_of(body), caps)
 
 
 def _tolerances(body: BodyDescription) -> Axes:

@@ -11,13 +11,13 @@ from gigabrain_schemas.base import TICK_NS, Cause, Velocity
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_zenoh.geometry.pose import PoseHistory
+from gigabrain_zenoh.geometry.pose import PoseHistory, axes
 from gigabrain_zenoh.geometry.scan import blind_ahead, hits, scan_problem
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.geometry.sweep import arc, straight, turning
 from gigabrain_zenoh.safety import blind_spots
 from gigabrain_zenoh.safety.catalogue import cause
-from gigabrain_zenoh.safety.tracking_error import Axes, axes
+from gigabrain_zenoh.safety.tracking_error import Axes
 
 HOUSING_M = 0.1  # nearer hits are the lidar's own housing
 CONE_DEG = 30.0  # ahead, in which some beam must be valid

@@ -218,7 +218,7 @@ class BarnBrain:
         self._planner = LocalPlanner(JACKAL, settings)
         self._surroundings = Surroundings()
         self._response = ActuationEstimator()
-        self._memory = control.Memory()
+        self._memory = control.ControlMemory()
         self._intent: Intent | None = None
         self._perception = PerceptionConfig(mapping="slam")
         self.cycles_ms: list[float] = []
@@ -230,7 +230,7 @@ class BarnBrain:
             world = perception.step(self._perception, JACKAL, scan)
             world = self._surroundings.add(world, LIDAR, scan, state.pose)
             self._intent = self._decide(state, world)
-        inputs = control.Inputs(state=state, intent=self._intent)
+        inputs = control.ControlInputs(state=state, intent=self._intent)
         self._memory, command = control.step(JACKAL, self._memory, inputs)
         command = replace(command, boot=BOOT, tick=state.tick)
         self._response.command(command)

@@ -304,11 +304,11 @@ def _steps_at(
     state = replace(heard.get(STATE), tick=tick)
     world = replace(heard.get(WORLD), tick=tick, basis=tick)
     intent = replace(heard.get(INTENT), tick=tick, basis=tick)
-    inputs = control.Inputs(state=state, intent=intent)
+    inputs = control.ControlInputs(state=state, intent=intent)
     return {
         SCAN.key: partial(perception.step, PerceptionConfig(), body, scan),
         WORLD.key: partial(loop.step, state, world),
-        INTENT.key: partial(control.step, body, control.Memory(boot=state.boot), inputs),
+        INTENT.key: partial(control.step, body, control.ControlMemory(boot=state.boot), inputs),
     }
 
 

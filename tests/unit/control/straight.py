@@ -6,7 +6,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import BodyDescription, GateStatus
 from gigabrain_schemas.brain import CmdVel, Intent
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.control.node import Inputs, Memory, step
+from gigabrain_zenoh.control.node import ControlInputs, ControlMemory, step
 from gigabrain_zenoh.testing.samples import DRIVING, WAFFLE, state
 
 SHUT = {
@@ -28,7 +28,7 @@ class Drive:
     def __init__(
         self, body: BodyDescription = WAFFLE, *, gain: float = 1.0, lag_s: float = 0.0
     ) -> None:
-        self.body, self.memory, self.tick = body, Memory(), 0
+        self.body, self.memory, self.tick = body, ControlMemory(), 0
         self._gain, self._follows = gain, 1 - math.exp(-0.02 / lag_s) if lag_s else 1.0
         self.v = self.w = 0.0
         self._told = CmdVel(linear_x=0.0)
@@ -48,7 +48,9 @@ class Drive:
         self.v += (self._gain * self._told.linear_x - self.v) * self._follows
         self.w += (self._gain * self._told.angular_z - self.w) * self._follows
         measured = state(self.tick, v=self.v, w=self.w, gate=gate, boot=boot)
-        inputs = Inputs(state=measured, intent=intent, teleop=teleop, caps=caps or SpeedCaps())
+        inputs = ControlInputs(
+            state=measured, intent=intent, teleop=teleop, caps=caps or SpeedCaps()
+        )
         self.memory, self._told = step(self.body, self.memory, inputs)
         return self._told
 

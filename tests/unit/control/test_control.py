@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.brain import Intent, JointTarget
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.control.node import Memory
+from gigabrain_zenoh.control.node import ControlMemory
 from gigabrain_zenoh.testing.samples import DRIVING
 from tests.unit.control.straight import SHUT, Drive, want
 
@@ -83,7 +83,7 @@ def test_a_new_start_of_the_driver_is_a_new_beginning() -> None:
     drive.go(want(0.2), teleop=Velocity(linear_x=0.2))
     drive.tick = 2
     assert drive.go(boot=8).linear_x == 0.0
-    anew = Memory(boot=8, tick=3, opened=3, enables=1, history=drive.memory.history)
+    anew = ControlMemory(boot=8, tick=3, enabled_tick=3, enables=1, history=drive.memory.history)
     assert drive.memory == anew
     assert drive.memory.history.ticks == (3,)
 

@@ -9,7 +9,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.control.node import Inputs, Memory, step
+from gigabrain_zenoh.control.node import ControlInputs, ControlMemory, step
 from gigabrain_zenoh.testing.samples import DRIVING, WAFFLE, state
 from tests.unit.control.straight import SHUT, Drive, want
 
@@ -104,7 +104,7 @@ Moment = tuple[Intent | None, Velocity | None, SpeedCaps, GateStatus, int]
 def test_no_wish_makes_a_command_that_jumps_or_goes_beyond_the_limits(
     story: list[Moment], gain: float
 ) -> None:
-    drive, before, open_before = Drive(gain=gain), Memory(), False
+    drive, before, open_before = Drive(gain=gain), ControlMemory(), False
     for intent, teleop, cap_now, gate, passed in story:
         command = drive.go(intent, teleop=teleop, caps=cap_now, gate=gate, ticks_passed=passed)
         now, opened = drive.memory, gate.mode == "enabled" and gate.commander == "control"
@@ -133,7 +133,7 @@ def test_asked_again_within_a_tick_it_answers_the_same(
     for wish, twist, cap_then, gate_then, passed in story:
         drive.go(wish, teleop=twist, caps=cap_then, gate=gate_then, ticks_passed=passed)
     now = state(drive.tick + 1, v=drive.v, w=drive.w, gate=gate)
-    inputs = Inputs(state=now, intent=intent, teleop=teleop, caps=cap_now)
+    inputs = ControlInputs(state=now, intent=intent, teleop=teleop, caps=cap_now)
     once = step(WAFFLE, drive.memory, inputs)
     assert step(WAFFLE, once[0], inputs) == once
     without = replace(inputs, intent=None, teleop=None)  # asked first when less had come

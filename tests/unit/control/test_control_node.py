@@ -10,9 +10,9 @@ from gigabrain_schemas.body import ControlGains, GateStatus
 from gigabrain_schemas.brain import Intent, Twist
 from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SAFETY, STATE, TELEOP, Topic
+from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.control import node as control
-from gigabrain_zenoh.control.node import EarlierCaps
-from gigabrain_zenoh.control.teleop import Teleop
+from gigabrain_zenoh.control.node import Teleop, caps_at
 from gigabrain_zenoh.geometry.limits import NO_CAPS
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import BOOT, DRIVING, TICK_NS, WAFFLE, body, state
@@ -145,16 +145,16 @@ async def test_no_command_depends_on_which_message_of_a_tick_was_quicker(
 
 
 def test_caps_hold_from_the_tick_after_their_verdict_for_150_ms() -> None:
-    caps = EarlierCaps()
-    assert caps.at(state(9)) == NO_CAPS
-    caps.receive(verdict(10, 0.1))
-    caps.receive(verdict(12, 0.3))
-    caps.receive(verdict(12, 0.2))  # with the scan of that tick
-    found = [caps.at(state(tick)).forward for tick in (10, 11, 12, 13, 19, 20)]
+    verdicts = PreviousTick[SafetyState]()
+    assert caps_at(verdicts, state(9)) == NO_CAPS
+    verdicts.receive(verdict(10, 0.1))
+    verdicts.receive(verdict(12, 0.3))
+    verdicts.receive(verdict(12, 0.2))  # with the scan of that tick
+    found = [caps_at(verdicts, state(tick)).forward for tick in (10, 11, 12, 13, 19, 20)]
     assert found == [None, 0.1, 0.1, 0.2, 0.2, None]
-    assert caps.at(state(13, boot=8)) == NO_CAPS
-    caps.receive(verdict(1, 0.05, boot=8))
-    assert caps.at(state(2, boot=8)).forward == 0.05
+    assert caps_at(verdicts, state(13, boot=8)) == NO_CAPS
+    verdicts.receive(verdict(1, 0.05, boot=8))
+    assert caps_at(verdicts, state(2, boot=8)).forward == 0.05
 
 
 FORWARD = Twist(linear_x=0.1)  # what a person types: no boot, no tick

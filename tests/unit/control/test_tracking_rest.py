@@ -10,8 +10,8 @@ from gigabrain_schemas.brain import ActuationModel, TrajectoryPoint
 from gigabrain_schemas.safety import SpeedCaps
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, STATE
 from gigabrain_zenoh.control import node as control
-from gigabrain_zenoh.control.node import Inputs, step
-from gigabrain_zenoh.control.tracking import predicted
+from gigabrain_zenoh.control.node import ControlInputs, step
+from gigabrain_zenoh.control.tracking import predict
 from gigabrain_zenoh.geometry.pose import compose
 from gigabrain_zenoh.testing.in_memory import NodeBench
 from gigabrain_zenoh.testing.samples import body, state
@@ -31,11 +31,11 @@ def test_what_the_body_will_do_with_commands_on_their_way_is_foreseen() -> None:
     for i in range(150):
         if i % 5 == 1:
             intent = course.intent(plant.tick, SLOW)
-        seen.append((plant.pose, plant.velocity, plant.memory.told))
+        seen.append((plant.pose, plant.velocity, plant.memory.sent))
         plant.go(intent if i else None)
     pose, velocity, _ = seen[100]
     told = seen[101][2]  # before that state
-    found = predicted(pose, velocity, told, 5, SLOW)
+    found = predict(pose, velocity, told, 5, SLOW)
     later = seen[105][0]
     assert (found.x, found.y, found.yaw) == pytest.approx((later.x, later.y, later.yaw), abs=1e-3)
 
@@ -86,7 +86,7 @@ async def test_the_process_brakes_and_says_so_once_when_it_is_too_far_off(
             bench.send(INTENT, replace(course.intent(basis, ActuationModel()), tick=tick))
             speeds += [command.linear_x for command in bench.sent(CMD_VEL)][-1:]
     assert [record.message for record in caplog.records] == [
-        "braking: too far off the trajectory",
+        "braking: too far from the trajectory",
         "on the trajectory again",
     ] * 2
     assert speeds[48] == pytest.approx(0.2, abs=0.02)
@@ -121,7 +121,7 @@ def test_asked_again_within_a_tick_it_answers_the_same() -> None:
     errors(course, plant, 2.0)
     pose = plant.pose
     now = replace(state(plant.tick + 1, pose=(pose.x, pose.y, pose.yaw)), velocity=plant.velocity)
-    inputs = Inputs(state=now, intent=course.intent(plant.tick, SLOW))
+    inputs = ControlInputs(state=now, intent=course.intent(plant.tick, SLOW))
     once = step(plant.body, plant.memory, inputs)
     assert step(plant.body, once[0], inputs) == once
     without = replace(inputs, intent=None)

@@ -10,7 +10,7 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, CmdVel, Intent, TrajectoryPoint
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.control.node import Inputs, Memory, step
+from gigabrain_zenoh.control.node import ControlInputs, ControlMemory, step
 from gigabrain_zenoh.geometry.pose import compose, relative
 from gigabrain_zenoh.testing.samples import WAFFLE, state
 
@@ -73,7 +73,7 @@ class Plant:
         gain: float = 1.0,
         slip: float = 1.0,
     ) -> None:
-        self.body, self.memory, self.tick = body, Memory(), 0
+        self.body, self.memory, self.tick = body, ControlMemory(), 0
         self.pose, self.velocity = Pose(x=0.0, y=0.0, yaw=0.0), Velocity()
         self._late = deque([CmdVel(linear_x=0.0)] * round(response.delay / 0.02))
         self._follows = 1 - math.exp(-0.02 / response.lag) if response.lag else 1.0
@@ -84,7 +84,9 @@ class Plant:
         self.tick += 1
         pose, v = self.pose, self.velocity
         now = state(self.tick, pose=(pose.x, pose.y, pose.yaw))
-        inputs = Inputs(state=replace(now, velocity=v), intent=intent, caps=caps or SpeedCaps())
+        inputs = ControlInputs(
+            state=replace(now, velocity=v), intent=intent, caps=caps or SpeedCaps()
+        )
         self.memory, told = step(self.body, self.memory, inputs)
         self._late.append(told)
         acts, share = self._late.popleft(), self._follows
