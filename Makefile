@@ -128,6 +128,7 @@ bench: setup
 
 golden: setup
 	$(BIN)/python -m gigabrain_schemas.golden
+	$(BIN)/python -m tests.user_texts
 
 recordings: setup
 	$(BIN)/python -m gigabrain_zenoh.qa.drives tests/recordings

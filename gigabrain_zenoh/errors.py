@@ -71,4 +71,4 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownName:
     parts = {part: whole for whole in names for part in (*whole.split("_"), whole)}
     close = difflib.get_close_matches(name, parts, n=1, cutoff=0.6)
     hint = f"; did you mean {parts[close[0]]!r}?" if close else ";"
-    return UnknownName(f"no {kind} {name!r}{hint} known: {', '.join(names)}")
+    return UnknownName(f"no {kind} {name!r}{hint} known: {', '.join(names) or 'none'}")

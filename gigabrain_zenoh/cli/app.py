@@ -172,15 +172,19 @@ def _call(words: "Sequence[str]") -> object:
     from gigabrain_zenoh.errors import ConfigError, GigabrainError
     from gigabrain_zenoh.host.signals import interrupts
 
-    words = renamed_arguments(words)
     try:
+        words, notices = renamed_arguments(words)
         app = make_app(words)
         command, bound, _ = app.parse_args(words, exit_on_error=False, print_error=False)
+        for notice in notices:
+            print(notice, file=sys.stderr)
         with interrupts.raising():
             return command(*bound.args, **bound.kwargs)
     except GigabrainError as error:
         print(f"gigabrain: {error}", file=sys.stderr)
         return interrupts.exit_code if interrupts.received else error.exit_code
     except CycloptsError as error:
-        print(f"gigabrain: {' '.join(str(error).split())}", file=sys.stderr)
+        from gigabrain_zenoh.cli.options import usage_error
+
+        print(f"gigabrain: {usage_error(error)}", file=sys.stderr)
         return ConfigError.exit_code

@@ -6,11 +6,20 @@ from pathlib import Path
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.cli.options import Body, KeepStuck, Seed, World, check_positive, checked
+from gigabrain_zenoh.cli.options import (
+    Body,
+    KeepStuck,
+    Level,
+    Seed,
+    World,
+    check_positive,
+    checked,
+)
 from gigabrain_zenoh.config.loading import located
-from gigabrain_zenoh.config.settings import LinkName, Resume
+from gigabrain_zenoh.config.settings import LinkName, PageConfig, Resume
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.files import check_result_path
 from gigabrain_zenoh.host.signals import run_async
 from gigabrain_zenoh.runtime.deployment import (
     Deployment,
@@ -113,6 +122,7 @@ def demo(*, robot: RobotOptions = ROBOT, view: ViewOptions = VIEW) -> int:
     deployment, address = checked(values, Deployment), ""
     behaviours.check(deployment.decision)
     if view.page or (view.page is None and not view.headless):
+        checked({"port": view.port}, PageConfig)
         deployment, address = with_page(deployment, view.port, login=view.login)
     options = DemoOptions(
         seconds=robot.seconds,
@@ -129,7 +139,7 @@ def up(
     *,
     host: str | None = None,
     keys: Path | None = None,
-    level: str = "info",
+    level: Level = "info",
     keep_stuck: KeepStuck = False,
 ) -> int:
     """Run the processes of a deployment file on this host, until Ctrl-C.
@@ -142,7 +152,7 @@ def up(
         deployment: Deployment file, or the name of a known one.
         host: Which of the file's hosts this is; required if it has several.
         keys: Folder of this host's identity, instead of the one in the file.
-        level: Lowest level to log: debug, info, warning or error.
+        level: Lowest level to log.
     """
     from gigabrain_zenoh.host.terminal import LINES, Display, writer
     from gigabrain_zenoh.launch.up import up as run
@@ -199,5 +209,6 @@ def render(
     """
     from gigabrain_drivers.sim.portrait import portray
 
+    check_result_path(file)
     portray(body, world, seed, file)
     print(file)

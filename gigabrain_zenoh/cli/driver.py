@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 from gigabrain_zenoh.cli.options import (
     Seed,
@@ -52,7 +51,7 @@ def test(
     name: RobotName,
     *,
     link: Literal["sim", "emulated"] | None = None,  # noqa: PT028
-    repeat: Annotated[int, Parameter(validator=Number(gte=1))] = 1,  # noqa: PT028
+    repeat: int = 1,  # noqa: PT028
 ) -> int:
     """Run the conformance checks on a driver. Exit code 1 if one fails.
 
@@ -71,6 +70,7 @@ def test(
     from gigabrain_zenoh.qa.conformance import kit
     from gigabrain_zenoh.qa.judging import COLOURS
 
+    check_positive(repeat=repeat)
     links = links_of(load_robot(name))
     chosen: LinkName = link or ("emulated" if "emulated" in links else "sim")
     table = Table(title=f"{name}, link {chosen}")

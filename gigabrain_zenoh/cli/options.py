@@ -1,25 +1,40 @@
 """Options that several commands share: completion, checks of values, output to the terminal."""
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
 
-from cyclopts import App, ArgumentCollection, Parameter
+from cyclopts import (
+    App,
+    Argument,
+    ArgumentCollection,
+    CoercionError,
+    CycloptsError,
+    MissingArgumentError,
+    Parameter,
+    RepeatArgumentError,
+    UnknownCommandError,
+    UnknownOptionError,
+    UnusedCliTokensError,
+)
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
 
 if TYPE_CHECKING:
+    from msgspec import Struct
     from rich.table import Table
 
     from gigabrain_schemas.requests import Description
     from gigabrain_zenoh.runtime.connect import Where
 
-T = TypeVar("T")
+T = TypeVar("T", bound="Struct")
 
 COMPLETION_TIMEOUT_S = 0.3  # a shell waits for the names
 PIPE_COLUMNS = 160  # width of tables where the output has none
+UNIT = re.compile("_(s|mb)$")  # part of a setting's name, but not of its option's
 
 
 @Parameter(name="*")
@@ -100,6 +115,7 @@ TopicNames = Annotated[
         help='Names such as scan, or key expressions such as "robot/image/*". Default: all.',
     ),
 ]
+Level = Literal["debug", "info", "warning", "error"]
 Count = Annotated[int | None, Parameter(alias="-n")]
 Take = Annotated[bool, Parameter(help="Take over from any commander, the robot's brain too.")]
 JsonLines = Annotated[bool, Parameter(help="Print one JSON object per line.")]
@@ -120,12 +136,20 @@ def checked(values: Mapping[str, object], type: type[T]) -> T:
     """Return `values` as a `type`. Raises ConfigError, which names the option that does not fit."""
     import msgspec
 
+    from gigabrain_zenoh.config.loading import expected
+
     try:
         return msgspec.convert(values, type)
     except msgspec.ValidationError as error:
         text, _, path = str(error).partition(" - at `$.")
-        name = path.rstrip("`").replace("_", "-")
-        raise ConfigError(f"--{name}: {text[0].lower()}{text[1:]}" if name else text) from None
+        name = path.rstrip("`")
+        fields = {field.name: field.type for field in msgspec.structs.fields(type)}
+        if name in fields:
+            text = f"expected {expected(fields[name])}, got {values[name]}"
+        elif text.partition(": ")[0] in fields:  # the type refuses the value of this field
+            name, _, text = text.partition(": ")
+        option = "--" + UNIT.sub("", name).replace("_", "-")
+        raise ConfigError(f"{option}: {text}" if name else text) from None
 
 
 def check_finite(name: str, value: float) -> None:
@@ -141,6 +165,43 @@ def check_positive(**options: float | None) -> None:
         if value is not None and not 0 < value < 1e9:
             shown = name.replace("_", "-")
             raise ConfigError(f"--{shown}: expected a number above 0, got {value:g}")
+
+
+def usage_error(error: CycloptsError) -> str:
+    """Return one line on arguments that cannot be parsed: what is wrong, and what is right."""
+    from gigabrain_zenoh.config.loading import expected, nearest
+
+    command = " ".join(("gigabrain", *(error.command_chain or ())))
+    see = f"; see `{command} --help`"
+    match error:
+        case UnknownCommandError(unused_tokens=[str(name), *_], app=app):
+            kind = "option" if name.startswith("-") else "command"
+            return f"no {kind} {name!r}{nearest(name, app or ()) or see}"
+        case UnknownOptionError(token=token, argument_collection=known):
+            name = token.keyword or token.value
+            names = [each for argument in known for each in argument.names]
+            return f"no option {name!r}{nearest(name, names) or see}"
+        case UnusedCliTokensError(unused_tokens=[str(name), *_]):
+            return f"unexpected argument {name!r}{see}"
+        case MissingArgumentError(argument=Argument() as argument):
+            given = error.keyword or next((token.keyword for token in argument.tokens), None)
+            return (
+                f"{given}: a value is missing" if given else f"missing {_shown(argument)}"
+            ) + see
+        case RepeatArgumentError(token=token):
+            return f"{token.keyword}: given twice"
+        case CoercionError(argument=Argument() as argument, token=token) if token:
+            type_, got = error.target_type, token.value
+            choices = [each for each in get_args(type_) if isinstance(each, str)]
+            text = f"expected {expected(type_)}, got {got!r}{nearest(got, choices)}"
+            return f"{_shown(argument)}: {text}"
+    return " ".join(str(error).split())
+
+
+def _shown(argument: Argument) -> str:
+    """Return an argument as the help shows it: `--seed`, or `FILE` for a positional one."""
+    name = argument.name
+    return name.lstrip("-").upper() if argument.field_info.is_positional else name
 
 
 def refuse_fractions(_app: App, _command: tuple[str, ...], arguments: ArgumentCollection) -> None:

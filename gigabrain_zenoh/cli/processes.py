@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 from cyclopts import Parameter
 
 from gigabrain_zenoh.bus.zenoh.config import router_config, secured
-from gigabrain_zenoh.cli.options import Seed, World, checked, print_progress
+from gigabrain_zenoh.cli.options import Level, Seed, World, checked, print_progress
 from gigabrain_zenoh.config.settings import (
     ButtonConfig,
     DecisionConfig,
@@ -42,7 +42,7 @@ class ProcessOptions:
     "Folder of this host's identity, for a router that requires keys."
     run_dir: Path | None = None
     "Write a log file to this folder."
-    level: Literal["debug", "info", "warning", "error"] = "info"
+    level: Level = "info"
     "Lowest level to log."
 
     @property
@@ -174,7 +174,8 @@ def driver(
         ports: Folder of the emulator's ports, for `--link emulated`.
         state_dir: Folder for the cause of a latch, which survives a restart.
     """
-    from gigabrain_drivers.driver.catalog import load_robot
+    from gigabrain_drivers.driver.catalog import load_link
+    from gigabrain_drivers.driver.robot import Run
 
     values = {
         "body": name,
@@ -187,7 +188,7 @@ def driver(
         "state_dir": _state_folder(state_dir, process.namespace or Path(name).stem),
     }
     settings = checked(values, DriverConfig)
-    load_robot(name)  # refuse a wrong name before connecting
+    load_link(name, Run(folder=Path(), link=link))  # refuse a wrong name before connecting
     return process.run("driver", msgspec.to_builtins(settings))
 
 

@@ -4,9 +4,11 @@ A row goes in the release that `REMOVED_IN` names. Until then the old word means
 """
 
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
+
+from gigabrain_zenoh.errors import ConfigError
 
 if TYPE_CHECKING:  # PyYAML takes long to import, and a command line does not need it
     from gigabrain_zenoh.config.yaml_text import Node
@@ -24,7 +26,8 @@ class Rename:
     empty `new` drops a field that has no effect there.
 
     On the command line, `old` is a command (`warm`, `task list`), an option of a command
-    (`goto --how`) or an option of every command (`--remember`); `new` is the new words.
+    (`goto --how`) or an option of every command (`--remember`); `new` is the new words. Where an
+    option has another name and `values`, those are all values that it takes.
     """
 
     old: str
@@ -130,40 +133,48 @@ def renamed_word(word: str, table: Sequence[Rename]) -> str:
     return word
 
 
-def renamed_arguments(arguments: Iterable[str], table: Sequence[Rename] = CLI_WORDS) -> list[str]:
-    """Return the arguments of `gigabrain` in current words; print a notice for each old one."""
+def renamed_arguments(
+    arguments: Iterable[str], table: Sequence[Rename] = CLI_WORDS
+) -> tuple[list[str], list[str]]:
+    """Return the arguments of `gigabrain` in current words, and a notice for each old one.
+
+    Raises ConfigError for a value that an old option does not take.
+    """
     result = list(arguments)
+    notices: list[str] = []
     for rename in table:
         command, dashes, option = rename.old.partition("--")
-        words, new = command.split(), rename.new.split()
+        words = command.split()
         if result[: len(words)] != words:
             continue
         if dashes:
-            result = _renamed_option(result, f"--{option}", rename)
+            notices += _rename_option(result, f"--{option}", rename)
         else:
-            result[: len(words)] = new
-            _notice("", rename.old, rename.new)
-    return result
+            result[: len(words)] = rename.new.split()
+            notices.append(_notice_text(rename.old, rename.new))
+    return result, notices
 
 
-def _renamed_option(arguments: list[str], option: str, rename: Rename) -> list[str]:
+def _rename_option(arguments: list[str], option: str, rename: Rename) -> Iterator[str]:
+    """Replace an old option in `arguments`; yield the notices. Raises ConfigError."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
     for i, argument in enumerate(arguments[:end]):
         name, equals, value = argument.partition("=")
-        if name != option:
-            continue
         apart = not equals and bool(rename.values) and i + 1 < end
         value = arguments[i + 1] if apart else value
-        if option == rename.new and value not in rename.values:
+        if name != option or (option == rename.new and value not in rename.values):
             continue
-        arguments[i] = rename.new + equals + (rename.values.get(value, value) if equals else "")
+        if (equals or apart) and rename.values and value not in rename.values:
+            known = ", ".join(map(repr, rename.values))
+            raise ConfigError(f"{option}: expected one of {known}, got {value!r}")
+        new = rename.values.get(value, value)
+        arguments[i] = rename.new + equals + (new if equals else "")
         if apart:
-            arguments[i + 1] = rename.values.get(value, value)
-        if value in rename.values:
-            _notice("", f"{option} {value}", f"{rename.new} {rename.values[value]}")
+            arguments[i + 1] = new
+        if rename.values and new != value:
+            yield _notice_text(f"{option} {value}", f"{rename.new} {new}")
         else:
-            _notice("", option, rename.new)
-    return arguments
+            yield _notice_text(option, rename.new)
 
 
 def _renamed_node(node: "Node", path: str, source: str, table: Sequence[Rename]) -> "Node":
@@ -225,8 +236,12 @@ def _with(node: "Node", key: str, line: int, value: "Node", *, whole: bool = Fal
 
 
 def _notice(where: str, old: str, new: str) -> None:
-    now = f"is now '{new}'" if new else "has no effect here"
-    text = f"{where}'{old}' {now}; the old word goes in {REMOVED_IN}"
+    text = where + _notice_text(old, new)
     if text not in _printed:
         _printed.add(text)
         print(text, file=sys.stderr)
+
+
+def _notice_text(old: str, new: str) -> str:
+    now = f"is now '{new}'" if new else "has no effect here"
+    return f"'{old}' {now}; the old word goes in {REMOVED_IN}"

@@ -125,7 +125,7 @@ def deployment_path(name: str) -> Path:
     """The deployment file at a path, or the one of ours with that name. Raises UnknownName."""
     path = Path(name)
     ours = {file.stem: file for file in sorted(deployment_folder().glob("*.yaml"))}
-    if not path.exists() and not name.endswith((".yaml", ".yml")):
+    if not name or (not path.exists() and not name.endswith((".yaml", ".yml"))):
         if name not in ours:
             raise unknown("deployment", name, ours)
         return ours[name]

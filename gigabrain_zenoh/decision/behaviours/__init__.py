@@ -127,7 +127,7 @@ def parse_settings(pairs: Iterable[str]) -> dict[str, Any]:
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals:
-            raise ConfigError(f"expected NAME=VALUE, got {pair!r}")
+            raise ConfigError(f"--set: expected NAME=VALUE, got {pair!r}")
         found[name] = loading.loads(f"value: {value}", dict[str, Any], pair)["value"]
     return found
 

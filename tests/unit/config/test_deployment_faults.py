@@ -118,7 +118,7 @@ def test_a_host_that_is_like_no_other_gets_no_suggestion() -> None:
 def test_a_button_that_can_be_nowhere_is_refused(port: str) -> None:
     with pytest.raises(ConfigError) as error:
         button(port=port)
-    assert str(error.value) == f"port: {PORT} {port!r}"
+    assert str(error.value) == f"--port: {PORT} {port!r}"
     with pytest.raises(ValueError, match="port: expected a path"):
         ButtonConfig(port=port)
 
