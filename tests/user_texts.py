@@ -16,7 +16,7 @@ from unittest import mock
 from msgspec.structs import replace
 from rich.console import Console
 
-from gigabrain_drivers.driver import latch
+from gigabrain_drivers.driver import gatekeeper as latch
 from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.body import GateStatus, RobotState

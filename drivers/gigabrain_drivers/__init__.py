@@ -1,10 +1,72 @@
-"""Bodies: adding one means a folder in `bodies`, and for a new kind of link a line in DRIVERS."""
+"""The tables of drivers and lidars. Adding one is a folder, and one entry here.
 
-# name in a robot's file -> "module:class"; imported only when used, so a body's SDK stays optional
+Each names both ends of a wire: the driver of a body, or the source of a lidar's scans, and the
+emulator that answers it. Packages offer theirs as entry points in the groups `gigabrain.drivers`,
+`gigabrain.lidars` and `gigabrain.emulators`.
+"""
+
+from typing import NamedTuple
+
+
+class Ends(NamedTuple):
+    """Both ends of a wire, each as "module:class" and imported only when used."""
+
+    host: str  # a driver.base.Driver, or of a lidar its lidars.base.ScanSource
+    emulator: str = ""  # an emulators.base.Device; empty where there is no wire
+
+
+# by the name in a robot's file: `driver: NAME` of a link
 DRIVERS = {
-    "alpha": "gigabrain_drivers.bodies.alpha.driver:AlphaDriver",
-    "line": "gigabrain_drivers.bodies.line.driver:LineDriver",
-    "mock": "gigabrain_drivers.bodies.mock.driver:MockBody",
-    "mujoco": "gigabrain_drivers.sim.driver:MujocoDriver",
-    "opencr": "gigabrain_drivers.bodies.turtlebot3.driver:OpenCrDriver",
+    "alpha": Ends(
+        "gigabrain_drivers.bodies.alpha.driver:AlphaDriver",
+        "gigabrain_drivers.bodies.alpha.emulator:Alpha",
+    ),
+    "line": Ends(
+        "gigabrain_drivers.bodies.line.driver:LineDriver",
+        "gigabrain_drivers.bodies.line.emulator:LineBase",
+    ),
+    "mock": Ends("gigabrain_drivers.bodies.mock.driver:MockBody"),
+    "mujoco": Ends("gigabrain_drivers.sim.driver:MujocoDriver"),
+    "opencr": Ends(
+        "gigabrain_drivers.bodies.turtlebot3.driver:OpenCrDriver",
+        "gigabrain_drivers.bodies.turtlebot3.emulator:OpenCr",
+    ),
 }
+
+# by the name in a robot's file: `scan: {driver: NAME}` of a link
+LIDARS = {
+    "ld06": Ends(
+        "gigabrain_drivers.lidars.ld.source:Ld06",
+        "gigabrain_drivers.lidars.ld.emulator:LdDevice",
+    ),
+    "ld19": Ends(
+        "gigabrain_drivers.lidars.ld.source:Ld19",
+        "gigabrain_drivers.lidars.ld.emulator:LdDevice",
+    ),
+    "lds01": Ends(
+        "gigabrain_drivers.lidars.lds.lds01:Lds01",
+        "gigabrain_drivers.lidars.lds.emulator:Lds01Device",
+    ),
+    "lds02": Ends(
+        "gigabrain_drivers.lidars.ld.source:Lds02",
+        "gigabrain_drivers.lidars.ld.emulator:Lds02Device",
+    ),
+    "lds03": Ends(
+        "gigabrain_drivers.lidars.lds.lds03:Lds03",
+        "gigabrain_drivers.lidars.lds.emulator:Lds03Device",
+    ),
+    "rplidar": Ends(
+        "gigabrain_drivers.lidars.rplidar.source:Rplidar",
+        "gigabrain_drivers.lidars.rplidar.emulator:RplidarDevice",
+    ),
+}
+
+
+def shipped_hosts(table: dict[str, Ends]) -> dict[str, str]:
+    """Return the host's end of each entry, by name."""
+    return {name: ends.host for name, ends in table.items()}
+
+
+def shipped_emulators() -> dict[str, str]:
+    """Return the emulator's end of each driver and lidar that has one, by name."""
+    return {name: ends.emulator for name, ends in (DRIVERS | LIDARS).items() if ends.emulator}

@@ -207,7 +207,7 @@ def render(
     Args:
         file: File to write.
     """
-    from gigabrain_drivers.sim.portrait import portray
+    from gigabrain_drivers.sim.picture import portray
 
     check_result_path(file)
     portray(body, world, seed, file)

@@ -200,10 +200,10 @@ def button(*, port: str, process: ProcessOptions = LOCAL) -> int:
     Args:
         port: Serial adapter: a path, or usb:VID:PID[:SERIAL].
     """
-    from gigabrain_drivers.links.ports import absent
+    from gigabrain_drivers.links.serial_link import describe_absent
 
     settings = checked({"port": port}, ButtonConfig)
-    if problem := absent(port):  # the process itself reports it only once a robot is there
+    if problem := describe_absent(port):  # the process itself reports it only once a robot is there
         print_progress(f"gigabrain: {problem} Waiting for it.")
     return process.run("button", msgspec.to_builtins(settings))
 

@@ -39,7 +39,9 @@ PROCESSES = {
         stops=True,
     ),
     "button": ProcessType(
-        "gigabrain_drivers.button:run", "gigabrain_zenoh.config.settings:ButtonConfig", stops=True
+        "gigabrain_drivers.driver.button:run",
+        "gigabrain_zenoh.config.settings:ButtonConfig",
+        stops=True,
     ),
     "perception": ProcessType(
         "gigabrain_zenoh.perception.node:run",

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 
 from gigabrain_drivers.driver.catalog import make_driver
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.sim.driver import STEPS, MujocoDriver
-from gigabrain_drivers.sim.geometry import Cylinder, Pose
-from gigabrain_drivers.sim.options import sim_body
+from gigabrain_drivers.sim.body import sim_body
+from gigabrain_drivers.sim.driver import STEPS, MujocoDriver, scan_of, state_of
 from gigabrain_drivers.sim.physics import Simulation
-from gigabrain_drivers.sim.readings import scan_of, state_of
-from gigabrain_drivers.sim.world import World
+from gigabrain_drivers.sim.world import Cylinder, Pose, World
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import TICK_NS, Velocity
 from gigabrain_schemas.body import RobotState

@@ -12,11 +12,10 @@ from gigabrain_drivers.bodies.line.emulator import LineBase
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.emulators.base import Snapshot
+from gigabrain_drivers.emulators.emulator import Station
 from gigabrain_drivers.emulators.faults import NONE
-from gigabrain_drivers.emulators.station import Station
-from gigabrain_drivers.kinematics import Twist, base_of
-from gigabrain_drivers.odometry import advanced
-from gigabrain_drivers.sim.physics import Charge, ImuSample, Odometry, Wheel
+from gigabrain_drivers.kinematics.wheels import Twist, advanced, base_of
+from gigabrain_drivers.sim.physics import Charge, ImuSample, OdometryReading, Wheel
 from gigabrain_schemas.base import TICK_S, Pose
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
@@ -67,7 +66,7 @@ class IdealBody:
         wheels = zip(names, self._angles, speeds, strict=True)
         return Snapshot(
             time_ns=self._then_ns,
-            odometry=Odometry(self._pose.x, self._pose.y, self._yaw, x, turn),
+            odometry=OdometryReading(self._pose.x, self._pose.y, self._yaw, x, turn),
             wheels=tuple(Wheel(f"wheel_{n}_joint", a, s, 0.0, 30.0) for n, a, s in wheels),
             imu=ImuSample((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)),
             battery=Charge(12.0, 80.0, 0.5),

@@ -4,9 +4,8 @@ from typing import Any
 
 from gigabrain_drivers.bodies.alpha import protocol as alpha
 from gigabrain_drivers.bodies.line.protocol import Template
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
-from gigabrain_drivers.legs.senses import Senses
+from gigabrain_drivers.kinematics.legs import Senses
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.lds import lds01, lds03
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
@@ -33,12 +32,12 @@ def samples(template: Template) -> dict[str, bytes]:
     nodes = [node(n * 10.0, 500.0, quality=20, begins=n % 36 == 0) for n in range(80)]
     dense = [dense_capsule(n * 40.0 % 360, (500,) * 40, begins=n == 0) for n in range(12)]
     express = [express_capsule(n * 40.0 % 360, (500,) * 32, begins=n == 0) for n in range(12)]
-    status = dynamixel.status(opencr.ID, bytes(opencr.LENGTH))
+    status = opencr.status(opencr.ID, bytes(opencr.LENGTH))
     return {
         "alpha": b"".join(
             alpha.state(state_of_alpha(milliseconds=1000 + 10 * n), n + 1) for n in range(3)
         ) + alpha.stop(4),
-        "dynamixel": status + opencr.velocity(0.1, 0.2).frame + dynamixel.ping(opencr.ID),
+        "dynamixel": status + opencr.velocity(0.1, 0.2).frame + opencr.ping(opencr.ID),
         "ld": b"".join(
             ld.encode(
                 ld.LdFrame(3600, at % 36000, (at + 800) % 36000, ranges, (200,) * 12, at // 90)

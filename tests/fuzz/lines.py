@@ -8,17 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gigabrain_drivers import LIDARS
 from gigabrain_drivers.bodies.alpha import protocol as alpha
 from gigabrain_drivers.bodies.alpha.driver import AlphaDriver
 from gigabrain_drivers.bodies.line import protocol as line
 from gigabrain_drivers.bodies.line.driver import LineDriver
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrDriver
 from gigabrain_drivers.driver.catalog import load_link
-from gigabrain_drivers.driver.clip import clipped
+from gigabrain_drivers.driver.process import clipped
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.lidars import SCAN_SOURCES
 from gigabrain_drivers.lidars.base import source_class
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.lds import lds01, lds03
@@ -69,13 +68,13 @@ def line_again(values: dict[str, float]) -> bytes:
 
 
 PROTOCOLS = {
-    "alpha": Protocol(alpha.Decoder, alpha.describe, 400, alpha.encode),
-    "dynamixel": Protocol(dynamixel.Decoder, opencr.describe, 1100, dynamixel.encode),
+    "alpha": Protocol(alpha.AlphaDecoder, alpha.describe, 400, alpha.encode),
+    "dynamixel": Protocol(opencr.DynamixelDecoder, opencr.describe, 1100, opencr.encode),
     "ld": Protocol(ld.LdDecoder, ld.describe, 47, ld.encode),
     "lds01": Protocol(lds01.Lds01Decoder, lds01.describe, 44),
     "lds03": Protocol(lds03.Lds03Decoder, lds03.describe, 800),
     "line": Protocol(
-        lambda: line.Decoder(CUSTOM.state_templates()), line.describe, 256, line_again, "_rest"
+        lambda: line.LineDecoder(CUSTOM.state_templates()), line.describe, 256, line_again, "_rest"
     ),
     "rplidar": Protocol(rplidar.RplidarDecoder, rplidar.describe, 420),
     "rplidar request": Protocol(rplidar.RequestDecoder, rplidar.describe_request, 260),
@@ -166,7 +165,7 @@ def in_pieces(data: bytes, size: int) -> list[bytes]:
 def alpha_states(data: bytes) -> list[bytes]:
     size = alpha._STATE.size
     return [
-        alpha.encode(alpha.Frame(alpha.STATE, number + 1, piece))
+        alpha.encode(alpha.AlphaFrame(alpha.STATE, number + 1, piece))
         for number, piece in enumerate(in_pieces(data, size))
     ]
 
@@ -190,7 +189,7 @@ BODIES = ("alpha", "mycustombot")
 
 TARGETS: dict[str, Callable[[bytes], None]] = {
     **{f"protocol {name}": (lambda data, name=name: protocol(name, data)) for name in PROTOCOLS},
-    **{f"source {name}": (lambda data, name=name: source(name, data)) for name in SCAN_SOURCES},
+    **{f"source {name}": (lambda data, name=name: source(name, data)) for name in LIDARS},
     **{f"body {name}": (lambda data, name=name: body(name, data)) for name in BODIES},
     **{f"sealed {name}": (lambda data, name=name: sealed(name, data)) for name in SEALS},
 }  # fmt: skip

@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 
 from gigabrain_drivers.driver.catalog import load_robot
-from gigabrain_drivers.driver.latch import LatchFile
-from gigabrain_drivers.links import port_name
-from gigabrain_drivers.links.address import address
+from gigabrain_drivers.driver.gatekeeper import LatchFile
+from gigabrain_drivers.links import serial_link
+from gigabrain_drivers.links.tcp_link import address
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import GateStatus
 from gigabrain_zenoh.errors import ConfigError
@@ -70,7 +70,7 @@ def typed(data: bytes) -> None:
 
 
 CONFIG = gate.GateConfig(limits=limits_of(load_robot("mock")))
-PARSERS: tuple[Callable[[str], object], ...] = (parse_command, address, port_name.usb_id)
+PARSERS: tuple[Callable[[str], object], ...] = (parse_command, address, serial_link.usb_id)
 CHECKS = {"latch": latch, "note": note, "record": record, "typed": typed}
 
 

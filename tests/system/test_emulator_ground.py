@@ -9,11 +9,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gigabrain_drivers.emulators import DEVICES
+from gigabrain_drivers import shipped_emulators
 from gigabrain_drivers.emulators.base import Device
-from gigabrain_drivers.emulators.emulator import device_class
+from gigabrain_drivers.emulators.emulator import Station, device_class
 from gigabrain_drivers.emulators.faults import Faults, FaultyWire
-from gigabrain_drivers.emulators.station import Station
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import UnknownName
 from gigabrain_zenoh.testing.waiting import until
@@ -123,7 +122,7 @@ def test_faults_are_strict() -> None:
         msgspec.json.decode(b'{"bit_errors": 1.5}', type=Faults)
 
 
-@pytest.mark.parametrize("driver", sorted(DEVICES))
+@pytest.mark.parametrize("driver", sorted(shipped_emulators()))
 def test_every_device_of_the_table_is_a_device(driver: str) -> None:
     assert issubclass(device_class(driver), Device)
 

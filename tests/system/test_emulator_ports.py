@@ -12,9 +12,8 @@ from pathlib import Path
 import pytest
 
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.emulators.claim import claimed
-from gigabrain_drivers.emulators.emulator import Emulator
-from gigabrain_drivers.emulators.pty import Pty
+from gigabrain_drivers.emulators.emulator import Emulator, claimed
+from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.testing.waiting import until
 
@@ -104,7 +103,7 @@ def test_the_port_of_an_emulator_that_was_killed_leads_nowhere(tmp_path: Path) -
     port = tmp_path / "base"
     program = (
         "import asyncio, os, pathlib, signal, sys\n"
-        "from gigabrain_drivers.emulators.pty import Pty\n"
+        "from gigabrain_drivers.emulators.ports import Pty\n"
         "async def main():\n"
         "    Pty(pathlib.Path(sys.argv[1])).plug()\n"
         "    print(os.path.realpath(sys.argv[1]))\n"

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import serial
 
-from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.links import port_name, ports
+from gigabrain_drivers.emulators.ports import Pty
+from gigabrain_drivers.links import serial_link
 from gigabrain_drivers.links.serial_link import SerialLink, open_port
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.testing.waiting import until
@@ -168,7 +168,7 @@ async def test_auto_takes_the_port_that_answers(
     for pty in (right, wrong):
         pty.plug()
     paths = [str(wrong.path), str(tmp_path / "gone"), str(right.path)]
-    monkeypatch.setattr(ports, "candidates", lambda port: paths)
+    monkeypatch.setattr(serial_link, "candidate_paths", lambda port: paths)
     right.on_bytes = lambda data: right.write(b"mycustombot") and None
 
     def probe(port: serial.Serial) -> bool:
@@ -185,12 +185,12 @@ async def test_auto_takes_the_port_that_answers(
 
 
 def test_a_usb_port_is_named_by_its_numbers() -> None:
-    assert port_name.usb_id("usb:0483:5740") == (0x0483, 0x5740, "")
-    assert port_name.usb_id("usb:10c4:ea60:0001") == (0x10C4, 0xEA60, "0001")
+    assert serial_link.usb_id("usb:0483:5740") == (0x0483, 0x5740, "")
+    assert serial_link.usb_id("usb:10c4:ea60:0001") == (0x10C4, 0xEA60, "0001")
     with pytest.raises(ValueError, match="expected usb:VID:PID"):
-        port_name.usb_id("usb:0483")
+        serial_link.usb_id("usb:0483")
     with pytest.raises(ValueError, match="hexadecimal"):
-        port_name.usb_id("usb:048x:5740")
+        serial_link.usb_id("usb:048x:5740")
 
 
 @pytest.mark.parametrize(
@@ -206,17 +206,20 @@ def test_a_usb_port_is_named_by_its_numbers() -> None:
 )
 def test_what_can_be_no_serial_port_is_refused_with_its_field(name: str, said: str) -> None:
     with pytest.raises(ValueError, match=f"^port: .*{said}"):
-        port_name.check_port(name)
+        serial_link.check_port(name)
 
 
 @pytest.mark.parametrize("name", ["auto", "usb:2341:0043", "usb:2341:43:A-1", "/dev/ttyUSB0"])
 def test_what_may_be_a_serial_port_is_taken(name: str) -> None:
-    port_name.check_port(name)
+    serial_link.check_port(name)
 
 
 def test_what_is_wrong_with_a_port_says_what_to_do() -> None:
-    assert ports.missing("usb:0483:5740") == "no USB device usb:0483:5740: is it plugged in?"
-    assert 'KERNEL=="ttyACM9", MODE="0666"' in ports.refused(
+    assert (
+        serial_link.describe_missing("usb:0483:5740")
+        == "no USB device usb:0483:5740: is it plugged in?"
+    )
+    assert 'KERNEL=="ttyACM9", MODE="0666"' in serial_link.describe_refusal(
         "/dev/ttyACM9", PermissionError(13, "Permission denied")
     )
 

@@ -15,7 +15,7 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import Emulator
 from gigabrain_drivers.emulators.faults import NONE, Faults
-from gigabrain_drivers.sim.options import MujocoOptions, sim_body
+from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.world import World
 from gigabrain_schemas.arrays import ranges

@@ -7,16 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel
-from gigabrain_drivers.bodies.turtlebot3.board import is_opencr
-from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrDriver
+from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
+from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrDriver, is_opencr
 from gigabrain_drivers.bodies.turtlebot3.emulator import OpenCr
 from gigabrain_drivers.driver.catalog import make_driver
 from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.emulators.emulator import Station, emulated_body
 from gigabrain_drivers.emulators.faults import Faults
-from gigabrain_drivers.emulators.physics import emulated_body
-from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.emulators.station import Station
+from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
 from tests.unit.drivers.opencr import Rig, make_rig  # noqa: F401
@@ -93,7 +91,7 @@ async def test_somebody_elses_dynamixel_is_not_driven(rig: Rig) -> None:
     rig.cable.drop("cut")
     rig.cable.to_board = lambda data: None
     rig.cable.plug()
-    rig.cable.on_bytes(dynamixel.status(200, bytes([0x06, 0x04, 0x26])))
+    rig.cable.on_bytes(opencr.status(200, bytes([0x06, 0x04, 0x26])))
     assert rig.cable.drops[-1].endswith("a Dynamixel of model 1030, not to an OpenCR")
     assert not (await rig.driver.set_base_velocity(0.2, 0.0, 0.0)).linear_x
 
@@ -104,7 +102,7 @@ async def test_a_port_on_which_nobody_answers_is_knocked_at_and_opened_anew(rig:
     rig.cable.plug()
     before = len(rig.cable.sent)
     await rig.wait(900)
-    pings = [p for p in rig.cable.sent[before:] if p.instruction == dynamixel.PING]
+    pings = [p for p in rig.cable.sent[before:] if p.instruction == opencr.PING]
     assert 6 <= len(pings) <= 10
     await rig.wait(200)
     assert rig.cable.drops[-1].endswith("is open, but no OpenCR answers: right port, power on?")
@@ -114,15 +112,15 @@ async def test_silent_motors_and_debug_mode_count_as_a_body_that_does_not_answer
     rig: Rig, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO")
-    rig.board.feed(dynamixel.write(200, 14, b"\x01"))
+    rig.board.feed(opencr.write(200, 14, b"\x01"))
     await rig.drive(0.0, 0.0, 700)
     assert not (await rig.driver.read_state()).link.connected
     assert "does not stop by itself" in rig.driver.problem
-    rig.board.feed(dynamixel.write(200, 14, b"\x00"))
-    rig.board.feed(dynamixel.write(200, 18, b"\xff"))
+    rig.board.feed(opencr.write(200, 14, b"\x00"))
+    rig.board.feed(opencr.write(200, 18, b"\xff"))
     await rig.drive(0.0, 0.0, 60)
     assert "switch their power on" in rig.driver.problem
-    rig.board.feed(dynamixel.write(200, 18, b"\x00"))
+    rig.board.feed(opencr.write(200, 18, b"\x00"))
     await rig.drive(0.0, 0.0, 60)
     assert (await rig.driver.read_state()).link.connected
     assert [record.message for record in caplog.records] == [
@@ -147,8 +145,8 @@ async def test_garbage_and_a_board_that_restarts_do_not_move_the_pose(rig: Rig) 
 @pytest.mark.parametrize(
     ("answer", "ours"),
     [
-        (dynamixel.status(200, b"\x00\x50\x05"), True),
-        (dynamixel.status(200, b"\x06\x04\x26"), False),
+        (opencr.status(200, b"\x00\x50\x05"), True),
+        (opencr.status(200, b"\x06\x04\x26"), False),
         (b"", False),
         (b"\x54\x2c" * 7, False),
     ],
@@ -166,7 +164,7 @@ def test_a_port_is_known_by_its_answer(answer: bytes, ours: bool) -> None:
 
     port = Port()
     assert is_opencr(port) is ours  # type: ignore[arg-type]
-    assert port.written == dynamixel.ping(200)
+    assert port.written == opencr.ping(200)
 
 
 async def until(true: Callable[[], bool]) -> None:

@@ -1,7 +1,6 @@
 """Finds robots and drivers by name: ours, those of installed packages, and people's own files."""
 
 import difflib
-import importlib
 import importlib.util
 from importlib import resources
 from importlib.metadata import entry_points
@@ -11,17 +10,19 @@ from typing import Any, TypeVar, cast
 import msgspec
 from msgspec import Struct
 
-from gigabrain_drivers import DRIVERS
+from gigabrain_drivers import DRIVERS, shipped_hosts
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LINKS, LinkOptions, RobotFile, Run
 from gigabrain_drivers.lidars.base import check_turns, source_class
-from gigabrain_drivers.links.port_name import AUTO
+from gigabrain_drivers.links.serial_link import AUTO
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.loading import located
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import ConfigError, UnknownName, unknown
 from gigabrain_zenoh.host.run_folders import state_dir
+from gigabrain_zenoh.plugins import load_plugin, plugin_names
 
+GROUP = "gigabrain.drivers"  # of entry points
 EMULATOR = "{emulator}"  # in a robot's file: the folder of the emulator's ports
 Options = TypeVar("Options", bound=Struct)
 
@@ -36,7 +37,7 @@ def robot_files() -> dict[str, Path]:
 def _robots_of_packages() -> dict[str, Path]:
     """A package that offers a driver may have a robot.yaml of the driver's name in its folder."""
     found = {}
-    for point in entry_points(group="gigabrain.drivers"):
+    for point in entry_points(group=GROUP):
         spec = importlib.util.find_spec(point.module.partition(".")[0])
         for folder in (spec.submodule_search_locations or ()) if spec else ():
             if (path := Path(folder) / "robot.yaml").is_file():
@@ -46,7 +47,7 @@ def _robots_of_packages() -> dict[str, Path]:
 
 def known_drivers() -> list[str]:
     """The names of all drivers: ours, and those that installed packages offer."""
-    return [*DRIVERS, *(point.name for point in entry_points(group="gigabrain.drivers"))]
+    return plugin_names(shipped_hosts(DRIVERS), GROUP)
 
 
 def robot_path(name: str) -> Path:
@@ -97,22 +98,13 @@ def driver_class(name: str) -> type[Driver]:
 
     Raises UnknownName listing the known ones, and ConfigError when what it needs is missing.
     """
-    offered = {point.name: point for point in entry_points(group="gigabrain.drivers")}
-    if name in DRIVERS:
-        module, _, attribute = DRIVERS[name].partition(":")
-        try:
-            return cast("type[Driver]", getattr(importlib.import_module(module), attribute))
-        except ModuleNotFoundError as error:
-            raise ConfigError(
-                f"driver {name!r} needs the package {error.name!r}; "
-                "install it with: pip install 'gigabrain-zenoh[sim]'"
-            ) from None
-    if name in offered:
-        try:
-            return cast("type[Driver]", offered[name].load())
-        except (ImportError, AttributeError) as error:
-            raise ConfigError(f"driver {name!r} of {offered[name].value}: {error}") from None
-    raise unknown("driver", name, {**DRIVERS, **offered})
+    try:
+        return cast("type[Driver]", load_plugin("driver", name, shipped_hosts(DRIVERS), GROUP))
+    except ModuleNotFoundError as error:  # of one of ours: only the simulator needs an extra
+        raise ConfigError(
+            f"driver {name!r} needs the package {error.name!r}; "
+            "install it with: pip install 'gigabrain-zenoh[sim]'"
+        ) from None
 
 
 def make_driver(name: str, run: Run) -> tuple[RobotFile, Driver]:

@@ -1,30 +1,130 @@
-"""The gate of one body: what it remembers on disk, what people ask of it, and what is audited."""
+"""The gate of one body: what it remembers on disk, the requests to it, and what is audited."""
 
 import logging
 import secrets
 from collections.abc import Awaitable, Callable
 from pathlib import Path
+from typing import Annotated
 
+import msgspec
+from msgspec import Meta
 from msgspec.structs import replace
 
-from gigabrain_drivers.driver.cause_watch import CauseWatch
-from gigabrain_drivers.driver.latch import Latched, LatchFile
 from gigabrain_schemas.audit import What
 from gigabrain_schemas.base import TICK_NS, Cause
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.topics import ENABLE, ESTOP, ESTOP_SAID, RELEASE
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.gate.gate import GateState
+from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
 from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.runtime.audit import AuditTrail
 
-log = logging.getLogger(__name__)
+MOST_BYTES = 65_536
+UNREADABLE = Cause(
+    code="latch_unreadable",
+    text="the file that remembers what latched the gate cannot be read",
+    latching=True,
+    remedy="look at the robot, then release it",
+)
 
+Raised = dict[str, tuple[str, Cause]]  # by its code: who raised it, and the cause
+log = logging.getLogger(__name__)
 STEP_NS = TICK_NS // 2  # so long after a tick at least, the next one is no longer late
 EVERY_TICKS = 50  # once a second: what the disk did not take is tried again
 Stop = Callable[[], Awaitable[None]]
+
+
+class Latched(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The content of the file."""
+
+    causes: tuple[Cause, ...] = ()
+    estop_generation: Annotated[int, Meta(ge=0, le=2**62)] = 0  # and it can still count on
+
+
+class LatchFile:
+    """One small file, replaced as a whole and synced."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._path = folder, folder / "latch.json"
+        self._written = Latched()
+
+    def read(self) -> Latched:
+        """What was latched when the driver ended; a file that cannot be read counts as latched.
+
+        Raises ConfigError when the folder cannot be written.
+        """
+        try:
+            make_folder(self._folder)
+            found = msgspec.json.decode(read_bounded(self._path, MOST_BYTES), type=Latched)
+        except FileNotFoundError:
+            found = Latched()
+        except (ConfigError, *DECODE_ERRORS):
+            found = Latched(causes=(UNREADABLE,))
+        except OSError as error:
+            raise ConfigError(_unwritable(self._folder, error)) from None
+        self.write(found)
+        return found
+
+    def keep(self, latched: Latched) -> str:
+        """Write; the problem in one line, or an empty text. From one thread at a time."""
+        try:
+            self.write(latched)
+        except ConfigError as error:
+            return str(error)
+        return ""
+
+    def write(self, latched: Latched) -> None:
+        """On disk when this returns. Raises ConfigError when the folder cannot be written."""
+        if latched == self._written and self._path.exists():
+            return
+        try:
+            replace_file(self._path, msgspec.json.encode(latched))
+        except OSError as error:
+            raise ConfigError(_unwritable(self._folder, error)) from None
+        self._written = latched
+
+
+def _unwritable(folder: Path, error: OSError) -> str:
+    return (
+        f"cannot write {folder}: {error.strerror}; make it writable, "
+        "or name another with --state-dir or XDG_STATE_HOME"
+    )
+
+
+class CauseWatch:
+    """Compares what holds the robot back now with what did so before."""
+
+    def __init__(self, trail: AuditTrail) -> None:
+        self._trail = trail
+        self._known: Raised = {}
+
+    def look(self, state: GateState) -> None:
+        """Write down what is new, and what is gone."""
+        before = self._known
+        now = {code: before.get(code, found) for code, found in raised(state).items()}
+        for code, (who, cause) in now.items():
+            if code not in before:
+                self._trail.note("raised", who, cause.text, code=code)
+        for code, (who, cause) in before.items():
+            if code not in now:
+                self._trail.note("cleared", who, cause.text, code=code)
+        self._known = now
+
+
+def raised(state: GateState) -> Raised:
+    """Every cause of this moment. What safety or the driver has found is not the gate's own."""
+    safety = state.safety
+    found: Raised = {cause.code: ("gate", cause) for cause in state.causes}
+    found |= {cause.code: ("driver", cause) for cause in state.faults}
+    for cause in (*safety.causes, *safety.warnings) if safety else ():
+        found[cause.code] = ("safety", cause)
+    return found
 
 
 class Gatekeeper:

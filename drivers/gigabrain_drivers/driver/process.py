@@ -1,37 +1,30 @@
 """The driver process: joins a body to the bus, through the gate. Written once for all bodies."""
 
 import asyncio
+import functools
 import logging
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, TypeVar, get_args
 
+import msgspec
+from msgspec import Struct, inspect
 from msgspec.structs import replace
 
 from gigabrain_drivers.driver.base import Driver
-from gigabrain_drivers.driver.button_watch import ButtonWatch
+from gigabrain_drivers.driver.button import ButtonWatch
 from gigabrain_drivers.driver.catalog import make_driver, ports_folder
-from gigabrain_drivers.driver.clip import clipped
 from gigabrain_drivers.driver.gatekeeper import Gatekeeper
-from gigabrain_drivers.driver.lockstep import REPEAT_S, Lockstep
-from gigabrain_drivers.driver.raw_speeds import not_finite
+from gigabrain_drivers.driver.lockstep import REPEAT_S, Lockstep, RoundTrip
 from gigabrain_drivers.driver.robot import RobotFile, Run
-from gigabrain_drivers.driver.round_trip import RoundTrip
-from gigabrain_drivers.links.wording import of_command
+from gigabrain_drivers.links.frames import of_command
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import Body, RobotState, SafeState
 from gigabrain_schemas.brain import CmdVel, JointCommand
 from gigabrain_schemas.safety import SafetyState
-from gigabrain_schemas.topics import (
-    BODY,
-    JOINT_CMD,
-    SAFETY,
-    SCAN,
-    STATE,
-    Topic,
-    command_topic,
-)
+from gigabrain_schemas.topics import BODY, JOINT_CMD, SAFETY, SCAN, STATE, Topic, command_topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import DriverConfig
 from gigabrain_zenoh.errors import ConfigError
@@ -41,10 +34,82 @@ from gigabrain_zenoh.geometry.limits import ZERO, limits_of
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
+R = TypeVar("R", bound=Struct)
+Bounds = tuple[float, float]
 log = logging.getLogger(__name__)
-
 BODY_EVERY_TICKS = 50  # once a second
 STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
+
+
+class RawSpeeds(msgspec.Struct):
+    """A command before its numbers are looked at."""
+
+    linear_x: float = 0.0
+    linear_y: float = 0.0
+    angular_z: float = 0.0
+    source: str = ""
+    boot: int = 0
+
+
+def not_finite(payload: bytes) -> tuple[str, int] | None:
+    """Source and boot of a command with NaN or infinity in it; None for anything else."""
+    try:
+        raw = msgspec.msgpack.decode(payload, type=RawSpeeds)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return None
+    speeds = (raw.linear_x, raw.linear_y, raw.angular_z)
+    if all(abs(speed) < float("inf") for speed in speeds):
+        return None
+    return raw.source, raw.boot
+
+
+def clipped(record: R) -> R:
+    """Return `record` with each bounded float within its bounds, in nested records as well."""
+    changes: dict[str, Any] = {}
+    for name, bounds in _fields(type(record)).items():
+        value = getattr(record, name)
+        within = _within(value, bounds)
+        if within is not value:
+            changes[name] = within
+    return msgspec.structs.replace(record, **changes) if changes else record
+
+
+def _within(value: Any, bounds: Bounds | None) -> Any:
+    """Return what is to stand in place of `value`: itself, unless it is out of bounds."""
+    if isinstance(value, Struct):
+        return clipped(value)
+    if isinstance(value, tuple):
+        parts = tuple(_within(part, bounds) for part in value)
+        return value if all(a is b for a, b in zip(value, parts, strict=True)) else parts
+    if bounds is None or not isinstance(value, float) or bounds[0] <= value <= bounds[1]:
+        return value
+    return value if math.isnan(value) else min(max(value, bounds[0]), bounds[1])
+
+
+@functools.cache
+def _fields(of: type[Struct]) -> dict[str, Bounds | None]:
+    """Return the fields that may have to be clipped, with the bounds of their floats."""
+    told = inspect.type_info(of)
+    assert isinstance(told, inspect.StructType)
+    fields = {field.name: _bounds(field.type) for field in told.fields}
+    return {name: bounds for name, bounds in fields.items() if bounds != ()}  # type: ignore[misc]
+
+
+def _bounds(told: inspect.Type) -> Bounds | tuple[()] | None:
+    """Return the bounds of a float or of a tuple's floats; None for records, () for all else."""
+    if isinstance(told, inspect.FloatType):
+        low, high = told.ge, told.le
+        return (-math.inf if low is None else low, math.inf if high is None else high)
+    if isinstance(told, inspect.StructType):
+        return None
+    if isinstance(told, inspect.VarTupleType):
+        return _bounds(told.item_type)
+    if isinstance(told, inspect.TupleType):
+        return _bounds(told.item_types[0])
+    if isinstance(told, inspect.UnionType):
+        found = [one for one in map(_bounds, told.types) if one != ()]
+        return found[0] if found else ()
+    return ()
 
 
 class DriverProcess:

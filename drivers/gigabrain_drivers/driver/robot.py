@@ -5,7 +5,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from gigabrain_drivers.links.port_name import AUTO, check_port
+from gigabrain_drivers.links.serial_link import AUTO, check_port
 from gigabrain_schemas.base import Finite, Name, NonNegative, Positive
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_zenoh.config.settings import LinkName
@@ -42,7 +42,7 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
 class ScanOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A lidar on a line of its own; scan sources add their own fields."""
 
-    driver: str  # one of gigabrain_drivers.lidars.SCAN_SOURCES
+    driver: str  # one of gigabrain_drivers.LIDARS, or of a package's
     port: str = AUTO  # a path, usb:VID:PID[:SERIAL], or auto
 
     def __post_init__(self) -> None:

@@ -1,28 +1,135 @@
-"""A whole emulated robot: one body in MuJoCo, a station for each of its links."""
+"""An emulated robot: one body in MuJoCo, and a device on its port for each of its links."""
 
+import asyncio
 import contextlib
+import dataclasses
 import functools
-import importlib
-from collections.abc import Mapping
-from importlib.metadata import entry_points
+import os
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, cast
 
 import msgspec
+from msgspec.structs import replace
 
+from gigabrain_drivers import shipped_emulators
+from gigabrain_drivers.bodies.line.options import LineOptions
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import LinkOptions, Run
-from gigabrain_drivers.emulators import DEVICES
-from gigabrain_drivers.emulators.base import Broken, Device, EmulatedBody
-from gigabrain_drivers.emulators.claim import claimed, no_ports
-from gigabrain_drivers.emulators.faults import NONE, Faults, faults_in
-from gigabrain_drivers.emulators.physics import emulated_body
-from gigabrain_drivers.emulators.station import Station
-from gigabrain_drivers.emulators.tcp import TcpPort
+from gigabrain_drivers.emulators.base import Broken, Device, EmulatedBody, Port, Wire
+from gigabrain_drivers.emulators.faults import NONE, Faults, FaultyWire, faults_in
+from gigabrain_drivers.emulators.ports import TcpPort
+from gigabrain_drivers.sim.body import MujocoOptions, SimBattery, sim_body
+from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import unknown
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.host.posix import fcntl
+from gigabrain_zenoh.plugins import load_plugin
 
 BASE, SCAN = "base", "scan"
+
+
+def emulated_body(name: str, run: Run) -> EmulatedBody:
+    """Return the robot called `name` in MuJoCo, by the `sim` part of its file.
+
+    Its battery has the voltages that its real link expects. Raises ConfigError.
+    """
+    robot, _, options, folder = catalog.load_link(name, replace(run, link="sim"))
+    if not isinstance(options, MujocoOptions):
+        raise ConfigError(
+            f"{robot.robot_type} has no MuJoCo model, so it cannot be emulated: "
+            "use its own simulation (--link sim), or give it `sim: {driver: mujoco}` and a model"
+        )
+    run = replace(run, folder=folder)
+    body, world = sim_body(robot, options, run), load_world(run.world, run.seed)
+    _, _, real, _ = catalog.load_link(name, replace(run, link="emulated"))
+    if isinstance(real, LineOptions):
+        body = dataclasses.replace(body, battery=_charged(body.battery, real))
+    return EmulatedBody(robot, Simulation(body, world, run.seed), run)
+
+
+def _charged(battery: SimBattery, line: LineOptions) -> SimBattery:
+    """Return the battery between the voltages that the line's driver takes for empty and full."""
+    empty, full = line.battery_empty, line.battery_full
+    if empty is None or full is None:
+        return battery
+    nominal = (empty + full) / 2
+    return dataclasses.replace(
+        battery, empty_voltage=empty, nominal_voltage=nominal, full_voltage=full
+    )
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Have the folder for this process alone, until it ends or dies. Raises ConfigError."""
+    with contextlib.ExitStack() as stack:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+            stack.callback(os.close, descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(
+                f"another emulator has its ports in {folder}; end it, or take another folder "
+                "(--ports)"
+            ) from None
+        except OSError as error:
+            raise no_ports(folder, error) from None
+        yield
+
+
+def no_ports(folder: Path, error: OSError) -> ConfigError:
+    """What to say when ports cannot be made."""
+    return ConfigError(f"no ports can be made in {folder}: {error.strerror}; expected a folder")
+
+
+class Station:
+    """Plugs a device in and runs it. `device` may be looked at, `faults` set at any time."""
+
+    def __init__(self, make: Callable[[Wire], Device], port: Port, clock: Clock) -> None:
+        self._port, self._clock = port, clock
+        self._wire = FaultyWire(port)
+        self.device = make(self._wire)
+        self.faults = NONE
+        self._task: asyncio.Task[None] | None = None
+        port.on_bytes = self._take
+
+    def start(self) -> None:
+        """Switch it on."""
+        self._port.plug()
+        self.device.reset()
+        self._task = asyncio.create_task(self._run())
+
+    async def close(self) -> None:
+        """Switch it off and take the port away. Any number of times."""
+        task, self._task = self._task, None
+        if task:
+            task.cancel()
+            await asyncio.wait((task,))
+        self._port.unplug()
+
+    def set(self, faults: Faults) -> None:
+        """Have these faults and no others from now on."""
+        before, self.faults, self._wire.faults = self.faults, faults, faults
+        self.device.sag_volts = faults.brown_out
+        if faults.unplugged:
+            self._port.unplug()
+        else:
+            self._port.plug()
+        if before.reboot != faults.reboot:  # into reset, with the motors off; or out of it
+            self.device.reset()
+        if before.frozen and not faults.frozen:
+            self._take(b"")
+
+    def _take(self, data: bytes) -> None:
+        if data := self._wire.incoming(data):
+            self.device.feed(data)
+
+    async def _run(self) -> None:
+        async for now_ns in self._clock.every(round(self.device.period_s * 1e9)):
+            if not self.faults.reboot:
+                self.device.step(now_ns)
 
 
 class Emulator:
@@ -102,13 +209,9 @@ def device_class(driver: str) -> type[Device]:
 
     Packages offer theirs in the group `gigabrain.emulators`. Raises UnknownName.
     """
-    offered = {point.name: point for point in entry_points(group="gigabrain.emulators")}
-    if driver not in DEVICES and driver in offered:
-        return offered[driver].load()  # type: ignore[no-any-return]
-    if driver not in DEVICES:
-        raise unknown("emulator for driver", driver, [*DEVICES, *offered])
-    module, _, attribute = DEVICES[driver].partition(":")
-    return getattr(importlib.import_module(module), attribute)  # type: ignore[no-any-return]
+    shipped = shipped_emulators()
+    device = load_plugin("emulator for driver", driver, shipped, "gigabrain.emulators")
+    return cast("type[Device]", device)
 
 
 def wire_of(name: str) -> Literal["serial", "tcp", ""]:

@@ -15,6 +15,14 @@ Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 LONGEST_GARBAGE = 64  # bytes
 
+NUMBERS = {  # what is expected of those that take one
+    "garbage": "from 0 to 1, such as garbage=0.1",
+    "bit_errors": "from 0 to 1, such as bit_errors=0.001",
+    "half_frames": "from 0 to 1, such as half_frames=0.1",
+    "brown_out": "of volts from 0, such as brown_out=6",
+    "runaway": "of m/s, such as runaway=0.1",
+}
+
 
 class Faults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """What is wrong with a device at present. Written as JSON, or as words such as `silence`."""
@@ -43,13 +51,6 @@ class Faults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
 
 
 NONE = Faults()
-NUMBERS = {  # what is expected of those that take one
-    "garbage": "from 0 to 1, such as garbage=0.1",
-    "bit_errors": "from 0 to 1, such as bit_errors=0.001",
-    "half_frames": "from 0 to 1, such as half_frames=0.1",
-    "brown_out": "of volts from 0, such as brown_out=6",
-    "runaway": "of m/s, such as runaway=0.1",
-}
 
 
 def faults_in(words: Iterable[str], stations: Iterable[str]) -> Faults:

@@ -1,7 +1,6 @@
 """What every lidar on a line of its own offers, and how a body carries one."""
 
 import abc
-import importlib
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -10,15 +9,22 @@ from typing import Any, ClassVar, Generic, TypeVar, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gigabrain_drivers import LIDARS, shipped_hosts
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import ScanOptions
-from gigabrain_drivers.lidars import SCAN_SOURCES
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.body import Lidar, LinkHealth
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import ConfigError, unknown
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.plugins import load_plugin
+
+Samples = NDArray[np.float64]
+Piece = TypeVar("Piece")
+MOST_SAMPLES = 20_000  # per turn; the fastest lidar here measures 3200
+CLOCKWISE = -math.pi / 180  # from degrees clockwise to radians counter-clockwise
+SHORTEST, LONGEST = 0.25, 3.0  # of the nominal period; less is a backlog, more is two turns mixed
 
 
 class ScanSource(abc.ABC):
@@ -58,11 +64,12 @@ class ScanSource(abc.ABC):
 
 
 def source_class(name: str) -> type[ScanSource]:
-    """The scan source called `name`. Raises UnknownName listing the known ones."""
-    if name not in SCAN_SOURCES:
-        raise unknown("lidar", name, SCAN_SOURCES)
-    module, _, attribute = SCAN_SOURCES[name].partition(":")
-    return cast("type[ScanSource]", getattr(importlib.import_module(module), attribute))
+    """Return the scan source called `name`: one of ours, or one that a package offers.
+
+    Raises UnknownName listing the known ones, and ConfigError where it cannot be imported.
+    """
+    source = load_plugin("lidar", name, shipped_hosts(LIDARS), "gigabrain.lidars")
+    return cast("type[ScanSource]", source)
 
 
 def check_turns(name: str, lidar: Lidar | None) -> None:
@@ -105,14 +112,6 @@ def carry(driver: Driver, clock: Clock) -> ScanSource | None:
     source.emit = hand_on
     source.open()
     return source
-
-
-Samples = NDArray[np.float64]
-Piece = TypeVar("Piece")
-
-MOST_SAMPLES = 20_000  # per turn; the fastest lidar here measures 3200
-CLOCKWISE = -math.pi / 180  # from degrees clockwise to radians counter-clockwise
-SHORTEST, LONGEST = 0.25, 3.0  # of the nominal period; less is a backlog, more is two turns mixed
 
 
 class Gathered(abc.ABC, Generic[Piece]):

@@ -19,6 +19,15 @@ from gigabrain_zenoh.clock import Clock
 _LDS01 = re.compile(rb"\xfa[\xa0-\xdb].{40}\xfa[\xa0-\xdb]", re.DOTALL)
 _COIN_D4 = re.compile(rb"\xaa\x55.{8}", re.DOTALL)
 
+log = logging.getLogger(__name__)
+LOOK_NS = 100_000_000  # how often it is looked at whether scans come
+PATIENCE_NS = 2_000_000_000  # without a scan, until something is said
+REOPEN_NS = 5_000_000_000  # without a scan, until the port is opened anew
+GATHER_S = 0.01  # a turn takes ten times as long; its bytes come hundreds of times a second
+GATHER_BAUD = 460_800  # what comes faster fills the 4 KB of a port too soon
+LAST_WORDS_S = 0.02
+NEWEST = 256  # bytes, kept to say what else may be sending there
+
 
 def who_sends(data: bytes) -> str:
     """Which known lidar sends such bytes, or an empty text."""
@@ -31,17 +40,6 @@ def who_sends(data: bytes) -> str:
     if _COIN_D4.search(data):
         return "an LDS-03 or a YDLIDAR"
     return ""
-
-
-log = logging.getLogger(__name__)
-
-LOOK_NS = 100_000_000  # how often it is looked at whether scans come
-PATIENCE_NS = 2_000_000_000  # without a scan, until something is said
-REOPEN_NS = 5_000_000_000  # without a scan, until the port is opened anew
-GATHER_S = 0.01  # a turn takes ten times as long; its bytes come hundreds of times a second
-GATHER_BAUD = 460_800  # what comes faster fills the 4 KB of a port too soon
-LAST_WORDS_S = 0.02
-NEWEST = 256  # bytes, kept to say what else may be sending there
 
 
 class SerialSource(ScanSource):

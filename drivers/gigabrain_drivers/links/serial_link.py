@@ -1,23 +1,115 @@
-"""A body on a serial line: opened by pyserial, read and written by the event loop."""
+"""Serial lines: opened by pyserial, read and written by the event loop; and how ports are named.
+
+A robot's file names a port by a path, `usb:VID:PID[:SERIAL]`, or `auto`.
+"""
 
 import asyncio
 import contextlib
 import errno
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
 import serial
+from serial.tools import list_ports
 
-from gigabrain_drivers.links import ports
 from gigabrain_drivers.links.link import Link, LinkProblem
-from gigabrain_drivers.links.port_name import AUTO
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.host.posix import termios
 
-Probe = Callable[[serial.Serial], bool]
+AUTO = "auto"
+USB = "usb:"
+_ID = re.compile(r"[0-9A-Fa-f]{1,4}")
 
+NO_PORT = (errno.ENOTTY, errno.EINVAL, errno.EISDIR)  # a file, a folder, another device
+Probe = Callable[[serial.Serial], bool]
 NO_MODEM_LINES = (errno.ENOTTY, errno.EINVAL)  # ptys have none, nor have some USB adapters
+
+
+def check_port(name: str) -> None:
+    """Raises ValueError, as `port: ...`, for what can be no serial port."""
+    if not name.strip() or "://" in name:
+        raise ValueError(
+            f"port: expected a path such as /dev/ttyUSB0, usb:VID:PID or auto, got {name!r}"
+        )
+    for word in (AUTO, USB):
+        if name.lower().startswith(word) and not name.startswith(word):
+            right = word + name[len(word) :]
+            raise ValueError(f"port: expected small letters; did you mean {right!r}?")
+    if name.startswith(USB):
+        try:
+            usb_id(name)
+        except ValueError as error:
+            raise ValueError(f"port: {error}") from None
+
+
+def usb_id(port: str) -> tuple[int, int, str]:
+    """(vendor, product, serial number or "") of `usb:VID:PID[:SERIAL]`. Raises ValueError."""
+    parts = port.removeprefix(USB).split(":", 2)
+    if len(parts) < 2:
+        raise ValueError(f"expected usb:VID:PID or usb:VID:PID:SERIAL, got {port!r}")
+    if not all(_ID.fullmatch(part) for part in parts[:2]):
+        raise ValueError(f"expected VID and PID of up to four hexadecimal digits, got {port!r}")
+    return int(parts[0], 16), int(parts[1], 16), parts[2] if len(parts) > 2 else ""
+
+
+def candidate_paths(port: str) -> list[str]:
+    """The paths that `port` (a path, `usb:VID:PID[:SERIAL]` or `auto`) may stand for."""
+    if port == AUTO:
+        return sorted(p.device for p in list_ports.comports() if p.vid is not None)
+    if not port.startswith(USB):
+        return [port]
+    vendor, product, serial_number = usb_id(port)
+    return sorted(
+        p.device
+        for p in list_ports.comports()
+        if (p.vid, p.pid) == (vendor, product) and serial_number in ("", p.serial_number)
+    )
+
+
+def describe_missing(port: str) -> str:
+    """What to say when there is no such device."""
+    if port == AUTO:
+        return "no serial port at all: is it plugged in?"
+    what = "USB device " if port.startswith(USB) else ""
+    return f"no {what}{port}: is it plugged in?"
+
+
+def describe_absent(port: str) -> str:
+    """What to say of a port that is not there now; nothing where it is. Raises ValueError."""
+    return (
+        "" if any(Path(path).exists() for path in candidate_paths(port)) else describe_missing(port)
+    )
+
+
+def describe_refusal(path: str, error: OSError) -> str:
+    """What to say when the device is there but cannot be opened."""
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return (
+            f"no permission to open {path}; add yourself to its group (dialout on Debian), or "
+            f'this udev rule: KERNEL=="{Path(path).resolve().name}", MODE="0666"'
+        )
+    if error.errno in (errno.EAGAIN, errno.EBUSY):
+        holders = ", ".join(map(str, _holders(path)))
+        return f"{path} is in use{f' by pid {holders}' if holders else ''}"
+    cause = error.__context__  # of pyserial's errors without a number
+    number = cause.args[0] if isinstance(cause, termios.error) else error.errno
+    if number in NO_PORT:
+        return f"{path} is no serial port"
+    return f"{path}: {error.strerror or error}"
+
+
+def _holders(path: str) -> list[int]:
+    """Who has the device open, as far as we may look (Linux)."""
+    device, found = os.path.realpath(path), []
+    for entry in Path("/proc").glob("[0-9]*/fd/*"):
+        try:
+            if os.readlink(entry) == device:
+                found.append(int(entry.parts[2]))
+        except OSError:
+            continue  # not ours to look at, or gone meanwhile
+    return sorted(set(found))
 
 
 class SerialLink(Link):
@@ -65,9 +157,9 @@ class SerialLink(Link):
 
     def _open(self) -> serial.Serial:
         """In a thread: some adapters take tens of milliseconds."""
-        paths = ports.candidates(self._port)
+        paths = candidate_paths(self._port)
         if not paths:
-            raise LinkProblem(ports.missing(self._port))
+            raise LinkProblem(describe_missing(self._port))
         if self._port != AUTO:
             self.path = paths[0]
             return ready(open_port(self.path, self.baud))
@@ -109,11 +201,11 @@ class SerialLink(Link):
 def open_port(path: str, baud: int) -> serial.Serial:
     """Open a serial port for us alone. Raises LinkProblem saying what to do about it."""
     if not Path(path).exists():
-        raise LinkProblem(ports.missing(path))
+        raise LinkProblem(describe_missing(path))
     try:
         return serial.Serial(path, baud, timeout=0.2, write_timeout=0.2, exclusive=True)
     except OSError as error:  # serial.SerialException is one
-        raise LinkProblem(ports.refused(path, error)) from None
+        raise LinkProblem(describe_refusal(path, error)) from None
     except (ValueError, termios.error) as error:
         raise LinkProblem(f"{path}: {error}") from None
 

@@ -8,29 +8,61 @@ import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
-from gigabrain_drivers.sim.account import account_of
-from gigabrain_drivers.sim.options import MujocoOptions, sim_body
-from gigabrain_drivers.sim.pace import Pace
-from gigabrain_drivers.sim.physics import Simulation
-from gigabrain_drivers.sim.readings import scan_of, state_of
+from gigabrain_drivers.sim.body import MujocoOptions, sim_body
+from gigabrain_drivers.sim.physics import Simulation, account_of
 from gigabrain_drivers.sim.tick import TICK_NS as STEP_NS
+from gigabrain_drivers.sim.tick import Pace
 from gigabrain_drivers.sim.worlds import load_world
-from gigabrain_schemas.base import TICK_NS, Message, Velocity
-from gigabrain_schemas.body import RobotState
-from gigabrain_schemas.sensors import Imu, LaserScan
+from gigabrain_schemas.arrays import ranges_bytes
+from gigabrain_schemas.base import TICK_NS, Message, Pose, Velocity
+from gigabrain_schemas.body import Battery, Joint, Lidar, RobotState
+from gigabrain_schemas.sensors import Imu, ImuData, LaserScan
 from gigabrain_schemas.topics import IMU, SCAN
 from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
 T = TypeVar("T")
-
 STEPS = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
 STEP_S = STEP_NS / 1e9
 DEAD_MAN_NS = 150_000_000  # of simulated time: as long as a firmware would wait
 SPEEDS = (0.1, 100.0)
+
+
+def state_of(simulation: Simulation, robot_type: str) -> RobotState:
+    """By the body's own sensors, as it is now."""
+    odometry, charge, imu = simulation.odometry(), simulation.battery(), simulation.imu()
+    return RobotState(
+        robot_type=robot_type,
+        pose=Pose(x=odometry.x, y=odometry.y, yaw=math.remainder(odometry.yaw, math.tau)),
+        velocity=Velocity(**simulation.velocity()._asdict()),
+        joints=tuple(Joint(**motor._asdict()) for motor in simulation.motors()),
+        battery=Battery(
+            voltage=charge.voltage, percentage=charge.percentage, current=charge.current
+        ),
+        imu=ImuData(
+            orientation=imu.orientation,
+            angular_velocity=imu.angular_velocity,
+            linear_acceleration=imu.linear_acceleration,
+        ),
+        bumpers=(simulation.bumper(),),
+    )
+
+
+def scan_of(lidar: Lidar, ranges: NDArray[np.float32]) -> LaserScan:
+    """One turn of `lidar` with these `ranges` (beams,) [m]."""
+    return LaserScan(
+        angle_min=0.0,
+        angle_increment=math.tau / lidar.beams,
+        range_min=lidar.range_min,
+        range_max=lidar.range_max,
+        ranges=ranges_bytes(ranges),
+    )
 
 
 class Reading(NamedTuple):

@@ -1,11 +1,78 @@
-"""How a body gets about: on wheels or on legs, behind one interface."""
+"""How a simulated body moves: on wheels or on legs, behind one interface; and how it wears."""
 
 import abc
+import math
+from collections import deque
 from typing import NamedTuple
 
-from gigabrain_drivers.kinematics import Gait, Twist
-from gigabrain_drivers.sim.imu import ImuSample
+import mujoco
+import numpy as np
+
+from gigabrain_drivers.kinematics.legs import JOINT_NAMES, LEGS, Gait, Senses, Vector
+from gigabrain_drivers.kinematics.trot import Trot
+from gigabrain_drivers.kinematics.wheels import Twist
+from gigabrain_drivers.sim.body import SimBattery, SimBody, SimMotor, SimQuadruped
+from gigabrain_drivers.sim.scene import ROBOT
+from gigabrain_drivers.sim.sensors import ImuSample
+from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_zenoh.errors import Unsupported
+
+HOUR_S = 3600.0
+
+VELOCITY_TICKS = 5  # velocity is measured over 50 ms: a finer one would be encoder noise
+REST = Twist(0.0, 0.0, 0.0)
+
+
+class Charge(NamedTuple):
+    """The battery as the robot's board reports it."""
+
+    voltage: float  # [V], at the terminals
+    percentage: float  # 0-100
+    current: float  # [A], positive when it drains
+
+
+class Battery:
+    """Counts charge; the voltage falls along two straight lines, less the drop inside the cells."""
+
+    def __init__(self, config: SimBattery) -> None:
+        self._config = config
+        self._left_ah = config.capacity_ah * config.percentage / 100
+        self._current = config.idle_current_a
+
+    def drain(self, drive_current: float) -> None:
+        """Take one tick of `drive_current` [A] and the idle current out of it."""
+        self._current = self._config.idle_current_a + drive_current
+        self._left_ah = max(self._left_ah - self._current * TICK_S / HOUR_S, 0.0)
+
+    def read(self) -> Charge:
+        """What the board reports now."""
+        config, share = self._config, self._left_ah / self._config.capacity_ah
+        if share > 0.5:
+            rest = config.nominal_voltage
+            rest += (2 * share - 1) * (config.full_voltage - config.nominal_voltage)
+        else:
+            rest = config.empty_voltage
+            rest += 2 * share * (config.nominal_voltage - config.empty_voltage)
+        return Charge(
+            rest - self._current * config.internal_resistance_ohm, 100 * share, self._current
+        )
+
+
+class MotorHeat:
+    """One motor's temperature: heated by its current squared, cooled by the air."""
+
+    def __init__(self, config: SimMotor) -> None:
+        self._config = config
+        self.celsius = config.ambient_celsius
+
+    def warm(self, free_current: float, torque: float) -> float:
+        """One tick at a no-load current [A] and a torque [N m]; returns the whole current [A]."""
+        config = self._config
+        current = free_current + abs(torque) / config.torque_per_ampere
+        cooling = (self.celsius - config.ambient_celsius) / config.thermal_resistance
+        power = current * current * config.resistance_ohm - cooling
+        self.celsius += power * TICK_S / config.heat_capacity
+        return current
 
 
 class Motor(NamedTuple):
@@ -18,7 +85,7 @@ class Motor(NamedTuple):
     temperature: float  # [deg C]
 
 
-class Odometry(NamedTuple):
+class OdometryReading(NamedTuple):
     """Where the body's own sensors say that it is, from (0, 0, 0) at the start."""
 
     x: float  # [m]
@@ -57,7 +124,7 @@ class Locomotion(abc.ABC):
         """Warm the motors by the tick's work; returns the current [A] that it took."""
 
     @abc.abstractmethod
-    def odometry(self) -> Odometry:
+    def odometry(self) -> OdometryReading:
         """Pose and velocity."""
 
     @abc.abstractmethod
@@ -71,3 +138,234 @@ class Locomotion(abc.ABC):
     def contacts(self) -> tuple[bool, ...]:
         """Which feet bear weight; none for a body without feet."""
         return ()
+
+
+class DifferentialBase:
+    """Differential kinematics of two wheels with incremental encoders (left, right)."""
+
+    def __init__(self, body: SimBody) -> None:
+        self._body = body
+        radius = body.odometry_wheel_radius or body.wheel_radius
+        self._angle_per_tick = math.tau / body.encoder_ticks
+        self._metres_per_tick = self._angle_per_tick * radius
+        self._target = (0.0, 0.0)
+        self._speed = (0.0, 0.0)
+        self._counts = (0, 0)
+        self._past = deque([(0, 0)] * (VELOCITY_TICKS + 1), maxlen=VELOCITY_TICKS + 1)
+        self._x = self._y = self._yaw = 0.0
+
+    def command(self, linear_x: float, angular_z: float) -> tuple[float, float]:
+        """Aim for a velocity; both wheels slow down alike if one would be too fast."""
+        body = self._body
+        turn = angular_z * body.wheel_separation / 2
+        left, right = (linear_x - turn) / body.wheel_radius, (linear_x + turn) / body.wheel_radius
+        scale = max(abs(left), abs(right)) / body.max_wheel_speed
+        if scale > 1:
+            left, right = left / scale, right / scale
+        self._target = (left, right)
+        forward = (left + right) / 2 * body.wheel_radius
+        return forward, (right - left) * body.wheel_radius / body.wheel_separation
+
+    def ramp(self) -> tuple[float, float]:
+        """The wheel speeds to ask the motors for in the next tick [rad/s]."""
+        step = self._body.max_wheel_acceleration * TICK_S
+        (left, right), (left_now, right_now) = self._target, self._speed
+        self._speed = (
+            left_now + min(max(left - left_now, -step), step),
+            right_now + min(max(right - right_now, -step), step),
+        )
+        return self._speed
+
+    def measure(self, left_angle: float, right_angle: float) -> None:
+        """Count the encoder ticks of the past tick and integrate them at the mid heading."""
+        left = self._count(left_angle, self._counts[0])
+        right = self._count(right_angle, self._counts[1])
+        moved = (left + right - self._counts[0] - self._counts[1]) / 2 * self._metres_per_tick
+        self._counts = (left, right)
+        self._past.append(self._counts)
+        yaw = (right - left) * self._metres_per_tick / self._body.wheel_separation
+        middle = (yaw + self._yaw) / 2
+        self._x += moved * math.cos(middle)
+        self._y += moved * math.sin(middle)
+        self._yaw = yaw
+
+    def _count(self, angle: float, count: int) -> int:
+        """The new count; it moves by whole ticks only, so a wheel at rest does not flicker."""
+        return count + math.trunc(angle / self._angle_per_tick - count)
+
+    def odometry(self) -> OdometryReading:
+        """Pose and velocity by the encoders alone."""
+        (left, right), (left_then, right_then) = self._counts, self._past[0]
+        per_second = self._metres_per_tick / (VELOCITY_TICKS * TICK_S)
+        left_speed, right_speed = (left - left_then) * per_second, (right - right_then) * per_second
+        turn = (right_speed - left_speed) / self._body.wheel_separation
+        return OdometryReading(self._x, self._y, self._yaw, (left_speed + right_speed) / 2, turn)
+
+    def wheels(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """(angle [rad], speed [rad/s]) of the left and of the right wheel, by the encoders."""
+        (left, right), (left_then, right_then) = self._counts, self._past[0]
+        angle, per_second = self._angle_per_tick, self._angle_per_tick / (VELOCITY_TICKS * TICK_S)
+        return (
+            (left * angle, (left - left_then) * per_second),
+            (right * angle, (right - right_then) * per_second),
+        )
+
+
+class Rolling(Locomotion):
+    """The wheels get to what is commanded at their greatest acceleration; nothing goes sideways."""
+
+    def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._body, self._base, self._data = body, DifferentialBase(body), data
+        self._angles = [int(model.joint(f"{ROBOT}{n}_joint").qposadr[0]) for n in body.wheels]
+        self._motors = [int(model.actuator(f"{ROBOT}{n}").id) for n in body.wheels]
+        self._heat = [MotorHeat(body.motor) for _ in body.wheels]
+
+    def command(self, twist: Twist) -> Twist:
+        """Both wheels slow down alike if one would be too fast."""
+        forward, turn = self._base.command(twist.linear_x, twist.angular_z)
+        return Twist(forward, 0.0, turn)
+
+    def act(self) -> None:
+        """Wheel speeds."""
+        left, right = self._base.ramp()
+        control = self._data.ctrl
+        control[self._motors[0]], control[self._motors[1]] = left, right
+
+    def sense(self, imu: ImuSample) -> None:
+        """Wheel angles alone."""
+        position = self._data.qpos
+        self._base.measure(float(position[self._angles[0]]), float(position[self._angles[1]]))
+
+    def wear(self) -> float:
+        """The motors draw by their speed and by their torque."""
+        config, effort, current = self._body, self._data.actuator_force.tolist(), 0.0
+        share = config.battery.drive_current_a / len(self._heat) / config.max_wheel_speed
+        wheels = zip(self._heat, self._motors, self._base.wheels(), strict=True)
+        for heat, motor, (_, speed) in wheels:
+            current += heat.warm(share * abs(speed), effort[motor])
+        return current
+
+    def odometry(self) -> OdometryReading:
+        """By the wheel encoders alone."""
+        return self._base.odometry()
+
+    def velocity(self) -> Twist:
+        """By the wheel encoders alone."""
+        odometry = self._base.odometry()
+        return Twist(odometry.linear_x, 0.0, odometry.angular_z)
+
+    def motors(self) -> tuple[Motor, ...]:
+        """Left and right wheel."""
+        effort = self._data.actuator_force
+        parts = zip(self._body.wheels, self._base.wheels(), self._motors, self._heat, strict=True)
+        return tuple(
+            Motor(f"{name}_joint", angle, speed, float(effort[motor]), heat.celsius)
+            for name, (angle, speed), motor, heat in parts
+        )
+
+
+class Walking(Locomotion):
+    """Trots on what the body itself measures; stands at the start."""
+
+    def __init__(self, body: SimQuadruped, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._body, self._data = body, data
+        names = [f"{ROBOT}{name}" for name in JOINT_NAMES]
+        self._angles = np.array([model.joint(name).qposadr[0] for name in names])
+        self._motors = np.array([model.actuator(name).id for name in names])
+        self._touch = np.array([model.sensor(f"{ROBOT}{leg}_contact").adr[0] for leg in LEGS])
+        self._heat = [MotorHeat(body.motor) for _ in names]
+        self._radians = math.tau / body.encoder_ticks
+        self._gait = body.walker.to_gait(REST)
+        height = self._gait.height
+        self._targets = body.geometry.standing(height)
+        standing = [angle for leg in self._targets for angle in leg]
+        data.qpos[self._angles] = data.ctrl[self._motors] = standing
+        self._counts = [round(angle / self._radians) for angle in standing]
+        stiffness = float(model.actuator_gainprm[self._motors[0], 0])
+        mass = float(model.body_subtreemass[model.body(f"{ROBOT}base").id])
+        self._trot = Trot(body.geometry, mass, stiffness, height)
+        self._senses: Senses | None = None
+        self._turned = 0.0  # [rad], not wrapped
+
+    @property
+    def fallen(self) -> bool:  # type: ignore[override]
+        """Whether it lies on the floor, by its own attitude."""
+        return self._trot.fallen
+
+    def command(self, twist: Twist) -> Twist:
+        """By the walker's gait for it."""
+        self._gait = self._body.walker.to_gait(twist)
+        return self._body.walker.to_body(self._gait)
+
+    def walk(self, gait: Gait) -> None:
+        """From the next tick on."""
+        self._gait = gait
+
+    def act(self) -> None:
+        """Where the servos shall be at the end of the tick."""
+        if self._senses:
+            self._targets = self._trot.step(self._gait, self._senses, TICK_S)
+        self._data.ctrl[self._motors] = _flat(self._targets)
+
+    def sense(self, imu: ImuSample) -> None:
+        """Encoders, feet and inertial unit become one sample."""
+        angles = self._data.qpos[self._angles].tolist()
+        counts = [round(angle / self._radians) for angle in angles]
+        steps = zip(counts, self._counts, strict=True)
+        rates = [(now - before) * self._radians / TICK_S for now, before in steps]
+        self._counts = counts
+        forces = self._data.sensordata[self._touch].tolist()
+        self._senses = Senses(
+            joints=_by_leg([count * self._radians for count in counts]),
+            rates=_by_leg(rates),
+            contacts=tuple(force > self._body.contact_n for force in forces),
+            orientation=imu.orientation,
+            angular_velocity=imu.angular_velocity,
+            linear_acceleration=imu.linear_acceleration,
+        )
+        self._trot.sense(self._senses, TICK_S)
+        self._turned += self._trot.odometry.velocity.angular_z * TICK_S
+
+    def wear(self) -> float:
+        """Torque heats the windings; what the joints do to the world comes on top."""
+        power, resistance = 0.0, self._body.motor.resistance_ohm
+        rates = _flat(self._senses.rates) if self._senses else [0.0] * len(self._heat)
+        for heat, effort, rate in zip(self._heat, self._efforts(), rates, strict=True):
+            amperes = heat.warm(0.0, effort)
+            power += amperes * amperes * resistance + max(effort * rate, 0.0)
+        return power / self._body.battery.nominal_voltage
+
+    def odometry(self) -> OdometryReading:
+        """By legs and gyroscope."""
+        pose, velocity = self._trot.odometry.pose, self._trot.odometry.velocity
+        return OdometryReading(pose.x, pose.y, self._turned, velocity.linear_x, velocity.angular_z)
+
+    def velocity(self) -> Twist:
+        """By legs, accelerometer and gyroscope."""
+        return self._trot.odometry.velocity
+
+    def motors(self) -> tuple[Motor, ...]:
+        """The twelve joints, leg by leg."""
+        rates = _flat(self._senses.rates) if self._senses else [0.0] * len(self._heat)
+        parts = zip(JOINT_NAMES, self._counts, rates, self._efforts(), self._heat, strict=True)
+        return tuple(
+            Motor(name, count * self._radians, rate, effort, heat.celsius)
+            for name, count, rate, effort, heat in parts
+        )
+
+    def contacts(self) -> tuple[bool, ...]:
+        """In the order of LEGS."""
+        return self._senses.contacts if self._senses else (False,) * len(LEGS)
+
+    def _efforts(self) -> list[float]:
+        """Each joint's torque [N m]."""
+        return self._data.actuator_force[self._motors].tolist()  # type: ignore[no-any-return]
+
+
+def _flat(legs: tuple[Vector, ...]) -> list[float]:
+    return [angle for leg in legs for angle in leg]
+
+
+def _by_leg(values: list[float]) -> tuple[Vector, ...]:
+    a = iter(values)
+    return tuple(zip(a, a, a, strict=True))

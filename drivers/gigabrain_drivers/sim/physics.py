@@ -1,10 +1,14 @@
 """A body in a world, one tick of 10 ms at a time. No bus, no clock and no thread of its own."""
 
+from typing import Any
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_drivers.kinematics import Gait, Twist
+from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_drivers.kinematics.legs import Gait
+from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.sim.body import (
     SimBattery,
     SimBody,
@@ -13,26 +17,27 @@ from gigabrain_drivers.sim.body import (
     SimMotor,
     SimQuadruped,
 )
-from gigabrain_drivers.sim.geometry import ClosedPath
-from gigabrain_drivers.sim.imu import Imu, ImuSample
-from gigabrain_drivers.sim.lidar import Lidar
-from gigabrain_drivers.sim.locomotion import Locomotion, Motor, Odometry
-from gigabrain_drivers.sim.person import Person
-from gigabrain_drivers.sim.rolling import Rolling
-from gigabrain_drivers.sim.scene import PERSON, ROBOT, compile_scene, yaw_quaternion
-from gigabrain_drivers.sim.streams import Stream, generator
+from gigabrain_drivers.sim.locomotion import (
+    Battery,
+    Charge,
+    Locomotion,
+    Motor,
+    OdometryReading,
+    Rolling,
+    Walking,
+)
+from gigabrain_drivers.sim.scene import PERSON, ROBOT, Person, compile_scene, yaw_quaternion
+from gigabrain_drivers.sim.sensors import Imu, ImuSample, Lidar
 from gigabrain_drivers.sim.tick import TICK_NS
 from gigabrain_drivers.sim.truth import Truth
-from gigabrain_drivers.sim.walking import Walking
-from gigabrain_drivers.sim.wear import Battery, Charge
-from gigabrain_drivers.sim.world import World
+from gigabrain_drivers.sim.world import ClosedPath, Stream, World, generator
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
 __all__ = [
     "Charge",
     "ImuSample",
     "Motor",
-    "Odometry",
+    "OdometryReading",
     "SimBattery",
     "SimBody",
     "SimLidar",
@@ -119,7 +124,7 @@ class Simulation:
             raise Unsupported("this body has no lidar")
         return self._lidar.scan(self.data)
 
-    def odometry(self) -> Odometry:
+    def odometry(self) -> OdometryReading:
         """Pose and velocity by the body's own sensors."""
         return self._locomotion.odometry()
 
@@ -176,3 +181,23 @@ def locomotion_of(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) ->
     if isinstance(body, SimQuadruped):
         return Walking(body, model, data)
     raise ConfigError(f"{type(body).__name__} has neither wheels nor legs")
+
+
+def account_of(simulation: Simulation, robot: RobotFile, run: Run) -> dict[str, Any]:
+    """The truth of the run so far, by the physics itself."""
+    truth = simulation.truth
+    pose = truth.pose()
+    return {
+        "body": robot.robot_type,
+        "world": run.world,
+        "seed": run.seed,
+        "sim_seconds": round(simulation.time_ns / 1e9, 2),
+        "distance_m": round(truth.distance_m, 3),
+        "contacts": truth.contacts,
+        "min_clearance_m": round(truth.min_clearance_m, 3),
+        "person_stood": simulation.person_stood,
+        "true_speed": round(truth.speed()[0], 4),
+        "true_x": round(pose.x, 4),
+        "true_y": round(pose.y, 4),
+        "true_yaw": round(pose.yaw, 4),
+    }

@@ -1,4 +1,4 @@
-"""A picture of a robot in its room, drawn without a screen."""
+"""Pictures of a robot in its room, rendered off screen."""
 
 import importlib
 import math
@@ -13,11 +13,14 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_drivers.sim.body import SimModel
-from gigabrain_drivers.sim.geometry import Pose, clearance
+from gigabrain_drivers.driver.catalog import make_driver
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.sim.body import SimModel, sim_body
+from gigabrain_drivers.sim.driver import MujocoDriver
 from gigabrain_drivers.sim.physics import Simulation
-from gigabrain_drivers.sim.world import World
-from gigabrain_zenoh.errors import ConfigError
+from gigabrain_drivers.sim.world import Pose, World, clearance
+from gigabrain_drivers.sim.worlds import load_world
+from gigabrain_zenoh.errors import ConfigError, Unsupported
 
 DISTANCE_M, HEIGHT_M = 1.0, 0.50  # of the camera, from the robot and above the floor
 AIM_HEIGHT_M = 0.22  # above the robot, so that the room is in the picture
@@ -129,3 +132,11 @@ def _camera(world: World, robot: Pose) -> mujoco.MjvCamera:
     camera.azimuth = math.degrees(robot.yaw + side) + 180
     camera.elevation = -math.degrees(math.atan2(HEIGHT_M - AIM_HEIGHT_M, DISTANCE_M))
     return camera
+
+
+def portray(body: str, world: str, seed: int, png: Path) -> None:
+    """Draw a robot in its world. Raises ConfigError, and Unsupported without a MuJoCo model."""
+    robot, driver = make_driver(body, Run(folder=Path(), world=world, seed=seed))
+    if not isinstance(driver, MujocoDriver):
+        raise Unsupported(f"{body} has no MuJoCo model to draw")
+    render(sim_body(robot, driver.options, driver.run), load_world(world, seed), seed, png)

@@ -1,24 +1,111 @@
-"""From a world and a body to one MuJoCo model."""
+"""Compiles a world and a body into one MuJoCo model."""
 
 import logging
 import math
+from collections.abc import Callable
 
 import mujoco
 
 from gigabrain_drivers.sim.body import SimBody, SimModel
-from gigabrain_drivers.sim.geometry import Box, Pose, Shape
-from gigabrain_drivers.sim.looks import FLOOR, add_light, add_materials
-from gigabrain_drivers.sim.person import RADIUS_M
 from gigabrain_drivers.sim.tick import TICK_S
-from gigabrain_drivers.sim.world import World
+from gigabrain_drivers.sim.world import Box, ClosedPath, Pose, Shape, World
 from gigabrain_zenoh.errors import ConfigError
 
-log = logging.getLogger(__name__)
+FLOOR = "floor"  # name of the floor's geom, material and texture
 
+MATERIALS = {
+    "wall": (0.93, 0.92, 0.89),
+    "wood": (0.66, 0.47, 0.28),
+    "dark_wood": (0.36, 0.24, 0.16),
+    "carton": (0.76, 0.60, 0.42),
+    "white": (0.95, 0.95, 0.95),
+    "black": (0.06, 0.06, 0.07),
+    "steel": (0.66, 0.69, 0.72),
+    "blue": (0.20, 0.36, 0.60),
+    "teal": (0.13, 0.52, 0.53),
+    "green": (0.38, 0.56, 0.36),
+    "leaf": (0.20, 0.46, 0.20),
+    "clay": (0.72, 0.38, 0.26),
+    "orange": (0.90, 0.48, 0.16),
+    "yellow": (0.94, 0.76, 0.26),
+    "skin": (0.86, 0.66, 0.53),
+}
+
+RADIUS_M = 0.25
+SPEED = 0.8  # [m/s]
+KEEP_AWAY_M = 0.5  # from the person's side to the robot's outer edge
+ANEW_M = 1.0  # walked since it last stood: standing again is another meeting
+log = logging.getLogger(__name__)
 ROBOT = "robot/"  # prefix of all names of the robot's model
 PERSON = "person"
 UNLIKE = 0.05  # share by which two measures differ that should be the same
 PERSON_HEIGHT_M = 1.45  # to the shoulders
+
+
+def add_materials(spec: mujoco.MjSpec, world: World) -> None:
+    """Sky, the floor's checks, and a material for each colour that a shape may name."""
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=(0.80, 0.87, 0.94),
+        rgb2=(0.42, 0.52, 0.64),
+        width=64,
+        height=384,
+    )
+    spec.add_texture(
+        name=FLOOR,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=world.floor[0],
+        rgb2=world.floor[1],
+        width=128,
+        height=128,
+    )
+    repeat = (0.5 / world.check[0], 0.5 / world.check[1])  # a texture holds two checks each way
+    floor = spec.add_material(name=FLOOR, texrepeat=repeat, texuniform=True, reflectance=0.04)
+    floor.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = FLOOR
+    for name, colour in MATERIALS.items():
+        spec.add_material(name=name, rgba=(*colour, 1), specular=0.2, shininess=0.3)
+
+
+def add_light(spec: mujoco.MjSpec) -> None:
+    """A low sun that casts shadows, and soft light from the camera."""
+    spec.visual.headlight.ambient = (0.45, 0.45, 0.46)
+    spec.visual.headlight.diffuse = (0.30, 0.30, 0.30)
+    spec.visual.headlight.specular = (0.1, 0.1, 0.1)
+    spec.worldbody.add_light(
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=(0, 0, 5),
+        dir=(0.30, 0.38, -0.87),
+        diffuse=(0.62, 0.60, 0.56),
+        specular=(0.25, 0.25, 0.25),
+        castshadow=True,
+    )
+
+
+class Person:
+    """Walks a closed path at 0.8 m/s, and stands while one more step would come too close."""
+
+    def __init__(self, path: ClosedPath, start: float) -> None:
+        self._path = path
+        self._walked = start
+        self.pose = path.at(start)
+        self.stood = 0  # how often it had to, for the robot
+        self._since_m = ANEW_M
+
+    def advance(self, robot_distance: Callable[[float, float], float]) -> Pose:
+        """Walk for one tick; `robot_distance(x, y)` is from a point to the robot's edge [m]."""
+        walked = (self._walked + SPEED * TICK_S) % self._path.length
+        ahead = self._path.at(walked)
+        gap = robot_distance(ahead.x, ahead.y)
+        if gap >= KEEP_AWAY_M + RADIUS_M or gap > robot_distance(self.pose.x, self.pose.y):
+            self._walked, self.pose = walked, ahead
+            self._since_m += SPEED * TICK_S
+        else:
+            self.stood += self._since_m >= ANEW_M
+            self._since_m = 0.0
+        return self.pose
 
 
 def compile_scene(body: SimModel, world: World) -> mujoco.MjModel:

@@ -1,4 +1,27 @@
-"""The simulation's own clock: whole ticks, so that time never drifts."""
+"""The simulation's clock: whole ticks, so that time never drifts, paced by the wall clock."""
+
+import time
 
 TICK_NS = 10_000_000  # one advance of the simulation
 TICK_S = TICK_NS / 1e9
+
+
+LATE_S = 0.25  # further behind than this, time is dropped instead of raced after
+
+
+class Pace:
+    """Absolute deadlines, `step_s` [s] apart, counted from the making of this."""
+
+    def __init__(self, step_s: float) -> None:
+        self._step_s, self._start_s, self._done = step_s, time.perf_counter(), 0
+        self.dropped_s = 0.0  # all together
+
+    def wait(self, steps: int = 1) -> None:
+        """Sleep until the deadline that lies so many steps behind the last one."""
+        self._done += steps
+        wait = self._start_s + self._done * self._step_s - time.perf_counter()
+        if wait > 0:
+            time.sleep(wait)
+        elif wait < -LATE_S:
+            self._start_s -= wait
+            self.dropped_s -= wait

@@ -6,10 +6,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from gigabrain_drivers.sim.geometry import Footprint, Pose
-from gigabrain_drivers.sim.looks import FLOOR
-from gigabrain_drivers.sim.scene import ROBOT
+from gigabrain_drivers.sim.scene import FLOOR, ROBOT
 from gigabrain_drivers.sim.tick import TICK_NS
+from gigabrain_drivers.sim.world import Footprint, Pose
 
 APART_TICKS = 500_000_000 // TICK_NS  # contact again after half a second is a new contact
 CLEARANCE_TICKS = 100_000_000 // TICK_NS

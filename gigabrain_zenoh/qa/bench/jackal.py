@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gigabrain_drivers.sim.body import SimLidar, SimModel
-from gigabrain_drivers.sim.geometry import Cylinder
-from gigabrain_drivers.sim.geometry import Pose as Place
-from gigabrain_drivers.sim.lidar import Lidar
 from gigabrain_drivers.sim.scene import ROBOT, compile_scene
-from gigabrain_drivers.sim.world import World
+from gigabrain_drivers.sim.sensors import Lidar
+from gigabrain_drivers.sim.world import Cylinder, World
+from gigabrain_drivers.sim.world import Pose as Place
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import Lidar as LidarDescription

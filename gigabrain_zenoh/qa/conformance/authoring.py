@@ -17,7 +17,7 @@ from gigabrain_drivers.driver.catalog import known_drivers, robot_files
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import BASE, SCAN, Emulator
 from gigabrain_drivers.links import link as links
-from gigabrain_drivers.links.wording import of_command
+from gigabrain_drivers.links.frames import of_command
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import LinkName

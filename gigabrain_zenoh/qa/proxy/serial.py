@@ -7,9 +7,9 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Self
 
-from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.links.address import address
+from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.links.serial_link import SerialLink
+from gigabrain_drivers.links.tcp_link import address
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.proxy.chaos import CALM, WAYS, Chaos, LinkDamage, Way, WayCounters

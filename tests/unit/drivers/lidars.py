@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import Device, EmulatedBody
-from gigabrain_drivers.emulators.physics import emulated_body
-from gigabrain_drivers.emulators.station import Station
+from gigabrain_drivers.emulators.emulator import Station, emulated_body
 from gigabrain_drivers.lidars.serial_source import SerialSource
 from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import Lidar

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrDriver, OpenCrOptions
-from gigabrain_drivers.bodies.turtlebot3.dynamixel import Decoder, Packet
 from gigabrain_drivers.bodies.turtlebot3.emulator import OpenCr
+from gigabrain_drivers.bodies.turtlebot3.protocol import DynamixelDecoder, DynamixelPacket
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.emulators.physics import emulated_body
+from gigabrain_drivers.emulators.emulator import emulated_body
 from gigabrain_drivers.links.link import Link
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import RobotState
@@ -30,10 +30,10 @@ class Cable(Link):
     def __init__(self, clock: Clock) -> None:
         super().__init__(clock)
         self.to_board: Callable[[bytes], None] = lambda data: None
-        self.sent: list[Packet] = []
+        self.sent: list[DynamixelPacket] = []
         self.held: list[bytes] | None = None  # answers on their way, while they are held back
         self.drops: list[str] = []
-        self._decoder = Decoder()
+        self._decoder = DynamixelDecoder()
 
     def __str__(self) -> str:
         return "Cable"

@@ -15,14 +15,12 @@ from gigabrain_drivers.bodies.alpha.driver import AlphaDriver, AlphaOptions
 from gigabrain_drivers.bodies.alpha.emulator import REST, Alpha
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.emulators import tcp
+from gigabrain_drivers.emulators import ports
+from gigabrain_drivers.emulators.emulator import Station, emulated_body
 from gigabrain_drivers.emulators.faults import NONE, Faults
-from gigabrain_drivers.emulators.physics import emulated_body
-from gigabrain_drivers.emulators.station import Station
-from gigabrain_drivers.emulators.tcp import TcpPort
-from gigabrain_drivers.legs.gait import WALKER
-from gigabrain_drivers.legs.geometry import JOINT_NAMES
-from gigabrain_drivers.links.address import address
+from gigabrain_drivers.emulators.ports import TcpPort
+from gigabrain_drivers.kinematics.legs import JOINT_NAMES, WALKER
+from gigabrain_drivers.links.tcp_link import address
 from gigabrain_schemas.topics import IMU
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, Unsupported
@@ -169,7 +167,7 @@ async def test_one_client_at_a_time(rig: Rig, monkeypatch: pytest.MonkeyPatch) -
         assert await loop.sock_recv(other, 10) == b""
     assert rig.port.refused == 1
     await until(lambda: rig.connected[-1])
-    monkeypatch.setattr(tcp, "SILENT_NS", 0)  # as if the first had been silent for long
+    monkeypatch.setattr(ports, "SILENT_NS", 0)  # as if the first had been silent for long
     with socket.socket() as other:
         other.setblocking(False)
         await loop.sock_connect(other, rig.port.address)

@@ -10,18 +10,17 @@ from hypothesis import strategies as st
 from gigabrain_drivers.bodies.alpha import protocol as alpha
 from gigabrain_drivers.bodies.alpha.driver import AlphaOptions
 from gigabrain_drivers.bodies.alpha.emulator import REST, Alpha
-from gigabrain_drivers.bodies.alpha.protocol import Decoder, State, Walk
+from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, State, Walk
 from gigabrain_drivers.emulators.base import Snapshot
-from gigabrain_drivers.kinematics import Gait, Twist
-from gigabrain_drivers.legs.gait import WALKER
-from gigabrain_drivers.legs.geometry import JOINT_NAMES
-from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, Odometry
+from gigabrain_drivers.kinematics.legs import JOINT_NAMES, WALKER, Gait
+from gigabrain_drivers.kinematics.wheels import Twist
+from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, OdometryReading
 
 FORWARD = WALKER.to_gait(Twist(0.3, 0.0, 0.0))
 MS = 1_000_000
 STANDING = Snapshot(
     time_ns=0,
-    odometry=Odometry(0, 0, 0, 0, 0),
+    odometry=OdometryReading(0, 0, 0, 0, 0),
     wheels=tuple(Motor(name, 0.1, 0.0, 1.0, 30.0) for name in JOINT_NAMES),
     imu=ImuSample((0, 0, 0, 1), (0, 0, 0), (0, 0, 9.81)),
     battery=Charge(28.0, 90.0, 3.0),
@@ -40,7 +39,7 @@ class Firmware:
         self.body = SimpleNamespace(snapshot=STANDING, walk=self.gaits.append, fresh=self._fresh)
         wire = SimpleNamespace(write=self._write)
         self.device = Alpha(self.body, AlphaOptions(driver="alpha"), wire)  # type: ignore[arg-type]
-        self._decoder, self.now_ns = Decoder(), 0
+        self._decoder, self.now_ns = AlphaDecoder(), 0
         self.step(0)
 
     def _write(self, data: bytes) -> bool:
@@ -77,7 +76,7 @@ def test_steps_in_which_it_was_held_up_are_reported_all_the_same() -> None:
     firmware = Firmware()
     firmware.untaken = [STANDING._replace(time_ns=ms * MS) for ms in (10, 20, 30)]
     firmware.device.step(30 * MS)
-    frames = Decoder().feed(bytes(firmware.bytes))
+    frames = AlphaDecoder().feed(bytes(firmware.bytes))
     reports = [alpha.state_of(frame) for frame in frames]
     assert [report.milliseconds for report in reports if report] == [10, 20, 30]
     assert [frame.sequence for frame in frames] == [2, 3, 4]
@@ -88,7 +87,7 @@ def test_its_clock_stands_still_while_its_body_does() -> None:
     firmware.step(10)
     firmware.bytes.clear()
     firmware.device.step(90 * MS)
-    [frame] = Decoder().feed(bytes(firmware.bytes))
+    [frame] = AlphaDecoder().feed(bytes(firmware.bytes))
     report = alpha.state_of(frame)
     assert report
     assert report.milliseconds == 10

@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_drivers.bodies.alpha import protocol as alpha
-from gigabrain_drivers.bodies.alpha.protocol import Decoder, Frame, State, Walk
-from gigabrain_drivers.kinematics import Gait, Twist
-from gigabrain_drivers.legs.gait import WALKER
-from gigabrain_drivers.legs.senses import Senses
-from gigabrain_drivers.links.address import address
+from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, AlphaFrame, State, Walk
+from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses
+from gigabrain_drivers.kinematics.wheels import Twist
+from gigabrain_drivers.links.tcp_link import address
 from gigabrain_zenoh.errors import ConfigError
 
 # the vectors of docs/firmware_alpha.md
@@ -59,7 +58,7 @@ def a_state(**changes: object) -> State:
 def test_the_vectors_of_the_firmware_page() -> None:
     assert alpha.stop(1) == STOP_1
     assert alpha.walk(Walk(1000, FORWARD), 2) == WALK_2
-    frames = Decoder().feed(STOP_1 + WALK_2)
+    frames = AlphaDecoder().feed(STOP_1 + WALK_2)
     assert [(frame.type, frame.sequence) for frame in frames] == [(0x02, 1), (0x01, 2)]
     command = alpha.walk_of(frames[1])
     assert command
@@ -89,28 +88,28 @@ def test_each_number_of_a_state_is_where_the_firmware_page_says() -> None:
 
 @given(gaits, st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
 def test_a_command_there_and_back(gait: Gait, seen: int, sequence: int) -> None:
-    (frame,) = Decoder().feed(alpha.walk(Walk(seen, gait), sequence))
+    (frame,) = AlphaDecoder().feed(alpha.walk(Walk(seen, gait), sequence))
     assert frame.sequence == sequence
     assert alpha.walk_of(frame) == Walk(seen, gait)
 
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.2, 0.2), st.floats(-1, 1))
 def test_a_velocity_survives_the_wire_to_a_millionth(x: float, y: float, turn: float) -> None:
-    (frame,) = Decoder().feed(alpha.walk(Walk(0, WALKER.to_gait(Twist(x, y, turn))), 1))
+    (frame,) = AlphaDecoder().feed(alpha.walk(Walk(0, WALKER.to_gait(Twist(x, y, turn))), 1))
     command = alpha.walk_of(frame)
     assert command
     assert WALKER.to_body(command.gait) == pytest.approx((x, y, turn), abs=1e-6)
 
 
 def test_a_state_there_and_back() -> None:
-    (frame,) = Decoder().feed(alpha.state(a_state(), 9))
+    (frame,) = AlphaDecoder().feed(alpha.state(a_state(), 9))
     assert alpha.state_of(frame) == a_state()
 
 
 @given(st.lists(st.integers(1, 60), max_size=40))
 def test_frames_are_found_however_they_are_cut(cuts: list[int]) -> None:
     stream = alpha.stop(1) + alpha.walk(Walk(0, FORWARD), 2) + alpha.state(a_state(), 3)
-    decoder, found = Decoder(), list[Frame]()
+    decoder, found = AlphaDecoder(), list[AlphaFrame]()
     for cut in cuts:
         found += decoder.feed(stream[:cut])
         stream = stream[cut:]
@@ -121,7 +120,7 @@ def test_frames_are_found_however_they_are_cut(cuts: list[int]) -> None:
 
 @given(st.binary(max_size=400))
 def test_no_bytes_make_the_decoder_raise_or_keep_more_than_a_frame(noise: bytes) -> None:
-    decoder = Decoder()
+    decoder = AlphaDecoder()
     decoder.feed(noise)
     decoder.feed(b"\x00" * 300)
     assert [frame.sequence for frame in decoder.feed(STOP_1)] == [1]
@@ -130,20 +129,20 @@ def test_no_bytes_make_the_decoder_raise_or_keep_more_than_a_frame(noise: bytes)
 
 @given(st.binary(min_size=44, max_size=44))
 def test_no_payload_makes_a_command_raise(payload: bytes) -> None:
-    command = alpha.walk_of(Frame(alpha.WALK, 1, payload))
+    command = alpha.walk_of(AlphaFrame(alpha.WALK, 1, payload))
     assert command is None or all(map(math.isfinite, command.gait.phases))
 
 
 @given(st.binary(min_size=234, max_size=234))
 def test_no_payload_makes_a_state_raise(payload: bytes) -> None:
-    state = alpha.state_of(Frame(alpha.STATE, 1, payload))
+    state = alpha.state_of(AlphaFrame(alpha.STATE, 1, payload))
     assert state is None or 0.99 < math.hypot(*state.senses.orientation) < 1.01
 
 
 def test_a_broken_frame_costs_no_more_than_itself() -> None:
     broken = bytearray(WALK_2)
     broken[20] ^= 1
-    decoder = Decoder()
+    decoder = AlphaDecoder()
     assert [f.sequence for f in decoder.feed(STOP_1 + bytes(broken) + STOP_1)] == [1, 1]
     assert decoder.errors == 1
 
@@ -151,20 +150,20 @@ def test_a_broken_frame_costs_no_more_than_itself() -> None:
 def test_a_length_that_does_not_belong_to_its_type_is_not_waited_for() -> None:
     wrong = bytearray(WALK_2)
     wrong[2:4] = b"\xff\xff"
-    assert [f.sequence for f in Decoder().feed(bytes(wrong) + STOP_1)] == [1]
+    assert [f.sequence for f in AlphaDecoder().feed(bytes(wrong) + STOP_1)] == [1]
 
 
 def test_another_version_is_not_obeyed() -> None:
     other = bytearray(STOP_1[:-4])
     other[5] = 2
-    assert Decoder().feed(bytes(other) + struct.pack("<I", zlib.crc32(other))) == []
+    assert AlphaDecoder().feed(bytes(other) + struct.pack("<I", zlib.crc32(other))) == []
 
 
 def test_what_is_not_a_number_is_no_command_and_no_state() -> None:
     walk = alpha.walk(Walk(0, FORWARD._replace(turn=math.nan)), 1)
-    assert alpha.walk_of(Decoder().feed(walk)[0]) is None
+    assert alpha.walk_of(AlphaDecoder().feed(walk)[0]) is None
     state = alpha.state(a_state(voltage=math.inf), 1)
-    assert alpha.state_of(Decoder().feed(state)[0]) is None
+    assert alpha.state_of(AlphaDecoder().feed(state)[0]) is None
 
 
 def test_sequences_and_times_wrap() -> None:
@@ -180,7 +179,7 @@ def test_sequences_and_times_wrap() -> None:
 @pytest.mark.parametrize(("rate", "least"), [(0.001, 0.9), (0.05, 0.03)])
 def test_byte_errors_make_no_wrong_command(rate: float, least: float) -> None:
     noise, count = random.Random(1), 20_000
-    decoder, right = Decoder(), 0
+    decoder, right = AlphaDecoder(), 0
     for sequence in range(count):
         gait = FORWARD._replace(stride_x=struct.unpack("<f", struct.pack("<f", sequence))[0])
         data = bytearray(alpha.walk(Walk(sequence, gait), sequence))

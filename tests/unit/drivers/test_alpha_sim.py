@@ -7,7 +7,7 @@ import pytest
 
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.legs.geometry import JOINT_NAMES
+from gigabrain_drivers.kinematics.legs import JOINT_NAMES
 from gigabrain_drivers.sim.driver import MujocoDriver
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost

@@ -7,11 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers import button
-from gigabrain_drivers.button import Button
-from gigabrain_drivers.driver.button_watch import ButtonWatch
-from gigabrain_drivers.echo_loop import EchoLoop
-from gigabrain_drivers.emulators.pty import Pty
+from gigabrain_drivers.driver import button
+from gigabrain_drivers.driver.button import Button, ButtonWatch, EchoLoop
+from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.requests import EstopRequest, GateReply
 from gigabrain_schemas.safety import ButtonState

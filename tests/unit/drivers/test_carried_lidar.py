@@ -2,10 +2,10 @@ from pathlib import Path
 
 import pytest
 
+from gigabrain_drivers import LIDARS
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.catalog import make_driver
 from gigabrain_drivers.driver.robot import Run, ScanOptions
-from gigabrain_drivers.lidars import SCAN_SOURCES
 from gigabrain_drivers.lidars.base import ScanSource, source_class
 from gigabrain_drivers.lidars.ld.emulator import LdDevice
 from gigabrain_drivers.lidars.rplidar.source import RplidarOptions
@@ -91,7 +91,6 @@ async def test_a_lidar_on_a_body_that_does_not_describe_one_is_refused(tmp_path:
         await driver.open()
 
 
-@pytest.mark.parametrize("name", ["ld06", "ld19", "rplidar"])
+@pytest.mark.parametrize("name", sorted(LIDARS))
 def test_every_lidar_that_is_listed_can_be_had(name: str) -> None:
     assert issubclass(source_class(name), ScanSource)
-    assert name in SCAN_SOURCES

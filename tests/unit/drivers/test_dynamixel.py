@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.bodies.turtlebot3.dynamixel import (
+from gigabrain_drivers.bodies.turtlebot3.protocol import (
     READ,
     STATUS,
     WRITE,
-    Decoder,
-    Packet,
+    DynamixelDecoder,
+    DynamixelPacket,
     crc16,
     encode,
     ping,
@@ -42,7 +42,7 @@ FRAMES = {
 }
 HARD = [b"\xff", b"\xfd", b"\x00", b"\x12"]  # what headers and stuffing are made of
 packets = st.builds(
-    Packet,
+    DynamixelPacket,
     id=st.integers(0, 252),
     instruction=st.sampled_from([READ, WRITE, STATUS]),
     params=st.lists(st.sampled_from(HARD), max_size=60).map(b"".join),
@@ -57,7 +57,9 @@ def test_frames_are_those_of_the_manual(name: str) -> None:
 
 def test_the_stuffed_write_is_read_without_its_stuffing() -> None:
     frame = bytes.fromhex(FRAMES["stuffed write at 174"][0])
-    assert Decoder().feed(frame) == [Packet(200, WRITE, bytes.fromhex("ae00 fffffd00 fffffd00"))]
+    assert DynamixelDecoder().feed(frame) == [
+        DynamixelPacket(200, WRITE, bytes.fromhex("ae00 fffffd00 fffffd00"))
+    ]
 
 
 @given(st.binary(max_size=300))
@@ -67,16 +69,18 @@ def test_the_check_is_the_vendors(data: bytes) -> None:
 
 
 @given(packets)
-def test_what_is_encoded_is_decoded_whatever_it_holds(packet: Packet) -> None:
-    decoder = Decoder()
+def test_what_is_encoded_is_decoded_whatever_it_holds(packet: DynamixelPacket) -> None:
+    decoder = DynamixelDecoder()
     assert decoder.feed(encode(packet)) == [packet]
     assert decoder.errors == 0
 
 
 @given(st.lists(packets, max_size=4), st.lists(st.integers(1, 40), min_size=1, max_size=20))
-def test_pieces_of_any_size_make_no_difference(sent: list[Packet], sizes: list[int]) -> None:
+def test_pieces_of_any_size_make_no_difference(
+    sent: list[DynamixelPacket], sizes: list[int]
+) -> None:
     stream = b"".join(map(encode, sent))
-    decoder, found = Decoder(), []
+    decoder, found = DynamixelDecoder(), []
     while stream:
         for size in sizes:
             found += decoder.feed(stream[:size])
@@ -86,16 +90,16 @@ def test_pieces_of_any_size_make_no_difference(sent: list[Packet], sizes: list[i
 
 
 @given(st.binary(max_size=200), packets)
-def test_a_packet_is_found_behind_any_noise(noise: bytes, packet: Packet) -> None:
-    decoder = Decoder(longest=100)
+def test_a_packet_is_found_behind_any_noise(noise: bytes, packet: DynamixelPacket) -> None:
+    decoder = DynamixelDecoder(longest=100)
     decoder.feed(noise)
     flushed = decoder.feed(bytes(110)) + decoder.feed(encode(packet))
     assert flushed[-1:] == [packet]
 
 
 def test_a_boot_banner_before_the_answer_costs_one_error() -> None:
-    decoder = Decoder()
-    assert decoder.feed(b"OpenCR boot\r\n" + status(200)) == [Packet(200, STATUS, b"\0")]
+    decoder = DynamixelDecoder()
+    assert decoder.feed(b"OpenCR boot\r\n" + status(200)) == [DynamixelPacket(200, STATUS, b"\0")]
     assert decoder.errors == 1
 
 
@@ -104,37 +108,37 @@ def test_no_single_flipped_bit_passes_for_a_command() -> None:
     for bit in range(8 * len(good)):
         frame = bytearray(good)
         frame[bit // 8] ^= 1 << bit % 8
-        assert Decoder().feed(bytes(frame)) == []
+        assert DynamixelDecoder().feed(bytes(frame)) == []
 
 
 def test_a_flipped_bit_in_the_length_costs_only_its_own_packet() -> None:
     broken = bytearray(status(200, bytes(172)))
     broken[6] = 0x02  # now 512 bytes longer
-    decoder = Decoder()
-    assert decoder.feed(bytes(broken) + status(200)) == [Packet(200, STATUS, b"\0")]
+    decoder = DynamixelDecoder()
+    assert decoder.feed(bytes(broken) + status(200)) == [DynamixelPacket(200, STATUS, b"\0")]
     assert decoder.errors == 1
 
 
 def test_endless_noise_takes_no_room() -> None:
-    decoder = Decoder()
+    decoder = DynamixelDecoder()
     for _ in range(100):
         decoder.feed(b"\xff\xff\xfd\x00\xc8\xff\x03" + bytes(4096))
     assert len(decoder._buffer) < 1100
 
 
 def test_an_impossible_length_is_not_waited_for() -> None:
-    decoder = Decoder()
+    decoder = DynamixelDecoder()
     for length in (0, 1, 2, 1025, 65535):
         head = b"\xff\xff\xfd\x00\xc8" + length.to_bytes(2, "little")
-        assert decoder.feed(head + ping(200)) == [Packet(200, 1)]
+        assert decoder.feed(head + ping(200)) == [DynamixelPacket(200, 1)]
     assert decoder.errors == 5
 
 
 def test_what_had_begun_is_forgotten_when_asked() -> None:
-    decoder = Decoder()
+    decoder = DynamixelDecoder()
     decoder.feed(status(200, bytes(10))[:12])
     decoder.clear()
-    assert decoder.feed(status(200)) == [Packet(200, STATUS, b"\0")]
+    assert decoder.feed(status(200)) == [DynamixelPacket(200, STATUS, b"\0")]
     assert decoder.errors == 0
 
 
@@ -144,7 +148,7 @@ def test_noise_of_one_byte_in_a_thousand_makes_no_wrong_command() -> None:
     stream = bytearray(b"".join(sent))
     for at in noise.sample(range(len(stream)), len(stream) // 1000):
         stream[at] ^= noise.randint(1, 255)
-    decoder, found = Decoder(), list[Packet]()
+    decoder, found = DynamixelDecoder(), list[DynamixelPacket]()
     for at in range(0, len(stream), 1000):
         found += decoder.feed(bytes(stream[at : at + 1000]))
     assert {encode(packet) for packet in found} <= set(sent)

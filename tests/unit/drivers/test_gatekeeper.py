@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gigabrain_drivers.driver.latch import LatchFile
+from gigabrain_drivers.driver.gatekeeper import LatchFile
 from gigabrain_schemas.audit import AuditRecord
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest

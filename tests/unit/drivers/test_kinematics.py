@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from gigabrain_drivers.driver import catalog
-from gigabrain_drivers.kinematics import (
+from gigabrain_drivers.kinematics.legs import Walker
+from gigabrain_drivers.kinematics.wheels import (
     Ackermann,
     Base,
     Differential,
     Mecanum,
     Omni,
     Twist,
-    Walker,
     base_of,
 )
 

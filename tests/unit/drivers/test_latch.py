@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.driver.latch import Latched, LatchFile
+from gigabrain_drivers.driver.gatekeeper import Latched, LatchFile
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.causes import NAN_STORM, estop
 

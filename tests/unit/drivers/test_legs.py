@@ -6,11 +6,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.kinematics import Gait, Twist
-from gigabrain_drivers.legs.gait import WALKER, sound
-from gigabrain_drivers.legs.geometry import JOINT_NAMES, LegGeometry, Vector
-from gigabrain_drivers.legs.odometry import LegOdometry
-from gigabrain_drivers.legs.senses import Senses
+from gigabrain_drivers.kinematics.legs import (
+    JOINT_NAMES,
+    WALKER,
+    Gait,
+    LegGeometry,
+    LegOdometry,
+    Senses,
+    Vector,
+    sound,
+)
+from gigabrain_drivers.kinematics.wheels import Twist
 
 GEOMETRY = LegGeometry()
 LEVEL = (0.0, 0.0, 0.0, 1.0)

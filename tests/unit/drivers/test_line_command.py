@@ -2,10 +2,9 @@
 
 import pytest
 
-from gigabrain_drivers.bodies.line.command import LineCommand, Spoken
-from gigabrain_drivers.bodies.line.fields import COMMAND
-from gigabrain_drivers.bodies.line.protocol import Template
-from gigabrain_drivers.kinematics import Ackermann, Differential
+from gigabrain_drivers.bodies.line.conversion import LineCommand, SentWording
+from gigabrain_drivers.bodies.line.protocol import COMMAND, Template
+from gigabrain_drivers.kinematics.wheels import Ackermann, Differential
 from gigabrain_schemas.base import Velocity
 
 BASE = Differential(0.033, 0.287)
@@ -29,7 +28,7 @@ def test_a_car_may_be_told_its_speed_and_its_steering_angle() -> None:
 
 def test_start_and_stop_are_told_apart_from_the_commands() -> None:
     template = Template("V,{linear_x:.1f},{angular_z:.1f}\n", COMMAND)
-    spoken = Spoken(template, {b"$ON\r\nGO\n": "start", b"$OFF\n": "stop"})
+    spoken = SentWording(template, {b"$ON\r\nGO\n": "start", b"$OFF\n": "stop"})
     told = [spoken.feed(bytes((byte,))) for byte in b"$ON\r\nGO\nV,0.1,0.0\n$OFF\nV,0.0,0.0\n"]
     assert [text for texts in told for text in texts] == [
         "start",

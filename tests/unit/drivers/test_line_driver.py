@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_drivers.emulators.faults import NONE, Faults
-from gigabrain_drivers.links import ports
+from gigabrain_drivers.links import serial_link
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.testing.line import BARE, bench
@@ -271,7 +271,7 @@ async def test_auto_finds_the_port_from_which_right_lines_come(
     paths = [str(tmp_path / "nothing"), str(tmp_path / "base")]
     async with bench(tmp_path) as it:
         await it.driver.link.close()
-        monkeypatch.setattr(ports, "candidates", lambda port: paths)
+        monkeypatch.setattr(serial_link, "candidate_paths", lambda port: paths)
         it.driver.link._port = "auto"
         it.driver.link.open()
         await it.until_connected()

@@ -6,9 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.bodies.line.checks import CHECKS
-from gigabrain_drivers.bodies.line.fields import COMMAND, STATE, UNITS, factor
-from gigabrain_drivers.bodies.line.protocol import LONGEST, Decoder, Template
+from gigabrain_drivers.bodies.line.protocol import (
+    CHECKS,
+    COMMAND,
+    LONGEST,
+    STATE,
+    UNITS,
+    LineDecoder,
+    Template,
+    factor,
+)
 
 BARE = Template("V,{linear_x:.3f},{angular_z:.3f}\n", COMMAND)
 TICKS = Template(
@@ -147,7 +154,7 @@ def lines(count: int) -> list[bytes]:
 
 @given(st.lists(st.integers(1, 40), min_size=1, max_size=30))
 def test_however_the_bytes_are_cut_the_lines_are_whole(cuts: list[int]) -> None:
-    data, decoder, found = b"".join(lines(20)), Decoder((BARE,)), []
+    data, decoder, found = b"".join(lines(20)), LineDecoder((BARE,)), []
     for cut in cuts:
         found += decoder.feed(data[:cut])
         data = data[cut:]
@@ -157,7 +164,7 @@ def test_however_the_bytes_are_cut_the_lines_are_whole(cuts: list[int]) -> None:
 
 
 def test_a_banner_is_no_error_and_what_comes_between_is() -> None:
-    decoder = Decoder((BARE,))
+    decoder = LineDecoder((BARE,))
     decoder.feed(b"\xff\x00Arduino\r\nbooting\r\n" + lines(1)[0])
     assert decoder.errors == 0
     decoder.feed(b"oops\n\n" + lines(1)[0])
@@ -165,7 +172,7 @@ def test_a_banner_is_no_error_and_what_comes_between_is() -> None:
 
 
 def test_a_line_that_is_too_long_costs_one_error_and_the_next_one_is_read() -> None:
-    decoder = Decoder((BARE,))
+    decoder = LineDecoder((BARE,))
     decoder.feed(lines(1)[0])
     for _ in range(50):
         decoder.feed(b"x" * 100)
@@ -176,14 +183,14 @@ def test_a_line_that_is_too_long_costs_one_error_and_the_next_one_is_read() -> N
 
 @given(st.binary(max_size=2000))
 def test_no_bytes_make_it_raise_or_grow(data: bytes) -> None:
-    decoder = Decoder((BARE, TICKS))
+    decoder = LineDecoder((BARE, TICKS))
     decoder.feed(data)
     assert len(decoder._rest) <= LONGEST
 
 
 def test_a_crlf_line_and_its_bare_cousin_are_read_alike() -> None:
     template = Template("V,{linear_x:.3f}\r\n", COMMAND)
-    assert Decoder((template,)).feed(b"V,0.100\r\nV,0.200\n") == [
+    assert LineDecoder((template,)).feed(b"V,0.100\r\nV,0.200\n") == [
         {"linear_x": 0.1},
         {"linear_x": 0.2},
     ]

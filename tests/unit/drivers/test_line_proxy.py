@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.emulators.tcp import TcpPort
-from gigabrain_drivers.links.address import AddressLink
+from gigabrain_drivers.emulators.ports import Pty, TcpPort
 from gigabrain_drivers.links.serial_link import SerialLink
+from gigabrain_drivers.links.tcp_link import AddressLink
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
 from gigabrain_zenoh.qa.proxy.serial import LineProxy, in_front_of

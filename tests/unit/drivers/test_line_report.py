@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
+from gigabrain_drivers.bodies.line.conversion import LineReport
 from gigabrain_drivers.bodies.line.options import LineOptions
-from gigabrain_drivers.bodies.line.report import LineReport
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.kinematics import Ackermann, Twist, base_of
+from gigabrain_drivers.kinematics.wheels import Ackermann, Twist, base_of
 
 MS = 1_000_000
 ROBOT, _, OPTIONS, _ = catalog.load_link("mycustombot", Run(folder=Path(), link="real"))

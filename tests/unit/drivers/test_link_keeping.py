@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import serial
 
-from gigabrain_drivers.emulators.pty import Pty
+from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.links import serial_link
 from gigabrain_drivers.links.link import Link, LinkProblem
 from gigabrain_drivers.links.serial_link import SerialLink
@@ -191,7 +191,7 @@ async def test_a_probe_that_fails_leaves_no_port_open(
             raise termios.error(5, "Input/output error")
         return True
 
-    monkeypatch.setattr(serial_link.ports, "candidates", lambda name: [str(pty.path)])
+    monkeypatch.setattr(serial_link, "candidate_paths", lambda name: [str(pty.path)])
     link = SerialLink("auto", 115200, Clock(), probe=probe)
     link.open()
     await until(lambda: link.connected)

@@ -4,20 +4,25 @@ import math
 
 import pytest
 
-from gigabrain_drivers.kinematics import Differential, Mecanum, Twist
-from gigabrain_drivers.odometry import Encoders, Odometry
+from gigabrain_drivers.kinematics.wheels import (
+    Differential,
+    Encoders,
+    Mecanum,
+    Twist,
+    WheelOdometry,
+)
 
 WAFFLE = Differential(radius=0.033, separation=0.287)
 
 
 def test_straight_ahead_is_the_way_that_the_wheels_roll() -> None:
-    odometry = Odometry(WAFFLE)
+    odometry = WheelOdometry(WAFFLE)
     odometry.add((math.tau, math.tau))
     assert (odometry.pose.x, odometry.pose.y) == pytest.approx((0.20735, 0.0), abs=1e-5)
 
 
 def test_a_circle_in_small_steps_ends_where_it_began() -> None:
-    odometry = Odometry(WAFFLE)
+    odometry = WheelOdometry(WAFFLE)
     steps, radius = 1000, 0.5
     for _ in range(steps):
         turn = math.tau / steps
@@ -28,7 +33,7 @@ def test_a_circle_in_small_steps_ends_where_it_began() -> None:
 
 def test_a_body_that_faces_left_and_slides_left_goes_backwards() -> None:
     base = Mecanum(radius=0.05, separation=0.3, wheel_base=0.3)
-    odometry = Odometry(base)
+    odometry = WheelOdometry(base)
     for twist in (Twist(0.0, 0.0, math.pi / 2), Twist(0.0, 1.0, 0.0)):
         odometry.add(base.to_wheels(twist))
     assert (odometry.pose.x, odometry.pose.y) == pytest.approx((-1, 0), abs=1e-9)

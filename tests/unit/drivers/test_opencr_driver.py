@@ -5,7 +5,6 @@ import struct
 
 import pytest
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.bodies.turtlebot3.driver import imu_of
 from gigabrain_schemas.sensors import Imu
@@ -16,7 +15,7 @@ from tests.unit.drivers.opencr import MS, Rig, make_rig  # noqa: F401
 async def test_a_connection_begins_with_zero_and_with_the_question_who_is_there(rig: Rig) -> None:
     first, second = rig.cable.sent[:2]
     assert rig.cable.velocities()[0] == (0, 0)
-    assert (first.instruction, second.instruction) == (dynamixel.WRITE, dynamixel.PING)
+    assert (first.instruction, second.instruction) == (opencr.WRITE, opencr.PING)
     assert rig.driver.problem == ""
 
 
@@ -97,7 +96,7 @@ async def test_nothing_is_ever_written_to_address_14(rig: Rig) -> None:
     written = {
         struct.unpack_from("<H", packet.params)[0]: len(packet.params) - 2
         for packet in rig.cable.sent
-        if packet.instruction == dynamixel.WRITE
+        if packet.instruction == opencr.WRITE
     }
     assert written == {19: 1, 149: 1, 150: 24}
 
@@ -137,7 +136,7 @@ async def test_its_motors_can_be_let_go_and_the_next_connection_holds_them_again
     rig: Rig,
 ) -> None:
     def torques() -> list[int]:
-        written = [p.params for p in rig.cable.sent if p.instruction == dynamixel.WRITE]
+        written = [p.params for p in rig.cable.sent if p.instruction == opencr.WRITE]
         return [params[2] for params in written if params[:2] == b"\x95\x00"]
 
     assert torques() == [1]

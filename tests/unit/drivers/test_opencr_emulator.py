@@ -11,17 +11,15 @@ from typing import Any
 import dynamixel_sdk
 import pytest
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrOptions
-from gigabrain_drivers.bodies.turtlebot3.dynamixel import Decoder, Packet
 from gigabrain_drivers.bodies.turtlebot3.emulator import OpenCr
+from gigabrain_drivers.bodies.turtlebot3.protocol import DynamixelDecoder, DynamixelPacket
 from gigabrain_drivers.driver.catalog import load_robot
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.base import EmulatedBody
-from gigabrain_drivers.emulators.physics import emulated_body
-from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.emulators.station import Station
+from gigabrain_drivers.emulators.emulator import Station, emulated_body
+from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_zenoh.clock import Clock
 
 MS = 1_000_000
@@ -31,8 +29,8 @@ class Wire:
     """What the board answers."""
 
     def __init__(self) -> None:
-        self._decoder = Decoder()
-        self.answers: list[Packet] = []
+        self._decoder = DynamixelDecoder()
+        self.answers: list[DynamixelPacket] = []
 
     def write(self, data: bytes) -> bool:
         self.answers += self._decoder.feed(data)
@@ -55,13 +53,13 @@ class Bench:
             self.board.step(self.now_ns)
             self.now_ns += 20 * MS
 
-    def ask(self, frame: bytes) -> Packet | None:
+    def ask(self, frame: bytes) -> DynamixelPacket | None:
         self.wire.answers.clear()
         self.board.feed(frame)
         return self.wire.answers[0] if self.wire.answers else None
 
     def read(self, address: int, length: int) -> bytes:
-        answer = self.ask(dynamixel.read(opencr.ID, address, length))
+        answer = self.ask(opencr.read(opencr.ID, address, length))
         assert answer
         return answer.params[1:]
 
@@ -78,21 +76,21 @@ def make_bench() -> Bench:
 
 
 def test_it_says_who_it_is(bench: Bench) -> None:
-    answer = bench.ask(dynamixel.ping(200))
-    assert answer == Packet(200, dynamixel.STATUS, bytes([0, 0x00, 0x50, 5]))
+    answer = bench.ask(opencr.ping(200))
+    assert answer == DynamixelPacket(200, opencr.STATUS, bytes([0, 0x00, 0x50, 5]))
     assert bench.read(0, 10).hex(" ") == "00 50 02 00 00 00 05 c8 03 02"
 
 
 @pytest.mark.parametrize(
     "frame",
     [
-        dynamixel.ping(1),
-        dynamixel.ping(254),
-        dynamixel.encode(Packet(200, 0x82, bytes(6))),
-        dynamixel.read(200, 0, 1014),
-        dynamixel.encode(Packet(200, dynamixel.READ, bytes(3))),
-        dynamixel.encode(Packet(200, dynamixel.WRITE, bytes(2))),
-        dynamixel.status(200),
+        opencr.ping(1),
+        opencr.ping(254),
+        opencr.encode(DynamixelPacket(200, 0x82, bytes(6))),
+        opencr.read(200, 0, 1014),
+        opencr.encode(DynamixelPacket(200, opencr.READ, bytes(3))),
+        opencr.encode(DynamixelPacket(200, opencr.WRITE, bytes(2))),
+        opencr.status(200),
     ],
     ids=["other id", "broadcast", "sync read", "too long", "short read", "empty write", "status"],
 )
@@ -108,9 +106,9 @@ def test_only_whole_items_are_read_and_gaps_are_zero(bench: Bench) -> None:
 
 
 def test_only_whole_items_are_written(bench: Bench) -> None:
-    bench.ask(dynamixel.write(200, 150, b"\x01\x02\x03"))
+    bench.ask(opencr.write(200, 150, b"\x01\x02\x03"))
     assert bench.read(150, 4) == bytes(4)
-    bench.ask(dynamixel.write(200, 149, b"\x00" + struct.pack("<i", 7) + b"\xff"))
+    bench.ask(opencr.write(200, 149, b"\x00" + struct.pack("<i", 7) + b"\xff"))
     assert bench.read(149, 6) == b"\x00\x07\x00\x00\x00\x00"
 
 
@@ -167,7 +165,7 @@ def test_a_heartbeat_alone_does_not_bring_the_old_speed_back(bench: Bench) -> No
 
 
 def test_in_debug_mode_it_would_drive_on(bench: Bench) -> None:
-    bench.ask(dynamixel.write(200, 14, b"\x01"))
+    bench.ask(opencr.write(200, 14, b"\x01"))
     bench.drive(0.2, 0.0, beat=1)
     bench.wait(2000)
     assert bench.body.commanded[0] > 0.19
@@ -180,8 +178,8 @@ def test_without_torque_it_stands(bench: Bench) -> None:
 
 
 def test_calibration_makes_it_deaf_for_five_seconds(bench: Bench) -> None:
-    assert bench.ask(dynamixel.write(200, 59, b"\x01")) is None
-    assert bench.ask(dynamixel.ping(200)) is None
+    assert bench.ask(opencr.write(200, 59, b"\x01")) is None
+    assert bench.ask(opencr.ping(200)) is None
     bench.wait(4980)
     assert bench.wire.answers == []
     bench.wait(60)
@@ -206,7 +204,7 @@ def test_with_too_little_voltage_it_is_off_and_starts_anew_with_enough(bench: Be
     bench.drive(0.2, 0.0, beat=1)
     bench.board.sag_volts = 9.0
     bench.wait(20)
-    assert bench.ask(dynamixel.ping(200)) is None
+    assert bench.ask(opencr.ping(200)) is None
     assert bench.body.commanded == (0.0, 0.0, 0.0)
     bench.board.sag_volts = 0.0
     bench.wait(40)

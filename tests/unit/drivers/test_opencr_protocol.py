@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
-from gigabrain_drivers.bodies.turtlebot3.dynamixel import Decoder
+from gigabrain_drivers.bodies.turtlebot3.protocol import DynamixelDecoder
 
 
 def table(**items: bytes) -> bytes:
@@ -67,7 +67,7 @@ def test_nothing_that_is_ever_sent_touches_address_14(
         opencr.torque(on),
     )
     for frame in frames:
-        (packet,) = Decoder().feed(frame)
+        (packet,) = DynamixelDecoder().feed(frame)
         (address,) = struct.unpack_from("<H", packet.params)
         length = len(packet.params) - 2
         assert packet.instruction == 2 or not address <= 14 < address + length

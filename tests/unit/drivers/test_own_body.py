@@ -7,14 +7,13 @@ from typing import Any
 
 import pytest
 
-from gigabrain_drivers.bodies.line.command import LineCommand
-from gigabrain_drivers.bodies.line.fields import COMMAND
-from gigabrain_drivers.bodies.line.protocol import Template
+from gigabrain_drivers.bodies.line.conversion import LineCommand
+from gigabrain_drivers.bodies.line.protocol import COMMAND, Template
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.catalog import links_of, load_robot, robot_path
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.emulators.physics import emulated_body
-from gigabrain_drivers.sim.options import MujocoOptions, sim_body
+from gigabrain_drivers.emulators.emulator import emulated_body
+from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_drivers.sim.scene import compile_scene
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Velocity

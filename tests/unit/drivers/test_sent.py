@@ -6,15 +6,14 @@ from pathlib import Path
 import pytest
 from msgspec.structs import replace
 
-from gigabrain_drivers.bodies.line.command import LineCommand
-from gigabrain_drivers.bodies.line.fields import COMMAND
-from gigabrain_drivers.bodies.line.protocol import Template
+from gigabrain_drivers.bodies.line.conversion import LineCommand
+from gigabrain_drivers.bodies.line.protocol import COMMAND, Template
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.kinematics import Twist, base_of
-from gigabrain_drivers.legs.gait import WALKER
+from gigabrain_drivers.kinematics.legs import WALKER
+from gigabrain_drivers.kinematics.wheels import Twist, base_of
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.qa.faults.rows.commands import commanded_over, let_through, over

@@ -9,9 +9,8 @@ import pytest
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim import driver as sim_driver
-from gigabrain_drivers.sim.account import account_of
 from gigabrain_drivers.sim.driver import MujocoDriver
-from gigabrain_drivers.sim.physics import Simulation
+from gigabrain_drivers.sim.physics import Simulation, account_of
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from gigabrain_drivers.sim.body import SimBody, SimLidar
-from gigabrain_drivers.sim.geometry import Cylinder, Pose, Shape
 from gigabrain_drivers.sim.physics import Simulation
-from gigabrain_drivers.sim.world import World
+from gigabrain_drivers.sim.world import Cylinder, Pose, Shape, World
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import Unsupported
 

@@ -10,10 +10,9 @@ import mujoco
 import pytest
 
 from gigabrain_drivers.sim.body import SimBattery, SimBody
-from gigabrain_drivers.sim.geometry import Box, Pose, Shape
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.scene import compile_scene
-from gigabrain_drivers.sim.world import World
+from gigabrain_drivers.sim.world import Box, Pose, Shape, World
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 

@@ -10,13 +10,11 @@ import pytest
 from numpy.typing import NDArray
 
 from gigabrain_drivers.driver import catalog
-from gigabrain_drivers.kinematics import Twist
-from gigabrain_drivers.legs.gait import WALKER
-from gigabrain_drivers.legs.geometry import JOINT_NAMES
+from gigabrain_drivers.kinematics.legs import JOINT_NAMES, WALKER
+from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.sim.body import SimQuadruped
-from gigabrain_drivers.sim.geometry import Box, Shape
 from gigabrain_drivers.sim.physics import Simulation
-from gigabrain_drivers.sim.world import World
+from gigabrain_drivers.sim.world import Box, Shape, World
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_zenoh.errors import ConfigError, Unsupported
 

@@ -6,9 +6,8 @@ from importlib.resources import files
 import pytest
 
 from gigabrain_drivers.sim.body import SimBody
-from gigabrain_drivers.sim.geometry import Box, Shape
 from gigabrain_drivers.sim.physics import Simulation
-from gigabrain_drivers.sim.world import World
+from gigabrain_drivers.sim.world import Box, Shape, World
 
 
 def waffle() -> SimBody:

@@ -6,9 +6,8 @@ import math
 import mujoco
 import pytest
 
-from gigabrain_drivers.sim.geometry import Box, ClosedPath, Cylinder, Footprint, Pose, clearance
-from gigabrain_drivers.sim.person import Person
-from gigabrain_drivers.sim.scene import world_spec
+from gigabrain_drivers.sim.scene import Person, world_spec
+from gigabrain_drivers.sim.world import Box, ClosedPath, Cylinder, Footprint, Pose, clearance
 from gigabrain_drivers.sim.worlds import load_world, world_names
 from gigabrain_zenoh.errors import UnknownName
 

@@ -9,7 +9,7 @@ import pytest
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.process import DriverProcess
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.emulators.physics import emulated_body
+from gigabrain_drivers.emulators.emulator import emulated_body
 from gigabrain_drivers.sim.driver import MujocoDriver
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_schemas.brain import CmdVel

@@ -9,15 +9,13 @@ from typing import Any
 import pytest
 
 from gigabrain_drivers.bodies.alpha import protocol as alpha
-from gigabrain_drivers.bodies.line.fields import COMMAND
-from gigabrain_drivers.bodies.line.protocol import Decoder, Template, describe
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel
+from gigabrain_drivers.bodies.line.protocol import COMMAND, LineDecoder, Template, describe
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.lds import lds01, lds03
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
 from gigabrain_drivers.links import link as links
-from gigabrain_drivers.links.wording import Spelling, Wording, of_command, whole
+from gigabrain_drivers.links.frames import Spelling, Wording, of_command, whole
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.cli import driver
 from gigabrain_zenoh.cli.driver import trace
@@ -29,26 +27,26 @@ from gigabrain_zenoh.testing.line import BARE, bench
 LINE = Template("V,{linear_x:.3f},{angular_z|deg/s:.1f}\n", COMMAND)
 FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [
     (
-        dynamixel.Decoder().feed,
+        opencr.DynamixelDecoder().feed,
         opencr.describe,
         "ff ff fd 00 c8 1d 00 03 96 00 0a 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 00 "
         "32 00 00 00 4d 37",
         "velocity: linear x 10 x 0.01 m/s = 0.10 m/s, angular z 50 x 0.01 rad/s = 0.50 rad/s",
     ),
     (
-        dynamixel.Decoder().feed,
+        opencr.DynamixelDecoder().feed,
         opencr.describe,
         "ff ff fd 00 c8 06 00 03 13 00 07 23 a7",
         "heartbeat 7",
     ),
     (
-        dynamixel.Decoder().feed,
+        opencr.DynamixelDecoder().feed,
         opencr.describe,
         "ff ff fd 00 c8 07 00 02 0a 00 ac 00 b6 2f",
         "read 172 bytes at 10",
     ),
     (
-        dynamixel.Decoder().feed,
+        opencr.DynamixelDecoder().feed,
         opencr.describe,
         "ff ff fd 00 c8 07 00 55 00 00 50 05 4c b7",
         "status: model 0x5000, firmware 5",
@@ -74,9 +72,9 @@ FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [
         "a5 82 05 00 00 00 00 00 22",
         "express scan 00 00 00 00 00",
     ),
-    (alpha.Decoder().feed, alpha.describe, alpha.stop(7).hex(" "), "7 stop"),
+    (alpha.AlphaDecoder().feed, alpha.describe, alpha.stop(7).hex(" "), "7 stop"),
     (
-        Decoder([LINE]).feed,
+        LineDecoder([LINE]).feed,
         describe,
         LINE.encode({"linear_x": 0.1, "angular_z": 0.5}).hex(" "),
         "linear_x 0.1 m/s, angular_z 0.4992 rad/s",
@@ -96,7 +94,7 @@ def test_a_frame_stands_beside_its_bytes(
 
 
 def test_bytes_that_are_no_frame_are_shown_as_they_are() -> None:
-    spelling = Spelling(dynamixel.Decoder().feed, opencr.describe)
+    spelling = Spelling(opencr.DynamixelDecoder().feed, opencr.describe)
     told = spelling.spell(bytes(600))
     assert [line[-8:] for line in told] == ["no frame"]
     assert Wording().lines("tx", b"\x01\xff") == ["tx 01 ff"]

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gigabrain_drivers.driver.latch import Latched, LatchFile
+from gigabrain_drivers.driver.gatekeeper import Latched, LatchFile
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile
 from gigabrain_zenoh.gate.causes import estop
 from gigabrain_zenoh.host import files

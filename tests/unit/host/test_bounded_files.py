@@ -14,11 +14,11 @@ import zstandard
 from mcap.records import Message
 
 from gigabrain_drivers.driver.catalog import load_robot
-from gigabrain_drivers.driver.latch import UNREADABLE, LatchFile
+from gigabrain_drivers.driver.gatekeeper import UNREADABLE, LatchFile
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.links.address import written
 from gigabrain_drivers.links.link import LinkProblem
-from gigabrain_drivers.sim.options import MujocoOptions, sim_body
+from gigabrain_drivers.links.tcp_link import written
+from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_zenoh.config import loading as config
 from gigabrain_zenoh.config.loading import located
 from gigabrain_zenoh.decision.tasks import mission

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.driver.round_trip import RoundTrip
+from gigabrain_drivers.driver.lockstep import RoundTrip
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, SCAN
 from gigabrain_zenoh.config.settings import Endpoint

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from msgspec.structs import fields
 
-from gigabrain_drivers.driver.latch import UNREADABLE
+from gigabrain_drivers.driver.gatekeeper import UNREADABLE
 from gigabrain_schemas.base import Cause
 from gigabrain_schemas.body import Thresholds
 from gigabrain_zenoh.gate import causes

@@ -9,18 +9,16 @@ import logging
 from msgspec.structs import replace
 
 from gigabrain_drivers.bodies.alpha import protocol as alpha
-from gigabrain_drivers.bodies.alpha.protocol import Decoder, Frame, State
+from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, AlphaFrame, State
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
-from gigabrain_drivers.kinematics import Twist
-from gigabrain_drivers.legs.gait import WALKER
-from gigabrain_drivers.legs.geometry import JOINT_NAMES, LegGeometry
-from gigabrain_drivers.legs.odometry import LegOdometry
+from gigabrain_drivers.kinematics.legs import JOINT_NAMES, WALKER, LegGeometry, LegOdometry
+from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.lidars.base import ScanSource, carry
-from gigabrain_drivers.links.address import AddressLink
 from gigabrain_drivers.links.device_clock import DeviceClock, EchoClock
-from gigabrain_drivers.links.hearing import Hearing
-from gigabrain_drivers.links.wording import Spelling, Wording
+from gigabrain_drivers.links.frames import Spelling, Wording
+from gigabrain_drivers.links.link import Liveness
+from gigabrain_drivers.links.tcp_link import AddressLink
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import Battery, Joint, LinkHealth, RobotState
 from gigabrain_schemas.sensors import Imu, ImuData
@@ -55,17 +53,17 @@ class AlphaDriver(Driver):
         self._clock = Clock()
         self.link = AddressLink(options.port, self._clock)
         self.link.wording = Wording(
-            Spelling(alpha.Decoder().feed, alpha.describe),
-            Spelling(alpha.Decoder().feed, alpha.describe),
+            Spelling(alpha.AlphaDecoder().feed, alpha.describe),
+            Spelling(alpha.AlphaDecoder().feed, alpha.describe),
         )
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
-        self._decoder, self._odometry = Decoder(), LegOdometry(LegGeometry())
+        self._decoder, self._odometry = AlphaDecoder(), LegOdometry(LegGeometry())
         self._sequence = 0  # of the newest command
         self._unsound = 0  # whole frames without sense
         self._last: tuple[int, int] | None = None  # sequence and milliseconds of the newest state
         self._state: State | None = None
-        self._hearing = Hearing(self.link, self._clock, SILENT_NS, SENSELESS, log)
+        self._liveness = Liveness(self.link, self._clock, SILENT_NS, SENSELESS, log)
         self._stamps, self._echoes = DeviceClock(MILLISECONDS), EchoClock(USUAL_MS)
         self._untold = False  # whether a loss has not been reported yet
         self._open = self._parked = False
@@ -92,13 +90,13 @@ class AlphaDriver(Driver):
 
     async def stop(self) -> None:
         """Come to rest and stand; a body that lies goes on lying."""
-        if self._hearing.heard:
+        if self._liveness.received:
             say = alpha.park if self._parked else alpha.stop
             self.link.write(say(self._next()))
 
     async def park(self) -> None:
         """Lie down; only a step gets it up again."""
-        if not self._hearing.heard:
+        if not self._liveness.received:
             raise BodyLost(f"{self.link}: {self.link.problem or 'the body is silent'}")
         self._parked = True
         self.link.write(alpha.park(self._next()))
@@ -109,7 +107,7 @@ class AlphaDriver(Driver):
         """Walk; a value that is not a number is zero for all, and so is all while it is lost."""
         if not self._open:
             raise BodyLost("the connection is not open")
-        if not self._hearing.heard:  # it may still be starting
+        if not self._liveness.received:  # it may still be starting
             return ZERO
         to = self.bounded(linear_x, linear_y, angular_z)
         if self._untold or self._fallen:
@@ -126,7 +124,7 @@ class AlphaDriver(Driver):
 
     async def read_state(self) -> RobotState:
         """What the body said last; `link` says whether that is still so."""
-        velocity = self._odometry.velocity if self._hearing.heard else Twist(0.0, 0.0, 0.0)
+        velocity = self._odometry.velocity if self._liveness.received else Twist(0.0, 0.0, 0.0)
         state = RobotState(
             robot_type=self.robot.robot_type,
             pose=self._odometry.pose,
@@ -156,12 +154,12 @@ class AlphaDriver(Driver):
     def _opened(self) -> None:
         """A new connection: nothing from before counts."""
         self._decoder.clear()
-        self._hearing.forget()
+        self._liveness.reset()
         self._last = None
 
     def _lost(self, why: str) -> None:
-        self._untold = self._untold or self._hearing.heard
-        self._hearing.forget()
+        self._untold = self._untold or self._liveness.received
+        self._liveness.reset()
 
     def _received(self, data: bytes) -> None:
         for frame in self._decoder.feed(data):
@@ -172,13 +170,13 @@ class AlphaDriver(Driver):
                 self._take(frame, state)
         self.link.errors = self._decoder.errors + self._unsound
 
-    def _take(self, frame: Frame, state: State) -> None:
+    def _take(self, frame: AlphaFrame, state: State) -> None:
         """One report. Its own clock says how much time has passed since the last."""
         last, self._last = self._last, (frame.sequence, state.milliseconds)
         if last and not alpha.newer(frame.sequence, last[0]):
             self._last = last
             return
-        first, self._state = self._hearing.hear(), state
+        first, self._state = self._liveness.mark_received(), state
         now_ns = self._clock.now_ns()
         self._stamps.arrived(state.milliseconds, now_ns)
         self._echoes.echoed(state.echo, now_ns)
@@ -206,7 +204,7 @@ class AlphaDriver(Driver):
 
         A loss is told at least once, however soon the body is back.
         """
-        alive = self._hearing.alive()
+        alive = self._liveness.alive()
         told, self._untold = not self._untold, False
         late_ms = max(self._stamps.late_ms, self._echoes.late_ms)
         return replace(self.link.health, connected=alive and told, late_ms=late_ms)

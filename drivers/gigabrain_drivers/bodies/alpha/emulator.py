@@ -6,12 +6,11 @@ from typing import Any, ClassVar
 
 from gigabrain_drivers.bodies.alpha import protocol as alpha
 from gigabrain_drivers.bodies.alpha.driver import AlphaOptions
-from gigabrain_drivers.bodies.alpha.protocol import Decoder, Frame, State
+from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, AlphaFrame, State
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Snapshot, Wire
-from gigabrain_drivers.emulators.tcp import TcpPort
-from gigabrain_drivers.kinematics import Gait, Twist
-from gigabrain_drivers.legs.gait import WALKER, sound
-from gigabrain_drivers.legs.senses import Senses
+from gigabrain_drivers.emulators.ports import TcpPort
+from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, sound
+from gigabrain_drivers.kinematics.wheels import Twist
 
 LYING_M = 0.13  # height of the hips of a body that lies
 REST = WALKER.to_gait(Twist(0.0, 0.0, 0.0))
@@ -44,7 +43,7 @@ class Alpha(Device):
 
     def reset(self) -> None:
         """Power has come: it stands."""
-        self._decoder = Decoder()
+        self._decoder = AlphaDecoder()
         self._echo = self._sent = self._refused = 0
         self._last: int | None = None  # sequence of the newest command
         self._obeyed_ns: int | None = None  # when it came
@@ -90,7 +89,7 @@ class Alpha(Device):
             self._sent += 1
             self.wire.write(alpha.state(self._report(sample), self._sent))
 
-    def _wanted(self, frame: Frame) -> Gait | None:
+    def _wanted(self, frame: AlphaFrame) -> Gait | None:
         """What a frame asks for, or None where it is not a sound, new and fresh command."""
         if frame.type == alpha.STOP:
             return REST

@@ -14,8 +14,7 @@ import struct
 import zlib
 from typing import NamedTuple
 
-from gigabrain_drivers.kinematics import Gait
-from gigabrain_drivers.legs.senses import Senses
+from gigabrain_drivers.kinematics.legs import Gait, Senses
 from gigabrain_drivers.links.frames import FrameDecoder
 
 PORT = 8080
@@ -36,7 +35,7 @@ _LENGTHS = {WALK: _GAIT.size, STOP: 0, PARK: 0, STATE: _STATE.size}
 _FASTEST = 1e4  # beyond which, either way, no number in a state is a measurement
 
 
-class Frame(NamedTuple):
+class AlphaFrame(NamedTuple):
     """One frame; what its payload holds depends on its type."""
 
     type: int
@@ -66,7 +65,7 @@ class State(NamedTuple):
     temperatures: tuple[float, ...]  # [deg C], of their motors
 
 
-def encode(frame: Frame) -> bytes:
+def encode(frame: AlphaFrame) -> bytes:
     """The bytes of a frame on the wire."""
     length, sequence = len(frame.payload), frame.sequence % SEQUENCES
     head = _HEADER.pack(MAGIC, length, frame.type, VERSION, sequence)
@@ -78,20 +77,20 @@ def walk(command: Walk, sequence: int) -> bytes:
     """A command to walk."""
     seen, gait = command
     values = (gait.stride_x, gait.stride_y, gait.turn, gait.frequency, gait.duty)
-    return encode(Frame(WALK, sequence, _GAIT.pack(seen, *values, *gait.phases, gait.height)))
+    return encode(AlphaFrame(WALK, sequence, _GAIT.pack(seen, *values, *gait.phases, gait.height)))
 
 
 def stop(sequence: int) -> bytes:
     """A command to come to rest and stand."""
-    return encode(Frame(STOP, sequence))
+    return encode(AlphaFrame(STOP, sequence))
 
 
 def park(sequence: int) -> bytes:
     """A command to come to rest and lie down, and to stay so until the next step is asked for."""
-    return encode(Frame(PARK, sequence))
+    return encode(AlphaFrame(PARK, sequence))
 
 
-def walk_of(frame: Frame) -> Walk | None:
+def walk_of(frame: AlphaFrame) -> Walk | None:
     """The command in a frame, or None where it holds what is not a number."""
     seen, x, y, turn, frequency, duty, a, b, c, d, height = _GAIT.unpack(frame.payload)
     if not all(map(math.isfinite, (x, y, turn, frequency, duty, a, b, c, d, height))):
@@ -126,10 +125,10 @@ def state(now: State, sequence: int) -> bytes:
         *(value for joint in each for value in joint),
         *(max(-32768, min(32767, round(10 * value))) for value in now.temperatures),
     )
-    return encode(Frame(STATE, sequence, payload))
+    return encode(AlphaFrame(STATE, sequence, payload))
 
 
-def state_of(frame: Frame) -> State | None:
+def state_of(frame: AlphaFrame) -> State | None:
     """The report in a frame, or None where it holds what cannot have been measured."""
     milliseconds, echo, refused, flags, feet, *rest = _STATE.unpack(frame.payload)
     numbers, temperatures = rest[:49], rest[49:]
@@ -167,7 +166,7 @@ def newer(sequence: int, than: int) -> bool:
     return 0 < (sequence - than) % SEQUENCES < SEQUENCES // 2
 
 
-def describe(frame: Frame) -> str:
+def describe(frame: AlphaFrame) -> str:
     """A frame in words."""
     if frame.type == WALK and (command := walk_of(frame)):
         gait = command.gait
@@ -189,7 +188,7 @@ def describe(frame: Frame) -> str:
     return f"{frame.sequence} unsound frame of type {frame.type:#04x}"
 
 
-class Decoder(FrameDecoder[Frame]):
+class AlphaDecoder(FrameDecoder[AlphaFrame]):
     """Finds frames in whatever comes in."""
 
     HEADER = MAGIC
@@ -201,12 +200,12 @@ class Decoder(FrameDecoder[Frame]):
         right = version == VERSION and _LENGTHS.get(kind) == length
         return _HEADER.size + int(length) + _CRC.size if right else 0
 
-    def _frame(self, data: bytes) -> Frame | None:
+    def _frame(self, data: bytes) -> AlphaFrame | None:
         body, (crc,) = data[: -_CRC.size], _CRC.unpack(data[-_CRC.size :])
         if zlib.crc32(body) != crc:
             return None
         _, _, kind, _, sequence = _HEADER.unpack_from(body)
-        return Frame(kind, sequence, body[_HEADER.size :])
+        return AlphaFrame(kind, sequence, body[_HEADER.size :])
 
 
 def _by_leg(values: list[float]) -> tuple[tuple[float, float, float], ...]:

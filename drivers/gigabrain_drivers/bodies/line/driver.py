@@ -10,18 +10,16 @@ import time
 import serial
 from msgspec.structs import replace
 
-from gigabrain_drivers.bodies.line import check as line_check
-from gigabrain_drivers.bodies.line.command import LineCommand, Spoken
-from gigabrain_drivers.bodies.line.options import BITS_PER_BYTE, LineOptions
-from gigabrain_drivers.bodies.line.protocol import Decoder, describe
-from gigabrain_drivers.bodies.line.report import LineReport
+from gigabrain_drivers.bodies.line.conversion import LineCommand, LineReport, SentWording
+from gigabrain_drivers.bodies.line.options import BITS_PER_BYTE, LineOptions, check_lines
+from gigabrain_drivers.bodies.line.protocol import LineDecoder, describe
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
-from gigabrain_drivers.kinematics import base_of
+from gigabrain_drivers.kinematics.wheels import base_of
 from gigabrain_drivers.lidars.base import ScanSource, carry
-from gigabrain_drivers.links.hearing import Hearing
+from gigabrain_drivers.links.frames import Spelling, Wording
+from gigabrain_drivers.links.link import Liveness
 from gigabrain_drivers.links.serial_link import SerialLink
-from gigabrain_drivers.links.wording import Spelling, Wording
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
@@ -50,18 +48,18 @@ class LineDriver(Driver):
         super().__init__(robot, options, run)
         base = base_of(robot)
         self._command = LineCommand(options.command_template(), base)
-        self._decoder = Decoder(options.state_templates())
+        self._decoder = LineDecoder(options.state_templates())
         self._clock = Clock()
         self.link = SerialLink(options.port, options.baud, self._clock, probe=self._is_ours)
         self.link.wording = Wording(
-            Spelling(Spoken(self._command.template, options.strings()).feed, str),
-            Spelling(Decoder(options.state_templates()).feed, describe),
+            Spelling(SentWording(self._command.template, options.strings()).feed, str),
+            Spelling(LineDecoder(options.state_templates()).feed, describe),
         )
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
         self._report = LineReport(options, robot, base)
         silent_ns = max(round(MISSED / options.state_hz * 1e9), LEAST_SILENT_NS)
-        self._hearing = Hearing(self.link, self._clock, silent_ns, SENSELESS, log)
+        self._liveness = Liveness(self.link, self._clock, silent_ns, SENSELESS, log)
         self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
         self._started = False  # whether start went out and no stop since: then a stop is owed
         self._wanted = self._as_sent = self._sent = ZERO  # the second is what the line keeps of it
@@ -74,7 +72,7 @@ class LineDriver(Driver):
     @classmethod
     def check(cls, robot: RobotFile, options: LineOptions) -> None:
         """Raises ValueError where the lines do not fit the body."""
-        line_check.check(options, robot)
+        check_lines(options, robot)
 
     async def open(self) -> None:
         """Begin to look for the body and its lidar; neither has to be there yet."""
@@ -117,7 +115,7 @@ class LineDriver(Driver):
             joints=report.joints(),
             battery=report.battery(),
             bumpers=self._bumpers(),
-            link=replace(self.link.health, connected=self._hearing.alive()),
+            link=replace(self.link.health, connected=self._liveness.alive()),
         )
 
     async def get_sensor_data(self, sensor_name: str) -> Message | None:
@@ -128,13 +126,13 @@ class LineDriver(Driver):
 
     def _still(self) -> None:
         self._send(ZERO)
-        if self._started and self._hearing.heard:
+        if self._started and self._liveness.received:
             stop = self.options.stop.encode()
             self._started = bool(stop) and not self.link.write(stop)
 
     def _send(self, wanted: Velocity) -> None:
         """Write a command that is new, or due again; `_sent` is what the body then goes by."""
-        if not self._hearing.heard:  # it may still be booting: nothing that could disturb it
+        if not self._liveness.received:  # it may still be booting: nothing that could disturb it
             self._sent = ZERO
             return
         now_ns = self._clock.now_ns()
@@ -157,10 +155,10 @@ class LineDriver(Driver):
         """A new line: nothing from before counts, and nothing is said before the body was heard."""
         self._decoder.clear()
         self._report.restart()
-        self._hearing.forget()
+        self._liveness.reset()
 
     def _lost(self, why: str) -> None:
-        self._hearing.forget()
+        self._liveness.reset()
         self._sent = ZERO
 
     def _received(self, data: bytes) -> None:
@@ -168,7 +166,7 @@ class LineDriver(Driver):
         for values in self._decoder.feed(data):
             moves = self._report.take(values, now_ns)
             if (
-                moves and self._hearing.hear()
+                moves and self._liveness.mark_received()
             ):  # after a boot or a loss: at rest, whatever it was told
                 self._sent_ns = 0
                 self._still()
@@ -195,7 +193,7 @@ class LineDriver(Driver):
 
     def _is_ours(self, port: serial.Serial) -> bool:
         """Whether a good line comes from this port. Runs in a thread."""
-        decoder, until = Decoder(self.options.state_templates()), time.monotonic() + PROBE_S
+        decoder, until = LineDecoder(self.options.state_templates()), time.monotonic() + PROBE_S
         while time.monotonic() < until:
             if decoder.feed(port.read(max(1, port.in_waiting))):
                 return True

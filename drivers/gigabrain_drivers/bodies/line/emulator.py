@@ -8,13 +8,12 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from gigabrain_drivers.bodies.line.command import LineCommand
-from gigabrain_drivers.bodies.line.number import Field
+from gigabrain_drivers.bodies.line.conversion import LineCommand
 from gigabrain_drivers.bodies.line.options import LineOptions
-from gigabrain_drivers.bodies.line.protocol import LONGEST
+from gigabrain_drivers.bodies.line.protocol import LONGEST, Field
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
-from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.kinematics import base_of
+from gigabrain_drivers.emulators.ports import Pty
+from gigabrain_drivers.kinematics.wheels import base_of
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
 

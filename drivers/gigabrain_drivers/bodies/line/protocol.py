@@ -2,21 +2,225 @@
 
 A template is the line as it is on the wire, with `{FIELD}`, `{FIELD|UNIT}` or
 `{FIELD|UNIT:FORMAT}` where the numbers are: `V,{linear_x:.3f},{angular_z:.3f}` and a newline. A
-checksum (`{crc16}`, see checks.py) stands last and covers the text before it, as in NMEA 0183:
+checksum (`{crc16}`, see CHECKS) stands last and covers the text before it, as in NMEA 0183:
 without a `$` at the beginning and without a `*` right before the checksum.
 """
 
+import binascii
+import functools
+import math
+import operator
 import re
-from collections.abc import Mapping, Sequence
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
-from gigabrain_drivers.bodies.line.checks import CHECKS
-from gigabrain_drivers.bodies.line.fields import COMMAND, IGNORED, STATE, UNITS
-from gigabrain_drivers.bodies.line.number import field_of
+from gigabrain_drivers.kinematics.wheels import Ackermann, Differential, Mecanum, Omni
+from gigabrain_zenoh.errors import unknown
 
+CRC8_POLYNOMIAL = 0x07
+
+DRIVES = (Differential, Mecanum, Omni, Ackermann)
+WHEELS = tuple(dict.fromkeys(name for drive in DRIVES for name in drive.wheels))
+ANGLES = ("steering",)  # of WHEELS, those that are told an angle and not a speed
+IGNORED = "_"  # a number in a state line that means nothing to us
+UNITS = {
+    "length": {"m": 1.0, "cm": 0.01, "mm": 0.001},
+    "speed": {"m/s": 1.0, "cm/s": 0.01, "mm/s": 0.001},
+    "angle": {
+        "rad": 1.0, "mrad": 0.001, "deg": math.radians(1), "turn": math.tau, "tick": math.nan,
+    },
+    "turning speed": {
+        "rad/s": 1.0, "mrad/s": 0.001, "deg/s": math.radians(1), "rpm": math.tau / 60,
+        "tick/s": math.nan,
+    },
+    "torque": {"Nm": 1.0, "mNm": 0.001},
+    "temperature": {"C": 1.0},
+    "voltage": {"V": 1.0, "mV": 0.001},
+    "current": {"A": 1.0, "mA": 0.001},
+    "share": {"%": 1.0},
+    "count": {"": 1.0},
+    "flags": {"": 1.0},
+    "number": {"": 1.0},
+}  # fmt: skip
+BODY = {"linear_x": "speed", "linear_y": "speed", "angular_z": "turning speed"}
+COMMAND = {
+    **BODY,
+    "seq": "count",
+    **{f"wheel_{name}": "angle" if name in ANGLES else "turning speed" for name in WHEELS},
+}
+STATE = {
+    **BODY,
+    "x": "length",
+    "y": "length",
+    "yaw": "angle",
+    **{f"wheel_{name}_position": "angle" for name in WHEELS},
+    **{f"wheel_{name}_velocity": "turning speed" for name in WHEELS},
+    **{f"wheel_{name}_effort": "torque" for name in WHEELS},
+    **{f"wheel_{name}_temperature": "temperature" for name in WHEELS},
+    "battery_voltage": "voltage",
+    "battery_current": "current",
+    "battery_percentage": "share",
+    "flags": "flags",
+    IGNORED: "number",
+}
+DEFAULT_FORMATS = {"count": "d", "flags": "x"}
+_UNIT = re.compile(r"\s*([-+]?[0-9]*\.?[0-9]*)\s*([A-Za-z%].*?)?\s*")
+EXACT = 1e-6  # of a digit: what binary fractions miss
+_FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.[0-9])?f|d|[xX])")
+_ANY_NUMBER = r" *[-+]?[0-9]{1,12}(?:\.[0-9]{0,9})?"
 LONGEST = 256  # bytes of a line
 MOST = 1e8  # in SI units; beyond, either way, no number is a measurement. Counters may count on.
 DIGITS = "0123456789."  # what is no end of a number
 _FIELD = re.compile(r"\{([^{}|:]*)(?:\|([^{}|:]*))?(?::([^{}]*))?\}")
+
+
+class Check(NamedTuple):
+    """A checksum and how many hexadecimal digits it has."""
+
+    of: Callable[[bytes], int]
+    digits: int
+
+
+def xor8(data: bytes) -> int:
+    """All bytes in exclusive or, as in NMEA 0183."""
+    return functools.reduce(operator.xor, data, 0)
+
+
+def crc8(data: bytes) -> int:
+    """CRC-8: polynomial 0x07, initial value 0, not reflected; 0xF4 for "123456789"."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ (CRC8_POLYNOMIAL if crc & 0x80 else 0)) & 0xFF
+    return crc
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16/CCITT-FALSE: polynomial 0x1021, initial value 0xFFFF; 0x29B1 for "123456789"."""
+    return binascii.crc_hqx(data, 0xFFFF)
+
+
+def crc32(data: bytes) -> int:
+    """CRC-32 of Ethernet and zlib; 0xCBF43926 for "123456789"."""
+    return zlib.crc32(data)
+
+
+CHECKS = {
+    "xor8": Check(xor8, 2),
+    "crc8": Check(crc8, 2),
+    "crc16": Check(crc16, 4),
+    "crc32": Check(crc32, 8),
+}
+
+
+def factor(quantity: str, unit: str, ticks_per_turn: float | None) -> float:
+    """What the number on the wire is multiplied with to get SI units (volts, degrees C, percent).
+
+    A unit may have a number before it: in `0.1C` or `-tick`, the wire counts tenths of degrees,
+    or ticks backwards. Raises ValueError saying what was expected.
+    """
+    known = UNITS[quantity]
+    match = _UNIT.fullmatch(unit)
+    name = (match[2] or "") if match else ""
+    if match is None or (name not in known and not (name == "" and not unit.strip())):
+        choices = " or ".join(filter(None, known)) or "no unit"
+        raise ValueError(f"it is a {quantity}: expected {choices}, got {unit!r}")
+    one = known[name] if name in known else next(iter(known.values()))
+    if name.startswith("tick"):
+        if not ticks_per_turn:
+            raise ValueError(f"{name!r} needs `ticks_per_turn`")
+        one = math.tau / ticks_per_turn
+    number = match[1] + "1" if match[1] in ("", "+", "-") else match[1]
+    try:
+        scale = float(number)
+    except ValueError:
+        scale = 0.0
+    if scale == 0.0:
+        raise ValueError(f"expected a number other than 0 before the unit, got {unit!r}")
+    return scale * one
+
+
+@dataclass(frozen=True)
+class Field:
+    """One number of a line."""
+
+    name: str
+    unit: str
+    factor: float  # wire * factor is in SI units
+    format: str  # of Python's format(); whole numbers and hexadecimals are rounded first
+    pattern: str  # of a regular expression
+
+    @property
+    def counts(self) -> bool:
+        """Whether it is a counter or a set of flags, which may be as large as they like."""
+        return self.unit.endswith("tick") or self.format[-1] in "xX"
+
+    @property
+    def step(self) -> float:
+        """The least by which two values on the wire differ, in SI units."""
+        if self.format[-1] != "f":
+            return abs(self.factor)
+        return abs(self.factor) * 10.0 ** -_places(self.format)
+
+    def write(self, value: float, *, toward_zero: bool = False) -> str:
+        """The text for a value in SI units, rounded to its digits; zero has no sign."""
+        wire = value / self.factor
+        if toward_zero:
+            places = 10.0 ** _places(self.format) if self.format[-1] == "f" else 1.0
+            wire = math.copysign(math.floor(abs(wire) * places + EXACT), wire) / places
+        if self.format[-1] != "f":
+            return format(round(wire), self.format)
+        text = format(wire, self.format)
+        return format(0.0, self.format) if float(text) == 0 else text
+
+    def read(self, text: str) -> float:
+        """The value in SI units of a text that fits the pattern."""
+        return (int(text, 16) if self.format[-1] in "xX" else float(text)) * self.factor + 0.0
+
+
+def field_of(
+    name: str, unit: str | None, form: str | None, known: Mapping[str, str], turn: float | None
+) -> Field:
+    """What stands between two braces. Raises ValueError naming the field."""
+    if name in CHECKS:
+        raise ValueError(f"the checksum {{{name}}} must stand last in the line")
+    if name not in known:
+        raise ValueError(str(unknown("field", name, [*known, *CHECKS])))
+    quantity, unit = known[name], (unit or "").strip()
+    try:
+        scale = factor(quantity, unit, turn)
+    except ValueError as error:
+        raise ValueError(f"{{{name}}}: {error}") from None
+    if form is None:
+        pattern = "[0-9A-Fa-f]{1,8}" if quantity == "flags" else _ANY_NUMBER
+        plain = "d" if unit.lstrip("-") in ("tick", "tick/s") else ".3f"
+        return Field(name, unit, scale, DEFAULT_FORMATS.get(quantity, plain), pattern)
+    if not _FORMAT.fullmatch(form):
+        raise ValueError(f"{{{name}}}: expected a format such as .3f, d or 02x, got {form!r}")
+    if form[-1] in "xX" and quantity not in DEFAULT_FORMATS:
+        raise ValueError(f"{{{name}}}: a {quantity} has a sign; expected .3f or d, got {form!r}")
+    return Field(name, unit, scale, form, _pattern(form))
+
+
+def _places(form: str) -> int:
+    """The decimals that a format ending in `f` writes."""
+    _, dot, digits = form.rstrip("f").partition(".")
+    return int(digits) if dot else 6
+
+
+def _pattern(form: str) -> str:
+    """What a number of this format looks like, and nothing else."""
+    sign = "[-+]" if form.startswith("+") else "-?"
+    padding = " *" if len(form.rstrip("fdxX").partition(".")[0].lstrip("+0")) else ""
+    if form[-1] in "xX":
+        return f"{padding}[0-9A-Fa-f]{{1,8}}"
+    if form[-1] == "d":
+        return f"{padding}{sign}[0-9]{{1,12}}"
+    places = _places(form)
+    return rf"{padding}{sign}[0-9]{{1,12}}" + (rf"\.[0-9]{{{places}}}" if places else "")
 
 
 class Template:
@@ -139,7 +343,7 @@ def describe(values: Mapping[str, float]) -> str:
     return ", ".join(told)
 
 
-class Decoder:
+class LineDecoder:
     """Cuts bytes into lines and reads those that fit one of the templates.
 
     `errors` counts the others, from the first good line on: what comes before is a boot banner.

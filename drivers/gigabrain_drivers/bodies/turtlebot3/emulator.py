@@ -1,13 +1,13 @@
 """TurtleBot3's OpenCR board with the firmware of `turtlebot3_ros2`, version 5."""
 
 import math
+import struct
+from collections.abc import Mapping
 from typing import Any
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
-from gigabrain_drivers.bodies.turtlebot3.control_table import ControlTable
 from gigabrain_drivers.bodies.turtlebot3.driver import OpenCrOptions
-from gigabrain_drivers.bodies.turtlebot3.dynamixel import Packet
+from gigabrain_drivers.bodies.turtlebot3.protocol import DynamixelPacket
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Wire
 
 FIRMWARE = 5
@@ -20,13 +20,11 @@ WHEEL_UNITS = 1263.632956882  # of the motors per [m/s]
 MOST_UNITS = 337
 AMPERES_PER_NM = 1 / 1.07
 FIRST_TICKS = (1234, 3210)  # a motor's absolute encoder does not start at 0
-
 MODEL, MODEL_INFO, MILLIS, DEBUG, HOST, STATUS = 0, 2, 10, 14, 15, 18
 BUMPERS, VOLTAGE, PERCENTAGE, CALIBRATE = 28, 42, 46, 59
 GYRO, ACCELERATION, ORIENTATION = 60, 72, 96
 CURRENT, SPEED, POSITION, MOTORS, TORQUE = 120, 128, 136, 148, 149
 FORWARD, TURN = 150, 170
-
 ITEMS = {  # address -> type
     **dict.fromkeys((6, 7, 8, 9, opencr.HEARTBEAT, 50), "B"),
     **dict.fromkeys((DEBUG, HOST, 16, *range(20, 24), *range(26, 30)), "?"),
@@ -38,6 +36,49 @@ ITEMS = {  # address -> type
     MODEL: "H",
     30: "H",
 }
+
+
+class ControlTable:
+    """Reads and writes as the vendor's slave library does: only whole items, gaps are zero."""
+
+    def __init__(self, items: Mapping[int, str]) -> None:
+        """`items` by address, each a `struct` code of one value."""
+        self._codes = {address: struct.Struct("<" + code) for address, code in items.items()}
+        self._data = bytearray(max(address + code.size for address, code in self._codes.items()))
+
+    def __getitem__(self, address: int) -> float:
+        return float(self._codes[address].unpack_from(self._data, address)[0])
+
+    def __setitem__(self, address: int, value: float) -> None:
+        code = self._codes[address]
+        code.pack_into(self._data, address, value if code.format[-1:] in "fd" else round(value))
+
+    def put(self, address: int, code: str, *values: float) -> None:
+        """Set items of the same type in a row."""
+        size = struct.calcsize(code)
+        for place, value in enumerate(values):
+            self[address + place * size] = value
+
+    def read(self, address: int, length: int) -> bytes:
+        """What a READ of this range answers."""
+        answer = bytearray(length)
+        for at in self._inside(address, length):
+            size = self._codes[at].size
+            answer[at - address : at - address + size] = self._data[at : at + size]
+        return bytes(answer)
+
+    def write(self, address: int, data: bytes) -> list[int]:
+        """Do a WRITE; returns the addresses of the items that it reached."""
+        reached = self._inside(address, len(data))
+        for at in reached:
+            size = self._codes[at].size
+            self._data[at : at + size] = data[at - address : at - address + size]
+        return reached
+
+    def _inside(self, address: int, length: int) -> list[int]:
+        """The items that lie wholly in a range."""
+        end = address + length
+        return [at for at, code in self._codes.items() if address <= at and at + code.size <= end]
 
 
 class OpenCr(Device):
@@ -58,7 +99,7 @@ class OpenCr(Device):
 
     def reset(self) -> None:
         """As after power-on; it says nothing by itself."""
-        self._decoder = dynamixel.Decoder(BUFFER)
+        self._decoder = opencr.DynamixelDecoder(BUFFER)
         self._table = ControlTable(ITEMS)
         self._goal = (0.0, 0.0)
         self._on = True
@@ -102,15 +143,15 @@ class OpenCr(Device):
         self._refresh(now_ns - self._began_ns)
         self._drive()
 
-    def _obey(self, packet: Packet) -> None:
+    def _obey(self, packet: DynamixelPacket) -> None:
         kind, params = packet.instruction, packet.params
-        if kind == dynamixel.PING:
+        if kind == opencr.PING:
             self._answer(opencr.MODEL.to_bytes(2, "little") + bytes([FIRMWARE]))
-        elif kind == dynamixel.READ and len(params) == 4:
+        elif kind == opencr.READ and len(params) == 4:
             address, length = params[0] | params[1] << 8, params[2] | params[3] << 8
             if length + 11 <= BUFFER:
                 self._answer(self._table.read(address, length))
-        elif kind == dynamixel.WRITE and len(params) > 2:
+        elif kind == opencr.WRITE and len(params) > 2:
             reached = self._table.write(params[0] | params[1] << 8, params[2:])
             if CALIBRATE in reached and self._table[CALIBRATE]:
                 self._calibrating_ns = -1  # from the next pass on; it answers when it is done
@@ -127,7 +168,7 @@ class OpenCr(Device):
         self._goal = (forward, turn)
 
     def _answer(self, data: bytes = b"") -> None:
-        self.wire.write(dynamixel.status(opencr.ID, data))
+        self.wire.write(opencr.status(opencr.ID, data))
 
     def _watch_host(self, now_ns: int) -> None:
         """Whether somebody is there. Without the host there is no goal, whatever was written."""

@@ -1,25 +1,31 @@
-"""TurtleBot3's OpenCR board: its control table, read and written by Dynamixel Protocol 2.0.
+"""TurtleBot3's OpenCR board: Dynamixel Protocol 2.0 packets, and the board's control table.
 
-Source: the firmware, OpenCR `libraries/turtlebot3_ros2`. Address 14 switches the firmware's
-watchdog off; nothing here can write it.
+Packets have byte stuffing and CRC-16: https://emanual.robotis.com/docs/en/dxl/protocol2/
+The table is that of the firmware, OpenCR `libraries/turtlebot3_ros2`. Address 14 switches the
+firmware's watchdog off; nothing here can write it.
 """
 
 import math
 import struct
 from typing import NamedTuple
 
-from gigabrain_drivers.bodies.turtlebot3 import dynamixel
+from gigabrain_drivers.links.frames import FrameDecoder
+
+HEADER = b"\xff\xff\xfd\x00"
+PING, READ, WRITE, STATUS = 0x01, 0x02, 0x03, 0x55
+LONGEST = 1024  # of the length field; nothing here sends as much, so more is noise
+
+_PREFIX = len(HEADER) + 3  # header, id, length: what the length does not count
+_CRC = 2
+_MARK, _STUFFED = b"\xff\xff\xfd", b"\xff\xff\xfd\xfd"
 
 ID = 200
 MODEL = 0x5000  # of the board; which TurtleBot3 it is stands at MODEL_INFO
 USB_ID = "0483:5740"
 BAUD = 1_000_000  # USB, so any does
-
 FIRST, LENGTH = 10, 172  # what one read per cycle fetches
 HEARTBEAT, TORQUE, VELOCITY = 19, 149, 150
-
 RUNNING, MOTORS_SILENT = 0, -1  # device status; silent mostly means that their switch is off
-
 TICKS = 4096  # of a wheel's encoder per turn
 RADIANS_PER_TICK = math.tau / TICKS
 VELOCITY_UNIT = 0.229 * math.tau / 60  # [rad/s]
@@ -27,7 +33,6 @@ FASTEST_WHEEL = 337 * VELOCITY_UNIT  # [rad/s], beyond which the firmware cuts o
 CURRENT_UNIT = 0.00269  # [A]
 SPEED_UNIT = 0.01  # [m/s] and [rad/s], of a command
 EMPTY_VOLTAGE = 10.5  # [V], below which the percentage stands still
-
 _TABLE = struct.Struct(
     "<I??"  # 10 milliseconds; debug mode, host connected
     "?xbB"  # 16 manipulator, device status, heartbeat
@@ -37,11 +42,98 @@ _TABLE = struct.Struct(
     "2i2i2i4x"  # 120 current, velocity, position
     "??6i2I"  # 148 motors connected, torque; 150 command; 174 profile acceleration
 )
-assert _TABLE.size == LENGTH
-
 Pair = tuple[int, int]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+
+
+class DynamixelPacket(NamedTuple):
+    """An instruction, or as STATUS an answer, whose first parameter is then its error."""
+
+    id: int
+    instruction: int
+    params: bytes = b""
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        value = byte << 8
+        for _ in range(8):
+            value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
+        table.append(value & 0xFFFF)
+    return tuple(table)
+
+
+_CRC_TABLE = _crc_table()
+
+
+def crc16(data: bytes) -> int:
+    """The check of `data`: polynomial 0x8005, from 0, nothing reflected."""
+    crc = 0
+    for byte in data:
+        crc = ((crc << 8) & 0xFFFF) ^ _CRC_TABLE[(crc >> 8) ^ byte]
+    return crc
+
+
+def encode(packet: DynamixelPacket) -> bytes:
+    """The bytes of a packet on the wire."""
+    body = bytes([packet.instruction]) + packet.params
+    body = body.replace(_MARK, _STUFFED)
+    frame = HEADER + struct.pack("<BH", packet.id, len(body) + _CRC) + body
+    return frame + struct.pack("<H", crc16(frame))
+
+
+def ping(device: int) -> bytes:
+    """Ask who is there; the answer is model number u16 and firmware version u8."""
+    return encode(DynamixelPacket(device, PING))
+
+
+def read(device: int, address: int, length: int) -> bytes:
+    """Ask for `length` bytes of the control table."""
+    return encode(DynamixelPacket(device, READ, struct.pack("<HH", address, length)))
+
+
+def write(device: int, address: int, data: bytes) -> bytes:
+    """Put `data` into the control table."""
+    return encode(DynamixelPacket(device, WRITE, struct.pack("<H", address) + data))
+
+
+def status(device: int, data: bytes = b"", error: int = 0) -> bytes:
+    """A device's answer."""
+    return encode(DynamixelPacket(device, STATUS, bytes([error]) + data))
+
+
+class DynamixelDecoder(FrameDecoder[DynamixelPacket]):
+    """Finds packets in whatever comes in."""
+
+    HEADER = HEADER
+
+    def __init__(self, longest: int = LONGEST) -> None:
+        super().__init__()
+        self._longest = longest
+
+    def _size(self, buffer: bytearray) -> int | None:
+        if len(buffer) < _PREFIX:
+            return None
+        length = int.from_bytes(buffer[_PREFIX - 2 : _PREFIX], "little")
+        size = _PREFIX + length
+        if not 1 + _CRC <= length <= self._longest:
+            return 0
+        inside = buffer.find(HEADER, len(HEADER), size - _CRC)
+        return 0 if inside > 0 else size  # stuffing leaves no header inside a packet
+
+    def _frame(self, data: bytes) -> DynamixelPacket | None:
+        right = crc16(data[:-_CRC]) == int.from_bytes(data[-_CRC:], "little")
+        return _packet(data) if right else None
+
+
+def _packet(frame: bytes) -> DynamixelPacket:
+    body = frame[_PREFIX:-_CRC].replace(_STUFFED, _MARK)
+    return DynamixelPacket(frame[4], body[0], body[1:])
+
+
+assert _TABLE.size == LENGTH
 
 
 class Readings(NamedTuple):
@@ -66,7 +158,7 @@ class Readings(NamedTuple):
 
 def ask() -> bytes:
     """The one read of a cycle."""
-    return dynamixel.read(ID, FIRST, LENGTH)
+    return read(ID, FIRST, LENGTH)
 
 
 def model_of(answer: bytes) -> tuple[int, int] | None:
@@ -111,30 +203,30 @@ def velocity(linear_x: float, angular_z: float) -> Sent:
     """Drive [m/s], [rad/s], both finite. The board knows hundredths, and cuts off what is more."""
     forward, turn = _hundredths(linear_x), _hundredths(angular_z)
     data = struct.pack("<6i", forward, 0, 0, 0, 0, turn)
-    return Sent(dynamixel.write(ID, VELOCITY, data), forward * SPEED_UNIT, turn * SPEED_UNIT)
+    return Sent(write(ID, VELOCITY, data), forward * SPEED_UNIT, turn * SPEED_UNIT)
 
 
 def heartbeat(count: int) -> bytes:
     """A sign of life: the board stops 500 ms after the lowest 8 bits of `count` last changed."""
-    return dynamixel.write(ID, HEARTBEAT, bytes([count & 0xFF]))
+    return write(ID, HEARTBEAT, bytes([count & 0xFF]))
 
 
 def torque(on: bool) -> bytes:
     """Switch the motors on or off."""
-    return dynamixel.write(ID, TORQUE, bytes([on]))
+    return write(ID, TORQUE, bytes([on]))
 
 
-def describe(packet: dynamixel.Packet) -> str:
+def describe(packet: DynamixelPacket) -> str:
     """A packet between a host and the board, in words."""
     kind, params = packet.instruction, packet.params
-    if kind == dynamixel.STATUS:
+    if kind == STATUS:
         return _answer_in_words(params)
-    if kind == dynamixel.PING:
+    if kind == PING:
         return f"ping {packet.id}"
-    if kind == dynamixel.READ and len(params) == 4:
+    if kind == READ and len(params) == 4:
         address, length = struct.unpack("<HH", params)
         return f"read {length} bytes at {address}"
-    if kind != dynamixel.WRITE or len(params) < 3:
+    if kind != WRITE or len(params) < 3:
         return f"instruction {kind:02x}"
     address, data = params[0] | params[1] << 8, params[2:]
     if address == HEARTBEAT and len(data) == 1:

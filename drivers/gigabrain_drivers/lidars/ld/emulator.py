@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from gigabrain_drivers.driver.robot import ScanOptions
-from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
-from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.emulators.sweep import Sample, Sweep
+from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Sample, Sweep, Wire
+from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.lidars.ld import protocol as ld
 
 LEAST_VOLTS = 0.5  # below its 5 V by more than this, the motor does not keep its speed

@@ -12,7 +12,7 @@ from gigabrain_drivers.lidars.base import Gathered, Samples
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.serial_source import SerialSource
 from gigabrain_drivers.links.device_clock import DeviceClock
-from gigabrain_drivers.links.wording import Spelling, Wording
+from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import Clock
@@ -22,6 +22,9 @@ Place = Callable[[Samples, Samples], tuple[Samples, Samples]]
 POINTS, WHOLE = np.arange(ld.POINTS), slice(None)
 PROBE_BYTES = 300  # at least five frames
 PROBE_FRAMES = 3
+
+OFFSET_X, OFFSET_Y = 5.9, -20.14  # [mm], of the lens
+SLANT = 0.11923  # of the beam against the direction that the lidar tells
 
 
 class Frames(Gathered[tuple[bytes, slice]]):
@@ -119,10 +122,6 @@ def turn_start(raw: ld.RawFrame, last: int | None) -> int | None:
         return None
     step = (raw.end - raw.start) % ld.TURN / (ld.POINTS - 1)
     return min(math.ceil((ld.TURN - raw.start) / step), ld.POINTS - 1)
-
-
-OFFSET_X, OFFSET_Y = 5.9, -20.14  # [mm], of the lens
-SLANT = 0.11923  # of the beam against the direction that the lidar tells
 
 
 class Lds02(Ld):

@@ -4,9 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from gigabrain_drivers.driver.robot import ScanOptions
-from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
-from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.emulators.sweep import Sample, Sweep
+from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Sample, Sweep, Wire
+from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.lidars.ld.emulator import LEAST_VOLTS
 from gigabrain_drivers.lidars.lds import lds01, lds03
 

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import serial
 
 from gigabrain_drivers.lidars.serial_source import SerialSource
-from gigabrain_drivers.links.frames import FrameDecoder
-from gigabrain_drivers.links.wording import Spelling, Wording, whole
+from gigabrain_drivers.links.frames import FrameDecoder, Spelling, Wording, whole
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock
 
@@ -22,6 +21,11 @@ SIZE = 42
 NO_RETURN = 0  # [mm]
 
 _SYNC, _FIRST = 0xFA, 0xA0
+
+PROBE_BYTES = 600  # fourteen packets
+PROBE_PACKETS = 3
+RESTART_NS = 1_000_000_000  # without a packet, until it is started again
+LAST_WORD_NS = 20_000_000  # until a command has left the port
 
 
 class Lds01Packet(NamedTuple):
@@ -74,12 +78,6 @@ class Lds01Decoder(FrameDecoder[Lds01Packet]):
 def _packet(frame: bytes) -> Lds01Packet:
     values = struct.unpack("<BBH" + "HHH" * SAMPLES + "H", frame)
     return Lds01Packet(values[1] - _FIRST, values[2] / 10, values[3:-1:3], values[4:-1:3])
-
-
-PROBE_BYTES = 600  # fourteen packets
-PROBE_PACKETS = 3
-RESTART_NS = 1_000_000_000  # without a packet, until it is started again
-LAST_WORD_NS = 20_000_000  # until a command has left the port
 
 
 class Lds01(SerialSource):

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import serial
 
 from gigabrain_drivers.lidars.serial_source import SerialSource
-from gigabrain_drivers.links.frames import FrameDecoder
-from gigabrain_drivers.links.wording import Spelling, Wording
+from gigabrain_drivers.links.frames import FrameDecoder, Spelling, Wording
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock
 
@@ -22,6 +21,14 @@ BAUD = 230_400
 _HEADER = b"\xaa\x55"
 _PREFIX = 10
 _TURN = 360.0
+
+PROBE_BYTES = 600
+DTR_NS = 100_000_000  # after opening, until the terminal-ready line is cleared
+START_NS = 1_000_000_000  # after opening, until it listens
+RESTART_NS = 3_000_000_000  # without a packet, until it is stopped and started
+LAST_WORD_NS = 20_000_000  # until a command has left the port
+NEAR_MM, WEAK = 150, 65  # up to here, a sample this weak is a reflection of the housing
+MIRROR_QUALITY = 255
 
 
 def command(code: int) -> bytes:
@@ -147,15 +154,6 @@ def _packet(frame: bytes) -> Lds03Packet:
         )
     begins = bool(kind & 1)
     return Lds03Packet(begins, (kind >> 1) / 10 if begins else 0.0, tuple(samples))
-
-
-PROBE_BYTES = 600
-DTR_NS = 100_000_000  # after opening, until the terminal-ready line is cleared
-START_NS = 1_000_000_000  # after opening, until it listens
-RESTART_NS = 3_000_000_000  # without a packet, until it is stopped and started
-LAST_WORD_NS = 20_000_000  # until a command has left the port
-NEAR_MM, WEAK = 150, 65  # up to here, a sample this weak is a reflection of the housing
-MIRROR_QUALITY = 255
 
 
 class Lds03(SerialSource):

@@ -3,9 +3,8 @@
 from pathlib import Path
 from typing import NamedTuple
 
-from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
-from gigabrain_drivers.emulators.pty import Pty
-from gigabrain_drivers.emulators.sweep import Sample, Sweep
+from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Sample, Sweep, Wire
+from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
 from gigabrain_drivers.lidars.rplidar.protocol import (
     DENSE,

@@ -28,6 +28,15 @@ _DESCRIPTOR = struct.Struct("<2sIB")
 _ENDLESS = 1 << 30
 _SYNC = b"\xa5\x5a"
 
+REQUESTS = {
+    STOP: "stop", RESET: "reset",
+    SCAN: "scan", FORCE_SCAN: "force scan", EXPRESS_SCAN: "express scan",
+    GET_INFO: "get info", GET_HEALTH: "get health",
+    GET_SAMPLERATE: "get sample rate", GET_BOARD: "get board",
+    GET_CONF: "get setting", SET_SPEED: "set speed", SET_PWM: "set motor",
+}  # fmt: skip
+_BEFORE_CHECKSUM = 3  # bytes of a request with a payload before the payload
+
 
 def request(command: int, payload: bytes = b"") -> bytes:
     """The bytes of a request. Commands from 0x80 carry a payload and a checksum."""
@@ -204,16 +213,6 @@ def describe(item: "Answer | Samples") -> str:
     if item.kind == HEALTH:
         return f"health: status {Health.read(item.data).status}"
     return f"answer of type {item.kind:#04x}, {len(item.data)} bytes"
-
-
-REQUESTS = {
-    STOP: "stop", RESET: "reset",
-    SCAN: "scan", FORCE_SCAN: "force scan", EXPRESS_SCAN: "express scan",
-    GET_INFO: "get info", GET_HEALTH: "get health",
-    GET_SAMPLERATE: "get sample rate", GET_BOARD: "get board",
-    GET_CONF: "get setting", SET_SPEED: "set speed", SET_PWM: "set motor",
-}  # fmt: skip
-_BEFORE_CHECKSUM = 3  # bytes of a request with a payload before the payload
 
 
 class Request(NamedTuple):

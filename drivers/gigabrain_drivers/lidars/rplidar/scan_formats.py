@@ -19,6 +19,10 @@ MOST_JUMP_DEG = 25.0  # between two nodes in step; their triangulation shifts th
 FULL_TURN_DEG = 400.0  # no start of a turn for so long: its node was lost
 WIDER = 1.5  # a capsule this much wider than the last: one between them was lost
 
+_NODE = struct.Struct("<BHH")
+_CABINS = struct.Struct("<" + "HHB" * 16)
+_DENSE = struct.Struct("<40H")
+
 
 class Samples(NamedTuple):
     """Measurements in the order they were made."""
@@ -156,10 +160,6 @@ class Dense(Capsule):
 
 
 FORMATS: dict[int, type[ScanFormat]] = {f.kind: f for f in (Standard, Express, Dense)}
-
-_NODE = struct.Struct("<BHH")
-_CABINS = struct.Struct("<" + "HHB" * 16)
-_DENSE = struct.Struct("<40H")
 
 
 def capsule_checksum(block: bytes) -> int:

@@ -18,7 +18,7 @@ from gigabrain_drivers.lidars.rplidar.protocol import (
 )
 from gigabrain_drivers.lidars.rplidar.scan_formats import FORMATS, Samples
 from gigabrain_drivers.lidars.serial_source import LOOK_NS, SerialSource
-from gigabrain_drivers.links.wording import Spelling, Wording
+from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock
 
@@ -39,6 +39,10 @@ EXPRESS_FIRMWARE = (1, 17)  # from here on it has the express mode
 
 ModelName = Literal["auto", "a1", "a2m8", "a2m12", "a3", "c1", "s1", "s2", "s3"]
 ScanMode = Literal["auto", "standard", "express", "dense"]
+
+BAUDS = (115_200, 460_800, 1_000_000, 256_000)
+FAMILIES = {1: "A1", 2: "A2", 3: "A3", 4: "C1", 6: "S1", 7: "S2", 8: "S3"}
+KINDS = {"standard": rplidar.STANDARD, "express": rplidar.EXPRESS, "dense": rplidar.DENSE}
 
 
 class RplidarOptions(ScanOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -69,9 +73,6 @@ MODELS = {
     "s2": ModelFigures(1_000_000, 7),
     "s3": ModelFigures(1_000_000, 8),
 }
-BAUDS = (115_200, 460_800, 1_000_000, 256_000)
-FAMILIES = {1: "A1", 2: "A2", 3: "A3", 4: "C1", 6: "S1", 7: "S2", 8: "S3"}
-KINDS = {"standard": rplidar.STANDARD, "express": rplidar.EXPRESS, "dense": rplidar.DENSE}
 
 
 class Line(Protocol):

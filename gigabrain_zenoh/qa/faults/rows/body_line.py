@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from gigabrain_drivers.bodies.line.fields import COMMAND
-from gigabrain_drivers.bodies.line.protocol import Decoder, Template
+from gigabrain_drivers.bodies.line.protocol import COMMAND, LineDecoder, Template
 from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.config.settings import ProcessConfig
@@ -113,7 +112,7 @@ def let_through(checksum: str, byte_errors: float, lines: int, seed: int = 0) ->
     A million lines give the table in docs/firmware_line.md.
     """
     template = _command_line(checksum)
-    noise, decoder = np.random.default_rng(seed), Decoder((template,))
+    noise, decoder = np.random.default_rng(seed), LineDecoder((template,))
     sent: deque[dict[str, float]] = deque(maxlen=2 * CHUNK)
     right = wrong = 0
     for _ in range(lines // CHUNK):
@@ -137,7 +136,7 @@ def lost_after_garbage(checksum: str, times: int, seed: int = 0) -> int:
     template, noise = _command_line(checksum), np.random.default_rng(seed)
     line, worst = template.encode({"linear_x": 0.2, "angular_z": 0.1}), 0
     for _ in range(times):
-        decoder = Decoder((template,))
+        decoder = LineDecoder((template,))
         decoder.feed(noise.bytes(int(noise.integers(1, LONGEST_GARBAGE))))
         lost = 0
         while not decoder.feed(line):

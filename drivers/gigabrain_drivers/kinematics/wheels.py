@@ -1,7 +1,7 @@
-"""From a body's velocity to its wheels or its gait, and back. Pure; SI units; x forward, y left.
+"""From a body's velocity to its wheels and back, and dead reckoning by how the wheels turned.
 
-What holds for speeds holds for small distances: `to_body` of wheel angles [rad] is how far the
-body has moved [m, m, rad].
+Pure; SI units; x forward, y left. What holds for speeds holds for small distances: `to_body` of
+wheel angles [rad] is how far the body has moved [m, m, rad].
 """
 
 import abc
@@ -12,6 +12,14 @@ from typing import NamedTuple
 import numpy as np
 
 from gigabrain_drivers.driver.robot import RobotFile
+from gigabrain_schemas.base import Pose
+
+MEASURES = {  # of each drive type with wheels
+    "differential": ("wheel_radius", "wheel_separation"),
+    "mecanum": ("wheel_radius", "wheel_separation", "wheel_base"),
+    "omni": ("wheel_radius", "wheel_separation"),
+    "ackermann": ("wheel_radius", "wheel_base"),
+}
 
 
 class Twist(NamedTuple):
@@ -150,61 +158,6 @@ class Ackermann(Base):
         return left, math.atan(self.wheel_base / (turning + separation / 2))
 
 
-class Gait(NamedTuple):
-    """How a quadruped walks: each foot is on the ground for `duty` of a cycle."""
-
-    stride_x: float  # [m], by which the body moves in one cycle
-    stride_y: float  # [m]
-    turn: float  # [rad], by which it turns in one cycle
-    frequency: float  # [Hz], cycles
-    duty: float  # 0-1
-    phases: tuple[float, float, float, float]  # 0-1, of front left, front right, rear left, right
-    height: float  # [m], of the hips
-
-
-@dataclass(frozen=True)
-class Walker:
-    """A quadruped's way to walk: a trot whose steps grow with the speed, then come faster."""
-
-    frequency: float = 2.5  # [Hz], as long as the stride allows it
-    max_frequency: float = 4.0  # [Hz]
-    max_stride: float = 0.2  # [m] in one cycle
-    duty: float = 0.55
-    height: float = 0.29  # [m]
-    phases: tuple[float, float, float, float] = (0.0, 0.5, 0.5, 0.0)
-
-    def to_gait(self, twist: Twist) -> Gait:
-        """The gait for a velocity; faster than it can step, all parts slow down alike."""
-        speed = math.hypot(twist.linear_x, twist.linear_y)
-        fastest = self.max_frequency * self.max_stride
-        scale = min(1.0, fastest / speed) if speed else 1.0
-        x, y, turn = (part * scale for part in twist)
-        frequency = max(self.frequency, speed * scale / self.max_stride)
-        return Gait(
-            stride_x=x / frequency,
-            stride_y=y / frequency,
-            turn=turn / frequency,
-            frequency=frequency,
-            duty=self.duty,
-            phases=self.phases,
-            height=self.height,
-        )
-
-    @staticmethod
-    def to_body(gait: Gait) -> Twist:
-        """The velocity of a body whose feet do not slip."""
-        strides = (gait.stride_x, gait.stride_y, gait.turn)
-        return Twist(*(stride * gait.frequency for stride in strides))
-
-
-MEASURES = {  # of each drive type with wheels
-    "differential": ("wheel_radius", "wheel_separation"),
-    "mecanum": ("wheel_radius", "wheel_separation", "wheel_base"),
-    "omni": ("wheel_radius", "wheel_separation"),
-    "ackermann": ("wheel_radius", "wheel_base"),
-}
-
-
 def missing_measures(robot: RobotFile) -> list[str]:
     """The measures of its wheels that a robot's file does not give."""
     return [name for name in MEASURES.get(robot.drive_type, ()) if not getattr(robot, name)]
@@ -222,3 +175,56 @@ def base_of(robot: RobotFile) -> Base | None:
     if robot.drive_type == "omni":
         return Omni(radius, across / math.sqrt(3.0))
     return Ackermann(radius, along)
+
+
+def advanced(pose: Pose, moved: Twist) -> Pose:
+    """Where a body is after a small step in its own frame, taken at the mid heading."""
+    middle = pose.yaw + moved.angular_z / 2
+    cos, sin = math.cos(middle), math.sin(middle)
+    return Pose(
+        x=pose.x + moved.linear_x * cos - moved.linear_y * sin,
+        y=pose.y + moved.linear_x * sin + moved.linear_y * cos,
+        yaw=math.remainder(pose.yaw + moved.angular_z, math.tau),
+    )
+
+
+def between(start: Pose, end: Pose) -> Twist:
+    """The small step, in the body's own frame, that leads from one pose to another."""
+    turn = math.remainder(end.yaw - start.yaw, math.tau)
+    middle, x, y = start.yaw + turn / 2, end.x - start.x, end.y - start.y
+    cos, sin = math.cos(middle), math.sin(middle)
+    return Twist(cos * x + sin * y, cos * y - sin * x, turn)
+
+
+class WheelOdometry:
+    """The pose since the start (REP-103), integrated at the mid heading."""
+
+    def __init__(self, base: Base) -> None:
+        self._base = base
+        self.pose = Pose(x=0.0, y=0.0, yaw=0.0)
+
+    def add(self, wheels: tuple[float, ...]) -> None:
+        """The wheels have turned by so much [rad], in the order of `base.wheels`."""
+        self.pose = advanced(self.pose, self._base.to_body(wheels))
+
+
+class Encoders:
+    """Counters that wrap, read as the angles by which wheels turned between two looks."""
+
+    def __init__(self, per_turn: float, bits: int) -> None:
+        self._radians, self._range = math.tau / per_turn, 1 << bits
+        self._last: tuple[int, ...] | None = None
+
+    def turned(self, counts: tuple[int, ...]) -> tuple[float, ...]:
+        """By how much [rad] since the last look; nothing at the first."""
+        last, self._last = self._last or counts, counts
+        pairs = zip(counts, last, strict=True)
+        return tuple(self._radians * self._wrapped(now - before) for now, before in pairs)
+
+    def restart(self) -> None:
+        """The counters may have been set anew: what comes next counts from there."""
+        self._last = None
+
+    def _wrapped(self, difference: int) -> int:
+        half = self._range // 2
+        return (difference + half) % self._range - half

@@ -2,24 +2,78 @@
 
 import asyncio
 import logging
+import os
+from collections import deque
 from collections.abc import Callable
 
-from gigabrain_drivers.echo_loop import EchoLoop
 from gigabrain_drivers.links.serial_link import SerialLink
+from gigabrain_schemas.base import Cause
 from gigabrain_schemas.safety import ButtonState
 from gigabrain_schemas.topics import BUTTON, STATE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.estop import press
 from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import NotConfirmed
+from gigabrain_zenoh.gate import causes as why
+
+LATE_NS = 200_000_000  # what has not come back by then counts as never coming
+BYTES = 2  # of each question: none of them can be guessed, nor held over from before
 
 log = logging.getLogger(__name__)
-
 BAUD = 115_200
 PERIOD_NS = 20_000_000  # between two questions
 TELL_EVERY = 2  # of them: 25 times a second
 START_NS = 1_000_000_000  # for the port to open and the first echo, in which nothing is said
 AGAIN_S = 0.1  # between two looks at whether the robot is latched
+
+
+class EchoLoop:
+    """Random bytes go out at TX, through a normally closed contact, and in at RX.
+
+    An open contact, a broken wire and an adapter that is gone all look the same: nothing comes
+    back. A short circuit to something else that talks looks wrong.
+    """
+
+    def __init__(self, random: Callable[[int], bytes] = os.urandom) -> None:
+        self._random = random
+        self._expected: deque[tuple[int, int]] = deque()  # byte, sent at [ns]
+        self._good_ns: int | None = None  # when the newest byte that came back was sent
+        self._deaf_until_ns = 0
+
+    def opened(self) -> None:
+        """The line is new: nothing from before counts."""
+        self._expected.clear()
+        self._good_ns = None
+
+    def question(self, now_ns: int) -> bytes:
+        """What to send now."""
+        if now_ns < self._deaf_until_ns:
+            return b""
+        while self._expected and now_ns - self._expected[0][1] > LATE_NS:
+            self._expected.popleft()
+        data = self._random(BYTES)
+        self._expected.extend((byte, now_ns) for byte in data)
+        return data
+
+    def heard(self, data: bytes, now_ns: int) -> None:
+        """What has come back. After a wrong byte nothing is believed until the line is quiet."""
+        for byte in data:
+            if now_ns < self._deaf_until_ns:
+                return
+            expected, sent_ns = self._expected.popleft() if self._expected else (None, 0)
+            if byte != expected:
+                self._deaf_until_ns, self._good_ns = now_ns + LATE_NS, None
+                self._expected.clear()
+            elif now_ns - sent_ns <= LATE_NS:
+                self._good_ns = sent_ns
+
+    def problem(self, now_ns: int) -> str:
+        """Why the contact does not count as closed, or an empty text."""
+        if now_ns < self._deaf_until_ns:
+            return "what comes back is not what was sent"
+        if self._good_ns is None or now_ns - self._good_ns > LATE_NS:
+            return "the contact is open, or its wire is broken"
+        return ""
 
 
 class Button:
@@ -93,3 +147,29 @@ class Button:
 async def run(config: ButtonConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Watch one button until the process ends."""
     await Button(config, bus).run(ready)
+
+
+class ButtonWatch:
+    """Holds the gate shut while the button is pressed, or silent for 200 ms.
+
+    `on_press` is called as soon as it is pressed. Until the button has been heard for the first
+    time its silence does not latch.
+    """
+
+    def __init__(self, bus: Bus, on_press: Callable[[str], object]) -> None:
+        self._on_press = on_press
+        self._pressed = self._heard = False
+        self._newest = bus.latest(BUTTON, self._take)
+
+    def faults(self) -> tuple[Cause, ...]:
+        """What speaks against moving now."""
+        state = self._newest.fresh()
+        if state is None:
+            return (why.BUTTON_LOST if self._heard else why.BUTTON_AWAITED,)
+        self._heard = True
+        return (why.button(state.text),) if state.pressed else ()
+
+    def _take(self, state: ButtonState) -> None:
+        pressed, self._pressed = self._pressed, state.pressed
+        if state.pressed and not pressed:
+            self._on_press(state.text)

@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from gigabrain_drivers.links.hearing import Hearing
+from gigabrain_drivers.links.link import Liveness
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_zenoh.clock import FakeClock
 
@@ -19,23 +19,23 @@ class Body:
         self.clock = FakeClock()
         self.link = SerialLink(port, 115_200, self.clock)
         self.link.problem = ""  # it is open
-        self.hearing = Hearing(self.link, self.clock, 100 * MS, "it talks nonsense", LOG)
+        self.liveness = Liveness(self.link, self.clock, 100 * MS, "it talks nonsense", LOG)
 
     async def alive_after(self, milliseconds: int) -> bool:
         await self.clock.advance(milliseconds * MS)
-        return self.hearing.alive()
+        return self.liveness.alive()
 
 
 async def test_it_is_alive_for_as_long_as_its_word_is_fresh() -> None:
     body = Body()
     assert not await body.alive_after(0)
-    assert body.hearing.hear()
-    assert not body.hearing.hear()
+    assert body.liveness.mark_received()
+    assert not body.liveness.mark_received()
     assert await body.alive_after(100)
     assert not await body.alive_after(1)
-    assert body.hearing.heard
-    body.hearing.forget()
-    assert not body.hearing.heard
+    assert body.liveness.received
+    body.liveness.reset()
+    assert not body.liveness.received
 
 
 async def test_a_line_that_opens_and_is_dropped_again_and_again_is_told_once(
@@ -43,7 +43,7 @@ async def test_a_line_that_opens_and_is_dropped_again_and_again_is_told_once(
 ) -> None:
     body = Body()
     for _ in range(10):
-        body.hearing.forget()
+        body.liveness.reset()
         assert not await body.alive_after(200)
     assert [record.message for record in caplog.records] == ["usb:0483:5740: it talks nonsense"]
 
@@ -61,6 +61,6 @@ async def test_the_end_of_a_silence_is_told_as_well(caplog: pytest.LogCaptureFix
     caplog.set_level("INFO")
     body = Body("/dev/ttyUSB9")
     await body.alive_after(501)
-    body.hearing.hear()
-    assert body.hearing.alive()
+    body.liveness.mark_received()
+    assert body.liveness.alive()
     assert caplog.messages == ["/dev/ttyUSB9: it talks nonsense", "/dev/ttyUSB9: heard again"]

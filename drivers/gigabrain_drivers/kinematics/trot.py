@@ -8,10 +8,16 @@ They also lean against what the body is too fast by: servos alone are springs, a
 
 import math
 
-from gigabrain_drivers.kinematics import Gait, Twist, Walker
-from gigabrain_drivers.legs.geometry import LegGeometry, Vector
-from gigabrain_drivers.legs.odometry import GRAVITY, LegOdometry
-from gigabrain_drivers.legs.senses import Senses
+from gigabrain_drivers.kinematics.legs import (
+    GRAVITY,
+    Gait,
+    LegGeometry,
+    LegOdometry,
+    Senses,
+    Vector,
+    Walker,
+)
+from gigabrain_drivers.kinematics.wheels import Twist
 
 ACCELERATION = Twist(1.0, 1.0, 2.0)  # [m/s2], [rad/s2]
 SMOOTH_S = 0.1  # over which the measured velocity is smoothed

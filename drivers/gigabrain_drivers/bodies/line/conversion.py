@@ -1,16 +1,16 @@
-"""What the lines of a body say, put together to what it measures."""
+"""Converts velocities to the numbers of a command line, and state lines to a body's state."""
 
 import math
 from collections import deque
 from collections.abc import Mapping
 
-from gigabrain_drivers.bodies.line.check import POSE, positions_of, speeds_of
-from gigabrain_drivers.bodies.line.fields import ANGLES, BODY
-from gigabrain_drivers.bodies.line.options import LineOptions
-from gigabrain_drivers.kinematics import Base, Twist
-from gigabrain_drivers.odometry import advanced, between
+from gigabrain_drivers.bodies.line.options import POSE, LineOptions, positions_of, speeds_of
+from gigabrain_drivers.bodies.line.protocol import ANGLES, BODY, LineDecoder, Template, describe
+from gigabrain_drivers.kinematics.wheels import Base, Twist, advanced, between
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Battery, BodyDescription, Joint
+
+WHEEL = "wheel_"
 
 VELOCITY_S = 0.05  # a velocity from positions is taken over so much time: one line is noise
 SLACK = 3.0  # a step so many times longer than the body can go is no step ...
@@ -19,6 +19,64 @@ GAP_NS = 100_000_000  # without a line: the firmware may have restarted
 LONGEST_S = 0.2  # a speed says nothing of a longer time
 STILL = Twist(0.0, 0.0, 0.0)
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
+
+
+class LineCommand:
+    """Writes velocities with a template, and knows what its digits leave of them."""
+
+    def __init__(self, template: Template, base: Base | None) -> None:
+        self.template, self._base = template, base
+        self._by_wheels = any(name.startswith(WHEEL) for name in template.names)
+
+    def line(self, wanted: Velocity, seq: int) -> bytes:
+        """The line that asks for a velocity, rounded so that no limit is exceeded."""
+        values = {**self._values(wanted), "seq": float(seq)}
+        return self.template.encode(values, toward_zero=True)
+
+    def sent(self, wanted: Velocity) -> Velocity:
+        """What is left of a velocity after it was written with the line's digits."""
+        values = self._values(wanted).items()
+        names, sent = self.template.names, self.template.sent
+        return self.means({name: sent(name, value) for name, value in values if name in names})
+
+    def means(self, values: Mapping[str, float]) -> Velocity:
+        """What a line with these values tells the body; what it does not say is 0."""
+        twist = Twist(*(values.get(name, 0.0) for name in Twist._fields))
+        if self._base and self._by_wheels:
+            wheels = zip(self._base.wheels, self._base.to_wheels(twist), strict=True)
+            told = tuple(values.get(WHEEL + name, speed) for name, speed in wheels)
+            twist = self._base.to_body(told)
+        return Velocity(**{name: value + 0.0 for name, value in twist._asdict().items()})  # no -0
+
+    def _values(self, velocity: Velocity) -> dict[str, float]:
+        """All that a command line may say of a velocity."""
+        twist = Twist(velocity.linear_x, velocity.linear_y, velocity.angular_z)
+        values = twist._asdict()
+        if self._base:
+            speeds = zip(self._base.wheels, self._base.to_wheels(twist), strict=True)
+            values.update({WHEEL + name: speed for name, speed in speeds})
+        return values
+
+
+class SentWording:
+    """What goes out on the line, byte after byte: commands, and strings that have a name."""
+
+    def __init__(self, template: Template, named: Mapping[bytes, str]) -> None:
+        self._decoder, self._named = LineDecoder([template]), named
+        self._longest = max(map(len, named), default=0)
+        self._held = b""
+
+    def feed(self, data: bytes) -> list[str]:
+        """In words, what `data` completes."""
+        self._held = (self._held + data)[-self._longest - 1 :]
+        if name := self._named.get(self._held):
+            self._held = b""
+            self._decoder.clear()
+            return [name]
+        found = [describe(values) for values in self._decoder.feed(data)]
+        if found:
+            self._held = b""
+        return found
 
 
 class LineReport:

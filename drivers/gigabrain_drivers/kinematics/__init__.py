@@ -1,0 +1,1 @@
+"""Kinematics of wheels and legs, dead reckoning, and a trot. Pure; imports no bus."""
