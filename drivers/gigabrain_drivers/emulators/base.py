@@ -227,6 +227,7 @@ class Device(abc.ABC):
     """
 
     Options: ClassVar[type[Struct]]  # those of the driver or scan source that it answers
+    baud: ClassVar[int | None] = None  # of its line; None: as fast as the host
     period_s: ClassVar[float] = 0.01  # between two steps
     watchdog_ns: ClassVar[int] = 150_000_000  # without a command, until its motors are told zero
     promised_in: ClassVar[str] = "the rule for firmware"  # where its makers say so
@@ -238,7 +239,7 @@ class Device(abc.ABC):
     @classmethod
     def port(cls, options: Any) -> Port:
         """What it is plugged into: the pty that the options of its driver name."""
-        return Pty(Path(options.port))
+        return Pty(Path(options.port), cls.baud)
 
     @abc.abstractmethod
     def feed(self, data: bytes) -> None:

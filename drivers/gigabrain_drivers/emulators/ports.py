@@ -11,9 +11,7 @@ from pathlib import Path
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.host.posix import tty
 
-READ_BYTES = 4096
 BITS_PER_BYTE = 10  # 8N1: start, eight, stop
-
 READ_BYTES = 4096
 HOST = "127.0.0.1"  # an emulated body is nobody else's to drive
 SILENT_NS = 1_000_000_000  # a client that says nothing for so long makes way for another

@@ -5,7 +5,7 @@ import asyncio
 import contextlib
 import logging
 import re
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import serial
 
@@ -42,14 +42,29 @@ def who_sends(data: bytes) -> str:
     return ""
 
 
+class StreamDecoder(Protocol):
+    """A decoder of what comes from a lidar."""
+
+    errors: int  # how often something was thrown away
+
+    def clear(self) -> None:
+        """Forget what has begun to come in."""
+
+
 class SerialSource(ScanSource):
-    """Keeps its port open, and says in one line why there are no scans: once, and when it ends."""
+    """Keeps its port open. Logs once why there are no scans, and once that they come again.
+
+    A subclass sets `understood` when what came since the port was opened makes sense.
+    """
 
     name: ClassVar[str]  # as people call it
 
-    def __init__(self, options: Any, lidar: Lidar, clock: Clock, baud: int) -> None:
+    def __init__(
+        self, options: Any, lidar: Lidar, clock: Clock, baud: int, decoder: StreamDecoder
+    ) -> None:
         super().__init__(options, lidar, clock)
-        self.baud = baud
+        self.baud, self._stream = baud, decoder
+        self.understood = False
         self.link = SerialLink(options.port, baud, clock, probe=self.probe)
         self.link.on_bytes, self.link.on_open = self._on_bytes, self._on_open
         self.turn = Turn(lidar)
@@ -65,10 +80,6 @@ class SerialSource(ScanSource):
     @abc.abstractmethod
     def connected(self) -> None:
         """The port was opened, for the first time or again: nothing from before counts."""
-
-    @abc.abstractmethod
-    def understands(self) -> bool:
-        """Whether anything that came since the port was opened made sense."""
 
     @abc.abstractmethod
     def probe(self, port: serial.Serial) -> bool:
@@ -130,7 +141,7 @@ class SerialSource(ScanSource):
 
     def trouble(self) -> str:
         """Why there are no scans though the port is open."""
-        if not self.understands():
+        if not self.understood:
             return self.no_answer()
         return f"the {self.name} on {self.link} answers, but does not turn"
 
@@ -160,10 +171,12 @@ class SerialSource(ScanSource):
     def _on_open(self) -> None:
         self._opened_ns = self.clock.now_ns()
         self.link.gather_s = GATHER_S if self.link.baud <= GATHER_BAUD else 0.0
-        self._newest = b""
+        self._newest, self.understood = b"", False
+        self._stream.clear()
         self.turn.clear()
         self.connected()
 
     def _on_bytes(self, data: bytes) -> None:
         self._newest = (self._newest + data)[-NEWEST:]
         self.received(data)
+        self.link.errors = self._stream.errors

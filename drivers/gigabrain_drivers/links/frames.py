@@ -1,6 +1,8 @@
 """Frames in a stream of bytes: found by binary protocols, and put into words for the log."""
 
 import abc
+import functools
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -11,6 +13,22 @@ Frame = TypeVar("Frame")
 LONGEST = 512  # bytes without a frame, after which they are shown as they are
 Feed = Callable[[bytes], Sequence[Any]]  # of a protocol's decoder
 Describe = Callable[[Any], str]  # a frame of that decoder
+
+
+def xor_of(data: bytes) -> int:
+    """Return the exclusive or of all bytes."""
+    return functools.reduce(operator.xor, data, 0)
+
+
+def crc_table(polynomial: int, bits: int) -> tuple[int, ...]:
+    """Return the table, for a byte at a time, of a CRC of 8 or 16 bits that is not reflected."""
+    top, table = 1 << bits - 1, []
+    for byte in range(256):
+        value = byte << bits - 8
+        for _ in range(8):
+            value = value << 1 ^ (polynomial if value & top else 0)
+        table.append(value & (1 << bits) - 1)
+    return tuple(table)
 
 
 class FrameDecoder(abc.ABC, Generic[Frame]):

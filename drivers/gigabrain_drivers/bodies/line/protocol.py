@@ -7,9 +7,7 @@ without a `$` at the beginning and without a `*` right before the checksum.
 """
 
 import binascii
-import functools
 import math
-import operator
 import re
 import zlib
 from collections.abc import Callable, Mapping, Sequence
@@ -17,9 +15,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from gigabrain_drivers.kinematics.wheels import Ackermann, Differential, Mecanum, Omni
+from gigabrain_drivers.links.frames import crc_table, xor_of
 from gigabrain_zenoh.errors import unknown
 
-CRC8_POLYNOMIAL = 0x07
+_CRC8_TABLE = crc_table(0x07, bits=8)
 
 DRIVES = (Differential, Mecanum, Omni, Ackermann)
 WHEELS = tuple(dict.fromkeys(name for drive in DRIVES for name in drive.wheels))
@@ -83,18 +82,11 @@ class Check(NamedTuple):
     digits: int
 
 
-def xor8(data: bytes) -> int:
-    """All bytes in exclusive or, as in NMEA 0183."""
-    return functools.reduce(operator.xor, data, 0)
-
-
 def crc8(data: bytes) -> int:
     """CRC-8: polynomial 0x07, initial value 0, not reflected; 0xF4 for "123456789"."""
     crc = 0
     for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = (crc << 1 ^ (CRC8_POLYNOMIAL if crc & 0x80 else 0)) & 0xFF
+        crc = _CRC8_TABLE[crc ^ byte]
     return crc
 
 
@@ -109,7 +101,7 @@ def crc32(data: bytes) -> int:
 
 
 CHECKS = {
-    "xor8": Check(xor8, 2),
+    "xor8": Check(xor_of, 2),
     "crc8": Check(crc8, 2),
     "crc16": Check(crc16, 4),
     "crc32": Check(crc32, 8),

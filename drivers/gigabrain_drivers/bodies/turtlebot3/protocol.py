@@ -9,7 +9,7 @@ import math
 import struct
 from typing import NamedTuple
 
-from gigabrain_drivers.links.frames import FrameDecoder
+from gigabrain_drivers.links.frames import FrameDecoder, crc_table
 
 HEADER = b"\xff\xff\xfd\x00"
 PING, READ, WRITE, STATUS = 0x01, 0x02, 0x03, 0x55
@@ -55,17 +55,7 @@ class DynamixelPacket(NamedTuple):
     params: bytes = b""
 
 
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        value = byte << 8
-        for _ in range(8):
-            value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
-        table.append(value & 0xFFFF)
-    return tuple(table)
-
-
-_CRC_TABLE = _crc_table()
+_CRC_TABLE = crc_table(0x8005, bits=16)
 
 
 def crc16(data: bytes) -> int:

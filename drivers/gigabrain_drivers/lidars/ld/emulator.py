@@ -2,12 +2,10 @@
 
 import math
 from collections import deque
-from pathlib import Path
 from typing import Any, ClassVar
 
 from gigabrain_drivers.driver.robot import ScanOptions
-from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Sample, Sweep, Wire
-from gigabrain_drivers.emulators.ports import Pty
+from gigabrain_drivers.emulators.base import Device, EmulatedBody, Sample, Sweep, Wire
 from gigabrain_drivers.lidars.ld import protocol as ld
 
 LEAST_VOLTS = 0.5  # below its 5 V by more than this, the motor does not keep its speed
@@ -21,7 +19,7 @@ class LdDevice(Device):
     """LD06 and LD19. A subclass is another model that sends the same frame."""
 
     Options = ScanOptions
-    baud: ClassVar[int] = 230_400
+    baud: ClassVar[int | None] = 230_400
     samples_hz: ClassVar[float] = 4500
     reach: ClassVar[tuple[float, float]] = 0.02, 12.0  # [m]
 
@@ -29,11 +27,6 @@ class LdDevice(Device):
         super().__init__(body, options, wire)
         self._sweep = Sweep(body, *self.reach)
         self._turn_hz = body.robot.lidar.rate_hz if body.robot.lidar else 10.0
-
-    @classmethod
-    def port(cls, options: Any) -> Port:
-        """A serial line at its only speed."""
-        return Pty(Path(options.port), cls.baud)
 
     def feed(self, data: bytes) -> None:
         """It has no input."""

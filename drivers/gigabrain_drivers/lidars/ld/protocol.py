@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_drivers.links.frames import crc_table
+
 POINTS = 12  # per frame
 SIZE = 47  # bytes
 HEADER, VERSIONS = 0x54, (0x2C, 0xEC)  # low five bits of the second byte: 12 points
@@ -27,16 +29,7 @@ _FRAMES = np.dtype(
 )  # fmt: skip
 
 
-def _table() -> bytes:
-    values = []
-    for value in range(256):
-        for _ in range(8):
-            value = (value << 1) ^ (0x4D if value & 0x80 else 0)
-        values.append(value & 0xFF)
-    return bytes(values)
-
-
-_CRC = _table()
+_CRC = crc_table(0x4D, bits=8)
 
 
 def crc8(data: bytes) -> int:

@@ -63,13 +63,12 @@ class Ld(SerialSource):
     rate_baud: ClassVar[int]
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
-        super().__init__(options, lidar, clock, self.rate_baud)
-        self.link.wording = Wording(received=Spelling(ld.LdDecoder().feed, ld.describe))
         self._decoder = ld.LdDecoder()
+        super().__init__(options, lidar, clock, self.rate_baud, self._decoder)
+        self.link.wording = Wording(received=Spelling(ld.LdDecoder().feed, ld.describe))
         self._frames = Frames(lidar, self.place)
         self._stamps = DeviceClock(ld.CLOCK_MS)
         self._last: int | None = None  # [0.01 deg], of the newest sample
-        self._understood = False
 
     def place(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
         """Angles (n,) [deg], clockwise, and distances (n,) [mm], as they are seen from the axis."""
@@ -77,25 +76,19 @@ class Ld(SerialSource):
 
     def connected(self) -> None:
         """A new stream."""
-        self._decoder.clear()
         self._frames.clear()
         self._stamps.clear()
-        self._last, self._understood = None, False
+        self._last = None
 
     def received(self, data: bytes) -> None:
         """Frames, or parts of them."""
         now_ns = self.clock.now_ns()
         for raw in self._decoder.cut(data):
-            self._understood = True
+            self.understood = True
             self._stamps.arrived(raw.time_ms, now_ns)
             turn_at, self._last = turn_start(raw, self._last), raw.end
             scan = self._frames.take(raw.data, turn_at, now_ns)
             self.finished(replace(scan, late_ms=self._stamps.late_ms) if scan else None)
-        self.link.errors = self._decoder.errors
-
-    def understands(self) -> bool:
-        """Whether frames come."""
-        return self._understood
 
     def probe(self, port: serial.Serial) -> bool:
         """Whether frames come from this port."""

@@ -1,11 +1,9 @@
 """LDS-01 and LDS-03, which turn and stop on command."""
 
-from pathlib import Path
 from typing import Any
 
 from gigabrain_drivers.driver.robot import ScanOptions
-from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Sample, Sweep, Wire
-from gigabrain_drivers.emulators.ports import Pty
+from gigabrain_drivers.emulators.base import Device, EmulatedBody, Sample, Sweep, Wire
 from gigabrain_drivers.lidars.ld.emulator import LEAST_VOLTS
 from gigabrain_drivers.lidars.lds import lds01, lds03
 
@@ -20,15 +18,11 @@ class Lds01Device(Device):
     """Turns from `b` to `e`."""
 
     Options = ScanOptions
+    baud = lds01.BAUD
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         super().__init__(body, options, wire)
         self._sweep = Sweep(body, 0.12, 3.5)
-
-    @classmethod
-    def port(cls, options: Any) -> Port:
-        """A serial line at its only speed."""
-        return Pty(Path(options.port), lds01.BAUD)
 
     def feed(self, data: bytes) -> None:
         """Obey the newest command."""
@@ -57,16 +51,12 @@ class Lds03Device(Device):
     """Turns from its start command to its stop command."""
 
     Options = ScanOptions
+    baud = lds03.BAUD
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         super().__init__(body, options, wire)
         self._sweep = Sweep(body, 0.1, 8.0)
         self.reset()
-
-    @classmethod
-    def port(cls, options: Any) -> Port:
-        """A serial line at its only speed."""
-        return Pty(Path(options.port), lds03.BAUD)
 
     def reset(self) -> None:
         """At rest."""

@@ -25,7 +25,6 @@ _SYNC, _FIRST = 0xFA, 0xA0
 PROBE_BYTES = 600  # fourteen packets
 PROBE_PACKETS = 3
 RESTART_NS = 1_000_000_000  # without a packet, until it is started again
-LAST_WORD_NS = 20_000_000  # until a command has left the port
 
 
 class Lds01Packet(NamedTuple):
@@ -87,17 +86,16 @@ class Lds01(SerialSource):
     samples_hz, turns_hz = 1800.0, 5.0  # 300 rpm; it takes no speed
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
-        super().__init__(options, lidar, clock, BAUD)
+        self._decoder = Lds01Decoder()
+        super().__init__(options, lidar, clock, BAUD, self._decoder)
         self.link.wording = Wording(
             Spelling(whole, describe_command), Spelling(Lds01Decoder().feed, describe)
         )
-        self._decoder = Lds01Decoder()
         self._last: int | None = None  # number of the newest packet
         self._told_ns = 0  # when it was last told to start, or last seen to turn
 
     def connected(self) -> None:
         """Start it."""
-        self._decoder.clear()
         self._last = None
         self._start()
 
@@ -106,21 +104,16 @@ class Lds01(SerialSource):
         now_ns = self.clock.now_ns()
         for packet in self._decoder.feed(data):
             turn_at = 0 if self._last is not None and packet.number <= self._last else None
-            self._last, self._told_ns = packet.number, now_ns
+            self.understood, self._last, self._told_ns = True, packet.number, now_ns
             first = packet.number * SAMPLES + 1  # the vendor's driver puts sample 0 at 359
             angles = range(first, first + SAMPLES)
             self.finished(self.turn.clockwise(angles, packet.ranges, turn_at, now_ns))
-        self.link.errors = self._decoder.errors
 
     def look(self, now_ns: int) -> None:
         """Start it again where it does not turn: it may have had no power before."""
         super().look(now_ns)
         if now_ns - self._told_ns > RESTART_NS:
             self._start()
-
-    def understands(self) -> bool:
-        """Whether packets come."""
-        return self._last is not None
 
     def probe(self, port: serial.Serial) -> bool:
         """Whether packets come from this port once it is told to start."""
@@ -130,11 +123,9 @@ class Lds01(SerialSource):
             port.write(STOP)
         return found
 
-    async def close(self) -> None:
-        """Stop it, and free the port."""
-        if self.link.write(STOP):
-            await self.clock.sleep_ns(LAST_WORD_NS)
-        await super().close()
+    def farewell(self) -> bool:
+        """Stop it."""
+        return self.link.write(STOP)
 
     def _start(self) -> None:
         self._told_ns = self.clock.now_ns()

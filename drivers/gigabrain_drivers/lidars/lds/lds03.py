@@ -4,15 +4,13 @@ Source: the vendor's driver coin_d4_driver.
 """
 
 import math
-import operator
 import struct
-from functools import reduce
 from typing import Any, NamedTuple
 
 import serial
 
 from gigabrain_drivers.lidars.serial_source import SerialSource
-from gigabrain_drivers.links.frames import FrameDecoder, Spelling, Wording
+from gigabrain_drivers.links.frames import FrameDecoder, Spelling, Wording, xor_of
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock
 
@@ -26,7 +24,6 @@ PROBE_BYTES = 600
 DTR_NS = 100_000_000  # after opening, until the terminal-ready line is cleared
 START_NS = 1_000_000_000  # after opening, until it listens
 RESTART_NS = 3_000_000_000  # without a packet, until it is stopped and started
-LAST_WORD_NS = 20_000_000  # until a command has left the port
 NEAR_MM, WEAK = 150, 65  # up to here, a sample this weak is a reflection of the housing
 MIRROR_QUALITY = 255
 
@@ -114,13 +111,9 @@ class Lds03Decoder(FrameDecoder[Lds03Packet]):
 
 def _check(head: bytes, body: bytes) -> int:
     """The exclusive or of the packet's 16-bit words; of each sample its first byte by itself."""
-    low = _xor(head[0::2]) ^ _xor(body[0::3]) ^ _xor(body[1::3])
-    high = _xor(head[1::2]) ^ _xor(body[2::3])
+    low = xor_of(head[0::2]) ^ xor_of(body[0::3]) ^ xor_of(body[1::3])
+    high = xor_of(head[1::2]) ^ xor_of(body[2::3])
     return 0x55AA ^ (low | high << 8)
-
-
-def _xor(data: bytes) -> int:
-    return reduce(operator.xor, data, 0)
 
 
 def _angle(degrees: float) -> int:
@@ -163,31 +156,29 @@ class Lds03(SerialSource):
     samples_hz = 4000.0
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
-        super().__init__(options, lidar, clock, BAUD)
+        self._decoder = Lds03Decoder()
+        super().__init__(options, lidar, clock, BAUD, self._decoder)
         self.link.wording = Wording(
             Spelling(CommandDecoder().feed, describe_command),
             Spelling(Lds03Decoder().feed, describe),
         )
-        self._decoder = Lds03Decoder()
-        self._cleared = self._started = self._understood = False
+        self._cleared = self._started = False
         self._told_ns = 0  # when it was last told something, or last seen to turn
 
     def connected(self) -> None:
         """Leave it alone for a second; then it is started by `look`."""
-        self._decoder.clear()
-        self._cleared = self._started = self._understood = False
+        self._cleared = self._started = False
         self._told_ns = self.clock.now_ns()
 
     def received(self, data: bytes) -> None:
         """Packets, or parts of them."""
         now_ns = self.clock.now_ns()
         for packet in self._decoder.feed(data):
-            self._understood, self._told_ns = True, now_ns
+            self.understood, self._told_ns = True, now_ns
             angles = [sample.angle for sample in packet.samples]
             distances = [trusted(sample) for sample in packet.samples]
             turn_at = 0 if packet.begins else None
             self.finished(self.turn.clockwise(angles, distances, turn_at, now_ns))
-        self.link.errors = self._decoder.errors
 
     def look(self, now_ns: int) -> None:
         """Start it when it is ready for that, and once more where it does not turn."""
@@ -203,10 +194,6 @@ class Lds03(SerialSource):
             self._tell(STOP)
             self._tell(START)
 
-    def understands(self) -> bool:
-        """Whether packets come."""
-        return self._understood
-
     def probe(self, port: serial.Serial) -> bool:
         """Whether packets come from this port once it is told to start."""
         port.write(START)
@@ -215,11 +202,9 @@ class Lds03(SerialSource):
             port.write(STOP)
         return found
 
-    async def close(self) -> None:
-        """Stop it, and free the port."""
-        if self.link.write(STOP):
-            await self.clock.sleep_ns(LAST_WORD_NS)
-        await super().close()
+    def farewell(self) -> bool:
+        """Stop it."""
+        return self.link.write(STOP)
 
     def _tell(self, command: bytes) -> None:
         self._told_ns = self.clock.now_ns()

@@ -5,12 +5,11 @@ with a descriptor of 7 bytes: `A5 5A`, u32 (size: 30 bits, endless: bit 30), typ
 Sources: Slamtec's interface protocol document and the public rplidar_sdk.
 """
 
-import functools
-import operator
 import struct
 from typing import NamedTuple, Self
 
 from gigabrain_drivers.lidars.rplidar.scan_formats import FORMATS, Samples, ScanFormat
+from gigabrain_drivers.links.frames import xor_of
 
 STOP, RESET, SCAN, FORCE_SCAN = 0x25, 0x40, 0x20, 0x21
 GET_INFO, GET_HEALTH, GET_SAMPLERATE = 0x50, 0x52, 0x59
@@ -43,7 +42,7 @@ def request(command: int, payload: bytes = b"") -> bytes:
     if command < 0x80:
         return bytes([0xA5, command])
     head = bytes([0xA5, command, len(payload)]) + payload
-    return head + bytes([xor(head)])
+    return head + bytes([xor_of(head)])
 
 
 def express_request(mode: int = 0) -> bytes:
@@ -65,11 +64,6 @@ def answer(kind: int, data: bytes) -> bytes:
 def descriptor(kind: int, size: int, *, endless: bool = False) -> bytes:
     """What comes before an answer, or before a stream of blocks of `size` bytes."""
     return _DESCRIPTOR.pack(_SYNC, size | endless * _ENDLESS, kind)
-
-
-def xor(data: bytes) -> int:
-    """All bytes of `data` in one."""
-    return functools.reduce(operator.xor, data, 0)
 
 
 class Info(NamedTuple):
@@ -250,7 +244,7 @@ class RequestDecoder:
             if len(buffer) < _BEFORE_CHECKSUM or len(buffer) < buffer[2] + 4:
                 return found
             whole = bytes(buffer[: buffer[2] + 4])
-            if xor(whole) == 0:
+            if xor_of(whole) == 0:
                 found.append(Request(whole[1], whole[_BEFORE_CHECKSUM:-1]))
                 del buffer[: len(whole)]
             else:

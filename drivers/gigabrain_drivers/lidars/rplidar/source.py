@@ -191,16 +191,15 @@ class Rplidar(SerialSource):
     def __init__(self, options: RplidarOptions, lidar: Lidar, clock: Clock) -> None:
         model = MODELS.get(options.model)
         self._bauds = [model.baud] if model else list(BAUDS)
-        super().__init__(options, lidar, clock, self._bauds[0])
+        self._decoder = rplidar.RplidarDecoder()
+        super().__init__(options, lidar, clock, self._bauds[0], self._decoder)
         self.link.on_lost = self._lost
         self.link.wording = Wording(
             Spelling(RequestDecoder().feed, describe_request),
             Spelling(rplidar.RplidarDecoder().feed, rplidar.describe),
         )
-        self._decoder = rplidar.RplidarDecoder()
         self._connected = asyncio.Event()
         self._asked: tuple[int, asyncio.Future[bytes]] | None = None
-        self._understood = False
         self._trouble = self._stranger = ""
         self._samples_ns = 0
         self._info: Info | None = None
@@ -208,26 +207,19 @@ class Rplidar(SerialSource):
 
     def connected(self) -> None:
         """The start-up may begin."""
-        self._decoder.clear()
-        self._understood = False
         self._connected.set()
 
     def received(self, data: bytes) -> None:
         """Answers and samples, or parts of them."""
         now_ns = self.clock.now_ns()
         for item in self._decoder.feed(data):
-            self._understood = True
+            self.understood = True
             if isinstance(item, Samples):
                 self._samples_ns = now_ns
                 scan = self.turn.clockwise(*item, now_ns)
                 self.finished(scan)
             elif self._asked and self._asked[0] == item.kind and not self._asked[1].done():
                 self._asked[1].set_result(item.data)
-        self.link.errors = self._decoder.errors
-
-    def understands(self) -> bool:
-        """Whether anything that came was an answer or a sample."""
-        return self._understood
 
     def trouble(self) -> str:
         """What the last start-up failed for."""
@@ -281,7 +273,7 @@ class Rplidar(SerialSource):
             async with asyncio.timeout(ANSWER_S):
                 return await future
         except TimeoutError:
-            if self._understood:
+            if self.understood:
                 raise Trouble(
                     f"the {self.name} on {self.link} does not answer request {request.hex(' ')}"
                 ) from None
@@ -338,7 +330,7 @@ class Rplidar(SerialSource):
 
     def _next_baud(self) -> None:
         """Where the model is not known and nothing was understood, try the next baud rate."""
-        if not self._understood:
+        if not self.understood:
             self._use(self._bauds[1 % len(self._bauds)])
 
     def _use(self, baud: int) -> None:
