@@ -38,6 +38,7 @@ class Driver(abc.ABC):
     def __init__(self, robot: RobotFile, options: Any, run: Run) -> None:
         self.robot, self.options, self.run = robot, options, run
         self.emit: Emit = lambda topic, message: None  # the driver's process puts its own here
+        self.sensors: dict[str, Message | None] = {}  # newest readings; None before the first
 
     @classmethod  # noqa: B027 - most drivers fit any body
     def check(cls, robot: RobotFile, options: Any) -> None:
@@ -140,8 +141,13 @@ class Driver(abc.ABC):
         return (await self.read_state()).joints
 
     async def get_sensor_data(self, sensor_name: str) -> Message | None:
-        """The newest reading of a sensor, or None before its first. Raises BodyLost."""
-        raise Unsupported(f"{type(self).__name__} has no sensor {sensor_name!r}")
+        """Return the newest reading of a sensor, or None before its first. Raises Unsupported."""
+        if sensor_name not in self.sensors:
+            has = ", ".join(sorted(self.sensors)) or "none"
+            raise Unsupported(
+                f"{self.robot.robot_type} has no sensor {sensor_name!r}; it has: {has}"
+            )
+        return self.sensors[sensor_name]
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """Figures for reports that only this driver knows, such as a simulation's truth."""

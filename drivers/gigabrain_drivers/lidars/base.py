@@ -42,7 +42,6 @@ class ScanSource(abc.ABC):
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:
         self.options, self.lidar, self.clock = options, lidar, clock
         self.emit: Callable[[LaserScan], None] = lambda scan: None  # the owner puts its own here
-        self.newest: LaserScan | None = None  # set by `carry`
 
     @abc.abstractmethod
     def open(self) -> None:
@@ -106,7 +105,7 @@ def carry(driver: Driver, clock: Clock) -> ScanSource | None:
     source = source_class(options.driver)(options, lidar, clock)
 
     def hand_on(scan: LaserScan) -> None:
-        source.newest = scan
+        driver.sensors["scan"] = scan
         driver.emit(SCAN, scan)
 
     source.emit = hand_on

@@ -19,13 +19,13 @@ from gigabrain_drivers.sim.tick import TICK_NS as STEP_NS
 from gigabrain_drivers.sim.tick import Pace
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.arrays import ranges_bytes
-from gigabrain_schemas.base import TICK_NS, Message, Pose, Velocity
+from gigabrain_schemas.base import TICK_NS, Pose, Velocity
 from gigabrain_schemas.body import Battery, Joint, Lidar, RobotState
 from gigabrain_schemas.sensors import Imu, ImuData, LaserScan
 from gigabrain_schemas.topics import IMU, SCAN
 from gigabrain_zenoh.bus.bridge import Bridge
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
+from gigabrain_zenoh.errors import BodyLost, ConfigError
 
 T = TypeVar("T")
 STEPS = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
@@ -99,14 +99,14 @@ class MujocoDriver(Driver):
         self._readings: asyncio.Queue[Reading | Exception | None] = asyncio.Queue()
         self._account = account_of(self._simulation, robot, run)  # as of the newest tick
         self._state: RobotState | None = None
-        self._newest: dict[str, Message] = {}  # by sensor
+        self.sensors = dict.fromkeys(("imu", "scan") if robot.lidar else ("imu",))
 
     async def open(self) -> None:
         """Take the first readings; time stands still until somebody asks for ticks."""
         self._state = self._look()
-        self._newest = {"imu": self._imu()}
+        self.sensors["imu"] = self._imu()
         if self.robot.lidar:
-            self._newest["scan"] = self._scan()
+            self.sensors["scan"] = self._scan()
 
     async def close(self) -> None:
         """End the physics thread."""
@@ -165,24 +165,16 @@ class MujocoDriver(Driver):
             raise BodyLost("the simulation is not open")
         return self._state
 
-    async def get_sensor_data(self, sensor_name: str) -> Message | None:
-        """The newest `scan` or `imu`."""
-        if sensor_name in self._newest:
-            return self._newest[sensor_name]
-        raise Unsupported(
-            f"{self.robot.robot_type} has no sensor {sensor_name!r}; it has: scan, imu"
-        )
-
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far."""
         return self._account | {"physics_cpu_s": round(self._physics_s, 3)}
 
     def _take(self, reading: Reading) -> None:
         self._state = reading.state or self._state
-        self._newest["imu"] = reading.imu
+        self.sensors["imu"] = reading.imu
         self.emit(IMU, reading.imu)
         if reading.scan:
-            self._newest["scan"] = reading.scan
+            self.sensors["scan"] = reading.scan
             self.emit(SCAN, reading.scan)
 
     def _work(self) -> None:

@@ -19,12 +19,12 @@ from gigabrain_drivers.links.device_clock import DeviceClock, EchoClock
 from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Liveness
 from gigabrain_drivers.links.tcp_link import AddressLink
-from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import Battery, Joint, LinkHealth, RobotState
 from gigabrain_schemas.sensors import Imu, ImuData
 from gigabrain_schemas.topics import IMU
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, Unsupported
+from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.logs import Fault
 
@@ -68,7 +68,7 @@ class AlphaDriver(Driver):
         self._untold = False  # whether a loss has not been reported yet
         self._open = self._parked = False
         self._fall = Fault(log)
-        self._imu: Imu | None = None
+        self.sensors = dict.fromkeys(("imu", "scan") if options.scan else ("imu",))
         self._lidar: ScanSource | None = None
 
     async def open(self) -> None:
@@ -133,15 +133,6 @@ class AlphaDriver(Driver):
         )
         return _with(state, self._state) if self._state else state
 
-    async def get_sensor_data(self, sensor_name: str) -> Message | None:
-        """The newest `imu`, and `scan` where a lidar is carried."""
-        if sensor_name == "imu":
-            return self._imu
-        if sensor_name == "scan" and self.options.scan:
-            return self._lidar.newest if self._lidar else None
-        has = "imu, scan" if self.options.scan else "imu"
-        raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}; it has: {has}")
-
     @property
     def _fallen(self) -> bool:
         return self._state is not None and bool(self._state.flags & alpha.FALLEN)
@@ -188,12 +179,13 @@ class AlphaDriver(Driver):
             say = alpha.park if self._parked else alpha.stop
             self.link.write(say(self._next()))
         senses = state.senses
-        self._imu = Imu(
+        imu = Imu(
             orientation=senses.orientation,
             angular_velocity=senses.angular_velocity,
             linear_acceleration=senses.linear_acceleration,
         )
-        self.emit(IMU, self._imu)
+        self.sensors["imu"] = imu
+        self.emit(IMU, imu)
         if self._fallen:
             self._fall.begin("the body has fallen over; it stands up when its firmware starts anew")
         else:

@@ -20,10 +20,10 @@ from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Liveness
 from gigabrain_drivers.links.serial_link import SerialLink
-from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, Unsupported
+from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.logs import Fault
 
@@ -68,6 +68,7 @@ class LineDriver(Driver):
         self._told_flags = 0
         self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
         self._lidar: ScanSource | None = None
+        self.sensors = {"scan": None} if robot.lidar else {}
 
     @classmethod
     def check(cls, robot: RobotFile, options: LineOptions) -> None:
@@ -117,12 +118,6 @@ class LineDriver(Driver):
             bumpers=self._bumpers(),
             link=replace(self.link.health, connected=self._liveness.alive()),
         )
-
-    async def get_sensor_data(self, sensor_name: str) -> Message | None:
-        """The newest `scan`."""
-        if sensor_name != "scan" or self.robot.lidar is None:
-            raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}")
-        return self._lidar.newest if self._lidar else None
 
     def _still(self) -> None:
         self._send(ZERO)

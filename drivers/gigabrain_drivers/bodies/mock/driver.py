@@ -9,12 +9,12 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
 from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_schemas.arrays import ranges_bytes
-from gigabrain_schemas.base import TICK_NS, Message, Pose, Velocity
+from gigabrain_schemas.base import TICK_NS, Pose, Velocity
 from gigabrain_schemas.body import Battery, RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, Unsupported
+from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.geometry.limits import ZERO
 
 TICK_S = TICK_NS / 1e9
@@ -41,7 +41,7 @@ class MockBody(Driver):
         self._pose = Pose(x=0.0, y=0.0, yaw=0.0)
         self._noise = np.random.default_rng(run.seed)
         self._ticks = self._next_scan = 0
-        self._scan: LaserScan | None = None
+        self.sensors = {"scan": None}
         self._lidar: ScanSource | None = None  # a real one, where its link has one
 
     async def open(self) -> None:
@@ -49,7 +49,7 @@ class MockBody(Driver):
         self._open = True
         self._lidar = carry(self, Clock())
         if self._lidar is None:
-            self._scan = self._look()
+            self.sensors["scan"] = self._look()
 
     async def close(self) -> None:
         """Forget the connection."""
@@ -99,12 +99,6 @@ class MockBody(Driver):
             battery=Battery(voltage=12.0, percentage=100.0),
         )
 
-    async def get_sensor_data(self, sensor_name: str) -> Message | None:
-        """The scan of a round room, with a centimetre of noise."""
-        if sensor_name != "scan":
-            raise Unsupported(f"the mock has no sensor {sensor_name!r}; it has: scan")
-        return self._lidar.newest if self._lidar else self._scan
-
     def _advance(self) -> None:
         v, pose = self._velocity, self._pose
         yaw = pose.yaw + v.angular_z * TICK_S / 2
@@ -121,11 +115,12 @@ class MockBody(Driver):
         if lidar and self._ticks >= self._next_scan:
             period = max(1, round(1 / (lidar.rate_hz * TICK_S)))
             self._next_scan = (self._ticks // period + 1) * period
-            self._scan = self._look()
-            if self._scan:
-                self.emit(SCAN, self._scan)
+            if scan := self._look():
+                self.sensors["scan"] = scan
+                self.emit(SCAN, scan)
 
     def _look(self) -> LaserScan | None:
+        """Measure a round room, with a centimetre of noise."""
         lidar = self.robot.lidar
         if lidar is None:
             return None

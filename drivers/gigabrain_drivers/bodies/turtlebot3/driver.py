@@ -28,12 +28,12 @@ from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.links.serial_link import SerialLink, check_port
-from gigabrain_schemas.base import Message, Pose, Velocity
+from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Battery, Joint, LinkHealth, RobotState
 from gigabrain_schemas.sensors import Imu, ImuData
 from gigabrain_schemas.topics import IMU
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
+from gigabrain_zenoh.errors import BodyLost, ConfigError
 
 log = logging.getLogger(__name__)
 
@@ -267,7 +267,7 @@ class OpenCrDriver(Driver):
         self._state = RobotState(
             robot_type=robot.robot_type, pose=Pose(x=0.0, y=0.0, yaw=0.0), velocity=Velocity()
         )
-        self._imu: Imu | None = None
+        self.sensors = dict.fromkeys(("imu", "scan") if options.scan else ("imu",))
         self._lidar: ScanSource | None = None
         self._guard: asyncio.Task[None] | None = None
 
@@ -322,15 +322,6 @@ class OpenCrDriver(Driver):
         await self._board.ask()
         return replace(self._state, link=self._board.health)
 
-    async def get_sensor_data(self, sensor_name: str) -> Message | None:
-        """The newest `imu`, and `scan` where a lidar is carried."""
-        if sensor_name == "imu":
-            return self._imu
-        if sensor_name == "scan" and self.options.scan:
-            return self._lidar.newest if self._lidar else None
-        has = "imu, scan" if self.options.scan else "imu"
-        raise Unsupported(f"{self.robot.robot_type} has no sensor {sensor_name!r}; it has: {has}")
-
     async def _look_after(self) -> None:
         """Zero where nobody commands, again and again; a single frame may get lost."""
         async for now_ns in self._clock.every(GUARD_NS):
@@ -359,12 +350,13 @@ class OpenCrDriver(Driver):
             bumpers=now.bumpers,
         )
         if imu := self._state.imu:
-            self._imu = Imu(
+            message = Imu(
                 orientation=imu.orientation,
                 angular_velocity=imu.angular_velocity,
                 linear_acceleration=imu.linear_acceleration,
             )
-            self.emit(IMU, self._imu)
+            self.sensors["imu"] = message
+            self.emit(IMU, message)
 
 
 def imu_of(now: Readings) -> ImuData | None:
