@@ -15,7 +15,8 @@ from gigabrain_drivers.emulators.base import Snapshot
 from gigabrain_drivers.emulators.emulator import Station
 from gigabrain_drivers.emulators.faults import NONE
 from gigabrain_drivers.kinematics.wheels import Twist, advanced, base_of
-from gigabrain_drivers.sim.physics import Charge, ImuSample, OdometryReading, Wheel
+from gigabrain_drivers.sim.locomotion import Charge, Motor, OdometryReading
+from gigabrain_drivers.sim.sensors import ImuSample
 from gigabrain_schemas.base import TICK_S, Pose
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.clock import Clock
@@ -67,7 +68,7 @@ class IdealBody:
         return Snapshot(
             time_ns=self._then_ns,
             odometry=OdometryReading(self._pose.x, self._pose.y, self._yaw, x, turn),
-            wheels=tuple(Wheel(f"wheel_{n}_joint", a, s, 0.0, 30.0) for n, a, s in wheels),
+            wheels=tuple(Motor(f"wheel_{n}_joint", a, s, 0.0, 30.0) for n, a, s in wheels),
             imu=ImuSample((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)),
             battery=Charge(12.0, 80.0, 0.5),
             bumper=self.bumper,

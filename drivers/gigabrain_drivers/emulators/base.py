@@ -19,16 +19,10 @@ from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.kinematics.legs import WALKER, Gait
 from gigabrain_drivers.kinematics.wheels import Twist, base_of
 from gigabrain_drivers.sim.body import SimLidar
-from gigabrain_drivers.sim.physics import (
-    Charge,
-    ImuSample,
-    Motor,
-    OdometryReading,
-    Simulation,
-    account_of,
-)
+from gigabrain_drivers.sim.locomotion import Charge, Motor, OdometryReading
+from gigabrain_drivers.sim.physics import Simulation, account_of
 from gigabrain_drivers.sim.scene import ROBOT
-from gigabrain_drivers.sim.sensors import Lidar
+from gigabrain_drivers.sim.sensors import ImuSample, Lidar
 from gigabrain_drivers.sim.tick import TICK_S, Pace
 from gigabrain_drivers.sim.world import Stream, generator
 from gigabrain_zenoh.errors import BodyLost
@@ -192,7 +186,7 @@ class EmulatedBody:
         return Snapshot(
             time_ns=self.clock_ns,
             odometry=simulation.odometry(),
-            wheels=simulation.wheels(),
+            wheels=simulation.motors(),
             imu=simulation.imu(),
             battery=simulation.battery(),
             bumper=simulation.bumper(),

@@ -10,7 +10,7 @@ import numpy as np
 
 from gigabrain_drivers.kinematics.legs import JOINT_NAMES, LEGS, Gait, Senses, Vector
 from gigabrain_drivers.kinematics.trot import Trot
-from gigabrain_drivers.kinematics.wheels import Twist
+from gigabrain_drivers.kinematics.wheels import Differential, Twist
 from gigabrain_drivers.sim.body import SimBattery, SimBody, SimMotor, SimQuadruped
 from gigabrain_drivers.sim.scene import ROBOT
 from gigabrain_drivers.sim.sensors import ImuSample
@@ -140,47 +140,52 @@ class Locomotion(abc.ABC):
         return ()
 
 
-class DifferentialBase:
-    """Differential kinematics of two wheels with incremental encoders (left, right)."""
+class Rolling(Locomotion):
+    """A differential base: two wheel motors and their incremental encoders, left and right.
 
-    def __init__(self, body: SimBody) -> None:
-        self._body = body
-        radius = body.odometry_wheel_radius or body.wheel_radius
+    The wheels get to what is commanded at their greatest acceleration; nothing goes sideways.
+    """
+
+    def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        self._body, self._data = body, data
+        self._kinematics = Differential(body.wheel_radius, body.wheel_separation)
+        self._angles = [int(model.joint(f"{ROBOT}{n}_joint").qposadr[0]) for n in body.wheels]
+        self._motors = [int(model.actuator(f"{ROBOT}{n}").id) for n in body.wheels]
+        self._heat = [MotorHeat(body.motor) for _ in body.wheels]
         self._angle_per_tick = math.tau / body.encoder_ticks
+        radius = body.odometry_wheel_radius or body.wheel_radius
         self._metres_per_tick = self._angle_per_tick * radius
-        self._target = (0.0, 0.0)
-        self._speed = (0.0, 0.0)
+        self._target = self._speed = (0.0, 0.0)  # [rad/s]
         self._counts = (0, 0)
         self._past = deque([(0, 0)] * (VELOCITY_TICKS + 1), maxlen=VELOCITY_TICKS + 1)
         self._x = self._y = self._yaw = 0.0
 
-    def command(self, linear_x: float, angular_z: float) -> tuple[float, float]:
-        """Aim for a velocity; both wheels slow down alike if one would be too fast."""
-        body = self._body
-        turn = angular_z * body.wheel_separation / 2
-        left, right = (linear_x - turn) / body.wheel_radius, (linear_x + turn) / body.wheel_radius
-        scale = max(abs(left), abs(right)) / body.max_wheel_speed
+    def command(self, twist: Twist) -> Twist:
+        """Both wheels slow down alike if one would be too fast."""
+        left, right = self._kinematics.to_wheels(twist)
+        scale = max(abs(left), abs(right)) / self._body.max_wheel_speed
         if scale > 1:
             left, right = left / scale, right / scale
         self._target = (left, right)
-        forward = (left + right) / 2 * body.wheel_radius
-        return forward, (right - left) * body.wheel_radius / body.wheel_separation
+        return self._kinematics.to_body(self._target)
 
-    def ramp(self) -> tuple[float, float]:
-        """The wheel speeds to ask the motors for in the next tick [rad/s]."""
+    def act(self) -> None:
+        """Set the wheel speeds of the next tick."""
         step = self._body.max_wheel_acceleration * TICK_S
         (left, right), (left_now, right_now) = self._target, self._speed
         self._speed = (
             left_now + min(max(left - left_now, -step), step),
             right_now + min(max(right - right_now, -step), step),
         )
-        return self._speed
+        control = self._data.ctrl
+        control[self._motors[0]], control[self._motors[1]] = self._speed
 
-    def measure(self, left_angle: float, right_angle: float) -> None:
+    def sense(self, imu: ImuSample) -> None:
         """Count the encoder ticks of the past tick and integrate them at the mid heading."""
-        left = self._count(left_angle, self._counts[0])
-        right = self._count(right_angle, self._counts[1])
-        moved = (left + right - self._counts[0] - self._counts[1]) / 2 * self._metres_per_tick
+        position, counts = self._data.qpos, self._counts
+        left = self._counted(float(position[self._angles[0]]), counts[0])
+        right = self._counted(float(position[self._angles[1]]), counts[1])
+        moved = (left + right - counts[0] - counts[1]) / 2 * self._metres_per_tick
         self._counts = (left, right)
         self._past.append(self._counts)
         yaw = (right - left) * self._metres_per_tick / self._body.wheel_separation
@@ -189,79 +194,51 @@ class DifferentialBase:
         self._y += moved * math.sin(middle)
         self._yaw = yaw
 
-    def _count(self, angle: float, count: int) -> int:
+    def _counted(self, angle: float, count: int) -> int:
         """The new count; it moves by whole ticks only, so a wheel at rest does not flicker."""
         return count + math.trunc(angle / self._angle_per_tick - count)
-
-    def odometry(self) -> OdometryReading:
-        """Pose and velocity by the encoders alone."""
-        (left, right), (left_then, right_then) = self._counts, self._past[0]
-        per_second = self._metres_per_tick / (VELOCITY_TICKS * TICK_S)
-        left_speed, right_speed = (left - left_then) * per_second, (right - right_then) * per_second
-        turn = (right_speed - left_speed) / self._body.wheel_separation
-        return OdometryReading(self._x, self._y, self._yaw, (left_speed + right_speed) / 2, turn)
-
-    def wheels(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """(angle [rad], speed [rad/s]) of the left and of the right wheel, by the encoders."""
-        (left, right), (left_then, right_then) = self._counts, self._past[0]
-        angle, per_second = self._angle_per_tick, self._angle_per_tick / (VELOCITY_TICKS * TICK_S)
-        return (
-            (left * angle, (left - left_then) * per_second),
-            (right * angle, (right - right_then) * per_second),
-        )
-
-
-class Rolling(Locomotion):
-    """The wheels get to what is commanded at their greatest acceleration; nothing goes sideways."""
-
-    def __init__(self, body: SimBody, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        self._body, self._base, self._data = body, DifferentialBase(body), data
-        self._angles = [int(model.joint(f"{ROBOT}{n}_joint").qposadr[0]) for n in body.wheels]
-        self._motors = [int(model.actuator(f"{ROBOT}{n}").id) for n in body.wheels]
-        self._heat = [MotorHeat(body.motor) for _ in body.wheels]
-
-    def command(self, twist: Twist) -> Twist:
-        """Both wheels slow down alike if one would be too fast."""
-        forward, turn = self._base.command(twist.linear_x, twist.angular_z)
-        return Twist(forward, 0.0, turn)
-
-    def act(self) -> None:
-        """Wheel speeds."""
-        left, right = self._base.ramp()
-        control = self._data.ctrl
-        control[self._motors[0]], control[self._motors[1]] = left, right
-
-    def sense(self, imu: ImuSample) -> None:
-        """Wheel angles alone."""
-        position = self._data.qpos
-        self._base.measure(float(position[self._angles[0]]), float(position[self._angles[1]]))
 
     def wear(self) -> float:
         """The motors draw by their speed and by their torque."""
         config, effort, current = self._body, self._data.actuator_force.tolist(), 0.0
         share = config.battery.drive_current_a / len(self._heat) / config.max_wheel_speed
-        wheels = zip(self._heat, self._motors, self._base.wheels(), strict=True)
-        for heat, motor, (_, speed) in wheels:
+        wheels = zip(self._heat, self._motors, self._speeds(self._angle_per_tick), strict=True)
+        for heat, motor, speed in wheels:
             current += heat.warm(share * abs(speed), effort[motor])
         return current
 
     def odometry(self) -> OdometryReading:
         """By the wheel encoders alone."""
-        return self._base.odometry()
+        left, right = self._speeds(self._metres_per_tick)
+        turn = (right - left) / self._body.wheel_separation
+        return OdometryReading(self._x, self._y, self._yaw, (left + right) / 2, turn)
 
     def velocity(self) -> Twist:
         """By the wheel encoders alone."""
-        odometry = self._base.odometry()
+        odometry = self.odometry()
         return Twist(odometry.linear_x, 0.0, odometry.angular_z)
 
     def motors(self) -> tuple[Motor, ...]:
         """Left and right wheel."""
         effort = self._data.actuator_force
-        parts = zip(self._body.wheels, self._base.wheels(), self._motors, self._heat, strict=True)
+        speeds = self._speeds(self._angle_per_tick)
+        parts = zip(self._body.wheels, self._counts, speeds, self._motors, self._heat, strict=True)
         return tuple(
-            Motor(f"{name}_joint", angle, speed, float(effort[motor]), heat.celsius)
-            for name, (angle, speed), motor, heat in parts
+            Motor(
+                name=f"{name}_joint",
+                position=count * self._angle_per_tick,
+                velocity=speed,
+                effort=float(effort[motor]),
+                temperature=heat.celsius,
+            )
+            for name, count, speed, motor, heat in parts
         )
+
+    def _speeds(self, per_tick: float) -> tuple[float, float]:
+        """The speed of both wheels, in units of `per_tick` a second."""
+        (left, right), (left_then, right_then) = self._counts, self._past[0]
+        per_second = per_tick / (VELOCITY_TICKS * TICK_S)
+        return (left - left_then) * per_second, (right - right_then) * per_second
 
 
 class Walking(Locomotion):

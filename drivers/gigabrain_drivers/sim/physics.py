@@ -10,11 +10,8 @@ from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.kinematics.legs import Gait
 from gigabrain_drivers.kinematics.wheels import Twist
 from gigabrain_drivers.sim.body import (
-    SimBattery,
     SimBody,
-    SimLidar,
     SimModel,
-    SimMotor,
     SimQuadruped,
 )
 from gigabrain_drivers.sim.locomotion import (
@@ -32,23 +29,6 @@ from gigabrain_drivers.sim.tick import TICK_NS
 from gigabrain_drivers.sim.truth import Truth
 from gigabrain_drivers.sim.world import ClosedPath, Stream, World, generator
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
-
-__all__ = [
-    "Charge",
-    "ImuSample",
-    "Motor",
-    "OdometryReading",
-    "SimBattery",
-    "SimBody",
-    "SimLidar",
-    "SimModel",
-    "SimMotor",
-    "SimQuadruped",
-    "Simulation",
-    "Wheel",
-]
-
-Wheel = Motor  # what the motors of a base on wheels report
 
 EDGE_OF_THE_WORLD_M = 1e3
 
@@ -138,10 +118,6 @@ class Simulation:
 
     def motors(self) -> tuple[Motor, ...]:
         """All driven joints."""
-        return self._locomotion.motors()
-
-    def wheels(self) -> tuple[Motor, ...]:
-        """The driven joints of a base on wheels: left and right."""
         return self._locomotion.motors()
 
     def contacts(self) -> tuple[bool, ...]:

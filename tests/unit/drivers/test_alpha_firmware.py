@@ -14,7 +14,8 @@ from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, State, Walk
 from gigabrain_drivers.emulators.base import Snapshot
 from gigabrain_drivers.kinematics.legs import JOINT_NAMES, WALKER, Gait
 from gigabrain_drivers.kinematics.wheels import Twist
-from gigabrain_drivers.sim.physics import Charge, ImuSample, Motor, OdometryReading
+from gigabrain_drivers.sim.locomotion import Charge, Motor, OdometryReading
+from gigabrain_drivers.sim.sensors import ImuSample
 
 FORWARD = WALKER.to_gait(Twist(0.3, 0.0, 0.0))
 MS = 1_000_000

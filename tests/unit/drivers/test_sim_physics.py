@@ -162,7 +162,7 @@ def test_wheels_report_names_angle_speed_and_effort() -> None:
     simulation = Simulation(waffle(), room(), 0)
     simulation.command(0.165, 0.0)
     run(simulation, 2)
-    left, right = simulation.wheels()
+    left, right = simulation.motors()
     assert (left.name, right.name) == ("wheel_left_joint", "wheel_right_joint")
     assert left.velocity == pytest.approx(5.0, abs=0.05)
     assert left.position == pytest.approx(10.0, abs=0.3)
@@ -197,9 +197,9 @@ def test_a_stalled_motor_gets_warmer_than_a_free_one() -> None:
     for simulation in (free, stalled):
         simulation.command(0.2, 0.0)
         run(simulation, 10)
-    assert free.wheels()[0].temperature == pytest.approx(25.6, abs=0.5)
-    assert stalled.wheels()[0].temperature > free.wheels()[0].temperature + 0.5
-    assert abs(stalled.wheels()[0].effort) > 0.2
+    assert free.motors()[0].temperature == pytest.approx(25.6, abs=0.5)
+    assert stalled.motors()[0].temperature > free.wheels()[0].temperature + 0.5
+    assert abs(stalled.motors()[0].effort) > 0.2
 
 
 def test_the_same_seed_and_commands_give_the_same_bits() -> None:
@@ -215,7 +215,7 @@ def _recording(seed: int) -> list[object]:
     for tick in range(200):
         simulation.command(0.2, 0.5 if tick % 80 < 40 else -0.3)
         simulation.advance()
-        record += [simulation.odometry(), simulation.imu(), simulation.wheels()]
+        record += [simulation.odometry(), simulation.imu(), simulation.motors()]
         if tick % 10 == 0:
             record.append(simulation.scan().tobytes())
     return [*record, simulation.battery(), simulation.truth.pose()]
