@@ -16,7 +16,7 @@ from unittest import mock
 from msgspec.structs import replace
 from rich.console import Console
 
-from gigabrain_drivers.driver import gatekeeper as latch
+from gigabrain_drivers.driver import gatekeeper
 from gigabrain_drivers.driver.robot import RobotFile
 from gigabrain_schemas.base import Cause, Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
@@ -216,7 +216,7 @@ def _gate_causes() -> Iterator[Cause]:
     yield from (one for one in vars(causes).values() if isinstance(one, Cause))
     yield causes.button("the contact is open")
     yield causes.estop("ann")
-    yield latch.UNREADABLE
+    yield gatekeeper.UNREADABLE
 
 
 def _gate_answers() -> Iterator[str]:
