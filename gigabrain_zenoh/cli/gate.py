@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.cli.options import LOCAL, JsonLines, RobotAddress, Take, print_line
-from gigabrain_zenoh.client.estop import BY_HAND
+from gigabrain_zenoh.client.requests import BY_HAND
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.client.robot import connect as connect_robot
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, NotConfirmed, unknown

@@ -1,4 +1,4 @@
-"""The robot from a script or a notebook: the primitives of the HAL, over Zenoh."""
+"""Python API to a running robot, for scripts and notebooks: the HAL's primitives over Zenoh."""
 
 import asyncio
 import os
@@ -10,7 +10,7 @@ from msgspec.structs import asdict
 
 from gigabrain_schemas.audit import AuditRecord
 from gigabrain_schemas.base import Message, Velocity
-from gigabrain_schemas.body import BodyDescription, Joint, RobotState
+from gigabrain_schemas.body import BodyDescription, GateStatus, Joint, RobotState
 from gigabrain_schemas.brain import CmdVel, Twist
 from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.tasks import Task
@@ -25,21 +25,13 @@ from gigabrain_schemas.topics import (
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import listen, topic_named
-from gigabrain_zenoh.client.asking import ANSWER_S, ask, audit_log, granted
-from gigabrain_zenoh.client.estop import press
-from gigabrain_zenoh.client.hold import Hold
+from gigabrain_zenoh.client.requests import ANSWER_S, ask_gate, audit_log, press_estop
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, Unsupported
 from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
 from gigabrain_zenoh.runtime.running import find_endpoint
 from gigabrain_zenoh.security.identity_files import may_not_ask, no_router
-
-M = TypeVar("M", bound=Message)
-
-HOLD_TICKS = 50  # a velocity lasts one second of the robot's time unless it is asked for again
-ROUTER_S = 3.0  # how long a router may take to answer
-BODY_TICKS = 100  # the driver says twice in that time what the body is
 
 
 @asynccontextmanager
@@ -52,14 +44,13 @@ async def connect(
     take: bool = False,
     wait: bool = True,
 ) -> AsyncIterator["Robot"]:
-    """A robot to drive and to listen to.
+    """Connect to a robot.
 
-    `connect` is its router's Zenoh endpoint; without it, the only robot that runs on this machine.
-    `keys` is the folder of this script's identity, for a router that wants one. `source` is the
-    name under which the gate knows this script; with `take` it takes the body over from whoever
-    drives. With `wait` the body's first state is waited for: without, an e-stop can be sent to a
-    body that says nothing. Raises BusError when there is no router, ConfigError when the keys are
-    at fault, BodyLost when there is no driver.
+    `connect` is its router's Zenoh endpoint; by default the only robot on this machine. `keys` is
+    the folder of this script's identity, if the router requires one. `source` names this script to
+    the gate; with `take` it takes the body over from another commander. With `wait=False` the
+    first state is not awaited, so that an e-stop reaches a silent body. Raises BusError without a
+    router, ConfigError for invalid keys, and BodyLost without a driver.
     """
     from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport  # takes a while: only when used
 
@@ -79,8 +70,53 @@ async def connect(
         await bus.close()
 
 
+class ControlLease:
+    """Tracks whether one commander has the body, from the gate's states.
+
+    A passing stop, as for an obstacle, does not end the lease. It is lost when another commander
+    takes over or the gate latches. Then the script must ask again, so that it does not take the
+    body back from the person who has just stopped it.
+    """
+
+    def __init__(self, source: str) -> None:
+        self._source = source
+        self._boot = self._enables = 0  # of the gate when it granted the body
+        self._had = False  # in the last state
+        self.lost = False
+
+    def granted(self, boot: int, gate: GateStatus) -> None:
+        """Record that the gate has granted the body."""
+        self._boot, self._enables = boot, gate.enables
+        self._had, self.lost = True, False
+
+    def update(self, state: RobotState) -> None:
+        """Record a state, unless it is from before the gate's answer."""
+        if not self._boot or self._is_old(state):
+            return
+        has, gate = self.has(state), state.gate
+        taken = self._had and gate.commander not in ("", self._source)
+        self.lost = not has and (self.lost or taken or gate.mode == "latched")
+        self._had = has
+
+    def has(self, state: RobotState) -> bool:
+        """Return whether the body obeys this commander."""
+        gate = state.gate
+        mine = gate.mode == "enabled" and gate.commander == self._source
+        return mine or (self._boot > 0 and self._is_old(state))
+
+    def _is_old(self, state: RobotState) -> bool:
+        return state.boot == self._boot and state.gate.enables < self._enables
+
+
+M = TypeVar("M", bound=Message)
+
+HOLD_TICKS = 50  # how long a requested velocity lasts: one second of the robot's time
+ROUTER_S = 3.0  # timeout of the connection
+BODY_TICKS = 100  # timeout for `robot/body`, which is published once a second
+
+
 class Robot:
-    """One robot. Commands go out at 50 Hz with the echo that the gate asks for."""
+    """A running robot. Commands are published at 50 Hz with the echo that the gate requires."""
 
     def __init__(self, bus: Bus, *, take: bool = False, keys: str = "") -> None:
         self._bus, self._take, self._keys = bus, take, keys
@@ -88,15 +124,15 @@ class Robot:
         self._bodies = bus.latest(BODY)
         self._target: Velocity | None = None
         self._until_tick = 0
-        self._hold = Hold(bus.process)
+        self._lease = ControlLease(bus.process)
         self._arrived = asyncio.Event()
         self.tasks = Tasks(bus, keys)
 
     async def go_to(self, x: float, y: float, yaw: float | None = None) -> Task:
-        """Send the robot to a place in its map [m, m, rad]; how that ended, once it has.
+        """Send the robot to a pose in its map [m, m, rad]; return the task once it has ended.
 
-        Whoever is cancelled meanwhile leaves the robot without that goal. `tasks` has the rest:
-        missions, the queue, progress. Raises Refused, and BodyLost when nobody serves goals.
+        Cancelling this call cancels the goal. `tasks` has missions, the queue and progress. Raises
+        Refused, and BodyLost if no process serves goals.
         """
         name = await self.tasks.go_to(x, y, yaw)
         try:
@@ -108,16 +144,16 @@ class Robot:
     async def set_base_velocity(
         self, linear_x: float, linear_y: float = 0.0, angular_z: float = 0.0
     ) -> Velocity:
-        """Drive [m/s, m/s, rad/s] for one second, or until the next call; returns what was asked.
+        """Drive [m/s, m/s, rad/s] for one second, or until the next call.
 
-        What was asked is what the body's limits leave of it. The first call asks the gate for the
-        body, which this script then keeps. Raises Refused, with the gate's reason, when it does not
-        let this script drive, and when somebody else has taken the body over or latched it.
+        Returns the velocity within the body's limits. The first call asks the gate for the body,
+        which this script then keeps. Raises Refused if the gate does not grant it, or if another
+        commander has taken the body over or latched it.
         """
         state, body = await self.read_state(), await self.read_body()
         wanted = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
         wanted = clamp(wanted, limits_of(body))
-        if not self._hold.has(state):
+        if not self._lease.has(state):
             await self._acquire()
         self._target, self._until_tick = wanted, self._bus.time.tick + HOLD_TICKS
         self._send()
@@ -133,15 +169,15 @@ class Robot:
         await self.stop()
 
     def steer(self, wanted: Velocity) -> None:
-        """Tell the robot's own control what an operator wants; to be said twenty times a second.
+        """Publish an operator's velocity to the robot's control; repeat at 20 Hz.
 
-        Control obeys while the gate is open for the brain, and keeps the body until somebody
-        enables the brain again.
+        Control obeys while the gate is enabled for the brain. It keeps the body until the brain is
+        enabled again.
         """
         self._bus.publish(TELEOP, Twist(**asdict(wanted)))
 
     async def stop(self) -> None:
-        """Come to rest, if this script drives. It keeps the body."""
+        """Come to rest, if this script drives; it keeps the body."""
         if self._target is None:
             return
         self._target, self._until_tick = ZERO, self._bus.time.tick + HOLD_TICKS
@@ -153,40 +189,37 @@ class Robot:
             await self._ticks(1)
 
     async def enable(self, source: str = "", *, take: bool = False) -> GateReply:
-        """Ask the gate for the body, for this script or for `source`. Raises Refused, and why."""
+        """Ask the gate for the body, for this script or for `source`. Raises Refused."""
         me = self._bus.process
         request = EnableRequest(source=source or me, take=take, by=me)
-        reply = granted(await ask(self._bus, ENABLE, request, self._keys))
+        reply = await ask_gate(self._bus, ENABLE, request, self._keys)
         if request.source == self._bus.process:
-            self._hold.granted(self._bus.time.boot, reply.gate)
+            self._lease.granted(self._bus.time.boot, reply.gate)
         return reply
 
     async def release(self) -> GateReply:
-        """Let go of a latched gate; it takes an enable as well to move. Raises Refused."""
+        """Release a latched gate; `enable` is still needed to move. Raises Refused."""
         generation = (await self.read_state()).gate.estop_generation
         request = ReleaseRequest(estop_generation=generation, source=self._bus.process)
-        return granted(await ask(self._bus, RELEASE, request, self._keys))
+        return await ask_gate(self._bus, RELEASE, request, self._keys)
 
     async def estop(self, reason: str = "") -> GateReply:
         """Stop at once and latch; this script's own commands stop first.
 
-        Raises NotConfirmed when no body has confirmed it within two seconds.
+        Raises NotConfirmed if no body has confirmed it within two seconds.
         """
         self._target = None
         try:
-            return await press(self._bus, reason)
+            return await press_estop(self._bus, reason)
         except NotConfirmed as error:
             raise NotConfirmed(f"{error}{may_not_ask(self._keys)}") from None
 
     async def audit(self, newest: int = 100) -> tuple[AuditRecord, ...]:
-        """The newest entries of the audit log, oldest first. Raises BodyLost where nobody has one.
-
-        They are those of every process that keeps one, within a second.
-        """
+        """Return the newest entries of all audit logs, oldest first. Raises BodyLost."""
         return await audit_log(self._bus, newest)
 
     async def read_state(self) -> RobotState:
-        """What the body measures. Raises BodyLost when it is silent for a second."""
+        """Return the newest state. Raises BodyLost if none arrives within a second."""
         if self._states.fresh() is None:
             await self._ticks(1)
         state = self._states.fresh()
@@ -196,11 +229,11 @@ class Robot:
 
     @property
     def state(self) -> RobotState | None:
-        """The newest state, or None when the robot is silent."""
+        """The newest state; None while the robot is silent."""
         return self._states.fresh()
 
     async def read_body(self) -> BodyDescription:
-        """What the body is: its limits, its outline, its sensors. Raises BodyLost."""
+        """Return the body's description: limits, footprint, sensors. Raises BodyLost."""
         for _ in range(BODY_TICKS):
             if body := self._bodies.current:
                 return body.description
@@ -208,21 +241,21 @@ class Robot:
         raise BodyLost("no robot/body; is the driver running?")
 
     async def get_joint_states(self) -> tuple[Joint, ...]:
-        """All joints as measured. Raises BodyLost."""
+        """Return all measured joints. Raises BodyLost."""
         return (await self.read_state()).joints
 
     async def set_joint_position(self, joint_name: str, position: float) -> float:
-        """No driver obeys joint commands yet: raises Unsupported."""
+        """Raise Unsupported: no driver obeys joint commands yet."""
         state = await self.read_state()
         raise Unsupported(f"{state.robot_type} has no joint that can be positioned")
 
     async def get_sensor_data(self, sensor_name: str) -> Message:
-        """The next reading of `scan`, `imu` or any other topic. Raises BodyLost after a second."""
+        """Return the next message of `scan`, `imu` or another topic. Raises BodyLost after 1 s."""
         readings = self.topic(sensor_name)
         try:
             reading: Message = await asyncio.wait_for(anext(readings), ANSWER_S)
         except TimeoutError:
-            raise BodyLost(f"nobody sends robot/{sensor_name}") from None
+            raise BodyLost(f"no message on robot/{sensor_name}; is it published?") from None
         return reading
 
     @overload
@@ -232,19 +265,19 @@ class Robot:
     def topic(self, topic: str) -> AsyncIterator[Any]: ...
 
     def topic(self, topic: Topic[M] | str) -> AsyncIterator[M]:
-        """Every message on a topic from now on: `async for scan in robot.topic("scan")`.
+        """Yield each message on a topic: `async for scan in robot.topic("scan")`.
 
         Raises UnknownName for a topic that is not in the table.
         """
         return listen(self._bus, topic_named(topic) if isinstance(topic, str) else topic)
 
     async def _acquire(self) -> None:
-        """Ask the gate for the body, once it has come to rest from whatever it was doing."""
+        """Ask the gate for the body, once it has finished stopping."""
         state = await self.read_state()
-        if self._hold.lost:
-            who = state.gate.commander or "an e-stop"
+        if self._lease.lost:
+            holder = state.gate.commander or "an e-stop"
             raise Refused(
-                f"{state.robot_type}: {who} has the body; ask again with enable(take=True)"
+                f"{state.robot_type}: {holder} has the body; ask again with enable(take=True)"
             )
         for _ in range(HOLD_TICKS):
             if state.gate.mode != "stopping":
@@ -254,13 +287,13 @@ class Robot:
         await self.enable(take=self._take)
 
     def _repeat(self, state: RobotState) -> None:
-        self._hold.see(state)
+        self._lease.update(state)
         self._arrived.set()
         self._send()
 
     def _send(self) -> None:
         target, body = self._target, self._bodies.current
-        if target is None or body is None or self._hold.lost:
+        if target is None or body is None or self._lease.lost:
             return
         if self._bus.time.tick > self._until_tick:
             target = ZERO
@@ -268,7 +301,7 @@ class Robot:
         self._bus.publish(command_topic(body.description), command)
 
     async def _ticks(self, count: int) -> None:
-        """Let the robot's time go on by `count` states, or a second of ours."""
+        """Wait for `count` states. Raises BodyLost after a second without one."""
         for _ in range(count):
             self._arrived.clear()
             try:

@@ -16,7 +16,7 @@ from gigabrain_schemas.tasks import (
 )
 from gigabrain_schemas.topics import GOAL, MISSION, TASK, TASK_CHANGE, Service
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.client.asking import ANSWER_S
+from gigabrain_zenoh.client.requests import ANSWER_S
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.security.identity_files import may_not_ask
 
@@ -25,7 +25,7 @@ PLAN_S = 5.0  # how long path planning in a large map may take
 SILENT_S = 5.0  # after this long without a task status, the robot counts as lost
 STARTING_S = 3.0  # how long a starting robot may take until it serves goals
 AGAIN_S = 0.2
-OnNews = Callable[[TaskStatus], None]
+OnStatus = Callable[[TaskStatus], None]
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
 OnWait = Callable[[str], None]
@@ -50,9 +50,9 @@ class Tasks:
         """
         self._bus, self._keys = bus, keys
         self._on_wait, self._starting_s, self._silent_s = on_wait, starting_s, silent_s
-        self._news = asyncio.Event()
+        self._arrived = asyncio.Event()
         self._newest: TaskStatus | None = None
-        self._heard = False
+        self._subscribed = False
 
     async def go_to(
         self, x: float, y: float, yaw: float | None = None, *, how: How = "replace"
@@ -120,14 +120,14 @@ class Tasks:
         """Return the current, the waiting and the most recent ended tasks. Raises BodyLost."""
         self._listen()
         if self._newest is None:
-            await self._hear()
+            await self._next_status()
         assert self._newest
         return self._newest
 
-    async def result(self, task: str, on_news: OnNews | None = None) -> Task:
+    async def result(self, task: str, on_status: OnStatus | None = None) -> Task:
         """Wait until a task has ended, and return it. Raises BodyLost.
 
-        Meanwhile `on_news` is called with each status.
+        Meanwhile `on_status` is called with each status.
         """
         self._listen()
         while True:
@@ -136,9 +136,9 @@ class Tasks:
                 for one in status.done:
                     if one.id == task:
                         return one
-                if on_news:
-                    on_news(status)
-            await self._hear()
+                if on_status:
+                    on_status(status)
+            await self._next_status()
 
     async def _ask(self, service: Service[Q, R], request: Q, timeout_s: float) -> R:
         """Return the first answer; retry while no process serves tasks, as on a starting robot."""
@@ -151,27 +151,29 @@ class Tasks:
                 return replies[0]
             # after a timeout the request may have been received: do not repeat it
             if now() >= min(until, asked + timeout_s) or may_not_ask(self._keys):
-                raise self._nobody()
+                raise self._no_server()
             if self._on_wait and not waits:
-                self._on_wait("waiting: nobody serves goals yet; is the robot just starting?")
+                self._on_wait(
+                    "waiting: no process serves goals yet; the robot may still be starting"
+                )
             waits = True
             await asyncio.sleep(AGAIN_S)
 
     def _listen(self) -> None:
-        if not self._heard:
-            self._heard = True
-            self._bus.subscribe(TASK, self._take)
+        if not self._subscribed:
+            self._subscribed = True
+            self._bus.subscribe(TASK, self._on_status)
 
-    def _take(self, _key: str, status: TaskStatus) -> None:
+    def _on_status(self, _key: str, status: TaskStatus) -> None:
         self._newest = status
-        self._news.set()
+        self._arrived.set()
 
-    async def _hear(self) -> None:
-        self._news.clear()
+    async def _next_status(self) -> None:
+        self._arrived.clear()
         try:
-            await asyncio.wait_for(self._news.wait(), self._silent_s)
+            await asyncio.wait_for(self._arrived.wait(), self._silent_s)
         except TimeoutError:
-            raise self._nobody() from None
+            raise self._no_server() from None
 
     async def _change(self, request: TaskRequest) -> str:
         reply = await self._ask(TASK_CHANGE, request, ANSWER_S)
@@ -179,8 +181,8 @@ class Tasks:
             raise Refused(reply.text)
         return reply.text
 
-    def _nobody(self) -> BodyLost:
+    def _no_server(self) -> BodyLost:
         doubt = may_not_ask(self._keys)
         return BodyLost(
-            f"nobody serves goals{doubt or '; does decision run with behaviour: navigate?'}"
+            f"no process serves goals{doubt or '; run decision with behaviour: navigate'}"
         )

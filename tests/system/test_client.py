@@ -145,7 +145,7 @@ async def test_what_there_is_not_is_said_in_words(robot: Probe) -> None:
     async with connect() as script:
         with pytest.raises(UnknownName, match=r"no topic 'scna'; did you mean 'scan'\? known: "):
             script.topic("scna")
-        with pytest.raises(BodyLost, match="nobody sends robot/map"):
+        with pytest.raises(BodyLost, match="no message on robot/map"):
             await script.get_sensor_data("map")
         with pytest.raises(Unsupported, match="no joint that can be positioned"):
             await script.set_joint_position("arm", 1.0)

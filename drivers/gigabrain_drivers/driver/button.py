@@ -11,7 +11,7 @@ from gigabrain_schemas.base import Cause
 from gigabrain_schemas.safety import ButtonState
 from gigabrain_schemas.topics import BUTTON, STATE
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.client.estop import press
+from gigabrain_zenoh.client.requests import press_estop
 from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import NotConfirmed
 from gigabrain_zenoh.gate import causes as why
@@ -137,7 +137,7 @@ class Button:
             state = self._states.fresh()
             if state is None or state.gate.mode != "latched":
                 try:
-                    reply = await press(self._bus, self._problem or "")
+                    reply = await press_estop(self._bus, self._problem or "")
                     log.info("%s: %s", reply.robot_type, reply.text)
                 except NotConfirmed as error:
                     log.error("%s", error)

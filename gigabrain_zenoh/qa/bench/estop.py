@@ -14,7 +14,7 @@ from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.requests import EnableRequest, ReleaseRequest
 from gigabrain_schemas.topics import ENABLE, RELEASE, STATE
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.client.estop import press
+from gigabrain_zenoh.client.requests import press_estop
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
@@ -99,7 +99,7 @@ class _Operator:
 
     async def _press(self) -> float:
         began = time.perf_counter()
-        await press(self._bus, "bench")
+        await press_estop(self._bus, "bench")
         return (time.perf_counter() - began) * 1e3
 
     def _fast(self) -> bool:

@@ -14,8 +14,7 @@ from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
 from gigabrain_schemas.topics import ENABLE, GOAL, RELEASE, TASK_CHANGE
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.client.asking import ANSWER_S, ask, granted
-from gigabrain_zenoh.client.estop import press
+from gigabrain_zenoh.client.requests import ANSWER_S, ask_gate, press_estop
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.plugins import package_version
@@ -97,7 +96,7 @@ class Operator:
         if asked.what == "cancel":
             return await self._cancel(), ""
         if asked.what == "estop":
-            reply = await press(self._bus, "operator page")
+            reply = await press_estop(self._bus, "operator page")
         elif asked.what == "release":
             reply = await self._release(asked.estop_generation)
         else:
@@ -106,11 +105,11 @@ class Operator:
 
     async def _release(self, generation: int) -> GateReply:
         request = ReleaseRequest(estop_generation=generation, source=self._bus.process)
-        return granted(await ask(self._bus, RELEASE, request))
+        return await ask_gate(self._bus, RELEASE, request)
 
     async def _enable(self, *, take: bool) -> GateReply:
         request = EnableRequest(source=BRAIN, take=take, by=self._bus.process)
-        return granted(await ask(self._bus, ENABLE, request))
+        return await ask_gate(self._bus, ENABLE, request)
 
     async def _cancel(self) -> str:
         request = TaskRequest(do="cancel", source=self._bus.process)

@@ -9,7 +9,7 @@ import pytest
 from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.requests import EstopRequest, GateReply
 from gigabrain_schemas.topics import ESTOP
-from gigabrain_zenoh.client.estop import press
+from gigabrain_zenoh.client.requests import press_estop
 from gigabrain_zenoh.errors import NotConfirmed, Refused
 from gigabrain_zenoh.testing.in_memory import Net
 
@@ -38,21 +38,21 @@ class Driver:
 async def test_the_first_confirmation_ends_it() -> None:
     net = Net()
     driver = Driver(net, LATCHED)
-    assert await press(net.two, "a child") == LATCHED
+    assert await press_estop(net.two, "a child") == LATCHED
     assert driver.asked == [EstopRequest(source="two", reason="a child")]
 
 
 async def test_a_lost_request_is_repeated() -> None:
     net = Net()
     driver = Driver(net, None, None, LATCHED)
-    assert await press(net.two) == LATCHED
+    assert await press_estop(net.two) == LATCHED
     assert len(driver.asked) == 3
 
 
 async def test_an_answer_from_a_gate_that_is_not_latched_confirms_nothing() -> None:
     net = Net()
     Driver(net, OPEN, "not now", LATCHED)
-    assert await press(net.two) == LATCHED
+    assert await press_estop(net.two) == LATCHED
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ async def test_what_nobody_confirms_says_what_a_person_has_to_do(
     driver = Driver(net, *answers)
     text = f"NOT CONFIRMED: {why}; press the hardware e-stop or cut the robot's power"
     with pytest.raises(NotConfirmed, match=f"^{re.escape(text)}$") as error:
-        await press(net.two, within_s=0.4)
+        await press_estop(net.two, within_s=0.4)
     assert error.value.exit_code == 3
     assert 2 <= len(driver.asked) <= 6  # after 150 ms, and then every 50
 
@@ -83,7 +83,7 @@ async def test_what_was_confirmed_while_the_presser_itself_was_held_up_is_heard(
         return LATCHED
 
     net.one.serve(ESTOP, slow)
-    pressed = asyncio.create_task(press(net.two, within_s=0.05))
+    pressed = asyncio.create_task(press_estop(net.two, within_s=0.05))
     for _ in range(5):  # the request is on its way
         await asyncio.sleep(0)
     hold_up(0.1)
@@ -92,4 +92,4 @@ async def test_what_was_confirmed_while_the_presser_itself_was_held_up_is_heard(
 
 async def test_where_nobody_is_at_all_it_is_not_confirmed_either() -> None:
     with pytest.raises(NotConfirmed):
-        await press(Net().two, within_s=0.2)
+        await press_estop(Net().two, within_s=0.2)

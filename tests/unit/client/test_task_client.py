@@ -40,7 +40,7 @@ async def test_a_script_hears_how_its_goal_ended(site: Site) -> None:
 
 async def test_a_script_is_told_who_is_missing() -> None:
     net = Net()
-    with pytest.raises(BodyLost, match="nobody serves goals; does decision run with behaviour: n"):
+    with pytest.raises(BodyLost, match="no process serves goals; run decision with behaviour: n"):
         await Tasks(net.two, starting_s=0.0).go_to(1.0, 0.0)
 
 
@@ -50,7 +50,7 @@ async def test_whoever_says_nothing_of_the_tasks_is_taken_for_gone_as_soon_as_wa
     done, _ = await asyncio.wait((patient, hasty), return_when=asyncio.FIRST_COMPLETED)
     patient.cancel()
     assert done == {hasty}
-    with pytest.raises(BodyLost, match="nobody serves goals"):
+    with pytest.raises(BodyLost, match="no process serves goals"):
         await hasty
 
 
@@ -59,7 +59,7 @@ async def test_a_goal_that_comes_while_the_robot_starts_waits_for_who_serves_goa
     tasks = Tasks(net.two, on_wait=said.append, starting_s=60.0)
     sending = asyncio.ensure_future(tasks.go_to(1.0, 0.0))
     await until(lambda: said)
-    assert said == ["waiting: nobody serves goals yet; is the robot just starting?"]
+    assert said == ["waiting: no process serves goals yet; the robot may still be starting"]
 
     async def answer(request: GoalRequest) -> GoalReply:
         return GoalReply(ok=True, text="accepted", goal=f"goal to {request.x:g}")

@@ -76,7 +76,7 @@ async def test_a_question_that_the_host_has_slept_through_is_asked_again(
     async def go_to(_: Tasks, x: float, _y: float, _yaw: float | None) -> str:
         asked.append(x)
         if len(asked) < 3:
-            raise BodyLost("nobody serves goals")
+            raise BodyLost("no process serves goals")
         return "goal-1"
 
     class Alive:

@@ -2,7 +2,7 @@
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import GateMode, GateStatus, RobotState
-from gigabrain_zenoh.client.hold import Hold
+from gigabrain_zenoh.client.robot import ControlLease
 
 
 def state(mode: GateMode, commander: str = "", enables: int = 1, boot: int = 7) -> RobotState:
@@ -15,25 +15,25 @@ def state(mode: GateMode, commander: str = "", enables: int = 1, boot: int = 7) 
     )
 
 
-def granted() -> Hold:
-    hold = Hold("script")
-    hold.granted(7, GateStatus(mode="enabled", commander="script", enables=4))
-    return hold
+def granted() -> ControlLease:
+    lease = ControlLease("script")
+    lease.granted(7, GateStatus(mode="enabled", commander="script", enables=4))
+    return lease
 
 
 def after(*states: RobotState) -> tuple[bool, bool]:
     """(has, lost) of a script that was granted the body and then sees `states`."""
-    hold = granted()
+    lease = granted()
     for each in states:
-        hold.see(each)
-    return hold.has(states[-1]), hold.lost
+        lease.update(each)
+    return lease.has(states[-1]), lease.lost
 
 
 def test_before_it_asks_it_has_nothing_and_loses_nothing() -> None:
-    hold = Hold("script")
-    hold.see(state("enabled", "control"))
-    hold.see(state("latched"))
-    assert (hold.has(state("enabled", "control")), hold.lost) == (False, False)
+    lease = ControlLease("script")
+    lease.update(state("enabled", "control"))
+    lease.update(state("latched"))
+    assert (lease.has(state("enabled", "control")), lease.lost) == (False, False)
 
 
 def test_states_from_before_the_answer_say_nothing() -> None:
@@ -58,14 +58,14 @@ def test_somebody_who_takes_it_over_has_it_for_good() -> None:
 
 
 def test_a_latch_loses_it_until_it_asks_anew() -> None:
-    hold = granted()
+    lease = granted()
     for each in (state("latched", "", 4), state("idle", "", 4)):
-        hold.see(each)
-    assert hold.lost
-    hold.granted(7, GateStatus(mode="enabled", commander="script", enables=5))
-    hold.see(state("idle", "", 4))
-    assert (hold.lost, hold.has(state("idle", "", 4))) == (False, True)
-    assert not hold.has(state("enabled", "control", 6))
+        lease.update(each)
+    assert lease.lost
+    lease.granted(7, GateStatus(mode="enabled", commander="script", enables=5))
+    lease.update(state("idle", "", 4))
+    assert (lease.lost, lease.has(state("idle", "", 4))) == (False, True)
+    assert not lease.has(state("enabled", "control", 6))
 
 
 def test_another_start_of_the_driver_gives_it_nothing() -> None:

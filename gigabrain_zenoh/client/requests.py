@@ -1,0 +1,93 @@
+"""Requests to a robot: of its gate, its e-stop and its audit log."""
+
+import asyncio
+from typing import TypeVar
+
+from gigabrain_schemas.audit import AuditRecord, AuditRequest
+from gigabrain_schemas.base import Message
+from gigabrain_schemas.requests import EstopRequest, GateReply
+from gigabrain_schemas.topics import AUDIT_LOG, ESTOP, Service
+from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused
+from gigabrain_zenoh.runtime.audit import in_order
+from gigabrain_zenoh.security.identity_files import may_not_ask
+
+Q = TypeVar("Q", bound=Message)
+
+ANSWER_S = 1.0  # timeout of an answer
+
+FIRST_S, AGAIN_S = 0.15, 0.05  # until the e-stop request is repeated, and between repetitions
+GIVE_UP_S = 2.0
+LAST_LOOK_S = 0.05  # for answers that arrived while this process was blocked
+BY_HAND = "press the hardware e-stop or cut the robot's power"
+
+Asks = set[asyncio.Task[list[GateReply]]]
+
+
+async def ask_gate(
+    bus: Bus, service: Service[Q, GateReply], request: Q, keys: str = ""
+) -> GateReply:
+    """Return the granted request's reply.
+
+    Raises Refused with the gate's reason, and BodyLost without an answer, which may be for lack of
+    rights of `keys`.
+    """
+    replies = await bus.ask(service, request, timeout_s=ANSWER_S)
+    if not replies:
+        doubt = may_not_ask(keys) or "; is it running?"
+        raise BodyLost(f"no driver answers {service.key}{doubt}")
+    if not replies[0].ok:
+        raise Refused(f"{replies[0].robot_type}: {replies[0].text}")
+    return replies[0]
+
+
+async def audit_log(bus: Bus, newest: int) -> tuple[AuditRecord, ...]:
+    """Return the newest entries of all audit logs, oldest first. Raises BodyLost without any."""
+    pages = await bus.ask(AUDIT_LOG, AuditRequest(newest=newest), timeout_s=ANSWER_S)
+    if not pages:
+        raise BodyLost("no process answers with an audit log; is the driver running?")
+    return in_order([page.records for page in pages])[-newest:]
+
+
+async def press_estop(bus: Bus, reason: str = "", *, within_s: float = GIVE_UP_S) -> GateReply:
+    """Press the e-stop until a body confirms that it is latched. Raises NotConfirmed."""
+    loop = asyncio.get_running_loop()
+    request = EstopRequest(source=bus.process or "anonymous", reason=reason)
+    end_s, pause_s, refused = loop.time() + within_s, FIRST_S, ""
+    asks: Asks = set()
+    try:
+        while (left_s := end_s - loop.time()) > 0:
+            asks.add(asyncio.create_task(bus.ask(ESTOP, request, timeout_s=left_s)))
+            reply, refusal = await _answer(asks, min(pause_s, left_s))
+            if reply:
+                return reply
+            refused, pause_s = refusal or refused, AGAIN_S
+        reply, refusal = await _answer(asks, LAST_LOOK_S)
+        if reply:
+            return reply
+        refused = refusal or refused
+    finally:
+        for ask in asks:
+            ask.cancel()
+        await asyncio.gather(*asks, return_exceptions=True)
+    why = refused or "no driver answers"
+    raise NotConfirmed(f"NOT CONFIRMED: {why}; {BY_HAND}")
+
+
+async def _answer(asks: Asks, within_s: float) -> tuple[GateReply | None, str]:
+    """Return the first confirmation within the time, or None and the newest refusal."""
+    loop = asyncio.get_running_loop()
+    end_s, refused = loop.time() + within_s, ""
+    while asks and (left_s := end_s - loop.time()) > 0:
+        done, _ = await asyncio.wait(asks, timeout=left_s, return_when=asyncio.FIRST_COMPLETED)
+        asks -= done
+        for ask in done:
+            try:
+                latched = [reply for reply in ask.result() if reply.gate.mode == "latched"]
+            except Refused as error:
+                refused = str(error)
+                continue
+            if latched:
+                return latched[0], ""
+    await asyncio.sleep(max(0.0, end_s - loop.time()))
+    return None, refused
