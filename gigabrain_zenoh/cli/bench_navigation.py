@@ -318,7 +318,7 @@ def goals(*, options: GoalsOptions = GOALS, json: JsonFile = None, logs: Path | 
 
 def _print_failures(result: "GoalsResult") -> None:
     """Print the memory of each run, and each goal that was not reached."""
-    from gigabrain_zenoh.decision.tasks.drive_command import describe_goal
+    from gigabrain_zenoh.decision.behaviours import describe_goal
 
     console = Console()
     for run in result.runs:

@@ -172,7 +172,7 @@ def _with_tasks(at: RobotAddress, do: "Callable[[Tasks], Awaitable[None]]") -> i
 
 def _send(at: RobotAddress, send: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> int:
     async def run(tasks: "Tasks") -> None:
-        from gigabrain_zenoh.decision.tasks.drive_command import describe_end
+        from gigabrain_zenoh.decision.behaviours import describe_end
 
         name = await send(tasks)
         if not wait:

@@ -13,8 +13,7 @@ from gigabrain_schemas.topics import BODY, MAP, POSE, STATE, command_topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.decision.actuation_model import ActuationEstimator
-from gigabrain_zenoh.decision.behaviours import battery_nearly_empty
-from gigabrain_zenoh.decision.tasks.drive_command import WaitReason
+from gigabrain_zenoh.decision.behaviours import WaitReason, battery_nearly_empty
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
 from gigabrain_zenoh.geometry.pose import PoseHistory, compose, inverse, velocity_of

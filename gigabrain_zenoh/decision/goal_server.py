@@ -5,7 +5,8 @@ Goals are accepted from the start, while the planning kernels still compile.
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
 
 from msgspec.structs import replace
 
@@ -27,15 +28,19 @@ from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, Se
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.bus.input_log import log_accepted
-from gigabrain_zenoh.decision.behaviours import Behaviour, Inputs, NavigationConfig, Step
-from gigabrain_zenoh.decision.tasks import mission as missions
-from gigabrain_zenoh.decision.tasks.drive_command import (
+from gigabrain_zenoh.decision.behaviours import (
+    Behaviour,
     DriveCommand,
     Idle,
-    Outcome,
+    Inputs,
+    NavigationConfig,
+    StepOutcome,
+    StepResult,
     WaitReason,
     describe_end,
 )
+from gigabrain_zenoh.decision.node import InputSource
+from gigabrain_zenoh.decision.tasks import mission as missions
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.tasks.scripts import Scripts
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskFile, TaskQueue
@@ -55,25 +60,16 @@ STARTING_STATUS_NS = 200_000_000  # the same while the kernels compile
 POSE_TIMEOUT_NS, POLL_NS = 700_000_000, 50_000_000  # wait for a first pose in the map
 
 
-class NavigatorPort(Protocol):
-    """What tasks ask of the navigator before they are accepted."""
-
-    async def check_located(self) -> WaitReason | None:
-        """Return what driving still waits for. Raises Refused if that will not come by itself."""
-        ...
-
-    async def check_goal(self, goal: Goal) -> str:
-        """Return how the robot would reach `goal`, for people. Raises Refused if it cannot."""
-        ...
+# returns how the robot would reach a goal, for people; without a goal, checks only that its pose in
+# the map is known. Raises Refused
+CheckGoal = Callable[[Goal | None], Awaitable[str]]
 
 
 class TaskServer:
     """Serves tasks on the bus: keeps the queue, publishes its status and writes it to disk."""
 
-    def __init__(
-        self, bus: Bus, navigator: NavigatorPort, *, folder: str = "", scripts: str = ""
-    ) -> None:
-        self._bus, self._navigator = bus, navigator
+    def __init__(self, bus: Bus, check: CheckGoal, *, folder: str = "", scripts: str = "") -> None:
+        self._bus, self._check = bus, check
         self._scripts, self._topics, file = Scripts(scripts), TopicCache(bus), TaskFile(folder)
         saved, problem = file.read()
         if problem:
@@ -94,9 +90,12 @@ class TaskServer:
         self._publish()
 
     def step(
-        self, state: RobotState, outcome: Outcome | None, basis: int = 0
-    ) -> DriveCommand | None:
-        """Advance the queue, with the world of tick `basis`; return the next command."""
+        self, state: RobotState, outcome: StepOutcome | None, basis: int = 0
+    ) -> tuple[DriveCommand | None, Idle]:
+        """Advance the queue, with the world of tick `basis`.
+
+        Return the next command, and why the robot stands if there is none.
+        """
         self._waits = ""
         same_boot = state.boot == self._boot
         seconds = max(0, state.tick - self._tick) * TICK_S if same_boot else 0.0
@@ -105,15 +104,10 @@ class TaskServer:
             self._queue.restart(state.boot)
             self._status_tick = 0
         self._topics.observe(state)
-        command = self._queue.step(seconds, outcome)
+        wanted = self._queue.step(seconds, outcome)
         if not 0 <= state.tick - self._status_tick < STATUS_TICKS or self._just_ended():
             self._publish()
-        return command
-
-    @property
-    def idle(self) -> Idle:
-        """Why the robot stands where `step` returns no command."""
-        return self._queue.idle
+        return wanted
 
     def begin(self, mission: Mission, label: str, boot: int) -> None:
         """Start a mission, unless there were tasks in this start of the driver."""
@@ -153,18 +147,18 @@ class TaskServer:
         if problem:
             self._write_fault.begin(problem)
         else:
-            self._write_fault.end("tasks are written down again")
+            self._write_fault.end("tasks are saved again")
 
     async def _on_goal(self, request: GoalRequest) -> GoalReply:
         goal = Goal(x=request.x, y=request.y, yaw=request.yaw)
         try:
-            way = await self._navigator.check_goal(goal)
+            path = await self._check(goal)
             name = self._queue.add_goal(goal, request.how, request.source)
         except GigabrainError as error:
             _log_refusal("goal", request.source, error)
             return GoalReply(ok=False, text=str(error)[:500])
         self._accept(name, GOAL, request)
-        return GoalReply(ok=True, text=f"{name}: {way}"[:500], goal=name)
+        return GoalReply(ok=True, text=f"{name}: {path}"[:500], goal=name)
 
     async def _on_mission(self, request: MissionRequest) -> MissionReply:
         label = request.label or "mission"
@@ -174,7 +168,7 @@ class TaskServer:
             for script in mission.scripts:
                 self._scripts.path(script)
             if mission.drives:
-                await self._navigator.check_located()
+                await self._check(None)
             name = self._queue.add_mission(mission, label, request.how, request.source)
         except GigabrainError as error:
             _log_refusal("mission", request.source, error)
@@ -197,30 +191,30 @@ class TaskServer:
         return TaskReply(ok=True, text=text[:500], task=request.task)
 
     def _accept(
-        self, name: str, of: Service[Any, Any], request: GoalRequest | MissionRequest
+        self, name: str, service: Service[Any, Any], request: GoalRequest | MissionRequest
     ) -> None:
         data = {"event": "task", "task": name, "source": request.source}
         log.info("accepted %s from %s", name, request.source, extra={"data": data})
-        self._record(of, request)
+        self._record(service, request)
 
     def _record(
-        self, of: Service[Any, Any], request: GoalRequest | MissionRequest | TaskRequest
+        self, service: Service[Any, Any], request: GoalRequest | MissionRequest | TaskRequest
     ) -> None:
         """Publish when a request takes effect, so that a recording can be replayed."""
-        log_accepted(self._bus, of.key, request, self._basis)
+        log_accepted(self._bus, service.key, request, self._basis)
         self._publish()
 
 
-class GoalServer:
+class GoalServer(InputSource):
     """Input source of behaviours that drive by a map: the task queue and the navigator."""
 
     def __init__(
         self, config: NavigationConfig, bus: Bus, behaviour: str, *, state_dir: str = ""
     ) -> None:
         self._bus, self._config, self._name = bus, config, behaviour
-        self._tasks = TaskServer(bus, self, folder=state_dir, scripts=config.scripts)
+        self._tasks = TaskServer(bus, self.check, folder=state_dir, scripts=config.scripts)
         self._navigator: Navigator | None = None  # once the kernels are compiled
-        self._outcome: Outcome | None = None  # of the last command
+        self._outcome: StepOutcome | None = None  # of the last command
         self._started = False
 
     async def warm_up(self) -> None:
@@ -235,7 +229,7 @@ class GoalServer:
         self._navigator = Navigator(self._config, self._bus, self._name)
 
     def configure(self, config: NavigationConfig) -> None:
-        """Use other settings from now on."""
+        """Use another speed limit from now on."""
         self._ready.configure(config)
 
     def observe(self, state: RobotState) -> None:
@@ -248,14 +242,14 @@ class GoalServer:
         state: RobotState,
         world: WorldModel | None,
         verdict: SafetyState | None,
-    ) -> Step:
+    ) -> StepResult:
         """Advance the queue and step the behaviour with the command that it wants."""
         if self._config.start == "explore" and not self._started:
             self._tasks.begin(missions.explore_mission(), "roaming", state.boot)
         self._started = True
         tick = world.basis if world else state.tick
-        command = self._tasks.step(state, self._outcome, tick)
-        idle, navigator = self._tasks.idle, self._ready
+        command, idle = self._tasks.step(state, self._outcome, tick)
+        navigator = self._ready
         context = navigator.at_scan(state, world, verdict)
         intent, outcome = behaviour.step(
             Inputs(
@@ -271,7 +265,7 @@ class GoalServer:
 
     @property
     def hung(self) -> bool:
-        """Whether a plan in the worker thread is so overdue that it will never finish."""
+        """Whether the plan in the worker thread will never finish."""
         return self._navigator is not None and self._navigator.hung
 
     async def close(self) -> None:
@@ -280,19 +274,18 @@ class GoalServer:
         if self._navigator:
             self._navigator.close()
 
-    async def check_located(self) -> WaitReason | None:
-        """Wait briefly for a pose in the map; raise Refused, with a remedy, if there is none."""
+    async def check(self, goal: Goal | None) -> str:
+        """Return how the robot would reach `goal`, for people; see CheckGoal. Raises Refused."""
         for _ in range(POSE_TIMEOUT_NS // POLL_NS):
-            waits = self._waits
-            if waits or self._ready.located:
-                return waits
+            if waits := self._waits:
+                return f"accepted; {waits}"
+            if self._ready.located:
+                break
             await self._bus.clock.sleep_ns(POLL_NS)
-        raise Refused(self._ready.lost)
-
-    async def check_goal(self, goal: Goal) -> str:
-        """Return how the robot would reach `goal`, for people. Raises Refused if it cannot."""
-        if waits := await self.check_located():
-            return f"accepted; {waits}"
+        else:
+            raise Refused(self._ready.lost)
+        if goal is None:
+            return ""
         found = await self._ready.check(goal)
         offset = f"; {found.offset}" if found.offset else ""
         return f"on the way, {found.length_m:.1f} m{offset}"

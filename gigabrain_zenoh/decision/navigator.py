@@ -16,17 +16,18 @@ from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import MOST_POINTS, Goal
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.decision.behaviours import NavigationConfig, Step
-from gigabrain_zenoh.decision.context import ContextSource, NavigationContext
-from gigabrain_zenoh.decision.route import PathCheck, Route, RouteFeedback, RoutePlanner
-from gigabrain_zenoh.decision.route_schedule import RouteSchedule
-from gigabrain_zenoh.decision.tasks.drive_command import (
+from gigabrain_zenoh.decision.behaviours import (
     DriveCommand,
     Idle,
-    Outcome,
+    NavigationConfig,
+    StepOutcome,
+    StepResult,
     WaitReason,
     describe_goal,
 )
+from gigabrain_zenoh.decision.context import ContextSource, NavigationContext
+from gigabrain_zenoh.decision.route import PathCheck, Route, RouteFeedback, RoutePlanner
+from gigabrain_zenoh.decision.route_schedule import RouteSchedule
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import compose, inverse
@@ -83,7 +84,7 @@ class Navigator:
         self._routes.count_held(state.boot, context.tick, context.held)
         return context
 
-    def drive(self, command: DriveCommand | None, idle: Idle) -> Step:
+    def drive(self, command: DriveCommand | None, idle: Idle) -> StepResult:
         """Carry out `command` for one scan, or stand as `idle`; once after each `at_scan`."""
         context = self._context
         assert context
@@ -152,19 +153,19 @@ class Navigator:
                 self._routes.request(context, here, command, grid)
         return self._routes.route
 
-    def _stand(self, command: DriveCommand | None, why: Idle) -> Step:
+    def _stand(self, command: DriveCommand | None, why: Idle) -> StepResult:
         reason = why.reason[:500]
         number = command.number if command else 0
-        outcome = Outcome(number=number, activity=why.activity, reason=reason)
+        outcome = StepOutcome(number=number, activity=why.activity, reason=reason)
         return self._intent(reason=reason), outcome
 
     def _without_path(
         self, context: NavigationContext, command: DriveCommand, route: Route
-    ) -> Step:
+    ) -> StepResult:
         assert context.map_from_odom
         here = compose(context.map_from_odom, context.pose)
         position_error, heading_error = _errors(command, here)
-        outcome = Outcome(
+        outcome = StepOutcome(
             number=command.number, state=route.state, reason=route.reason, activity="waiting",
             position_error=position_error, heading_error=heading_error,
         )  # fmt: skip
@@ -177,7 +178,7 @@ class Navigator:
         route: Route,
         goal: Goal,
         points: Floats,
-    ) -> Step:
+    ) -> StepResult:
         assert context.map_from_odom
         assert context.world
         to_odom = inverse(context.map_from_odom)
@@ -186,9 +187,7 @@ class Navigator:
             tick=context.tick,
             pose=context.pose,
             velocity=context.velocity,
-            goal=local_planner.Goal(
-                x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw
-            ),
+            goal=Goal(x=there.x, y=there.y, yaw=None if goal.yaw is None else there.yaw),
             hits=hits(context.world).astype(np.float64),
             path=transform(from_pose(to_odom), points),
             obstacles=context.world.obstacles,
@@ -226,7 +225,7 @@ class Navigator:
         command: DriveCommand,
         route: Route,
         plan: local_planner.LocalPlan,
-    ) -> Outcome:
+    ) -> StepOutcome:
         assert context.map_from_odom
         assert context.body
         assert route.goal
@@ -241,7 +240,7 @@ class Navigator:
         place = describe_goal(route.goal)
         driving = "exploring" if command.kind == "explore" else f"going to {place}"
         at = f"at {place}, {route.reason}" if route.reason else f"at {place}"
-        return Outcome(
+        return StepOutcome(
             number=command.number,
             state="done" if arrived else "running",
             activity=route.activity or driving,

@@ -1,8 +1,8 @@
-"""The decision process: turns what is known into an intent, with a reason."""
+"""Decision node: steps the configured behaviour once per world model, and publishes intents."""
 
 import logging
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import RobotState
@@ -13,7 +13,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.freshness import PreviousTick
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
-from gigabrain_zenoh.decision.behaviours import Behaviour, Inputs, Step, battery_nearly_empty
+from gigabrain_zenoh.decision.behaviours import Behaviour, Inputs, StepResult, battery_nearly_empty
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
@@ -26,20 +26,17 @@ RENAMED_PARAMS = {  # by behaviour; removed in 0.3, like the words in config/ren
 }
 
 
-class InputSource(Protocol):
-    """Steps a behaviour with inputs beyond the world model, and gets its outcome."""
+class InputSource:
+    """Steps a behaviour with its inputs: here the world model and the odometry alone."""
 
     async def warm_up(self) -> None:
         """Prepare everything that takes long, before anything drives."""
-        ...
 
     def configure(self, config: Any) -> None:
         """Use other settings from now on."""
-        ...
 
     def observe(self, state: RobotState) -> None:
         """Record a robot state; called with every state."""
-        ...
 
     def step(
         self,
@@ -47,56 +44,30 @@ class InputSource(Protocol):
         state: RobotState,
         world: WorldModel | None,
         verdict: SafetyState | None,
-    ) -> Step:
+    ) -> StepResult:
         """Step the behaviour once with the present inputs."""
-        ...
+        must_charge = battery_nearly_empty(verdict)
+        return behaviour.step(Inputs(world=world, pose=state.pose, must_charge=must_charge))
 
     @property
     def hung(self) -> bool:
         """Whether a part of it will never finish, while the rest continues."""
-        ...
+        return False
 
     async def close(self) -> None:
-        """Return once all is written."""
-        ...
-
-
-class WorldOnly:
-    """Input source of behaviours that need no more than the world model."""
-
-    hung = False
-
-    async def warm_up(self) -> None: ...  # noqa: D102
-
-    def configure(self, config: Any) -> None: ...  # noqa: D102
-
-    def observe(self, state: RobotState) -> None: ...  # noqa: D102
-
-    def step(
-        self,
-        behaviour: Behaviour,
-        state: RobotState,
-        world: WorldModel | None,
-        verdict: SafetyState | None,
-    ) -> Step:
-        """Step the behaviour with the world and the odometry."""
-        must_charge = battery_nearly_empty(verdict)
-        return behaviour.step(Inputs(world=world, pose=state.pose, must_charge=must_charge))
-
-    async def close(self) -> None: ...  # noqa: D102
+        """Return once everything is written."""
 
 
 class DecisionLoop:
     """Steps the behaviour once per world, and keeps the intent in between.
 
-    A world whose state is still on its way waits for it: which of two messages is quicker must not
-    matter.
+    A world waits for the state of its tick, so that the order of the two does not matter.
     """
 
     def __init__(self, config: DecisionConfig, source: InputSource | None = None) -> None:
         self._type = behaviours.load(config.behaviour)
         self._settings = behaviours.settings_of(config)
-        self._source = source or WorldOnly()
+        self._source = source or InputSource()
         self._behaviour, self._boot = self._type(self._settings), 0
         self.intent = Intent(behaviour=config.behaviour, reason="starting")
         self.activity = "starting"
@@ -133,7 +104,7 @@ class DecisionLoop:
 
 
 async def run(config: DecisionConfig, bus: Bus, ready: Callable[[], None]) -> None:
-    """Publish an intent per world at once, and again with the newest tick at each state."""
+    """Publish an intent at once for each world, and repeat it at each state."""
     source = input_source(config, bus)
     try:
         await source.warm_up()
@@ -148,7 +119,7 @@ def input_source(config: DecisionConfig, bus: Bus) -> InputSource:
     """Return the input source that the configured behaviour needs. Raises ConfigError."""
     settings = behaviours.settings_of(config)
     if not behaviours.needs_map(config.behaviour):
-        return WorldOnly()
+        return InputSource()
     try:
         from gigabrain_zenoh.decision.goal_server import GoalServer
     except ModuleNotFoundError as error:
@@ -183,7 +154,7 @@ def _serve(config: DecisionConfig, bus: Bus, source: InputSource) -> None:
 
     def on_world(world: WorldModel) -> None:
         nonlocal too_old
-        too_old += newest_world() is None  # over a slow link: received, and refused
+        too_old += newest_world() is None  # received too late, over a slow link
         if world.basis <= bus.time.tick:
             decide(world)
 

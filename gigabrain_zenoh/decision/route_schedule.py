@@ -6,6 +6,7 @@ from gigabrain_schemas.arrays import hits
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.decision.behaviours import DriveCommand
 from gigabrain_zenoh.decision.context import NavigationContext
 from gigabrain_zenoh.decision.route import (
     Route,
@@ -13,7 +14,6 @@ from gigabrain_zenoh.decision.route import (
     RoutePlanner,
     RouteRequest,
 )
-from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand
 from gigabrain_zenoh.geometry.se2 import from_pose, transform
 from gigabrain_zenoh.host.threads import ScheduledWorker, Take
 from gigabrain_zenoh.navigation.costmap import Unknown

@@ -11,6 +11,7 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S, Pose, Positive, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, Obstacle, TrajectoryPoint
+from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.navigation import dynamic_obstacles
 from gigabrain_zenoh.navigation.cost import Scene, Weights, distance_in
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
@@ -57,14 +58,6 @@ class LocalSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 DEFAULTS = LocalSettings()
-
-
-class Goal(Struct, frozen=True, kw_only=True):
-    """Where to go, in the frame that is planned in."""
-
-    x: float  # [m]
-    y: float  # [m]
-    yaw: float | None = None  # [rad]; None where any will do
 
 
 class SentCommand(Struct, frozen=True):

@@ -20,7 +20,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.behaviours import NavigationConfig
-from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand, Outcome
+from gigabrain_zenoh.decision.behaviours import DriveCommand, StepOutcome
 
 
 class SpinConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -45,7 +45,7 @@ class Spin:
     def step(self, inputs):
         twist = Velocity(angular_z=self.config.rate)
         intent = Intent(twist=twist, behaviour="spin", reason="spinning")
-        return intent, Outcome(activity="spinning")
+        return intent, StepOutcome(activity="spinning")
 
 
 class ThereConfig(NavigationConfig, frozen=True, kw_only=True):

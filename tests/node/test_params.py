@@ -13,13 +13,13 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.brain import WorldModel
-from gigabrain_schemas.tasks import GoalRequest
+from gigabrain_schemas.tasks import Goal, GoalRequest
 from gigabrain_schemas.topics import GOAL, INTENT, STATE, WORLD
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import behaviours
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.navigation.local_planner import Goal, LocalPlanner
+from gigabrain_zenoh.navigation.local_planner import LocalPlanner
 from gigabrain_zenoh.runtime.deployment import load_deployment
 from gigabrain_zenoh.runtime.services import LOG_LEVEL, serve_params
 from gigabrain_zenoh.testing.in_memory import NodeBench

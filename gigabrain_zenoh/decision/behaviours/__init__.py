@@ -1,4 +1,4 @@
-"""Behaviours: what each must offer, and how one is found by its name.
+"""Behaviours: their inputs and outcomes, and how one is found by its name.
 
 A behaviour is one module: its class, its `Config`, and the parameters that may change while it
 runs. Packages offer theirs as entry points of the group `gigabrain.behaviours`.
@@ -6,9 +6,10 @@ runs. Packages offer theirs as entry points of the group `gigabrain.behaviours`.
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Protocol, cast
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol, cast
 
 import msgspec
 from msgspec import Meta, Struct
@@ -16,9 +17,9 @@ from msgspec import Meta, Struct
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.brain import Intent, WorldModel
 from gigabrain_schemas.safety import SafetyState
+from gigabrain_schemas.tasks import Goal, Task
 from gigabrain_zenoh.config import loading
 from gigabrain_zenoh.config.settings import DecisionConfig
-from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand, Outcome
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.plugins import load_plugin, plugin_names
 
@@ -31,8 +32,57 @@ SHIPPED = {  # name in a deployment file -> "module:class"
 NAVIGATION_PACKAGES = ("numba", "cv2", "py_trees")
 
 SpeedLimit = Annotated[float, Meta(gt=0, le=10)]  # [m/s] or [rad/s]
-Step = tuple[Intent, Outcome]
-Drive = Callable[[DriveCommand | None], Step]
+DriveKind = Literal["goto", "explore", "visit"]  # `visit`: a random reachable place
+
+
+class DriveCommand(Struct, frozen=True):
+    """A request to drive somewhere."""
+
+    number: int  # a new number is a new command, even for the same goal
+    kind: DriveKind
+    goal: Goal | None = None  # of `goto`
+
+
+class StepOutcome(Struct, frozen=True, kw_only=True):
+    """Result of one step of a behaviour, and progress of the command that it carries out."""
+
+    number: int = 0  # of the command; 0 without one
+    state: Literal["running", "done", "failed"] = "running"
+    activity: str = ""  # short name of what the robot does; each change is logged
+    reason: str = ""  # for people
+    held: bool = False  # the body does not follow: the gate or an operator has it
+    progress: float = 0.0
+    distance: float | None = None  # [m] left along the path
+    eta: float | None = None  # [s]
+    goal: Goal | None = None  # present destination
+    path: tuple[tuple[float, float], ...] = ()  # [m] in the map, for drawing
+    position_error: float | None = None  # [m] from the requested place
+    heading_error: float | None = None  # [rad] from the requested heading
+
+
+class Idle(NamedTuple):
+    """Why the robot stands: a short name, whose changes are logged, and a text for people."""
+
+    activity: str
+    reason: str
+
+
+class WaitReason(StrEnum):
+    """Why the robot cannot drive by its map yet; the value is the text for people."""
+
+    STARTING = "starting up"
+    PERCEPTION_STARTING = "perception is starting up"
+    NO_LOCALIZATION = (
+        "nobody says yet where in a map the robot is; perception: {mapping: slam} would"
+    )
+    NOT_LOCALIZED = "the pose in the map is uncertain"
+    NO_ODOMETRY_OF_POSE = "no odometry for the last pose in the map"
+    NO_ODOMETRY_OF_SCAN = "no odometry for the scan"
+    NO_MAP = "no map yet"
+
+
+StepResult = tuple[Intent, StepOutcome]
+Drive = Callable[[DriveCommand | None], StepResult]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,7 +110,7 @@ class Behaviour(Protocol):
         """Use other settings from now on, and keep the memory."""
         ...
 
-    def step(self, inputs: Inputs) -> Step:
+    def step(self, inputs: Inputs) -> StepResult:
         """Return the intent, and the outcome of `inputs.command` if there is one."""
         ...
 
@@ -135,3 +185,22 @@ def parse_settings(pairs: Iterable[str]) -> dict[str, Any]:
 def battery_nearly_empty(verdict: SafetyState | None) -> bool:
     """Return whether safety wants the robot to come to rest and be charged."""
     return verdict is not None and any(w.code == "battery_return" for w in verdict.warnings)
+
+
+def describe_goal(goal: Goal) -> str:
+    """Return a goal as text: `(x, y)` or `(x, y, yaw rad)`."""
+    turned = "" if goal.yaw is None else f", {goal.yaw:.2f} rad"
+    return f"({goal.x:.2f}, {goal.y:.2f}{turned})"
+
+
+def describe_end(task: Task) -> str:
+    """Return how a task ended as text, with its reason and errors."""
+    if task.state == "cancelled":
+        return f"{task.id} was {task.reason or task.state}"  # its reason names the source
+    errors = []
+    if task.position_error is not None:
+        errors.append(f"position error {task.position_error:.2f} m")
+    if task.heading_error is not None:
+        errors.append(f"heading error {task.heading_error:.2f} rad")
+    measured = f" ({', '.join(errors)})" if errors else ""
+    return f"{task.id} has {task.state}{f': {task.reason}' if task.reason else ''}{measured}"

@@ -9,8 +9,7 @@ from msgspec import Struct
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import Intent, TrajectoryPoint, WorldModel
-from gigabrain_zenoh.decision.behaviours import Inputs, SpeedLimit, Step
-from gigabrain_zenoh.decision.tasks.drive_command import Outcome
+from gigabrain_zenoh.decision.behaviours import Inputs, SpeedLimit, StepOutcome, StepResult
 
 HORIZON_S, STEP_S = 2.0, 0.25  # of the expected trajectory
 MAX_LEG_M = 2.5  # expected length of a leg where nothing is in sight
@@ -50,7 +49,7 @@ class Avoid:
         """Use other settings; a turn that has begun keeps its side."""
         self._config = config
 
-    def step(self, inputs: Inputs) -> Step:
+    def step(self, inputs: Inputs) -> StepResult:
         """Return the intent for what is ahead."""
         world = inputs.world
         if inputs.must_charge:
@@ -63,13 +62,13 @@ class Avoid:
             return self._turn_away(world, inputs.pose)
         return self._straight(world, inputs.pose)
 
-    def _wait(self, reason: str, activity: str = "waiting") -> Step:
+    def _wait(self, reason: str, activity: str = "waiting") -> StepResult:
         self._activity, self._turn = activity, ""
         text = f"{activity}: {reason}"
         intent = Intent(twist=Velocity(), behaviour="avoid", reason=text)
-        return intent, Outcome(activity=activity, reason=text)
+        return intent, StepOutcome(activity=activity, reason=text)
 
-    def _straight(self, world: WorldModel, pose: Pose) -> Step:
+    def _straight(self, world: WorldModel, pose: Pose) -> StepResult:
         if self._activity != "forward":
             free = world.sectors[0] if world.sectors else None
             self._begin("forward", pose, MAX_LEG_M if free is None else free)
@@ -78,7 +77,7 @@ class Avoid:
         text = f"forward {speed:.2f} m/s"
         return self._step(Velocity(linear_x=speed), driven, text, activity=text)
 
-    def _turn_away(self, world: WorldModel, pose: Pose) -> Step:
+    def _turn_away(self, world: WorldModel, pose: Pose) -> StepResult:
         if not self._turn:
             side = self._side(world)
             self._begin(f"turning {side}", pose, TURN_RAD, side)
@@ -104,7 +103,7 @@ class Avoid:
         self._start, self._progress = pose, 0.0
         self._expected = max(expected, 0.1)
 
-    def _step(self, twist: Velocity, done: float, reason: str, *, activity: str) -> Step:
+    def _step(self, twist: Velocity, done: float, reason: str, *, activity: str) -> StepResult:
         self._progress = min(1.0, max(self._progress, done / self._expected))
         intent = Intent(
             twist=twist,
@@ -113,7 +112,7 @@ class Avoid:
             behaviour="avoid",
             reason=reason,
         )
-        return intent, Outcome(activity=activity, reason=reason, progress=self._progress)
+        return intent, StepOutcome(activity=activity, reason=reason, progress=self._progress)
 
 
 @lru_cache(maxsize=16)

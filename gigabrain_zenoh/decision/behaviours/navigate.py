@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from gigabrain_zenoh.decision.behaviours import Inputs, NavigationConfig, Step
+from gigabrain_zenoh.decision.behaviours import Inputs, NavigationConfig, StepResult
 
 
 class Navigate:
@@ -21,7 +21,7 @@ class Navigate:
     def configure(self, config: NavigationConfig) -> None:
         """Keep nothing: the navigator has the settings."""
 
-    def step(self, inputs: Inputs) -> Step:
+    def step(self, inputs: Inputs) -> StepResult:
         """Carry out the present command."""
         assert inputs.drive
         return inputs.drive(inputs.command)

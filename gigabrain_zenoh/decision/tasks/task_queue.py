@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 from msgspec import Struct
@@ -10,11 +11,17 @@ from py_trees.common import Status
 
 from gigabrain_schemas.tasks import Goal, How, Task, TaskState, TaskStatus
 from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.decision.behaviours import DriveCommand, Idle, StepOutcome, describe_goal
+from gigabrain_zenoh.decision.tasks.behaviour_tree import (
+    MissionContext,
+    Progress,
+    StartScript,
+    TreeBuilder,
+    progress_of,
+    restore,
+)
 from gigabrain_zenoh.decision.tasks.conditions import Read
-from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand, Idle, Outcome, describe_goal
 from gigabrain_zenoh.decision.tasks.mission import Mission, goal_mission, loads
-from gigabrain_zenoh.decision.tasks.tree_builder import Job, SavedJob
-from gigabrain_zenoh.decision.tasks.tree_nodes import MissionContext, StartScript
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.files import make_folder, read_bounded, replace_file
 
@@ -22,6 +29,61 @@ MAX_QUEUED, MAX_DONE = 32, 16
 MAX_FILE_BYTES = 1_000_000
 AFTER_A_RESTART = "the robot was restarted; resume the task, or cancel it"
 NO_GOAL = Idle("waiting", "waiting: for a goal")
+
+
+class SavedJob(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """A task as the file holds it."""
+
+    id: str
+    kind: Literal["goal", "mission"]
+    label: str
+    source: str
+    mission: str  # as JSON, which is YAML too
+    held: bool = False
+    memory: Progress = {}
+
+
+class Job:
+    """A task with the tree of its mission. A goal is a mission of one step."""
+
+    def __init__(self, saved: SavedJob, mission: Mission, context: MissionContext) -> None:
+        self._saved, self.context = saved, context
+        self.id, self.held = saved.id, saved.held  # held: paused by a person
+        self.begun = bool(saved.memory)
+        self.why_held = ""
+        self._root = TreeBuilder(mission, context).tree()
+        restore(self._root, saved.memory)
+
+    def step(self, seconds: float, outcome: StepOutcome | None) -> Status:
+        """Tick the tree once, `seconds` after the last tick."""
+        self.context.begin(seconds if self.begun else 0.0, outcome)
+        self.begun = True
+        self._root.tick_once()
+        return self._root.status
+
+    def stop(self) -> None:
+        """Stop all nodes."""
+        self._root.stop(Status.INVALID)
+
+    @property
+    def saved(self) -> SavedJob:
+        """The part that survives a restart."""
+        return SavedJob(
+            id=self.id, kind=self._saved.kind, label=self._saved.label, source=self._saved.source,
+            mission=self._saved.mission, held=self.held,
+            memory=progress_of(self._root, self.context.free_s),
+        )  # fmt: skip
+
+    def task(self, state: TaskState, reason: str = "", outcome: StepOutcome | None = None) -> Task:
+        """Return the task as published; a goal that has ended has its errors from `outcome`."""
+        saved = self._saved
+        measured = outcome if saved.kind == "goal" else None
+        return Task(
+            id=self.id, kind=saved.kind, label=saved.label[:64], source=saved.source[:64],
+            state=state, reason=reason[:500],
+            position_error=measured.position_error if measured else None,
+            heading_error=measured.heading_error if measured else None,
+        )  # fmt: skip
 
 
 class Saved(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag="gigabrain tasks"):
@@ -40,7 +102,7 @@ class TaskQueue:
         self._count, self._boot = saved.count, saved.boot
         self._jobs: list[Job] = []
         self._done: list[Task] = []
-        self._outcome: Outcome | None = None
+        self._outcome: StepOutcome | None = None
         for one in saved.jobs:
             try:
                 mission = loads(one.mission, one.label)
@@ -90,21 +152,24 @@ class TaskQueue:
         job.held, job.why_held = False, ""
         return f"{job.id} goes on"
 
-    def step(self, seconds: float, outcome: Outcome | None) -> DriveCommand | None:
-        """Advance by `seconds` with the last command's outcome; return the next command."""
+    def step(self, seconds: float, outcome: StepOutcome | None) -> tuple[DriveCommand | None, Idle]:
+        """Advance by `seconds` with the last command's outcome.
+
+        Return the next command, and why the robot stands if there is none.
+        """
         self._outcome = outcome
         while self._jobs:
             job = self._jobs[0]
             if job.held:
-                return None
-            status = job.step(seconds, outcome)
+                return None, Idle(f"{job.id} is paused", f"{job.id} is paused: {job.why_held}")
+            status, doing = job.step(seconds, outcome), job.context.doing
             if status is Status.RUNNING:
-                return job.context.command
+                return job.context.command, Idle(doing, doing) if doing else NO_GOAL
             succeeded = status is Status.SUCCESS
             reason = outcome.reason if outcome and succeeded else job.context.problem
             self._end(job, "succeeded" if succeeded else "failed", reason, outcome)
             outcome, seconds = None, 0.0
-        return None
+        return None, NO_GOAL
 
     def knows(self, boot: int) -> bool:
         """Return whether it, or its file, was last used in this start of the driver."""
@@ -114,17 +179,6 @@ class TaskQueue:
     def empty(self) -> bool:
         """Whether there is no task."""
         return not self._jobs
-
-    @property
-    def idle(self) -> Idle:
-        """Why the robot stands where `step` returns no command."""
-        if not self._jobs:
-            return NO_GOAL
-        job = self._jobs[0]
-        if job.held:
-            return Idle(f"{job.id} is paused", f"{job.id} is paused: {job.why_held}")
-        doing = job.context.doing
-        return Idle(doing, doing) if doing else NO_GOAL
 
     @property
     def saved(self) -> Saved:
@@ -145,7 +199,7 @@ class TaskQueue:
         context, outcome = job.context, self._outcome
         command = context.command
         if command is None or outcome is None or outcome.number != command.number:
-            outcome = Outcome(progress=context.progress or 0.0, eta=context.left_s)
+            outcome = StepOutcome(progress=context.progress or 0.0, eta=context.left_s)
         return TaskStatus(
             current=job.task("active", outcome.reason or context.doing),
             doing=context.doing[:500],
@@ -188,7 +242,9 @@ class TaskQueue:
         known = ", ".join(job.id for job in self._jobs)
         raise Refused(f"there is no task {name!r} any more; there is: {known}")
 
-    def _end(self, job: Job, state: TaskState, reason: str, outcome: Outcome | None = None) -> None:
+    def _end(
+        self, job: Job, state: TaskState, reason: str, outcome: StepOutcome | None = None
+    ) -> None:
         self._jobs.remove(job)
         job.stop()
         self._done = [job.task(state, reason, outcome), *self._done][:MAX_DONE]

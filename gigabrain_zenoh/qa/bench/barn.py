@@ -19,7 +19,7 @@ from gigabrain_schemas.base import TICK_S, Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
 from gigabrain_schemas.brain import CmdVel, Intent, PoseInMap, WorldModel
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.tasks import GoalRequest
+from gigabrain_schemas.tasks import Goal, GoalRequest
 from gigabrain_schemas.topics import GOAL, MAP, POSE, STATE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import DecisionConfig, PerceptionConfig
@@ -32,7 +32,6 @@ from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of, ramp
 from gigabrain_zenoh.host.bounded import percentile
 from gigabrain_zenoh.navigation import local_planner
 from gigabrain_zenoh.navigation.local_planner import (
-    Goal,
     LocalPlanner,
     LocalSettings,
     PlanRequest,

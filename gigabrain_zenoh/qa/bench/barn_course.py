@@ -17,11 +17,11 @@ from gigabrain_schemas.arrays import Floats, ranges_bytes
 from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Lidar, RobotState, Thresholds
 from gigabrain_schemas.sensors import LaserScan
+from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.geometry.pose import to_frame
 from gigabrain_zenoh.kernels.jit import kernel
-from gigabrain_zenoh.navigation.local_planner import Goal
 
 SUBSTEPS = 4  # of a tick
 ACCELERATION, ANGULAR_ACCELERATION = 5.0, 20.0  # [m/s2], [rad/s2], what the floor takes

@@ -10,7 +10,7 @@ import pytest
 from gigabrain_schemas.tasks import GoalReply, GoalRequest, TaskStatus
 from gigabrain_schemas.topics import GOAL
 from gigabrain_zenoh.client.tasks import Tasks
-from gigabrain_zenoh.decision.tasks.drive_command import Outcome
+from gigabrain_zenoh.decision.behaviours import StepOutcome
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import until
@@ -30,7 +30,7 @@ async def test_a_script_hears_how_its_goal_ended(site: Site) -> None:
     waiting = asyncio.ensure_future(tasks.result(name, seen.append))
     await site.step(10)
     assert site.command
-    site.outcome = Outcome(number=site.command.number, state="failed", reason="a wall")
+    site.outcome = StepOutcome(number=site.command.number, state="failed", reason="a wall")
     await site.step(10)
     end = await waiting
     assert (end.id, end.state, end.reason) == ("goal-1", "failed", "a wall")

@@ -20,9 +20,9 @@ from gigabrain_schemas.tasks import (
     TaskStatus,
 )
 from gigabrain_schemas.topics import GOAL, MISSION, STATE, TASK, TASK_CHANGE, Topic
+from gigabrain_zenoh.decision.behaviours import DriveCommand, StepOutcome
 from gigabrain_zenoh.decision.goal_server import TaskServer
 from gigabrain_zenoh.decision.tasks import mission as missions
-from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand, Outcome
 from gigabrain_zenoh.decision.tasks.mission import Script
 from gigabrain_zenoh.decision.tasks.task_queue import Saved, TaskQueue
 from gigabrain_zenoh.errors import Refused
@@ -52,14 +52,14 @@ class Robot:
         self.pose: PoseInMap | None = None
         self.tasks = TaskQueue(self._read, self._start, saved or Saved())
         self.command: DriveCommand | None = None
-        self.outcome: Outcome | None = None
+        self.outcome: StepOutcome | None = None
 
     def carry_out(self, text: str, how: Any = "replace") -> str:
         return self.tasks.add_mission(missions.loads(PLACES + text, "m"), "m", how, "ann")
 
     def step(self, seconds: float = 0.1) -> float | str | None:
         """One step; where the robot is wanted: x of a goal, `explore`, or nowhere."""
-        self.command = self.tasks.step(seconds, self.outcome)
+        self.command, _ = self.tasks.step(seconds, self.outcome)
         self.outcome = None
         return _short(self.command)
 
@@ -82,7 +82,7 @@ class Robot:
 
     def _became(self, state: Any, reason: str) -> float | str | None:
         assert self.command
-        self.outcome = Outcome(number=self.command.number, state=state, reason=reason)
+        self.outcome = StepOutcome(number=self.command.number, state=state, reason=reason)
         return self.step()
 
     def _read(self, topic: Topic[Any]) -> Message | None:
@@ -113,22 +113,19 @@ class Site:
     def __init__(self, folder: Path, *, scripts: str = "") -> None:
         self.net = Net()
         self.wall, self.lost = "", ""
-        self.service = TaskServer(self.net.one, self, folder=str(folder), scripts=scripts)
+        self.service = TaskServer(self.net.one, self._check, folder=str(folder), scripts=scripts)
         self.told: list[TaskStatus] = []
         self.net.two.subscribe(TASK, lambda _key, status: self.told.append(status))
         self.tick, self.command, self.outcome = 0, None, None
         self.command: DriveCommand | None
-        self.outcome: Outcome | None
+        self.outcome: StepOutcome | None
 
-    async def check_goal(self, goal: Goal) -> str:
-        await self.check_located()
-        if self.wall:
-            raise Refused(self.wall)
-        return "on the way, 4.2 m"
-
-    async def check_located(self) -> None:
+    async def _check(self, goal: Goal | None) -> str:
         if self.lost:
             raise Refused(self.lost)
+        if goal and self.wall:
+            raise Refused(self.wall)
+        return "on the way, 4.2 m"
 
     async def go(self, x: float, **how: str) -> GoalReply:
         request = msgspec.convert({"x": x, "y": 0.0, "source": "ann"} | how, GoalRequest)
@@ -145,7 +142,7 @@ class Site:
     async def step(self, ticks: int = 5, boot: int = BOOT) -> None:
         self.tick += ticks
         self.net.one.time.see(state(self.tick, boot=boot))
-        self.command = self.service.step(state(self.tick, boot=boot), self.outcome)
+        self.command, _ = self.service.step(state(self.tick, boot=boot), self.outcome)
         self.outcome = None
         await settle()
 

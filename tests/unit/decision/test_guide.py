@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from gigabrain_schemas.base import Pose
 from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.decision.behaviours import DriveCommand
 from gigabrain_zenoh.decision.route import (
     PathCheck,
     Route,
@@ -17,7 +18,6 @@ from gigabrain_zenoh.decision.route import (
     RoutePlanner,
     RouteRequest,
 )
-from gigabrain_zenoh.decision.tasks.drive_command import DriveCommand
 from gigabrain_zenoh.navigation.global_planner import Unreachable
 from tests.unit.navigation.drives import WAFFLE
 from tests.unit.navigation.grids import empty, grid_of

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 from gigabrain_schemas.tasks import Goal
-from gigabrain_zenoh.decision.tasks.drive_command import describe_end
+from gigabrain_zenoh.decision.behaviours import describe_end
 from gigabrain_zenoh.errors import Refused
 from tests.unit.decision.sites import Robot, one_robot
 

@@ -11,8 +11,8 @@ from gigabrain_schemas.input_log import AcceptedRequest
 from gigabrain_schemas.tasks import Goal, GoalReply, GoalRequest
 from gigabrain_schemas.topics import REQUEST_LOG
 from gigabrain_zenoh.decision import goal_server
+from gigabrain_zenoh.decision.behaviours import StepOutcome
 from gigabrain_zenoh.decision.tasks import mission
-from gigabrain_zenoh.decision.tasks.drive_command import Outcome
 from gigabrain_zenoh.decision.tasks.mission import Mission
 from gigabrain_zenoh.decision.tasks.task_queue import TaskFile
 from gigabrain_zenoh.testing.samples import BOOT, state
@@ -33,11 +33,11 @@ async def test_a_goal_is_accepted_with_its_way_and_told_from_then_on(site: Site)
     assert site.command
     assert site.command.goal
     assert site.command.goal == Goal(x=3.0, y=0.0)
-    site.outcome = Outcome(number=site.command.number, progress=0.5, distance=2.1, eta=8.0)
+    site.outcome = StepOutcome(number=site.command.number, progress=0.5, distance=2.1, eta=8.0)
     await site.step(10)
     now = site.told[-1]
     assert (now.doing, now.progress, now.distance_remaining) == ("going to (3.00, 0.00)", 0.5, 2.1)
-    site.outcome = Outcome(number=site.command.number, state="done", reason="at (3.00, 0.00)")
+    site.outcome = StepOutcome(number=site.command.number, state="done", reason="at (3.00, 0.00)")
     await site.step()
     assert [(task.id, task.state) for task in site.told[-1].done] == [("goal-1", "succeeded")]
     assert site.told[-1].current is None

@@ -10,9 +10,9 @@ from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_S, Pose, Velocity
 from gigabrain_schemas.body import BodyDescription, Lidar
 from gigabrain_schemas.brain import ActuationModel, Obstacle
+from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.geometry.sweep import depth, edges
 from gigabrain_zenoh.navigation.local_planner import (
-    Goal,
     LocalPlan,
     LocalPlanner,
     LocalSettings,

@@ -9,12 +9,12 @@ import pytest
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import Obstacle
+from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.navigation import cost, dynamic_obstacles
 from gigabrain_zenoh.navigation.cost import NO_DISC, Weights
 from gigabrain_zenoh.navigation.footprint import outline_of
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
 from gigabrain_zenoh.navigation.local_planner import (
-    Goal,
     LocalPlan,
     LocalPlanner,
     LocalSettings,

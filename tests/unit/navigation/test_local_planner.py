@@ -9,7 +9,8 @@ from msgspec.structs import replace
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_schemas.brain import ActuationModel, Obstacle
-from gigabrain_zenoh.navigation.local_planner import Goal, LocalPlanner, PlanRequest, SentCommand
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.navigation.local_planner import LocalPlanner, PlanRequest, SentCommand
 from tests.unit.navigation.drives import CAR, OMNI, QUICK, WAFFLE, Drive, wall
 
 NOTHING = np.empty((0, 2))

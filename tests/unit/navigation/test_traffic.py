@@ -8,6 +8,7 @@ import pytest
 
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.brain import Obstacle
+from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.decision.navigator import ANY_BODY
 from gigabrain_zenoh.navigation import cost_to_go, dynamic_obstacles, local_planner
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
@@ -15,7 +16,6 @@ from gigabrain_zenoh.navigation.dynamic_obstacles import UPDATE_TICKS, TrafficMa
 from gigabrain_zenoh.navigation.footprint import distance_at
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
 from gigabrain_zenoh.navigation.local_planner import (
-    Goal,
     LocalPlan,
     LocalPlanner,
     LocalSettings,

@@ -12,7 +12,7 @@ from gigabrain_schemas.brain import WorldModel
 from gigabrain_schemas.topics import WORLD
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.decision import node as decision
-from gigabrain_zenoh.decision.node import WorldOnly
+from gigabrain_zenoh.decision.node import InputSource
 from gigabrain_zenoh.host.threads import ScheduledWorker
 from gigabrain_zenoh.qa.faults.rig.broken_process import HANGING_TOPICS, HangingBus
 from gigabrain_zenoh.runtime.heartbeat import LOOK_S, Progress, Silence
@@ -192,7 +192,7 @@ async def test_a_plan_that_never_ends_is_no_progress(
     beside = ScheduledWorker(0.0)
     beside.start(lambda: ends.wait(20.0) and list, 2)  # type: ignore[arg-type,return-value]
 
-    class Hanging(WorldOnly):
+    class Hanging(InputSource):
         @property
         def hung(self) -> bool:  # type: ignore[override]
             return beside.overdue > 200

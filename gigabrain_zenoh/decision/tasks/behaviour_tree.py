@@ -1,24 +1,38 @@
-"""Behaviour-tree nodes of missions, besides those of py-trees. They use the robot's time."""
+"""Behaviour trees of missions: own nodes for py-trees, the builder, and their progress on disk.
+
+All nodes use the robot's time.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Annotated, Protocol
 
+from msgspec import Meta
 from py_trees.behaviour import Behaviour
 from py_trees.common import Status
-from py_trees.decorators import Decorator
+from py_trees.composites import Selector, Sequence
+from py_trees.decorators import Decorator, Repeat, Retry
 
-from gigabrain_zenoh.decision.tasks.drive_command import (
+from gigabrain_schemas.tasks import Goal
+from gigabrain_zenoh.decision.behaviours import (
     DriveCommand,
     DriveKind,
-    Outcome,
+    StepOutcome,
     describe_goal,
 )
+from gigabrain_zenoh.decision.tasks.conditions import Condition, Read, parse
+from gigabrain_zenoh.decision.tasks.mission import (
+    BatteryBelow,
+    Mission,
+    Patrol,
+    Place,
+    Script,
+    Step,
+)
 
-if TYPE_CHECKING:
-    from gigabrain_schemas.tasks import Goal
-    from gigabrain_zenoh.decision.tasks.conditions import Condition, Read
-    from gigabrain_zenoh.decision.tasks.mission import Script
+FOREVER = -1  # for py-trees
+Index = Annotated[float, Meta(ge=0, le=1e9)]
+Progress = dict[str, Index]  # of each running node, by its number in depth-first order
 
 
 class RunningScript(Protocol):
@@ -34,19 +48,19 @@ class RunningScript(Protocol):
         ...
 
 
-StartScript = Callable[["Script"], RunningScript]
+StartScript = Callable[[Script], RunningScript]
 
 
 @dataclass
 class MissionContext:
     """Inputs and outputs of a mission's nodes in one tick. Time stops while a mission waits."""
 
-    read: "Read"
+    read: Read
     start: StartScript
     numbers: Iterator[int]  # of drive commands, each only once
     now_s: float = 0.0
     held_s: float = 0.0  # of that, while the body did not follow a command
-    outcome: Outcome | None = None  # of the command of the last tick
+    outcome: StepOutcome | None = None  # of the command of the last tick
     command: DriveCommand | None = None  # of the active node
     doing: str = ""  # the active step, for people
     problem: str = ""  # the last failure, for people
@@ -58,7 +72,7 @@ class MissionContext:
         """Time that the mission has run while nothing held the body [s]."""
         return self.now_s - self.held_s
 
-    def begin(self, seconds: float, outcome: Outcome | None) -> None:
+    def begin(self, seconds: float, outcome: StepOutcome | None) -> None:
         """Begin the next tick, `seconds` after the last."""
         self.now_s += seconds
         if outcome and outcome.held:
@@ -80,11 +94,11 @@ class Leaf(Behaviour):
         return Status.FAILURE
 
 
-class Drive(Leaf):
+class DriveNode(Leaf):
     """Issues a drive command, and ends with its outcome."""
 
     def __init__(
-        self, kind: DriveKind, context: MissionContext, goal: "Goal | None" = None, place: str = ""
+        self, kind: DriveKind, context: MissionContext, goal: Goal | None = None, place: str = ""
     ) -> None:
         doing = {"explore": "exploring", "visit": "visiting a place"}.get(kind)
         super().__init__(doing or f"going to {place or (goal and describe_goal(goal))}", context)
@@ -107,7 +121,7 @@ class Drive(Leaf):
         return Status.RUNNING
 
 
-class Wait(Leaf):
+class WaitNode(Leaf):
     """Succeeds after some seconds of the robot's time."""
 
     def __init__(self, seconds: float, context: MissionContext) -> None:
@@ -128,28 +142,28 @@ class Wait(Leaf):
         return Status.RUNNING
 
 
-class WaitUntil(Leaf):
+class WaitUntilNode(Leaf):
     """Succeeds once a condition holds. An unknown value does not hold."""
 
-    def __init__(self, condition: "Condition", context: MissionContext) -> None:
+    def __init__(self, condition: Condition, context: MissionContext) -> None:
         super().__init__(f"waiting until {condition.text}", context)
         self._condition = condition
 
     def update(self) -> Status:
-        """Check the condition."""
+        """Evaluate the condition."""
         self.context.doing = self.name
         return Status.SUCCESS if self._condition.holds(self.context.read) else Status.RUNNING
 
 
-class Check(Leaf):
+class CheckNode(Leaf):
     """Succeeds if a condition holds, and fails if it does not or is unknown."""
 
-    def __init__(self, condition: "Condition", context: MissionContext) -> None:
+    def __init__(self, condition: Condition, context: MissionContext) -> None:
         super().__init__(f"checking {condition.text}", context)
         self._condition = condition
 
     def update(self) -> Status:
-        """Check the condition once."""
+        """Evaluate the condition once."""
         self.context.doing = self.name
         holds = self._condition.holds(self.context.read)
         if holds:
@@ -158,10 +172,10 @@ class Check(Leaf):
         return self.failed(f"{self._condition.text} {why}")
 
 
-class RunScript(Leaf):
+class ScriptNode(Leaf):
     """Runs a program of the host, which ends with the node."""
 
-    def __init__(self, script: "Script", context: MissionContext) -> None:
+    def __init__(self, script: Script, context: MissionContext) -> None:
         super().__init__(f"running {script.run}", context)
         self._script = script
         self._running: RunningScript | None = None
@@ -185,7 +199,7 @@ class RunScript(Leaf):
             self._running = None
 
 
-class Timeout(Decorator):
+class TimeoutNode(Decorator):
     """Fails if its child takes longer than some seconds of the robot's time.
 
     The clock stops while the gate or an operator holds the body.
@@ -212,11 +226,11 @@ class Timeout(Decorator):
         return self.decorated.status
 
 
-class Guard(Behaviour):
+class GuardNode(Behaviour):
     """Ticks `then` to its end whenever a condition holds, otherwise `do`, which then continues."""
 
     def __init__(
-        self, condition: "Condition", then: Behaviour, do: Behaviour, context: MissionContext
+        self, condition: Condition, then: Behaviour, do: Behaviour, context: MissionContext
     ) -> None:
         super().__init__(f"while not {condition.text}")
         self._condition, self._context = condition, context
@@ -259,3 +273,133 @@ class Guard(Behaviour):
             if child.status is Status.RUNNING or new_status is Status.INVALID:
                 child.stop(Status.INVALID)
         super().stop(new_status)
+
+
+class TreeBuilder:
+    """Builds the nodes of one mission, which share one context."""
+
+    def __init__(self, mission: Mission, context: MissionContext) -> None:
+        self._mission, self._context = mission, context
+
+    def tree(self) -> Behaviour:
+        """Return the root of the whole mission."""
+        return self._sequence(self._mission.do)
+
+    def _sequence(self, steps: tuple[Step, ...]) -> Behaviour:
+        if len(steps) == 1:
+            return self._node(steps[0])
+        return Sequence("sequence", memory=True, children=[self._node(step) for step in steps])
+
+    def _node(self, step: Step) -> Behaviour:
+        leaf = self._leaf(step)
+        if leaf:
+            return leaf
+        if step.patrol:
+            return self._patrol(step.patrol)
+        if step.tree is not None:
+            return self._sequence(self._mission.trees[step.tree])
+        if step.sequence:
+            return self._sequence(step.sequence)
+        if step.fallback:
+            children = [self._node(inner) for inner in step.fallback]
+            return Selector("fallback", memory=True, children=children)
+        return self._decorated(step)
+
+    def _leaf(self, step: Step) -> Behaviour | None:
+        context = self._context
+        if step.goto is not None:
+            return self._go_to(step.goto)
+        if step.explore or step.visit:
+            return DriveNode("explore" if step.explore else "visit", context)
+        if step.wait is not None:
+            return WaitNode(step.wait, context)
+        if step.wait_until is not None:
+            return WaitUntilNode(parse(step.wait_until), context)
+        if step.check is not None:
+            return CheckNode(parse(step.check), context)
+        return ScriptNode(step.script, context) if step.script else None
+
+    def _decorated(self, step: Step) -> Behaviour:
+        if step.retry:
+            child = self._sequence(step.retry.do)
+            return Retry(f"up to {step.retry.times} times", child, step.retry.times)
+        if step.repeat:
+            return _repeated(self._sequence(step.repeat.do), step.repeat.times)
+        if step.timeout:
+            child = self._sequence(step.timeout.do)
+            return TimeoutNode(child, step.timeout.seconds, self._context)
+        if step.guard:
+            then, do = self._sequence(step.guard.then), self._sequence(step.guard.do)
+            return GuardNode(parse(step.guard.when), then, do, self._context)
+        assert step.battery_below
+        return self._battery(step.battery_below)
+
+    def _battery(self, low: BatteryBelow) -> Behaviour:
+        then = self._go_to(low.goto)
+        if low.until is not None:
+            charged = parse(f"battery.percentage >= {low.until:g}")
+            wait = WaitUntilNode(charged, self._context)
+            then = Sequence("charge", memory=True, children=[then, wait])
+        when = parse(f"battery.percentage < {low.percentage:g}")
+        return GuardNode(when, then, self._sequence(low.do), self._context)
+
+    def _patrol(self, patrol: Patrol) -> Behaviour:
+        children: list[Behaviour] = []
+        for place in patrol.points:
+            children.append(self._go_to(place))
+            if patrol.wait:
+                children.append(WaitNode(patrol.wait, self._context))
+        return _repeated(Sequence("round", memory=True, children=children), patrol.loops)
+
+    def _go_to(self, place: Place) -> Behaviour:
+        name = place if isinstance(place, str) else ""
+        return DriveNode("goto", self._context, self._mission.goal(place), name)
+
+
+def _repeated(child: Behaviour, times: int | None) -> Behaviour:
+    return Repeat("for ever" if times is None else f"{times} times", child, times or FOREVER)
+
+
+def progress_of(root: Behaviour, free_s: float) -> Progress:
+    """Return how far the running nodes below `root` have come; leaves have no progress."""
+    progress: Progress = {}
+    for number, node in enumerate(_nodes(root)):
+        if node.status is not Status.RUNNING:
+            continue
+        if isinstance(node, Sequence | Selector) and node.current_child:
+            progress[str(number)] = node.children.index(node.current_child)
+        elif isinstance(node, Retry):
+            progress[str(number)] = node.failures
+        elif isinstance(node, Repeat):
+            progress[str(number)] = node.success
+        elif isinstance(node, TimeoutNode):
+            progress[str(number)] = round(free_s - node.began_s, -1)  # coarse: each change is saved
+        elif isinstance(node, GuardNode):
+            progress[str(number)] = node.interrupted
+    return progress
+
+
+def restore(root: Behaviour, progress: Progress) -> None:
+    """Let the nodes below `root` continue from `progress`; leaves start again."""
+    for number, node in enumerate(_nodes(root)):
+        if str(number) not in progress:
+            continue
+        value = progress[str(number)]
+        if isinstance(node, Sequence | Selector):
+            node.current_child = node.children[min(int(value), len(node.children) - 1)]
+        elif isinstance(node, Retry):
+            node.failures = int(value)
+        elif isinstance(node, Repeat):
+            node.success = int(value)
+        elif isinstance(node, TimeoutNode):
+            node.began_s = -value
+        elif isinstance(node, GuardNode):
+            node.interrupted = bool(value)
+        else:
+            continue
+        node.status = Status.RUNNING
+
+
+def _nodes(root: Behaviour) -> list[Behaviour]:
+    """Return `root` and all nodes below it, depth first."""
+    return [root, *(node for child in root.children for node in _nodes(child))]
