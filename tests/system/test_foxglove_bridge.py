@@ -26,8 +26,8 @@ from gigabrain_zenoh.testing.processes import Home, free_port, listens
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.foxglove.access import topic_to_steer, write_layout
 from gigabrain_zenoh.ui.page.access import token_file, tokens
-from tests.unit.ui.foxglove_bridge import Bridge, bridged, hold
-from tests.unit.ui.foxglove_viewer import Viewer, fields
+from tests.system.foxglove_bridge import Bridge, bridged, hold
+from tests.system.foxglove_viewer import Viewer, fields
 
 LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}
 

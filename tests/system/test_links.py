@@ -12,7 +12,7 @@ from gigabrain_drivers.links import serial_link
 from gigabrain_drivers.links.serial_link import SerialLink, open_port
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.testing.waiting import until
-from tests.unit.drivers.links import Heard
+from tests.system.links import Heard
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_drivers.links.tcp_link import TcpLink
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.testing.waiting import until
-from tests.unit.drivers.links import Heard
+from tests.system.links import Heard
 
 
 class Flaky(Link):

@@ -6,7 +6,7 @@ from gigabrain_drivers.lidars.rplidar import protocol as rplidar
 from gigabrain_drivers.lidars.rplidar.emulator import RplidarDevice
 from gigabrain_drivers.lidars.rplidar.protocol import EXPRESS, STANDARD, Info, RplidarDecoder
 from gigabrain_drivers.lidars.rplidar.source import RplidarOptions, Trouble, choose
-from tests.unit.drivers.lidars import Wire, run_for, waffle
+from tests.system.lidars import Wire, run_for, waffle
 
 
 def decoded(model: Any, request: bytes, seconds: float) -> tuple[bytes, RplidarDecoder, int]:

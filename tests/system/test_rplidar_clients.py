@@ -21,7 +21,7 @@ import serial
 
 from gigabrain_drivers.lidars.rplidar.emulator import RplidarDevice
 from gigabrain_drivers.lidars.rplidar.source import RplidarOptions
-from tests.unit.drivers.lidars import emulated, truth
+from tests.system.lidars import emulated, truth
 
 Point = tuple[float, float]  # [deg] clockwise, [mm]
 

@@ -22,7 +22,7 @@ from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.testing.waiting import until
-from tests.unit.drivers.lidars import LIDAR, Listener, Wire, agree, emulated, run_for, truth, waffle
+from tests.system.lidars import LIDAR, Listener, Wire, agree, emulated, run_for, truth, waffle
 
 MS = 1_000_000
 COARSE = Lidar(beams=180, rate_hz=10, range_min=0.16, range_max=3.5)

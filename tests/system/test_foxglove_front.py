@@ -11,7 +11,7 @@ from websockets.exceptions import InvalidStatus
 
 from gigabrain_zenoh.ui.foxglove import access
 from gigabrain_zenoh.ui.foxglove.access import Front, hidden_host
-from tests.unit.ui.foxglove_bridge import Bridge, bridged
+from tests.system.foxglove_bridge import Bridge, bridged
 
 HEAD = "GET / HTTP/1.1\r\nHost: 127.0.0.1:8765\r\nUpgrade: websocket\r\n{}\r\n\r\n"
 

@@ -20,7 +20,7 @@ from gigabrain_zenoh.qa.proxy.serial import LineProxy
 from gigabrain_zenoh.safety.latency import SpeedDelay
 from gigabrain_zenoh.testing.line import EmulatedLine
 from gigabrain_zenoh.testing.waiting import until
-from tests.unit.drivers.lidars import LIDAR, Listener, emulated
+from tests.system.lidars import LIDAR, Listener, emulated
 
 
 async def test_an_emulated_ld19_behind_a_late_line_says_so(tmp_path: Path) -> None:

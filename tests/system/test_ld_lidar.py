@@ -16,7 +16,7 @@ from gigabrain_schemas.arrays import ranges
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.testing.waiting import until
-from tests.unit.drivers.lidars import LIDAR, Listener, Wire, agree, emulated, run_for, truth, waffle
+from tests.system.lidars import LIDAR, Listener, Wire, agree, emulated, run_for, truth, waffle
 
 SMALL = Lidar(beams=8, rate_hz=10, range_min=0.1, range_max=3.0)
 MS = 1_000_000

@@ -18,7 +18,7 @@ from gigabrain_zenoh.config.settings import FoxgloveConfig
 from gigabrain_zenoh.testing.processes import free_port
 from gigabrain_zenoh.testing.waiting import PATIENCE_S
 from gigabrain_zenoh.ui.foxglove.node import run
-from tests.unit.ui.foxglove_viewer import Viewer
+from tests.system.foxglove_viewer import Viewer
 
 
 class Bridge:

@@ -8,7 +8,7 @@ import pytest
 from gigabrain_drivers.links.tcp_link import TcpLink
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.testing.waiting import PATIENCE_S, until
-from tests.unit.drivers.links import Heard
+from tests.system.links import Heard
 
 
 def server() -> socket.socket:

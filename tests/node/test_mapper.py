@@ -18,8 +18,8 @@ from gigabrain_zenoh.mapping import map_file, occupancy_grid
 from gigabrain_zenoh.perception.mapper import chart_of
 from gigabrain_zenoh.runtime.services import publish_health
 from gigabrain_zenoh.testing.samples import scan, state
+from tests.node.mapping_robot import Robot
 from tests.unit.mapping.houses import HOUSE, Rooms, at, drawn
-from tests.unit.perception.mapping_robot import Robot
 
 START = at(3.0, 2.0)
 

@@ -14,7 +14,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.testing.waiting import until
-from tests.unit.drivers.lidars import agree, emulated, truth
+from tests.system.lidars import agree, emulated, truth
 
 BODY = """\
 summary: a body in memory that carries a lidar

@@ -16,7 +16,7 @@ from gigabrain_zenoh.mapping.slam_map import Still
 from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
-from tests.unit.perception.mapping_robot import SLAM, Robot
+from tests.node.mapping_robot import SLAM, Robot
 
 
 @pytest.fixture(autouse=True)

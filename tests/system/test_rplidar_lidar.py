@@ -21,7 +21,7 @@ from gigabrain_drivers.lidars.rplidar.source import Rplidar, RplidarOptions
 from gigabrain_schemas.arrays import ranges
 from gigabrain_zenoh.clock import Clock, FakeClock
 from gigabrain_zenoh.testing.waiting import until
-from tests.unit.drivers.lidars import LIDAR, Listener, agree, emulated, truth
+from tests.system.lidars import LIDAR, Listener, agree, emulated, truth
 
 
 def options(folder: Path, **settings: Any) -> RplidarOptions:

@@ -21,7 +21,7 @@ from gigabrain_zenoh.perception import node as perception
 from gigabrain_zenoh.recording.process_replay import with_requests
 from gigabrain_zenoh.runtime.replay import record, replay
 from gigabrain_zenoh.testing.samples import state
-from tests.unit.perception.mapping_robot import Robot
+from tests.node.mapping_robot import Robot
 
 SCANS_IN_5_S = 50
 Usage = namedtuple("Usage", "total used free")
