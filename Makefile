@@ -14,7 +14,7 @@ PYTEST := $(BIN)/pytest
 SIDE_BY_SIDE := -n 2 --dist loadfile
 MAKEFLAGS += --no-print-directory
 
-.PHONY: setup demo lint unit node system check test qa qa-tests extremes dockerfile signals \
+.PHONY: setup demo lint style rooms types unit node system check test qa qa-tests extremes dockerfile signals \
   ci-extra bench faults soak mutation fuzz golden recordings pictures clean
 
 setup: $(WARM)
@@ -42,11 +42,19 @@ demo: setup
 
 # ---- checks ----
 
+# side by side, as mypy takes one core without a cache
 lint: $(INSTALLED)
+	@$(MAKE) -j2 types style rooms
+
+style: $(INSTALLED)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+
+rooms: $(INSTALLED)
 	$(BIN)/lint-imports
 	$(BIN)/python -m gigabrain_zenoh.qa.house
+
+types: $(INSTALLED)
 	$(BIN)/mypy
 
 unit: setup

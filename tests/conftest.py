@@ -1,5 +1,6 @@
 """Marks tests by their folders; fixtures and settings that all folders share."""
 
+import gc
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark each test by the folder that it lies in."""
     for item in items:
         item.add_marker(MARKS[item.path.relative_to(TESTS).parts[0]])
+
+
+def pytest_collection_finish() -> None:
+    """Keep what was collected out of every garbage collection, which takes 60 ms otherwise."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

@@ -18,6 +18,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("gigabrain_zenoh", "drivers/gigabrain_drivers", "schemas/gigabrain_schemas")
 NAME = re.compile(r"gigabrain_(?:zenoh|drivers|schemas)(?:\.\w+)+")
+BEGINS = re.compile(r"""["'}]gigabrain_""")  # a string that may be such a name
 MAX_FUNCTION_LINES, MAX_FILE_LINES, MIN_FILE_LINES = 50, 450, 50
 ROOMS = "each room names only rooms below it"
 BY_NAME = ("launch", "gigabrain_drivers")  # the table of processes names what runs a driver
@@ -84,7 +85,10 @@ def rules(root: Path) -> Rules:
 
 def names_in_strings(path: Path, known: Modules) -> Iterator[tuple[int, str]]:
     """Yield the modules that are named in strings of a file, each with its line."""
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    source = path.read_text("utf-8")
+    if not BEGINS.search(source):
+        return  # to parse all files takes a second
+    for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             text = node.value.partition(":")[0]
             if NAME.fullmatch(text):

@@ -161,8 +161,8 @@ def test_yaml_of_60_mb_is_not_parsed(tmp_path: Path) -> None:
 
 def test_thousands_of_hosts_are_refused_by_their_number(tmp_path: Path) -> None:
     path = tmp_path / "file.yaml"
-    path.write_text("hosts:\n" + "".join(f"  h{n}: []\n" for n in range(10_000)))
-    with pytest.raises(ConfigError, match="1: hosts: 10000 of them; expected at most 64"):
+    path.write_text("hosts:\n" + "".join(f"  h{n}: []\n" for n in range(1000)))
+    with pytest.raises(ConfigError, match="1: hosts: 1000 of them; expected at most 64"):
         load_deployment(path)
     assert config.loads("hosts: {a: [router], b: [driver]}", Deployment, "f").hosts
 

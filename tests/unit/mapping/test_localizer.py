@@ -130,7 +130,9 @@ def test_a_place_that_is_mapped_whole_is_not_taken_for_one_that_is_mapped_half(x
     assert place.why == "it could be in 2 places"
 
 
-@pytest.mark.parametrize("reach", [9, 15])  # m of the hall that are mapped
+@pytest.mark.parametrize(  # m of the hall that are mapped
+    "reach", [9, pytest.param(15, marks=pytest.mark.qa)]
+)
 def test_in_a_hall_that_is_the_same_from_both_ends_neither_is_believed(reach: int) -> None:
     saved, rooms = hall(reach), Rooms(HALL)
     for k, x in enumerate((4.8, 6.5, 8.0, 9.2, 10.5, 11.0, 11.4, 11.8)):

@@ -10,17 +10,14 @@ from gigabrain_zenoh.qa import house
 SKIPPED = shutil.ignore_patterns("__pycache__", "*.js", "*.svg")
 
 
-@pytest.fixture
-def copy(tmp_path: Path) -> Path:
-    """A copy of the product's sources that a test may break."""
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the product's sources in which a test may break one file at a time."""
+    folder = tmp_path_factory.mktemp("copy")
     for package in house.PACKAGES:
-        shutil.copytree(house.ROOT / package, tmp_path / package, ignore=SKIPPED)
-    shutil.copy(house.ROOT / "pyproject.toml", tmp_path)
-    return tmp_path
-
-
-def add(path: Path, text: str) -> None:
-    path.write_text(path.read_text("utf-8") + text, "utf-8")
+        shutil.copytree(house.ROOT / package, folder / package, ignore=SKIPPED)
+    shutil.copy(house.ROOT / "pyproject.toml", folder)
+    return folder
 
 
 def test_no_string_names_a_module_that_its_room_must_not_import() -> None:
@@ -37,8 +34,11 @@ def test_no_string_names_a_module_that_its_room_must_not_import() -> None:
     ],
 )
 def test_a_name_in_a_string_is_found(copy: Path, where: str, name: str, contract: str) -> None:
-    add(copy / "gigabrain_zenoh" / where, f'\nELSEWHERE = "{name}"\n')
+    path = copy / "gigabrain_zenoh" / where
+    source = path.read_text("utf-8")
+    path.write_text(f'{source}\nELSEWHERE = "{name}"\n', "utf-8")
     (line,) = house.broken(copy)
+    path.write_text(source, "utf-8")
     assert line.startswith(f"gigabrain_zenoh/{where}:")
     assert line.partition("the contract is: ")[2].startswith(contract)
 
