@@ -61,7 +61,7 @@ def record(
     return run_async(run(checked(values, RecorderConfig), at.where(), seconds))
 
 
-def info(file: Recording, *, json: bool = False) -> int:
+def info(file: Recording, *, json: bool = False) -> None:
     """Describe a recording: duration, and count, rate, gaps and size per topic.
 
     Example: gigabrain bag info drive.mcap --json
@@ -79,7 +79,6 @@ def info(file: Recording, *, json: bool = False) -> int:
         print(msgspec.json.format(msgspec.json.encode(found), indent=2).decode())
     else:
         print_info(found)
-    return 0
 
 
 def check(file: Recording) -> int:
@@ -171,7 +170,7 @@ def _pairs(texts: list[str]) -> dict[str, str]:
 
 def plot(
     file: Recording, fields: Annotated[list[str], Parameter(negative="")], *, output: Output = None
-) -> int:
+) -> None:
     """Plot values of a recording over time, as a PNG.
 
     Example: gigabrain bag plot drive.mcap state.velocity.linear_x cmd_vel.linear_x
@@ -183,10 +182,9 @@ def plot(
     from gigabrain_zenoh.recording.message_tables import plot as draw
 
     print(draw(file, fields, output or file.with_suffix(".png")))
-    return 0
 
 
-def convert(file: Recording, *, csv: Path | None = None, lerobot: Path | None = None) -> int:
+def convert(file: Recording, *, csv: Path | None = None, lerobot: Path | None = None) -> None:
     """Convert a recording to CSV tables, one per topic, or to a LeRobot dataset.
 
     Example: gigabrain bag convert drive.mcap --csv tables
@@ -204,7 +202,6 @@ def convert(file: Recording, *, csv: Path | None = None, lerobot: Path | None = 
         print(path)
     if lerobot:
         print(write_lerobot(file, lerobot))
-    return 0
 
 
 def replay(

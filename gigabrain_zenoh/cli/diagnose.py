@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from gigabrain_zenoh import logs
-from gigabrain_zenoh.cli.options import LOCAL, JsonLines, Process, RobotAddress, print_line
+from gigabrain_zenoh.cli.options import LOCAL, JsonLines, ProcessOrAll, RobotAddress, print_line
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
 from gigabrain_zenoh.host.signals import run_async, stop_signals
 
@@ -113,13 +113,13 @@ def log(
     /,
     *,
     at: RobotAddress = LOCAL,
-    process: Process = "",
+    process: ProcessOrAll = "",
     level: str = "debug",
     since: str = "",
     newest: Annotated[int, Parameter(alias="-n")] = 100,
     follow: bool = False,
     json: JsonLines = False,
-) -> int:
+) -> None:
     """Show the logs of all processes of a run on this machine, in order of time.
 
     Example: gigabrain log --process driver --level warning --since 10m
@@ -128,7 +128,6 @@ def log(
 
     Args:
         run: Folder of the run, or part of its name. Default: the newest run.
-        process: Name of one process. Default: all.
         level: Lowest level: debug, info, warning, error or critical.
         since: Maximum age: 90s, 10m, 2h, 1d.
         newest: Number of lines.
@@ -153,7 +152,6 @@ def log(
             show(line)
     if follow:
         run_async(_follow(at, wanted, show))
-    return 0
 
 
 async def _follow(at: RobotAddress, wanted: "LogFilter", show: "Callable[[Line], None]") -> None:

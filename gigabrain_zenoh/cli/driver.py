@@ -153,7 +153,7 @@ def _print_trace(
             return True
 
 
-def new(name: str, *, folder: Path = Path()) -> int:
+def new(name: str, *, folder: Path = Path()) -> None:
     """Create the package of a new driver, which passes `gigabrain driver test` as it is.
 
     Example: gigabrain driver new myrobot
@@ -168,12 +168,11 @@ def new(name: str, *, folder: Path = Path()) -> int:
 
     path = write_package(name, folder)
     print(f"{path}: edit robot.yaml and driver.py; README.md describes the next steps")
-    return 0
 
 
 def emulate(
     name: RobotName, *, world: World = "arena", seed: Seed = 0, ports: Path | None = None
-) -> int:
+) -> None:
     """Emulate a robot's hardware on serial and TCP ports, with MuJoCo, until Ctrl-C.
 
     Example: gigabrain emulate mycustombot --world house
@@ -191,4 +190,3 @@ def emulate(
     folder = ports or ports_folder(name)
     values = {"body": name, "world": world, "seed": seed, "folder": str(folder.absolute())}
     run_async(run(checked(values, EmulatorConfig), print_line))
-    return 0

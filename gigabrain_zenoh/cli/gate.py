@@ -12,7 +12,6 @@ from gigabrain_schemas.requests import GateReply
 from gigabrain_zenoh.cli.options import LOCAL, JsonLines, RobotAddress, Take, print_line
 from gigabrain_zenoh.client.requests import BY_HAND
 from gigabrain_zenoh.client.robot import Robot
-from gigabrain_zenoh.client.robot import connect as connect_robot
 from gigabrain_zenoh.errors import ConfigError, GigabrainError, NotConfirmed, unknown
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.signals import run_async
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 MAX_ENTRIES = 1000
 
 
-def estop(*, at: RobotAddress = LOCAL, reason: str = "") -> int:
+def estop(*, at: RobotAddress = LOCAL, reason: str = "") -> None:
     """Stop the robot at once, and latch it.
 
     Example: gigabrain estop --reason "a person is in the way"
@@ -35,27 +34,27 @@ def estop(*, at: RobotAddress = LOCAL, reason: str = "") -> int:
         reason: Reason, for the audit log.
     """
     try:
-        return _ask(at, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False)
+        _ask(at, lambda robot: robot.estop(reason), "CONFIRMED by ", wait=False)
     except NotConfirmed:
         raise
     except GigabrainError as error:  # anything that prevents the request
         raise NotConfirmed(f"NOT CONFIRMED: {error}; {BY_HAND}") from None
 
 
-def release(*, at: RobotAddress = LOCAL) -> int:
+def release(*, at: RobotAddress = LOCAL) -> None:
     """Release a latched robot. It moves only once it is enabled as well.
 
     Example: gigabrain release
     """
-    return _ask(at, lambda robot: robot.release())
+    _ask(at, lambda robot: robot.release())
 
 
-def enable(*, at: RobotAddress = LOCAL, take: Take = False) -> int:
+def enable(*, at: RobotAddress = LOCAL, take: Take = False) -> None:
     """Let the robot's brain drive.
 
     Example: gigabrain enable
     """
-    return _ask(at, lambda robot: robot.enable(BRAIN, take=take))
+    _ask(at, lambda robot: robot.enable(BRAIN, take=take))
 
 
 def _ask(
@@ -64,19 +63,15 @@ def _ask(
     prefix: str = "",
     *,
     wait: bool = True,
-) -> int:
+) -> None:
     async def run() -> None:
-        source = f"{getpass.getuser()}-cli"
-        async with connect_robot(
-            at.connect, namespace=at.namespace, keys=at.folder, source=source, wait=wait
-        ) as robot:
+        async with at.robot(f"{getpass.getuser()}-cli", wait=wait) as robot:
             start_s = time.perf_counter()
             reply = await request(robot)
             took_ms = (time.perf_counter() - start_s) * 1e3
             print(f"{prefix}{reply.robot_type}: {reply.text} ({took_ms:.0f} ms)")
 
     run_async(run())
-    return 0
 
 
 def audit(
@@ -87,7 +82,7 @@ def audit(
     newest: Annotated[int, Parameter(alias="-n")] = 20,
     follow: bool = False,
     json: JsonLines = False,
-) -> int:
+) -> None:
     """Show who did what to the robot: e-stops, releases, who drove, what stopped it.
 
     Example: gigabrain audit --newest 50
@@ -104,21 +99,18 @@ def audit(
     to_text = as_json if json else readable
     if not robot:
         run_async(_print_live(at, newest, follow, to_text))
-        return 0
+        return
     if follow or at.connect:
         raise ConfigError(f"{robot!r} names a robot that does not run; leave out the name")
     for record in read_audit(_audit_folder(robot), newest):
         print_line(to_text(record))
-    return 0
 
 
 async def _print_live(
     at: RobotAddress, newest: int, follow: bool, to_text: "Callable[[AuditRecord], str]"
 ) -> None:
     """Print the log of a running robot, and with `follow` its new entries."""
-    async with connect_robot(
-        at.connect, namespace=at.namespace, keys=at.folder, wait=False
-    ) as robot:
+    async with at.robot(wait=False) as robot:
         new_entries = robot.topic("audit") if follow else None
         for record in await robot.audit(newest):
             print_line(to_text(record))

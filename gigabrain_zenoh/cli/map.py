@@ -3,14 +3,14 @@
 import asyncio
 import time
 
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, print_line
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused
 from gigabrain_zenoh.host.signals import run_async
 
 SAVE_TIMEOUT_S = 20.0  # a large map takes long to write
 
 
-def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> int:
+def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> None:
     """Save the map that the robot makes, on the host where perception runs.
 
     Example: gigabrain map save office
@@ -27,8 +27,6 @@ def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> in
 
     from gigabrain_schemas.requests import MapRequest
     from gigabrain_schemas.topics import MAP_SAVE
-    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
-    from gigabrain_zenoh.runtime.connect import joined
 
     try:
         fields = {"name": name, "replace": replace, "source": getpass.getuser()}
@@ -38,23 +36,18 @@ def save(name: str, /, *, at: RobotAddress = LOCAL, replace: bool = False) -> in
             f"invalid map name {name!r}; expected letters, digits, - _ . and no file extension"
         ) from None
 
-    async def ask() -> None:
-        async with joined(at.where(), CLIENT_NAME) as (bus, _):
-            replies = await bus.ask(MAP_SAVE, request, timeout_s=SAVE_TIMEOUT_S)
-        if not replies:
-            raise BodyLost(
-                "no process makes a map; set perception: {mapping: slam}, "
-                "and check that your keys may ask"
-            )
-        if not replies[0].ok:
-            raise Refused(replies[0].text)
-        print_line(replies[0].text)
-
-    run_async(ask())
-    return 0
+    replies = on_bus(at, lambda bus: bus.ask(MAP_SAVE, request, timeout_s=SAVE_TIMEOUT_S))
+    if not replies:
+        raise BodyLost(
+            "no process makes a map; set perception: {mapping: slam}, "
+            "and check that your keys may ask"
+        )
+    if not replies[0].ok:
+        raise Refused(replies[0].text)
+    print_line(replies[0].text)
 
 
-def info(name: str, /) -> int:
+def info(name: str, /) -> None:
     """Check a saved map, and print its size.
 
     Example: gigabrain map info office
@@ -71,12 +64,11 @@ def info(name: str, /) -> int:
     print_line(f"{path}: {map_file.in_words(saved)}, {saved.resolution:g} m per cell")
     if not path.with_suffix(map_file.GRAPH).exists():
         print_line("no pose graph: usable for localization, not to continue mapping")
-        return 0
+        return
     poses = map_file.load_graph(path).get("poses")
     if poses is None or poses.ndim != 2:
         raise ConfigError(f"{path.with_suffix(map_file.GRAPH)}: no pose graph")
     print_line(f"pose graph: {len(poses)} keyframes; mapping can continue from it")
-    return 0
 
 
 def precompile() -> None:

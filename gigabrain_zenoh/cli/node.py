@@ -10,22 +10,25 @@ from gigabrain_zenoh.cli.options import (
     LOCAL,
     JsonLines,
     Process,
+    ProcessOrAll,
     RobotAddress,
+    on_bus,
     print_line,
     print_table,
 )
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused, unknown
-from gigabrain_zenoh.host.signals import run_async, stop_signals
+from gigabrain_zenoh.host.signals import stop_signals
 
 if TYPE_CHECKING:
     from gigabrain_schemas.requests import ParamReply
+    from gigabrain_zenoh.bus.bus import Bus
     from gigabrain_zenoh.diagnostics.discovery import Processes
     from gigabrain_zenoh.diagnostics.top import Feed
 
 INSTALL_TOP = "for the live view: pip install 'gigabrain-zenoh[view]'; or use: gigabrain top --once"
 
 
-def list_(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> int:
+def list_(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> None:
     """List the running processes: host, uptime, CPU, memory.
 
     Example: gigabrain node list
@@ -37,7 +40,7 @@ def list_(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> int:
     processes = _find(at)
     if not json:
         print_table(process_table(processes))
-        return 0
+        return
     for name in processes.names():
         row = {
             "process": name,
@@ -45,22 +48,17 @@ def list_(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> int:
             "health": processes.health.get(name),
         }
         print_line(msgspec.json.encode(row).decode())
-    return 0
 
 
-def info(process: Process, /, *, at: RobotAddress = LOCAL) -> int:
+def info(process: Process, /, *, at: RobotAddress = LOCAL) -> None:
     """Describe one process: what it sends and receives, latencies and counters.
 
     Example: gigabrain node info driver
-
-    Args:
-        process: Name of the process.
     """
     from gigabrain_zenoh.diagnostics.discovery import describe
 
     for line in describe(_find(at), process):
         print_line(line)
-    return 0
 
 
 def graph(
@@ -70,7 +68,7 @@ def graph(
     mermaid: bool = False,
     png: Path | None = None,
     everything: Annotated[bool, Parameter(name="--all")] = False,
-) -> int:
+) -> None:
     """Draw which process sends what to which, and how often, as measured on the bus.
 
     Example: gigabrain graph --png robot.png
@@ -91,26 +89,19 @@ def graph(
     if png:
         draw.write_png(found, png)
         print_line(str(png))
-        return 0
+        return
     as_lines = draw.as_dot if dot else draw.as_mermaid if mermaid else draw.as_text
     for line in as_lines(found):
         print_line(line)
-    return 0
 
 
 def _find(at: RobotAddress) -> "Processes":
     from gigabrain_zenoh.diagnostics.discovery import find_processes
-    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
-    from gigabrain_zenoh.runtime.connect import joined
 
-    async def find() -> "Processes":
-        async with joined(at.where(), CLIENT_NAME) as (bus, _):
-            return await find_processes(bus)
-
-    return run_async(find())
+    return on_bus(at, find_processes)
 
 
-def top(*, at: RobotAddress = LOCAL, once: bool = False) -> int:
+def top(*, at: RobotAddress = LOCAL, once: bool = False) -> None:
     """Watch processes and topics: load, rates, sizes and latencies.
 
     Example: gigabrain top
@@ -121,20 +112,16 @@ def top(*, at: RobotAddress = LOCAL, once: bool = False) -> int:
     Args:
         once: Print both tables once, and exit.
     """
-    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME, widest_pattern
+    from gigabrain_zenoh.diagnostics.listener import widest_pattern
     from gigabrain_zenoh.diagnostics.top import BusFeed
     from gigabrain_zenoh.diagnostics.topic_stats import monitored
-    from gigabrain_zenoh.runtime.connect import joined
 
-    async def run() -> None:
-        where = at.where()
-        async with joined(where, CLIENT_NAME) as (bus, _):
-            with monitored(bus, widest_pattern(where)) as monitor:
-                feed = BusFeed(bus, monitor)
-                await (_print_once(feed) if once else _watch(feed))
+    async def show(bus: "Bus") -> None:
+        with monitored(bus, widest_pattern(at.where())) as monitor:
+            feed = BusFeed(bus, monitor)
+            await (_print_once(feed) if once else _watch(feed))
 
-    run_async(run())
-    return 0
+    on_bus(at, show)
 
 
 async def _watch(feed: "Feed") -> None:
@@ -174,73 +161,68 @@ async def _print_once(feed: "Feed") -> None:
         print_table(table)
 
 
-def list_params(process: Process = "", /, *, at: RobotAddress = LOCAL) -> int:
+def list_params(process: ProcessOrAll = "", /, *, at: RobotAddress = LOCAL) -> None:
     """List the parameters that can be changed at run time: value, and what is accepted.
 
     Example: gigabrain param list decision
-
-    Args:
-        process: Name of one process. Default: all.
     """
-    for name, reply in sorted(run_async(_ask(at, process, "", "")).items()):
+    for name, reply in sorted(_ask(at, process).items()):
         for one in reply.params:
             print_line(f"{name:<12} {one.name:<14} {one.value:<10} {one.expected}")
-    return 0
 
 
-def get_param(process: Process, name: str, /, *, at: RobotAddress = LOCAL) -> int:
+def get_param(process: Process, name: str, /, *, at: RobotAddress = LOCAL) -> None:
     """Print one parameter.
 
     Example: gigabrain param get decision max_linear_speed
 
     Args:
-        process: Name of the process.
         name: Name of the parameter.
     """
-    reply = run_async(_ask(at, process, "", ""))[process]
+    reply = _ask(at, process)[process]
     params = {one.name: one for one in reply.params}
     if name not in params:
         raise unknown("parameter", name, params)
     print_line(params[name].value)
-    return 0
 
 
-def set_param(process: Process, name: str, value: str, /, *, at: RobotAddress = LOCAL) -> int:
+def set_param(process: Process, name: str, value: str, /, *, at: RobotAddress = LOCAL) -> None:
     """Change one parameter, until the process ends.
 
     Example: gigabrain param set decision max_linear_speed 0.15
 
     Args:
-        process: Name of the process.
         name: Name of the parameter.
         value: New value.
     """
-    reply = run_async(_ask(at, process, name, value))[process]
+    reply = _ask(at, process, name, value)[process]
     if not reply.ok:
         raise Refused(f"{process}: {reply.text}")
     print_line(f"{process}: {reply.text}")
-    return 0
 
 
-async def _ask(at: RobotAddress, process: str, name: str, value: str) -> "dict[str, ParamReply]":
+def _ask(
+    at: RobotAddress, process: str, name: str = "", value: str = ""
+) -> "dict[str, ParamReply]":
     """Return the replies of one process, or of all without a name."""
     import getpass
 
     from gigabrain_schemas.requests import ParamRequest
     from gigabrain_schemas.topics import PARAM
     from gigabrain_zenoh.diagnostics.discovery import discover
-    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
-    from gigabrain_zenoh.runtime.connect import joined
 
     request = ParamRequest(name=name, value=value, source=getpass.getuser())
-    async with joined(at.where(), CLIENT_NAME) as (bus, _):
+
+    async def ask(bus: "Bus") -> "dict[str, ParamReply]":
         known = await discover(bus)
         if process and process not in known:
             raise unknown("process", process, known)
         asked = [process] if process else list(known)
         answers = await asyncio.gather(*(bus.ask(PARAM, request, name=each) for each in asked))
-    replies = {each: some[0] for each, some in zip(asked, answers, strict=True) if some}
-    if not replies or (process and process not in replies):
+        return {each: some[0] for each, some in zip(asked, answers, strict=True) if some}
+
+    replies = on_bus(at, ask)
+    if not replies:
         silent = process or "any process"
         raise BodyLost(f"no answer from {silent}; check that it runs, and that your keys may ask")
     return replies

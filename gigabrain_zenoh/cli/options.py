@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
@@ -22,15 +23,19 @@ from cyclopts import (
 )
 
 from gigabrain_zenoh.errors import ConfigError, GigabrainError
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from msgspec import Struct
     from rich.table import Table
 
     from gigabrain_schemas.requests import Description
+    from gigabrain_zenoh.bus.bus import Bus
+    from gigabrain_zenoh.client.robot import Robot
     from gigabrain_zenoh.runtime.connect import Where
 
 T = TypeVar("T", bound="Struct")
+R = TypeVar("R")
 
 COMPLETION_TIMEOUT_S = 0.3  # a shell waits for the names
 PIPE_COLUMNS = 160  # width of tables where the output has none
@@ -54,6 +59,14 @@ class RobotAddress:
         """Return the folder of the identity; empty for none."""
         return str(self.keys) if self.keys else ""
 
+    def robot(self, source: str = "", *, wait: bool = True) -> AbstractAsyncContextManager["Robot"]:
+        """Return a connection to the robot; with `wait` it waits for the robot's state."""
+        from gigabrain_zenoh.client.robot import connect
+
+        return connect(
+            self.connect, namespace=self.namespace, keys=self.folder, source=source, wait=wait
+        )
+
     def where(self) -> "Where":
         """Return the address in the form that the tools take."""
         from gigabrain_zenoh.runtime.connect import Where
@@ -62,6 +75,18 @@ class RobotAddress:
 
 
 LOCAL = RobotAddress()  # the only robot on this machine
+
+
+def on_bus(at: RobotAddress, do: Callable[["Bus"], Awaitable[R]], name: str = "") -> R:
+    """Run `do` on the bus of a robot, under the name of the tools if none is given."""
+    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
+    from gigabrain_zenoh.runtime.connect import joined
+
+    async def run() -> R:
+        async with joined(at.where(), name or CLIENT_NAME) as (bus, _):
+            return await do(bus)
+
+    return run_async(run())
 
 
 def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
@@ -93,21 +118,25 @@ def _live_process_names(_: object) -> list[str]:
 def _live_processes() -> list["Description"]:
     """Return the processes that answer at once; empty on any error, since a shell waits."""
     from gigabrain_zenoh.diagnostics.discovery import discover
-    from gigabrain_zenoh.host.signals import run_async
-    from gigabrain_zenoh.runtime.connect import Where, joined
-
-    async def ask() -> list["Description"]:
-        async with joined(Where(), "completion") as (bus, _):
-            return list((await discover(bus, COMPLETION_TIMEOUT_S)).values())
 
     try:
-        return run_async(ask())
+        found = on_bus(LOCAL, lambda bus: discover(bus, COMPLETION_TIMEOUT_S), "completion")
+        return list(found.values())
     except GigabrainError:
         return []
 
 
-Topic = Annotated[str, Parameter(completer=_live_topics)]
-Process = Annotated[str, Parameter(completer=_live_process_names)]
+Topic = Annotated[
+    str,
+    Parameter(
+        completer=_live_topics,
+        help='Name such as scan or health/driver, key, or key expression such as "robot/*".',
+    ),
+]
+Process = Annotated[str, Parameter(completer=_live_process_names, help="Name of the process.")]
+ProcessOrAll = Annotated[
+    str, Parameter(completer=_live_process_names, help="Name of a process. Default: all.")
+]
 TopicNames = Annotated[
     list[str] | None,
     Parameter(
@@ -116,7 +145,8 @@ TopicNames = Annotated[
     ),
 ]
 Level = Literal["debug", "info", "warning", "error"]
-Count = Annotated[int | None, Parameter(alias="-n")]
+Count = Annotated[int | None, Parameter(alias="-n", help="End after this many messages.")]
+Lines = Annotated[int | None, Parameter(alias="-n", help="End after this many lines.")]
 Take = Annotated[bool, Parameter(help="Take over from any commander, the robot's brain too.")]
 JsonLines = Annotated[bool, Parameter(help="Print one JSON object per line.")]
 JsonFile = Annotated[Path | None, Parameter(help="Write the results as JSON to this file.")]

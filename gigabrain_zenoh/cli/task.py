@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from gigabrain_schemas.tasks import TaskStatus
-from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, print_line
+from gigabrain_zenoh.cli.options import LOCAL, RobotAddress, on_bus, print_line
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
     from gigabrain_zenoh.client.tasks import Tasks
@@ -37,7 +36,7 @@ def goto(
     mode: Mode = "replace",
     wait: Wait = True,
     at: RobotAddress = LOCAL,
-) -> int:
+) -> None:
     """Send the robot to a place in its map, and wait until it arrives.
 
     Example: gigabrain goto 3.0 1.5 1.57
@@ -49,15 +48,15 @@ def goto(
         y: In the map [m].
         yaw: Heading on arrival [rad]. Default: any.
     """
-    return _send(at, lambda tasks: tasks.go_to(x, y, yaw, how=mode), wait)
+    _send(at, lambda tasks: tasks.go_to(x, y, yaw, how=mode), wait)
 
 
-def explore(*, mode: Mode = "replace", wait: Wait = True, at: RobotAddress = LOCAL) -> int:
+def explore(*, mode: Mode = "replace", wait: Wait = True, at: RobotAddress = LOCAL) -> None:
     """Explore until the map is complete.
 
     Example: gigabrain explore
     """
-    return _send(at, lambda tasks: tasks.explore(how=mode), wait)
+    _send(at, lambda tasks: tasks.explore(how=mode), wait)
 
 
 def patrol(
@@ -68,7 +67,7 @@ def patrol(
     mode: Mode = "replace",
     wait: Wait = True,
     at: RobotAddress = LOCAL,
-) -> int:
+) -> None:
     """Visit the places of a file in turn.
 
     Example: gigabrain patrol round.yaml --loops 3
@@ -82,7 +81,7 @@ def patrol(
     if loops is not None and not 1 <= loops <= MAX_LOOPS:
         raise ConfigError(f"--loops: expected 1 to {MAX_LOOPS}, got {loops}")
     text = patrol_mission(load_patrol(file), loops)
-    return _send(at, lambda tasks: tasks.carry_out(text, how=mode, label=file.stem), wait)
+    _send(at, lambda tasks: tasks.carry_out(text, how=mode, label=file.stem), wait)
 
 
 def mission(
@@ -93,7 +92,7 @@ def mission(
     mode: Mode = "replace",
     wait: Wait = True,
     at: RobotAddress = LOCAL,
-) -> int:
+) -> None:
     """Run a mission from a file.
 
     Example: gigabrain mission evening.yaml
@@ -107,11 +106,11 @@ def mission(
     load(file)  # refuse a wrong file before connecting
     if check:
         print_line(f"{file}: valid")
-        return 0
-    return _send(at, lambda tasks: tasks.carry_out(file, how=mode), wait)
+        return
+    _send(at, lambda tasks: tasks.carry_out(file, how=mode), wait)
 
 
-def list_(*, at: RobotAddress = LOCAL) -> int:
+def list_(*, at: RobotAddress = LOCAL) -> None:
     """List the current task, the queue and the last tasks.
 
     Example: gigabrain task list
@@ -125,52 +124,47 @@ def list_(*, at: RobotAddress = LOCAL) -> int:
         if not rows:
             print_line("no tasks")
 
-    return _with_tasks(at, show)
+    _with_tasks(at, show)
 
 
-def cancel(task: TaskNameOrAll = "", /, *, at: RobotAddress = LOCAL) -> int:
+def cancel(task: TaskNameOrAll = "", /, *, at: RobotAddress = LOCAL) -> None:
     """Cancel the current task, or another one.
 
     Example: gigabrain task cancel goal-7
     """
-    return _with_tasks(at, lambda tasks: _print_reply(tasks.cancel(task)))
+    _with_tasks(at, lambda tasks: _print_reply(tasks.cancel(task)))
 
 
-def pause(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> int:
+def pause(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> None:
     """Pause a task.
 
     Example: gigabrain task pause
     """
-    return _with_tasks(at, lambda tasks: _print_reply(tasks.pause(task)))
+    _with_tasks(at, lambda tasks: _print_reply(tasks.pause(task)))
 
 
-def resume(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> int:
+def resume(task: TaskName = "", /, *, at: RobotAddress = LOCAL) -> None:
     """Resume a paused task.
 
     Example: gigabrain task resume
     """
-    return _with_tasks(at, lambda tasks: _print_reply(tasks.resume(task)))
+    _with_tasks(at, lambda tasks: _print_reply(tasks.resume(task)))
 
 
 async def _print_reply(reply: Awaitable[str]) -> None:
     print_line(await reply)
 
 
-def _with_tasks(at: RobotAddress, do: "Callable[[Tasks], Awaitable[None]]") -> int:
+def _with_tasks(at: RobotAddress, do: "Callable[[Tasks], Awaitable[None]]") -> None:
     import getpass
 
     from gigabrain_zenoh.client.tasks import Tasks
-    from gigabrain_zenoh.runtime.connect import joined
 
-    async def run() -> None:
-        async with joined(at.where(), f"{getpass.getuser()}-cli") as (bus, _):
-            await do(Tasks(bus, at.folder, on_wait=print_line))
-
-    run_async(run())
-    return 0
+    name = f"{getpass.getuser()}-cli"
+    on_bus(at, lambda bus: do(Tasks(bus, at.folder, on_wait=print_line)), name)
 
 
-def _send(at: RobotAddress, send: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> int:
+def _send(at: RobotAddress, send: "Callable[[Tasks], Awaitable[str]]", wait: bool) -> None:
     async def run(tasks: "Tasks") -> None:
         from gigabrain_zenoh.decision.behaviours import describe_end
 
@@ -190,7 +184,7 @@ def _send(at: RobotAddress, send: "Callable[[Tasks], Awaitable[str]]", wait: boo
             raise Refused(describe_end(ended))
         print_line(describe_end(ended))
 
-    return _with_tasks(at, run)
+    _with_tasks(at, run)
 
 
 class ProgressLine:

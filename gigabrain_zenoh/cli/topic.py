@@ -1,16 +1,18 @@
 """`gigabrain topic` and `schema export`: messages on the bus, and their definitions."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from gigabrain_zenoh.cli.options import (
     LOCAL,
     Count,
     JsonLines,
+    Lines,
     RobotAddress,
     Take,
     Topic,
     check_positive,
+    on_bus,
     print_line,
     print_table,
 )
@@ -18,11 +20,11 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
-    from gigabrain_schemas import topics
-    from gigabrain_schemas.base import Message
+    from gigabrain_zenoh.bus.bus import Bus
+    from gigabrain_zenoh.diagnostics.topics import TopicRow
 
 
-def list_(*, at: RobotAddress = LOCAL, all_topics: bool = False, json: JsonLines = False) -> int:
+def list_(*, at: RobotAddress = LOCAL, all_topics: bool = False, json: JsonLines = False) -> None:
     """List topics: rate, size, age, senders and receivers.
 
     Example: gigabrain topic list
@@ -32,23 +34,19 @@ def list_(*, at: RobotAddress = LOCAL, all_topics: bool = False, json: JsonLines
     """
     import msgspec
 
-    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME, snapshot, widest_pattern
+    from gigabrain_zenoh.diagnostics.listener import snapshot, widest_pattern
     from gigabrain_zenoh.diagnostics.topics import rows, topic_table
-    from gigabrain_zenoh.runtime.connect import joined
 
-    async def run() -> None:
-        where = at.where()
-        async with joined(where, CLIENT_NAME) as (bus, _):
-            found = await snapshot(bus, widest_pattern(where))
-            listed = rows(found, bus.clock.now_ns(), all_topics=all_topics)
-        if json:
-            for row in listed:
-                print_line(msgspec.json.encode(row).decode())
-        else:
-            print_table(topic_table(listed))
+    async def find(bus: "Bus") -> "list[TopicRow]":
+        found = await snapshot(bus, widest_pattern(at.where()))
+        return rows(found, bus.clock.now_ns(), all_topics=all_topics)
 
-    run_async(run())
-    return 0
+    listed = on_bus(at, find)
+    if not json:
+        print_table(topic_table(listed))
+        return
+    for row in listed:
+        print_line(msgspec.json.encode(row).decode())
 
 
 def echo(
@@ -68,9 +66,7 @@ def echo(
     With --json arrays are whole; nan is null, and infinity "inf".
 
     Args:
-        topic: Name such as scan or health/driver, key, or key expression such as "robot/*".
         fields: Dotted names of fields, separated by commas.
-        count: End after this many messages.
         within: Exit with code 1 if no message arrives in this time [s].
     """
     from gigabrain_zenoh.diagnostics.listener import open_topic
@@ -88,38 +84,26 @@ def echo(
     return run_async(run())
 
 
-def hz(topic: Topic, /, *, at: RobotAddress = LOCAL, count: Count = None) -> int:
+def hz(topic: Topic, /, *, at: RobotAddress = LOCAL, count: Lines = None) -> int:
     """Measure rates and gaps of messages, one line per second.
 
     Example: gigabrain topic hz scan -n 5
-
-    Args:
-        topic: Name such as scan, or key expression such as "robot/*".
-        count: End after this many seconds with messages.
     """
     return _measure("hz", topic, at, count)
 
 
-def bw(topic: Topic, /, *, at: RobotAddress = LOCAL, count: Count = None) -> int:
+def bw(topic: Topic, /, *, at: RobotAddress = LOCAL, count: Lines = None) -> int:
     """Measure bandwidth and size of messages, one line per second.
 
     Example: gigabrain topic bw "robot/*" -n 1
-
-    Args:
-        topic: Name such as scan, or key expression such as "robot/*".
-        count: End after this many seconds with messages.
     """
     return _measure("bw", topic, at, count)
 
 
-def delay(topic: Topic, /, *, at: RobotAddress = LOCAL, count: Count = None) -> int:
+def delay(topic: Topic, /, *, at: RobotAddress = LOCAL, count: Lines = None) -> int:
     """Measure the delay of messages by the clocks of both hosts, one line per second.
 
     Example: gigabrain topic delay cmd_vel
-
-    Args:
-        topic: Name such as scan, or key expression such as "robot/*".
-        count: End after this many seconds with messages.
     """
     return _measure("delay", topic, at, count)
 
@@ -139,13 +123,10 @@ def _measure(
     return run_async(run())
 
 
-def info(topic: Topic, /, *, at: RobotAddress = LOCAL) -> int:
+def info(topic: Topic, /, *, at: RobotAddress = LOCAL) -> None:
     """Describe one topic: message, promised rate, senders and receivers.
 
     Example: gigabrain topic info cmd_vel
-
-    Args:
-        topic: Name such as scan.
     """
     from gigabrain_zenoh.diagnostics.listener import open_topic, snapshot, widest_pattern
     from gigabrain_zenoh.diagnostics.topics import describe
@@ -158,7 +139,6 @@ def info(topic: Topic, /, *, at: RobotAddress = LOCAL) -> int:
                 print_line(line)
 
     run_async(run())
-    return 0
 
 
 def pub(
@@ -169,7 +149,7 @@ def pub(
     rate: float | None = None,
     count: Count = None,
     take: Take = False,
-) -> int:
+) -> None:
     """Publish a message. On cmd_vel it drives the robot, then the brain drives again.
 
     Example: gigabrain topic pub cmd_vel linear_x=0.1 angular_z=0.3 --take
@@ -178,13 +158,11 @@ def pub(
     Ctrl-C, or for --count messages.
 
     Args:
-        name: Name of the topic, such as cmd_vel.
         words: field=value, with dots for parts (pose.x=1), or one JSON object.
         rate: Publish at this rate [Hz], until Ctrl-C or --count.
-        count: Number of messages.
     """
     from gigabrain_schemas.topics import CMD_VEL
-    from gigabrain_zenoh.diagnostics.publishing import drive, parse_message
+    from gigabrain_zenoh.diagnostics.publishing import drive, parse_message, publish
     from gigabrain_zenoh.diagnostics.topic_names import (
         COMMAND_OF_SERVICE,
         no_topic,
@@ -201,25 +179,11 @@ def pub(
     if topic is None or topic is CMD_VEL:  # an unknown key may be the body's control topic
         seconds = None if rate and not count else (count or 1) / (rate or 1.0)
         print_line(run_async(drive(at.where(), name, words, seconds, take=take)))
-        return 0
+        return
     process = name.rpartition("/")[2] if topic.many else ""
-    run_async(_publish(at, topic, parse_message(topic, words), process, rate, count))
-    return 0
-
-
-async def _publish(
-    at: RobotAddress,
-    topic: "topics.Topic[Any]",
-    message: "Message",
-    process: str,
-    rate: float | None,
-    count: int | None,
-) -> None:
-    from gigabrain_zenoh.diagnostics.publishing import publish
-    from gigabrain_zenoh.runtime.connect import joined
-
-    async with joined(at.where(), "pub") as (bus, _):
-        print_line(f"sent {await publish(bus, topic, message, rate, count, process)}")
+    message = parse_message(topic, words)
+    sent = on_bus(at, lambda bus: publish(bus, topic, message, rate, count, process), "pub")
+    print_line(f"sent {sent}")
 
 
 def export(folder: Path) -> None:

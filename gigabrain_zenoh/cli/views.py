@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gigabrain_zenoh.config.settings import PageConfig
 
 
-def teleop(*, at: RobotAddress = LOCAL, take: Take = False) -> int:
+def teleop(*, at: RobotAddress = LOCAL, take: Take = False) -> None:
     """Drive the robot by keyboard or gamepad.
 
     Example: gigabrain teleop --take
@@ -24,7 +24,6 @@ def teleop(*, at: RobotAddress = LOCAL, take: Take = False) -> int:
     Speeds stay within the limits of safety. Releasing a key stops the robot.
     The space bar is the e-stop. At the end the robot's brain drives again.
     """
-    from gigabrain_zenoh.client.robot import connect as connect_robot
     from gigabrain_zenoh.ui.teleop_station import Gamepad, TeleopStation
 
     async def run() -> None:
@@ -32,16 +31,12 @@ def teleop(*, at: RobotAddress = LOCAL, take: Take = False) -> int:
         try:
             if not sys.stdin.isatty() and pad.pad is None:
                 raise ConfigError("teleop needs a terminal or a gamepad; connect one of them")
-            source = f"{getpass.getuser()}-teleop"
-            async with connect_robot(
-                at.connect, namespace=at.namespace, keys=at.folder, source=source
-            ) as robot:
+            async with at.robot(f"{getpass.getuser()}-teleop") as robot:
                 await TeleopStation(robot, pad).drive(take)
         finally:
             pad.close()
 
     run_async(run())
-    return 0
 
 
 @Parameter(name="*")
