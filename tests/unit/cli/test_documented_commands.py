@@ -9,7 +9,7 @@ from cyclopts import CycloptsError, MissingArgumentError
 from gigabrain_zenoh.cli.app import make_app
 from tests.places import ROOT
 
-FENCE = re.compile(r"^```sh\n(.*?)^```", re.MULTILINE | re.DOTALL)
+FENCE = re.compile(r"^```(?:sh)?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(gigabrain [a-z][^`]*)`")
 PLACEHOLDER = re.compile(r"\b[A-Z]{3,}\b|…|\.\.\.|\[|<")  # not a command to copy
 ENDS = {"|", "&", "&&", ";", ">", "2>"}
