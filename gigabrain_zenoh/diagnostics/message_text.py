@@ -13,11 +13,11 @@ from gigabrain_schemas import arrays
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.sensors import Image, LaserScan
+from gigabrain_zenoh.bus.headers import is_json
 from gigabrain_zenoh.codec import DECODE_ERRORS, Codec
 from gigabrain_zenoh.diagnostics.topic_names import topic_of
 from gigabrain_zenoh.errors import unknown
 from gigabrain_zenoh.host import terminal
-from gigabrain_zenoh.recording.headers import is_json
 
 MAX_LISTED = 8  # numbers; longer lists are summarised
 MAX_RAW_BYTES = 64  # shown of a payload that cannot be decoded

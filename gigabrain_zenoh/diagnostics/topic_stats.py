@@ -15,7 +15,7 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import BODY, CMD_VEL, INTENT, SCAN, STATE, WORLD, Topic
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.recording.headers import SequenceGaps, header_of
+from gigabrain_zenoh.bus.headers import SequenceGaps, header_of
 
 M = TypeVar("M", bound=Message)
 

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from msgspec import Struct
 
+from gigabrain_zenoh.bus.headers import SequenceGaps
 from gigabrain_zenoh.recording.bag_reader import Bag
-from gigabrain_zenoh.recording.headers import SequenceGaps
 
 TABLE_HEAD = (
     f"{'key':<28} {'message':<14} {'messages':>8} {'hz':>7} {'kB':>9} {'missing':>8} "

@@ -25,9 +25,9 @@ from mcap.records import Channel, Chunk, Footer, McapRecord, Message, Metadata, 
 from mcap.writer import MCAP0_MAGIC
 
 from gigabrain_schemas.topics import current_key
+from gigabrain_zenoh.bus.headers import Header, header_of
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import open_regular
-from gigabrain_zenoh.recording.headers import Header, header_of
 
 log = logging.getLogger(__name__)
 

@@ -12,13 +12,13 @@ from mcap.well_known import MessageEncoding
 from mcap.writer import IndexType, Writer
 
 from gigabrain_schemas.topics import CMD_VEL, INTENT, STATE, TASK, TOPICS, Topic
+from gigabrain_zenoh.bus.headers import Header, is_json
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.host.posix import fcntl
 from gigabrain_zenoh.recording.bag_reader import RAW
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn, json_schema
-from gigabrain_zenoh.recording.headers import Header, is_json
 
 PROFILE, LIBRARY = "gigabrain", "gigabrain-zenoh"
 VIEW = "view"  # kind of a channel, in its metadata; that of recorded messages is RAW

@@ -30,13 +30,13 @@ from gigabrain_schemas.topics import (
     Topic,
     current_key,
 )
+from gigabrain_zenoh.bus.headers import header_of
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.config.renames import renamed_settings
 from gigabrain_zenoh.config.settings import Endpoint, ProcessConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, samples
-from gigabrain_zenoh.recording.headers import header_of
 from gigabrain_zenoh.recording.message_tables import message_of, row
 from gigabrain_zenoh.runtime.deployment import deployment_path, load_deployment
 from gigabrain_zenoh.runtime.process import Node

@@ -14,13 +14,13 @@ from gigabrain_drivers.sim.driver import MujocoDriver
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.topics import IMU, INTENT, SCAN, STATE
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.headers import header_of
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import DecisionConfig, DriverConfig, PerceptionConfig
 from gigabrain_zenoh.control import node as control
 from gigabrain_zenoh.decision import node as decision
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.recording.headers import header_of
 from gigabrain_zenoh.safety import node as safety
 
 WAFFLE = "turtlebot3_waffle"

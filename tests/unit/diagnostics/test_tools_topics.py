@@ -3,6 +3,8 @@
 import asyncio
 import json
 import math
+import subprocess
+import sys
 from typing import Any
 
 import msgspec
@@ -44,7 +46,17 @@ from gigabrain_zenoh.runtime.services import NameClaim, publish_health
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
 
+WITHOUT_RECORDING = """
+import sys
+sys.modules |= dict.fromkeys(("mcap", "foxglove", "zstandard", "lz4"))
+from gigabrain_zenoh.diagnostics import discovery, doctor, graph, log_reader, publishing
+from gigabrain_zenoh.diagnostics import top, topics, why
+"""
 SCAN_BYTES = codec.encode(example(LaserScan))
+
+
+def test_the_tools_need_no_package_for_recordings() -> None:
+    subprocess.run([sys.executable, "-c", WITHOUT_RECORDING], check=True)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 
 from gigabrain_schemas.topics import TOPICS
+from gigabrain_zenoh.bus.headers import Header, SequenceGaps, header_of
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.bag_info import faults, read_info
@@ -24,7 +25,6 @@ from gigabrain_zenoh.recording.bag_reader import HEAD, MAGIC, ZSTD_NAME, Bag
 from gigabrain_zenoh.recording.bag_recovery import is_unfinished, recover, recover_all
 from gigabrain_zenoh.recording.bag_writer import BagWriter
 from gigabrain_zenoh.recording.drawing import flat_schema
-from gigabrain_zenoh.recording.headers import Header, SequenceGaps, header_of
 from tests.unit.recording import bags
 
 

@@ -14,6 +14,7 @@ from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import CMD_VEL, SCAN, STATE
+from gigabrain_zenoh.bus.headers import header_of
 from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.qa.faults.rig.rig import Rig, deployment_of
@@ -21,7 +22,6 @@ from gigabrain_zenoh.qa.judging import Failed
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.recording.bag_reader import MAGIC, Bag, Sample
 from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
-from gigabrain_zenoh.recording.headers import header_of
 from gigabrain_zenoh.recording.recorder import Recorder
 
 PROCESSES = ("router", "driver", "perception", "decision", "control", "safety", "recorder")

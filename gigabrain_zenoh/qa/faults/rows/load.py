@@ -16,6 +16,7 @@ import numpy as np
 from gigabrain_schemas.audit import AuditRequest
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_schemas.topics import AUDIT_LOG, CMD_VEL, SAFETY, SCAN, STATE, WORLD
+from gigabrain_zenoh.bus.headers import SequenceGaps, header_of
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.host.bounded import percentile
@@ -25,7 +26,6 @@ from gigabrain_zenoh.qa.faults.rows.estop import LATCHED, ZERO_P99, PressLog
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, open_files, rss_mb
-from gigabrain_zenoh.recording.headers import SequenceGaps, header_of
 from gigabrain_zenoh.runtime.deployment import client_endpoint
 
 SPINNERS_PER_CORE = 4
