@@ -71,8 +71,8 @@ def info(file: Recording, *, json: bool = False) -> None:
     """
     import msgspec
 
-    from gigabrain_zenoh.recording.bag_info import print_info
-    from gigabrain_zenoh.recording.bag_info import read_info as read
+    from gigabrain_zenoh.recording.bag_reader import print_info
+    from gigabrain_zenoh.recording.bag_reader import read_info as read
 
     found = read(file)
     if json:
@@ -88,8 +88,8 @@ def check(file: Recording) -> int:
 
     Exit code 1 if it is not complete.
     """
-    from gigabrain_zenoh.recording.bag_info import faults
-    from gigabrain_zenoh.recording.bag_info import read_info as read
+    from gigabrain_zenoh.recording.bag_reader import faults
+    from gigabrain_zenoh.recording.bag_reader import read_info as read
 
     found = read(file)
     problems = faults(found)
@@ -110,7 +110,7 @@ def recover(file: Recording, *, output: Output = None) -> int:
     Args:
         output: File to write. Default: the same name with `_recovered`.
     """
-    from gigabrain_zenoh.recording.bag_recovery import recover as run
+    from gigabrain_zenoh.recording.bag_writer import recover as run
 
     done = run(file, output or file.with_name(f"{file.stem}_recovered{file.suffix}"))
     for damage in done.damages:

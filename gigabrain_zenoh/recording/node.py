@@ -20,7 +20,7 @@ from gigabrain_zenoh.bus.listening import topic_named
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.host.signals import stop_signals
-from gigabrain_zenoh.recording.bag_recovery import recover_all
+from gigabrain_zenoh.recording.bag_writer import recover_all
 from gigabrain_zenoh.recording.recorder import Recorder, Status
 from gigabrain_zenoh.runtime.connect import Where, joined
 

@@ -17,7 +17,7 @@ from gigabrain_schemas.topics import MAP
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.recording import bag_writer
-from gigabrain_zenoh.recording.bag_info import read_info
+from gigabrain_zenoh.recording.bag_reader import read_info
 from gigabrain_zenoh.recording.bag_writer import AppendOnlyFile
 from gigabrain_zenoh.recording.recorder import Recorder
 from tests.unit.recording import bags

@@ -5,7 +5,7 @@ import signal
 from pathlib import Path
 
 from gigabrain_zenoh.qa.probe import probing
-from gigabrain_zenoh.recording.bag_info import faults, read_info
+from gigabrain_zenoh.recording.bag_reader import faults, read_info
 from gigabrain_zenoh.testing.processes import Home, endpoint_of
 from gigabrain_zenoh.testing.waiting import until
 

@@ -20,10 +20,8 @@ from gigabrain_schemas.topics import TOPICS
 from gigabrain_zenoh.bus.headers import Header, SequenceGaps, header_of
 from gigabrain_zenoh.cli.app import make_app
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.recording.bag_info import faults, read_info
-from gigabrain_zenoh.recording.bag_reader import HEAD, MAGIC, ZSTD_NAME, Bag
-from gigabrain_zenoh.recording.bag_recovery import is_unfinished, recover, recover_all
-from gigabrain_zenoh.recording.bag_writer import BagWriter
+from gigabrain_zenoh.recording.bag_reader import HEAD, MAGIC, ZSTD_NAME, Bag, faults, read_info
+from gigabrain_zenoh.recording.bag_writer import BagWriter, is_unfinished, recover, recover_all
 from gigabrain_zenoh.recording.drawing import flat_schema
 from tests.unit.recording import bags
 

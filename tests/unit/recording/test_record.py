@@ -14,8 +14,7 @@ from gigabrain_schemas.topics import IMAGE, INTENT, MAP, SCAN, STATE, TOPICS
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
-from gigabrain_zenoh.recording.bag_info import read_info
-from gigabrain_zenoh.recording.bag_reader import Bag
+from gigabrain_zenoh.recording.bag_reader import Bag, read_info
 from gigabrain_zenoh.recording.bag_writer import BagWriter
 from gigabrain_zenoh.recording.node import key_filter, listening, run
 from gigabrain_zenoh.recording.recorder import MAX_CHANNELS, OTHER_KEYS, Intake, Recorder
