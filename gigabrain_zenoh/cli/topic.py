@@ -162,13 +162,13 @@ def pub(
         rate: Publish at this rate [Hz], until Ctrl-C or --count.
     """
     from gigabrain_schemas.topics import CMD_VEL
-    from gigabrain_zenoh.diagnostics.publishing import drive, parse_message, publish
-    from gigabrain_zenoh.diagnostics.topic_names import (
+    from gigabrain_zenoh.diagnostics.discovery import (
         COMMAND_OF_SERVICE,
         no_topic,
         short,
         target,
     )
+    from gigabrain_zenoh.diagnostics.publishing import drive, parse_message, publish
 
     check_positive(rate=rate, count=count)
     aim = target(name)

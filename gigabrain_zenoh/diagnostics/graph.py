@@ -7,8 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from gigabrain_zenoh.diagnostics.discovery import Flow
-from gigabrain_zenoh.diagnostics.topic_names import short
+from gigabrain_zenoh.diagnostics.discovery import Flow, short
 from gigabrain_zenoh.errors import ConfigError
 
 INSTALL = "for pictures install: pip install 'gigabrain-zenoh[record]'"

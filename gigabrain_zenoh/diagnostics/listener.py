@@ -12,8 +12,7 @@ from msgspec import Struct
 
 from gigabrain_schemas.requests import Description
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.diagnostics.discovery import discover
-from gigabrain_zenoh.diagnostics.topic_names import Target, no_topic, target
+from gigabrain_zenoh.diagnostics.discovery import Target, discover, no_topic, target
 from gigabrain_zenoh.diagnostics.topic_stats import TopicMonitor, monitored
 from gigabrain_zenoh.runtime.connect import Where, joined
 from gigabrain_zenoh.runtime.running import find_endpoint

@@ -13,7 +13,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.robot import Robot, connect
-from gigabrain_zenoh.diagnostics.topic_names import PREFIX, no_topic, short
+from gigabrain_zenoh.diagnostics.discovery import PREFIX, no_topic, short
 from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.signals import stop_signals

@@ -9,7 +9,7 @@ from msgspec import Struct
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import HEALTH
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.diagnostics.topic_names import short, topic_of
+from gigabrain_zenoh.diagnostics.discovery import short, topic_of
 from gigabrain_zenoh.diagnostics.topic_stats import StreamStats, TopicMonitor
 from gigabrain_zenoh.host.bounded import put_newest
 

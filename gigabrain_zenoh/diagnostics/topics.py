@@ -12,10 +12,17 @@ from rich.table import Table
 
 from gigabrain_schemas.topics import TOPICS, Topic
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.diagnostics.discovery import discover, receivers, senders
+from gigabrain_zenoh.diagnostics.discovery import (
+    Target,
+    discover,
+    matches,
+    receivers,
+    senders,
+    short,
+    topic_of,
+)
 from gigabrain_zenoh.diagnostics.listener import RawMessage, Snapshot, messages, stop_on_broken_pipe
 from gigabrain_zenoh.diagnostics.message_text import as_json, in_a_line, lines, pick, read
-from gigabrain_zenoh.diagnostics.topic_names import Target, matches, short, topic_of
 from gigabrain_zenoh.diagnostics.topic_stats import StreamStats, monitored
 from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.host.signals import stop_signals

@@ -15,7 +15,7 @@ from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.foxglove.access import topic_to_steer
-from gigabrain_zenoh.ui.foxglove.steering import velocity_of
+from gigabrain_zenoh.ui.foxglove.node import velocity_of
 from tests.system.foxglove_bridge import Bridge, bridged, hold
 
 LEFT = {"linear": {"x": 0, "y": 0, "z": 0}, "angular": {"x": 0, "y": 0, "z": 0.5}}

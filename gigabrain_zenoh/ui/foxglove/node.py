@@ -7,17 +7,49 @@ the layout file of `gigabrain foxglove --layout` contains.
 
 import asyncio
 import logging
-from collections.abc import Callable
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import foxglove
-from foxglove.websocket import Capability, ServerListener, WebSocketServer
+import msgspec
+from foxglove import Channel, ConnectionGraph, Context
+from foxglove.websocket import (
+    Capability,
+    ChannelView,
+    Client,
+    ClientChannel,
+    ServerListener,
+    WebSocketServer,
+)
+from msgspec import Struct
 
+from gigabrain_schemas.base import Finite, Message, Velocity
+from gigabrain_schemas.body import Body
+from gigabrain_schemas.topics import (
+    CMD_VEL,
+    HEALTH,
+    IMAGE,
+    INTENT,
+    LOG,
+    POSE,
+    SAFETY,
+    SCAN,
+    STATE,
+    WORLD,
+    Topic,
+)
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.listening import Sampled
+from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import FoxgloveConfig
+from gigabrain_zenoh.diagnostics.discovery import discover, flows
+from gigabrain_zenoh.diagnostics.graph import chain
 from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.recording.drawing import Drawer, Drawn
 from gigabrain_zenoh.ui.foxglove.access import HOST, Front, hidden_host, topic_to_steer
-from gigabrain_zenoh.ui.foxglove.steering import FoxgloveSteering
-from gigabrain_zenoh.ui.foxglove.view import FoxgloveView, connection_graph
+from gigabrain_zenoh.ui.robot_view import RobotView, TeleopArbiter
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +57,202 @@ FRAME_INTERVAL_NS = 100_000_000
 GRAPH_INTERVAL_NS = 2_000_000_000
 MAX_WAITING_MESSAGES = 64  # for a slow viewer; the oldest are dropped
 NAME = "gigabrain"
+MAX_RECEIVED_HZ = 120  # messages of one viewer that are processed
+MAX_MESSAGE_BYTES = 1024
+MAX_CHANNELS = 64  # of all viewers
+
+
+class FoxgloveView(RobotView):
+    """Draws messages with the recorder's table."""
+
+    def __init__(self, bus: Bus, context: Context) -> None:
+        self._context, self._drawer = context, Drawer()
+        self._kept: dict[Topic[Any], Message] = {}
+        self._channels: dict[str, Channel] = {}
+        self._channel_names: dict[str, set[str]] = {}  # by the key that they are drawn from
+        super().__init__(bus)
+        self._busy: tuple[tuple[Topic[Any], Sampled[Any]], ...] = (
+            (STATE, self.state),
+            (SCAN, self.scan),
+            (WORLD, self.world),
+            (INTENT, self.intent),
+            (POSE, self.pose),
+            (SAFETY, self.safety),
+            (CMD_VEL, self.command),
+        )
+
+    def draw_new(self) -> None:
+        """Draw everything received since the last call."""
+        for topic, sampled in self._busy:
+            if self._has_viewers(topic.key) and (message := sampled.look()):
+                self._draw(topic, message)
+        for camera, sampled in list(self.images.items()):
+            if self._has_viewers(IMAGE.at(camera)) and (image := sampled.look()):
+                self._draw(IMAGE, image, camera)
+
+    def draw_kept(self, channel: str) -> None:
+        """Draw rare messages again for a new subscriber of a channel."""
+        for topic, message in self._kept.items():
+            if channel in self._channel_names.get(topic.key, ()):
+                self._draw(topic, message)
+
+    def show(self, topic: Topic[Any], message: Message) -> None:
+        """Draw a rare message at once, and keep it for later subscribers."""
+        if isinstance(message, Body):
+            self.body = message
+        if topic is HEALTH:
+            return
+        if topic is not LOG:
+            self._kept[topic] = message
+        self._draw(topic, message)
+
+    def _has_viewers(self, key: str) -> bool:
+        """Return whether a viewer subscribes, or cannot yet because nothing has been drawn."""
+        names: Iterable[str] = self._channel_names.get(key, ())
+        return not names or any(self._channels[name].base.has_sinks() for name in names)
+
+    def _draw(self, topic: Topic[Any], message: Message, name: str = "") -> None:
+        key = topic.at(name)
+        if not self._has_viewers(key):
+            return
+        for drawn in self._drawer.draw(topic, message, name):
+            self._channel_names.setdefault(key, set()).add(drawn.topic)
+            self._channel(drawn).log(drawn.data, log_time=message.stamp_ns or None)
+
+    def _channel(self, drawn: Drawn) -> Channel:
+        if drawn.topic not in self._channels:
+            self._channels[drawn.topic] = Channel(
+                drawn.topic,
+                message_encoding=drawn.encoding,
+                schema=drawn.schema(),
+                context=self._context,
+            )
+        return self._channels[drawn.topic]
+
+
+async def connection_graph(bus: Bus) -> ConnectionGraph:
+    """Return the graph of the robot's processes and the topics between them."""
+    senders, receivers = defaultdict[str, set[str]](set), defaultdict[str, set[str]](set)
+    processes = await discover(bus)
+    for flow in chain(flows(processes.values(), {})):
+        senders[flow.key].add(flow.sender)
+        receivers[flow.key].add(flow.receiver)
+    graph = ConnectionGraph()
+    for key in senders:
+        graph.set_published_topic(key, sorted(senders[key]))
+        graph.set_subscribed_topic(key, sorted(receivers[key]))
+    return graph
+
+
+class _Vector(Struct, frozen=True, forbid_unknown_fields=True):
+    x: Finite = 0.0
+    y: Finite = 0.0
+    z: Finite = 0.0
+
+
+class _Twist(Struct, frozen=True, forbid_unknown_fields=True):
+    """Twist of ROS, as the Teleop panel sends it."""
+
+    linear: _Vector
+    angular: _Vector
+
+
+def velocity_of(data: bytes) -> Velocity:
+    """Decode a velocity in JSON: a Twist of ROS, or a Velocity. Raises ValueError."""
+    try:
+        if b'"linear"' not in data:
+            return msgspec.json.decode(data, type=Velocity)
+        twist = msgspec.json.decode(data, type=_Twist)
+    except DECODE_ERRORS as error:
+        raise ValueError(str(error)) from None
+    if twist.linear.z or twist.angular.x or twist.angular.y:
+        raise ValueError("a ground robot moves in x and y and turns about z")
+    return Velocity(linear_x=twist.linear.x, linear_y=twist.linear.y, angular_z=twist.angular.z)
+
+
+class FoxgloveSteering(ServerListener):
+    """Receives from viewers in the server's threads, and acts in the event loop."""
+
+    def __init__(self, view: FoxgloveView, topic: str) -> None:
+        self._view, self._arbiter, self._topic = view, TeleopArbiter(view), topic
+        self._loop = asyncio.get_running_loop()
+        self._received: Counter[int] = Counter()  # by viewer, in this second
+        self._second_s = 0.0
+        self._channels: set[tuple[int, int]] = set()  # viewer and channel that may steer
+        self._refused: set[int] = set()  # viewers whose refusal was logged
+        self.graph_wanted = False
+
+    def close(self) -> None:
+        """End steering."""
+        self._arbiter.clear()
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        """Repeat the newest message of a topic for a new subscriber."""
+        self._in_loop(self._view.draw_kept, channel.topic)
+
+    def on_connection_graph_subscribe(self) -> None:
+        """Begin to publish the graph of processes."""
+        self.graph_wanted = True
+
+    def on_connection_graph_unsubscribe(self) -> None:
+        """Stop publishing the graph of processes."""
+        self.graph_wanted = False
+
+    def on_client_advertise(self, client: Client, channel: ClientChannel) -> None:
+        """Admit a viewer that advertises the secret topic."""
+        may = channel.topic == self._topic and channel.encoding == "json"
+        self._in_loop(self._open, client.id, channel.id, may)
+
+    def on_client_unadvertise(self, client: Client, client_channel_id: int) -> None:
+        """Forget a viewer that has left or publishes no longer."""
+        self._in_loop(self._close, client.id, client_channel_id)
+
+    def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
+        """Process a message from a viewer."""
+        if len(data) <= MAX_MESSAGE_BYTES and not self._floods(client.id):
+            self._in_loop(self._take, client.id, client_channel_id, data)
+
+    def _in_loop(self, act: Callable[..., None], *arguments: object) -> None:
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(act, *arguments)
+
+    def _floods(self, viewer: int) -> bool:
+        now_s = time.monotonic()
+        if now_s - self._second_s >= 1.0:
+            self._second_s = now_s
+            self._received.clear()
+        self._received[viewer] += 1
+        return self._received[viewer] > MAX_RECEIVED_HZ
+
+    def _open(self, viewer: int, channel: int, may: bool) -> None:
+        if may and len(self._channels) < MAX_CHANNELS:
+            self._channels.add((viewer, channel))
+        else:
+            self._refuse(viewer, "only the layout file knows the topic for steering")
+
+    def _close(self, viewer: int, channel: int) -> None:
+        if (viewer, channel) in self._channels:
+            self._channels.discard((viewer, channel))
+            self._refused.discard(viewer)
+            self._arbiter.leave(viewer)
+
+    def _take(self, viewer: int, channel: int, data: bytes) -> None:
+        if (viewer, channel) not in self._channels:
+            return
+        try:
+            wanted = velocity_of(data)
+        except ValueError as error:
+            self._arbiter.leave(viewer)
+            self._refuse(viewer, str(error)[:200])
+            return
+        if not self._arbiter.drive(viewer, wanted, self._loop.time()):
+            self._refuse(viewer, "another viewer steers the robot")
+
+    def _refuse(self, viewer: int, reason: str) -> None:
+        """Log a refusal, once for each viewer."""
+        if viewer not in self._refused and len(self._refused) < MAX_CHANNELS:
+            self._refused.add(viewer)
+            log.warning("viewer %d may not steer: %s", viewer, reason)
 
 
 def start(host: str, context: foxglove.Context, listener: ServerListener) -> WebSocketServer:

@@ -19,7 +19,15 @@ from gigabrain_schemas.examples import EXAMPLES, example
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, SERVICES, STATE, TOPICS, WORLD
 from gigabrain_zenoh import codec
-from gigabrain_zenoh.diagnostics.discovery import Flow, find_processes, flows
+from gigabrain_zenoh.diagnostics.discovery import (
+    Flow,
+    Target,
+    find_processes,
+    flows,
+    matches,
+    no_topic,
+    target,
+)
 from gigabrain_zenoh.diagnostics.listener import RawMessage, snapshot
 from gigabrain_zenoh.diagnostics.message_text import (
     as_json,
@@ -31,7 +39,6 @@ from gigabrain_zenoh.diagnostics.message_text import (
     tree,
 )
 from gigabrain_zenoh.diagnostics.publishing import parse_message
-from gigabrain_zenoh.diagnostics.topic_names import Target, matches, no_topic, target
 from gigabrain_zenoh.diagnostics.topic_stats import TopicMonitor
 from gigabrain_zenoh.diagnostics.topics import (
     EchoOptions,
