@@ -3,7 +3,7 @@
 import asyncio
 from collections import deque
 from collections.abc import AsyncIterator
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.topics import TOPICS, Topic, current_key
@@ -48,19 +48,19 @@ async def listen(bus: Bus, topic: Topic[M]) -> AsyncIterator[M]:
 SHOWN_NS = 500_000_000  # maximum age of a message that is shown
 
 
-class Sampled(Generic[M]):
+class Sampled(Latest[M]):
     """Newest message of a topic, decoded only when it is read."""
 
     def __init__(self, bus: Bus, topic: Topic[M]) -> None:
-        self._latest = Latest(topic, bus.clock, bus.time)
-        self._time = bus.time if topic.key in CLOCK_KEYS else None
+        super().__init__(topic, bus.clock, bus.time)
+        self._robot_time = bus.time if topic.key in CLOCK_KEYS else None
         self._codec = Codec(topic.type, topic.max_bytes)
         # topics that move the clock keep enough messages to confirm a jump between two reads
-        self._raw: deque[bytes] = deque(maxlen=CONFIRMED if self._time else 1)
+        self._raw: deque[bytes] = deque(maxlen=CONFIRMED if self._robot_time else 1)
         if not topic.many:
-            bus.tap(topic.key, self.take)
+            bus.tap(topic.key, self.receive)
 
-    def take(self, _key: str, _encoding: str, payload: bytes) -> None:
+    def receive(self, _key: str, _encoding: str, payload: bytes) -> None:
         """Keep an encoded payload. May be called from any thread."""
         self._raw.append(payload)
 
@@ -71,13 +71,13 @@ class Sampled(Generic[M]):
                 message = self._codec.decode(self._raw.pop())
             except ValueError:
                 continue
-            if self._time and not self._time.see(message):
+            if self._robot_time and not self._robot_time.see(message):
                 continue
             self._raw.clear()
-            return message if self._latest.take(message) else None
+            return message if self.take(message) else None
         return None
 
-    def fresh(self) -> M | None:
-        """Return the newest message if it is recent enough to show (SHOWN_NS), else None."""
+    def fresh(self, within_ns: int | None = SHOWN_NS) -> M | None:
+        """Return the newest message if it is recent enough to show, else None."""
         self.look()
-        return self._latest.fresh(SHOWN_NS)
+        return super().fresh(within_ns)

@@ -3,10 +3,13 @@
 import asyncio
 from typing import TypeVar
 
+from msgspec.structs import asdict
+
 from gigabrain_schemas.audit import AuditRecord, AuditRequest
-from gigabrain_schemas.base import Message
-from gigabrain_schemas.requests import EstopRequest, GateReply
-from gigabrain_schemas.topics import AUDIT_LOG, ESTOP, Service
+from gigabrain_schemas.base import Message, Velocity
+from gigabrain_schemas.brain import Twist
+from gigabrain_schemas.requests import EnableRequest, EstopRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.topics import AUDIT_LOG, ENABLE, ESTOP, RELEASE, TELEOP, Service
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused
 from gigabrain_zenoh.runtime.audit import in_order
@@ -39,6 +42,23 @@ async def ask_gate(
     if not replies[0].ok:
         raise Refused(f"{replies[0].robot_type}: {replies[0].text}")
     return replies[0]
+
+
+async def enable(bus: Bus, source: str, *, take: bool = False, keys: str = "") -> GateReply:
+    """Ask the gate to obey `source`, such as the brain. Raises Refused and BodyLost."""
+    request = EnableRequest(source=source, take=take, by=bus.process)
+    return await ask_gate(bus, ENABLE, request, keys)
+
+
+async def release(bus: Bus, estop_generation: int, keys: str = "") -> GateReply:
+    """Release the gate from the e-stop of that number. Raises Refused and BodyLost."""
+    request = ReleaseRequest(estop_generation=estop_generation, source=bus.process)
+    return await ask_gate(bus, RELEASE, request, keys)
+
+
+def steer(bus: Bus, wanted: Velocity) -> None:
+    """Publish the velocity that an operator wants of the robot's own control."""
+    bus.publish(TELEOP, Twist(**asdict(wanted)))
 
 
 async def audit_log(bus: Bus, newest: int) -> tuple[AuditRecord, ...]:

@@ -11,21 +11,25 @@ from msgspec.structs import asdict
 from gigabrain_schemas.audit import AuditRecord
 from gigabrain_schemas.base import Message, Velocity
 from gigabrain_schemas.body import BodyDescription, GateStatus, Joint, RobotState
-from gigabrain_schemas.brain import CmdVel, Twist
-from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
+from gigabrain_schemas.brain import CmdVel
+from gigabrain_schemas.requests import GateReply
 from gigabrain_schemas.tasks import Task
 from gigabrain_schemas.topics import (
     BODY,
-    ENABLE,
-    RELEASE,
     STATE,
-    TELEOP,
     Topic,
     command_topic,
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import listen, topic_named
-from gigabrain_zenoh.client.requests import ANSWER_S, ask_gate, audit_log, press_estop
+from gigabrain_zenoh.client.requests import (
+    ANSWER_S,
+    audit_log,
+    enable,
+    press_estop,
+    release,
+    steer,
+)
 from gigabrain_zenoh.client.tasks import Tasks
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, NotConfirmed, Refused, Unsupported
@@ -174,7 +178,7 @@ class Robot:
         Control obeys while the gate is enabled for the brain. It keeps the body until the brain is
         enabled again.
         """
-        self._bus.publish(TELEOP, Twist(**asdict(wanted)))
+        steer(self._bus, wanted)
 
     async def stop(self) -> None:
         """Come to rest, if this script drives; it keeps the body."""
@@ -190,18 +194,16 @@ class Robot:
 
     async def enable(self, source: str = "", *, take: bool = False) -> GateReply:
         """Ask the gate for the body, for this script or for `source`. Raises Refused."""
-        me = self._bus.process
-        request = EnableRequest(source=source or me, take=take, by=me)
-        reply = await ask_gate(self._bus, ENABLE, request, self._keys)
-        if request.source == self._bus.process:
+        source = source or self._bus.process
+        reply = await enable(self._bus, source, take=take, keys=self._keys)
+        if source == self._bus.process:
             self._lease.granted(self._bus.time.boot, reply.gate)
         return reply
 
     async def release(self) -> GateReply:
         """Release a latched gate; `enable` is still needed to move. Raises Refused."""
         generation = (await self.read_state()).gate.estop_generation
-        request = ReleaseRequest(estop_generation=generation, source=self._bus.process)
-        return await ask_gate(self._bus, RELEASE, request, self._keys)
+        return await release(self._bus, generation, self._keys)
 
     async def estop(self, reason: str = "") -> GateReply:
         """Stop at once and latch; this script's own commands stop first.

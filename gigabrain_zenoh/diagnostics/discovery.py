@@ -8,8 +8,9 @@ from rich.table import Table
 
 from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import Health
-from gigabrain_schemas.topics import DESCRIBE, HEALTH, TOPICS, Topic, current_key
+from gigabrain_schemas.topics import DESCRIBE, TOPICS, Topic, current_key
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.errors import BodyLost, UnknownName, unknown
 
 PREFIX = "robot/"
@@ -104,13 +105,12 @@ async def discover(bus: Bus, timeout_s: float = DESCRIBE_TIMEOUT_S) -> dict[str,
 
 async def find_processes(bus: Bus, seconds: float = HEALTH_WINDOW_S) -> Processes:
     """Return all processes with their health. Raises BodyLost where there are none."""
-    health: dict[str, Health] = {}
-    close = bus.subscribe(HEALTH, lambda _key, newest: health.update({newest.process: newest}))
+    health = ProcessHealth(bus)
     described, _ = await asyncio.gather(discover(bus), asyncio.sleep(seconds))
-    close()
-    if not described and not health:
+    health.close()
+    if not described and not health.newest:
         raise BodyLost("the router answers, but no process of a robot does; start the robot")
-    return Processes(described, health)
+    return Processes(described, health.newest)
 
 
 def senders(key: str, processes: Iterable[Description]) -> list[str]:

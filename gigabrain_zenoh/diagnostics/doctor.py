@@ -23,7 +23,6 @@ from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import (
     BODY,
     CMD_VEL,
-    HEALTH,
     INTENT,
     SAFETY,
     SCAN,
@@ -36,6 +35,7 @@ from gigabrain_zenoh.bus.zenoh.config import session_config
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.diagnostics.discovery import discover
 from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
+from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.host.run_folders import state_dir
 from gigabrain_zenoh.runtime import running
@@ -377,16 +377,14 @@ async def _port_open(endpoint: str) -> bool:
 
 
 async def _collect(bus: Bus, router: str, seconds: float) -> RobotFacts:
-    health: dict[str, Health] = {}
     lead_ms: dict[str, float] = {}
     states: list[RobotState] = []
 
-    def add(_key: str, newest: Health) -> None:
-        health[newest.process] = newest
+    def add_lead(newest: Health) -> None:
         lead = (bus.clock.unix_ns() - newest.stamp_ns) / 1e6
         lead_ms[newest.host] = min(lead, lead_ms.get(newest.host, lead), key=abs)
 
-    bus.subscribe(HEALTH, add)
+    health = ProcessHealth(bus, add_lead)
     bodies = bus.latest(BODY)
     bus.subscribe(STATE, lambda _key, state: states.append(state))
     described, _ = await asyncio.gather(discover(bus), asyncio.sleep(seconds))
@@ -394,7 +392,7 @@ async def _collect(bus: Bus, router: str, seconds: float) -> RobotFacts:
     return RobotFacts(
         router=router,
         described=described,
-        health=health,
+        health=health.newest,
         lead_ms=lead_ms,
         control_topic=body.description.control_topic if body else CMD_VEL.key,
         pace=_pace(states),

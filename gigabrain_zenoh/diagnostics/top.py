@@ -7,15 +7,13 @@ from typing import Protocol
 from msgspec import Struct
 
 from gigabrain_schemas.safety import Health
-from gigabrain_schemas.topics import HEALTH
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.diagnostics.discovery import short, topic_of
+from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.diagnostics.topic_stats import StreamStats, TopicMonitor
-from gigabrain_zenoh.host.bounded import put_newest
 
 BARS = "▁▂▃▄▅▆▇█"
 MAX_BARS = 20
-MAX_PROCESSES = 64
 SILENT_AFTER_S = 3.0  # a process that reports no health
 Cell = str | float
 Rows = dict[str, tuple[Cell, ...]]
@@ -156,21 +154,19 @@ class BusFeed:
     def __init__(self, bus: Bus, monitor: TopicMonitor) -> None:
         self._bus, self._monitor = bus, monitor
         self._since_ns = bus.clock.now_ns()
-        self._health: dict[str, tuple[Health, int]] = {}
         self._latencies, self._delays = History(), History()
-        bus.subscribe(HEALTH, self._add)
+        self._health = ProcessHealth(bus, self._add_latency)
 
-    def _add(self, _key: str, health: Health) -> None:
-        put_newest(self._health, health.process, (health, self._bus.clock.now_ns()), MAX_PROCESSES)
+    def _add_latency(self, health: Health) -> None:
         self._latencies.add(health.process, max(health.latency_ms.values(), default=None))
 
     def refresh(self) -> tuple[Rows, Rows]:
         """Return the rows of processes and topics since the last call."""
         now_ns = self._bus.clock.now_ns()
-        processes = {
-            name: cells(process_row(health, (now_ns - at_ns) / 1e9, self._latencies.line(name)))
-            for name, (health, at_ns) in self._health.items()
-        }
+        processes = {}
+        for name, health in self._health.newest.items():
+            age_s = (now_ns - self._health.arrived_ns[name]) / 1e9
+            processes[name] = cells(process_row(health, age_s, self._latencies.line(name)))
         return processes, self._streams(now_ns)
 
     def _streams(self, now_ns: int) -> Rows:

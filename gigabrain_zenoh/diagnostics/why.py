@@ -6,30 +6,28 @@
 import asyncio
 import itertools
 from collections.abc import Callable, Mapping
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from msgspec import Struct
 
-from gigabrain_schemas.base import Cause, Velocity
+from gigabrain_schemas.base import Cause, Message, Velocity
 from gigabrain_schemas.body import Body, RobotState
 from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
 from gigabrain_schemas.requests import Description
-from gigabrain_schemas.safety import Health, SafetyState, SpeedCaps
+from gigabrain_schemas.safety import SafetyState, SpeedCaps
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import (
-    BODY,
     CMD_VEL,
-    HEALTH,
     INTENT,
-    SAFETY,
     SCAN,
     STATE,
-    TASK,
     WORLD,
+    Topic,
     command_topic,
 )
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.diagnostics.discovery import discover
+from gigabrain_zenoh.diagnostics.robot_view import RobotView
 from gigabrain_zenoh.diagnostics.topic_stats import HOPS, ChainMonitor, monitor_chain
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.geometry.limits import NO_CAPS, ZERO, at_rest
@@ -42,8 +40,6 @@ LINKS: tuple[Link, ...] = get_args(Link)
 FIRST_CODE = 10  # exit code for a broken router; each further link has the next code
 WINDOW_S = 1.5
 SILENT_NS = 500_000_000  # wall time: also for a simulation that runs slowly
-# the watcher and the monitor both subscribe to these, so `Bus.received` counts them twice
-COUNTED_TWICE = frozenset(topic.key for topic in (*HOPS, STATE, BODY))
 
 START_ROUTER = (
     "start the robot with `gigabrain up` or `gigabrain demo`, or name its router with --connect"
@@ -353,62 +349,51 @@ def _lower(side: float | None, caps: SpeedCaps) -> float | None:
     return min((cap for cap in (side, caps.rotation) if cap is not None), default=None)
 
 
-class ChainWatcher:
+class ChainWatcher(RobotView):
     """Subscribes to the whole chain, and collects its facts."""
 
     def __init__(self, bus: Bus) -> None:
-        self._bus = bus
-        self._state, self._body = bus.latest(STATE), bus.latest(BODY, self._add_control_topic)
-        self._scan, self._world = bus.latest(SCAN), bus.latest(WORLD)
-        self._intent, self._safety = bus.latest(INTENT), bus.latest(SAFETY)
-        self._tasks = bus.latest(TASK)
+        self._commands: dict[str, list[tuple[int, CmdVel]]] = {}  # by sender, with their arrival
+        super().__init__(bus)
         self._monitor = monitor_chain(bus)
-        self._commands: dict[str, list[tuple[int, CmdVel]]] = {}
-        self._problems: dict[str, tuple[Cause, ...]] = {}  # by process
         bus.subscribe(CMD_VEL, self._add_command)
-        bus.subscribe(HEALTH, self._add_problems)
 
-    def _add_problems(self, _key: str, health: Health) -> None:
-        if health.problems:
-            self._problems[health.process] = health.problems
-
-    def _add_control_topic(self, body: Body) -> None:
+    def on_rare(self, topic: Topic[Any], message: Message) -> None:
         """Subscribe to the control topic of a body that has its own."""
-        topic = command_topic(body.description)
-        if topic.key not in self._bus.listens:
-            self._bus.subscribe(topic, self._add_command)
+        if isinstance(message, Body):
+            control_topic = command_topic(message.description)
+            if control_topic.key not in self.bus.listens:
+                self.bus.subscribe(control_topic, self._add_command)
 
     def _add_command(self, _key: str, command: CmdVel) -> None:
         commands = self._commands.setdefault(command.source, [])
-        commands.append((self._bus.clock.now_ns(), command))
+        commands.append((self.bus.clock.now_ns(), command))
 
     async def collect(self, seconds: float = WINDOW_S) -> ChainFacts:
         """Return the facts after `seconds`."""
-        bus = self._bus
+        bus = self.bus
         start_ns, counts = bus.clock.now_ns(), bus.received.copy()
         described, _ = await asyncio.gather(discover(bus), bus.clock.sleep_ns(round(seconds * 1e9)))
-        state = self._state.fresh()
+        state = self.state.fresh()
         elapsed_s = (bus.clock.now_ns() - start_ns) / 1e9
         commander = state.gate.commander if state else ""
-        scan_ns = self._scan.age_ns()
+        scan_ns = self.scan.age_ns()
         return ChainFacts(
             described=described,
             state=state,
-            body=self._body.current,
+            body=self.body,
             scan_age_ms=None if scan_ns is None else scan_ns / 1e6,
-            world=self._world.fresh(),
-            intent=self._intent.fresh(),
+            world=self.world.fresh(),
+            intent=self.intent.fresh(),
             command=self._newest(BRAIN),
             fastest=_fastest([command for _, command in self._commands.get(commander, [])]),
             strangers=tuple(sorted(set(self._commands) - {BRAIN, commander})),
-            safety=self._safety.fresh(),
-            tasks=self._tasks.fresh(),
-            problems=tuple(itertools.chain.from_iterable(self._problems.values())),
+            safety=self.safety.fresh(),
+            tasks=self.task.fresh(),
+            problems=tuple(cause for one in self.health.values() for cause in one.problems),
             hz={
-                key: round(
-                    (count - counts[key]) / elapsed_s / (2 if key in COUNTED_TWICE else 1), 1
-                )
-                for key, count in bus.received.items()
+                key: round((bus.received[key] - counts[key]) / 2 / elapsed_s, 1)
+                for key in (STATE.key, SCAN.key)  # received twice, by the monitor as well
             },
             after_ms=_latencies(self._monitor),
         )
@@ -416,7 +401,7 @@ class ChainWatcher:
     def _newest(self, source: str) -> CmdVel | None:
         """Return the newest command of `source`, unless it is silent now."""
         commands = self._commands.get(source)
-        if not commands or self._bus.clock.now_ns() - commands[-1][0] > SILENT_NS:
+        if not commands or self.bus.clock.now_ns() - commands[-1][0] > SILENT_NS:
             return None
         return commands[-1][1]
 

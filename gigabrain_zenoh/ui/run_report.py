@@ -2,71 +2,66 @@
 
 import asyncio
 import contextlib
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 from msgspec import Struct
 
-from gigabrain_schemas.base import TICK_S
+from gigabrain_schemas.base import TICK_S, Message
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import Intent
 from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.tasks import TaskStatus
 from gigabrain_schemas.topics import (
-    CMD_VEL,
     DESCRIBE,
-    HEALTH,
     INTENT,
     MAP,
-    SAFETY,
     STATE,
-    TASK,
-    WORLD,
+    Topic,
 )
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.freshness import Latest
+from gigabrain_zenoh.diagnostics.robot_view import RobotView
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.causes import LATE
-from gigabrain_zenoh.host.bounded import put_newest
+
+M = TypeVar("M", bound=Message)
 
 UNKNOWN_CELL = b"\xff"
-MAX_PROCESSES = 64  # whose health is kept
 ASK_S, ASK_PAUSE_S = 1.0, 0.1  # timeout of one query, and pause before the next
 MIN_DISTANCE_M = 0.05  # a shorter distance counts as no motion
 
 
-class RunMonitor:
-    """Newest state of a robot, and the distance that it has driven.
-
-    It decodes every state, for the distance; pages and bridges use `RobotView`.
-    """
+class RunMonitor(RobotView):
+    """Newest messages of a robot, and the distance that it has driven."""
 
     def __init__(self, bus: Bus) -> None:
-        self._bus = bus
-        self.state = bus.latest(STATE, self._moved)
-        self.world = bus.latest(WORLD)
-        self.intent = bus.latest(INTENT, self._count_turn)
-        self.command = bus.latest(CMD_VEL)
-        self.safety = bus.latest(SAFETY)
-        self.task = bus.latest(TASK)
-        self.map = bus.latest(MAP)
-        self.health: dict[str, Health] = {}
         self.distance_m = 0.0  # by odometry
         self.turns = 0  # turns on the spot that the brain decided on
         self._turning = False
         self._last: RobotState | None = None
-        bus.subscribe(HEALTH, self._healthy)
+        super().__init__(bus)
+        self.map = bus.latest(MAP)
+
+    def newest_of(self, topic: Topic[M]) -> Latest[M]:
+        """Subscribe to a busy topic; every state and every intent is counted."""
+        counters: dict[str, Callable[[Any], None]] = {
+            STATE.key: self._add_distance,
+            INTENT.key: self._count_turn,
+        }
+        return self.bus.latest(topic, counters.get(topic.key))
 
     @property
     def problem(self) -> str:
         """Return why messages can no longer be processed; an empty text while they are."""
-        failed = self._bus.failed
+        failed = self.bus.failed
         return str(failed.exception()) if failed.done() else ""
 
     @property
     def seconds(self) -> float:
         """Return the robot's time since its driver started [s]."""
-        return self._bus.time.tick * TICK_S
+        return self.bus.time.tick * TICK_S
 
     @property
     def mapped_m2(self) -> float | None:
@@ -96,7 +91,7 @@ class RunMonitor:
         end_s = loop.time() + timeout_s
         while (left_s := end_s - loop.time()) > 0:
             with contextlib.suppress(Refused):
-                for reply in await self._bus.ask(
+                for reply in await self.bus.ask(
                     DESCRIBE, DescribeRequest(), timeout_s=min(left_s, ASK_S), name=process
                 ):
                     return reply
@@ -109,10 +104,7 @@ class RunMonitor:
         self.turns += turning and not self._turning
         self._turning = turning
 
-    def _healthy(self, _key: str, health: Health) -> None:
-        put_newest(self.health, health.process, health, MAX_PROCESSES)
-
-    def _moved(self, state: RobotState) -> None:
+    def _add_distance(self, state: RobotState) -> None:
         last, self._last = self._last, state
         if last and last.boot == state.boot:
             dx, dy = state.pose.x - last.pose.x, state.pose.y - last.pose.y

@@ -46,7 +46,7 @@ def add(path: Path, text: str) -> None:
         ("mapping/slam.py", "def late():\n    import gigabrain_zenoh.bus.bus", "gate, geometry"),
         ("host/files.py", "from gigabrain_zenoh.bus.bus import Bus", "each room"),
         (
-            "ui/robot_view.py",
+            "ui/steering.py",
             "from gigabrain_drivers.bodies.mock.driver import Mock",
             "only the commands",
         ),

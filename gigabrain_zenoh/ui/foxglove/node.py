@@ -26,22 +26,13 @@ from foxglove.websocket import (
 from msgspec import Struct
 
 from gigabrain_schemas.base import Finite, Message, Velocity
-from gigabrain_schemas.body import Body
 from gigabrain_schemas.topics import (
-    CMD_VEL,
     HEALTH,
     IMAGE,
-    INTENT,
     LOG,
-    POSE,
-    SAFETY,
-    SCAN,
-    STATE,
-    WORLD,
     Topic,
 )
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.bus.listening import Sampled
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.config.settings import FoxgloveConfig
 from gigabrain_zenoh.diagnostics.discovery import discover, flows
@@ -49,7 +40,7 @@ from gigabrain_zenoh.diagnostics.graph import chain
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn
 from gigabrain_zenoh.ui.foxglove.access import HOST, Front, hidden_host, topic_to_steer
-from gigabrain_zenoh.ui.robot_view import RobotView, TeleopArbiter
+from gigabrain_zenoh.ui.steering import TeleopArbiter, ViewerScene
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +53,7 @@ MAX_MESSAGE_BYTES = 1024
 MAX_CHANNELS = 64  # of all viewers
 
 
-class FoxgloveView(RobotView):
+class FoxgloveView(ViewerScene):
     """Draws messages with the recorder's table."""
 
     def __init__(self, bus: Bus, context: Context) -> None:
@@ -71,19 +62,10 @@ class FoxgloveView(RobotView):
         self._channels: dict[str, Channel] = {}
         self._channel_names: dict[str, set[str]] = {}  # by the key that they are drawn from
         super().__init__(bus)
-        self._busy: tuple[tuple[Topic[Any], Sampled[Any]], ...] = (
-            (STATE, self.state),
-            (SCAN, self.scan),
-            (WORLD, self.world),
-            (INTENT, self.intent),
-            (POSE, self.pose),
-            (SAFETY, self.safety),
-            (CMD_VEL, self.command),
-        )
 
     def draw_new(self) -> None:
         """Draw everything received since the last call."""
-        for topic, sampled in self._busy:
+        for topic, sampled in self.sampled.items():
             if self._has_viewers(topic.key) and (message := sampled.look()):
                 self._draw(topic, message)
         for camera, sampled in list(self.images.items()):
@@ -96,10 +78,8 @@ class FoxgloveView(RobotView):
             if channel in self._channel_names.get(topic.key, ()):
                 self._draw(topic, message)
 
-    def show(self, topic: Topic[Any], message: Message) -> None:
+    def on_rare(self, topic: Topic[Any], message: Message) -> None:
         """Draw a rare message at once, and keep it for later subscribers."""
-        if isinstance(message, Body):
-            self.body = message
         if topic is HEALTH:
             return
         if topic is not LOG:

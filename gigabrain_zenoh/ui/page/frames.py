@@ -9,21 +9,19 @@ import msgspec
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
+from gigabrain_schemas import topics
 from gigabrain_schemas.base import Count, Finite, Message, Pose, Text, Velocity
 from gigabrain_schemas.body import Body, BodyDescription, RobotState
 from gigabrain_schemas.brain import Intent, OccupancyGrid, WorldModel
 from gigabrain_schemas.safety import Health, LogRecord, SafetyState
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.tasks import GoalRequest
-from gigabrain_schemas.topics import Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
-from gigabrain_zenoh.host.bounded import put_newest
-from gigabrain_zenoh.ui.robot_view import RobotView
+from gigabrain_zenoh.ui.steering import ViewerScene
 
 ABOUT, MOMENT, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
 LOGIN, DRIVE, ASK = range(1, 4)  # from the browser
-MAX_PROCESSES = 64  # whose health is shown
 MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
 
 T = TypeVar("T")
@@ -134,7 +132,7 @@ def decoded(content: bytes, kind: type[T]) -> T:
         raise ValueError(str(error)) from None
 
 
-class PageView(RobotView):
+class PageView(ViewerScene):
     """Newest messages of a robot as frames. `send` passes a frame and its slot to all viewers."""
 
     max_cameras = 4
@@ -142,8 +140,8 @@ class PageView(RobotView):
     def __init__(self, bus: Bus, send: Callable[[str, bytes], None]) -> None:
         self._send = send
         self._kept: dict[str, bytes] = {}  # map and task, by slot
-        self._health: dict[str, bytes] = {}
         self._lines: list[bytes] = []
+        self._described: BodyDescription | None = None
         self._numbers = itertools.count()
         self.on_body: Callable[[], None] = lambda: None
         super().__init__(bus)
@@ -168,7 +166,7 @@ class PageView(RobotView):
     def new_frames(self) -> Iterator[tuple[str, bytes]]:
         """Yield scan and images received since the last call, with their slots."""
         pose, _ = self._newest_pose(self.state.fresh())
-        scan = self.scan.look()
+        scan: LaserScan | None = self.sampled[topics.SCAN].look()
         if scan and pose and self.body:
             yield "scan", scan_frame(scan, self.body.description, pose)
         for camera, sampled in list(self.images.items()):
@@ -178,19 +176,17 @@ class PageView(RobotView):
     def kept_frames(self) -> Iterator[tuple[str, bytes]]:
         """Yield the frames for a new viewer: map, task, health and log."""
         yield from self._kept.items()
-        yield from ((f"health/{name}", frame) for name, frame in self._health.items())
+        yield from ((f"health/{name}", as_json(HEALTH, one)) for name, one in self.health.items())
         yield from ((f"log/{next(self._numbers)}", frame) for frame in self._lines)
 
-    def show(self, topic: Topic[Any], message: Message) -> None:
+    def on_rare(self, topic: topics.Topic[Any], message: Message) -> None:
         """Send a rare message at once, and keep it for later viewers."""
         if isinstance(message, Body):
-            before, self.body = self.body, message
-            if before is None or before.description != message.description:
+            before, self._described = self._described, message.description
+            if before != message.description:
                 self.on_body()
         elif isinstance(message, Health):
-            frame = as_json(HEALTH, message)
-            put_newest(self._health, message.process, frame, MAX_PROCESSES)
-            self._send(f"health/{message.process}", frame)
+            self._send(f"health/{message.process}", as_json(HEALTH, message))
         elif isinstance(message, LogRecord):
             frame = as_json(LOG, message)
             self._lines = [*self._lines[1 - MAX_KEPT_LINES :], frame]

@@ -23,7 +23,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.ui.page.access import Access, check, token_file, wants_login
 from gigabrain_zenoh.ui.page.frames import PageView
 from gigabrain_zenoh.ui.page.sessions import Operator, Sessions
-from gigabrain_zenoh.ui.robot_view import TeleopArbiter
+from gigabrain_zenoh.ui.steering import TeleopArbiter
 
 log = logging.getLogger(__name__)
 

@@ -10,18 +10,17 @@ from collections.abc import Sequence
 from msgspec.structs import replace
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from gigabrain_schemas.requests import EnableRequest, GateReply, ReleaseRequest
 from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
-from gigabrain_schemas.topics import ENABLE, GOAL, RELEASE, TASK_CHANGE
+from gigabrain_schemas.topics import GOAL, TASK_CHANGE
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.client.requests import ANSWER_S, ask_gate, press_estop
+from gigabrain_zenoh.client.requests import ANSWER_S, enable, press_estop, release
 from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.plugins import package_version
 from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, Role
 from gigabrain_zenoh.ui.page.frames import Ask, PageView, Reply
-from gigabrain_zenoh.ui.robot_view import TeleopArbiter
+from gigabrain_zenoh.ui.steering import TeleopArbiter
 
 log = logging.getLogger(__name__)
 
@@ -98,18 +97,10 @@ class Operator:
         if asked.what == "estop":
             reply = await press_estop(self._bus, "operator page")
         elif asked.what == "release":
-            reply = await self._release(asked.estop_generation)
+            reply = await release(self._bus, asked.estop_generation)
         else:
-            reply = await self._enable(take=asked.what == "take")
+            reply = await enable(self._bus, BRAIN, take=asked.what == "take")
         return reply.text, reply.robot_type
-
-    async def _release(self, generation: int) -> GateReply:
-        request = ReleaseRequest(estop_generation=generation, source=self._bus.process)
-        return await ask_gate(self._bus, RELEASE, request)
-
-    async def _enable(self, *, take: bool) -> GateReply:
-        request = EnableRequest(source=BRAIN, take=take, by=self._bus.process)
-        return await ask_gate(self._bus, ENABLE, request)
 
     async def _cancel(self) -> str:
         request = TaskRequest(do="cancel", source=self._bus.process)

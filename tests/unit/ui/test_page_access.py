@@ -24,7 +24,7 @@ from gigabrain_zenoh.ui.page.frames import Ask, GoalRequest, PageView
 from gigabrain_zenoh.ui.page.node import free_port, with_page
 from gigabrain_zenoh.ui.page.server import run
 from gigabrain_zenoh.ui.page.sessions import Operator, Viewer
-from gigabrain_zenoh.ui.robot_view import TeleopArbiter
+from gigabrain_zenoh.ui.steering import TeleopArbiter
 
 
 def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:

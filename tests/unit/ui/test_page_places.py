@@ -15,7 +15,7 @@ from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, tokens
 from gigabrain_zenoh.ui.page.frames import PageView
 from gigabrain_zenoh.ui.page.sessions import Operator, Sessions
-from gigabrain_zenoh.ui.robot_view import TeleopArbiter
+from gigabrain_zenoh.ui.steering import TeleopArbiter
 
 HOST = "127.0.0.1:8080"
 
