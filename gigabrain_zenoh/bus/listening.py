@@ -13,6 +13,7 @@ from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import unknown
 
 M = TypeVar("M", bound=Message)
+TOPIC_BY_KEY: dict[str, Topic[Any]] = {topic.key: topic for topic in TOPICS}
 ROOM = 64  # messages that wait for a slow `async for`; the oldest give way
 
 
@@ -23,6 +24,14 @@ def topic_named(name: str) -> Topic[Any]:
     if short not in known:
         raise unknown("topic", name, known)
     return known[short]
+
+
+def topic_of(key: str) -> Topic[Any] | None:
+    """Return the topic of a key; None for a key that is not in the topic table."""
+    if key in TOPIC_BY_KEY:
+        return TOPIC_BY_KEY[key]
+    topic = TOPIC_BY_KEY.get(key.rpartition("/")[0])
+    return topic if topic and topic.many else None
 
 
 async def listen(bus: Bus, topic: Topic[M]) -> AsyncIterator[M]:

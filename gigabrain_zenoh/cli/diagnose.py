@@ -92,12 +92,12 @@ def doctor(*, at: RobotAddress = LOCAL, json: JsonLines = False) -> int:
     from gigabrain_zenoh.diagnostics.doctor import (
         examine,
         exit_code,
-        look_at_machine,
-        look_at_robot,
+        inspect_machine,
+        inspect_robot,
     )
 
-    robot, keys = run_async(look_at_robot(at.where()))
-    results = examine(look_at_machine(keys), robot)
+    robot, keys = run_async(inspect_robot(at.where()))
+    results = examine(inspect_machine(keys), robot)
     for one in results:
         if json:
             print_line(msgspec.json.encode(one).decode())

@@ -142,8 +142,7 @@ async def _watch(feed: "Feed") -> None:
 
 
 async def _print_once(feed: "Feed") -> None:
-    from rich.table import Table
-
+    from gigabrain_zenoh.diagnostics.discovery import plain_table
     from gigabrain_zenoh.diagnostics.top import (
         PROCESS_COLUMNS,
         TOPIC_COLUMNS,
@@ -153,12 +152,8 @@ async def _print_once(feed: "Feed") -> None:
 
     await asyncio.sleep(1.3)
     for columns, rows in zip((PROCESS_COLUMNS, TOPIC_COLUMNS), feed.refresh(), strict=True):
-        table = Table(box=None, pad_edge=False, header_style="dim")
-        for i, column in enumerate(columns):
-            table.add_column(column, justify="right" if i else "left", no_wrap=True)
-        for _, cells in sorted_rows(rows, 0, down=False):
-            table.add_row(*map(cell_text, cells))
-        print_table(table)
+        texts = [[cell_text(cell) for cell in row] for _, row in sorted_rows(rows, 0, down=False)]
+        print_table(plain_table(columns, texts, left=columns[:1]))
 
 
 def list_params(process: ProcessOrAll = "", /, *, at: RobotAddress = LOCAL) -> None:

@@ -105,10 +105,11 @@ def completion(shell: Literal["bash", "zsh", "fish"]) -> None:
 def _live_topics(_: object) -> list[str]:
     """Return the topics that a running robot publishes, or all known ones if none runs."""
     from gigabrain_schemas.topics import TOPICS
-    from gigabrain_zenoh.diagnostics.discovery import short, topic_of
+    from gigabrain_zenoh.bus.listening import topic_of
+    from gigabrain_zenoh.diagnostics.discovery import short_name
 
     published = {key for one in _live_processes() for key in one.publishes if topic_of(key)}
-    return sorted(map(short, published or {topic.key for topic in TOPICS}))
+    return sorted(map(short_name, published or {topic.key for topic in TOPICS}))
 
 
 def _live_process_names(_: object) -> list[str]:

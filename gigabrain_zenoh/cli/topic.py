@@ -78,8 +78,8 @@ def echo(
     options = EchoOptions(json=json, fields=chosen, count=count, within_s=within)
 
     async def run() -> int:
-        async with open_topic(at.where(), topic, looks_on=True) as (bus, aim):
-            return await run_echo(bus, aim, options, print_line)
+        async with open_topic(at.where(), topic, looks_on=True) as (bus, wanted):
+            return await run_echo(bus, wanted, options, print_line)
 
     return run_async(run())
 
@@ -117,8 +117,8 @@ def _measure(
     check_positive(count=count)
 
     async def run() -> int:
-        async with open_topic(at.where(), topic) as (bus, aim):
-            return await measure(bus, aim, what, count, print_line)
+        async with open_topic(at.where(), topic) as (bus, wanted):
+            return await measure(bus, wanted, what, count, print_line)
 
     return run_async(run())
 
@@ -133,9 +133,9 @@ def info(topic: Topic, /, *, at: RobotAddress = LOCAL) -> None:
 
     async def run() -> None:
         where = at.where()
-        async with open_topic(where, topic) as (bus, aim):
+        async with open_topic(where, topic) as (bus, wanted):
             found = await snapshot(bus, widest_pattern(where))
-            for line in describe(aim, found, bus.clock.now_ns()):
+            for line in describe(wanted, found, bus.clock.now_ns()):
                 print_line(line)
 
     run_async(run())
@@ -164,18 +164,18 @@ def pub(
     from gigabrain_schemas.topics import CMD_VEL
     from gigabrain_zenoh.diagnostics.discovery import (
         COMMAND_OF_SERVICE,
-        no_topic,
-        short,
-        target,
+        short_name,
+        topic_pattern,
+        unknown_topic,
     )
     from gigabrain_zenoh.diagnostics.publishing import drive, parse_message, publish
 
     check_positive(rate=rate, count=count)
-    aim = target(name)
-    topic = aim.topic if aim else None
-    invalid = "/" not in name or short(name) in COMMAND_OF_SERVICE
-    if (aim and "*" in aim.pattern) or (topic is None and invalid):
-        raise no_topic(name, ())
+    wanted = topic_pattern(name)
+    topic = wanted.topic if wanted else None
+    invalid = "/" not in name or short_name(name) in COMMAND_OF_SERVICE
+    if (wanted and "*" in wanted.pattern) or (topic is None and invalid):
+        raise unknown_topic(name, ())
     if topic is None or topic is CMD_VEL:  # an unknown key may be the body's control topic
         seconds = None if rate and not count else (count or 1) / (rate or 1.0)
         print_line(run_async(drive(at.where(), name, words, seconds, take=take)))

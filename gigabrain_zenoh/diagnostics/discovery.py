@@ -1,7 +1,8 @@
 """Finds the processes of a robot, how they are doing, and which sends to which."""
 
 import asyncio
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Literal
 
 from msgspec import Struct, field
 from rich.table import Table
@@ -10,6 +11,7 @@ from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import DESCRIBE, TOPICS, Topic, current_key
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.errors import BodyLost, UnknownName, unknown
 
@@ -19,11 +21,12 @@ COMMAND_OF_SERVICE = {  # services that people take for topics, and the commands
     "mission": "mission FILE", "task_change": "task", "map_save": "map save",
     "param": "param", "audit_log": "audit", "describe": "node info",
 }  # fmt: skip
+TEXT_COLUMNS = {"process", "host", "latency", "topic", "message", "from", "to"}
 DESCRIBE_TIMEOUT_S = 1.2
 HEALTH_WINDOW_S = 1.3  # health is published once a second
 
 
-class Target(Struct, frozen=True):
+class TopicPattern(Struct, frozen=True):
     """A key expression to subscribe to, and the topic of the table that it belongs to."""
 
     pattern: str
@@ -44,37 +47,34 @@ def _matches(pattern: list[str], key: list[str]) -> bool:
     return bool(key) and first in ("*", key[0]) and _matches(rest, key[1:])
 
 
-def topic_of(key: str) -> Topic | None:  # type: ignore[type-arg]
-    """Return the topic that a key belongs to; None for a key of another project."""
-    return next((topic for topic in TOPICS if matches(topic.at("**"), key)), None)
-
-
-def short(key: str) -> str:
+def short_name(key: str) -> str:
     """Return a key as people type it, without `robot/`."""
     return key.removeprefix(PREFIX)
 
 
-def target(name: str, live_keys: Iterable[str] = ()) -> Target | None:
+def topic_pattern(name: str, live_keys: Iterable[str] = ()) -> TopicPattern | None:
     """Return what `scan`, `robot/scan`, `health/driver`, a live key or an expression stands for.
 
     None where it is none of these.
     """
-    key = current_key(PREFIX + short(name))
+    key = current_key(PREFIX + short_name(name))
     for topic in TOPICS:
         if key == topic.key:
-            return Target(topic.at("*"), topic)
+            return TopicPattern(topic.at("*"), topic)
         if topic.many and matches(topic.at("*"), key):
-            return Target(key, topic)
+            return TopicPattern(key, topic)
     if name in live_keys or "*" in name:
-        return Target(name, topic_of(name))
-    return Target(key, topic_of(key)) if key in live_keys else None
+        return TopicPattern(name, topic_of(name))
+    return TopicPattern(key, topic_of(key)) if key in live_keys else None
 
 
-def no_topic(name: str, live_keys: Iterable[str]) -> UnknownName:
+def unknown_topic(name: str, live_keys: Iterable[str]) -> UnknownName:
     """Return the error for an unknown topic; it suggests the nearest topic, or a command."""
-    if command := COMMAND_OF_SERVICE.get(short(name)):
+    if command := COMMAND_OF_SERVICE.get(short_name(name)):
         return UnknownName(f"{name} is a service, not a topic; use: gigabrain {command}")
-    return unknown("topic", name, {*(short(t.key) for t in TOPICS), *map(short, live_keys)})
+    return unknown(
+        "topic", name, {*(short_name(t.key) for t in TOPICS), *map(short_name, live_keys)}
+    )
 
 
 class Flow(Struct, frozen=True, order=True):
@@ -147,15 +147,28 @@ def flows(processes: Iterable[Description], health: Mapping[str, Health]) -> lis
     return sorted(found)
 
 
+def plain_table(
+    columns: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    left: Collection[str],
+    wraps: Collection[str] = (),
+) -> Table:
+    """Return a table without lines; columns named in `left` are texts, others are numbers."""
+    table = Table(box=None, pad_edge=False, header_style="dim")
+    for name in columns:
+        justify: Literal["left", "right"] = "left" if name in left else "right"
+        table.add_column(name, justify=justify, no_wrap=name not in wraps)
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
 def process_table(processes: Processes) -> Table:
     """Return a table with one row per process."""
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in ("process", "pid", "host", "up", "CPU", "memory", "rejected", "latency"):
-        left = name in ("process", "host", "latency")
-        table.add_column(name, justify="left" if left else "right")
-    for name in processes.names():
-        table.add_row(*_row(name, processes))
-    return table
+    columns = ("process", "pid", "host", "up", "CPU", "memory", "rejected", "latency")
+    rows = (_row(name, processes) for name in processes.names())
+    return plain_table(columns, rows, left=TEXT_COLUMNS, wraps=columns)
 
 
 def _row(name: str, processes: Processes) -> tuple[str, ...]:
@@ -203,7 +216,7 @@ def describe(processes: Processes, name: str) -> Iterator[str]:
 def _rates(title: str, keys: tuple[str, ...], hz: Mapping[str, float]) -> Iterator[str]:
     yield f"  {title}:"
     for key in sorted({*keys, *hz}):
-        yield f"    {short(key):<20} {hz.get(key, 0.0):>6.1f} Hz"
+        yield f"    {short_name(key):<20} {hz.get(key, 0.0):>6.1f} Hz"
 
 
 def _values(title: str, values: Mapping[str, object]) -> Iterator[str]:

@@ -66,7 +66,7 @@ MAX_CPU = 0.9  # of one core
 WINDOW_S = 2.5  # every process reports its health twice
 
 
-class CheckResult(Struct, frozen=True, kw_only=True):
+class Diagnosis(Struct, frozen=True, kw_only=True):
     """Result of one check."""
 
     about: str
@@ -126,7 +126,7 @@ class RobotFacts(Struct, frozen=True, kw_only=True):
     pace: float | None = None  # robot's time over real time
 
 
-def examine(machine: MachineFacts, robot: RobotFacts) -> list[CheckResult]:
+def examine(machine: MachineFacts, robot: RobotFacts) -> list[Diagnosis]:
     """Return the results of all checks, the basic ones first."""
     checks = (
         _python(machine), _libraries(machine), _folders(machine), _serial(machine),
@@ -136,24 +136,24 @@ def examine(machine: MachineFacts, robot: RobotFacts) -> list[CheckResult]:
     return list(itertools.chain.from_iterable(checks))
 
 
-def exit_code(results: Sequence[CheckResult]) -> int:
+def exit_code(results: Sequence[Diagnosis]) -> int:
     """Return 1 if any result is bad; hints do not count."""
     return int(any(one.grade == "bad" for one in results))
 
 
-def _ok(about: str, text: str) -> CheckResult:
-    return CheckResult(about=about, grade="ok", text=text)
+def _ok(about: str, text: str) -> Diagnosis:
+    return Diagnosis(about=about, grade="ok", text=text)
 
 
-def _bad(about: str, text: str, cure: str) -> CheckResult:
-    return CheckResult(about=about, grade="bad", text=text, cure=cure)
+def _bad(about: str, text: str, cure: str) -> Diagnosis:
+    return Diagnosis(about=about, grade="bad", text=text, cure=cure)
 
 
-def _hint(about: str, text: str, cure: str) -> CheckResult:
-    return CheckResult(about=about, grade="hint", text=text, cure=cure)
+def _hint(about: str, text: str, cure: str) -> Diagnosis:
+    return Diagnosis(about=about, grade="hint", text=text, cure=cure)
 
 
-def _python(machine: MachineFacts) -> Iterator[CheckResult]:
+def _python(machine: MachineFacts) -> Iterator[Diagnosis]:
     version = ".".join(map(str, machine.python))
     if machine.python < MIN_PYTHON:
         yield _bad("python", f"{version} is too old", "install Python 3.11 or newer")
@@ -161,7 +161,7 @@ def _python(machine: MachineFacts) -> Iterator[CheckResult]:
         yield _ok("python", f"{version} on {machine.system}")
 
 
-def _libraries(machine: MachineFacts) -> Iterator[CheckResult]:
+def _libraries(machine: MachineFacts) -> Iterator[Diagnosis]:
     for name, version in machine.libraries.items():
         extra, lowest = EXTRAS.get(name), LIBRARIES.get(name, ())
         if version is None and extra:
@@ -176,7 +176,7 @@ def _libraries(machine: MachineFacts) -> Iterator[CheckResult]:
             yield _ok(name, version)
 
 
-def _folders(machine: MachineFacts) -> Iterator[CheckResult]:
+def _folders(machine: MachineFacts) -> Iterator[Diagnosis]:
     for folder in machine.folders:
         if not folder.writable:
             cure = f"chown or chmod {folder.path}, or set XDG_STATE_HOME and XDG_RUNTIME_DIR"
@@ -188,7 +188,7 @@ def _folders(machine: MachineFacts) -> Iterator[CheckResult]:
             yield _ok("folder", f"{folder.path} is writable, {folder.free_mb / 1e3:.0f} GB free")
 
 
-def _serial(machine: MachineFacts) -> Iterator[CheckResult]:
+def _serial(machine: MachineFacts) -> Iterator[Diagnosis]:
     if not machine.ports:
         yield _ok("serial", "no USB serial device is connected")
     for port in machine.ports:
@@ -208,14 +208,14 @@ def _serial(machine: MachineFacts) -> Iterator[CheckResult]:
         yield _bad("serial", f"this user may not open {device}", cure)
 
 
-def _multicast(machine: MachineFacts) -> Iterator[CheckResult]:
+def _multicast(machine: MachineFacts) -> Iterator[Diagnosis]:
     if machine.multicast:
         yield _bad("multicast", "on: sessions search for others", "reinstall the package")
     else:
         yield _ok("multicast", "off: a process joins only by the router's address")
 
 
-def _certificate(machine: MachineFacts) -> Iterator[CheckResult]:
+def _certificate(machine: MachineFacts) -> Iterator[Diagnosis]:
     mine = machine.certificate
     if mine is None:
         return
@@ -227,7 +227,7 @@ def _certificate(machine: MachineFacts) -> Iterator[CheckResult]:
     yield _bad("keys", text, cure) if mine.days_left < MIN_KEY_DAYS else _ok("keys", text)
 
 
-def _router(robot: RobotFacts) -> Iterator[CheckResult]:
+def _router(robot: RobotFacts) -> Iterator[Diagnosis]:
     if robot.problem and robot.port_open:
         cure = "use the robot's --keys, or stop what else uses that port"
         yield _bad("router", f"{robot.problem} Something listens on that port.", cure)
@@ -240,7 +240,7 @@ def _router(robot: RobotFacts) -> Iterator[CheckResult]:
         yield _ok("router", f"answers at {robot.router}")
 
 
-def _processes(robot: RobotFacts) -> Iterator[CheckResult]:
+def _processes(robot: RobotFacts) -> Iterator[Diagnosis]:
     if robot.problem:
         return
     for name in SYSTEMS:
@@ -262,7 +262,7 @@ def _processes(robot: RobotFacts) -> Iterator[CheckResult]:
         yield _bad("versions", f"the processes differ: {', '.join(sorted(versions))}", cure)
 
 
-def _rates(robot: RobotFacts) -> Iterator[CheckResult]:
+def _rates(robot: RobotFacts) -> Iterator[Diagnosis]:
     pace = min(robot.pace or 1.0, 1.0)
     for topic, process in SENDERS.items():
         health = robot.health.get(process)
@@ -279,7 +279,7 @@ def _rates(robot: RobotFacts) -> Iterator[CheckResult]:
             yield _hint(key, f"{process} has dropped {count} invalid messages", cure)
 
 
-def _clocks(robot: RobotFacts) -> Iterator[CheckResult]:
+def _clocks(robot: RobotFacts) -> Iterator[Diagnosis]:
     for host, lead_ms in robot.lead_ms.items():
         if abs(lead_ms) > MAX_CLOCK_OFFSET_MS:
             side = "behind" if lead_ms > 0 else "ahead of"
@@ -291,14 +291,14 @@ def _clocks(robot: RobotFacts) -> Iterator[CheckResult]:
         yield _ok("ticks", f"the robot's time runs at ×{robot.pace:.2f}")
 
 
-def _load(robot: RobotFacts) -> Iterator[CheckResult]:
+def _load(robot: RobotFacts) -> Iterator[Diagnosis]:
     for process, health in robot.health.items():
         if health.cpu > MAX_CPU:
             cure = "look at `gigabrain top`, or use a faster computer"
             yield _hint(process, f"uses {health.cpu:.0%} of a core", cure)
 
 
-def look_at_machine(keys: str = "") -> MachineFacts:
+def inspect_machine(keys: str = "") -> MachineFacts:
     """Return the state of this computer; `keys` is the folder of an identity."""
     major, minor, micro = platform.python_version_tuple()
     config = session_config(Endpoint(connect=("tcp/127.0.0.1:1",)))
@@ -346,7 +346,7 @@ def _load_certificate(keys: str) -> Certificate:
     return Certificate(folder=keys, name=identity.name, days_left=days)
 
 
-async def look_at_robot(where: Where, seconds: float = WINDOW_S) -> tuple[RobotFacts, str]:
+async def inspect_robot(where: Where, seconds: float = WINDOW_S) -> tuple[RobotFacts, str]:
     """Return the state of the robot, and the folder of the identity that reaches it."""
     try:
         endpoint = running.find_endpoint(where.connect, where.namespace, where.keys)

@@ -7,7 +7,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from gigabrain_zenoh.diagnostics.discovery import Flow, short
+from gigabrain_zenoh.diagnostics.discovery import Flow, short_name
 from gigabrain_zenoh.errors import ConfigError
 
 INSTALL = "for pictures install: pip install 'gigabrain-zenoh[record]'"
@@ -19,7 +19,7 @@ COMMON = ("health", "log", "audit")  # every process sends these: too much for a
 
 def chain(flows: Iterable[Flow], *, everything: bool = False) -> list[Flow]:
     """Return the flows that make the robot move, or all flows with `everything`."""
-    return [f for f in flows if everything or short(f.key).split("/")[0] not in COMMON]
+    return [f for f in flows if everything or short_name(f.key).split("/")[0] not in COMMON]
 
 
 def as_text(flows: Iterable[Flow]) -> Iterator[str]:
@@ -29,7 +29,7 @@ def as_text(flows: Iterable[Flow]) -> Iterator[str]:
         for key, same in groupby(of, key=lambda flow: flow.key):
             group = list(same)
             to = ", ".join(flow.receiver for flow in group)
-            yield f"  {short(key):<12} {group[0].hz:>5.1f} Hz  -> {to}"
+            yield f"  {short_name(key):<12} {group[0].hz:>5.1f} Hz  -> {to}"
 
 
 def as_dot(flows: Iterable[Flow]) -> Iterator[str]:
@@ -37,7 +37,7 @@ def as_dot(flows: Iterable[Flow]) -> Iterator[str]:
     yield "digraph robot {"
     yield "  rankdir=LR; node [shape=box, style=rounded]; edge [fontsize=10];"
     for flow in sorted(flows):
-        label = f"{short(flow.key)} {flow.hz:g} Hz"
+        label = f"{short_name(flow.key)} {flow.hz:g} Hz"
         yield f'  "{flow.sender}" -> "{flow.receiver}" [label="{label}"];'
     yield "}"
 
@@ -47,7 +47,7 @@ def as_mermaid(flows: Iterable[Flow]) -> Iterator[str]:
     yield "flowchart LR"
     for flow in sorted(flows):
         sender, receiver = (re.sub(r"\W", "_", name) for name in (flow.sender, flow.receiver))
-        label = f"{short(flow.key)} {flow.hz:g} Hz"
+        label = f"{short_name(flow.key)} {flow.hz:g} Hz"
         yield f'  {sender}["{flow.sender}"] -->|"{label}"| {receiver}["{flow.receiver}"]'
 
 
@@ -59,7 +59,7 @@ def write_png(flows: Iterable[Flow], path: Path) -> None:
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}; {INSTALL}") from None
     pairs = {
-        pair: [f"{short(flow.key)} {flow.hz:.0f} Hz" for flow in group]
+        pair: [f"{short_name(flow.key)} {flow.hz:.0f} Hz" for flow in group]
         for pair, group in groupby(
             sorted(flows, key=lambda f: (f.sender, f.receiver, f.key)),
             key=lambda f: (f.sender, f.receiver),

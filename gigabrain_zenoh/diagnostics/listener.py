@@ -12,7 +12,12 @@ from msgspec import Struct
 
 from gigabrain_schemas.requests import Description
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.diagnostics.discovery import Target, discover, no_topic, target
+from gigabrain_zenoh.diagnostics.discovery import (
+    TopicPattern,
+    discover,
+    topic_pattern,
+    unknown_topic,
+)
 from gigabrain_zenoh.diagnostics.topic_stats import TopicMonitor, monitored
 from gigabrain_zenoh.runtime.connect import Where, joined
 from gigabrain_zenoh.runtime.running import find_endpoint
@@ -62,19 +67,19 @@ async def snapshot(bus: Bus, pattern: str = ALL_KEYS, seconds: float = SNAPSHOT_
 @asynccontextmanager
 async def open_topic(
     where: Where, name: str, *, looks_on: bool = False
-) -> AsyncIterator[tuple[Bus, Target]]:
+) -> AsyncIterator[tuple[Bus, TopicPattern]]:
     """Connect, and find the topic that `name` stands for. Raises BusError and UnknownName."""
     async with joined(where, CLIENT_NAME, looks_on=looks_on) as (bus, _):
-        found = target(name)
+        found = topic_pattern(name)
         if found is None:
             live_keys = (await snapshot(bus, widest_pattern(where))).live_keys
-            found = target(name, live_keys)
+            found = topic_pattern(name, live_keys)
             if found is None:
-                raise no_topic(name, live_keys)
+                raise unknown_topic(name, live_keys)
         yield bus, found
 
 
-async def messages(bus: Bus, aim: Target) -> AsyncIterator[RawMessage | int]:
+async def messages(bus: Bus, wanted: TopicPattern) -> AsyncIterator[RawMessage | int]:
     """Yield messages as they arrive, the kept value first; an int is a number of dropped ones."""
     loop, arrived = asyncio.get_running_loop(), asyncio.Event()
     queue: deque[RawMessage] = deque(maxlen=MAX_QUEUED)
@@ -89,11 +94,11 @@ async def messages(bus: Bus, aim: Target) -> AsyncIterator[RawMessage | int]:
     def receive(key: str, _encoding: str, payload: bytes) -> None:
         loop.call_soon_threadsafe(append, RawMessage(key, payload))
 
-    close = bus.tap(aim.pattern, receive)
+    close = bus.tap(wanted.pattern, receive)
     try:
-        if aim.topic and aim.topic.keep:
-            for payload in await bus.kept(aim.topic):
-                yield RawMessage(aim.topic.key, payload)
+        if wanted.topic and wanted.topic.keep:
+            for payload in await bus.kept(wanted.topic):
+                yield RawMessage(wanted.topic.key, payload)
         while True:
             await arrived.wait()
             arrived.clear()

@@ -14,8 +14,8 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.brain import OccupancyGrid
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_zenoh.bus.headers import is_json
+from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.codec import DECODE_ERRORS, Codec
-from gigabrain_zenoh.diagnostics.discovery import topic_of
 from gigabrain_zenoh.errors import unknown
 from gigabrain_zenoh.host import terminal
 

@@ -13,7 +13,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, Topic
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.robot import Robot, connect
-from gigabrain_zenoh.diagnostics.discovery import PREFIX, no_topic, short
+from gigabrain_zenoh.diagnostics.discovery import PREFIX, short_name, unknown_topic
 from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.signals import stop_signals
@@ -112,8 +112,8 @@ async def drive(
         take=take,
     ) as robot:
         control_topic = (await robot.read_body()).control_topic
-        if PREFIX + short(name) not in (CMD_VEL.key, control_topic) and name != control_topic:
-            raise no_topic(name, (control_topic,))
+        if PREFIX + short_name(name) not in (CMD_VEL.key, control_topic) and name != control_topic:
+            raise unknown_topic(name, (control_topic,))
         return await hold_velocity(robot, command, seconds, take=take)
 
 

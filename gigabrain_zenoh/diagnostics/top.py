@@ -4,11 +4,10 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
-from msgspec import Struct
-
 from gigabrain_schemas.safety import Health
 from gigabrain_zenoh.bus.bus import Bus
-from gigabrain_zenoh.diagnostics.discovery import short, topic_of
+from gigabrain_zenoh.bus.listening import topic_of
+from gigabrain_zenoh.diagnostics.discovery import short_name
 from gigabrain_zenoh.diagnostics.robot_view import ProcessHealth
 from gigabrain_zenoh.diagnostics.topic_stats import StreamStats, TopicMonitor
 
@@ -19,84 +18,50 @@ Cell = str | float
 Rows = dict[str, tuple[Cell, ...]]
 
 
-class ProcessRow(Struct, frozen=True, kw_only=True):
-    """One process. The fields are the columns, in their order."""
-
-    process: str
-    state: str  # "ok", "silent"
-    cpu: float  # [% of a core]
-    rss_mb: float
-    sends_hz: float
-    receives_hz: float
-    rejected: int
-    latency_ms: float | str  # the largest that it measures
-    latency: str  # sparkline
-    uptime_s: float
-
-
-class StreamRow(Struct, frozen=True, kw_only=True):
-    """One key. The fields are the columns, in their order."""
-
-    topic: str
-    hz: float
-    promised_hz: float | str
-    kb_s: float
-    size: int
-    delay_ms: float | str  # median, by stamp
-    delay: str  # sparkline
-    jitter_ms: float | str  # standard deviation of the gaps
-    age_s: float
-    missing: int
-
-
+# the latency is the largest that a process measures; delays are by stamp, their median;
+# jitter is the standard deviation of the gaps; "latency" and "delay" are sparklines
 PROCESS_COLUMNS = ("process", "state", "CPU %", "MB", "sends Hz", "receives Hz", "rejected",
                    "latency ms", "latency", "up s")  # fmt: skip
 TOPIC_COLUMNS = ("topic", "Hz", "promised", "kB/s", "bytes", "delay ms", "delay", "jitter ms",
                  "age s", "missing")  # fmt: skip
 
 
-def process_row(health: Health, age_s: float, latency: str = "") -> ProcessRow:
+def process_cells(health: Health, age_s: float, latencies: str = "") -> tuple[Cell, ...]:
     """Return the row of a process whose newest health is `age_s` old."""
-    return ProcessRow(
-        process=health.process,
-        state="ok" if age_s < SILENT_AFTER_S else "silent",
-        cpu=health.cpu * 100,
-        rss_mb=health.rss_bytes / 1e6,
-        sends_hz=sum(health.sent_hz.values()),
-        receives_hz=sum(health.received_hz.values()),
-        rejected=sum(health.rejected.values()),
-        latency_ms=max(health.latency_ms.values(), default=""),
-        latency=latency,
-        uptime_s=health.uptime_s,
+    return (
+        health.process,
+        "ok" if age_s < SILENT_AFTER_S else "silent",
+        health.cpu * 100,
+        health.rss_bytes / 1e6,
+        sum(health.sent_hz.values()),
+        sum(health.received_hz.values()),
+        sum(health.rejected.values()),
+        max(health.latency_ms.values(), default=""),
+        latencies,
+        health.uptime_s,
     )
 
 
-def stream_row(
-    key: str, stats: StreamStats | None, age_s: float, missing: int, delay: str = ""
-) -> StreamRow:
+def topic_cells(
+    key: str, stats: StreamStats | None, age_s: float, missing: int, delays: str = ""
+) -> tuple[Cell, ...]:
     """Return the row of a key; `stats` is None where nothing arrived."""
     topic = topic_of(key)
-    return StreamRow(
-        topic=short(key),
-        hz=stats.hz if stats else 0.0,
-        promised_hz=topic.hz if topic else "",
-        kb_s=stats.bytes_s / 1e3 if stats else 0.0,
-        size=stats.size if stats else 0,
-        delay_ms=_or_empty(stats.delay_median_ms if stats else None),
-        delay=delay,
-        jitter_ms=_or_empty(stats.gap_std_ms if stats else None),
-        age_s=age_s,
-        missing=missing,
+    promised_hz: Cell = topic.hz if topic else ""
+    if stats is None:
+        return (short_name(key), 0.0, promised_hz, 0.0, 0, "", delays, "", age_s, missing)
+    return (
+        short_name(key),
+        stats.hz,
+        promised_hz,
+        stats.bytes_s / 1e3,
+        stats.size,
+        "" if stats.delay_median_ms is None else stats.delay_median_ms,
+        delays,
+        "" if stats.gap_std_ms is None else stats.gap_std_ms,
+        age_s,
+        missing,
     )
-
-
-def _or_empty(value: float | None) -> Cell:
-    return "" if value is None else value
-
-
-def cells(row: Struct) -> tuple[Cell, ...]:
-    """Return the values of a row, in the order of its columns."""
-    return tuple(getattr(row, name) for name in row.__struct_fields__)
 
 
 def cell_text(cell: Cell) -> str:
@@ -166,7 +131,7 @@ class BusFeed:
         processes = {}
         for name, health in self._health.newest.items():
             age_s = (now_ns - self._health.arrived_ns[name]) / 1e9
-            processes[name] = cells(process_row(health, age_s, self._latencies.line(name)))
+            processes[name] = process_cells(health, age_s, self._latencies.line(name))
         return processes, self._streams(now_ns)
 
     def _streams(self, now_ns: int) -> Rows:
@@ -175,6 +140,6 @@ class BusFeed:
             stats, age_s = found.get(key), stream.age_s(now_ns) or 0.0
             self._delays.add(key, stats.delay_median_ms if stats else None)
             missing, delay = self._monitor.missing(key), self._delays.line(key)
-            rows[key] = cells(stream_row(key, stats, age_s, missing, delay))
+            rows[key] = topic_cells(key, stats, age_s, missing, delay)
         self._since_ns = now_ns
         return rows

@@ -12,14 +12,16 @@ from rich.table import Table
 
 from gigabrain_schemas.topics import TOPICS, Topic
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.diagnostics.discovery import (
-    Target,
+    TEXT_COLUMNS,
+    TopicPattern,
     discover,
     matches,
+    plain_table,
     receivers,
     senders,
-    short,
-    topic_of,
+    short_name,
 )
 from gigabrain_zenoh.diagnostics.listener import RawMessage, Snapshot, messages, stop_on_broken_pipe
 from gigabrain_zenoh.diagnostics.message_text import as_json, in_a_line, lines, pick, read
@@ -74,14 +76,10 @@ def rows(found: Snapshot, now_ns: int, *, all_topics: bool = False) -> list[Topi
 
 def topic_table(found: list[TopicRow]) -> Table:
     """Return a table with one row per key."""
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for name in ("topic", "message", "Hz", "promised", "bytes", "age", "from", "to"):
-        left = name in ("topic", "message", "from", "to")
-        wraps = name in ("from", "to")
-        table.add_column(name, justify="left" if left else "right", no_wrap=not wraps)
-    for row in found:
-        table.add_row(
-            short(row.key),
+    columns = ("topic", "message", "Hz", "promised", "bytes", "age", "from", "to")
+    cells = (
+        (
+            short_name(row.key),
             row.type or "?",
             f"{row.hz:.1f}" if row.hz else "-",
             f"{row.promised_hz:g}" if row.promised_hz else "",
@@ -90,13 +88,15 @@ def topic_table(found: list[TopicRow]) -> Table:
             ", ".join(row.senders) or "-",
             ", ".join(row.receivers) or "-",
         )
-    return table
+        for row in found
+    )
+    return plain_table(columns, cells, left=TEXT_COLUMNS, wraps=("from", "to"))
 
 
-def describe(aim: Target, found: Snapshot, now_ns: int) -> Iterator[str]:
+def describe(wanted: TopicPattern, found: Snapshot, now_ns: int) -> Iterator[str]:
     """Yield lines with all that is known of one topic."""
-    topic = aim.topic
-    yield aim.pattern
+    topic = wanted.topic
+    yield wanted.pattern
     if topic:
         kept = ", last value kept for late subscribers" if topic.keep else ""
         yield f"  {topic.type.__name__}: {' '.join((topic.type.__doc__ or '').split())}"
@@ -108,7 +108,7 @@ def describe(aim: Target, found: Snapshot, now_ns: int) -> Iterator[str]:
     else:
         yield "  not a topic of this project; shown raw"
     for row in rows(found, now_ns, all_topics=True):
-        if matches(aim.pattern, row.key):
+        if matches(wanted.pattern, row.key):
             yield from _measured(row)
     if topic:
         yield "  fields:"
@@ -166,14 +166,16 @@ def message_lines(message: RawMessage, options: EchoOptions) -> Iterator[str]:
         yield from lines(value)
 
 
-async def echo(bus: Bus, aim: Target, options: EchoOptions, out: Callable[[str], None]) -> int:
+async def echo(
+    bus: Bus, wanted: TopicPattern, options: EchoOptions, out: Callable[[str], None]
+) -> int:
     """Print messages as they arrive. Raises BodyLost where the first one comes too late."""
     left = options.count
     first = asyncio.Event()
 
     async def show() -> None:
         nonlocal left
-        async for message in messages(bus, aim):
+        async for message in messages(bus, wanted):
             first.set()
             if isinstance(message, int):
                 print(f"{message} messages dropped: too fast to show", file=sys.stderr, flush=True)
@@ -184,18 +186,18 @@ async def echo(bus: Bus, aim: Target, options: EchoOptions, out: Callable[[str],
             if left == 0:
                 return
 
-    return await _until_stopped(show(), _report_silence(bus, aim, first, options.within_s))
+    return await _until_stopped(show(), _report_silence(bus, wanted, first, options.within_s))
 
 
 async def measure(
-    bus: Bus, aim: Target, what: Quantity, count: int | None, out: Callable[[str], None]
+    bus: Bus, wanted: TopicPattern, what: Quantity, count: int | None, out: Callable[[str], None]
 ) -> int:
     """Print one line per key and second, for `count` seconds with messages."""
     first = asyncio.Event()
 
     async def report() -> None:
         left = count
-        with monitored(bus, aim.pattern) as monitor:
+        with monitored(bus, wanted.pattern) as monitor:
             while left is None or left > 0:
                 since_ns = bus.clock.now_ns()
                 await asyncio.sleep(REPORT_PERIOD_S)
@@ -204,12 +206,12 @@ async def measure(
                     first.set()
                     missing = monitor.missing(key)
                     lost = f"  {missing} missing" if missing else ""
-                    out(f"{key}  {stats_text(what, stats, aim.topic)}{lost}")
+                    out(f"{key}  {stats_text(what, stats, wanted.topic)}{lost}")
                 if not found and first.is_set():
-                    out(f"{aim.pattern}  no messages")
+                    out(f"{wanted.pattern}  no messages")
                 left = left if left is None or not found else left - 1
 
-    return await _until_stopped(report(), _report_silence(bus, aim, first, None))
+    return await _until_stopped(report(), _report_silence(bus, wanted, first, None))
 
 
 def stats_text(what: Quantity, stats: StreamStats, topic: Topic[Any] | None) -> str:
@@ -233,16 +235,16 @@ def stats_text(what: Quantity, stats: StreamStats, topic: Topic[Any] | None) -> 
 
 
 async def _report_silence(
-    bus: Bus, aim: Target, first: asyncio.Event, within_s: float | None
+    bus: Bus, wanted: TopicPattern, first: asyncio.Event, within_s: float | None
 ) -> None:
     """Print a notice if no message arrives. Raises BodyLost instead if there is a limit."""
     try:
         await asyncio.wait_for(first.wait(), within_s or SILENCE_NOTICE_S)
     except TimeoutError:
         processes = (await discover(bus)).values()
-        by = ", ".join(senders(aim.pattern, processes)) or "none"
-        to = ", ".join(receivers(aim.pattern, processes)) or "none"
-        text = f"no messages on {aim.pattern} (senders: {by}; receivers: {to})"
+        by = ", ".join(senders(wanted.pattern, processes)) or "none"
+        to = ", ".join(receivers(wanted.pattern, processes)) or "none"
+        text = f"no messages on {wanted.pattern} (senders: {by}; receivers: {to})"
         if within_s:
             raise BodyLost(text) from None
         print(f"{text}; waiting", file=sys.stderr, flush=True)

@@ -24,7 +24,7 @@ from gigabrain_zenoh.launch.up import LIMIT_S, STOP_S
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.running import announced
 from gigabrain_zenoh.runtime.supervisor import Supervisor
-from gigabrain_zenoh.ui.live_view import HeadlessView, LiveView, View
+from gigabrain_zenoh.ui.live_view import DemoView, HeadlessView, LiveView
 from gigabrain_zenoh.ui.run_report import (
     Observed,
     Report,
@@ -179,7 +179,7 @@ class Demo:
         self._last_fault = newest_fault(text for _, text in self._faults)
         return await self._ask_for_truth(watch, HASTY_S if stop.is_set() else ANSWER_S)
 
-    def _look_at_capacity(self, watch: RunMonitor, view: View) -> None:
+    def _look_at_capacity(self, watch: RunMonitor, view: DemoView) -> None:
         """Say once that this machine is too small; in lock-step time may wait for the brain."""
         capacity, known = self._capacity, self._capacity.problem
         if self._starting or self._deployment.speed != 1.0:
@@ -219,7 +219,7 @@ class Demo:
         """Whether there is a page in the terminal."""
         return not self._options.headless and sys.stdout.isatty()
 
-    def _view(self, watch: RunMonitor) -> View:
+    def _view(self, watch: RunMonitor) -> DemoView:
         seconds, page = self._options.seconds, self._options.page
         if not self._live:
             return HeadlessView(watch, seconds, self._served, self._starting_up)

@@ -17,6 +17,7 @@ from msgspec import Struct
 
 from gigabrain_schemas.topics import CMD_VEL, INTENT, STATE, TASK, TOPICS, Topic
 from gigabrain_zenoh.bus.headers import Header, is_json
+from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.codec import Codec
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import open_regular
@@ -28,7 +29,6 @@ log = logging.getLogger(__name__)
 
 PROFILE, LIBRARY = "gigabrain", "gigabrain-zenoh"
 VIEW = "view"  # kind of a channel, in its metadata; that of recorded messages is RAW
-TOPIC_BY_KEY = {topic.key: topic for topic in TOPICS}
 MIN_DRAWN_INTERVAL_NS = {
     STATE.key: 30_000_000,
     CMD_VEL.key: 30_000_000,
@@ -45,14 +45,6 @@ class ReceivedMessage(NamedTuple):
     encoding: str  # Zenoh's
     payload: bytes
     header: Header
-
-
-def topic_of(key: str) -> Topic[Any] | None:
-    """Return the topic of a key, or None for a key that is not in the topic table."""
-    if key in TOPIC_BY_KEY:
-        return TOPIC_BY_KEY[key]
-    topic = TOPIC_BY_KEY.get(key.rpartition("/")[0])
-    return topic if topic and topic.many else None
 
 
 class AppendOnlyFile:

@@ -12,11 +12,11 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.requests import DescribeRequest
 from gigabrain_schemas.topics import DESCRIBE, Topic
 from gigabrain_zenoh.bus.bus import Bus
+from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.bus.transport import Transport
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, check_magic
-from gigabrain_zenoh.recording.bag_writer import topic_of
 from gigabrain_zenoh.recording.node import key_filter
 from gigabrain_zenoh.runtime.connect import Where, joined
 

@@ -11,11 +11,12 @@ from pathlib import Path
 from msgspec import Struct
 
 from gigabrain_zenoh.bus.headers import SequenceGaps, header_of
+from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.bus.zenoh.workarounds import LONGEST_S
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.logs import Fault
-from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage, topic_of
+from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
 
 log = logging.getLogger(__name__)
 

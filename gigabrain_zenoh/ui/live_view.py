@@ -27,7 +27,7 @@ Starting = Callable[[], str]  # processes that are not ready yet, in words; empt
 Where = Callable[[], str]  # address of the operator page, once it is served
 
 
-class View(Protocol):
+class DemoView(Protocol):
     """Shows a run for as long as its `with` block lasts."""
 
     def __enter__(self) -> Self: ...

@@ -10,7 +10,7 @@ from gigabrain_schemas.requests import Description
 from gigabrain_schemas.safety import Health
 from gigabrain_zenoh.diagnostics.doctor import (
     Certificate,
-    CheckResult,
+    Diagnosis,
     Folder,
     MachineFacts,
     Port,
@@ -53,7 +53,7 @@ PORT = Port(path="/dev/ttyACM0", about="OpenCR", usb="0483:5740", usable=False)
 EXPIRED = Certificate(folder="keys/red", problem="identity.crt expired on 2026-01-01")
 
 
-def found(machine: MachineFacts = MACHINE, robot: RobotFacts = ROBOT) -> list[CheckResult]:
+def found(machine: MachineFacts = MACHINE, robot: RobotFacts = ROBOT) -> list[Diagnosis]:
     return [one for one in examine(machine, robot) if one.grade != "ok"]
 
 

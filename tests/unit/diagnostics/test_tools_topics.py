@@ -21,12 +21,12 @@ from gigabrain_schemas.topics import CMD_VEL, INTENT, SCAN, SERVICES, STATE, TOP
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.diagnostics.discovery import (
     Flow,
-    Target,
+    TopicPattern,
     find_processes,
     flows,
     matches,
-    no_topic,
-    target,
+    topic_pattern,
+    unknown_topic,
 )
 from gigabrain_zenoh.diagnostics.listener import RawMessage, snapshot
 from gigabrain_zenoh.diagnostics.message_text import (
@@ -100,20 +100,20 @@ def test_key_expressions_are_read_as_zenoh_reads_them(pattern: str, key: str, fi
     ],
 )
 def test_topics_are_found_by_the_names_that_people_use(name: str, pattern: str, of: object) -> None:
-    assert target(name, {"weather/today"}) == Target(pattern, of)  # type: ignore[arg-type]
+    assert topic_pattern(name, {"weather/today"}) == TopicPattern(pattern, of)  # type: ignore[arg-type]
 
 
 def test_an_unknown_topic_is_answered_with_the_nearest_that_is_alive() -> None:
-    assert target("wether/today", {"weather/today"}) is None
-    assert "did you mean 'weather/today'" in str(no_topic("wether/today", {"weather/today"}))
-    assert "did you mean 'cmd_vel'" in str(no_topic("cmdvel", ()))
+    assert topic_pattern("wether/today", {"weather/today"}) is None
+    assert "did you mean 'weather/today'" in str(unknown_topic("wether/today", {"weather/today"}))
+    assert "did you mean 'cmd_vel'" in str(unknown_topic("cmdvel", ()))
     for service in SERVICES:
-        assert "is a service, not a topic; use: gigabrain " in str(no_topic(service.key, ()))
+        assert "is a service, not a topic; use: gigabrain " in str(unknown_topic(service.key, ()))
 
 
 def test_an_old_name_of_a_topic_still_finds_it() -> None:
     for old, new in (("granted", "request_log"), ("robot/heard/driver", "input_log/driver")):
-        assert target(old) == target(new) is not None
+        assert topic_pattern(old) == topic_pattern(new) is not None
 
 
 def monitor_of(
@@ -281,7 +281,9 @@ async def net() -> Net:
 async def test_echo_shows_what_comes_and_ends_after_so_many(net: Net) -> None:
     out: list[str] = []
     how = EchoOptions(count=2, fields=("linear_x",))
-    work = asyncio.ensure_future(echo(net.one, Target("robot/cmd_vel", CMD_VEL), how, out.append))
+    work = asyncio.ensure_future(
+        echo(net.one, TopicPattern("robot/cmd_vel", CMD_VEL), how, out.append)
+    )
     await settle()
     for speed in (0.1, 0.2, 0.3):
         net.two.publish(CMD_VEL, CmdVel(linear_x=speed))
@@ -293,13 +295,13 @@ async def test_echo_of_what_nobody_sends_says_so_when_its_time_is_over(net: Net)
     await NameClaim(net.two).take()
     how = EchoOptions(within_s=0.01)
     with pytest.raises(BodyLost) as told:
-        await echo(net.one, Target("robot/world", WORLD), how, lambda _: None)
+        await echo(net.one, TopicPattern("robot/world", WORLD), how, lambda _: None)
     assert "robot/world (senders: none; receivers: none)" in str(told.value)
 
 
 async def test_a_field_that_is_not_there_ends_echo_with_the_nearest(net: Net) -> None:
     how = EchoOptions(fields=("linar_x",))
-    work = asyncio.ensure_future(echo(net.one, Target("robot/cmd_vel", CMD_VEL), how, print))
+    work = asyncio.ensure_future(echo(net.one, TopicPattern("robot/cmd_vel", CMD_VEL), how, print))
     await settle()
     net.two.publish(CMD_VEL, CmdVel(linear_x=0.1))
     with pytest.raises(UnknownName, match="did you mean 'linear_x'"):
@@ -319,7 +321,7 @@ async def test_the_table_names_senders_receivers_sizes_and_strangers(net: Net) -
     assert (told["robot/state"].senders, told["robot/state"].receivers) == (("two",), ("one",))
     assert (told["robot/state"].type, told["robot/state"].promised_hz) == ("RobotState", 50)
     assert (told["weather/today"].type, told["weather/today"].size) == (None, 4)
-    text = list(describe(Target("robot/state", STATE), found, net.clock.now_ns()))
+    text = list(describe(TopicPattern("robot/state", STATE), found, net.clock.now_ns()))
     assert text[0] == "robot/state"
     assert any("from two to one" in line for line in text)
     assert any("joints: tuple[Joint]" in line for line in text)

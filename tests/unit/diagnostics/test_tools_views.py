@@ -32,11 +32,10 @@ from gigabrain_zenoh.diagnostics.top import (
     TOPIC_COLUMNS,
     Rows,
     cell_text,
-    cells,
-    process_row,
+    process_cells,
     sorted_rows,
     sparkline,
-    stream_row,
+    topic_cells,
 )
 from gigabrain_zenoh.diagnostics.top_app import TopApp
 from gigabrain_zenoh.errors import ConfigError, Refused, UnknownName
@@ -87,14 +86,11 @@ class Feed:
     """Two processes and two topics."""
 
     def refresh(self) -> tuple[Rows, Rows]:
-        calm = process_row(replace(example(Health), process="calm", cpu=0.01), 0.5)
-        busy = process_row(replace(example(Health), process="busy", cpu=0.9), 9.0)
-        scan = stream_row("robot/scan", None, 0.5, 0)
-        pose = stream_row("robot/pose", None, 1.5, 3)
-        return (
-            {"calm": cells(calm), "busy": cells(busy)},
-            {"robot/scan": cells(scan), "robot/pose": cells(pose)},
-        )
+        calm = process_cells(replace(example(Health), process="calm", cpu=0.01), 0.5)
+        busy = process_cells(replace(example(Health), process="busy", cpu=0.9), 9.0)
+        scan = topic_cells("robot/scan", None, 0.5, 0)
+        pose = topic_cells("robot/pose", None, 1.5, 3)
+        return {"calm": calm, "busy": busy}, {"robot/scan": scan, "robot/pose": pose}
 
 
 def column(table: DataTable[Text], index: int) -> list[str]:

@@ -14,9 +14,10 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.bus.headers import header_of
+from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.config.settings import RecorderConfig
 from gigabrain_zenoh.recording.bag_reader import Bag
-from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage, topic_of
+from gigabrain_zenoh.recording.bag_writer import BagWriter, ReceivedMessage
 from gigabrain_zenoh.recording.recorder import Recorder, Status
 
 QUICK = RecorderConfig(viewers=False, flush_s=0.05, keep_free_mb=0)
