@@ -16,7 +16,7 @@ from gigabrain_zenoh.client.robot import Robot, connect
 from gigabrain_zenoh.diagnostics.discovery import PREFIX, short_name, unknown_topic
 from gigabrain_zenoh.errors import ConfigError, Refused, unknown
 from gigabrain_zenoh.gate.gate import BRAIN
-from gigabrain_zenoh.host.signals import stop_signals
+from gigabrain_zenoh.host.signals import run_until, stop_signals
 from gigabrain_zenoh.runtime.connect import Where
 
 M = TypeVar("M", bound=Message)
@@ -130,12 +130,7 @@ async def hold_velocity(robot: Robot, command: CmdVel, seconds: float | None, *,
     start_tick = (await robot.read_state()).tick
     try:
         with stop_signals() as stop:
-            driving = asyncio.ensure_future(_send_velocity(robot, command, seconds))
-            stopped = asyncio.ensure_future(stop.wait())
-            await asyncio.wait((driving, stopped), return_when=asyncio.FIRST_COMPLETED)
-            stopped.cancel()
-            if not driving.cancel():
-                driving.result()
+            await run_until(stop, _send_velocity(robot, command, seconds))
     finally:
         await robot.stop()
     ticks = (await robot.read_state()).tick - start_tick

@@ -1,10 +1,11 @@
 """`gigabrain topic`: lists topics, and prints and measures their messages."""
 
 import asyncio
+import inspect
+import re
 import sys
 from collections.abc import Callable, Coroutine, Iterator
-from types import UnionType
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
 
 import msgspec
 from msgspec import Struct
@@ -112,9 +113,10 @@ def describe(wanted: TopicPattern, found: Snapshot, now_ns: int) -> Iterator[str
             yield from _measured(row)
     if topic:
         yield "  fields:"
+        types = get_type_hints(topic.type)  # without their bounds
         for one in msgspec.structs.fields(topic.type):
             optional = "" if one.required else "  (optional)"
-            yield f"    {one.name}: {_type_name(one.type)}{optional}"
+            yield f"    {one.name}: {_type_name(types[one.name])}{optional}"
 
 
 def _measured(row: TopicRow) -> Iterator[str]:
@@ -125,22 +127,9 @@ def _measured(row: TopicRow) -> Iterator[str]:
     yield f"    from {', '.join(row.senders) or '-'} to {', '.join(row.receivers) or '-'}"
 
 
-def _type_name(kind: object) -> str:
-    """Return a type in short form, without bounds and modules."""
-    text = getattr(kind, "__name__", None)
-    if isinstance(kind, type) and text and not hasattr(kind, "__args__"):
-        return str(text)
-    origin, inner = getattr(kind, "__origin__", None), getattr(kind, "__args__", ())
-    if getattr(kind, "__metadata__", None):
-        return _type_name(origin)
-    if not inner:
-        return repr(kind)
-    names = ["None" if a is type(None) else _type_name(a) for a in inner if a is not Ellipsis]
-    if isinstance(kind, UnionType) or str(origin) == "typing.Union":
-        return " | ".join(names)
-    if str(origin) == "typing.Literal":
-        return " | ".join(map(repr, inner))
-    return f"{getattr(origin, '__name__', origin)}[{', '.join(names)}]"
+def _type_name(kind: Any) -> str:
+    """Return a type without modules."""
+    return re.sub(r"[\w.]+\.(?=\w)", "", inspect.formatannotation(kind))
 
 
 class EchoOptions(Struct, frozen=True, kw_only=True):

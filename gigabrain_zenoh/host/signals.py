@@ -169,6 +169,19 @@ def stop_signals(limit_s: float = LIMIT_S) -> "Iterator[asyncio.Event]":
         yield stop
 
 
+async def run_until(stop: "asyncio.Event", work: Coroutine[Any, Any, None]) -> None:
+    """Run `work` until it ends or `stop` is set; raise its exception."""
+    import asyncio
+
+    working, stopped = asyncio.ensure_future(work), asyncio.ensure_future(stop.wait())
+    try:
+        await asyncio.wait((working, stopped), return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        stopped.cancel()
+        if not working.cancel():
+            working.result()
+
+
 def run_async(work: Coroutine[Any, Any, T]) -> T:
     """Run a command's coroutine until it ends; the first signal cancels it.
 

@@ -15,7 +15,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.listening import topic_of
 from gigabrain_zenoh.bus.transport import Transport
 from gigabrain_zenoh.errors import ConfigError, Refused
-from gigabrain_zenoh.host.signals import stop_signals
+from gigabrain_zenoh.host.signals import run_until, stop_signals
 from gigabrain_zenoh.recording.bag_reader import Bag, Sample, check_magic
 from gigabrain_zenoh.recording.node import key_filter
 from gigabrain_zenoh.runtime.connect import Where, joined
@@ -130,11 +130,6 @@ async def play(path: Path, options: PlayOptions, where: Where, *, beside_robot: 
             await check_nobody_drives(bus)
         player = Player(path, options, transport)
         with stop_signals() as stop:
-            playing = asyncio.ensure_future(player.play())
-            stopped = asyncio.ensure_future(stop.wait())
-            await asyncio.wait((playing, stopped), return_when=asyncio.FIRST_COMPLETED)
-            stopped.cancel()
-            if not playing.cancel():
-                playing.result()
+            await run_until(stop, player.play())
     print(f"{player.sent} messages sent, at most {player.late_s * 1e3:.0f} ms late")
     return 0

@@ -1,6 +1,7 @@
 """Parts shared by the operator page and the Foxglove bridge: what they show, and steering."""
 
 import functools
+from collections import Counter
 from typing import Any, TypeVar
 
 from gigabrain_schemas.base import Message, Velocity
@@ -17,6 +18,7 @@ M = TypeVar("M", bound=Message)
 
 LEASE_S = 0.5  # after this time without a command, another viewer may steer
 STREAM_GAP_S = 0.2  # after a longer gap, commands count as a new stream
+MAX_RECEIVED_HZ = 120  # messages of one viewer that are processed; held keys take 25
 SETTLE_S = 0.1  # start of a new stream that is ignored: commands the network had buffered
 
 
@@ -54,6 +56,22 @@ class ViewerScene(RobotView):
         if camera in self.images or len(self.images) < self.max_cameras:
             sampled = self.images.setdefault(camera, Sampled(self.bus, IMAGE))
             sampled.receive(key, encoding, payload)
+
+
+class RateLimiter:
+    """Counts the messages of each viewer in the present second."""
+
+    def __init__(self) -> None:
+        self._second_s = 0.0
+        self._received: Counter[int] = Counter()
+
+    def is_exceeded(self, viewer: int, now_s: float) -> bool:
+        """Count a message; return whether there are too many of this viewer."""
+        if now_s - self._second_s >= 1.0:
+            self._second_s = now_s
+            self._received.clear()
+        self._received[viewer] += 1
+        return self._received[viewer] > MAX_RECEIVED_HZ
 
 
 class TeleopArbiter:

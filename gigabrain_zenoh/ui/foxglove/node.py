@@ -8,7 +8,7 @@ the layout file of `gigabrain foxglove --layout` contains.
 import asyncio
 import logging
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -40,7 +40,7 @@ from gigabrain_zenoh.diagnostics.graph import chain
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.recording.drawing import Drawer, Drawn
 from gigabrain_zenoh.ui.foxglove.access import HOST, Front, hidden_host, topic_to_steer
-from gigabrain_zenoh.ui.steering import TeleopArbiter, ViewerScene
+from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter, ViewerScene
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,6 @@ FRAME_INTERVAL_NS = 100_000_000
 GRAPH_INTERVAL_NS = 2_000_000_000
 MAX_WAITING_MESSAGES = 64  # for a slow viewer; the oldest are dropped
 NAME = "gigabrain"
-MAX_RECEIVED_HZ = 120  # messages of one viewer that are processed
 MAX_MESSAGE_BYTES = 1024
 MAX_CHANNELS = 64  # of all viewers
 
@@ -156,8 +155,7 @@ class FoxgloveSteering(ServerListener):
     def __init__(self, view: FoxgloveView, topic: str) -> None:
         self._view, self._arbiter, self._topic = view, TeleopArbiter(view), topic
         self._loop = asyncio.get_running_loop()
-        self._received: Counter[int] = Counter()  # by viewer, in this second
-        self._second_s = 0.0
+        self._rates = RateLimiter()
         self._channels: set[tuple[int, int]] = set()  # viewer and channel that may steer
         self._refused: set[int] = set()  # viewers whose refusal was logged
         self.graph_wanted = False
@@ -189,20 +187,14 @@ class FoxgloveSteering(ServerListener):
 
     def on_message_data(self, client: Client, client_channel_id: int, data: bytes) -> None:
         """Process a message from a viewer."""
-        if len(data) <= MAX_MESSAGE_BYTES and not self._floods(client.id):
+        if self._rates.is_exceeded(client.id, time.monotonic()):
+            return
+        if len(data) <= MAX_MESSAGE_BYTES:
             self._in_loop(self._take, client.id, client_channel_id, data)
 
     def _in_loop(self, act: Callable[..., None], *arguments: object) -> None:
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(act, *arguments)
-
-    def _floods(self, viewer: int) -> bool:
-        now_s = time.monotonic()
-        if now_s - self._second_s >= 1.0:
-            self._second_s = now_s
-            self._received.clear()
-        self._received[viewer] += 1
-        return self._received[viewer] > MAX_RECEIVED_HZ
 
     def _open(self, viewer: int, channel: int, may: bool) -> None:
         if may and len(self._channels) < MAX_CHANNELS:

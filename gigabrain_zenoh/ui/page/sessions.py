@@ -20,7 +20,7 @@ from gigabrain_zenoh.plugins import package_version
 from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, Role
 from gigabrain_zenoh.ui.page.frames import Ask, PageView, Reply
-from gigabrain_zenoh.ui.steering import TeleopArbiter
+from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter
 
 log = logging.getLogger(__name__)
 
@@ -32,7 +32,6 @@ MAX_LOGINS = 64  # browsers that have not logged in; the oldest gives way to the
 MAX_PENDING = 8  # requests of one viewer under way; e-stops do not count
 MAX_REASON_BYTES = 120  # of a reason for closing
 MAX_WAITING_FRAMES = 64  # for a slow browser
-MAX_RECEIVED_HZ = 120  # frames that a browser may send; held keys take 25
 BAD_FRAME, STRANGER, FULL = 1008, 4401, 4429  # codes for closing a WebSocket (RFC 6455 7.4)
 OTHER_STEERS = "another page steers the robot"
 
@@ -45,7 +44,6 @@ class Viewer:
         self.gives_way = asyncio.Event()
         self._slots: dict[str, bytes] = {}
         self._filled = asyncio.Event()
-        self._second_s, self._received = 0.0, 0
 
     def put(self, slot: str, frame: bytes) -> None:
         """Send `frame` instead of what still waits in its slot. Never waits."""
@@ -61,13 +59,6 @@ class Viewer:
         if not self._slots:
             self._filled.clear()
         return frame
-
-    def floods(self, now_s: float) -> bool:
-        """Count a received frame; return whether there are too many in this second."""
-        if now_s - self._second_s >= 1.0:
-            self._second_s, self._received = now_s, 0
-        self._received += 1
-        return self._received > MAX_RECEIVED_HZ
 
 
 class Operator:
@@ -133,6 +124,7 @@ class Sessions:
         self._pending: dict[asyncio.Task[None], Viewer] = {}
         self._logins: list[asyncio.Task[Role | None]] = []
         self._loop = asyncio.get_running_loop()
+        self._rates = RateLimiter()
         self.viewers: list[Viewer] = []
 
     def serve(self, view: PageView, arbiter: TeleopArbiter, operator: Operator) -> None:
@@ -264,7 +256,7 @@ class Sessions:
     def _take(self, viewer: Viewer, frame: bytes) -> None:
         """Process one frame. Raises ValueError for one that our page never sends."""
         now_s = self._loop.time()
-        if viewer.floods(now_s):
+        if self._rates.is_exceeded(viewer.number, now_s):
             raise ValueError("too many frames")
         kind, content = frame[:1], frame[1:]
         if viewer.role != "operator":

@@ -24,7 +24,7 @@ from gigabrain_zenoh.ui.page.frames import Ask, GoalRequest, PageView
 from gigabrain_zenoh.ui.page.node import free_port, with_page
 from gigabrain_zenoh.ui.page.server import run
 from gigabrain_zenoh.ui.page.sessions import Operator, Viewer
-from gigabrain_zenoh.ui.steering import TeleopArbiter
+from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter
 
 
 def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
@@ -178,11 +178,12 @@ async def test_a_slow_browser_gets_the_newest_and_never_more_than_64_frames() ->
     assert await viewer.next() == b"936"
 
 
-def test_120_frames_a_second_are_heard_and_no_more() -> None:
-    viewer = Viewer(1, "operator")
-    assert not any(viewer.floods(10.0 + n / 200) for n in range(120))
-    assert viewer.floods(10.7)
-    assert not viewer.floods(11.1)
+def test_of_each_viewer_120_messages_a_second_are_processed() -> None:
+    rates = RateLimiter()
+    assert not any(rates.is_exceeded(1, 10.0 + n / 200) for n in range(120))
+    assert rates.is_exceeded(1, 10.7)
+    assert not rates.is_exceeded(2, 10.7)
+    assert not rates.is_exceeded(1, 11.1)
 
 
 class Seated:
