@@ -53,7 +53,7 @@ async def ready_to_drive(page: Page) -> None:
     if await page.is_enabled("#release"):
         await page.wait_for_timeout(600)
         await page.click("#release")
-        await told(page, "said", "released")
+        await told(page, "reply", "released")
     await page.wait_for_selector("#enable:enabled")
     await page.click("#enable")
     await page.wait_for_selector(ENABLED)
@@ -150,7 +150,7 @@ async def test_of_two_viewers_one_steers_and_both_see_it(chromium: Browser, seen
     await turning(seen)
     await told(two, "doing", "steered by viewer")
     await two.keyboard.down("d")
-    await told(two, "said", "another page steers")
+    await told(two, "reply", "another page steers")
     await seen.ticks(25)
     assert seen.state.velocity.angular_z > 0.3
     await two.keyboard.up("d")

@@ -122,7 +122,7 @@ async def test_a_click_sends_a_goal_in_the_map_and_a_drag_its_heading(
     assert (round(turned.x, 2), round(turned.y, 2), round(turned.yaw, 2)) == (0.5, 1.0, 1.57)
     assert plain.source == "page"
     await page.click("#cancel")
-    await page.wait_for_selector('#said:has-text("goal-7 is cancelled")')
+    await page.wait_for_selector('#reply:has-text("goal-7 is cancelled")')
     assert [(change.do, change.source) for change in fake.changes] == [("cancel", "page")]
 
 

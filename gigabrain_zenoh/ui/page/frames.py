@@ -20,7 +20,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
 from gigabrain_zenoh.ui.steering import ViewerScene
 
-ABOUT, MOMENT, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
+ABOUT, STATE, SCAN, MAP, HEALTH, LOG, REPLY, IMAGE, TASK = range(1, 10)  # to the browser
 LOGIN, DRIVE, ASK = range(1, 4)  # from the browser
 MAX_KEPT_LINES = 30  # of the log, for viewers that connect later
 
@@ -73,7 +73,7 @@ class Reply(Struct, frozen=True, kw_only=True):
     ok: bool
     text: Text
     robot: str = ""  # type of the robot that confirmed it
-    took_ms: float = 0.0
+    not_confirmed: bool = False  # of an e-stop; the text then says what to do
 
 
 def as_json(kind: int, content: Any) -> bytes:
@@ -161,7 +161,7 @@ class PageView(ViewerScene):
             driving=driving,
             viewers=viewers,
         )
-        return as_json(MOMENT, content)
+        return as_json(STATE, content)
 
     def new_frames(self) -> Iterator[tuple[str, bytes]]:
         """Yield scan and images received since the last call, with their slots."""

@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import itertools
 import logging
-import time
 from collections.abc import Sequence
 
 from msgspec.structs import replace
@@ -14,7 +13,7 @@ from gigabrain_schemas.tasks import GoalReply, TaskReply, TaskRequest
 from gigabrain_schemas.topics import GOAL, TASK_CHANGE
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.client.requests import ANSWER_S, enable, press_estop, release
-from gigabrain_zenoh.errors import BodyLost, GigabrainError, Refused
+from gigabrain_zenoh.errors import BodyLost, GigabrainError, NotConfirmed, Refused
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.plugins import package_version
 from gigabrain_zenoh.ui.page import frames
@@ -30,9 +29,10 @@ MAX_VIEWERS = 16  # browsers at a time; a viewer gives way to an operator
 MAX_OPERATORS = 64  # each of them can stop the robot, so the number of viewers keeps none out
 MAX_LOGINS = 64  # browsers that have not logged in; the oldest gives way to the newest
 MAX_PENDING = 8  # requests of one viewer under way; e-stops do not count
+MAX_REPLY_CHARS = 500
 MAX_REASON_BYTES = 120  # of a reason for closing
 MAX_WAITING_FRAMES = 64  # for a slow browser
-BAD_FRAME, STRANGER, FULL = 1008, 4401, 4429  # codes for closing a WebSocket (RFC 6455 7.4)
+BAD_FRAME, WRONG_TOKEN, FULL = 1008, 4401, 4429  # codes for closing a WebSocket (RFC 6455 7.4)
 OTHER_STEERS = "another page steers the robot"
 
 
@@ -69,15 +69,18 @@ class Operator:
 
     async def answer(self, asked: Ask) -> Reply:
         """Carry out a request. Errors are part of the reply."""
-        start_s = time.perf_counter()
+        ok, robot, unconfirmed = True, "", False
         try:
             text, robot = await self._do(asked)
-            ok = True
         except GigabrainError as error:
-            text, robot, ok = str(error), "", False
-        took_ms = round((time.perf_counter() - start_s) * 1e3, 1)
+            ok, text, unconfirmed = False, str(error), isinstance(error, NotConfirmed)
         return Reply(
-            id=asked.id, what=asked.what, ok=ok, text=text[:500], robot=robot, took_ms=took_ms
+            id=asked.id,
+            what=asked.what,
+            ok=ok,
+            text=text[:MAX_REPLY_CHARS],
+            robot=robot,
+            not_confirmed=unconfirmed,
         )
 
     async def _do(self, asked: Ask) -> tuple[str, str]:
@@ -140,7 +143,7 @@ class Sessions:
     def send_news(self) -> None:
         """Send the present state, scan and images to all viewers."""
         driving = self._arbiter.driving(self._loop.time())
-        self.send("moment", self._view.state_frame(driving, len(self.viewers)))
+        self.send("state", self._view.state_frame(driving, len(self.viewers)))
         for slot, frame in self._view.new_frames():
             self.send(slot, frame)
 
@@ -160,7 +163,7 @@ class Sessions:
         with contextlib.suppress(WebSocketDisconnect):
             role = await self._admit(socket)
             if role is None or not self._has_place(role):
-                await socket.close(FULL if role else STRANGER)
+                await socket.close(FULL if role else WRONG_TOKEN)
                 return
             viewer = Viewer(next(self._numbers), role)
             await self._serve_viewer(socket, viewer)

@@ -170,7 +170,7 @@ def test_it_answers_to_names_as_browsers_write_them(
 async def test_a_slow_browser_gets_the_newest_and_never_more_than_64_frames() -> None:
     viewer = Viewer(1, "viewer")
     for n in range(5):
-        viewer.put("moment", b"%d" % n)
+        viewer.put("state", b"%d" % n)
     viewer.put("scan", b"scan")
     assert [await viewer.next(), await viewer.next()] == [b"4", b"scan"]
     for n in range(1000):

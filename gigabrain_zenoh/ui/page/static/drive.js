@@ -5,35 +5,36 @@ const KEYS = {
   KeyA: [0, 0, 1], ArrowLeft: [0, 0, 1], KeyD: [0, 0, -1], ArrowRight: [0, 0, -1],
   KeyQ: [0, 1, 0], KeyE: [0, -1, 0],
 }
-const SHOULDERS = [4, 5], PAD_STOP = 1, DEAD_ZONE = 0.12
-const typing = (target) => target.matches?.('input:not([type=range]), textarea')
+const SHOULDER_BUTTONS = [4, 5], STOP_BUTTON = 1, DEAD_ZONE = 0.12
+const isTextInput = (target) => target.matches?.('input:not([type=range]), textarea')
 
 export class Drive {
   #held = new Set()
   #stick = null // [x, z] while it is held
   #sending = false
-  #padStopped = false
+  #stopPressed = false // on the gamepad
 
-  /** `limits()` returns the greatest speeds, `send(x, y, z)` sends a velocity, `stop()` is the e-stop. */
-  constructor({ stick, share, limits, send, stop, allowed, show }) {
-    Object.assign(this, { stick, share, limits, send, stop, allowed, show })
+  /** `limits()` returns the highest speeds, `send(x, y, z)` sends a velocity, `stop()` is the e-stop. */
+  constructor({ stick, speedShare, limits, send, stop, allowed, show }) {
+    Object.assign(this, { stick, speedShare, limits, send, stop, allowed, show })
     this.#listenToKeys()
     this.#listenToStick()
-    setInterval(() => this.#tick(), PERIOD_MS)
+    setInterval(() => this.#sendWanted(), PERIOD_MS)
   }
 
-  letGo() {
+  /** Count all keys and the joystick as released. */
+  releaseAll() {
     this.#held.clear()
-    this.#centre()
-    this.#tick()
+    this.#centreStick()
+    this.#sendWanted()
   }
 
-  #tick() {
+  #sendWanted() {
     const [x, y, z] = this.#axes()
     const held = this.allowed() && (x || y || z)
     if (!held && !this.#sending) return
-    const most = this.limits(), share = held ? this.share() : 0
-    const wanted = [x * share * most.x, y * share * most.y, z * share * most.z]
+    const limits = this.limits(), share = held ? this.speedShare() : 0
+    const wanted = [x * share * limits.x, y * share * limits.y, z * share * limits.z]
     this.#sending = Boolean(held)
     this.send(...wanted)
     this.show(held ? wanted : null)
@@ -43,39 +44,39 @@ export class Drive {
     if (this.#stick) return [this.#stick[0], 0, this.#stick[1]]
     const sum = [0, 0, 0]
     for (const code of this.#held) KEYS[code].forEach((value, i) => { sum[i] += value })
-    return sum.some(Boolean) ? sum.map(Math.sign) : this.#pad()
+    return sum.some(Boolean) ? sum.map(Math.sign) : this.#gamepadAxes()
   }
 
-  #pad() {
+  #gamepadAxes() {
     const pad = [...(navigator.getGamepads?.() ?? [])].find(Boolean)
     if (!pad || document.hidden) return [0, 0, 0]
-    const pressed = pad.buttons[PAD_STOP]?.pressed ?? false
-    const before = this.#padStopped
-    this.#padStopped = pressed // first: to stop is to let go, which looks at the pad again
+    const pressed = pad.buttons[STOP_BUTTON]?.pressed ?? false
+    const before = this.#stopPressed
+    this.#stopPressed = pressed // before the stop, which reads the gamepad again
     if (pressed && !before) this.stop()
-    if (!SHOULDERS.some((n) => pad.buttons[n]?.pressed)) return [0, 0, 0]
+    if (!SHOULDER_BUTTONS.some((n) => pad.buttons[n]?.pressed)) return [0, 0, 0]
     const axis = (n) => (Math.abs(pad.axes[n] ?? 0) < DEAD_ZONE ? 0 : -pad.axes[n])
     return [axis(1), axis(0), axis(2)]
   }
 
   #listenToKeys() {
     addEventListener('keydown', (event) => {
-      if (event.code === 'Space' && !typing(event.target)) {
+      if (event.code === 'Space' && !isTextInput(event.target)) {
         event.preventDefault()
-        if (!event.repeat) { this.letGo(); this.stop() }
-      } else if (event.code in KEYS && !typing(event.target) && !event.ctrlKey && !event.metaKey && !event.altKey) {
+        if (!event.repeat) { this.releaseAll(); this.stop() }
+      } else if (event.code in KEYS && !isTextInput(event.target) && !event.ctrlKey && !event.metaKey && !event.altKey) {
         if (event.target.matches?.('[role=tab], [type=range]') && event.code.startsWith('Arrow')) return
         event.preventDefault()
-        if (!event.repeat) { this.#held.add(event.code); this.#tick() }
+        if (!event.repeat) { this.#held.add(event.code); this.#sendWanted() }
       }
     }, true)
-    // a button that has the focus must not be pressed by the space bar that stops
+    // the space bar that stops must not press the button that has the focus
     addEventListener('keyup', (event) => {
-      if (event.code === 'Space' && !typing(event.target)) event.preventDefault()
-      if (this.#held.delete(event.code)) this.#tick()
+      if (event.code === 'Space' && !isTextInput(event.target)) event.preventDefault()
+      if (this.#held.delete(event.code)) this.#sendWanted()
     }, true)
-    addEventListener('blur', () => this.letGo())
-    document.addEventListener('visibilitychange', () => this.letGo())
+    addEventListener('blur', () => this.releaseAll())
+    document.addEventListener('visibilitychange', () => this.releaseAll())
   }
 
   #listenToStick() {
@@ -86,7 +87,7 @@ export class Drive {
       this.#stick = [-down / length, -right / length].map((v) => (Math.abs(v) < DEAD_ZONE ? 0 : v))
       const knob = this.stick.firstElementChild
       knob.style.transform = `translate(${(right / length) * radius * 0.7}px, ${(down / length) * radius * 0.7}px)`
-      this.#tick()
+      this.#sendWanted()
     }
     this.stick.addEventListener('pointerdown', (event) => {
       this.stick.setPointerCapture(event.pointerId)
@@ -94,11 +95,11 @@ export class Drive {
     })
     this.stick.addEventListener('pointermove', (event) => this.#stick && move(event))
     for (const end of ['pointerup', 'pointercancel', 'lostpointercapture']) {
-      this.stick.addEventListener(end, () => { this.#centre(); this.#tick() })
+      this.stick.addEventListener(end, () => { this.#centreStick(); this.#sendWanted() })
     }
   }
 
-  #centre() {
+  #centreStick() {
     this.#stick = null
     this.stick.firstElementChild.style.transform = ''
   }

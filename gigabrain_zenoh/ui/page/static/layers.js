@@ -1,11 +1,13 @@
 // Layers drawn in the robot's frame. Each function takes the canvas context and the map view.
 const TAU = 2 * Math.PI
-const AHEAD_S = 1, SLOW = 0.05 // how far ahead of a moving thing its line reaches; below [m/s] there is none
-const LARGE = 0.3, GAP = 0.25 // [m] radius of what is drawn as it was seen; between beams on one thing
+const LINE_TIME_S = 1 // the line of a moving obstacle reaches to its place after this time
+const MIN_SPEED = 0.05 // [m/s] below it an obstacle has no line
+const MIN_WALL_RADIUS_M = 0.3 // larger obstacles at rest are drawn as the points seen of them
+const MAX_POINT_GAP_M = 0.25 // between two neighbouring points on one obstacle
 
-/** Free space up to the nearest obstacle in each sector. */
-function paintFree(pen, view) {
-  const sectors = view.moment.world?.sectors ?? []
+/** Paint the distance to the nearest obstacle in each sector. */
+function paintSectors(pen, view) {
+  const sectors = view.robot.world?.sectors ?? []
   pen.beginPath()
   sectors.forEach((distance, i) => {
     if (distance === null) return
@@ -18,9 +20,9 @@ function paintFree(pen, view) {
   pen.globalAlpha = 1
 }
 
-/** What must be free for the body to stop at its present speed. */
-function paintZones(pen, view) {
-  const { body, moment: { state } } = view
+/** Paint the zone that must be free for the body to stop from its present speed. */
+function paintStopZone(pen, view) {
+  const { body, robot: { state } } = view
   if (!body || !state) return
   const v = state.velocity.linear_x, t = body.thresholds
   const reach = Math.abs(v) * t.reaction_time + (v * v) / (2 * body.max_linear_deceleration) + t.stop_margin
@@ -34,7 +36,7 @@ function paintZones(pen, view) {
 }
 
 function paintPlan(pen, view) {
-  const points = view.moment.intent?.trajectory ?? []
+  const points = view.robot.intent?.trajectory ?? []
   pen.beginPath()
   pen.moveTo(0, 0)
   for (const [, x, y] of points) pen.lineTo(x, y)
@@ -58,37 +60,40 @@ function paintRobot(pen, view) {
   pen.fill()
 }
 
-/** Points as seen from a pose. */
-const from = ({ x, y, yaw }) => {
+/** Return a function that transforms a point into the frame of a pose. */
+const toFrameOf = ({ x, y, yaw }) => {
   const c = Math.cos(yaw), s = Math.sin(yaw)
   return ([px, py]) => [c * (px - x) + s * (py - y), c * (py - y) - s * (px - x)]
 }
 
-/** What perception follows from scan to scan; it is told in the frame of the odometry.
+/** Paint the obstacles that perception tracks, which are in the odometry frame.
 
-What is large and stands, such as a wall, is drawn as what was seen of it, and all else as a disc. */
-function paintThings(pen, view) {
-  const { world, state, pose } = view.moment
+Large ones at rest, such as walls, are drawn as the points seen of them, all others as discs. */
+function paintObstacles(pen, view) {
+  const { world, state, pose } = view.robot
   if (!state || !pose) return
-  const seen = (view.scan ?? []).map(from(pose)), here = from(state.pose), turned = from({ x: 0, y: 0, yaw: state.pose.yaw })
-  for (const thing of world?.obstacles ?? []) {
-    const [x, y] = here([thing.x, thing.y]), moves = Math.hypot(thing.velocity_x, thing.velocity_y) > SLOW
-    const near = moves || thing.radius <= LARGE ? [] : seen.filter(([px, py]) => Math.hypot(px - x, py - y) < thing.radius + GAP)
-    if (near.length) paintSeen(pen, view, near)
-    else paintDisc(pen, view, x, y, thing.radius, moves ? turned([thing.velocity_x, thing.velocity_y]) : null)
+  const points = (view.scan ?? []).map(toFrameOf(pose))
+  const toRobot = toFrameOf(state.pose), rotate = toFrameOf({ x: 0, y: 0, yaw: state.pose.yaw })
+  for (const obstacle of world?.obstacles ?? []) {
+    const velocity = [obstacle.velocity_x, obstacle.velocity_y], moves = Math.hypot(...velocity) > MIN_SPEED
+    const [x, y] = toRobot([obstacle.x, obstacle.y]), reach = obstacle.radius + MAX_POINT_GAP_M
+    const isWall = !moves && obstacle.radius > MIN_WALL_RADIUS_M
+    const near = isWall ? points.filter(([px, py]) => Math.hypot(px - x, py - y) < reach) : []
+    if (near.length) paintPoints(pen, view, near)
+    else paintDisc(pen, view, x, y, obstacle.radius, moves ? rotate(velocity) : null)
   }
 }
 
-function paintSeen(pen, view, points) {
+function paintPoints(pen, view, points) {
   pen.beginPath()
   points.forEach(([x, y], i) => {
-    const joined = i && Math.hypot(x - points[i - 1][0], y - points[i - 1][1]) < GAP
+    const joined = i && Math.hypot(x - points[i - 1][0], y - points[i - 1][1]) < MAX_POINT_GAP_M
     if (joined) pen.lineTo(x, y)
     else pen.moveTo(x, y)
   })
   pen.lineCap = pen.lineJoin = 'round'
   pen.globalAlpha = 0.45
-  view.stroke(pen, view.colour.thing, 9)
+  view.stroke(pen, view.colour.obstacle, 9)
   pen.globalAlpha = 1
 }
 
@@ -96,14 +101,14 @@ function paintDisc(pen, view, x, y, radius, velocity) {
   pen.beginPath()
   pen.arc(x, y, Math.max(radius, 3 * view.pixel), 0, TAU)
   pen.globalAlpha = 0.35
-  pen.fillStyle = view.colour.thing
+  pen.fillStyle = view.colour.obstacle
   pen.fill()
   pen.globalAlpha = 1
   if (velocity) {
     pen.moveTo(x, y)
-    pen.lineTo(x + AHEAD_S * velocity[0], y + AHEAD_S * velocity[1])
+    pen.lineTo(x + LINE_TIME_S * velocity[0], y + LINE_TIME_S * velocity[1])
   }
-  view.stroke(pen, view.colour.thing, 2)
+  view.stroke(pen, view.colour.obstacle, 2)
 }
 
-export const ON_ROBOT = [paintFree, paintZones, paintThings, paintPlan, paintRobot]
+export const ON_ROBOT = [paintSectors, paintStopZone, paintObstacles, paintPlan, paintRobot]

@@ -1,35 +1,35 @@
-// Connects the page: shows what the link receives, and sends what a person does.
+// Connects the parts of the page: shows the frames that the link receives, and sends the operator's requests.
 import { Drive } from './drive.js'
 import { Link } from './link.js'
 import { MapView } from './map.js'
-import { $, showHealth, showLogLine, put, showFigures, showGate, showImage, showSafety, showTables, showTask } from './panels.js'
+import { $, setText, showFigures, showGate, showHealth, showImage, showLogLine, showSafety, showTables, showTask } from './panels.js'
 
-const STOP_MS = 2500 // the server gives up after two seconds
-const HANDS = 'press the hardware e-stop or cut the power'
-const remembered = (key) => { try { return sessionStorage.getItem(key) ?? '' } catch { return '' } }
-const remember = (key, value) => { try { sessionStorage.setItem(key, value) } catch { /* private mode */ } }
+const STOP_TIMEOUT_MS = 2500 // the server gives up after two seconds
+const BY_HAND = 'press the hardware e-stop or cut the power'
+const stored = (key) => { try { return sessionStorage.getItem(key) ?? '' } catch { return '' } }
+const store = (key, value) => { try { sessionStorage.setItem(key, value) } catch { /* private mode */ } }
 
 let about = { role: 'operator', body: null }
-let moment = null
+let robot = null // its present state
 
-const given = decodeURIComponent(location.hash.slice(1))
-if (given) { remember('token', given); history.replaceState(null, '', location.pathname) }
+const token = decodeURIComponent(location.hash.slice(1))
+if (token) { store('token', token); history.replaceState(null, '', location.pathname) }
 
 const map = new MapView($('map'), sendGoal)
 const link = new Link({
-  about(told) {
-    about = told
-    map.body = told.body
-    put($('robot'), told.body ? `${told.body.robot_type} · ${told.link}` : 'gigabrain')
-    document.title = `${told.body?.robot_type ?? 'gigabrain'}${looking() ? ' (view only)' : ''}`
-    $('estop').disabled = looking()
-    $('estop').querySelector('small').textContent = looking() ? 'view only: this token cannot stop the robot' : 'space bar'
+  about(info) {
+    about = info
+    map.body = info.body
+    setText($('robot'), info.body ? `${info.body.robot_type} · ${info.link}` : 'gigabrain')
+    document.title = `${info.body?.robot_type ?? 'gigabrain'}${viewOnly() ? ' (view only)' : ''}`
+    $('estop').disabled = viewOnly()
+    $('estop').querySelector('small').textContent = viewOnly() ? 'view only: this token cannot stop the robot' : 'space bar'
   },
-  moment(now) {
-    moment = now
-    if (now.state?.gate.mode === 'latched') drive.letGo() // a held key must not move the robot right after the release
-    map.setMoment(now)
-    showGate(now.state, looking())
+  robot(now) {
+    robot = now
+    if (now.state?.gate.mode === 'latched') drive.releaseAll() // a held key must not move the robot right after the release
+    map.setRobot(now)
+    showGate(now.state, viewOnly())
     showFigures(now.state, now)
     showSafety(now.safety, about.body)
     $('stick').classList.toggle('off', !mayDrive())
@@ -38,96 +38,96 @@ const link = new Link({
   map: (head, cells) => map.setMap(head, cells),
   task(status) {
     map.setTask(status)
-    showTask(status, looking())
+    showTask(status, viewOnly())
   },
   health: showHealth,
   log: showLogLine,
   image: showImage,
-  told: (reply) => say(reply),
-  state(word) {
-    const live = word === 'live'
-    put($('link'), live ? `live${moment?.viewers > 1 ? ` · ${moment.viewers} viewers` : ''}` : word)
+  reply: showReply,
+  connection(status) {
+    const live = status === 'live'
+    setText($('link'), live ? `live${robot?.viewers > 1 ? ` · ${robot.viewers} viewers` : ''}` : status)
     $('link').classList.toggle('live', live)
     document.body.classList.toggle('silent', !live)
     if (!live) {
-      drive.letGo()
-      moment = null
-      showGate(null, looking())
+      drive.releaseAll()
+      robot = null
+      showGate(null, viewOnly())
       showFigures(null, {})
       showSafety(null, about.body)
-      put($('doing'), word === 'offline' ? 'no connection to the page’s server; retrying' : 'no messages from the page’s server')
+      setText($('doing'), status === 'offline' ? 'no connection to the page’s server; retrying' : 'no messages from the page’s server')
     }
   },
   login() { $('login').showModal() },
-}, remembered('token'))
+}, stored('token'))
 
 const drive = new Drive({
   stick: $('stick'),
-  share: () => $('share').value / 100,
+  speedShare: () => $('speed-share').value / 100,
   limits: () => ({ x: about.body?.max_linear_speed ?? 0, y: about.body?.max_lateral_speed ?? 0, z: about.body?.max_angular_speed ?? 0 }),
   send: (x, y, z) => link.drive(x, y, z),
   stop: () => stop(),
   allowed: mayDrive,
   show(wanted) {
-    put($('wanted'), wanted ? `${wanted[0].toFixed(2)} m/s  ${wanted[2].toFixed(2)} rad/s` : 'released')
+    setText($('wanted'), wanted ? `${wanted[0].toFixed(2)} m/s  ${wanted[2].toFixed(2)} rad/s` : 'released')
   },
 })
 
-function looking() { return about.role !== 'operator' }
+function viewOnly() { return about.role !== 'operator' }
 
 function mayDrive() {
-  const gate = moment?.state?.gate
-  return !looking() && gate?.mode === 'enabled' && gate.commander === 'control'
+  const gate = robot?.state?.gate
+  return !viewOnly() && gate?.mode === 'enabled' && gate.commander === 'control'
 }
 
 async function stop() {
-  if (looking()) return
-  drive.letGo()
-  const began = performance.now()
+  if (viewOnly()) return
+  drive.releaseAll()
+  const startMs = performance.now()
   show($('confirmed'), 'stopping …', '')
-  const reply = await link.ask('estop', {}, STOP_MS)
-  if (reply.ok) return show($('confirmed'), `CONFIRMED by ${reply.robot} in ${(performance.now() - began).toFixed(0)} ms: ${reply.text}`, 'ok')
-  const why = reply.text.startsWith('NOT CONFIRMED') ? reply.text : `NOT CONFIRMED: ${reply.text}; ${HANDS}`
-  show($('confirmed'), why, 'bad')
+  const reply = await link.request('estop', {}, STOP_TIMEOUT_MS)
+  if (reply.ok) return show($('confirmed'), `CONFIRMED by ${reply.robot} in ${(performance.now() - startMs).toFixed(0)} ms: ${reply.text}`, 'ok')
+  const text = reply.not_confirmed ? reply.text : `NOT CONFIRMED: ${reply.text}; ${BY_HAND}`
+  show($('confirmed'), text, 'bad')
 }
 
-async function ask(what) {
-  drive.letGo()
-  const generation = moment?.state?.gate.estop_generation ?? 0
-  const reply = await link.ask(what, what === 'release' ? { estop_generation: generation } : {})
-  say(reply)
+async function request(what) {
+  drive.releaseAll()
+  const generation = robot?.state?.gate.estop_generation ?? 0
+  const reply = await link.request(what, what === 'release' ? { estop_generation: generation } : {})
+  showReply(reply)
   if (reply.ok && what === 'release') show($('confirmed'), '', '')
 }
 
-function say(reply) {
-  show($('said'), reply.text, `note${reply.ok ? '' : ' bad'}`)
+function showReply(reply) {
+  show($('reply'), reply.text, `note${reply.ok ? '' : ' bad'}`)
 }
 
 async function sendGoal(goal) {
-  if (looking()) return
+  if (viewOnly()) return
   map.goal = goal
-  show($('goal'), 'asking …', 'note')
-  const reply = await link.ask('goal', { goal: { x: goal.x, y: goal.y, yaw: goal.yaw } })
+  show($('goal'), 'sending the goal …', 'note')
+  const reply = await link.request('goal', { goal: { x: goal.x, y: goal.y, yaw: goal.yaw } })
   if (!reply.ok) map.goal = map.task?.goal ?? null
   show($('goal'), reply.text, `note${reply.ok ? '' : ' bad'}`)
   map.draw()
 }
 
 function show(element, text, kind) {
-  put(element, text)
+  setText(element, text)
   element.className = kind
 }
 
 $('estop').addEventListener('pointerdown', (event) => { event.preventDefault(); stop() })
 $('estop').addEventListener('click', (event) => { if (event.detail === 0) stop() }) // by keyboard or by a screen reader
-for (const what of ['release', 'enable', 'take', 'cancel']) $(what).addEventListener('click', () => ask(what))
-$('share').addEventListener('input', () => put($('percent'), `${$('share').value} %`))
-$('closer').addEventListener('click', () => map.zoom(1.3))
-$('farther').addEventListener('click', () => map.zoom(1 / 1.3))
-for (const name of ['follow', 'grab']) {
-  $(name).addEventListener('click', () => { map[name] = !map[name]; $(name).setAttribute('aria-pressed', map[name]) })
+for (const what of ['release', 'enable', 'take', 'cancel']) $(what).addEventListener('click', () => request(what))
+$('speed-share').addEventListener('input', () => setText($('percent'), `${$('speed-share').value} %`))
+$('zoom-in').addEventListener('click', () => map.zoom(1.3))
+$('zoom-out').addEventListener('click', () => map.zoom(1 / 1.3))
+for (const [id, option] of [['follow', 'follow'], ['move-map', 'dragMoves']]) {
+  $(id).addEventListener('click', () => { map[option] = !map[option]; $(id).setAttribute('aria-pressed', map[option]) })
 }
-$('login').addEventListener('close', () => { link.token = $('token').value; remember('token', link.token); link.open() })
+$('login').addEventListener('close', () => { link.token = $('token').value; store('token', link.token); link.open() })
 
 $('theme').addEventListener('click', () => {
   const root = document.documentElement
@@ -140,7 +140,7 @@ try { const theme = localStorage.getItem('theme'); if (theme) { document.documen
 matchMedia('(prefers-color-scheme: dark)').addEventListener('change', () => map.recolour())
 
 const tabs = [...document.querySelectorAll('[role=tab]')]
-function choose(tab) {
+function selectTab(tab) {
   for (const other of tabs) {
     other.setAttribute('aria-selected', other === tab)
     other.tabIndex = other === tab ? 0 : -1
@@ -149,13 +149,13 @@ function choose(tab) {
   showTables()
 }
 tabs.forEach((tab, i) => {
-  tab.addEventListener('click', () => choose(tab))
+  tab.addEventListener('click', () => selectTab(tab))
   tab.addEventListener('keydown', (event) => {
     const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key]
     if (!step) return
     const next = tabs[(i + step + tabs.length) % tabs.length]
     next.focus()
-    choose(next)
+    selectTab(next)
   })
 })
 setInterval(showTables, 1000)

@@ -1,23 +1,25 @@
-// The map with the robot, its path and its goal. Redrawn when something has changed.
+// The map with the robot, its path and its goal. It is drawn again when something has changed.
 import { ON_ROBOT } from './layers.js'
 
-const CELL_M = 0.05, SIDE = 1200 // of the trace of scans, shown without a map
-const HEADING_M = 0.1 // a shorter drag sets no heading
+const TRACE_CELL_M = 0.05, TRACE_CELLS = 1200 // of the trace of scans, which is shown where there is no map
+const MIN_HEADING_DRAG_M = 0.1 // a shorter drag sets no heading
+const MIN_STEP_M = 0.03 // between two points of the driven path
+const MAX_TRAIL = 4000, TRAIL_CUT = 1000 // points of the driven path
 const TAU = 2 * Math.PI
-const COLOURS = ['floor', 'grid', 'wall', 'scan', 'plan', 'zone', 'trail', 'seen', 'robot', 'thing', 'ink']
+const COLOURS = ['floor', 'grid', 'scan', 'plan', 'zone', 'trail', 'trace', 'robot', 'obstacle', 'ink']
 
 export class MapView {
   #scale = 90 // pixels per metre
   #centre = [0, 0]
   #drag = null
-  #due = false
+  #drawScheduled = false
   #pointers = new Map()
 
   constructor(canvas, onGoal) {
     this.canvas = canvas
     this.onGoal = onGoal
     this.follow = true
-    this.grab = false
+    this.dragMoves = false // a drag moves the map and sets no goal
     this.clear()
     this.recolour()
     new ResizeObserver(() => this.draw()).observe(canvas)
@@ -25,9 +27,9 @@ export class MapView {
   }
 
   clear() {
-    this.seen = new OffscreenCanvas(SIDE, SIDE)
+    this.trace = new OffscreenCanvas(TRACE_CELLS, TRACE_CELLS)
     this.trail = []
-    this.scan = this.map = this.goal = this.moment = this.task = null
+    this.scan = this.map = this.goal = this.robot = this.task = null
   }
 
   recolour() {
@@ -37,32 +39,32 @@ export class MapView {
     this.draw()
   }
 
-  setMoment(moment) {
-    if (this.moment?.state && moment.state && moment.state.boot !== this.moment.state.boot) this.clear()
-    if (this.moment?.frame !== moment.frame) this.trail = []
-    this.moment = moment
-    const pose = moment.pose
+  setRobot(robot) {
+    if (this.robot?.state && robot.state && robot.state.boot !== this.robot.state.boot) this.clear()
+    if (this.robot?.frame !== robot.frame) this.trail = []
+    this.robot = robot
+    const pose = robot.pose
     if (pose) {
       const last = this.trail.at(-1)
-      if (!last || Math.hypot(pose.x - last[0], pose.y - last[1]) > 0.03) this.trail.push([pose.x, pose.y])
-      if (this.trail.length > 4000) this.trail.splice(0, 1000)
+      if (!last || Math.hypot(pose.x - last[0], pose.y - last[1]) > MIN_STEP_M) this.trail.push([pose.x, pose.y])
+      if (this.trail.length > MAX_TRAIL) this.trail.splice(0, TRAIL_CUT)
       if (this.follow) this.#centre = [pose.x, pose.y]
     }
     this.draw()
   }
 
-  /** Head: robot x, y, yaw; lidar x, y, yaw; first angle, increment, longest range. */
+  /** Head: robot x, y, yaw; lidar x, y, yaw; first angle, increment, greatest range. */
   setScan(head, ranges) {
-    const [x, y, yaw, mx, my, myaw, first, step, longest] = head
+    const [x, y, yaw, mx, my, myaw, first, step, maxRange] = head
     const points = []
     const lx = x + mx * Math.cos(yaw) - my * Math.sin(yaw), ly = y + mx * Math.sin(yaw) + my * Math.cos(yaw)
     ranges.forEach((range, i) => {
-      if (!(range > 0 && range <= longest)) return
+      if (!(range > 0 && range <= maxRange)) return
       const angle = yaw + myaw + first + i * step
       points.push([lx + range * Math.cos(angle), ly + range * Math.sin(angle)])
     })
     this.scan = points
-    if (!this.map) this.#remember(points)
+    if (!this.map) this.#addToTrace(points)
   }
 
   setMap(head, cells) {
@@ -73,7 +75,7 @@ export class MapView {
     this.draw()
   }
 
-  /** Path and goal of the present task, in the map. */
+  /** Set the path and the goal of the present task, in the map. */
   setTask(task) {
     this.task = task
     this.goal = task.goal
@@ -86,15 +88,15 @@ export class MapView {
   }
 
   draw() {
-    if (this.#due) return
-    this.#due = true
-    requestAnimationFrame(() => { this.#due = false; this.#paint() })
+    if (this.#drawScheduled) return
+    this.#drawScheduled = true
+    requestAnimationFrame(() => { this.#drawScheduled = false; this.#paint() })
   }
 
-  #remember(points) {
-    const pen = this.seen.getContext('2d')
-    pen.fillStyle = this.colour.seen
-    for (const [x, y] of points) pen.fillRect(Math.round(SIDE / 2 + x / CELL_M), Math.round(SIDE / 2 - y / CELL_M), 1, 1)
+  #addToTrace(points) {
+    const pen = this.trace.getContext('2d')
+    pen.fillStyle = this.colour.trace
+    for (const [x, y] of points) pen.fillRect(Math.round(TRACE_CELLS / 2 + x / TRACE_CELL_M), Math.round(TRACE_CELLS / 2 - y / TRACE_CELL_M), 1, 1)
   }
 
   #paintMap() {
@@ -124,20 +126,20 @@ export class MapView {
     pen.setTransform(k, 0, 0, -k, (w * ratio) / 2 - this.#centre[0] * k, (h * ratio) / 2 + this.#centre[1] * k)
     this.pixel = 1 / this.#scale
     this.#paintGrid(pen, w, h)
-    this.#paintPlace(pen)
-    const { moment } = this
-    if (moment?.pose) {
+    this.#paintSurroundings(pen)
+    const pose = this.robot?.pose
+    if (pose) {
       pen.save()
-      pen.translate(moment.pose.x, moment.pose.y)
-      pen.rotate(moment.pose.yaw)
+      pen.translate(pose.x, pose.y)
+      pen.rotate(pose.yaw)
       for (const paint of ON_ROBOT) paint(pen, this)
       pen.restore()
     }
-    this.#paintWay(pen)
+    this.#paintPath(pen)
     this.#paintGoal(pen)
   }
 
-  #paintWay(pen) {
+  #paintPath(pen) {
     const path = this.task?.path ?? []
     pen.beginPath()
     path.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)))
@@ -155,17 +157,17 @@ export class MapView {
     this.stroke(pen, this.colour.grid, 1)
   }
 
-  #paintPlace(pen) {
+  #paintSurroundings(pen) {
     pen.imageSmoothingEnabled = false
-    const put = (picture, x, y, cell) => {
+    const drawCells = (picture, x, y, cell) => {
       pen.save()
       pen.translate(x, y)
       pen.scale(cell, -cell)
       pen.drawImage(picture, 0, -picture.height)
       pen.restore()
     }
-    if (this.map) put(this.picture, this.map.x, this.map.y, this.map.resolution)
-    else put(this.seen, (-SIDE / 2) * CELL_M, (-SIDE / 2) * CELL_M, CELL_M)
+    if (this.map) drawCells(this.picture, this.map.x, this.map.y, this.map.resolution)
+    else drawCells(this.trace, (-TRACE_CELLS / 2) * TRACE_CELL_M, (-TRACE_CELLS / 2) * TRACE_CELL_M, TRACE_CELL_M)
     pen.beginPath()
     this.trail.forEach(([x, y], i) => (i ? pen.lineTo(x, y) : pen.moveTo(x, y)))
     this.stroke(pen, this.colour.trail, 2)
@@ -193,7 +195,8 @@ export class MapView {
     pen.stroke()
   }
 
-  #at(event) {
+  /** Return the place in the map under the pointer. */
+  #placeOf(event) {
     const box = this.canvas.getBoundingClientRect()
     return [
       this.#centre[0] + (event.clientX - box.left - box.width / 2) / this.#scale,
@@ -214,8 +217,8 @@ export class MapView {
   #down(event) {
     this.canvas.setPointerCapture(event.pointerId)
     this.#pointers.set(event.pointerId, [event.clientX, event.clientY])
-    const moving = this.grab || event.shiftKey || event.button > 0 || this.#pointers.size > 1
-    const [x, y] = this.#at(event)
+    const moving = this.dragMoves || event.shiftKey || event.button > 0 || this.#pointers.size > 1
+    const [x, y] = this.#placeOf(event)
     this.#drag = moving ? { last: [event.clientX, event.clientY] } : { goal: { x, y, yaw: null } }
     this.draw()
   }
@@ -225,25 +228,25 @@ export class MapView {
     if (!before || !this.#drag) return
     const now = [event.clientX, event.clientY], others = [...this.#pointers].filter(([id]) => id !== event.pointerId)
     if (others.length) {
-      const far = (p) => Math.hypot(p[0] - others[0][1][0], p[1] - others[0][1][1])
-      this.zoom(far(now) / Math.max(1, far(before)))
+      const distance = (p) => Math.hypot(p[0] - others[0][1][0], p[1] - others[0][1][1])
+      this.zoom(distance(now) / Math.max(1, distance(before)))
     } else if (this.#drag.last) {
       this.#setFollow(false)
       this.#centre = [this.#centre[0] - (now[0] - before[0]) / this.#scale, this.#centre[1] + (now[1] - before[1]) / this.#scale]
     } else {
-      const [x, y] = this.#at(event), goal = this.#drag.goal
+      const [x, y] = this.#placeOf(event), goal = this.#drag.goal
       const dx = x - goal.x, dy = y - goal.y
-      goal.yaw = Math.hypot(dx, dy) > HEADING_M ? Math.atan2(dy, dx) : null
+      goal.yaw = Math.hypot(dx, dy) > MIN_HEADING_DRAG_M ? Math.atan2(dy, dx) : null
     }
     this.#pointers.set(event.pointerId, now)
     this.draw()
   }
 
-  #up(event, done) {
+  #up(event, completed) {
     this.#pointers.delete(event.pointerId)
     const goal = this.#drag?.goal
     this.#drag = null
-    if (goal && done) this.onGoal(goal)
+    if (goal && completed) this.onGoal(goal)
     this.draw()
   }
 

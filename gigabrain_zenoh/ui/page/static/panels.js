@@ -1,45 +1,45 @@
-// Panels next to the map: gate, safety, processes, topics, log, images. Messages are shown as text, never as HTML.
+// Panels beside the map: gate, safety, processes, topics, log, images. Messages are shown as text, never as HTML.
 export const $ = (id) => document.getElementById(id)
 const MODES = { enabled: 'driving allowed', idle: 'idle', stopping: 'stopping', latched: 'latched' }
-const LINES = 200, LATE_MS = 3000
+const MAX_LOG_LINES = 200, SILENT_AFTER_MS = 3000
 const AXES = [
   ['forward', 'max_linear_speed', 'm/s'], ['backward', 'max_linear_speed', 'm/s'],
   ['left', 'max_lateral_speed', 'm/s'], ['right', 'max_lateral_speed', 'm/s'],
   ['turn_left', 'max_angular_speed', 'rad/s'], ['turn_right', 'max_angular_speed', 'rad/s'],
 ]
 
-export function put(element, text) {
+export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text
 }
 
-export function make(tag, text = '', kind = '') {
+function makeElement(tag, text = '', kind = '') {
   const element = document.createElement(tag)
   element.textContent = text
   if (kind) element.className = kind
   return element
 }
 
-/** Replaces the children only when their text has changed, so that a screen reader reads nothing twice. */
-function replace(parent, key, children) {
+/** Replace the children only when `key` has changed, so that a screen reader reads nothing twice. */
+function replaceChildren(parent, key, children) {
   if (parent.dataset.key === key) return
   parent.dataset.key = key
   parent.replaceChildren(...children())
 }
 
 function listCauses(list, causes) {
-  replace(list, JSON.stringify(causes), () => causes.map((cause) => {
-    const item = make('li', cause.text, cause.latching ? 'latching' : '')
-    if (cause.remedy) item.append(make('small', `→ ${cause.remedy}`))
+  replaceChildren(list, JSON.stringify(causes), () => causes.map((cause) => {
+    const item = makeElement('li', cause.text, cause.latching ? 'latching' : '')
+    if (cause.remedy) item.append(makeElement('small', `→ ${cause.remedy}`))
     return item
   }))
 }
 
-export function showGate(state, looking) {
+export function showGate(state, viewOnly) {
   const gate = state?.gate
   $('gate').dataset.mode = gate?.mode ?? 'silent'
-  put($('mode'), gate ? MODES[gate.mode] : 'silent')
-  const who = gate?.commander === 'control' ? 'the brain' : gate?.commander
-  put($('who'), gate ? `commander: ${who || 'none'}` : '')
+  setText($('mode'), gate ? MODES[gate.mode] : 'silent')
+  const commander = gate?.commander === 'control' ? 'the brain' : gate?.commander
+  setText($('commander'), gate ? `commander: ${commander || 'none'}` : '')
   const silent = { text: 'no messages from the robot', remedy: 'check its driver and the network', latching: true }
   listCauses($('causes'), gate ? gate.causes : [silent])
   $('release').disabled = gate?.mode !== 'latched'
@@ -47,57 +47,58 @@ export function showGate(state, looking) {
   $('take').disabled = gate?.mode !== 'enabled' || gate.commander === 'control'
   $('release').classList.toggle('urge', !$('release').disabled)
   $('enable').classList.toggle('urge', gate?.mode === 'idle')
-  document.body.classList.toggle('looking', looking)
+  document.body.classList.toggle('view-only', viewOnly)
 }
 
-export function showFigures(state, moment) {
+export function showFigures(state, robot) {
   const v = state?.velocity
-  put($('speed'), v ? `${v.linear_x.toFixed(2)} m/s  ${v.angular_z.toFixed(2)} rad/s` : '–')
-  put($('battery'), state?.battery ? `${state.battery.percentage.toFixed(0)} %  ${state.battery.voltage.toFixed(1)} V` : '–')
-  const heat = (state?.joints ?? []).map((joint) => joint.temperature).filter((t) => t !== null)
-  put($('heat'), heat.length ? `${Math.max(...heat).toFixed(0)} °C` : '–')
-  put($('doing'), doing(state, moment))
+  setText($('speed'), v ? `${v.linear_x.toFixed(2)} m/s  ${v.angular_z.toFixed(2)} rad/s` : '–')
+  setText($('battery'), state?.battery ? `${state.battery.percentage.toFixed(0)} %  ${state.battery.voltage.toFixed(1)} V` : '–')
+  const temperatures = (state?.joints ?? []).map((joint) => joint.temperature).filter((t) => t !== null)
+  setText($('temperature'), temperatures.length ? `${Math.max(...temperatures).toFixed(0)} °C` : '–')
+  setText($('doing'), activity(state, robot))
 }
 
-function doing(state, moment) {
+/** Describe what the robot does. */
+function activity(state, robot) {
   if (!state) return 'no messages from the robot'
   const { mode, commander } = state.gate
-  if (mode !== 'enabled' && compiling.size) return `starting up: ${[...compiling].join(' and ')} compiling (once per installation)`
-  if (mode !== 'enabled') return mode === 'idle' ? 'at rest, waiting to be enabled' : mode
+  if (mode !== 'enabled' && compiling.size) return `starting up: ${[...compiling].join(' and ')} compiling, once per installation`
+  if (mode !== 'enabled') return mode === 'idle' ? 'idle: waiting to be enabled' : MODES[mode]
   if (commander !== 'control') return `${commander} drives`
-  if (moment.driving) return `steered by viewer ${moment.driving}`
-  return moment.intent?.reason ?? 'no messages from decision'
+  if (robot.driving) return `steered by viewer ${robot.driving}`
+  return robot.intent?.reason ?? 'no messages from decision'
 }
 
 export function showSafety(safety, body) {
-  put($('verdict'), safety?.verdict ?? 'silent')
-  listCauses($('warnings'), [...(safety?.causes ?? []), ...(safety?.warnings ?? []), ...problems()])
+  setText($('verdict'), safety?.verdict ?? 'silent')
+  listCauses($('warnings'), [...(safety?.causes ?? []), ...(safety?.warnings ?? []), ...problemsOfProcesses()])
   if (!body) return
   const caps = safety?.caps ?? {}
-  const rows = AXES.filter(([, most]) => body[most] > 0).map(([name, key, unit]) => {
-    const turning = name.startsWith('turn') ? [caps.rotation, caps[name]].filter((c) => c != null) : [caps[name]].filter((c) => c != null)
-    return [name.replace('_', ' '), body[key], safety ? Math.min(body[key], ...turning) : 0, unit]
+  const rows = AXES.filter(([, limit]) => body[limit] > 0).map(([name, limit, unit]) => {
+    const lower = [caps[name], name.startsWith('turn') ? caps.rotation : null].filter((cap) => cap != null)
+    return [name.replace('_', ' '), body[limit], safety ? Math.min(body[limit], ...lower) : 0, unit]
   })
-  replace($('caps'), JSON.stringify(rows), () => rows.flatMap(([name, most, allowed, unit]) => {
-    const bar = make('i'), fill = make('b', '', allowed < most ? 'capped' : '')
-    fill.style.width = `${(100 * allowed) / most}%`
+  replaceChildren($('caps'), JSON.stringify(rows), () => rows.flatMap(([name, limit, allowed, unit]) => {
+    const bar = makeElement('i'), fill = makeElement('b', '', allowed < limit ? 'capped' : '')
+    fill.style.width = `${(100 * allowed) / limit}%`
     bar.append(fill)
-    return [make('span', name), bar, make('span', `${allowed.toFixed(2)} ${unit}`)]
+    return [makeElement('span', name), bar, makeElement('span', `${allowed.toFixed(2)} ${unit}`)]
   }))
 }
 
-/** Shows the present task and its progress, or the result of the last one. */
-export function showTask(status, looking) {
+/** Show the present task and its progress, or the result of the last one. */
+export function showTask(status, viewOnly) {
   const { current } = status
-  $('cancel').hidden = looking || !current
+  $('cancel').hidden = viewOnly || !current
   $('goal').className = current || status.done[0]?.state !== 'failed' ? 'note' : 'note bad'
-  put($('goal'), current ? present(status) : lastTask(status.done[0]))
+  setText($('goal'), current ? presentTask(status) : lastTask(status.done[0]))
 }
 
-function present({ current, doing, distance_remaining: left, eta, queue }) {
+function presentTask({ current, doing, distance_remaining: left, eta, queue }) {
   const words = [current.state === 'paused' ? `paused: ${doing}` : doing || current.label]
   if (left != null) words.push(`${left.toFixed(1)} m left`)
-  if (eta != null) words.push(`about ${since(eta)}`)
+  if (eta != null) words.push(`about ${duration(eta)}`)
   if (current.reason && current.reason !== words[0]) words.push(current.reason)
   if (queue.length) words.push(`then ${queue.map((task) => task.label).join(', ')}`)
   return words.join(' · ')
@@ -107,36 +108,36 @@ function lastTask(task) {
   return task ? [`${task.label}: ${task.state}`, task.reason].filter(Boolean).join(' · ') : ''
 }
 
-const healths = new Map() // process -> [health, when]
-const compiling = new Set() // processes that are compiling
+const healthByProcess = new Map() // [newest health, its arrival in ms]
+const compiling = new Set() // names of processes
 
 export function showHealth(health) {
-  healths.set(health.process, [health, performance.now()])
+  healthByProcess.set(health.process, [health, performance.now()])
   showTables()
 }
 
-function problems() {
-  return [...healths.values()].flatMap(([health]) => health.problems ?? [])
+function problemsOfProcesses() {
+  return [...healthByProcess.values()].flatMap(([health]) => health.problems ?? [])
 }
 
 export function showTables() {
   const now = performance.now()
-  const all = [...healths].sort().map(([, heard]) => heard)
-  if (!$('processes').hidden) fill($('processes'), all.map(([health, at]) => processRow(health, now - at > LATE_MS)))
-  if (!$('topics').hidden) fill($('topics'), topicRows(all.map(([health]) => health)))
-  const driver = healths.get('driver')?.[0].latency_ms ?? {}
+  const all = [...healthByProcess].sort().map(([, entry]) => entry)
+  if (!$('processes').hidden) fillTable($('processes'), all.map(([health, arrivalMs]) => processRow(health, now - arrivalMs > SILENT_AFTER_MS)))
+  if (!$('topics').hidden) fillTable($('topics'), topicRows(all.map(([health]) => health)))
+  const driver = healthByProcess.get('driver')?.[0].latency_ms ?? {}
   const [p50, p99] = [driver.scan_to_cmd_p50, driver.scan_to_cmd_p99]
-  put($('latency'), p50 ? `${p50.toFixed(1)} ms (p99 ${p99.toFixed(1)})` : '–')
+  setText($('latency'), p50 ? `${p50.toFixed(1)} ms (p99 ${p99.toFixed(1)})` : '–')
 }
 
-function processRow(health, late) {
+function processRow(health, silent) {
   const latency = Object.entries(health.latency_ms).map(([name, ms]) => `${name.replaceAll('_', ' ')} ${ms.toFixed(1)} ms`)
-  const refused = Object.values(health.rejected).reduce((sum, n) => sum + n, 0)
+  const rejected = Object.values(health.rejected).reduce((sum, n) => sum + n, 0)
   const cells = [
-    health.process, late ? 'silent' : `${(100 * health.cpu).toFixed(1)} %`, `${(health.rss_bytes / 1e6).toFixed(0)} MB`,
-    since(health.uptime_s), latency.join(', '), String(refused), health.host,
+    health.process, silent ? 'silent' : `${(100 * health.cpu).toFixed(1)} %`, `${(health.rss_bytes / 1e6).toFixed(0)} MB`,
+    duration(health.uptime_s), latency.join(', '), String(rejected), health.host,
   ]
-  return { cells, numbers: [1, 2, 3, 5], late }
+  return { cells, numbers: [1, 2, 3, 5], silent }
 }
 
 function topicRows(all) {
@@ -157,15 +158,15 @@ function topicRows(all) {
   ))
 }
 
-function fill(panel, rows) {
-  panel.querySelector('tbody').replaceChildren(...rows.map(({ cells, numbers, late }) => {
-    const row = make('tr', '', late ? 'late' : '')
-    row.append(...cells.map((text, i) => make('td', text, numbers.includes(i) ? 'n' : '')))
+function fillTable(panel, rows) {
+  panel.querySelector('tbody').replaceChildren(...rows.map(({ cells, numbers, silent }) => {
+    const row = makeElement('tr', '', silent ? 'silent' : '')
+    row.append(...cells.map((text, i) => makeElement('td', text, numbers.includes(i) ? 'n' : '')))
     return row
   }))
 }
 
-function since(seconds) {
+function duration(seconds) {
   if (seconds < 90) return `${seconds.toFixed(0)} s`
   return seconds < 5400 ? `${(seconds / 60).toFixed(0)} min` : `${(seconds / 3600).toFixed(1)} h`
 }
@@ -173,18 +174,18 @@ function since(seconds) {
 export function showLogLine(line) {
   if (line.event === 'compiling') compiling.add(line.process)
   if (line.event === 'ready') compiling.delete(line.process)
-  const list = $('log').firstElementChild, item = make('li', '', line.level)
-  item.append(make('time', new Date(line.stamp_ns / 1e6).toLocaleTimeString()), make('span', line.process, 'p'), make('span', line.text))
+  const list = $('log').firstElementChild, item = makeElement('li', '', line.level)
+  item.append(makeElement('time', new Date(line.stamp_ns / 1e6).toLocaleTimeString()), makeElement('span', line.process, 'p'), makeElement('span', line.text))
   list.prepend(item)
-  while (list.children.length > LINES) list.lastElementChild.remove()
+  while (list.children.length > MAX_LOG_LINES) list.lastElementChild.remove()
 }
 
 export function showImage(data) {
   const head = new DataView(data, 4, 88), text = new TextDecoder()
   const [width, height] = [head.getUint32(0, true), head.getUint32(4, true)]
-  const word = (at, length) => text.decode(new Uint8Array(data, 4 + at, length)).replace(/\0+$/, '')
-  const camera = word(8, 64), encoding = word(72, 16), pixels = new Uint8Array(data, 92)
-  const canvas = pictureOf(camera), pen = canvas.getContext('2d')
+  const textAt = (at, length) => text.decode(new Uint8Array(data, 4 + at, length)).replace(/\0+$/, '')
+  const camera = textAt(8, 64), encoding = textAt(72, 16), pixels = new Uint8Array(data, 92)
+  const canvas = canvasOf(camera), pen = canvas.getContext('2d')
   if (encoding === 'jpeg') {
     createImageBitmap(new Blob([pixels], { type: 'image/jpeg' })).then((picture) => {
       canvas.width = picture.width
@@ -205,12 +206,12 @@ export function showImage(data) {
   pen.putImageData(image, 0, 0)
 }
 
-function pictureOf(camera) {
+function canvasOf(camera) {
   const known = [...$('pictures').children].find((figure) => figure.dataset.camera === camera)
   if (known) return known.querySelector('canvas')
-  const figure = make('figure')
+  const figure = makeElement('figure')
   figure.dataset.camera = camera
-  figure.append(make('canvas'), make('figcaption', camera))
+  figure.append(makeElement('canvas'), makeElement('figcaption', camera))
   $('pictures').append(figure)
   return figure.querySelector('canvas')
 }
