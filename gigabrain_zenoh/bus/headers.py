@@ -53,7 +53,7 @@ class SequenceGaps:
         self.restarts: Counter[str] = Counter()  # how often a sender began to count from 1 again
         self._last: dict[tuple[str, str], Header] = {}
 
-    def see(self, key: str, header: Header) -> int:
+    def count(self, key: str, header: Header) -> int:
         """Count one message, and return how many are missing before it.
 
         A sender that restarts counts from 1. Nothing is missing before the first message received.

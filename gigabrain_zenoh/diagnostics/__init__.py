@@ -1,4 +1,4 @@
-"""What the tools compute about a running robot: topics, processes, logs, why it stands still.
+"""Figures of a running robot for the tools: topics, processes, logs, and why it stands still.
 
 It may import bus, client, config, gate, geometry, host, runtime and security.
 Ui, commands and qa may import it.

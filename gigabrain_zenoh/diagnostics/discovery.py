@@ -1,4 +1,4 @@
-"""Finds the processes of a robot, how they are doing, and which sends to which."""
+"""Finds the topics and the processes of a robot, and the flows of messages between them."""
 
 import asyncio
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -53,9 +53,9 @@ def short_name(key: str) -> str:
 
 
 def topic_pattern(name: str, live_keys: Iterable[str] = ()) -> TopicPattern | None:
-    """Return what `scan`, `robot/scan`, `health/driver`, a live key or an expression stands for.
+    """Return the topic or keys that `name` stands for; None for an unknown name.
 
-    None where it is none of these.
+    It may be `scan`, `robot/scan`, `health/driver`, a live key, or a key expression.
     """
     key = current_key(PREFIX + short_name(name))
     for topic in TOPICS:
@@ -190,7 +190,7 @@ def _row(name: str, processes: Processes) -> tuple[str, ...]:
 
 
 def describe(processes: Processes, name: str) -> Iterator[str]:
-    """Yield lines with all that is known of one process. Raises UnknownName."""
+    """Yield lines that describe one process. Raises UnknownName."""
     one, health = processes.described.get(name), processes.health.get(name)
     if one is None and health is None:
         raise unknown("process", name, processes.names())

@@ -1,4 +1,4 @@
-"""`gigabrain doctor`: examines this machine and its robot. `examine` is pure; the rest looks."""
+"""`gigabrain doctor`: checks this machine and its robot. `examine` is pure."""
 
 import asyncio
 import datetime

@@ -1,4 +1,4 @@
-"""The graph of processes and messages: as text, for Graphviz, for Mermaid, and as a PNG."""
+"""Draws the graph of processes and messages: as text, for Graphviz or Mermaid, or as a PNG."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Opens the topic that a name stands for, and receives its messages until nobody reads them."""
+"""Finds the topic that a name stands for, and receives its messages."""
 
 import asyncio
 import os
@@ -37,7 +37,7 @@ class RawMessage(Struct, frozen=True):
 
 
 class Snapshot(Struct, frozen=True):
-    """What was on the bus during a short time."""
+    """Messages and processes on the bus during a short time."""
 
     start_ns: int
     monitor: TopicMonitor

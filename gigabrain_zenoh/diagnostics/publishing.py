@@ -120,8 +120,7 @@ async def drive(
 async def hold_velocity(robot: Robot, command: CmdVel, seconds: float | None, *, take: bool) -> str:
     """Hold a velocity for `seconds` of the robot's time, or until Ctrl-C; return the result.
 
-    The gate is asked for the body before, and gives it back to the brain afterwards. Raises
-    Refused.
+    Asks the gate for the body before, and returns it to the brain afterwards. Raises Refused.
     """
     before = (await robot.read_state()).gate
     if before.mode == "enabled" and not take:
@@ -134,7 +133,7 @@ async def hold_velocity(robot: Robot, command: CmdVel, seconds: float | None, *,
     finally:
         await robot.stop()
     ticks = (await robot.read_state()).tick - start_tick
-    return f"driven for {ticks * TICK_S:.1f} s; {await _give_back(robot, before.commander)}"
+    return f"driven for {ticks * TICK_S:.1f} s; {await _return_body(robot, before.commander)}"
 
 
 async def _send_velocity(robot: Robot, command: CmdVel, seconds: float | None) -> None:
@@ -144,7 +143,7 @@ async def _send_velocity(robot: Robot, command: CmdVel, seconds: float | None) -
         await asyncio.sleep(0.1)
 
 
-async def _give_back(robot: Robot, commander: str) -> str:
+async def _return_body(robot: Robot, commander: str) -> str:
     """Enable the brain again if it drove before; for any other commander silence idles the gate."""
     if commander != BRAIN:
         return "the robot is idle now"

@@ -110,7 +110,7 @@ class TopicMonitor:
                 return
             stream = stream or self._streams.setdefault(key, Stream())
             stream.add(len(payload), header.stamp_ns, self._now_ns(), self._unix_ns())
-            self._gaps.see(key, header)
+            self._gaps.count(key, header)
 
     def streams(self) -> dict[str, Stream]:
         """Return all streams, by key."""
@@ -156,7 +156,7 @@ class ChainMonitor:
 
     @property
     def complete(self) -> bool:
-        """Whether each topic has a message, and one scan has passed all hops."""
+        """Return whether each topic has a message, and one scan has passed all hops."""
         followed = set.intersection(*(set(sent) for sent in self._sent_ns.values()))
         return bool(followed) and all(topic.key in self._newest for topic in CHAIN)
 

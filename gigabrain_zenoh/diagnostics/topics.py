@@ -95,7 +95,7 @@ def topic_table(found: list[TopicRow]) -> Table:
 
 
 def describe(wanted: TopicPattern, found: Snapshot, now_ns: int) -> Iterator[str]:
-    """Yield lines with all that is known of one topic."""
+    """Yield lines that describe one topic."""
     topic = wanted.topic
     yield wanted.pattern
     if topic:
@@ -133,7 +133,7 @@ def _type_name(kind: Any) -> str:
 
 
 class EchoOptions(Struct, frozen=True, kw_only=True):
-    """What `topic echo` prints, and when it ends."""
+    """Form of the output of `topic echo`, and its end."""
 
     json: bool = False
     fields: tuple[str, ...] = ()

@@ -97,7 +97,7 @@ class Verdict(Struct, frozen=True, kw_only=True):
 
     @property
     def moves(self) -> bool:
-        """Whether the body moves."""
+        """Return whether the body moves."""
         body = self.findings[-1]
         return body.link == "body" and body.ok and not body.waits
 
@@ -184,7 +184,7 @@ def _world(facts: ChainFacts) -> LinkStatus:
 
 
 def _other_commander(facts: ChainFacts) -> str:
-    """Return the commander that drives instead of the brain; empty if there is none."""
+    """Return the commander that drives instead of the brain; empty if the brain drives."""
     gate = facts.state.gate if facts.state else None
     other = gate is not None and gate.mode == "enabled" and gate.commander != BRAIN
     return gate.commander if gate and other else ""

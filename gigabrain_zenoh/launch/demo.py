@@ -188,7 +188,7 @@ class Demo:
         capacity.look(asyncio.get_running_loop().time(), watch.seconds, held=watch.held_by_load)
         if capacity.problem != known:
             self._faults.append((time.monotonic(), capacity.problem))
-            view.say(capacity.problem)
+            view.show_fault(capacity.problem)
 
     @property
     def _starting(self) -> bool:

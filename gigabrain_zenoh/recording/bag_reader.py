@@ -185,7 +185,7 @@ def _walk(data: mmap.mmap) -> Iterator[McapRecord | BagDamage | BagEnd]:
 
 
 def _head(data: mmap.mmap, at: int) -> tuple[int, int]:
-    """Return opcode and end of the record at `at`; opcode 0 if there is none."""
+    """Return opcode and end of the record at `at`; opcode 0 without a record."""
     if at + HEAD.size > len(data):
         return 0, at
     opcode, length = HEAD.unpack_from(data, at)
@@ -194,7 +194,7 @@ def _head(data: mmap.mmap, at: int) -> tuple[int, int]:
 
 
 def _next_chunk(data: mmap.mmap, at: int) -> int:
-    """Return where the next chunk begins, found by its compression's name; -1 if there is none."""
+    """Return where the next chunk begins, by the name of its compression; -1 without one."""
     name = data.find(ZSTD_NAME, at + BYTES_BEFORE_NAME)
     while name > 0:
         opcode, after = _head(data, name - BYTES_BEFORE_NAME)
@@ -351,7 +351,7 @@ def read_info(path: Path) -> BagInfo:
     bag, gaps, keys = Bag(path), SequenceGaps(), dict[str, _KeyCounts]()
     first_ns = last_ns = 0
     for sample in bag:
-        gaps.see(sample.key, sample.header)
+        gaps.count(sample.key, sample.header)
         key = keys.setdefault(sample.key, _KeyCounts())
         if key.messages:
             key.longest_ns = max(key.longest_ns, sample.log_ns - key.last_ns)

@@ -1,4 +1,4 @@
-"""The recorder as a process, and as the command `gigabrain record`."""
+"""Runs the recorder: as a process, and as the command `gigabrain record`."""
 
 import asyncio
 import contextlib
@@ -55,7 +55,7 @@ def file_name(label: str = "") -> str:
     return f"{stamp}-{label}.mcap" if label else f"{stamp}.mcap"
 
 
-def path_of(config: RecorderConfig) -> Path:
+def recording_path(config: RecorderConfig) -> Path:
     """Return the path of a recording. Raises ConfigError if there is no home folder."""
     if config.file:
         return Path(config.file).absolute()
@@ -72,16 +72,16 @@ def unused_path(path: Path) -> Path:
 @contextmanager
 def listening(bus: Bus, recorder: Recorder, names: tuple[str, ...]) -> Iterator[None]:
     """Pass all messages of the topics `names` to the recorder while the block runs."""
-    take, expressions = recorder.intake.take, key_expressions(names)
-    taps = {each: bus.tap(each, take) for each in expressions}
+    receive, expressions = recorder.intake.receive, key_expressions(names)
+    taps = {each: bus.tap(each, receive) for each in expressions}
 
-    def see(_key: str, body: Body) -> None:
+    def record_control_topic(_key: str, body: Body) -> None:
         """Record the key that a body obeys, which may lie outside `robot/`."""
         key = body.description.control_topic
         if not names and not key.startswith("robot/") and key not in taps:
-            taps[key] = bus.tap(key, take)
+            taps[key] = bus.tap(key, receive)
 
-    close = bus.subscribe(BODY, see)
+    close = bus.subscribe(BODY, record_control_topic)
     fetching = asyncio.ensure_future(_fetch_kept(bus, recorder, expressions))
     try:
         yield
@@ -98,7 +98,7 @@ async def _fetch_kept(bus: Bus, recorder: Recorder, expressions: list[str]) -> N
         if topic.keep and (ALL_KEYS in expressions or topic.key in expressions):
             for payload in await bus.kept(topic):
                 if not recorder.intake.seen[topic.key]:
-                    recorder.intake.take(topic.key, "", payload)
+                    recorder.intake.receive(topic.key, "", payload)
 
 
 def _recover_in_background(folder: Path) -> None:
@@ -108,7 +108,7 @@ def _recover_in_background(folder: Path) -> None:
 
 async def run(config: RecorderConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Record until the process ends."""
-    path = unused_path(path_of(config))  # after a restart it continues in another file
+    path = unused_path(recording_path(config))  # after a restart it continues in another file
     recorder = Recorder(path, config)
     _recover_in_background(path.parent)
     with recorder, listening(bus, recorder, config.topics):
@@ -142,7 +142,7 @@ async def _count(bus: Bus, recorder: Recorder) -> None:
 
 async def record(config: RecorderConfig, where: Where, seconds: float | None) -> int:
     """Record until Ctrl-C or for `seconds`; return the exit code. Raises GigabrainError."""
-    path = path_of(config)
+    path = recording_path(config)
     async with joined(where, "record", looks_on=True) as (bus, _):
         recorder = Recorder(path, config)
         recorder.begin()

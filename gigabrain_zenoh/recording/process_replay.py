@@ -282,7 +282,7 @@ async def replay_process(
     decoders = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in OUTPUTS[process]}
     sent = await replay(node, run.inputs, process)
     replayed = _by_id((key, decoders[key](data)) for key, data in sent if key in decoders)
-    real_time = not run.exact and notes_of(path).get("speed", "1") == "1"
+    real_time = not run.exact and read_notes(path).get("speed", "1") == "1"
     return msgspec.structs.replace(
         compare(run.outputs, replayed),
         real_time=real_time,
@@ -291,7 +291,7 @@ async def replay_process(
     )
 
 
-def notes_of(path: Path) -> Mapping[str, str]:
+def read_notes(path: Path) -> Mapping[str, str]:
     """Return the notes at the head of a recording."""
     bag = Bag(path)
     for _ in bag:
@@ -309,7 +309,7 @@ def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, 
         known = {"perception": loaded.perception, "decision": loaded.decision}
         settings = dict(msgspec.to_builtins(known.get(process, {})))
     else:
-        notes = notes_of(path)
+        notes = read_notes(path)
         if process in PROCESSES_WITH_SETTINGS and process not in notes:
             raise ConfigError(
                 f"{path} does not hold the settings of {process}: it was recorded by hand; "

@@ -49,7 +49,7 @@ class Intake:
         self.seen: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
 
-    def take(self, key: str, encoding: str, payload: bytes) -> None:
+    def receive(self, key: str, encoding: str, payload: bytes) -> None:
         """Queue one message, or drop it. May be called from any thread."""
         now_ns, size = self._unix_ns(), len(payload)
         with self._lock:
@@ -60,7 +60,7 @@ class Intake:
             self.seen[key] += 1
             if self._held_bytes + size > self._max_bytes:
                 self._parse()  # earlier messages are counted before this one
-                self.gaps.see(key, header_of(payload))
+                self.gaps.count(key, header_of(payload))
                 self.dropped[key] += 1
                 return
             before, self._held_bytes = self._held_bytes, self._held_bytes + size
@@ -75,14 +75,14 @@ class Intake:
             self._channels.add(channel)
         return channel in self._channels
 
-    def hand_over(self) -> list[ReceivedMessage]:
-        """Return all queued messages, oldest first; they count as held until `written`."""
+    def take_batch(self) -> list[ReceivedMessage]:
+        """Return all queued messages, oldest first; they count as held until `release`."""
         with self._lock:
             self._parse()
             batch, self._parsed = self._parsed, []
         return batch
 
-    def written(self, batch: list[ReceivedMessage]) -> None:
+    def release(self, batch: list[ReceivedMessage]) -> None:
         """Release the space of a batch that has been written."""
         with self._lock:
             self._held_bytes -= sum(len(message.payload) for message in batch)
@@ -99,10 +99,10 @@ class Intake:
 
     def _parse(self) -> None:
         """Read the headers of waiting messages; many in a row cost less than each alone."""
-        newest_ns, parsed, see = self._newest_ns, self._parsed, self.gaps.see
+        newest_ns, parsed, count = self._newest_ns, self._parsed, self.gaps.count
         for taken_ns, key, encoding, payload in self._waiting:
             header = header_of(payload)
-            see(key, header)
+            count(key, header)
             recent = 0 < taken_ns - header.stamp_ns < MAX_BATCH_NS
             received_ns = header.stamp_ns if recent else taken_ns
             newest_ns = received_ns if received_ns > newest_ns else newest_ns + 1
@@ -207,10 +207,10 @@ class Recorder:
         self._finish()
 
     def _write_batch(self) -> None:
-        batch = self.intake.hand_over()
+        batch = self.intake.take_batch()
         for message in batch:
             self._write(message)
-        self.intake.written(batch)
+        self.intake.release(batch)
         if time.monotonic() - self._flushed_s >= self._config.flush_s:
             self._flush()
 

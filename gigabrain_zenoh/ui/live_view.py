@@ -37,7 +37,7 @@ class DemoView(Protocol):
     def show(self) -> None:
         """Update the view."""
 
-    def say(self, fault: str) -> None:
+    def show_fault(self, fault: str) -> None:
         """Show a fault."""
 
 
@@ -65,7 +65,7 @@ class HeadlessView:
             self._display.put("\n")
         self._display.__exit__(*end)
 
-    def say(self, fault: str) -> None:
+    def show_fault(self, fault: str) -> None:
         """Print a fault on a line of its own."""
         below = "\n" if self._in_place else ""  # the line that is redrawn
         self._display.put(f"{below}{fault}\n")
@@ -89,7 +89,7 @@ class HeadlessView:
 
 
 class LiveView:
-    """The whole robot on one page, and the last page left behind."""
+    """One page in the terminal with the whole robot; the last page stays after the end."""
 
     def __init__(
         self,
@@ -127,8 +127,8 @@ class LiveView:
             self._next_s = now_s + 1 / FRAMES_HZ
             self._display.put(self._page())
 
-    def say(self, fault: str) -> None:
-        """Do nothing: the page shows faults anyway."""
+    def show_fault(self, fault: str) -> None:
+        """Do nothing: the page lists the faults itself."""
 
     def _page(self) -> Panel:
         deployment, watch = self._deployment, self._watch
@@ -230,7 +230,7 @@ def _activity(name: str, watch: RunMonitor) -> str:
     if name == "driver":
         return f"state {sent.get('robot/state', 0):.0f} Hz, scan {sent.get('robot/scan', 0):.0f} Hz"
     if name == "perception":
-        return _seen(watch)
+        return _world_summary(watch)
     if name == "decision":
         intent = watch.intent.fresh()
         if intent is None:
@@ -250,7 +250,7 @@ def _activity(name: str, watch: RunMonitor) -> str:
     return f"{verdict.verdict}: {causes}" if causes else verdict.verdict
 
 
-def _seen(watch: RunMonitor) -> str:
+def _world_summary(watch: RunMonitor) -> str:
     world = watch.world.fresh()
     if world is None:
         return "silent"

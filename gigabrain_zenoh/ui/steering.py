@@ -33,7 +33,7 @@ class ViewerScene(RobotView):
         self.images: dict[str, Sampled[Image]] = {}  # by camera
         bus.latest(MAP, functools.partial(self.on_rare, MAP))
         bus.subscribe(LOG, lambda _key, record: self.on_rare(LOG, record))
-        bus.tap(IMAGE.at("*"), self._take_image)
+        bus.tap(IMAGE.at("*"), self._receive_image)
 
     def newest_of(self, topic: Topic[M]) -> Latest[M]:
         """Subscribe to a busy topic; decode only the messages that are read."""
@@ -51,7 +51,7 @@ class ViewerScene(RobotView):
         self.sampled[STATE].look()
         steer(self.bus, wanted)
 
-    def _take_image(self, key: str, encoding: str, payload: bytes) -> None:
+    def _receive_image(self, key: str, encoding: str, payload: bytes) -> None:
         camera = key.rpartition("/")[2]
         if camera in self.images or len(self.images) < self.max_cameras:
             sampled = self.images.setdefault(camera, Sampled(self.bus, IMAGE))

@@ -186,7 +186,7 @@ def test_a_replay_runs_no_programs_and_remembers_nothing(tmp_path: Path) -> None
     path = tmp_path / "a.mcap"
     notes = {"decision": '{"behaviour":"navigate","scripts":"/bin","state_dir":"/tmp"}'}
     with Recorder(path, RecorderConfig(notes=notes, keep_free_mb=0)) as recorder:
-        recorder.intake.take(STATE.key, "", said(STATE, 1)[2])
+        recorder.intake.receive(STATE.key, "", said(STATE, 1)[2])
     settings = settings_for(path, "decision", None)
     assert settings == {
         "behaviour": "navigate",

@@ -57,7 +57,7 @@ def test_on_a_slow_disk_what_is_written_and_what_was_dropped_is_what_came(
         count = 0
         while recorder.status().dropped < 500:  # of 1.5 kB that do not compress
             count += 1
-            recorder.intake.take("robot/scan", "", bags.scan(count))
+            recorder.intake.receive("robot/scan", "", bags.scan(count))
     status = recorder.status()
     assert status.seen == count
     assert status.written + status.dropped == count
@@ -85,9 +85,9 @@ def test_whoever_hands_messages_over_never_waits_for_the_disk(
         first = 0
         while not stood.wait(0.01):  # until the disk stands still
             first += 1
-            recorder.intake.take("robot/scan", "", bags.scan(first))
+            recorder.intake.receive("robot/scan", "", bags.scan(first))
         for seq in range(first + 1, first + 1001):
-            recorder.intake.take("robot/scan", "", bags.scan(seq))
+            recorder.intake.receive("robot/scan", "", bags.scan(seq))
         stuck = recorder.status()
         gate.set()
     assert stuck.seen == first + 1000  # all were taken while the disk stood still
@@ -105,7 +105,7 @@ def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_f
 
     def send(first: int, count: int) -> None:
         for seq in range(first, first + count):
-            recorder.intake.take("robot/state", "", bags.state(seq))
+            recorder.intake.receive("robot/state", "", bags.state(seq))
 
     with Recorder(path, QUICK) as recorder:
         send(1, 100)
@@ -134,7 +134,7 @@ def test_a_full_disk_costs_what_comes_meanwhile_and_recording_goes_on_in_a_new_f
 def test_what_must_stay_free_of_the_disk_stays_free(tmp_path: Path) -> None:
     config = RecorderConfig(viewers=False, flush_s=0.02, keep_free_mb=1e9)
     with Recorder(tmp_path / "a.mcap", config) as recorder:
-        recorder.intake.take("robot/state", "", bags.state(1))
+        recorder.intake.receive("robot/state", "", bags.state(1))
         wait(recorder, lambda now: "less than 1e+09 MB are free" in now.fault)
     assert recorder.status().dropped == 1
     assert recorder.status().written == 0
@@ -145,9 +145,9 @@ def test_a_recording_is_split_by_size_and_each_part_has_the_map(tmp_path: Path) 
     config = RecorderConfig(viewers=False, flush_s=0, keep_free_mb=0, split_mb=0.08, queue_mb=0.1)
     grid = codec.encode(example(MAP.type))
     with Recorder(tmp_path / "s.mcap", config) as recorder:
-        recorder.intake.take("robot/map", "", grid)
+        recorder.intake.receive("robot/map", "", grid)
         for seq in range(1, 301):
-            recorder.intake.take("robot/scan", "", bags.scan(seq))
+            recorder.intake.receive("robot/scan", "", bags.scan(seq))
             if seq % 20 == 0:  # 30 kB, more than a quarter of the queue, so it is written at once
                 wait(recorder, lambda now, seq=seq: now.written > seq - 10)
     paths = [tmp_path / name for name in ("s.mcap", "s_1.mcap", "s_2.mcap", "s_3.mcap")]
@@ -164,7 +164,7 @@ def test_a_recording_is_split_by_time(tmp_path: Path) -> None:
     config = RecorderConfig(viewers=False, flush_s=0.01, keep_free_mb=0, split_s=0.2)
     with Recorder(tmp_path / "s.mcap", config) as recorder:
         for seq in range(1, 61):
-            recorder.intake.take("robot/scan", "", bags.scan(seq))
+            recorder.intake.receive("robot/scan", "", bags.scan(seq))
             time.sleep(0.01)
     assert recorder.status().files >= 3
     assert sum(kept(path)["robot/scan"] for path in tmp_path.iterdir()) == 60
@@ -178,7 +178,7 @@ from gigabrain_zenoh.config.settings import RecorderConfig
 from tests.unit.recording import bags
 with Recorder(Path(sys.argv[1]), RecorderConfig(viewers=False, keep_free_mb=0)) as recorder:
     for seq in range(1, 10_000):
-        recorder.intake.take("robot/state", "", bags.state(seq))
+        recorder.intake.receive("robot/state", "", bags.state(seq))
         print(seq, flush=True)
         time.sleep(0.005)
 """
@@ -215,7 +215,7 @@ module.RETRY_S = 1e9  # no second file
 config = RecorderConfig(viewers=False, keep_free_mb=0, flush_s=0)
 with Recorder(Path(sys.argv[1]), config) as recorder:
     for seq in range(1, 101):
-        recorder.intake.take("robot/scan", "", bags.scan(seq))
+        recorder.intake.receive("robot/scan", "", bags.scan(seq))
         if seq % 25 == 0:
             bags.wait(recorder, lambda now: now.written + now.dropped == seq)
 now = recorder.status()

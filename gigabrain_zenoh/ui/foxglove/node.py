@@ -1,8 +1,8 @@
-"""The bridge as a process: viewers connect by Foxglove's WebSocket protocol, on loopback only.
+"""Bridge to viewers of Foxglove's WebSocket protocol, on loopback only.
 
-The protocol has no login, so any program of this machine may look. Of browsers only pages of this
-machine and of known viewers may (`Front`). To steer, a viewer publishes on a secret topic, which
-the layout file of `gigabrain foxglove --layout` contains.
+The protocol has no login, so any program of this machine may connect. Browsers may connect only
+from pages of this machine and of known viewers (`Front`). To steer, a viewer publishes on a secret
+topic, which the layout file of `gigabrain foxglove --layout` contains.
 """
 
 import asyncio
@@ -190,7 +190,7 @@ class FoxgloveSteering(ServerListener):
         if self._rates.is_exceeded(client.id, time.monotonic()):
             return
         if len(data) <= MAX_MESSAGE_BYTES:
-            self._in_loop(self._take, client.id, client_channel_id, data)
+            self._in_loop(self._process, client.id, client_channel_id, data)
 
     def _in_loop(self, act: Callable[..., None], *arguments: object) -> None:
         if not self._loop.is_closed():
@@ -208,7 +208,7 @@ class FoxgloveSteering(ServerListener):
             self._refused.discard(viewer)
             self._arbiter.leave(viewer)
 
-    def _take(self, viewer: int, channel: int, data: bytes) -> None:
+    def _process(self, viewer: int, channel: int, data: bytes) -> None:
         if (viewer, channel) not in self._channels:
             return
         try:

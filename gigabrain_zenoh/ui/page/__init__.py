@@ -1,1 +1,1 @@
-"""The operator page: shows a robot in a browser, and steers it."""
+"""Operator page: shows a robot in a browser, and steers it."""

@@ -56,7 +56,7 @@ class Login(Struct, frozen=True, forbid_unknown_fields=True):
     token: Annotated[str, Meta(max_length=128)] = ""
 
 
-class Ask(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class PageRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Request to the robot."""
 
     id: Annotated[int, Meta(ge=0, le=2**31)]
@@ -65,7 +65,7 @@ class Ask(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     goal: GoalRequest | None = None
 
 
-class Reply(Struct, frozen=True, kw_only=True):
+class PageReply(Struct, frozen=True, kw_only=True):
     """Result of a request."""
 
     id: int
@@ -125,7 +125,7 @@ def drive_of(content: bytes) -> Velocity:
 
 
 def decoded(content: bytes, kind: type[T]) -> T:
-    """Return the Login or Ask in a frame. Raises ValueError."""
+    """Return the Login or PageRequest in a frame. Raises ValueError."""
     try:
         return msgspec.json.decode(content, type=kind)
     except DECODE_ERRORS as error:

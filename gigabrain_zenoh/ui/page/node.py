@@ -1,4 +1,4 @@
-"""The page as a process, and beside a demo; its libraries are imported only when it starts."""
+"""Runs the page as a process, or with a demo; imports its libraries only when it starts."""
 
 import contextlib
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The page's web server: a process of its own that the robot never waits for."""
+"""Web server of the page: a process of its own, for which the robot never waits."""
 
 import asyncio
 import contextlib
@@ -22,7 +22,7 @@ from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.ui.page.access import Access, check, token_file, wants_login
 from gigabrain_zenoh.ui.page.frames import PageView
-from gigabrain_zenoh.ui.page.sessions import Operator, Sessions
+from gigabrain_zenoh.ui.page.sessions import RequestHandler, Sessions
 from gigabrain_zenoh.ui.steering import TeleopArbiter
 
 log = logging.getLogger(__name__)
@@ -121,7 +121,7 @@ async def run(config: PageConfig, bus: Bus, ready: Callable[[], None]) -> None:
         access = Access(config, listener.getsockname()[1])
         sessions = Sessions(access)
         view = PageView(bus, sessions.send)
-        sessions.serve(view, TeleopArbiter(view), Operator(bus))
+        sessions.serve(view, TeleopArbiter(view), RequestHandler(bus))
         server = _server(config, access, sessions)
         serving = asyncio.ensure_future(server.serve(sockets=[listener]))
         sending = asyncio.ensure_future(_send_frames(bus, sessions))

@@ -18,7 +18,7 @@ from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.plugins import package_version
 from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, Role
-from gigabrain_zenoh.ui.page.frames import Ask, PageView, Reply
+from gigabrain_zenoh.ui.page.frames import PageReply, PageRequest, PageView
 from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter
 
 log = logging.getLogger(__name__)
@@ -45,14 +45,14 @@ class Viewer:
         self._slots: dict[str, bytes] = {}
         self._filled = asyncio.Event()
 
-    def put(self, slot: str, frame: bytes) -> None:
+    def queue(self, slot: str, frame: bytes) -> None:
         """Send `frame` instead of what still waits in its slot. Never waits."""
         self._slots[slot] = frame
         while len(self._slots) > MAX_WAITING_FRAMES:
             del self._slots[next(iter(self._slots))]
         self._filled.set()
 
-    async def next(self) -> bytes:
+    async def next_frame(self) -> bytes:
         """Wait for the next frame to send."""
         await self._filled.wait()
         frame = self._slots.pop(next(iter(self._slots)))
@@ -61,50 +61,50 @@ class Viewer:
         return frame
 
 
-class Operator:
-    """Carries out requests."""
+class RequestHandler:
+    """Carries out the requests of operators."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
 
-    async def answer(self, asked: Ask) -> Reply:
+    async def handle(self, request: PageRequest) -> PageReply:
         """Carry out a request. Errors are part of the reply."""
         ok, robot, unconfirmed = True, "", False
         try:
-            text, robot = await self._do(asked)
+            text, robot = await self._carry_out(request)
         except GigabrainError as error:
             ok, text, unconfirmed = False, str(error), isinstance(error, NotConfirmed)
-        return Reply(
-            id=asked.id,
-            what=asked.what,
+        return PageReply(
+            id=request.id,
+            what=request.what,
             ok=ok,
             text=text[:MAX_REPLY_CHARS],
             robot=robot,
             not_confirmed=unconfirmed,
         )
 
-    async def _do(self, asked: Ask) -> tuple[str, str]:
-        if asked.what == "goal":
-            return await self._goal(asked), ""
-        if asked.what == "cancel":
+    async def _carry_out(self, request: PageRequest) -> tuple[str, str]:
+        if request.what == "goal":
+            return await self._goal(request), ""
+        if request.what == "cancel":
             return await self._cancel(), ""
-        if asked.what == "estop":
+        if request.what == "estop":
             reply = await press_estop(self._bus, "operator page")
-        elif asked.what == "release":
-            reply = await release(self._bus, asked.estop_generation)
+        elif request.what == "release":
+            reply = await release(self._bus, request.estop_generation)
         else:
-            reply = await enable(self._bus, BRAIN, take=asked.what == "take")
+            reply = await enable(self._bus, BRAIN, take=request.what == "take")
         return reply.text, reply.robot_type
 
     async def _cancel(self) -> str:
-        request = TaskRequest(do="cancel", source=self._bus.process)
-        replies = await self._bus.ask(TASK_CHANGE, request, timeout_s=ANSWER_S)
+        change = TaskRequest(do="cancel", source=self._bus.process)
+        replies = await self._bus.ask(TASK_CHANGE, change, timeout_s=ANSWER_S)
         return _text_of(replies)
 
-    async def _goal(self, asked: Ask) -> str:
-        if asked.goal is None:
+    async def _goal(self, request: PageRequest) -> str:
+        if request.goal is None:
             raise Refused("a goal needs a place")
-        goal = replace(asked.goal, source=self._bus.process)
+        goal = replace(request.goal, source=self._bus.process)
         replies = await self._bus.ask(GOAL, goal, timeout_s=ANSWER_S)
         return _text_of(replies)
 
@@ -130,15 +130,15 @@ class Sessions:
         self._rates = RateLimiter()
         self.viewers: list[Viewer] = []
 
-    def serve(self, view: PageView, arbiter: TeleopArbiter, operator: Operator) -> None:
+    def serve(self, view: PageView, arbiter: TeleopArbiter, handler: RequestHandler) -> None:
         """Set the sources of frames, and the recipients of commands and requests."""
-        self._view, self._arbiter, self._operator = view, arbiter, operator
+        self._view, self._arbiter, self._handler = view, arbiter, handler
         view.on_body = self._introduce_all
 
     def send(self, slot: str, frame: bytes) -> None:
         """Send a frame to all viewers without waiting."""
         for viewer in self.viewers:
-            viewer.put(slot, frame)
+            viewer.queue(slot, frame)
 
     def send_news(self) -> None:
         """Send the present state, scan and images to all viewers."""
@@ -234,9 +234,9 @@ class Sessions:
             body=body.description if body else None,
             link=body.link if body else "",
         )
-        viewer.put("about", frames.as_json(frames.ABOUT, about))
+        viewer.queue("about", frames.as_json(frames.ABOUT, about))
         for slot, frame in self._view.kept_frames():
-            viewer.put(slot, frame)
+            viewer.queue(slot, frame)
 
     def _introduce_all(self) -> None:
         for viewer in self.viewers:
@@ -249,14 +249,14 @@ class Sessions:
             if message["type"] == "websocket.disconnect":
                 return
             try:
-                self._take(viewer, message.get("bytes") or b"")
+                self._process(viewer, message.get("bytes") or b"")
             except ValueError as error:
                 log.warning("disconnected viewer %d: %s", viewer.number, str(error)[:200])
                 reason = str(error).encode()[:MAX_REASON_BYTES].decode(errors="ignore")
                 await socket.close(BAD_FRAME, reason)
                 return
 
-    def _take(self, viewer: Viewer, frame: bytes) -> None:
+    def _process(self, viewer: Viewer, frame: bytes) -> None:
         """Process one frame. Raises ValueError for one that our page never sends."""
         now_s = self._loop.time()
         if self._rates.is_exceeded(viewer.number, now_s):
@@ -266,30 +266,30 @@ class Sessions:
             raise ValueError("a viewer may look and not drive")
         if kind == bytes((frames.DRIVE,)):
             if not self._arbiter.drive(viewer.number, frames.drive_of(content), now_s):
-                self._reply(viewer, Reply(id=0, what="drive", ok=False, text=OTHER_STEERS))
+                self._reply(viewer, PageReply(id=0, what="drive", ok=False, text=OTHER_STEERS))
         elif kind == bytes((frames.ASK,)):
-            self._ask(viewer, frames.decoded(content, Ask))
+            self._start_request(viewer, frames.decoded(content, PageRequest))
         else:
             raise ValueError("an unknown frame")
 
-    def _ask(self, viewer: Viewer, asked: Ask) -> None:
-        if asked.what == "estop":
+    def _start_request(self, viewer: Viewer, request: PageRequest) -> None:
+        if request.what == "estop":
             self._arbiter.clear()
         elif list(self._pending.values()).count(viewer) >= MAX_PENDING:
             text = "too many requests are still under way"
-            self._reply(viewer, Reply(id=asked.id, what=asked.what, ok=False, text=text))
+            self._reply(viewer, PageReply(id=request.id, what=request.what, ok=False, text=text))
             return
-        task = self._loop.create_task(self._answer(viewer, asked))
+        task = self._loop.create_task(self._handle(viewer, request))
         self._pending[task] = viewer
         task.add_done_callback(self._pending.pop)
 
-    async def _answer(self, viewer: Viewer, asked: Ask) -> None:
-        self._reply(viewer, await self._operator.answer(asked))
+    async def _handle(self, viewer: Viewer, request: PageRequest) -> None:
+        self._reply(viewer, await self._handler.handle(request))
 
-    def _reply(self, viewer: Viewer, reply: Reply) -> None:
-        viewer.put(f"reply/{reply.id}", frames.as_json(frames.REPLY, reply))
+    def _reply(self, viewer: Viewer, reply: PageReply) -> None:
+        viewer.queue(f"reply/{reply.id}", frames.as_json(frames.REPLY, reply))
 
 
 async def _send_frames(socket: WebSocket, viewer: Viewer) -> None:
     while True:
-        await socket.send_bytes(await viewer.next())
+        await socket.send_bytes(await viewer.next_frame())

@@ -100,18 +100,18 @@ def test_missing_messages_are_counted_and_make_the_check_fail(
 def test_a_sender_that_starts_anew_is_told_from_a_gap() -> None:
     gaps = SequenceGaps()
     for seq, boot in ((5, 1), (6, 1), (9, 1), (2, 2), (3, 2), (9, 3)):
-        gaps.see("robot/state", Header(seq=seq, boot=boot))
+        gaps.count("robot/state", Header(seq=seq, boot=boot))
     assert gaps.missing["robot/state"] == 2 + 1 + 8
     assert gaps.restarts["robot/state"] == 2
     for seq, boot in ((5, 1), (6, 2), (7, 2), (1, 2)):
-        gaps.see("robot/intent", Header(seq=seq, boot=boot))  # decision lives on
+        gaps.count("robot/intent", Header(seq=seq, boot=boot))  # decision lives on
     assert (gaps.missing["robot/intent"], gaps.restarts["robot/intent"]) == (0, 1)
 
 
 def test_two_senders_on_one_key_have_a_count_each() -> None:
     gaps = SequenceGaps()
     for seq, source in ((100, "control"), (1, "script"), (101, "control"), (2, "script")):
-        gaps.see("robot/cmd_vel", Header(seq=seq, source=source))
+        gaps.count("robot/cmd_vel", Header(seq=seq, source=source))
     assert gaps.missing.total() == 0
     assert gaps.restarts.total() == 0
 

@@ -134,27 +134,27 @@ def test_messages_that_gathered_bear_the_times_of_their_own_stamps() -> None:
     intake = Intake(1 << 20, lambda: 1_000_000_000)
     for ago_ms in (50, 30, 10, 70, -5):
         state = replace(example(STATE.type), stamp_ns=(1_000 - ago_ms) * 1_000_000)
-        intake.take("robot/state", "", codec.encode(state))
-    times = [arrival.log_ns for arrival in intake.hand_over()]
+        intake.receive("robot/state", "", codec.encode(state))
+    times = [arrival.log_ns for arrival in intake.take_batch()]
     assert times == [950_000_000, 970_000_000, 990_000_000, 1_000_000_000, 1_000_000_001]
 
 
 def test_what_is_dropped_is_not_missing_nor_a_new_sender() -> None:
     intake = Intake(5000, lambda: 1)
     for seq in range(1, 6):  # of 1.5 kB each: three fit
-        intake.take("robot/scan", "", bags.scan(seq))
-    assert (intake.counts(), len(intake.hand_over())) == ((5, 2, 0), 3)
+        intake.receive("robot/scan", "", bags.scan(seq))
+    assert (intake.counts(), len(intake.take_batch())) == ((5, 2, 0), 3)
     assert not intake.gaps.restarts
 
 
 def test_who_makes_up_keys_and_encodings_costs_a_bounded_number_of_them() -> None:
     intake = Intake(1 << 30, lambda: 1)
-    intake.take("robot/scan", "", bags.scan(1))
+    intake.receive("robot/scan", "", bags.scan(1))
     for n in range(10_000):
-        intake.take(f"robot/{n}", "", b"x")
-        intake.take("robot/state", f"text/{n}", b"x")
-    intake.take("robot/scan", "", bags.scan(2))
-    arrivals = intake.hand_over()
+        intake.receive(f"robot/{n}", "", b"x")
+        intake.receive("robot/state", f"text/{n}", b"x")
+    intake.receive("robot/scan", "", bags.scan(2))
+    arrivals = intake.take_batch()
     assert len({(one.key, one.encoding) for one in arrivals}) == MAX_CHANNELS
     assert arrivals[-1].header.seq == 2
     assert len(intake.seen) <= MAX_CHANNELS + 1
@@ -180,9 +180,9 @@ def test_the_writer_is_told_to_hurry_once_a_quarter_of_the_room_is_full() -> Non
     told: list[int] = []
     intake = Intake(4000, lambda: 1, lambda: told.append(1))
     for expected in (0, 0, 1, 1):
-        intake.take("robot/scan", "", bytes(400))
+        intake.receive("robot/scan", "", bytes(400))
         assert len(told) == expected
-    intake.written(intake.hand_over())
+    intake.release(intake.take_batch())
     for expected in (1, 1, 2):
-        intake.take("robot/scan", "", bytes(400))
+        intake.receive("robot/scan", "", bytes(400))
         assert len(told) == expected

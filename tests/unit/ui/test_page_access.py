@@ -20,10 +20,10 @@ from gigabrain_zenoh.runtime.deployment import Deployment
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page.access import Access, check, tokens
-from gigabrain_zenoh.ui.page.frames import Ask, GoalRequest, PageView
+from gigabrain_zenoh.ui.page.frames import GoalRequest, PageRequest, PageView
 from gigabrain_zenoh.ui.page.node import free_port, with_page
 from gigabrain_zenoh.ui.page.server import run
-from gigabrain_zenoh.ui.page.sessions import Operator, Viewer
+from gigabrain_zenoh.ui.page.sessions import RequestHandler, Viewer
 from gigabrain_zenoh.ui.steering import RateLimiter, TeleopArbiter
 
 
@@ -170,12 +170,12 @@ def test_it_answers_to_names_as_browsers_write_them(
 async def test_a_slow_browser_gets_the_newest_and_never_more_than_64_frames() -> None:
     viewer = Viewer(1, "viewer")
     for n in range(5):
-        viewer.put("state", b"%d" % n)
-    viewer.put("scan", b"scan")
-    assert [await viewer.next(), await viewer.next()] == [b"4", b"scan"]
+        viewer.queue("state", b"%d" % n)
+    viewer.queue("scan", b"scan")
+    assert [await viewer.next_frame(), await viewer.next_frame()] == [b"4", b"scan"]
     for n in range(1000):
-        viewer.put(f"log/{n}", b"%d" % n)
-    assert await viewer.next() == b"936"
+        viewer.queue(f"log/{n}", b"%d" % n)
+    assert await viewer.next_frame() == b"936"
 
 
 def test_of_each_viewer_120_messages_a_second_are_processed() -> None:
@@ -240,8 +240,8 @@ async def test_what_a_network_had_stored_and_hands_over_at_once_steers_nobody() 
 
 async def test_a_goal_that_nobody_serves_is_said_to_be_so() -> None:
     page = Seated()
-    goal = Ask(id=7, what="goal", goal=GoalRequest(x=1.0, y=2.0))
-    reply = await Operator(page.net.one).answer(goal)
+    goal = PageRequest(id=7, what="goal", goal=GoalRequest(x=1.0, y=2.0))
+    reply = await RequestHandler(page.net.one).handle(goal)
     assert (reply.id, reply.ok) == (7, False)
     assert reply.text == "no process serves goals: this robot runs no navigation"
 

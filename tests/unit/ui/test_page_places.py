@@ -14,7 +14,7 @@ from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, tokens
 from gigabrain_zenoh.ui.page.frames import PageView
-from gigabrain_zenoh.ui.page.sessions import Operator, Sessions
+from gigabrain_zenoh.ui.page.sessions import RequestHandler, Sessions
 from gigabrain_zenoh.ui.steering import TeleopArbiter
 
 HOST = "127.0.0.1:8080"
@@ -56,7 +56,7 @@ class Page:
         self.sessions = Sessions(Access(config, 8080))
         self.net = Net()
         scene = PageView(self.net.one, self.sessions.send)
-        self.sessions.serve(scene, TeleopArbiter(scene), Operator(self.net.one))
+        self.sessions.serve(scene, TeleopArbiter(scene), RequestHandler(self.net.one))
         self._talks: list[asyncio.Task[None]] = []
 
     async def comes(self, token: str = "") -> Socket:

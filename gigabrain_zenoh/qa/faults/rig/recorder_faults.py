@@ -167,7 +167,7 @@ def _unaccounted(folder: Path, disk: type[BadDisk]) -> int:
     with Recorder(folder / "bad.mcap", config, make) as recorder:
         for seq in range(1, SENT + 1):
             ranges = chance.randbytes(SCAN_BYTES)
-            recorder.intake.take(SCAN.key, "", encode(replace(example, seq=seq, ranges=ranges)))
+            recorder.intake.receive(SCAN.key, "", encode(replace(example, seq=seq, ranges=ranges)))
             time.sleep(PACE_S)
     status = recorder.status()
     kept = sum(1 for path in folder.glob("*.mcap") for _ in Bag(path))

@@ -214,7 +214,7 @@ async def soak(rig: Rig) -> Measured:
     files = {pid: open_files(pid) for pid in pids.values()}
 
     def count(key: str, _encoding: str, payload: bytes) -> None:
-        gaps.see(key, header_of(payload))
+        gaps.count(key, header_of(payload))
 
     closes = [probe.bus.tap(topic.key, count) for topic in COUNTED]
     begun, stopped, events = dict(pids), 0, SoakEvents(rig, robot, pids)
