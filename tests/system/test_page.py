@@ -79,7 +79,7 @@ async def test_a_held_key_drives_and_letting_go_stops(chromium: Browser, seen: P
     await ready_to_drive(page)
     await page.keyboard.down("a")
     await turning(seen)
-    await told(page, "wanted", "0.00 m/s  0.91 rad/s")
+    await told(page, "wanted", "0.00 m/s · 0.91 rad/s")
     await page.keyboard.up("a")
     await seen.at_rest()
     assert (seen.state.gate.mode, seen.state.gate.commander) == ("enabled", "control")

@@ -69,7 +69,7 @@ const drive = new Drive({
   stop: () => stop(),
   allowed: mayDrive,
   show(wanted) {
-    setText($('wanted'), wanted ? `${wanted[0].toFixed(2)} m/s  ${wanted[2].toFixed(2)} rad/s` : 'released')
+    setText($('wanted'), wanted ? `${wanted[0].toFixed(2)} m/s · ${wanted[2].toFixed(2)} rad/s` : 'released')
   },
 })
 

@@ -52,8 +52,8 @@ export function showGate(state, viewOnly) {
 
 export function showFigures(state, robot) {
   const v = state?.velocity
-  setText($('speed'), v ? `${v.linear_x.toFixed(2)} m/s  ${v.angular_z.toFixed(2)} rad/s` : '–')
-  setText($('battery'), state?.battery ? `${state.battery.percentage.toFixed(0)} %  ${state.battery.voltage.toFixed(1)} V` : '–')
+  setText($('speed'), v ? `${v.linear_x.toFixed(2)} m/s · ${v.angular_z.toFixed(2)} rad/s` : '–')
+  setText($('battery'), state?.battery ? `${state.battery.percentage.toFixed(0)} % · ${state.battery.voltage.toFixed(1)} V` : '–')
   const temperatures = (state?.joints ?? []).map((joint) => joint.temperature).filter((t) => t !== null)
   setText($('temperature'), temperatures.length ? `${Math.max(...temperatures).toFixed(0)} °C` : '–')
   setText($('doing'), activity(state, robot))
@@ -175,7 +175,7 @@ export function showLogLine(line) {
   if (line.event === 'compiling') compiling.add(line.process)
   if (line.event === 'ready') compiling.delete(line.process)
   const list = $('log').firstElementChild, item = makeElement('li', '', line.level)
-  item.append(makeElement('time', new Date(line.stamp_ns / 1e6).toLocaleTimeString()), makeElement('span', line.process, 'p'), makeElement('span', line.text))
+  item.append(makeElement('time', new Date(line.stamp_ns / 1e6).toLocaleTimeString([], { hour12: false })), makeElement('span', line.process, 'p'), makeElement('span', line.text))
   list.prepend(item)
   while (list.children.length > MAX_LOG_LINES) list.lastElementChild.remove()
 }
