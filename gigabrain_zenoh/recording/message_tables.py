@@ -122,7 +122,7 @@ def plot(path: Path, fields: Sequence[str], to: Path) -> Path:
     except ModuleNotFoundError:
         raise ConfigError("plots need matplotlib: pip install 'gigabrain-zenoh[record]'") from None
     if not fields:
-        raise ConfigError("name what to draw, such as cmd_vel.linear_x")
+        raise ConfigError("no field to plot; name one, such as cmd_vel.linear_x")
     drawn = read_series(path, fields)
     figure = Figure(figsize=(10, 5), layout="constrained")
     axes = figure.subplots()

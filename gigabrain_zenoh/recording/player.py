@@ -112,13 +112,13 @@ class Player:
         self.late_s = max(self.late_s, now_s - due_s)
 
 
-async def check_nobody_drives(bus: Bus) -> None:
-    """Raise Refused if a driver runs on this bus: its robot would receive every message twice."""
+async def check_no_driver(bus: Bus) -> None:
+    """Raise Refused if a driver runs on this bus."""
     replies = await bus.ask(DESCRIBE, DescribeRequest(), timeout_s=ASK_S, name="driver")
     if replies:
         raise Refused(
-            f"a driver runs here (pid {replies[0].pid}); play with another --namespace, "
-            "or with --beside-robot"
+            f"a driver runs on this bus (pid {replies[0].pid}): its robot would receive "
+            "all messages twice; play with another --namespace, or with --beside-robot"
         )
 
 
@@ -127,7 +127,7 @@ async def play(path: Path, options: PlayOptions, where: Where, *, beside_robot: 
     check_magic(path)
     async with joined(where, "play") as (bus, transport):
         if not beside_robot:
-            await check_nobody_drives(bus)
+            await check_no_driver(bus)
         player = Player(path, options, transport)
         with stop_signals() as stop:
             await run_until(stop, player.play())

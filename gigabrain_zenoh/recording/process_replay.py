@@ -2,7 +2,7 @@
 
 Not compared are the time of sending (`stamp_ns`), the message number (`seq`), and warnings of
 safety about its computer. Of several messages on one key for one tick and basis only the last is
-compared: how often a node repeats it depends on which of two inputs within a tick came first.
+compared: the number of repetitions depends on the order of two inputs within a tick.
 """
 
 from collections import defaultdict
@@ -87,7 +87,7 @@ class ReplayResult(Struct, frozen=True, kw_only=True):
 
     @property
     def same(self) -> bool:
-        """Return whether the process still does what it did."""
+        """Return whether the process behaves as recorded."""
         most = MAX_UNMATCHED_SHARE * (self.compared + self.only_recorded)
         return self.difference is None and max(self.only_recorded, self.only_replayed) <= most
 
@@ -312,7 +312,7 @@ def settings_for(path: Path, process: str, deployment: str | None) -> dict[str, 
         notes = read_notes(path)
         if process in PROCESSES_WITH_SETTINGS and process not in notes:
             raise ConfigError(
-                f"{path} does not hold the settings of {process}: it was recorded by hand; "
+                f"{path} does not hold the settings of {process}: it was recorded by command; "
                 "name the robot's deployment file: --deployment FILE"
             )
         settings = dict(msgspec.json.decode(notes.get(process, "{}")))
@@ -344,20 +344,20 @@ def report_lines(path: Path, process: str, result: ReplayResult) -> Iterator[str
         counts += f", {result.only_recorded} only in the recording, "
         counts += f"{result.only_replayed} only in the replay"
     if found := result.difference:
-        yield f"{path}: {process} does something else; the first difference:"
-        yield f"{found.key} at tick {found.tick}, resting on tick {found.basis}: {found.field}"
+        yield f"{path}: {process} behaves differently; first difference:"
+        yield f"{found.key} at tick {found.tick}, based on tick {found.basis}: {found.field}"
         yield f"  recorded {found.recorded!r}, now {found.replayed!r}"
         yield f"  recorded {msgspec.json.encode(found.recorded_message).decode()}"
         yield f"  now      {msgspec.json.encode(found.replayed_message).decode()}"
     elif not result.same:
-        yield f"{path}: {process} sends at other times: {counts}"
+        yield f"{path}: {process} sends at different times: {counts}"
     else:
-        yield f"{path}: {process} does what it did: {counts}"
+        yield f"{path}: {process} behaves as recorded: {counts}"
     if result.same:
         return
     if result.real_time:
-        yield "it was recorded in real time: two messages within a tick may have changed places"
+        yield "recorded in real time: messages within a tick may be in another order"
     if result.lost:
-        yield f"the recording lacks {result.lost} messages that {process} received"
+        yield f"{result.lost} messages that {process} received are not in the recording"
     if result.begun_late:
-        yield "the recording begins in the middle of a run, whose earlier part may be the reason"
+        yield "the recording begins in the middle of a run; its earlier part may be the reason"

@@ -271,7 +271,7 @@ class TeleopStation:
                 with contextlib.suppress(Refused):
                     await self._enable(take=False)
         except GigabrainError as error:
-            print(f"the body was not handed back: {error}", file=sys.stderr)
+            print(f"cannot return the body to the brain: {error}", file=sys.stderr)
 
     def _lines(self, wanted: Velocity) -> list[str]:
         state = self._robot.state

@@ -105,10 +105,10 @@ def test_of_a_process_that_was_changed_the_first_difference_is_shown(
     changed.write_text("decision:\n  settings: {max_linear_speed: 0.1}\n")
     command = ("replay", "--check", str(path), "--process", "decision")
     assert call(*command) == 0
-    assert "decision does what it did" in capsys.readouterr().out
+    assert "decision behaves as recorded" in capsys.readouterr().out
     assert call(*command, "--deployment", str(changed)) == 1
     told = capsys.readouterr().out.splitlines()
-    assert told[0] == f"{path}: decision does something else; the first difference:"
+    assert told[0] == f"{path}: decision behaves differently; first difference:"
     assert told[1].startswith("robot/intent at tick ")
     assert told[1].endswith(": twist.linear_x")
     assert told[2] == "  recorded 0.2, now 0.1"

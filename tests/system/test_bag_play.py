@@ -16,7 +16,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError, Refused
 from gigabrain_zenoh.recording.bag_reader import Bag
 from gigabrain_zenoh.recording.bag_writer import BagWriter
-from gigabrain_zenoh.recording.player import Player, PlayOptions, check_nobody_drives
+from gigabrain_zenoh.recording.player import Player, PlayOptions, check_no_driver
 from gigabrain_zenoh.testing.in_memory import Net, RobotInMemory
 from gigabrain_zenoh.testing.processes import repeat, robot
 from gigabrain_zenoh.testing.waiting import until
@@ -87,14 +87,14 @@ async def test_the_pace_is_that_of_the_recording(drive: Path) -> None:
 
 async def test_where_a_driver_runs_playing_is_refused() -> None:
     net = Net()
-    await check_nobody_drives(net.one)
+    await check_no_driver(net.one)
 
     async def describe(_: DescribeRequest) -> object:
         return example(DESCRIBE.reply)
 
     net.two.serve(DESCRIBE, describe, name="driver")  # type: ignore[arg-type]
-    with pytest.raises(Refused, match=r"a driver runs here \(pid 4710\); play with another"):
-        await check_nobody_drives(net.one)
+    with pytest.raises(Refused, match=r"a driver runs on this bus \(pid 4710\): "):
+        await check_no_driver(net.one)
     await net.one.close()
     await net.two.close()
 

@@ -179,4 +179,4 @@ async def test_a_station_that_cannot_hand_back_says_so_and_ends(
         raise BodyLost("robot/state has stopped")
 
     await cancelled_while_driving(Held(lost), tmp_path)
-    assert "not handed back" in capsys.readouterr().err
+    assert "cannot return the body" in capsys.readouterr().err
