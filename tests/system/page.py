@@ -83,6 +83,12 @@ class Browser:
         await page.wait_for_selector("#link.live")
         return page
 
+    async def close_pages(self) -> None:
+        """Close what a test has opened; the browser stays."""
+        for page in self._context.pages[1:]:  # it ends with its last one
+            await page.close()
+        assert self.faults == []
+
     def _check(self, url: str) -> None:
         if not url.startswith((self._robot.origin, "blob:", "data:")):
             self.faults.append(f"asked for {url}")

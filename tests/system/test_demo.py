@@ -33,6 +33,7 @@ from gigabrain_zenoh.ui.run_report import (
 )
 from tests.places import ROOT
 
+IN_QA = pytest.mark.qa
 BODIES = ROOT / "drivers" / "gigabrain_drivers" / "bodies"
 DRIVER_HEALTH = Health(
     process="driver", pid=7, host="robot", uptime_s=60.0, cpu=0.5, rss_bytes=1,
@@ -69,9 +70,9 @@ def test_the_fault_that_is_told_is_the_drivers_newest_or_the_newest(
 @pytest.mark.parametrize(
     ("world", "body"),
     [
-        ("arena", "turtlebot3_waffle"),
+        pytest.param("arena", "turtlebot3_waffle", marks=IN_QA),
         ("house", "turtlebot3_burger"),
-        ("random:3", "turtlebot3_waffle"),
+        pytest.param("random:3", "turtlebot3_waffle", marks=IN_QA),
     ],
 )
 async def test_a_robot_roams_without_touching_anything(home: Home, world: str, body: str) -> None:
@@ -93,8 +94,8 @@ async def test_a_robot_roams_without_touching_anything(home: Home, world: str, b
 
 async def test_the_same_seed_gives_the_same_decisions_at_any_speed(home: Home) -> None:
     options = ("--world", "warehouse", "--seconds", "12", "--seed", "4", "--lockstep-timeout", "30")
-    _, slow = await run(home, *options, "--speed", "2")
-    _, fast = await run(home, *options, "--speed", "5")
+    _, slow = await run(home, *options, "--speed", "4")
+    _, fast = await run(home, *options, "--speed", "10")
     assert (slow["lockstep_timeouts"], fast["lockstep_timeouts"]) == (0, 0)
     assert len(slow["decisions"]) >= 3
     assert slow["decisions"] == fast["decisions"]
@@ -127,7 +128,7 @@ async def test_a_robot_that_does_not_move_fails_the_run(home: Home) -> None:
 
 async def test_a_process_that_dies_fails_the_run_but_does_not_end_it(home: Home) -> None:
     report = home.folder / "report.json"
-    options = ("--seconds", "30", "--speed", "4", "--headless", "--report", str(report))
+    options = ("--seconds", "16", "--speed", "4", "--headless", "--report", str(report))
     demo = home.start(*AVOID, *options)
     async with probing(await robot_of(home, demo)) as robot:
         await until(lambda: robot.state.gate.mode == "enabled", "driving")
@@ -135,7 +136,7 @@ async def test_a_process_that_dies_fails_the_run_but_does_not_end_it(home: Home)
     assert await demo.ended() == 1
     told = json.loads(report.read_bytes())
     assert (told["verdict"], told["restarts"]) == ("1 process died", 1)
-    assert (told["sim_seconds"], told["contacts"]) == (30.0, 0)
+    assert (told["sim_seconds"], told["contacts"]) == (16.0, 0)
 
 
 async def test_a_body_without_a_truth_of_its_own_is_judged_by_its_odometry(home: Home) -> None:
@@ -146,7 +147,10 @@ async def test_a_body_without_a_truth_of_its_own_is_judged_by_its_odometry(home:
     assert "contact" not in demo.out
 
 
-@pytest.mark.parametrize("frozen", ["none", "router", "driver", "decision"])
+@pytest.mark.parametrize(
+    "frozen",
+    ["none", "driver", pytest.param("router", marks=IN_QA), pytest.param("decision", marks=IN_QA)],
+)
 async def test_ctrl_c_ends_all_of_it_also_when_one_hangs(home: Home, frozen: str) -> None:
     demo = home.start(*AVOID, "--headless")
     async with probing(await robot_of(home, demo)) as robot:

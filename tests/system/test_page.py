@@ -4,9 +4,9 @@ import os
 import re
 import signal
 from collections.abc import AsyncIterator, Iterator
-from pathlib import Path
 
 import pytest
+import pytest_asyncio
 from playwright.async_api import Page
 
 from gigabrain_zenoh.qa.probe import Probe, at_rest, probing
@@ -14,7 +14,7 @@ from gigabrain_zenoh.testing.processes import Home
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.page import VIEWER, Browser, Robot, browser, needs_browser
 
-pytestmark = needs_browser
+pytestmark = [needs_browser, pytest.mark.asyncio(loop_scope="module")]
 
 ENABLED, LIVE = "#gate[data-mode=enabled]", "#link.live"
 
@@ -26,17 +26,23 @@ def robot(shared_home: Home) -> Iterator[Robot]:
     made.command.close()
 
 
-@pytest.fixture
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
 async def seen(robot: Robot) -> AsyncIterator[Probe]:
     async with probing(robot.endpoint) as onlooker:
         yield onlooker
 
 
-@pytest.fixture
-async def chromium(robot: Robot, tmp_path: Path) -> AsyncIterator[Browser]:
+@pytest_asyncio.fixture(loop_scope="module", scope="module")
+async def started(robot: Robot, tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Browser]:
     await robot.served()
-    async with browser(robot, tmp_path / "profile") as made:
+    async with browser(robot, tmp_path_factory.mktemp("profile")) as made:
         yield made
+
+
+@pytest_asyncio.fixture(loop_scope="module")
+async def chromium(started: Browser) -> AsyncIterator[Browser]:
+    yield started
+    await started.close_pages()
 
 
 async def text(page: Page, name: str) -> str:

@@ -86,7 +86,13 @@ async def relay_lost(robot: Probe, *, killed: bool) -> None:
     assert (truth["stale_commands_executed"], truth["contacts"]) == (0, 0)
 
 
-@pytest.mark.parametrize("secure", [False, True], ids=["bare", "with keys in a fleet"])
+@pytest.mark.parametrize(
+    "secure",
+    [
+        pytest.param(False, id="bare", marks=pytest.mark.qa),
+        pytest.param(True, id="with keys in a fleet"),
+    ],
+)
 async def test_a_robot_whose_brain_loses_its_relay_stops_and_drives_again_and_nobody_is_refused(
     secure: bool, tmp_path: Path
 ) -> None:
