@@ -85,9 +85,11 @@ test: check
 qa: setup
 	@$(MAKE) qa-tests extremes dockerfile signals faults mutation fuzz
 
-# every test that `make test` leaves out, and all properties with a thousand examples each
+# every test that `make test` leaves out, and all properties with a thousand examples each; goes on
+# where it was stopped, with what failed or was not reached
+PASSED ?= .qa/passed_tests
 qa-tests: setup
-	$(PYTEST) -q -m 'qa or hypothesis' --hypothesis-profile=qa $(ARGS)
+	$(PYTEST) -q -m 'qa or hypothesis' --hypothesis-profile=qa --passed $(PASSED) $(ARGS)
 
 # every extreme value in every message
 extremes: setup

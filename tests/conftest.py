@@ -8,7 +8,7 @@ from hypothesis import settings
 
 import gigabrain_zenoh.recording.arithmetic  # noqa: F401  before anything imports numpy
 
-pytest_plugins = ["gigabrain_zenoh.testing.fixtures"]
+pytest_plugins = ["gigabrain_zenoh.testing.fixtures", "tests.resuming"]
 
 TESTS = Path(__file__).parent
 MARKS = {"unit": "unit", "fuzz": "unit", "node": "node", "system": "system"}
