@@ -36,7 +36,7 @@ from gigabrain_zenoh.navigation import global_planner, local_planner
 from gigabrain_zenoh.navigation.global_planner import Unreachable
 
 MAX_SCAN_AGE_TICKS = 10  # of a scan to drive by
-NO_ROUTE = Idle("waiting", "waiting: for a way through the map")
+NO_ROUTE = Idle("waiting", "waiting: for a path through the map")
 
 ANY_BODY = BodyDescription(
     robot_type="any", drive_type="differential",
@@ -208,7 +208,7 @@ class Navigator:
         outcome = self._outcome(context, command, route, plan)
         headline = f"{route.activity}: {route.reason}" if route.temporary else outcome.activity
         late = context.delayed_s
-        slow = f"; slower, this host is busy: {late:.2f} s late" if late else ""
+        slow = f"; slower: this host is late by {late:.2f} s" if late else ""
         intent = self._intent(
             twist=plan.twist,
             trajectory=plan.trajectory,
@@ -279,12 +279,12 @@ def _why_not(context: NavigationContext, command: DriveCommand | None) -> Idle |
     elif not context.world.scan_ok:
         why = context.world.scan_problem
     elif context.body is None:
-        why = "the driver has not said what body this is"
+        why = "no robot/body from the driver yet"
     elif context.lost and command is not None:
         why = context.lost
     elif context.late_ticks > MAX_SCAN_AGE_TICKS:
         late_s = context.late_ticks * TICK_S
-        why = f"this host is too busy, its newest scan is {late_s:.2f} s old"
+        why = f"this host is too busy: its newest scan is {late_s:.2f} s old"
     return Idle("waiting", f"waiting: {why}") if why else None
 
 

@@ -1,4 +1,4 @@
-"""Route planning for drive commands: the next place, the way there, and when to give up."""
+"""Route planning for drive commands: the next place, the path to it, and when to give up."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,6 +17,20 @@ from gigabrain_zenoh.navigation.costmap import LETHAL, Costmap, Unknown, costmap
 from gigabrain_zenoh.navigation.global_planner import GlobalPlanner, Path, Unreachable, frontiers
 from gigabrain_zenoh.navigation.grid_search import GridSearch
 from gigabrain_zenoh.navigation.local_planner import LocalSettings
+
+GIVE_UP_TICKS = 1500  # 30 s of driving without progress
+NO_PROGRESS = "no progress for 30 s"
+LEAVE_FRONTIER_TICKS = 500  # 10 s without progress towards a frontier or a visited place
+BLOCKED_MEMORY_TICKS = 500  # 10 s, for which a plan avoids what blocked the last route
+FRONTIER_HYSTERESIS_M = 1.5  # switch frontiers only for a gain of this much
+SAME_FRONTIER_M = 0.6  # a frontier moves as the map grows
+FRONTIER_CONFIRM_TICKS = 125  # 2.5 s: the map is published once a second
+MAX_VISIT_COST, MIN_VISIT_M = 2.0, 1.5  # cost of a place worth visiting, and length of the way [m]
+ARRIVED_M = LocalSettings().position_tolerance
+NEAR_GOAL_M = 0.25  # good enough for a goal that was free when it was requested: maps shift
+OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal
+GOAL_MARGIN_M = 2.0  # of unknown space around a goal outside the map
+MAX_ENLARGED_CELLS = 4_000_000
 
 PROGRESS_M = 0.3  # a smaller gain is no progress
 DETOUR_M = 1.0  # a path that is longer than the last plan by this is another way
@@ -80,37 +94,37 @@ class GiveWay:
         self.place: Goal | None = None  # where the robot waits now
 
     def update(
-        self, goal: Goal, here: Point, tick: int, stuck: bool, chart: Costmap, search: GridSearch
+        self, goal: Goal, here: Point, tick: int, stuck: bool, costs: Costmap, search: GridSearch
     ) -> bool:
         """Begin, continue or stop giving way; return whether that has changed."""
-        before, cell = self.place, chart.cell(goal.x, goal.y)
-        occupied = cell is not None and chart.cost[cell] > LETHAL
+        before, cell = self.place, costs.cell(goal.x, goal.y)
+        occupied = cell is not None and costs.cost[cell] > LETHAL
         near = math.dist(here, (goal.x, goal.y)) < OCCUPIED_NEAR_M
         if before:
             waiting = tick - self._since_tick < GIVE_WAY_TICKS
             self.place = before if occupied and waiting else None
         elif occupied and stuck and self._count < MAX_GIVE_WAYS and near:
-            self.place = waiting_place(chart, search, here, goal, far=self._count > 0)
+            self.place = waiting_place(costs, search, here, goal, far=self._count > 0)
             self._count, self._since_tick = self._count + 1, tick
         return self.place is not before
 
 
 def waiting_place(
-    chart: Costmap, search: GridSearch, here: Point, goal: Goal, *, far: bool
+    costs: Costmap, search: GridSearch, here: Point, goal: Goal, *, far: bool
 ) -> Goal | None:
     """Return the nearest place away from the line goal-`here`, or the one farthest from the goal.
 
     An obstacle at the goal probably moves on along that line. The farthest place is for one that
     went another way, and for a robot without room to the side. None if no place is reachable.
     """
-    start = chart.cell(*here)
+    start = costs.cell(*here)
     if start is None:
         return None
-    way = search.field(chart.cost, start, "from") * chart.resolution
-    rows, columns = np.nonzero((chart.cost < MAX_WAITING_COST) & (way < MAX_WAITING_PATH_M))
+    way = search.field(costs.cost, start, "from") * costs.resolution
+    rows, columns = np.nonzero((costs.cost < MAX_WAITING_COST) & (way < MAX_WAITING_PATH_M))
     if not len(rows):
         return None
-    off = chart.points(rows, columns) - (goal.x, goal.y)
+    off = costs.points(rows, columns) - (goal.x, goal.y)
     ahead = math.atan2(here[1] - goal.y, here[0] - goal.x)
     offset = np.abs(off[:, 1] * math.cos(ahead) - off[:, 0] * math.sin(ahead))
     score = np.where(offset >= MIN_OFFSET_M, -way[rows, columns], -math.inf)
@@ -118,21 +132,6 @@ def waiting_place(
         score = np.hypot(*off.T)
     x, y = (off[int(score.argmax())] + (goal.x, goal.y)).tolist()
     return Goal(x=x, y=y)
-
-
-GIVE_UP_TICKS = 1500  # 30 s of driving without progress
-NO_PROGRESS = "no progress for 30 s"
-LEAVE_FRONTIER_TICKS = 500  # 10 s without progress towards a frontier or a visited place
-BLOCKED_MEMORY_TICKS = 500  # 10 s, for which a plan avoids what blocked the last route
-FRONTIER_HYSTERESIS_M = 1.5  # switch frontiers only for a gain of this much
-SAME_FRONTIER_M = 0.6  # a frontier moves as the map grows
-FRONTIER_CONFIRM_TICKS = 125  # 2.5 s: the map is published once a second
-MAX_VISIT_COST, MIN_VISIT_M = 2.0, 1.5  # cost of a place worth visiting, and length of the way [m]
-ARRIVED_M = LocalSettings().position_tolerance
-NEAR_GOAL_M = 0.25  # good enough for a goal that was free when it was requested: maps shift
-OCCUPIED_TICKS = 500  # 10 s without progress towards an occupied goal
-GOAL_MARGIN_M = 2.0  # of unknown space around a goal outside the map
-MAX_ENLARGED_CELLS = 4_000_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -207,26 +206,26 @@ class RoutePlanner:
         self._update(request)
         if command.goal:
             request = replace(request, grid=self._enlarged(request.grid, command.goal))
-            return self._to_goal(command.goal, request, self._chart(request))
-        chart = self._chart(request)
+            return self._to_goal(command.goal, request, self._update_costmap(request))
+        costs = self._update_costmap(request)
         if command.kind == "visit":
             return self._to_goal(
-                self._goal or _random_place(request, chart, self._planner), request, chart
+                self._goal or _random_place(request, costs, self._planner), request, costs
             )
-        return self._explore(request, chart)
+        return self._explore(request, costs)
 
     def check(
         self, grid: OccupancyGrid, body: BodyDescription, here: Pose, goal: Goal
     ) -> PathCheck | Unreachable:
         """Return the length of the path to a goal, or why there is none."""
-        chart = costmap(
+        costs = costmap(
             self._enlarged(grid, goal), inflation(body, self._unknown_space), before=None
         )
         start, planner = (here.x, here.y), GlobalPlanner()
-        found, offset = planner.plan(chart, start, (goal.x, goal.y)), ""
+        found, offset = planner.plan(costs, start, (goal.x, goal.y)), ""
         if isinstance(found, Unreachable) and found.nearest and found.distance <= ARRIVED_M:
             offset = _offset(found)
-            found = planner.plan(chart, start, found.nearest)
+            found = planner.plan(costs, start, found.nearest)
         if isinstance(found, Unreachable):
             return found
         return PathCheck(length_m=float(found.remaining[0]), offset=offset)
@@ -258,7 +257,7 @@ class RoutePlanner:
         elif request.tick - self._blocking_tick > BLOCKED_MEMORY_TICKS:
             self._blocking = np.empty((0, 2))
 
-    def _chart(self, request: RouteRequest) -> Costmap:
+    def _update_costmap(self, request: RouteRequest) -> Costmap:
         key = (request.grid, request.body, self._blocking_tick if len(self._blocking) else 0)
         known = self._costmap_key
         same = known and all(a is b or a == b for a, b in zip(key, known, strict=True))
@@ -268,31 +267,32 @@ class RoutePlanner:
             self._costmap_key = key
         return self._costmap
 
-    def _to_goal(self, goal: Goal, request: RouteRequest, chart: Costmap) -> Route:
+    def _to_goal(self, goal: Goal, request: RouteRequest, costs: Costmap) -> Route:
         first, requested = self._goal is None, goal
         goal, offset = self._settled or (goal, "")
-        found = self._find(goal, request.here, chart)
-        away = None if first else self._giving_way(goal, request, chart)
+        found = self._find(goal, request.here, costs)
+        away = None if first else self._giving_way(goal, request, costs)
         if away:
             return away
         near = ARRIVED_M if first else NEAR_GOAL_M
         if isinstance(found, Unreachable) and found.nearest and found.distance <= near:
             offset = _offset(found)
             goal = Goal(x=found.nearest[0], y=found.nearest[1], yaw=goal.yaw)
-            found = self._planner.plan(chart, (request.here.x, request.here.y), found.nearest)
+            found = self._planner.plan(costs, (request.here.x, request.here.y), found.nearest)
         if isinstance(found, Unreachable):
             if first or self._progress.stuck(request.tick, GIVE_UP_TICKS):
-                return self._end("failed", found.reason)
+                return self._route(state="failed", reason=found.reason)
             if self._last_path:  # noise closes narrow ways in the map; the scan shows them
                 return self._go(goal, self._last_path)
-            return self._approach(found, request, chart)
+            return self._approach(found, request, costs)
         self._last_path = found
         self._progress.measure(float(found.remaining[0]), request.tick)
         if self._progress.stuck(request.tick, GIVE_UP_TICKS):
             if not self._settle(requested, request):
                 left = f"{found.remaining[0]:.2f} m from the goal"
-                return self._end("failed", f"gave up: {NO_PROGRESS}, {left}{self._why(request)}")
-            return self._to_goal(requested, request, chart)
+                reason = f"gave up: {NO_PROGRESS}, {left}{self._why(request)}"
+                return self._route(state="failed", reason=reason)
+            return self._to_goal(requested, request, costs)
         return self._go(goal, found, offset)
 
     def _settle(self, goal: Goal, request: RouteRequest) -> bool:
@@ -301,7 +301,7 @@ class RoutePlanner:
         off = math.hypot(goal.x - x, goal.y - y)
         if self._settled or not AT_GOAL_M < off <= NEAR_GOAL_M:
             return False
-        why = f"{off:.2f} m beside what was asked for: {NO_PROGRESS}{self._why(request)}"
+        why = f"{off:.2f} m from the requested goal: {NO_PROGRESS}{self._why(request)}"
         self._settled = Goal(x=x, y=y, yaw=goal.yaw), why
         self._progress = ProgressMonitor(request.tick)
         self._version += 1
@@ -311,61 +311,61 @@ class RoutePlanner:
         why = request.slowed_by or self._doing
         return f" ({why})" if why else ""
 
-    def _giving_way(self, goal: Goal, request: RouteRequest, chart: Costmap) -> Route | None:
+    def _giving_way(self, goal: Goal, request: RouteRequest, costs: Costmap) -> Route | None:
         """Return a route away from an occupied goal, if the robot gives way there."""
         here = (request.here.x, request.here.y)
         stuck = self._progress.stuck(request.tick, OCCUPIED_TICKS)
-        if self._give_way.update(goal, here, request.tick, stuck, chart, self._planner.search):
+        if self._give_way.update(goal, here, request.tick, stuck, costs, self._planner.search):
             self._progress, self._last_path = ProgressMonitor(request.tick), None
             self._version += 1
         place = self._give_way.place
-        way = self._planner.plan(chart, here, (place.x, place.y)) if place else None
+        way = self._planner.plan(costs, here, (place.x, place.y)) if place else None
         if place is None or not isinstance(way, Path):
             return None
-        return self._go(place, way, "something is at the goal", "making room")
+        return self._go(place, way, "the goal is occupied", "giving way")
 
-    def _approach(self, found: Unreachable, request: RouteRequest, chart: Costmap) -> Route:
+    def _approach(self, found: Unreachable, request: RouteRequest, costs: Costmap) -> Route:
         """Return a route to the nearest reachable place, to see whether the goal is free again."""
         here, nearest = (request.here.x, request.here.y), found.nearest
-        way = self._planner.plan(chart, here, nearest) if nearest else None
+        way = self._planner.plan(costs, here, nearest) if nearest else None
         if nearest is None or not isinstance(way, Path):
-            return self._wait(found.reason)
+            return self._route(reason=found.reason)
         x, y = nearest
-        return self._go(Goal(x=x, y=y), way, found.fault, "looking whether there is room")
+        return self._go(Goal(x=x, y=y), way, found.fault, "checking whether the goal is free")
 
-    def _explore(self, request: RouteRequest, chart: Costmap) -> Route:
+    def _explore(self, request: RouteRequest, costs: Costmap) -> Route:
         """Return a route to the best frontier."""
         here = request.here.x, request.here.y
         arrived = request.feedback is not None and request.feedback.arrived
         if self._goal and (arrived or self._progress.stuck(request.tick, LEAVE_FRONTIER_TICKS)):
             self._visited.append((self._goal.x, self._goal.y))
-            self._leave(request.tick)
+            self._drop_frontier(request.tick)
         for _ in range(len(self._visited) + 10):
-            goal = self._frontier(chart, here)
+            goal = self._frontier(costs, here)
             if goal is None:
-                return self._explored(request, chart)
+                return self._explored(request, costs)
             self._last_frontier_tick = request.tick
             if self._goal and _apart(goal, self._goal) > SAME_FRONTIER_M:
-                self._leave(request.tick)
-            found = self._find(goal, request.here, chart)
+                self._drop_frontier(request.tick)
+            found = self._find(goal, request.here, costs)
             if isinstance(found, Path):
                 self._progress.measure(float(found.remaining[0]), request.tick)
                 return self._go(goal, found)
             self._visited.append((goal.x, goal.y))
-        return self._wait("no way leads to what is still unknown")
+        return self._route(reason="no path to unexplored space")
 
-    def _explored(self, request: RouteRequest, chart: Costmap) -> Route:
+    def _explored(self, request: RouteRequest, costs: Costmap) -> Route:
         """End the exploration, once the map has been updated without a new frontier."""
-        cell = chart.cell(request.here.x, request.here.y)
-        if cell is None or chart.cells[cell] < 0:
-            return self._wait("the map does not reach here yet")
+        cell = costs.cell(request.here.x, request.here.y)
+        if cell is None or costs.cells[cell] < 0:
+            return self._route(reason="the robot is outside the map")
         if request.tick - self._last_frontier_tick < FRONTIER_CONFIRM_TICKS:
-            return self._wait("nothing new in sight; looking once more")
-        return self._end("done", "all is mapped that can be reached")
+            return self._route(reason="no frontier left; waiting for the next map")
+        return self._route(state="done", reason="everything reachable is explored")
 
-    def _frontier(self, chart: Costmap, here: Point) -> Goal | None:
+    def _frontier(self, costs: Costmap, here: Point) -> Goal | None:
         """Return the best frontier; the present one, unless another is much better."""
-        found = frontiers(chart, here, self._visited, self._planner.search)
+        found = frontiers(costs, here, self._visited, self._planner.search)
         if not found:
             return None
         best = min(found, key=lambda one: one.score)
@@ -377,18 +377,17 @@ class RoutePlanner:
                 best = same
         return Goal(x=best.x, y=best.y)
 
-    def _find(self, goal: Goal, here: Pose, chart: Costmap) -> Path | Unreachable:
+    def _find(self, goal: Goal, here: Pose, costs: Costmap) -> Path | Unreachable:
         start, end = (here.x, here.y), (goal.x, goal.y)
         if self._path is None or goal != self._goal:
-            found = self._planner.plan(chart, start, end)
+            found = self._planner.plan(costs, start, end)
         else:
-            found = self._planner.replan(chart, start, end, self._path)
+            found = self._planner.replan(costs, start, end, self._path)
         self._goal = goal
         self._path = found if isinstance(found, Path) else None
         return found
 
-    def _leave(self, tick: int) -> None:
-        """Drop the present frontier."""
+    def _drop_frontier(self, tick: int) -> None:
         self._goal = self._path = self._last_path = None
         self._progress = ProgressMonitor(tick)
         self._version += 1
@@ -396,26 +395,20 @@ class RoutePlanner:
     def _go(self, goal: Goal, path: Path, reason: str = "", activity: str = "") -> Route:
         return self._route(goal=goal, points=path.points, reason=reason, activity=activity)
 
-    def _wait(self, reason: str) -> Route:
-        return self._route(reason=reason)
-
-    def _end(self, state: Literal["done", "failed"], reason: str) -> Route:
-        return self._route(state=state, reason=reason)
-
     def _route(self, **fields: Any) -> Route:
         return Route(number=self._number, version=self._version, **fields)
 
 
-def _random_place(request: RouteRequest, chart: Costmap, planner: GlobalPlanner) -> Goal:
+def _random_place(request: RouteRequest, costs: Costmap, planner: GlobalPlanner) -> Goal:
     """Return a random reachable place away from obstacles; the robot's own if there is none."""
-    start, here = chart.cell(request.here.x, request.here.y), request.here
+    start, here = costs.cell(request.here.x, request.here.y), request.here
     if start is not None:
-        way = planner.search.field(chart.cost, start, "from") * chart.resolution
-        free = (chart.cost < MAX_VISIT_COST) & (way > MIN_VISIT_M) & np.isfinite(way)
+        way = planner.search.field(costs.cost, start, "from") * costs.resolution
+        free = (costs.cost < MAX_VISIT_COST) & (way > MIN_VISIT_M) & np.isfinite(way)
         rows, columns = np.nonzero(free)
         if len(rows):
             one = int(np.random.default_rng(request.command.number).integers(len(rows)))
-            x, y = chart.points(rows[one : one + 1], columns[one : one + 1])[0].tolist()
+            x, y = costs.points(rows[one : one + 1], columns[one : one + 1])[0].tolist()
             return Goal(x=x, y=y)
     return Goal(x=here.x, y=here.y)
 
@@ -458,4 +451,4 @@ def _apart(a: Goal, b: Goal) -> float:
 
 def _offset(found: Unreachable) -> str:
     """Return how far from its goal the robot goes instead, and why, for people."""
-    return f"{found.distance:.2f} m beside what was asked for: {found.fault}"
+    return f"{found.distance:.2f} m from the requested goal: {found.fault}"

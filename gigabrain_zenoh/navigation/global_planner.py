@@ -212,7 +212,7 @@ class Frontier:
 def next_frontier(
     costmap: Costmap, robot: Point, blacklist: Iterable[Point], search: GridSearch
 ) -> Frontier | None:
-    """The best frontier; None when all is mapped that can be reached.
+    """The best frontier; None when everything reachable is explored.
 
     In the blacklist is where the robot could not get to, and where it has been: what is unknown
     there will stay so.

@@ -156,8 +156,8 @@ class Mapper:
             self._chart, self._blank, self._mapped = chart, False, True
             odometry = np.array(head.odometry)
             self._before = Moment(head.tick, odometry, odometry, slipping=False, jumps=0)
-            text = f"the map of tick {head.tick} goes on"
-            log.info(text, extra={"data": {"event": "map"}})
+            data = {"event": "map_restored", "map_tick": head.tick}
+            log.info("resumed the map of tick %d", head.tick, extra={"data": data})
             return
 
     def _take(self, scan: LaserScan, moment: Moment) -> None:

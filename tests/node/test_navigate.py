@@ -100,7 +100,7 @@ async def test_without_a_map_it_says_what_to_change() -> None:
             reply = await plane.ask(service, request)  # type: ignore[arg-type]
             assert not reply.ok
             assert reply.text == (
-                "nobody says yet where in a map the robot is; perception: {mapping: slam} would"
+                "no localization; set perception: {mapping: slam} or {mapping: localize}"
             )
         assert (await plane.ask(MISSION, MissionRequest(mission="do: [{wait: 1}]"))).ok
 
@@ -157,7 +157,7 @@ async def test_a_goal_that_turns_out_to_be_too_close_to_something_is_reached_bes
         plane.cells[:, 83:86] = 100  # from x = 4.15 m on: the body does not fit at the goal
         await plane.until("succeeded", seconds=90)
         told = plane.status.done[0].reason
-        assert " m beside what was asked for: the goal is too close to something" in told
+        assert " m from the requested goal: the goal is too close to something" in told
         assert 0.1 < math.hypot(plane.x - 4.0, plane.y - 1.6) < 0.4
         assert plane.closest > 0.1
 

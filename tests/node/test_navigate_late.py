@@ -37,7 +37,7 @@ async def test_it_stands_while_its_scans_come_too_late_to_drive_by() -> None:
             said.add(plane.intent.reason)
         # between two of these scans the older one no longer counts at all
         assert said == {
-            "waiting: this host is too busy, its newest scan is 0.22 s old",
+            "waiting: this host is too busy: its newest scan is 0.22 s old",
             "waiting: perception is silent",
         }
         plane.late_ticks = 0
@@ -54,7 +54,7 @@ async def test_it_drives_more_slowly_while_its_scans_come_late_and_says_why() ->
         in_time = await fastest(plane, 1.5)
         plane.late_ticks = 7
         await plane.go(1.0)
-        assert plane.intent.reason.endswith("; slower, this host is busy: 0.10 s late")
+        assert plane.intent.reason.endswith("; slower: this host is late by 0.10 s")
         late = await fastest(plane, 1.5)
         plane.late_ticks = 0
         await plane.go(3.0)
@@ -113,10 +113,10 @@ async def test_a_plan_for_a_huge_map_does_not_delay_the_first_one_for_the_real_m
         await plane.go(0.1)
         await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
         await plane.go(0.2)
-        assert plane.intent.reason == "waiting: for a way through the map"
+        assert plane.intent.reason == "waiting: for a path through the map"
         began = plane.tick
         plane.bench.send(MAP, as_map(CELLS, plane.tick, plane.boot))
-        while plane.intent.reason == "waiting: for a way through the map":
+        while plane.intent.reason == "waiting: for a path through the map":
             await plane.go(0.02)
         assert plane.tick - began <= 25
 

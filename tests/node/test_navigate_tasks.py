@@ -48,7 +48,7 @@ async def test_exploring_ends_once_all_is_seen_that_can_be_reached() -> None:
         reply = await plane.ask(MISSION, MissionRequest(mission="do: [{explore: {}}]"))
         assert reply.ok
         await plane.until("succeeded", seconds=120)
-        assert plane.status.done[0].reason == "all is mapped that can be reached"
+        assert plane.status.done[0].reason == "everything reachable is explored"
         inside = CELLS[5:-5, 5:-5] == 0
         assert (plane.known[5:-5, 5:-5][inside] == 0).mean() > 0.98
         assert plane.travelled > 0.5

@@ -126,5 +126,5 @@ def test_no_program_of_elsewhere_is_run(tmp_path: Path, name: str) -> None:
 def test_a_program_that_may_not_be_run_is_refused(tmp_path: Path) -> None:
     folder = program(tmp_path, "exit 0")
     (tmp_path / "beep").chmod(0o644)
-    with pytest.raises(Refused, match="script 'beep' may not be run; chmod \\+x "):
+    with pytest.raises(Refused, match="script 'beep' is not executable; chmod \\+x "):
         Scripts(folder).path("beep")

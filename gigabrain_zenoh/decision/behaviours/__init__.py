@@ -72,9 +72,7 @@ class WaitReason(StrEnum):
 
     STARTING = "starting up"
     PERCEPTION_STARTING = "perception is starting up"
-    NO_LOCALIZATION = (
-        "nobody says yet where in a map the robot is; perception: {mapping: slam} would"
-    )
+    NO_LOCALIZATION = "no localization; set perception: {mapping: slam} or {mapping: localize}"
     NOT_LOCALIZED = "the pose in the map is uncertain"
     NO_ODOMETRY_OF_POSE = "no odometry for the last pose in the map"
     NO_ODOMETRY_OF_SCAN = "no odometry for the scan"

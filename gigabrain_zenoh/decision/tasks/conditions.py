@@ -90,7 +90,7 @@ def _kind(type_: Any, path: tuple[str, ...], field: str) -> type:
         elif typing.get_origin(type_) is tuple and part.isdigit():
             type_ = typing.get_args(type_)[0]
         else:
-            raise ValueError(f"{field}: there is nothing called {part!r}")
+            raise ValueError(f"{field}: no field {part!r}")
     kind = _bare(type_)
     if typing.get_origin(kind) is typing.Literal:
         return str

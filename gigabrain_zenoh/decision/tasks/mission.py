@@ -106,8 +106,7 @@ class BatteryBelow(Part, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if self.until is not None and self.until < self.percentage:
             raise ValueError(
-                f"until: expected at least the {self.percentage:g} % below which it goes there, "
-                f"got {self.until:g}"
+                f"until: expected at least the percentage {self.percentage:g}, got {self.until:g}"
             )
 
 
@@ -134,9 +133,11 @@ class Step(Part, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         given = [kind for kind in KINDS if getattr(self, kind) is not None]
         if len(given) > 1:
-            raise ValueError(f"{given[1]}: a step is one thing, and this one is {given[0]} already")
+            raise ValueError(
+                f"{given[1]}: a step has one kind, and this one is {given[0]!r} already"
+            )
         if not given:
-            raise ValueError(f"a step that does nothing; expected one of {', '.join(KINDS)}")
+            raise ValueError(f"an empty step; expected one of {', '.join(KINDS)}")
 
     @property
     def kind(self) -> str:

@@ -36,15 +36,15 @@ class Scripts:
         """Where a program is. Raises Refused, which says what to change, and UnknownName."""
         if self._folder is None:
             raise Refused(
-                f"script {name!r}: this robot runs none; name their folder in its deployment "
-                "file, as in decision: {scripts: /home/robot/scripts}"
+                f"script {name!r}: this robot runs no scripts; name their folder in its "
+                "deployment file, as in decision: {settings: {scripts: /home/robot/scripts}}"
             )
         there = sorted(p.name for p in self._folder.glob("*") if p.is_file())
         if name not in there:
             raise unknown("script", name, there or ("none",))
         path = self._folder / name
         if not os.access(path, os.X_OK):
-            raise Refused(f"script {name!r} may not be run; chmod +x {path}")
+            raise Refused(f"script {name!r} is not executable; chmod +x {path}")
         return path
 
     def start(self, script: Script) -> "Run":
@@ -121,7 +121,7 @@ async def _outcome(
         async with asyncio.timeout(seconds):
             await words.ended.wait()
     except TimeoutError:
-        return False, f"did not end within {seconds:g} s and was ended"
+        return False, f"did not end within {seconds:g} s; killed"
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(program.get_pid(), signal.SIGKILL)

@@ -150,7 +150,7 @@ class TaskQueue:
         if not job.held:
             raise Refused(f"{job.id} is not paused")
         job.held, job.why_held = False, ""
-        return f"{job.id} goes on"
+        return f"{job.id} is resumed"
 
     def step(self, seconds: float, outcome: StepOutcome | None) -> tuple[DriveCommand | None, Idle]:
         """Advance by `seconds` with the last command's outcome.
@@ -240,7 +240,7 @@ class TaskQueue:
             if job.id == name:
                 return job
         known = ", ".join(job.id for job in self._jobs)
-        raise Refused(f"there is no task {name!r} any more; there is: {known}")
+        raise Refused(f"there is no task {name!r}; tasks: {known}")
 
     def _end(
         self, job: Job, state: TaskState, reason: str, outcome: StepOutcome | None = None
@@ -253,13 +253,13 @@ class TaskQueue:
 def _queued(job: Job, first: str) -> Task:
     if job.held:
         return job.task("paused", job.why_held)
-    return job.task("paused", f"until {first} is done") if job.begun else job.task("queued")
+    return job.task("paused", f"preempted by {first}") if job.begun else job.task("queued")
 
 
 def _unreadable(one: SavedJob, error: ConfigError) -> Task:
     return Task(
         id=one.id[:64], kind=one.kind, label=one.label[:64], source=one.source[:64],
-        state="failed", reason=f"it cannot be carried out any more: {error}"[:500],
+        state="failed", reason=f"the saved mission is invalid: {error}"[:500],
     )  # fmt: skip
 
 

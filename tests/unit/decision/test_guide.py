@@ -115,7 +115,7 @@ def test_who_comes_no_nearer_than_a_hand_settles_there_and_says_so() -> None:
         assert ask(tick=tick, x=4.85).goal == goal
     settled = ask(tick=1502, x=4.85)
     assert settled.goal == Goal(x=4.85, y=1.0, yaw=1.5)
-    assert settled.reason == "0.15 m beside what was asked for: no progress for 30 s"
+    assert settled.reason == "0.15 m from the requested goal: no progress for 30 s"
     assert not settled.temporary
     again = ask(tick=3002, x=4.86)  # while it turns
     assert (again.goal, again.reason) == (settled.goal, settled.reason)
@@ -176,11 +176,11 @@ def test_a_goal_within_the_arrival_tolerance_of_a_reachable_place_is_driven_to()
     checked = RoutePlanner().check(grid_of(SHUT), WAFFLE, Pose(x=1.0, y=1.0, yaw=0.0), near)
     assert isinstance(checked, PathCheck)
     assert checked.length_m == pytest.approx(1.8, abs=0.05)
-    assert checked.offset.startswith("0.08 m beside what was asked for: the goal is too c")
+    assert checked.offset.startswith("0.08 m from the requested goal: the goal is too c")
     route = think(RoutePlanner(), SHUT, tick=1, goal=near)
     assert route.goal
     assert math.dist((route.goal.x, route.goal.y), (near.x, near.y)) == pytest.approx(0.08)
-    assert route.reason.startswith("0.08 m beside what was asked for: the goal is too close to ")
+    assert route.reason.startswith("0.08 m from the requested goal: the goal is too close to ")
 
 
 def test_what_no_way_has_ever_led_to_is_refused_at_once() -> None:
@@ -197,7 +197,7 @@ def test_it_makes_room_when_somebody_stays_where_it_is_to_go() -> None:
     assert not ask(TAKEN, tick=501).temporary
     leaves = ask(TAKEN, tick=502)
     assert leaves.temporary
-    assert (leaves.activity, leaves.reason) == ("making room", "something is at the goal")
+    assert (leaves.activity, leaves.reason) == ("giving way", "the goal is occupied")
     assert leaves.version != waits.version
     assert leaves.goal
     assert abs(leaves.goal.y - 3.0) >= 1.0  # beside the line on which the other is likely to go on
@@ -216,7 +216,7 @@ def test_what_stays_at_the_goal_for_ever_is_made_room_for_twice_and_then_told() 
     ticks = (502, 1251, 1252, 1752, 1753, 2502, 2503, 4003)
     routes = [ask(TAKEN, tick=tick) for tick in ticks]
     told = [one.activity for one in routes]
-    away, look = "making room", "looking whether there is room"
+    away, look = "giving way", "checking whether the goal is free"
     assert told == [away, away, look, look, away, away, look, look]
     assert routes[4].goal
     assert math.hypot(routes[4].goal.x - 5.0, routes[4].goal.y - 3.0) > 4.0  # far, the second time
@@ -233,7 +233,7 @@ def test_who_stood_aside_comes_back_to_look_whether_there_is_room_again() -> Non
     ask(ROOM, tick=1, x=4.0, y=3.0)
     ask(TAKEN, tick=502, x=4.0, y=3.0)
     looks = ask(TAKEN, tick=1252, x=1.0, y=1.0)
-    assert looks.activity == "looking whether there is room"
+    assert looks.activity == "checking whether the goal is free"
     assert looks.reason == "the goal is inside something"
     assert looks.goal
     assert looks.points is not None
@@ -250,7 +250,7 @@ def test_it_makes_room_for_who_keeps_it_from_the_place_beside_its_goal() -> None
     ask = functools.partial(think, guide, goal=Goal(x=4.85, y=3.0), x=4.0, y=3.0)
     ask(ROOM, tick=1)
     beside = ask(taken, tick=50)
-    assert beside.reason.startswith("0.11 m beside what was asked for: the goal is too close to ")
+    assert beside.reason.startswith("0.11 m from the requested goal: the goal is too close to ")
     assert not beside.temporary
     assert ask(taken, tick=502).temporary
 

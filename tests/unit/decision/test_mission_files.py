@@ -21,7 +21,7 @@ from gigabrain_zenoh.errors import ConfigError
         ("do:\n- goto: [1, .nan]", "m:2: .nan is not allowed; expected a finite number"),
         ("do:\n- goto: [1]", "m:2: do[0].goto: expected "),
         ("do:\n- wait: 1\n  goto: [1, 2]", "m:2: do[0].wait: a step is one thing"),
-        ("do:\n- explore:", "m:2: do[0]: a step that does nothing; expected one of goto, "),
+        ("do:\n- explore:", "m:2: do[0]: an empty step; expected one of goto, "),
         ("do:\n- tree: b", "m:2: do[0].tree: no tree 'b'; known: none"),
         (
             "trees:\n  a: [{tree: b}]\n  b: [{retry: {times: 2, do: [{tree: a}]}}]\n"
@@ -48,7 +48,7 @@ from gigabrain_zenoh.errors import ConfigError
         ),
         (
             "do:\n- battery_below: {percentage: 50, goto: [0, 0], until: 20, do: [{wait: 1}]}",
-            "m:2: do[0].battery_below.until: expected at least the 50 % below which it goes there",
+            "m:2: do[0].battery_below.until: expected at least the percentage 50, got",
         ),
         ("do:\n- explore: {speed: 1}", "m:2: unknown field 'speed'; known: none"),
         ("", "m:1: the file is empty"),

@@ -24,7 +24,7 @@ def test_goals_wait_in_a_queue_or_go_first_or_stand_in_for_all(robot: Robot) -> 
     tasks.add_goal(Goal(x=3.0, y=0.0), "preempt", "bob")
     assert robot.step() == 3.0
     waiting = [(task.id, task.state, task.reason) for task in robot.status.queue]
-    assert waiting == [("goal-1", "paused", "until goal-3 is done"), ("goal-2", "queued", "")]
+    assert waiting == [("goal-1", "paused", "preempted by goal-3"), ("goal-2", "queued", "")]
     assert robot.reached() == 1.0
     assert robot.reached() == 2.0
     tasks.add_goal(Goal(x=4.0, y=0.0), "replace", "bob")
@@ -61,7 +61,7 @@ def test_cancelling_goes_by_name_and_all_at_once(robot: Robot) -> None:
 
 def test_a_task_that_is_not_there_is_named_with_those_that_are(robot: Robot) -> None:
     robot.tasks.add_goal(Goal(x=1.0, y=0.0), "queue", "ann")
-    with pytest.raises(Refused, match="no task 'goal-7' any more; there is: goal-1"):
+    with pytest.raises(Refused, match="no task 'goal-7'; tasks: goal-1"):
         robot.tasks.cancel("goal-7", "bob")
     with pytest.raises(Refused, match="goal-1 is not paused"):
         robot.tasks.resume("goal-1")
@@ -128,7 +128,7 @@ def test_after_a_start_of_the_whole_robot_tasks_wait_for_a_person(robot: Robot) 
         "paused",
         "the robot was restarted; resume the task, or cancel it",
     )
-    assert again.tasks.resume("") == "mission-1 goes on"
+    assert again.tasks.resume("") == "mission-1 is resumed"
     assert again.step() == 1.0
     again.tasks.restart(9)  # a driver that starts anew alone: the gate asks for a person already
     assert again.step() == 1.0

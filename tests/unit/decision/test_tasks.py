@@ -97,12 +97,15 @@ async def test_missions_are_checked_before_they_are_accepted(site: Site, tmp_pat
     for text, why in (
         ("do:\n- gotoo: a", "tea:2: unknown field 'gotoo'; did you mean 'goto'?"),
         ("trees: {a: [{tree: a}]}\ndo: [{tree: a}]", "is a cycle: a → a"),
-        ("do: [{script: {run: beep}}]", "script 'beep': this robot runs none; name their folder"),
+        (
+            "do: [{script: {run: beep}}]",
+            "script 'beep': this robot runs no scripts; name their folder",
+        ),
     ):
         reply = await site.carry_out(text)
         assert not reply.ok
         assert why in reply.text
-    site.lost = "nobody says yet where in a map the robot is"
+    site.lost = "no localization"
     assert (await site.carry_out("do: [{explore: {}}]")).text == site.lost
     assert (await site.carry_out("do: [{wait: 5}]")).ok
     await site.end()
@@ -117,7 +120,7 @@ async def test_pausing_resuming_and_cancelling(site: Site) -> None:
     assert site.command is None
     assert site.told[-1].current
     assert site.told[-1].current.reason == "paused by bob"
-    assert (await site.change("resume")).text == "goal-1 goes on"
+    assert (await site.change("resume")).text == "goal-1 is resumed"
     assert (await site.change("cancel")).text == "goal-1 is cancelled"
     await site.step()
     assert site.command
@@ -126,7 +129,7 @@ async def test_pausing_resuming_and_cancelling(site: Site) -> None:
     refused = await site.change("cancel", "goal-1")
     assert (refused.ok, refused.text) == (
         False,
-        "there is no task 'goal-1' any more; there is: goal-2",
+        "there is no task 'goal-1'; tasks: goal-2",
     )
     await site.end()
 

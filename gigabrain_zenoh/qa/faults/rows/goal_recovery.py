@@ -3,7 +3,6 @@
 import asyncio
 import importlib.util
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -29,7 +28,6 @@ DEATHS = (("decision", 0.4), ("perception", 1.0))  # [m] from the start
 ARRIVAL_S = 120.0  # of wall time
 KILLS = 20  # in the long form
 EXPLORED_M, EXPLORE_S = 1.0, 180.0  # before each kill, and how long that may take
-MAP_RESTORED = re.compile(r"the map of tick (\d+) goes on")
 
 MOVED_WITHOUT = Figure("moved without it", "m")
 GOES_ON = Figure("goes on after", "s")
@@ -103,8 +101,8 @@ async def _map_death(robot: RobotUnderTest) -> Measured:
     first, found = poses[0].basis, next(pose.basis for pose in poses if pose.localized)
     await until(lambda: _under_way(probe.state), "it drives again")
     unsubscribe()
-    texts = (str(record.get("text", "")) for record in robot.records[records:])
-    saved = [int(words[1]) for text in texts if (words := MAP_RESTORED.match(text))]
+    new = robot.records[records:]
+    saved = [int(record["map_tick"]) for record in new if record.get("event") == "map_restored"]
     if not saved:
         raise Failed("a new map was begun")
     ticks = {
