@@ -1,30 +1,30 @@
-"""Why a robot is held back: codes for programs, sentences for people."""
+"""Causes of stops: a code for programs, a text and a remedy for people."""
 
 from gigabrain_schemas.base import Cause
 
 BOOT = Cause(
     code="boot",
-    text="just started; nobody has released it yet",
-    remedy="see that nobody is in its way",
+    text="just started, not released yet",
+    remedy="check that nobody is in its way",
 )
 SILENCE = Cause(
     code="silence",
-    text="no good command for 100 ms",
-    remedy="see that whoever drives runs and reaches the robot, then enable it again",
+    text="no valid command for 100 ms",
+    remedy="check that the commander runs and reaches the robot, then enable it again",
 )
 STALE = Cause(
     code="stale",
     text="commands rest on sensor data that is too old",
-    remedy="see that the lidar, perception and decision keep up, then enable it again",
+    remedy="check that lidar, perception and decision keep up, then enable it again",
 )
 SAFETY_SILENT = Cause(
     code="safety_silent",
     text="the safety process is silent",
-    remedy="start the safety process, or read its log to see why it ended",
+    remedy="start the safety process, or read its log",
 )
 SAFETY_STOP = Cause(
     code="safety_stop",
-    text="the safety process says stop",
+    text="safety stops the robot",
     remedy="read the log of the safety process",
 )
 NOT_FINITE = Cause(
@@ -41,37 +41,37 @@ NAN_STORM = Cause(
 LINK_LOST = Cause(
     code="link_lost",
     text="the body does not answer",
-    remedy="look at its power, its cable or its network",
+    remedy="check its power, its cable or its network",
 )
 
 
 BUTTON_AWAITED = Cause(
     code="button_lost",
-    text="the e-stop button has not been heard yet",
-    remedy="start its process, and see that its adapter is plugged in",
+    text="no message from the e-stop button yet",
+    remedy="start its process, and check that its adapter is plugged in",
 )
 BUTTON_LOST = Cause(
     code="button_lost",
     text="the e-stop button is silent",
     latching=True,
-    remedy="see that its process runs, then release the robot",
+    remedy="check that its process runs, then release the robot",
 )
 BRAIN_SILENT = frozenset(("perception_silent", "decision_silent", "control_silent"))  # safety's
-LATE = BRAIN_SILENT | {SILENCE.code, STALE.code, SAFETY_SILENT.code}  # somebody is too slow
+LATE = BRAIN_SILENT | {SILENCE.code, STALE.code, SAFETY_SILENT.code}  # a process is too slow
 
 
 def button(text: str) -> Cause:
-    """The e-stop button is pressed, or cannot be believed."""
+    """Return the cause of a pressed or faulty e-stop button."""
     return Cause(
         code="button",
         text=f"e-stop button: {text}"[:500],
         latching=True,
-        remedy="let the button go, or mend its wire or adapter, then release the robot",
+        remedy="unlock the button, or repair its wire or adapter, then release the robot",
     )
 
 
 def estop(source: str) -> Cause:
-    """An e-stop, by whom."""
+    """Return the cause of an e-stop that `source` has pressed."""
     return Cause(
         code="estop",
         text=f"e-stop pressed by {source}"[:500],
@@ -81,20 +81,20 @@ def estop(source: str) -> Cause:
 
 
 def latching(causes: tuple[Cause, ...]) -> tuple[Cause, ...]:
-    """Those of `causes` that only a person releases."""
+    """Return those of `causes` that only a person can release."""
     return tuple(cause for cause in causes if cause.latching)
 
 
 def merge(known: tuple[Cause, ...], more: tuple[Cause, ...]) -> tuple[Cause, ...]:
-    """`known`, and those of `more` that are new; one that has come to latch counts as new."""
+    """Return `known` and the new ones of `more`; a cause that now latches counts as new."""
     held = {(cause.code, cause.latching) for cause in known}
     return known + tuple(cause for cause in more if (cause.code, cause.latching) not in held)
 
 
 def in_words(causes: tuple[Cause, ...]) -> str:
-    """`causes` as one phrase, short enough to stand in a reply with words around it.
+    """Return `causes` as one phrase, each with its remedy in brackets.
 
-    What to do about a cause follows it in brackets.
+    The phrase is short enough to be a part of a reply.
     """
     return "; ".join(map(_in_words, causes))[:400]
 

@@ -38,7 +38,7 @@ STILL_TICKS = 25  # 0.5 s at rest before a release
 
 
 def estop(state: GateState, event: Estop) -> tuple[GateState, Outcome]:
-    """Zero at once and latched, whatever the gate was doing."""
+    """Stop at once and latch, from any mode."""
     generation = state.estop_generation + 1
     state = replace(
         state,
@@ -52,7 +52,7 @@ def estop(state: GateState, event: Estop) -> tuple[GateState, Outcome]:
 
 
 def release(state: GateState, event: Release) -> tuple[GateState, Outcome]:
-    """Idle, where the body rests and nothing latches it any more."""
+    """Release the latch, if the body rests and no latching cause remains."""
     if state.mode == "stopping":
         return rejected(state, "still stopping; try again when the body is at rest")
     if state.mode != "latched":
@@ -73,7 +73,7 @@ def release(state: GateState, event: Release) -> tuple[GateState, Outcome]:
 
 
 def rejected(state: GateState, text: str) -> tuple[GateState, Outcome]:
-    """A refusal, and why."""
+    """Return the outcome of a rejected request, with the reason."""
     return state, Outcome(ok=False, text=text)
 
 
@@ -95,14 +95,14 @@ __all__ = [
     "step",
 ]
 STOPPING_TICKS = 15  # 300 ms, then idle
-CALM_TICKS = 5  # 100 ms at zero after an enable, however hard somebody holds a joystick
+CALM_TICKS = 5  # 100 ms at zero after an enable, even if a joystick is held
 HEALTHY_TICKS = 25  # 0.5 s without a cause before an automatic resume
 RESUME_TICKS = 110  # from one start to an automatic one: starts and stops stay under 1 Hz
 NAN_STORM_COUNT, NAN_STORM_TICKS = 5, 50  # five in a second
 
 
 def step(config: GateConfig, state: GateState, event: Event) -> tuple[GateState, Outcome]:
-    """One event. Whether the body may go on, and how fast, follows from the state it leads to."""
+    """Process one event. The new state decides whether the body may move, and how fast."""
     taken, outcome = _take(config, state, event)
     if taken is state:
         return state, outcome
@@ -155,7 +155,7 @@ def _stop(state: GateState, found: tuple[Cause, ...]) -> GateState:
 
 
 def _stopping(state: GateState, now: tuple[Cause, ...]) -> GateState:
-    """No way back to enabled from here: whoever stopped is asked again."""
+    """Continue stopping. The commander must be enabled again afterwards."""
     state = replace(state, causes=why.merge(state.causes, why.latching(now)))
     if state.tick - state.stopped_tick < STOPPING_TICKS or state.before != ZERO:
         return state
@@ -164,7 +164,7 @@ def _stopping(state: GateState, now: tuple[Cause, ...]) -> GateState:
 
 
 def _waiting(config: GateConfig, state: GateState, now: tuple[Cause, ...]) -> GateState:
-    """Idle or latched."""
+    """Advance a tick while idle or latched."""
     held = why.merge(why.latching(state.causes), why.latching(now))
     if held:
         return replace(state, mode="latched", causes=held)
@@ -193,10 +193,10 @@ def _enabled(state: GateState, source: str) -> GateState:
 
 
 def _output(config: GateConfig, state: GateState) -> Velocity:
-    """One step from what the body was told in the last tick, however much happens in this one.
+    """Return the output: one ramp step from the output of the last tick.
 
-    Ticks that are made up for come all at once: a stop takes the steps that it has missed, but the
-    body is not sped up by several of them within a moment.
+    Missed ticks are processed in a burst. A stop then takes all its steps, but the body must not
+    gain speed by several steps at once.
     """
     if state.mode in ("latched", "idle"):
         return ZERO
@@ -232,7 +232,7 @@ def _command(state: GateState, event: Command) -> tuple[GateState, Outcome]:
 
 
 def _not_finite(state: GateState, event: NotFinite) -> tuple[GateState, Outcome]:
-    """Zero at once when it comes from the commander; from anybody else it is only counted."""
+    """Stop at once if the commander sent it; otherwise only count it."""
     refused = Outcome(refused="not_finite", ok=False)
     if event.boot != state.boot or not state.commander or event.source != state.commander:
         return state, refused

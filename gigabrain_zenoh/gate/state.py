@@ -15,7 +15,7 @@ BRAIN = "control"  # the commander of the normal chain
 
 
 class GateConfig(msgspec.Struct, frozen=True, kw_only=True):
-    """What the gate must know of the body and of the deployment."""
+    """Settings of the gate, from the body and the deployment."""
 
     limits: Limits
     basis_ns: int = 250_000_000  # oldest sensor data that may move the body
@@ -23,32 +23,32 @@ class GateConfig(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class GateState(msgspec.Struct, frozen=True, kw_only=True):
-    """Everything that the gate remembers."""
+    """State of the gate from event to event."""
 
     boot: int
     tick: int = 0
     issued_ns: tuple[int, ...] = ()  # wall time of the newest ticks, oldest first
     mode: GateMode = "latched"
     causes: tuple[Cause, ...] = (why.BOOT,)
-    faults: tuple[Cause, ...] = ()  # what the driver itself knew to be wrong at the last tick
+    faults: tuple[Cause, ...] = ()  # reported by the driver at the last tick
     estop_generation: int = 0
-    by_hand: bool = False  # released from a latch: only a person enables it, not auto resume
+    by_hand: bool = False  # released from a latch: no automatic resume
     commander: str = ""
     enables: int = 0
-    enabled_tick: int = -1000  # when the present commander was let in
-    command: CmdVel | None = None  # last good one of the commander
+    enabled_tick: int = -1000  # when the present commander was enabled
+    command: CmdVel | None = None  # last valid one of the commander
     command_tick: int = 0  # when it came
     next_seq: int = 0  # the lowest that the commander may use
-    heard: CmdVel | None = None  # last good one of the brain, whoever commands
+    heard: CmdVel | None = None  # last valid one of the brain, also while another commands
     heard_tick: int = -1000
     safety: SafetyState | None = None
     stopped_tick: int = 0  # when stopping began
     still_ticks: int = 0
     healthy_ticks: int = 0
     nan_ticks: tuple[int, ...] = ()
-    late: bool = False  # whether this tick is one that was missed and is made up for
-    before: Velocity = ZERO  # what the body was told in the last tick
-    output: Velocity = ZERO  # what the body is to be told now
+    late: bool = False  # this tick was missed and is made up for
+    before: Velocity = ZERO  # output of the last tick
+    output: Velocity = ZERO  # velocity for the body
 
 
 class Tick(msgspec.Struct, frozen=True):
@@ -56,55 +56,55 @@ class Tick(msgspec.Struct, frozen=True):
 
     measured: Velocity
     wall_ns: int | None = None
-    faults: tuple[Cause, ...] = ()  # what the driver itself knows to be wrong
+    faults: tuple[Cause, ...] = ()  # reported by the driver
     late: bool = False  # it was missed and is made up for, right behind another one
 
 
 class Command(msgspec.Struct, frozen=True):
-    """Somebody wants the body to move."""
+    """A velocity command has arrived."""
 
     command: CmdVel
     wall_ns: int | None = None
 
 
 class NotFinite(msgspec.Struct, frozen=True):
-    """Somebody sent NaN or infinity for a speed."""
+    """A command with NaN or infinity has arrived."""
 
     source: str
     boot: int
 
 
 class Safety(msgspec.Struct, frozen=True):
-    """The safety process has spoken."""
+    """A verdict of safety has arrived."""
 
     state: SafetyState
 
 
 class Estop(msgspec.Struct, frozen=True):
-    """Somebody pressed the e-stop."""
+    """The e-stop was pressed."""
 
     source: str
 
 
 class Release(msgspec.Struct, frozen=True):
-    """A person lets go of the latch."""
+    """A person releases the latch."""
 
     estop_generation: int
 
 
 class Enable(msgspec.Struct, frozen=True):
-    """Somebody asks for the body."""
+    """A commander asks for the body."""
 
     source: str
     take: bool = False
-    by: str = ""  # who asks for it, where that is somebody else
+    by: str = ""  # sender of the request, if another than `source`
 
 
 Event = Tick | Command | NotFinite | Safety | Estop | Release | Enable
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """What came of an event."""
+    """Result of an event."""
 
     refused: str = ""  # why a command was not obeyed; a code
     ok: bool = True  # whether a request was granted
@@ -112,7 +112,7 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 def status(state: GateState) -> GateStatus:
-    """The gate as `robot/state` shows it."""
+    """Return the gate's status for `robot/state`."""
     return GateStatus(
         mode=state.mode,
         causes=state.causes,
@@ -128,7 +128,7 @@ SILENCE_TICKS = 5  # 100 ms without a good command
 
 
 def age_ns(state: GateState, tick: int, wall_ns: int | None) -> int:
-    """How long ago `tick` was issued: by ticks, and by the wall clock where there is one [ns]."""
+    """Return the age of `tick` [ns]: the larger of tick count and wall clock, if there is one."""
     back = state.tick - tick
     age = back * TICK_NS
     if wall_ns is not None and 0 <= back < len(state.issued_ns):
@@ -137,20 +137,20 @@ def age_ns(state: GateState, tick: int, wall_ns: int | None) -> int:
 
 
 def is_finite(command: CmdVel) -> bool:
-    """Whether all speeds are numbers. What was decoded is; this is for what was not."""
+    """Return whether all speeds are finite; decoded messages always are."""
     speeds = (command.linear_x, command.linear_y, command.angular_z)
     return all(math.isfinite(speed) for speed in speeds)
 
 
 def stop_reasons(config: GateConfig, state: GateState, source: str) -> tuple[Cause, ...]:
-    """What speaks against letting `source` move the body now."""
+    """Return the causes for which `source` must not move the body now."""
     found = [*state.faults, *_verdict(state)]
     if state.mode == "enabled" and source == state.commander:
         command, came = state.command, state.command_tick
     elif source == BRAIN:
         command, came = state.heard, state.heard_tick
     else:
-        return tuple(found)  # somebody new need not have spoken yet
+        return tuple(found)  # a new commander need not have sent a command yet
     if state.tick - came > SILENCE_TICKS:
         found.append(why.SILENCE)
     if command and command.basis and age_ns(state, command.basis, None) > config.basis_ns:
@@ -159,7 +159,7 @@ def stop_reasons(config: GateConfig, state: GateState, source: str) -> tuple[Cau
 
 
 def _verdict(state: GateState) -> tuple[Cause, ...]:
-    """Zones alone only cap speeds, so their causes are not among these."""
+    """Return safety's stop causes; zones only cap speeds and are not among them."""
     safety = state.safety
     ticked_ns = state.issued_ns[-1] if state.issued_ns else None
     if safety is None or age_ns(state, safety.tick, ticked_ns) > ECHO_NS:
@@ -170,7 +170,7 @@ def _verdict(state: GateState) -> tuple[Cause, ...]:
 
 
 def refusal(state: GateState, command: CmdVel, wall_ns: int | None) -> str:
-    """Why `command` is no good, whoever sent it; a code, empty for a good one."""
+    """Return the code for which a command is refused, from any sender; empty if it is valid."""
     if command.boot != state.boot:
         return "boot"
     if command.tick > state.tick or command.basis > state.tick:
@@ -179,5 +179,5 @@ def refusal(state: GateState, command: CmdVel, wall_ns: int | None) -> str:
         return "old"
     moves = command.linear_x or command.linear_y or command.angular_z
     if moves and command.source == BRAIN and not command.basis:
-        return "basis"  # the brain has no business moving without having looked
+        return "basis"  # the brain must not move without sensor data
     return ""

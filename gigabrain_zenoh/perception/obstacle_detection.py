@@ -21,43 +21,43 @@ from gigabrain_zenoh.geometry.pose import compose
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 S = TypeVar("S", bound=np.generic)
-MAX_RANGE_M = 10.0  # things beyond are left alone
-MIN_CLUSTER_HITS = 3  # hits; fewer may be chance
-GRAZING_RAD = math.radians(10.0)  # surfaces met at less than that fall into single hits
+MAX_RANGE_M = 10.0  # farther things are ignored
+MIN_CLUSTER_HITS = 3  # fewer may be noise
+GRAZING_RAD = math.radians(10.0)  # surfaces met at a smaller angle give single hits
 MIN_GAP_M, MAX_GAP_M = 0.10, 0.35  # between two things
-NOISE_GAP_SIGMAS = 5.0  # standard deviations of what noise alone puts between two neighbours
+NOISE_GAP_SIGMAS = 5.0  # standard deviations of noise between two neighbours
 TO_DEVIATION = math.sqrt(2.0) / (0.6745 * math.sqrt(6.0))  # from the median of second differences
-LOST_GAP_M, LOST_BEAMS = 0.10, 6.5  # so near, few beams may be lost on one thing
-MISSING_BEAMS = 2.5  # neighbours so many beams apart are two things
-MAX_SIZE_M = 1.2  # what is longer is a wall
+LOST_GAP_M, LOST_BEAMS = 0.10, 6.5  # a smaller gap of fewer lost beams is no gap
+MISSING_BEAMS = 2.5  # from this many beams between two hits on, beams are missing
+MAX_SIZE_M = 1.2  # a longer cluster is a wall
 MAX_RADIUS_M = 0.75
-EDGE_BEAMS = 1.5  # so near to the end of the field of view a thing may go on beyond it
-USABLE_RANGE_SHARE = 0.97  # of the lidar's range; what reaches beyond is cut off there
-NOISE_M = 0.01  # of a place, beside what the spacing of the beams leaves open
+EDGE_BEAMS = 1.5  # closer to the end of the field of view a thing may extend beyond it
+USABLE_RANGE_SHARE = 0.97  # of the lidar's range; farther things may be cut off
+NOISE_M = 0.01  # of a position, in addition to the spacing of the beams
 
-RIM_GATES_M = (0.25, 0.2, 0.15, 0.12, 0.12)  # off its rim a hit may be, in each round
-MIN_RIM_HITS = 4  # hits; fewer say nothing of where the middle is
-MAX_RIM_RMS_M = 0.05  # root mean square off its rim; more is another thing
+RIM_GATES_M = (0.25, 0.2, 0.15, 0.12, 0.12)  # largest distance of a hit from the rim, by round
+MIN_RIM_HITS = 4  # fewer do not show the centre
+MAX_RIM_RMS_M = 0.05  # distance from the rim; more is another thing
 MIN_RIM_NOISE_M = 0.015
-MIN_MIDDLE_DISTANCE_M = 0.02  # so near to the middle a hit says nothing of where that is
-RIM_TOLERANCE_M = 0.1  # off the rim the hits on it are
-PRIOR_WEIGHT = 0.02  # of the hits' own weight: what they leave open stays where it was
+MIN_MIDDLE_DISTANCE_M = 0.02  # a hit closer to the centre does not show where that is
+RIM_TOLERANCE_M = 0.1  # distance from the rim up to which a hit is on it
+PRIOR_WEIGHT = 0.02  # of the expected centre, per hit
 
 FittedDisc = tuple[float, float, float]
-ARC_GAP_M = 0.2  # between hits; a wider one ends an arc
-MIN_ARC_HITS = 8  # hits of an arc
-MAX_ARC_RADII = 2.0  # radii; what is longer is a wall
-MIDDLE_OFFSET_RADII = 0.7  # radii, so far behind the middle of its hits the middle of a disc may be
-MAX_ARC_NOISE_M = 0.08  # standard deviation of its place
-MIN_RIM_SHARE = 0.9  # share of the hits
+ARC_GAP_M = 0.2  # a wider gap between hits ends an arc
+MIN_ARC_HITS = 8
+MAX_ARC_RADII = 2.0  # a longer arc is a wall
+MIDDLE_OFFSET_RADII = 0.7  # first guess of the centre, behind the mean of the hits
+MAX_ARC_NOISE_M = 0.08  # standard deviation of the centre
+MIN_RIM_SHARE = 0.9  # of the hits
 
-MOTION_M = 0.4  # or by something quick, since it has gone so far
-COMPARED_S = 0.5  # what was seen so long ago is compared
-KEPT_SCANS = 32  # scans
-BEYOND_MARGIN_M = 0.12  # beyond a point; noise and odometry do not reach so far
-HIT_MARGIN_M = 0.1  # round a thing, its hits may lie
-MIN_FREE_SHARE = 0.35  # of its hits that must be in free space
-FIELD_EDGE_BEAMS = 3  # at the ends of the field of view
+MOTION_M = 0.4  # a quick thing is compared with its position this far back
+COMPARED_S = 0.5  # age of the scan that is compared, for slow things
+KEPT_SCANS = 32
+BEYOND_MARGIN_M = 0.12  # how far beyond a free point a beam must go; more than noise
+HIT_MARGIN_M = 0.1  # around a disc, in which its hits lie
+MIN_FREE_SHARE = 0.35  # of hits in free space, to confirm motion
+FIELD_EDGE_BEAMS = 3  # ignored at the ends of the field of view
 
 
 class Cluster(Struct, frozen=True):
@@ -71,7 +71,7 @@ class Cluster(Struct, frozen=True):
 
 
 def find_clusters(hits: Floats, lidar: Lidar, spacing: float) -> list[Cluster]:
-    """The things among `hits`, (n, 2) [m] in the body's frame, of beams `spacing` [rad] apart."""
+    """Return clusters of `hits` (n, 2) [m] in the body's frame; beams are `spacing` [rad] apart."""
     dx, dy = hits[:, 0] - lidar.x, hits[:, 1] - lidar.y
     bearings = np.arctan2(dy, dx)
     order = np.argsort(bearings, kind="stable")
@@ -99,14 +99,14 @@ def find_clusters(hits: Floats, lidar: Lidar, spacing: float) -> list[Cluster]:
 
 
 def _rotated(begin: int, values: NDArray[S]) -> NDArray[S]:
-    """All `values` in turn, from one of them on. numpy's roll takes four times as long."""
+    """Return `values` rotated to begin at index `begin`. numpy's roll takes four times as long."""
     return np.concatenate((values[begin:], values[:begin]))
 
 
 def _breaks(
     points: Floats, bearings: Floats, ranges: Floats, spacing: float
 ) -> tuple[Bools, Bools]:
-    """After which hits one thing ends, and after which of them beams hit nothing; (n,) each."""
+    """Return after which hits a cluster ends, and after which of them beams hit nothing, (n,)."""
     following = _rotated(1, points)
     turned = _rotated(1, bearings) - bearings
     turned[-1:] += math.tau
@@ -121,9 +121,9 @@ def _breaks(
 
 
 def _roughness(ranges: Floats) -> float:
-    """How much ranges differ from beam to beam [m], as a standard deviation, where nothing ends.
+    """Return the standard deviation of the ranges' noise [m], from their second differences.
 
-    What a surface does to them is much the same on both sides of a beam; noise is not.
+    A surface changes ranges alike on both sides of a beam; noise does not.
     """
     if len(ranges) < MIN_CLUSTER_HITS:
         return 0.0
@@ -132,7 +132,7 @@ def _roughness(ranges: Floats) -> float:
 
 
 def _in_front(ranges: Floats, empty: Bools, first: Indices, last: Indices, reach: float) -> Bools:
-    """Which clusters are nearer than what is beside them, at both ends, (k,)."""
+    """Return which clusters are nearer than their neighbours at both ends, (k,)."""
     free_before, free_after = empty[first - 1], empty[last]
     before, after = ranges[first - 1], ranges[(last + 1) % len(ranges)]
     begins, ends = ranges[first], ranges[last]
@@ -156,7 +156,7 @@ def _inside(bearings: Floats, first: Indices, last: Indices, half: float, spacin
 
 
 def _sized(points: Floats, ranges: Floats, first: Indices, last: Indices) -> Bools:
-    """Which clusters have hits enough, are no walls and not too far away, (k,)."""
+    """Return which clusters have enough hits, are no walls and not too far away, (k,)."""
     sides = np.maximum.reduceat(points, first) - np.minimum.reduceat(points, first)
     small = np.hypot(sides[:, 0], sides[:, 1]) <= MAX_SIZE_M
     found: Bools = (last - first + 1 >= MIN_CLUSTER_HITS) & small & (ranges[first] <= MAX_RANGE_M)
@@ -166,7 +166,7 @@ def _sized(points: Floats, ranges: Floats, first: Indices, last: Indices) -> Boo
 def _disc_of_cluster(
     ranges: Floats, begins: float, ends: float, spacing: float, *, whole: bool
 ) -> Cluster:
-    """The disc that fills the angle between two tangents: sin(half the angle) = r / (near + r)."""
+    """Return the disc between two tangents: sin(half the angle) = r / (near + r)."""
     count = len(ranges)
     third = count // 3
     near = float(ranges[third : count - third].mean())
@@ -182,14 +182,14 @@ def _disc_of_cluster(
 
 
 def on_rim(points: Floats, x: float, y: float, radius: float) -> Bools:
-    """Which of the `points` (n, 2) are hits on a disc at (x, y) [m], (n,)."""
+    """Return which `points` (n, 2) are hits on the rim of a disc at (x, y) [m], (n,)."""
     away = np.hypot(points[:, 0] - x, points[:, 1] - y)
     found: Bools = np.abs(away - radius) < RIM_TOLERANCE_M
     return found
 
 
 def off_rims(points: Floats, discs: Floats) -> Floats:
-    """Those of the `points` (n, 2) that are hits on none of `discs` (m, 3): x, y, radius [m]."""
+    """Return the `points` (n, 2) on the rim of none of `discs` (m, 3): x, y, radius [m]."""
     away = np.hypot(points[:, :1] - discs[:, 0], points[:, 1:] - discs[:, 1])
     found: Floats = points[(np.abs(away - discs[:, 2]) >= RIM_TOLERANCE_M).all(axis=1)]
     return found
@@ -198,10 +198,10 @@ def off_rims(points: Floats, discs: Floats) -> Floats:
 def fit_disc(
     points: Floats, x: float, y: float, radius: float
 ) -> tuple[float, float, float] | None:
-    """The middle (x, y) [m] of a disc whose rim the `points` (n, 2) near it lie on, and how sure.
+    """Return the centre (x, y) of a disc and its standard deviation in the worse direction [m].
 
-    From where it should be, by Gauss and Newton's steps; the third number is the standard
-    deviation [m] in the worse direction. None where it does not show.
+    Gauss-Newton steps from the expected centre fit the rim to the `points` (n, 2) near it. None if
+    they do not show the disc.
     """
     for gate in RIM_GATES_M:
         dx, dy = points[:, 0] - x, points[:, 1] - y
@@ -225,10 +225,10 @@ def fit_disc(
 
 
 def discs_of(points: Floats, eye: tuple[float, float], radius: float) -> list[FittedDisc]:
-    """Discs of this `radius` [m] that arcs of the `points` (n, 2) belong to, as seen from `eye`.
+    """Return discs of this `radius` [m] that arcs of `points` (n, 2) belong to, seen from `eye`.
 
-    The points are in the order of their beams. Each disc: its middle (x, y) [m] and the standard
-    deviation of that.
+    The points are in the order of their beams. A disc is its centre (x, y) and the standard
+    deviation of that [m].
     """
     if len(points) < MIN_ARC_HITS:
         return []
@@ -239,7 +239,7 @@ def discs_of(points: Floats, eye: tuple[float, float], radius: float) -> list[Fi
 
 
 def _disc_of_arc(arc: Floats, eye: tuple[float, float], radius: float) -> FittedDisc | None:
-    """The disc that an arc belongs to, if there is one."""
+    """Return the disc that an arc belongs to, if there is one."""
     if len(arc) < MIN_ARC_HITS or np.hypot(*(arc[-1] - arc[0])) > MAX_ARC_RADII * radius:
         return None
     middle = arc.mean(axis=0)
@@ -265,7 +265,7 @@ class PastScan:
 
     @cached_property
     def _beams(self) -> tuple[Floats, Floats]:
-        """Bearings in order, and ranges; at both ends once more, so that each has a neighbour."""
+        """Sorted bearings with their ranges, padded at both ends by the opposite end."""
         bearings, ranges = self._polar(self.points)
         order = np.argsort(bearings)
         ends = [*order[-1:], *order, *order[:1]]
@@ -275,7 +275,7 @@ class PastScan:
         return bearings, ranges[ends]
 
     def free(self, points: Floats) -> Bools:
-        """At which of `points` (n, 2) nothing was: beams went well beyond them."""
+        """Return which `points` (n, 2) were free: beams went well beyond them."""
         bearings, ranges = self._polar(points)
         seen, far = self._beams
         passed = (np.abs(bearings) < self._half) & (ranges < self._reach - BEYOND_MARGIN_M)
@@ -303,18 +303,18 @@ class FreeSpace:
         """Forget all scans."""
         self._scans.clear()
 
-    def see(self, scan: PastScan) -> None:
-        """Take one scan."""
+    def add(self, scan: PastScan) -> None:
+        """Add the newest scan."""
         self._scans.append(scan)
 
     def is_free(self, x: float, y: float) -> bool:
-        """Whether beams of the newest scan went through (x, y) [m]."""
+        """Return whether beams of the newest scan went through (x, y) [m]."""
         return bool(self._scans[-1].free(np.array([[x, y]]))[0])
 
     def shows_motion(
         self, x: float, y: float, velocity_x: float, velocity_y: float, radius: float
     ) -> bool:
-        """Whether a thing at (x, y) [m], which is said to move so fast [m/s], does."""
+        """Return whether free space confirms the velocity [m/s] of a disc at (x, y) [m]."""
         now = self._scans[-1]
         speed = math.hypot(velocity_x, velocity_y)
         long_ago = COMPARED_S if speed * COMPARED_S < MOTION_M else MOTION_M / speed

@@ -27,30 +27,28 @@ from gigabrain_zenoh.perception.obstacle_detection import (
     on_rim,
 )
 
-ACCELERATION_SIGMA = (
-    0.8  # [m/s2], standard deviation of what a walking person does from scan to scan
-)
-INITIAL_SPEED_SIGMA = 1.0  # [m/s], standard deviation of a speed of which nothing is known
-TURNS_S = 0.06  # since it was last seen it may have gone the other way, for so long at most
-TURNED, TURNED_PARTLY = 10.0, 16.0  # squares of the deviations off that noise does not explain
-MAX_OFF_SIGMAS = 4.0  # deviations, [m]: what shows in part is so near
+ACCELERATION_SIGMA = 0.8  # [m/s2], standard deviation for a walking person
+INITIAL_SPEED_SIGMA = 1.0  # [m/s], standard deviation of an unknown speed
+TURNS_S = 0.06  # longest time in the opposite direction since it was last seen
+TURNED, TURNED_PARTLY = 10.0, 16.0  # squared deviations that noise does not explain
+MAX_OFF_SIGMAS = 4.0  # standard deviations between a track and its partly hidden disc
 SHIFT_M = 0.05
 MAX_OFF_M = 0.5
 RADIUS_GAIN = 0.25  # of a new radius in the filtered one
-MOVING_M, MOVING_SPEED = 0.15, 0.15  # [m], [m/s]: a thing must go so far, so fast, to count
+MOVING_M, MOVING_SPEED = 0.15, 0.15  # [m], [m/s]: less is no motion
 QUICK_SPEED = 0.5  # [m/s]
-MOVING_SIGMAS = 2.5  # standard deviations that a speed must be off zero
-STANDING_SPEED, STANDING_S = 0.12, 0.6  # slower for so long, it stands
+MOVING_SIGMAS = 2.5  # standard deviations of a speed above zero
+STANDING_SPEED, STANDING_S = 0.12, 0.6  # slower for this long, it stands
 
-GATE_SIGMAS = 4.0  # standard deviations; what is farther from where a thing should be is another
+GATE_SIGMAS = 4.0  # standard deviations from the prediction; a farther cluster is another
 MAX_JUMP_M = 0.6
-PARTIAL_NOISE_FACTOR = 4.0  # times as far off may be what is partly hidden
-CONFIRMED_SCANS = 2  # scans, before others hear of it
-FORGET_S, FORGET_NEW_S = 1.0, 0.25  # without having been seen, for what may be hidden
-FORGET_QUICK_S = 1.5  # what is quick may be behind a body that does not look there
-FORGET_GONE_S = 0.45  # where beams go through the place
-MAX_GAP_S = 1.0  # between scans; after a longer one it begins anew
-MAX_OBSTACLES = 64  # obstacles, the nearest of which are told
+PARTIAL_NOISE_FACTOR = 4.0  # for clusters that are partly hidden
+CONFIRMED_SCANS = 2  # before it is published
+FORGET_S, FORGET_NEW_S = 1.0, 0.25  # unseen, if it may be hidden
+FORGET_QUICK_S = 1.5  # unseen, if quick: it may be behind the body
+FORGET_GONE_S = 0.45  # if beams pass through its place
+MAX_GAP_S = 1.0  # between scans; a longer gap clears all tracks
+MAX_OBSTACLES = 64  # published, the nearest ones
 
 
 @dataclass
@@ -89,10 +87,9 @@ class ObstacleTrack:
     def correct(
         self, x: float, y: float, radius: float, noise: float, *, most_off: float = math.inf
     ) -> None:
-        """It was seen at (x, y) [m] with a deviation of `noise` [m].
+        """Correct by a measurement at (x, y) [m] with standard deviation `noise` [m].
 
-        Where it is more than `most_off` from where it should be (squares of deviations), it has
-        turned.
+        Beyond `most_off` (squared deviations) from the predicted position, it has turned.
         """
         dx, dy = x - self.x, y - self.y
         off = (dx * dx + dy * dy) / (self.position_variance + noise * noise)
@@ -113,34 +110,34 @@ class ObstacleTrack:
         self.unseen_s = 0.0
 
     def _turn(self) -> None:
-        """It is not where it should be: since it was last seen it goes another way, or stands."""
+        """Increase the uncertainty: it has turned or stopped since it was last seen."""
         square = max(self.velocity_x**2 + self.velocity_y**2, INITIAL_SPEED_SIGMA**2)
         self.velocity_variance += square
         self.covariance += self.unseen_s * square / 2
         self.position_variance += self.unseen_s**2 * square / 3
 
     def may_be_at(self, x: float, y: float, noise: float) -> bool:
-        """Whether it can be what was seen at (x, y) [m], with a deviation of `noise` [m]."""
+        """Return whether it can be at (x, y) [m], measured with a deviation of `noise` [m]."""
         most = SHIFT_M + MAX_OFF_SIGMAS * math.sqrt(self.position_variance + noise * noise)
         return math.hypot(x - self.x, y - self.y) < min(MAX_OFF_M, most)
 
     def covers(self, place: tuple[float, float]) -> bool:
-        """Whether a place [m] is within it."""
+        """Return whether a place [m] is within its disc."""
         return math.hypot(place[0] - self.x, place[1] - self.y) < self.radius
 
     @property
     def may_be_off(self) -> float:
-        """How far it may be from where it should be, for it may have turned round [m]."""
+        """How far it may be from the predicted position if it has turned round [m]."""
         speed = math.hypot(self.velocity_x, self.velocity_y)
         return 2 * speed * min(self.unseen_s, TURNS_S) if self.moving else 0.0
 
     @property
     def moves_quickly(self) -> bool:
-        """Whether it moves, and not at a stroll."""
+        """Whether it moves faster than QUICK_SPEED."""
         return self.moving and math.hypot(self.velocity_x, self.velocity_y) > QUICK_SPEED
 
     def seems_to_move(self) -> bool:
-        """Whether it has gone so far and so fast that it must be told whether it moves."""
+        """Return whether it has moved so far and so fast that free space should confirm it."""
         if self.moving or self.unseen_s > 0:
             return False
         speed = math.hypot(self.velocity_x, self.velocity_y)
@@ -149,14 +146,14 @@ class ObstacleTrack:
         return gone > MOVING_M and speed > MOVING_SPEED and sure
 
     def _stand(self, dt: float) -> None:
-        """Notice when it has stopped."""
+        """Record that it has stopped, once it has been slow for STANDING_S."""
         speed = math.hypot(self.velocity_x, self.velocity_y)
         self.standing_s = self.standing_s + dt if speed < STANDING_SPEED else 0.0
         if self.moving and self.standing_s >= STANDING_S:
             self.moving, self.anchor_x, self.anchor_y = False, self.x, self.y
 
     def obstacle(self) -> Obstacle:
-        """As the world shows it; what stands has no velocity."""
+        """Return it as a message; without a velocity while it stands."""
         p, c, v = self.position_variance, self.covariance, self.velocity_variance
         return Obstacle(
             id=self.id,
@@ -170,7 +167,7 @@ class ObstacleTrack:
 
 
 class ObstacleTracker:
-    """Hands out an id per thing, which it keeps for as long as it is followed."""
+    """Tracks obstacles; each has an id for as long as it is tracked."""
 
     def __init__(self) -> None:
         self._tracks: list[ObstacleTrack] = []
@@ -180,17 +177,17 @@ class ObstacleTracker:
     def update(
         self, hits: Floats, lidar: Lidar, spacing: float, pose: Pose, boot: int, tick: int
     ) -> tuple[Obstacle, ...]:
-        """One scan more: `hits` (n, 2) [m] in the body's frame, taken at `tick` from `pose`.
+        """Process a scan of `tick`: `hits` (n, 2) [m] in the body's frame, from `pose`.
 
-        `spacing` [rad] is from beam to beam. A scan that is not newer than the last changes
-        nothing; a new start of the driver begins anew.
+        `spacing` [rad] is between beams. An old scan changes nothing; a restart of the driver or a
+        long gap clears all tracks.
         """
         dt = (tick - self._tick) * TICK_S
         if boot != self._boot or dt > MAX_GAP_S:
             self._tracks.clear()
             self._space.clear()
         elif dt <= 0:
-            return self._told(pose)
+            return self._obstacles(pose)
         self._boot, self._tick = boot, tick
         for track in self._tracks:
             track.predict(dt)
@@ -199,17 +196,17 @@ class ObstacleTracker:
         taken = self._match(clusters, places)
         points = _placed(hits, pose)
         parts = self._correct_all(clusters, taken, points, lidar, pose)
-        self._space.see(PastScan(tick, points, lidar, abs(spacing), pose))
+        self._space.add(PastScan(tick, points, lidar, abs(spacing), pose))
         self._judge()
         self._tracks = [track for track in self._tracks if self._lives(track)]
         self._begin_parts(points, lidar, pose)
         for j in set(range(len(clusters))) - set(taken.values()):
             if clusters[j].whole and not any(track.covers(places[j]) for track in parts):
                 self._begin(clusters[j], places[j])
-        return self._told(pose)
+        return self._obstacles(pose)
 
     def _match(self, clusters: list[Cluster], places: list[tuple[float, float]]) -> dict[int, int]:
-        """Which track is which cluster: the best pairs first, within the gates."""
+        """Return the cluster of each track: the best pairs first, within the gates."""
         if not clusters or not self._tracks:
             return {}
         mine = np.array(
@@ -236,7 +233,7 @@ class ObstacleTracker:
         self, clusters: list[Cluster], taken: dict[int, int], points: Floats, lidar: Lidar,
         pose: Pose,
     ) -> list[ObstacleTrack]:  # fmt: skip
-        """Correct what was seen. Told are the moving things of which only a part was."""
+        """Correct all tracks that were seen; return the moving ones that were seen in part."""
         whole, parts = [], []
         for i, track in enumerate(self._tracks):
             cluster = clusters[taken[i]] if i in taken else None
@@ -265,7 +262,7 @@ class ObstacleTracker:
             track.correct(x, y, track.radius, PARTIAL_NOISE_FACTOR * cluster.noise)
 
     def _judge(self) -> None:
-        """Which things move: what only turns another side to the robot does not."""
+        """Let free space decide which tracks move, rather than only show another side."""
         for t in self._tracks:
             if t.seems_to_move():
                 t.moving = self._space.shows_motion(t.x, t.y, t.velocity_x, t.velocity_y, t.radius)
@@ -288,7 +285,7 @@ class ObstacleTracker:
         )
 
     def _begin_parts(self, points: Floats, lidar: Lidar, pose: Pose) -> None:
-        """Follow also what others hide in part, where things move: it is taken to be as large."""
+        """Begin tracks of partly hidden discs near moving things, with their median size."""
         sizes = [track.radius for track in self._tracks if track.moves_quickly]
         if not sizes:
             return
@@ -298,19 +295,19 @@ class ObstacleTracker:
             if not any(track.covers((x, y)) for track in self._tracks):
                 self._add(x, y, radius, noise, partly=True)
 
-    def _told(self, pose: Pose) -> tuple[Obstacle, ...]:
+    def _obstacles(self, pose: Pose) -> tuple[Obstacle, ...]:
         known = [track for track in self._tracks if track.seen >= CONFIRMED_SCANS]
         known.sort(key=lambda track: math.hypot(track.x - pose.x, track.y - pose.y))
         return tuple(track.obstacle() for track in known[:MAX_OBSTACLES])
 
 
 def _beside(points: Floats, tracks: list[ObstacleTrack]) -> Floats:
-    """Those of the `points` (n, 2) that are hits on none of the `tracks`."""
+    """Return the `points` (n, 2) on the rim of none of the `tracks`."""
     return off_rims(points, np.array([(t.x, t.y, t.radius) for t in tracks]).reshape(-1, 3))
 
 
 def _placed(hits: Floats, pose: Pose) -> Floats:
-    """`hits` (n, 2) of the body's frame in that of `pose`."""
+    """Transform `hits` (n, 2) from the body's frame to the parent frame of `pose`."""
     cosine, sine = math.cos(pose.yaw), math.sin(pose.yaw)
     x = pose.x + cosine * hits[:, 0] - sine * hits[:, 1]
     y = pose.y + sine * hits[:, 0] + cosine * hits[:, 1]
@@ -318,7 +315,7 @@ def _placed(hits: Floats, pose: Pose) -> Floats:
 
 
 def _place(cluster: Cluster, lidar: Lidar, pose: Pose, radius: float) -> tuple[float, float]:
-    """The centre of a cluster [m] in the frame of `pose`, were it so large."""
+    """Return the centre of a cluster of this radius [m], in the parent frame of `pose`."""
     distance = cluster.near + radius
     ahead = lidar.x + distance * math.cos(cluster.bearing)
     left = lidar.y + distance * math.sin(cluster.bearing)
@@ -326,7 +323,7 @@ def _place(cluster: Cluster, lidar: Lidar, pose: Pose, radius: float) -> tuple[f
 
 
 class Surroundings:
-    """Remembers what was round the robot in the scans before."""
+    """Adds tracked obstacles to world models."""
 
     def __init__(self) -> None:
         self._tracker = ObstacleTracker()
@@ -334,7 +331,7 @@ class Surroundings:
     def add(
         self, world: WorldModel, lidar: Lidar | None, scan: LaserScan, pose: Pose | None
     ) -> WorldModel:
-        """`world` with the obstacles in the frame of `pose`; without, where that is not known."""
+        """Return `world` with its obstacles in the parent frame of `pose`, if that is known."""
         if lidar is None or pose is None or not world.scan_ok:
             return world
         hits = arrays.hits(world).astype(np.float64)

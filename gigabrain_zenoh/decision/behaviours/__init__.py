@@ -164,8 +164,8 @@ def check(config: DecisionConfig, path: Path | None = None) -> None:
             )
     if settings.scripts and not Path(settings.scripts).expanduser().is_dir():
         raise ConfigError(
-            f"no folder {settings.scripts!r}; "
-            "scripts: expected that of the programs that missions may run"
+            f"scripts: no folder {settings.scripts!r}; "
+            "expected the folder with the programs that missions may run"
         )
 
 

@@ -1,4 +1,4 @@
-"""Conditions on what the robot says: `battery.percentage < 20`, `state.gate.mode == enabled`."""
+"""Conditions on messages: `battery.percentage < 20`, `state.gate.mode == enabled`."""
 
 import operator
 import re
@@ -15,7 +15,7 @@ from gigabrain_schemas.topics import STATE, TOPICS, Topic
 from gigabrain_zenoh.errors import unknown
 
 Value = float | str | bool
-Read = Callable[[Topic[Any]], Message | None]  # the newest of a topic while it counts
+Read = Callable[[Topic[Any]], Message | None]  # returns the newest message while it is fresh
 
 OPERATORS: Mapping[str, Callable[[Any, Any], bool]] = {
     "<": operator.lt,
@@ -40,7 +40,7 @@ class Condition(msgspec.Struct, frozen=True):
     text: str
 
     def holds(self, read: Read) -> bool | None:
-        """Whether it does; None while that is not known."""
+        """Return whether the condition holds; None while the value is unknown."""
         here: Any = read(self.topic)
         for part in self.path:
             if isinstance(here, tuple):
@@ -51,7 +51,7 @@ class Condition(msgspec.Struct, frozen=True):
 
 
 def parse(text: str) -> Condition:
-    """The condition that a text states. Raises ValueError, which says what was expected."""
+    """Return the condition in a text. Raises ValueError that names what was expected."""
     found = FORM.fullmatch(text)
     if not found:
         raise ValueError(f"{EXPECTED}, got {text!r}")
@@ -68,7 +68,7 @@ def parse(text: str) -> Condition:
 
 
 def _place(field: str) -> tuple[Topic[Any], tuple[str, ...]]:
-    """The topic, and the way to the field in it; what names no topic is of the robot's state."""
+    """Return the topic and the path of a field in it; without a topic's name, `robot/state`."""
     first, *rest = field.split(".")
     known = {topic.key.removeprefix("robot/"): topic for topic in TOPICS if not topic.many}
     if first in known and rest:
@@ -79,14 +79,14 @@ def _place(field: str) -> tuple[Topic[Any], tuple[str, ...]]:
 
 
 def _kind(type_: Any, path: tuple[str, ...], field: str) -> type:
-    """What kind of value lies at the end of the way. Raises ValueError where none does."""
+    """Return the type of a field's value. Raises ValueError if there is no such field."""
     for part in path:
         type_ = _bare(type_)
         if isinstance(type_, type) and issubclass(type_, msgspec.Struct):
-            of = {f.name: f.type for f in msgspec.structs.fields(type_)}
-            if part not in of:
-                raise unknown("field", part, of)
-            type_ = of[part]
+            known = {f.name: f.type for f in msgspec.structs.fields(type_)}
+            if part not in known:
+                raise unknown("field", part, known)
+            type_ = known[part]
         elif typing.get_origin(type_) is tuple and part.isdigit():
             type_ = typing.get_args(type_)[0]
         else:
@@ -100,7 +100,7 @@ def _kind(type_: Any, path: tuple[str, ...], field: str) -> type:
 
 
 def _bare(type_: Any) -> Any:
-    """A type without its bounds, and without the None that it may be as well."""
+    """Return a type without its bounds and without None."""
     if typing.get_origin(type_) is typing.Annotated:
         return _bare(typing.get_args(type_)[0])
     if typing.get_origin(type_) in (typing.Union, types.UnionType):

@@ -1,4 +1,4 @@
-"""Programs of the host that missions may run: those of one folder, and no others."""
+"""Programs of the host that missions may run, from one folder only."""
 
 import asyncio
 import contextlib
@@ -8,32 +8,24 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from gigabrain_zenoh.decision.tasks.mission import Script
-from gigabrain_zenoh.errors import ConfigError, GigabrainError, Refused, unknown
+from gigabrain_zenoh.errors import GigabrainError, Refused, unknown
 
-LAST = 200  # bytes of what it wrote that are told
-LINGER_S = 1.0  # for the rest of its words, once it has ended
-# becomes a program; ends all of its group, itself included, once nobody holds its input open
+MAX_OUTPUT = 200  # bytes of a program's output that its result shows, the last ones
+LINGER_S = 1.0  # for the rest of its output, once it has ended
+# becomes the program; kills its process group, itself included, once its input is closed
 LEASHED = """exec 3<&0 </dev/null
 { read -r _ <&3; kill -s KILL 0; } >/dev/null 2>&1 &
 exec "$@" 3<&-"""
 
 
-def check_folder(folder: str) -> None:
-    """Whether the folder that `scripts` names is there, where it names one. Raises ConfigError."""
-    if folder and not Path(folder).expanduser().is_dir():
-        raise ConfigError(
-            f"no folder {folder!r}; scripts: expected that of the programs that missions may run"
-        )
-
-
 class Scripts:
-    """Starts what the deployment file allows."""
+    """Starts programs of the folder that the deployment file allows."""
 
     def __init__(self, folder: str) -> None:
         self._folder = Path(folder).expanduser() if folder else None
 
     def path(self, name: str) -> Path:
-        """Where a program is. Raises Refused, which says what to change, and UnknownName."""
+        """Return the path of a program. Raises Refused and UnknownName."""
         if self._folder is None:
             raise Refused(
                 f"script {name!r}: this robot runs no scripts; name their folder in its "
@@ -48,7 +40,7 @@ class Scripts:
         return path
 
     def start(self, script: Script) -> "Run":
-        """Run a program. What keeps it from running is its result."""
+        """Start a program; if it cannot be started, its result says so."""
         return Run(self, script)
 
 
@@ -60,27 +52,27 @@ class Run:
         self._task = asyncio.ensure_future(self._run(scripts, script))
 
     def stop(self) -> None:
-        """End it, and whatever it has started."""
+        """Kill it and all that it has started."""
         self._task.cancel()
 
     async def _run(self, scripts: Scripts, script: Script) -> None:
         try:
             path = scripts.path(script.run)
             with _leash() as end:
-                program, words = await asyncio.get_running_loop().subprocess_exec(
-                    _Words, "/bin/sh", "-c", LEASHED, "sh", path, *script.arguments,
+                program, output = await asyncio.get_running_loop().subprocess_exec(
+                    _Output, "/bin/sh", "-c", LEASHED, "sh", path, *script.arguments,
                     cwd=path.parent, start_new_session=True, stdin=end,
                     stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
                 )  # fmt: skip
                 with contextlib.closing(program):
-                    self.result = await _outcome(program, words, script.seconds)
+                    self.result = await _outcome(program, output, script.seconds)
         except (GigabrainError, OSError, ValueError) as error:
             self.result = False, f"cannot be run: {error}"
 
 
 @contextlib.contextmanager
 def _leash() -> Iterator[int]:
-    """What can be read, and is at its end once this process is, even with SIGKILL."""
+    """Yield a pipe that closes when this process ends, even by SIGKILL."""
     end, ours = os.pipe()
     try:
         yield end
@@ -89,47 +81,49 @@ def _leash() -> Iterator[int]:
         os.close(ours)
 
 
-class _Words(asyncio.SubprocessProtocol):
-    """The end of what a program writes, and whether more may come."""
+class _Output(asyncio.SubprocessProtocol):
+    """Collects the end of a program's output."""
 
     def __init__(self) -> None:
         self.ended, self.silent = asyncio.Event(), asyncio.Event()
-        self._said = bytearray()
+        self._text = bytearray()
 
     def __str__(self) -> str:
-        return " ".join(self._said.decode(errors="replace").split())
+        return " ".join(self._text.decode(errors="replace").split())
 
     def pipe_data_received(self, fd: int, data: bytes) -> None:
-        """It writes."""
-        self._said += data
-        del self._said[:-LAST]
+        """Keep the last bytes."""
+        self._text += data
+        del self._text[:-MAX_OUTPUT]
 
     def pipe_connection_lost(self, fd: int, exc: Exception | None) -> None:
-        """Nobody holds its output any more."""
+        """Record that all writers have closed the output."""
         self.silent.set()
 
     def process_exited(self) -> None:
-        """It has ended; others may write on."""
+        """Record that it has ended; its children may still write."""
         self.ended.set()
 
 
 async def _outcome(
-    program: asyncio.SubprocessTransport, words: _Words, seconds: float
+    program: asyncio.SubprocessTransport, output: _Output, seconds: float
 ) -> tuple[bool, str]:
-    """Whether a program ended well, and what it said; nothing of its group is left then."""
+    """Wait for a program's end, kill its process group, and return its success and a text."""
     try:
         async with asyncio.timeout(seconds):
-            await words.ended.wait()
+            await output.ended.wait()
     except TimeoutError:
         return False, f"did not end within {seconds:g} s; killed"
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(program.get_pid(), signal.SIGKILL)
-        await words.ended.wait()
-        with contextlib.suppress(TimeoutError):  # who has left the group may hold its output on
-            await asyncio.wait_for(words.silent.wait(), LINGER_S)
+        await output.ended.wait()
+        with contextlib.suppress(
+            TimeoutError
+        ):  # a process outside the group may keep the output open
+            await asyncio.wait_for(output.silent.wait(), LINGER_S)
     code = program.get_returncode()
-    return code == 0, _in_words(code, str(words))
+    return code == 0, _in_words(code, str(output))
 
 
 def _in_words(code: int | None, said: str) -> str:

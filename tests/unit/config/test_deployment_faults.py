@@ -87,8 +87,8 @@ def test_a_folder_of_scripts_that_is_not_there_is_told_at_the_start(
     file.write_text(f"body: mock\ndecision:\n  behaviour: navigate\n  scripts: {place}\n")
     with pytest.raises(ConfigError) as error:
         up(str(file))
-    expected = "scripts: expected that of the programs that missions may run"
-    assert str(error.value) == f"{file}:4: no folder '{place}'; {expected}"
+    expected = "expected the folder with the programs that missions may run"
+    assert str(error.value) == f"{file}:4: scripts: no folder '{place}'; {expected}"
     place.unlink(missing_ok=True)
     place.mkdir()
     with pytest.raises(Begun):

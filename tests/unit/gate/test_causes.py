@@ -47,6 +47,6 @@ def test_a_button_latches_and_says_why_and_what_to_do() -> None:
         code="button",
         text="e-stop button: the contact is open",
         latching=True,
-        remedy="let the button go, or mend its wire or adapter, then release the robot",
+        remedy="unlock the button, or repair its wire or adapter, then release the robot",
     )
     assert len(causes.button("x" * 1000).text) == 500

@@ -19,8 +19,8 @@ def test_it_boots_latched_and_at_rest() -> None:
         causes=(
             Cause(
                 code="boot",
-                text="just started; nobody has released it yet",
-                remedy="see that nobody is in its way",
+                text="just started, not released yet",
+                remedy="check that nobody is in its way",
             ),
         ),
         estop_generation=0,

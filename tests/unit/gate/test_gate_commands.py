@@ -256,7 +256,7 @@ def test_the_brain_takes_over_by_what_it_says_not_by_what_the_other_said() -> No
         rig.send(source="alice")
     assert rig.feed(gate.Enable("control", take=True, by="alice")) == gate.Outcome(
         ok=False,
-        text="not now: no good command for 100 ms (see that whoever drives runs and reaches the "
+        text="not now: no valid command for 100 ms (check that the commander runs and reaches the "
         "robot, then enable it again)",
     )
     assert (rig.mode, rig.state.commander) == ("enabled", "alice")

@@ -50,7 +50,7 @@ def _brain_stares(rig: Rig) -> None:
         (lambda rig: rig.tick(faults=(LOST,)), "the body does not answer", False),
         (lambda rig: rig.tick(8), "the safety process is silent", False),
         (lambda rig: rig.safety(BLIND, verdict="stop"), "the lidar is blind", False),
-        (_brain_quiet, "no good command for 100 ms", True),
+        (_brain_quiet, "no valid command for 100 ms", True),
         (_brain_stares, "commands rest on sensor data that is too old", True),
     ],
 )
@@ -73,8 +73,8 @@ def test_all_that_speaks_against_it_is_said() -> None:
     assert rig.feed(gate.Enable("control")) == gate.Outcome(
         ok=False,
         text="not now: the body does not answer; the safety process is silent (start the safety "
-        "process, or read its log to see why it ended); no good command for 100 ms (see that "
-        "whoever drives runs and reaches the robot, then enable it again)",
+        "process, or read its log); no valid command for 100 ms (check that the commander runs "
+        "and reaches the robot, then enable it again)",
     )
 
 

@@ -25,7 +25,7 @@ def test_100_ms_without_a_command_are_borne_and_no_more() -> None:
         assert (rig.mode, rig.state.output) == ("enabled", Velocity(linear_x=0.2))
     quiet(rig)
     assert (rig.mode, rig.state.output) == ("stopping", Velocity(linear_x=0.16))
-    assert plain(rig.state.causes) == [("silence", "no good command for 100 ms")]
+    assert plain(rig.state.causes) == [("silence", "no valid command for 100 ms")]
 
 
 def test_a_body_that_was_just_enabled_waits_as_long_for_its_first_command() -> None:
@@ -167,7 +167,7 @@ def test_a_stop_without_a_reason_is_a_stop() -> None:
     rig = driving(0.2)
     rig.safety(verdict="stop")
     assert rig.mode == "stopping"
-    assert plain(rig.state.causes) == [("safety_stop", "the safety process says stop")]
+    assert plain(rig.state.causes) == [("safety_stop", "safety stops the robot")]
 
 
 @pytest.mark.parametrize("verdict", ["ok", "slow"])
