@@ -111,7 +111,7 @@ class TaskServer:
 
     def begin(self, mission: Mission, label: str, boot: int) -> None:
         """Start a mission, unless there were tasks in this start of the driver."""
-        if self._queue.empty and not self._queue.knows(boot):
+        if self._queue.is_unused(boot):
             self._queue.add_mission(mission, label, "queue", "itself")
 
     async def close(self) -> None:

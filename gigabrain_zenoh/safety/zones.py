@@ -23,13 +23,13 @@ HOUSING_M = 0.1  # nearer hits are the lidar's own housing
 CONE_DEG = 30.0  # ahead, in which some beam must be valid
 TURN_MARGIN_M = 0.02  # around a turning body
 MIN_ARC_LINEAR, MIN_ARC_ANGULAR = 0.03, 0.05  # [m/s], [rad/s]; slower motion is no arc
-WHERE = {
-    "forward": "ahead",
-    "backward": "behind",
-    "left": "left",
-    "right": "right",
-    "turn_left": "turn_left",
-    "turn_right": "turn_right",
+ZONES = {  # code of the cause, and the text behind a distance [m]; turns have none
+    "forward": ("zone_ahead", "ahead of the body"),
+    "backward": ("zone_behind", "behind the body"),
+    "left": ("zone_left", "to the left of the body"),
+    "right": ("zone_right", "to the right of the body"),
+    "turn_left": ("zone_turn_left", ""),
+    "turn_right": ("zone_turn_right", ""),
 }
 
 Free = dict[str, float | None]  # [m] or [rad] by direction; None where nothing is in the way
@@ -108,14 +108,10 @@ class ProtectiveField(Struct, frozen=True, kw_only=True):
     def causes(self) -> tuple[Cause, ...]:
         """Causes that only limit motion towards an obstacle; the gate does not stop for them."""
         found = []
-        for direction, where in WHERE.items():
-            if direction not in self.stopped:
-                continue
-            code, free = f"zone_{where}", self.free[direction] or 0.0
-            if direction.startswith("turn"):
-                found.append(cause(code))
-            else:
-                found.append(cause(code, cause(code).text.replace(" ", f" {free:.2f} m ", 1)))
+        for direction, (code, side) in ZONES.items():
+            if direction in self.stopped:
+                free = self.free[direction] or 0.0
+                found.append(cause(code, f"obstacle {free:.2f} m {side}" if side else ""))
         return tuple(found)
 
 

@@ -142,32 +142,19 @@ class WaitNode(Leaf):
         return Status.RUNNING
 
 
-class WaitUntilNode(Leaf):
-    """Succeeds once a condition holds. An unknown value does not hold."""
+class ConditionNode(Leaf):
+    """Succeeds if a condition holds; otherwise waits or fails. An unknown value does not hold."""
 
-    def __init__(self, condition: Condition, context: MissionContext) -> None:
-        super().__init__(f"waiting until {condition.text}", context)
-        self._condition = condition
+    def __init__(self, condition: Condition, context: MissionContext, *, waits: bool) -> None:
+        super().__init__(f"{'waiting until' if waits else 'checking'} {condition.text}", context)
+        self._condition, self._waits = condition, waits
 
     def update(self) -> Status:
         """Evaluate the condition."""
         self.context.doing = self.name
-        return Status.SUCCESS if self._condition.holds(self.context.read) else Status.RUNNING
-
-
-class CheckNode(Leaf):
-    """Succeeds if a condition holds, and fails if it does not or is unknown."""
-
-    def __init__(self, condition: Condition, context: MissionContext) -> None:
-        super().__init__(f"checking {condition.text}", context)
-        self._condition = condition
-
-    def update(self) -> Status:
-        """Evaluate the condition once."""
-        self.context.doing = self.name
         holds = self._condition.holds(self.context.read)
-        if holds:
-            return Status.SUCCESS
+        if holds or self._waits:
+            return Status.SUCCESS if holds else Status.RUNNING
         why = "is not known" if holds is None else "does not hold"
         return self.failed(f"{self._condition.text} {why}")
 
@@ -314,9 +301,9 @@ class TreeBuilder:
         if step.wait is not None:
             return WaitNode(step.wait, context)
         if step.wait_until is not None:
-            return WaitUntilNode(parse(step.wait_until), context)
+            return ConditionNode(parse(step.wait_until), context, waits=True)
         if step.check is not None:
-            return CheckNode(parse(step.check), context)
+            return ConditionNode(parse(step.check), context, waits=False)
         return ScriptNode(step.script, context) if step.script else None
 
     def _decorated(self, step: Step) -> Behaviour:
@@ -338,7 +325,7 @@ class TreeBuilder:
         then = self._go_to(low.goto)
         if low.until is not None:
             charged = parse(f"battery.percentage >= {low.until:g}")
-            wait = WaitUntilNode(charged, self._context)
+            wait = ConditionNode(charged, self._context, waits=True)
             then = Sequence("charge", memory=True, children=[then, wait])
         when = parse(f"battery.percentage < {low.percentage:g}")
         return GuardNode(when, then, self._sequence(low.do), self._context)

@@ -171,14 +171,9 @@ class TaskQueue:
             outcome, seconds = None, 0.0
         return None, NO_GOAL
 
-    def knows(self, boot: int) -> bool:
-        """Return whether it, or its file, was last used in this start of the driver."""
-        return self._boot == boot
-
-    @property
-    def empty(self) -> bool:
-        """Whether there is no task."""
-        return not self._jobs
+    def is_unused(self, boot: int) -> bool:
+        """Return whether there is no task, nor was there one in this start of the driver."""
+        return not self._jobs and self._boot != boot
 
     @property
     def saved(self) -> Saved:
