@@ -94,11 +94,6 @@ class ActuationEstimator:
         """Return the current estimate; the prior until enough has been learnt."""
         return self._response
 
-    @property
-    def turn_gain(self) -> float:
-        """Return the ratio of measured to commanded turn rate, as in `response`."""
-        return self._response.turn_gain
-
     def command(self, command: CmdVel) -> None:
         """Add a command of the commander or the brain; for each tick, keep the highest `seq`.
 

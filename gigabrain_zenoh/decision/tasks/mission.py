@@ -30,10 +30,6 @@ Seconds = Annotated[float, Meta(gt=0, le=1e7)]
 Pause = Annotated[float, Meta(ge=0, le=1e7)]
 Times = Annotated[int, Meta(ge=1, le=MAX_LOOPS)]
 Comparison = Annotated[str, Meta(max_length=200)]  # see conditions.py
-KINDS = (
-    "goto", "patrol", "explore", "visit", "wait", "wait_until", "check", "script", "tree",
-    "sequence", "fallback", "retry", "repeat", "timeout", "guard", "battery_below",
-)  # fmt: skip
 DRIVING = ("goto", "patrol", "explore", "visit", "battery_below")
 Keys = tuple[str | int, ...]  # from the top of the file
 
@@ -131,18 +127,19 @@ class Step(Part, frozen=True, kw_only=True):
     battery_below: BatteryBelow | None = None
 
     def __post_init__(self) -> None:
-        given = [kind for kind in KINDS if getattr(self, kind) is not None]
+        kinds = self.__struct_fields__
+        given = [kind for kind in kinds if getattr(self, kind) is not None]
         if len(given) > 1:
             raise ValueError(
                 f"{given[1]}: a step has one kind, and this one is {given[0]!r} already"
             )
         if not given:
-            raise ValueError(f"an empty step; expected one of {', '.join(KINDS)}")
+            raise ValueError(f"an empty step; expected one of {', '.join(kinds)}")
 
     @property
     def kind(self) -> str:
         """Name of the field that is set."""
-        return next(kind for kind in KINDS if getattr(self, kind) is not None)
+        return next(kind for kind in self.__struct_fields__ if getattr(self, kind) is not None)
 
 
 class Mission(Part, frozen=True, kw_only=True):

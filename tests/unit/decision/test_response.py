@@ -72,7 +72,7 @@ def test_delay_and_lag_are_found_within_ten_seconds_of_driving_about(
     assert found.delay == pytest.approx(delay, abs=0.021)
     assert found.lag == pytest.approx(lag, abs=0.031)
     assert found.delay + found.lag == pytest.approx(delay + lag, abs=0.021)
-    assert plant.estimator.turn_gain == pytest.approx(0.8, abs=0.04)
+    assert plant.estimator.response.turn_gain == pytest.approx(0.8, abs=0.04)
 
 
 def test_driving_on_and_turning_as_avoid_does_is_enough() -> None:
@@ -141,7 +141,7 @@ def test_the_order_of_messages_within_a_few_ticks_does_not_matter() -> None:
 
     late.estimator.command = hold_back  # type: ignore[method-assign]
     assert early.wander(13) == late.wander(13)
-    assert early.estimator.turn_gain == late.estimator.turn_gain
+    assert early.estimator.response.turn_gain == late.estimator.response.turn_gain
 
 
 def test_it_remembers_what_the_body_was_told_of_late() -> None:
