@@ -111,9 +111,9 @@ def make_app(chosen: "Sequence[str]" = ()) -> "App":
     A command whose name is among the words `chosen` shows its own help. The others keep their line
     of the table, so that their modules are not imported.
     """
-    from cyclopts import App
+    from cyclopts import App, Parameter
 
-    from gigabrain_zenoh.cli.options import refuse_fractions
+    from gigabrain_zenoh.cli.options import default_text, refuse_fractions
 
     app = App(
         name="gigabrain",
@@ -121,6 +121,7 @@ def make_app(chosen: "Sequence[str]" = ()) -> "App":
         help_format="plaintext",  # the default, Markdown, takes twice as long to start
         version=_version,
         config=refuse_fractions,
+        default_parameter=Parameter(negative=(), show_default=default_text),
     )
     groups = {name: App(name=name, help=about) for name, about in GROUPS.items()}
     for group in groups.values():

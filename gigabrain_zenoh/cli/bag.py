@@ -168,9 +168,7 @@ def _pairs(texts: list[str]) -> dict[str, str]:
     return pairs
 
 
-def plot(
-    file: Recording, fields: Annotated[list[str], Parameter(negative="")], *, output: Output = None
-) -> None:
+def plot(file: Recording, fields: list[str], *, output: Output = None) -> None:
     """Plot values of a recording over time, as a PNG.
 
     Example: gigabrain bag plot drive.mcap state.velocity.linear_x cmd_vel.linear_x

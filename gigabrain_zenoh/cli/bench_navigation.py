@@ -184,7 +184,7 @@ class BarnOptions:
         "ideal: only 1 cm noise.\n"
         "mujoco: a skid-steer Jackal among solid posts, otherwise as hard; not with --dynamic."
     )
-    nodes: bool = True
+    nodes: Annotated[bool, Parameter(negative="--no-nodes")] = True
     (
         "Run the robot's nodes. Without them, and with --dynamic, only the functions that they "
         "call run, without map, bus and safety process."

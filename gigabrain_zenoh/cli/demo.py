@@ -3,6 +3,7 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from cyclopts import Parameter
 
@@ -93,7 +94,7 @@ class ViewOptions:
     "Write the results of the run as JSON to this file."
     record: Path | None = None
     "Record the whole run to this file, for `gigabrain replay`."
-    page: bool | None = None
+    page: Annotated[bool | None, Parameter(negative="--no-page")] = None
     "Serve the operator page. Default: with the live view."
     port: int = 8080
     "Port of the page; a free one if it is taken."

@@ -134,6 +134,9 @@ Topic = Annotated[
         help='Name such as scan or health/driver, key, or key expression such as "robot/*".',
     ),
 ]
+TopicName = Annotated[
+    str, Parameter(completer=_live_topics, help="Name of the topic, such as cmd_vel.")
+]
 Process = Annotated[str, Parameter(completer=_live_process_names, help="Name of the process.")]
 ProcessOrAll = Annotated[
     str, Parameter(completer=_live_process_names, help="Name of a process. Default: all.")
@@ -157,9 +160,7 @@ World = Annotated[str, Parameter(help="Simulated world; see `gigabrain worlds`."
 Seed = Annotated[int, Parameter(help="Random seed of the start pose and the sensor noise.")]
 KeepStuck = Annotated[
     bool,
-    Parameter(
-        negative=(), help="Do not restart a process that makes no progress (for a debugger)."
-    ),
+    Parameter(help="Do not restart a process that makes no progress (for a debugger)."),
 ]
 
 
@@ -243,6 +244,13 @@ def refuse_fractions(_app: App, _command: tuple[str, ...], arguments: ArgumentCo
                 if _is_fraction(token.value):
                     got = f"expected a whole number, got {token.value}"
                     raise ConfigError(f"{argument.name}: {got}")
+
+
+def default_text(value: object) -> str | None:
+    """Return a default as the help shows it; None for a switch that is off, or nothing."""
+    if value is None or value is False or value in ("", ()):
+        return None
+    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
 def _is_whole(hint: Any) -> bool:

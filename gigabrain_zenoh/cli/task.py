@@ -20,7 +20,10 @@ Mode = Annotated[
     Literal["replace", "queue", "preempt"],
     Parameter(help="Replace all tasks, append to the queue, or run first and then go on."),
 ]
-Wait = Annotated[bool, Parameter(help="Wait for the end; Ctrl-C then cancels the task.")]
+Wait = Annotated[
+    bool,
+    Parameter(negative="--no-wait", help="Wait for the end; Ctrl-C then cancels the task."),
+]
 TaskName = Annotated[str, Parameter(help="Name of the task. Default: the current one.")]
 TaskNameOrAll = Annotated[
     str, Parameter(help="Name of the task, or `all`. Default: the current one.")

@@ -11,6 +11,7 @@ from gigabrain_zenoh.cli.options import (
     RobotAddress,
     Take,
     Topic,
+    TopicName,
     check_positive,
     on_bus,
     print_line,
@@ -123,7 +124,7 @@ def _measure(
     return run_async(run())
 
 
-def info(topic: Topic, /, *, at: RobotAddress = LOCAL) -> None:
+def info(topic: TopicName, /, *, at: RobotAddress = LOCAL) -> None:
     """Describe one topic: message, promised rate, senders and receivers.
 
     Example: gigabrain topic info cmd_vel
@@ -142,7 +143,7 @@ def info(topic: Topic, /, *, at: RobotAddress = LOCAL) -> None:
 
 
 def pub(
-    name: Topic,
+    name: TopicName,
     /,
     *words: str,
     at: RobotAddress = LOCAL,
