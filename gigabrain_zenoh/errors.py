@@ -27,6 +27,11 @@ class ConfigError(GigabrainError):
 
     exit_code = 2
 
+    def __init__(self, text: str, *, value: str | None = None) -> None:
+        """Create an error; `value` is the invalid value, by which its line in a file is found."""
+        super().__init__(text)
+        self.value = value
+
 
 class UnknownName(ConfigError):
     """A name that nothing here answers to."""
@@ -71,4 +76,5 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UnknownName:
     parts = {part: whole for whole in names for part in (*whole.split("_"), whole)}
     close = difflib.get_close_matches(name, parts, n=1, cutoff=0.6)
     hint = f"; did you mean {parts[close[0]]!r}?" if close else ";"
-    return UnknownName(f"no {kind} {name!r}{hint} known: {', '.join(names) or 'none'}")
+    text = f"no {kind} {name!r}{hint} known: {', '.join(names) or 'none'}"
+    return UnknownName(text, value=name)

@@ -321,10 +321,10 @@ def _nearest(path: Path) -> str:
 
 
 def located(path: Path, error: ConfigError) -> ConfigError:
-    """What a process says of a name that it was given, with that name's line in the file."""
-    if named := re.match(r"no \w+ ('.*?');", str(error)):
+    """Return `error` with the line of its invalid value in the file, if that is found."""
+    if error.value is not None:
         for node in _scalars(yaml_text.read(read(path))):
-            if repr(node.value) == named[1]:
+            if node.value == error.value:
                 return type(error)(f"{path}:{node.line}: {error}")
     return error
 

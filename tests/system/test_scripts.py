@@ -63,7 +63,7 @@ async def test_a_program_that_takes_too_long_is_ended_with_all_it_has_started(
     text = f"sleep 600 & echo $! > {tmp_path}/child; wait"
     scripts = Scripts(program(tmp_path, text))
     run = scripts.start(Script(run="beep", seconds=0.5))
-    assert await ended(run) == (False, "did not end within 0.5 s and was ended")
+    assert await ended(run) == (False, "did not end within 0.5 s; killed")
     child = int((tmp_path / "child").read_text())
     await until(lambda: _gone(child))
 

@@ -276,7 +276,8 @@ def _build(name: str) -> World:
         raise unknown("world", name, [*DRAWN, f"{RANDOM}SEED"])
     layout = name.removeprefix(RANDOM)
     if not (layout.isascii() and layout.isdigit()):
-        raise UnknownName(f"no world {name!r}; random:SEED wants a whole number, as in random:7")
+        text = f"no world {name!r}; random:SEED needs a whole number, as in random:7"
+        raise UnknownName(text, value=name)
     return random_world(int(layout))
 
 

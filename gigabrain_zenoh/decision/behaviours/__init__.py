@@ -165,7 +165,8 @@ def check(config: DecisionConfig, path: Path | None = None) -> None:
     if settings.scripts and not Path(settings.scripts).expanduser().is_dir():
         raise ConfigError(
             f"scripts: no folder {settings.scripts!r}; "
-            "expected the folder with the programs that missions may run"
+            "expected the folder with the programs that missions may run",
+            value=settings.scripts,
         )
 
 

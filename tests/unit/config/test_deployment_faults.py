@@ -102,7 +102,7 @@ def test_a_folder_of_scripts_is_looked_for_only_where_decision_runs(tmp_path: Pa
     file.write_text(f"hosts: {{a: [router], b: [decision]}}\ndecision: {decision}\n")
     with pytest.raises(Begun):
         up(str(file), host="a")
-    with pytest.raises(ConfigError, match=r"robot\.yaml:2: no folder '/nowhere/beeps'; scripts: "):
+    with pytest.raises(ConfigError, match=r"robot\.yaml:2: scripts: no folder '/nowhere/beeps'; "):
         up(str(file), host="b")
 
 
