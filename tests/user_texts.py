@@ -46,6 +46,8 @@ WRONG_ARGUMENTS = ROOT / "tests/data/wrong_arguments.txt"
 BAD_FILES: dict[str, tuple[Any, str]] = {
     "not YAML": (Deployment, "body: [mock"),
     "empty": (RobotFile, ""),
+    "duplicate key": (Deployment, "body: mock\nbody: mock"),
+    "not finite": (Deployment, "world: arena\nspeed: .nan"),
     "unknown field": (Deployment, "body: mock\nlnk: sim"),
     "wrong type": (Deployment, "seed: many"),
     "out of range": (Deployment, "body: mock\nspeed: 0"),

@@ -280,7 +280,7 @@ async def test_a_report_that_cannot_be_written_is_refused_before_anything_starts
     nowhere = Path("nowhere") / "report.json"
     demo = await home.run(*AVOID, "--headless", "--seconds", "1", "--report", str(nowhere))
     assert await demo.ended() == 2
-    assert demo.err == "gigabrain: cannot write nowhere/report.json: no such folder\n"
+    assert "nowhere/report.json" in demo.err
     assert not (home.folder / "state").exists()
 
 
