@@ -6,11 +6,10 @@ import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, Literal, Self
-
-from cyclopts import Parameter
+from typing import Literal, Self
 
 from gigabrain_zenoh.cli.options import (
+    Body,
     Seed,
     World,
     check_finite,
@@ -20,8 +19,6 @@ from gigabrain_zenoh.cli.options import (
 )
 from gigabrain_zenoh.config.settings import EmulatorConfig, LinkName
 from gigabrain_zenoh.host.signals import run_async
-
-RobotName = Annotated[str, Parameter(help="Known robot, or path of a robot's YAML file.")]
 
 
 class _WarningCounter(logging.Handler):
@@ -48,7 +45,7 @@ class _WarningCounter(logging.Handler):
 
 
 def test(
-    name: RobotName,
+    name: Body,
     *,
     link: Literal["sim", "emulated"] | None = None,  # noqa: PT028
     repeat: int = 1,  # noqa: PT028
@@ -91,7 +88,7 @@ def test(
 
 
 def trace(
-    name: RobotName,
+    name: Body,
     *,
     link: Literal["emulated", "real"] = "emulated",
     part: Literal["base", "scan"] = "base",
@@ -171,7 +168,7 @@ def new(name: str, *, folder: Path = Path()) -> None:
 
 
 def emulate(
-    name: RobotName, *, world: World = "arena", seed: Seed = 0, ports: Path | None = None
+    name: Body, *, world: World = "arena", seed: Seed = 0, ports: Path | None = None
 ) -> None:
     """Emulate a robot's hardware on serial and TCP ports, with MuJoCo, until Ctrl-C.
 

@@ -155,7 +155,9 @@ Take = Annotated[bool, Parameter(help="Take over from any commander, the robot's
 JsonLines = Annotated[bool, Parameter(help="Print one JSON object per line.")]
 JsonFile = Annotated[Path | None, Parameter(help="Write the results as JSON to this file.")]
 Output = Annotated[Path | None, Parameter(alias="-o")]
-Body = Annotated[str, Parameter(help="Robot; see `gigabrain robots`.")]
+Body = Annotated[
+    str, Parameter(help="Name of the robot, or path of its YAML file; see `gigabrain robots`.")
+]
 World = Annotated[str, Parameter(help="Simulated world; see `gigabrain worlds`.")]
 Seed = Annotated[int, Parameter(help="Random seed of the start pose and the sensor noise.")]
 KeepStuck = Annotated[

@@ -167,7 +167,7 @@ def driver(
     Example: gigabrain driver run turtlebot3_waffle --world house --resume auto
 
     Args:
-        name: Known robot, or path of a robot's YAML file.
+        name: Name of the robot, or path of its YAML file; see `gigabrain robots`.
         link: How to reach the robot: simulated, emulated or real.
         speed: Simulated over real time. At any speed but 1, time waits for the brain.
         resume: Drive on after a stop whose cause has passed: by itself, or when enabled.

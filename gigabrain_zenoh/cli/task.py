@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 Coordinate = Annotated[float, Parameter(allow_leading_hyphen=True)]
 Mode = Annotated[
     Literal["replace", "queue", "preempt"],
-    Parameter(help="Replace all tasks, append to the queue, or run first and then go on."),
+    Parameter(
+        help="Replace all tasks, append to the queue, or run now and resume the others after."
+    ),
 ]
 Wait = Annotated[
     bool,
@@ -47,8 +49,8 @@ def goto(
     Exit code 0 on arrival.
 
     Args:
-        x: In the map [m].
-        y: In the map [m].
+        x: Place in the map [m].
+        y: Place in the map [m].
         yaw: Heading on arrival [rad]. Default: any.
     """
     _send(at, lambda tasks: tasks.go_to(x, y, yaw, how=mode), wait)
