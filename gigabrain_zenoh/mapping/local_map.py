@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -22,8 +23,7 @@ Ints = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
 
 
-@dataclass(frozen=True, slots=True)
-class Buckets:
+class Buckets(NamedTuple):
     """Points with normals in square buckets, those of a bucket side by side."""
 
     points: Points  # (n, 2), sorted by bucket, row by row
@@ -33,9 +33,8 @@ class Buckets:
     origin: Floats  # (2,), the corner of bucket (0, 0) [m]
 
 
-@dataclass(frozen=True, slots=True)
-class Image:
-    """How likely a hit is, by cell."""
+class LikelihoodImage(NamedTuple):
+    """Likelihood of a hit by cell."""
 
     cells: Bytes  # (height, width), 0 to 255 for certain
     coarse: Bytes  # (height, width), the most of the block of cells that begins here
@@ -47,7 +46,7 @@ class Image:
 class LocalMap:
     """What scans are searched in, and laid onto."""
 
-    image: Image
+    image: LikelihoodImage
     buckets: Buckets
 
 
@@ -91,13 +90,13 @@ def build(
     )
     if not len(points):
         nothing = np.zeros((1, 1), np.uint8)
-        return LocalMap(Image(nothing, nothing, np.zeros(2), cell), EMPTY)
+        return LocalMap(LikelihoodImage(nothing, nothing, np.zeros(2), cell), EMPTY)
     blob, wide = _blobs(cell, sigma)
     origin = low.astype(np.float64) - len(blob) * cell
     width, height = ((high - origin) / cell).astype(int) + len(blob)
     cells, coarse = _blank(height, width, room)
-    _stamp(cells, coarse, points, origin, cell, blob, wide)
-    image = Image(cells, coarse, origin, cell)
+    image = LikelihoodImage(cells, coarse, origin, cell)
+    _stamp(image, points, blob, wide)
     return LocalMap(image, _buckets(*_merged(points, normals, origin, cell, width)))
 
 
@@ -223,12 +222,9 @@ def _blobs(cell: float, sigma: float) -> tuple[Bytes, Bytes]:
 
 
 @kernel
-def _stamp(
-    cells: Bytes, coarse: Bytes, points: Points, origin: Floats, cell: float, blob: Bytes,
-    wide: Bytes,
-) -> None:  # fmt: skip
+def _stamp(image: LikelihoodImage, points: Points, blob: Bytes, wide: Bytes) -> None:
     """Put the blobs on every cell that holds a point; the likelier counts."""
-    half, rim = len(blob) // 2, BLOCK - 1
+    half, rim, (cells, coarse, origin, cell) = len(blob) // 2, BLOCK - 1, image
     for k in range(len(points)):
         column = int((points[k, 0] - origin[0]) / cell)
         row = int((points[k, 1] - origin[1]) / cell)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel, lean_kernel
 from gigabrain_zenoh.mapping.keyframes import Points, thinned
-from gigabrain_zenoh.mapping.local_map import BLOCK, BUCKET, Buckets, Bytes, Image
+from gigabrain_zenoh.mapping.local_map import BLOCK, BUCKET, Buckets, Bytes, LikelihoodImage
 
 SEARCHED = 90  # points of a scan are enough to search with
 ASIDE = 0.01  # of the score, at the window's rim: of equals, the one nearest to the guess
@@ -45,6 +45,14 @@ class Window:
     step: float = 0.025  # [rad]
 
 
+class Lattice(NamedTuple):
+    """Candidate poses: `steps` cells and `turns` headings to each side of the guess."""
+
+    steps: int
+    turns: int
+    turn: float  # [rad], from heading to heading
+
+
 @dataclass(frozen=True, slots=True)
 class Found:
     """The likeliest pose of a search."""
@@ -54,7 +62,7 @@ class Found:
 
 
 def search(
-    image: Image,
+    image: LikelihoodImage,
     points: Points,
     guess: Floats,
     window: Window,
@@ -70,31 +78,20 @@ def search(
         return Found(guess, 0.0)
     steps = int(np.ceil(window.away / image.cell))
     turns = int(np.ceil(window.turn / window.step))
-    few = thinned(points, most)
-    sides = BLOCK * (2 * steps // BLOCK + 1)
-    hits = _placed(
-        few, guess, image.origin, image.cell, steps, turns, window.step, image.cells.shape, sides
-    )
-    bounds = _bounds(image.coarse, hits, len(few), steps)
-    score, t, i, j = _best(image.cells, hits, bounds, len(few), steps, least)
+    lattice, few = Lattice(steps, turns, window.step), thinned(points, most)
+    hits = _placed(few, guess, image, lattice)
+    bounds = _bounds(image.coarse, hits, len(few), lattice)
+    score, t, i, j = _best(image.cells, hits, bounds, len(few), lattice, least)
     off = np.array(((j - steps) * image.cell, (i - steps) * image.cell, (t - turns) * window.step))
     return Found(guess + off, score)
 
 
 @kernel
-def _placed(
-    points: Points,
-    guess: Floats,
-    origin: Floats,
-    cell: float,
-    steps: int,
-    turns: int,
-    turn: float,
-    shape: tuple[int, int],
-    sides: int,
-) -> Hits:
-    """The points at each heading, the body being in the first corner of a window of `sides`."""
-    headings, count, (height, width) = 2 * turns + 1, len(points), shape
+def _placed(points: Points, guess: Floats, image: LikelihoodImage, lattice: Lattice) -> Hits:
+    """Place the points at each heading, with the body in the first corner of the window."""
+    (steps, turns, turn), (height, width) = lattice, image.cells.shape
+    origin, cell, sides = image.origin, image.cell, BLOCK * (2 * steps // BLOCK + 1)
+    headings, count = 2 * turns + 1, len(points)
     inside, inside_count = np.empty((headings, count), np.uint32), np.zeros(headings, np.int64)
     rim, rim_count = np.empty((headings, count, 2), np.int64), np.zeros(headings, np.int64)
     for t in range(headings):
@@ -115,10 +112,14 @@ def _placed(
 
 
 @lean_kernel
-def _worth(total: int, count: int, down: int, right: int, t: int, steps: int, turns: int) -> float:
-    """What a pose so many cells and headings off the guess is worth, its points being so likely."""
-    away = (down * down + right * right) / (steps * steps + 1)
-    return total / (255 * count) - ASIDE * (away + t * t / (turns * turns + 1))
+def _score(likelihood: float, down: int, right: int, t: int, lattice: Lattice) -> float:
+    """Return the likelihood of a candidate pose minus a penalty for its distance from the guess.
+
+    The distance is in cells and headings.
+    """
+    away = (down * down + right * right) / (lattice.steps * lattice.steps + 1)
+    turned = t * t / (lattice.turns * lattice.turns + 1)
+    return likelihood - ASIDE * (away + turned)
 
 
 @lean_kernel
@@ -136,10 +137,10 @@ def _total(cells: Bytes, flat: NDArray[np.uint8], hits: Hits, t: int, row: int, 
 
 
 @kernel
-def _bounds(coarse: Bytes, hits: Hits, count: int, steps: int) -> Floats:
-    """What the poses of each block are worth at most (headings, blocks, blocks)."""
-    headings, flat = len(hits.inside), coarse.ravel()
-    blocks, turns = 2 * steps // BLOCK + 1, headings // 2
+def _bounds(coarse: Bytes, hits: Hits, count: int, lattice: Lattice) -> Floats:
+    """Return upper bounds of the scores in each block (headings, blocks, blocks)."""
+    headings, flat, (steps, turns, _) = len(hits.inside), coarse.ravel(), lattice
+    blocks = 2 * steps // BLOCK + 1
     bounds = np.empty((headings, blocks, blocks))
     for t in range(headings):
         for i in range(blocks):
@@ -147,73 +148,50 @@ def _bounds(coarse: Bytes, hits: Hits, count: int, steps: int) -> Floats:
                 down = max(i * BLOCK - steps, steps - i * BLOCK - BLOCK + 1, 0)
                 right = max(j * BLOCK - steps, steps - j * BLOCK - BLOCK + 1, 0)
                 total = _total(coarse, flat, hits, t, i * BLOCK, j * BLOCK)
-                bounds[t, i, j] = _worth(total, count, down, right, t - turns, steps, turns)
+                bounds[t, i, j] = _score(total / (255 * count), down, right, t - turns, lattice)
     return bounds
 
 
 @kernel
 def _best(
-    cells: Bytes, hits: Hits, bounds: Floats, count: int, steps: int, least: float
+    cells: Bytes, hits: Hits, bounds: Floats, count: int, lattice: Lattice, least: float
 ) -> tuple[float, int, int, int]:
-    """Score, heading, row and column of the pose that is worth most; of equals, the first."""
-    (headings, blocks, _), best, flat = bounds.shape, least, cells.ravel()
-    turns = headings // 2
-    score, at_t, at_i, at_j = 0.0, turns, steps, steps
-    likeliest = np.argmax(bounds)  # the sooner something good is found, the more can be left out
+    """Return likelihood, heading, row and column of the pose with the best score, the first of
+    equals.
+    """
+    blocks, best, flat, (steps, turns, _) = bounds.shape[1], least, cells.ravel(), lattice
+    likeliest, at_t, at_i, at_j = 0.0, turns, steps, steps
+    first = np.argmax(bounds)  # the sooner something good is found, the more can be left out
     for n in range(-1, bounds.size):
-        block = likeliest if n < 0 else n
+        block = first if n < 0 else n
         t, top, left = block // (blocks * blocks), block // blocks % blocks, block % blocks
         if bounds[t, top, left] < best:
             continue
         for i in range(top * BLOCK, min(top * BLOCK + BLOCK, 2 * steps + 1)):
             for j in range(left * BLOCK, min(left * BLOCK + BLOCK, 2 * steps + 1)):
-                total = _total(cells, flat, hits, t, i, j)
-                worth = _worth(total, count, i - steps, j - steps, t - turns, steps, turns)
-                if worth > best or (worth == best and (t, i, j) < (at_t, at_i, at_j)):
-                    best, score, at_t, at_i, at_j = worth, total / (255 * count), t, i, j
-    return score, at_t, at_i, at_j
+                likelihood = _total(cells, flat, hits, t, i, j) / (255 * count)
+                score = _score(likelihood, i - steps, j - steps, t - turns, lattice)
+                if score > best or (score == best and (t, i, j) < (at_t, at_i, at_j)):
+                    best, likeliest, at_t, at_i, at_j = score, likelihood, t, i, j
+    return likeliest, at_t, at_i, at_j
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """What ICP arrived at."""
+class Fit(NamedTuple):
+    """Result of ICP."""
 
     pose: Floats
     information: Floats  # (3, 3), of x, y and yaw about the body, in the map's axes
-    inliers: float  # share of the scan's points
-    rms: float  # [m], of the inliers
-
-
-def icp(
-    local: Buckets, points: Points, start: Floats, gate: float, prior: Floats, guess: Floats
-) -> Fit:
-    """Slide `points` onto the lines of `local`, beginning at `start`.
-
-    `prior` is the (3, 3) information about `guess`, the pose that odometry expects: it decides
-    where the lines leave a direction open.
-    """
-    pose, information, inliers, rms = _icp(
-        local.points, local.normals, local.starts, local.width, local.origin,
-        points, start, gate, prior, guess,
-    )  # fmt: skip
-    return Fit(pose, information, inliers, rms)
+    inliers: float  # share of the points that lie on a line
+    rms: float  # [m], of their distances from it
 
 
 @lean_kernel
-def _nearest(
-    local: Points,
-    starts: NDArray[np.int32],
-    width: int,
-    origin: Floats,
-    x: float,
-    y: float,
-    gate: float,
-    known: int,
-) -> int:
-    """The index of the nearest point within `gate`, or -1; one that is `known` to be near helps."""
+def _nearest(local: Buckets, x: float, y: float, gate: float, known: int) -> int:
+    """Return the index of the nearest point within `gate`, or -1; start from `known` if >= 0."""
+    points, starts, width, origin = local.points, local.starts, local.width, local.origin
     best, found = gate * gate, -1
     if known >= 0:
-        away = _away(local, known, x, y)
+        away = _away(points, known, x, y)
         if away < best:
             best, found, gate = away, known, np.sqrt(away)
     height = (len(starts) - 1) // width
@@ -225,7 +203,7 @@ def _nearest(
         return found
     for row in range(top, bottom + 1):
         for k in range(starts[row * width + left], starts[row * width + right + 1]):
-            away = _away(local, k, x, y)
+            away = _away(points, k, x, y)
             if away < best:
                 best, found = away, k
     return found
@@ -254,37 +232,36 @@ def solved(m: Floats, v: Floats) -> Floats:
     return x
 
 
-@kernel
-def _lay(
-    local: Points,
-    normals: Points,
-    starts: NDArray[np.int32],
-    width: int,
-    origin: Floats,
-    points: Points,
-    pose: Floats,
-    gate: float,
-    nearest: NDArray[np.int32],
-    hessian: Floats,
-    gradient: Floats,
-) -> tuple[int, float]:
-    """Add the points at `pose` to the normal equations; how many have a line, and squares.
+class NormalEquations(NamedTuple):
+    """Sums over the residuals of one Gauss-Newton step."""
 
-    `nearest` are the points of `local` that they were laid onto before, or -1.
+    hessian: Floats  # (3, 3)
+    gradient: Floats  # (3,)
+
+
+@kernel
+def _linearize(
+    local: Buckets, points: Points, pose: Floats, gate: float, nearest: NDArray[np.int32],
+    sums: NormalEquations,
+) -> tuple[int, float]:  # fmt: skip
+    """Add the points at `pose` to `sums`; return how many have a line, and their squared errors.
+
+    `nearest` are the points of `local` that they were matched to before, or -1.
     """
     inliers, squares, near = 0, 0.0, -1
+    (hessian, gradient), normals, known = sums, local.normals, local.points
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     for k in range(len(points)):
         rx = cos * points[k, 0] - sin * points[k, 1]
         ry = sin * points[k, 0] + cos * points[k, 1]
         near = nearest[k] if nearest[k] >= 0 else near  # or that of the beam beside
-        j = _nearest(local, starts, width, origin, pose[0] + rx, pose[1] + ry, gate, near)
+        j = _nearest(local, pose[0] + rx, pose[1] + ry, gate, near)
         nearest[k] = j
         if j < 0:
             continue
         near = j
         nx, ny = normals[j, 0], normals[j, 1]
-        error = (pose[0] + rx - local[j, 0]) * nx + (pose[1] + ry - local[j, 1]) * ny
+        error = (pose[0] + rx - known[j, 0]) * nx + (pose[1] + ry - known[j, 1]) * ny
         weight = (SIGMA / (SIGMA * SIGMA + error * error)) ** 2  # divided by the variance
         lever = rx * ny - ry * nx  # how the error grows with yaw
         inliers += 1
@@ -303,27 +280,21 @@ def _lay(
 
 
 @kernel
-def _icp(
-    local: Points,
-    normals: Points,
-    starts: NDArray[np.int32],
-    width: int,
-    origin: Floats,
-    points: Points,
-    start: Floats,
-    gate: float,
-    prior: Floats,
-    guess: Floats,
-) -> tuple[Floats, Floats, float, float]:
-    pose = start.copy()
-    hessian = np.zeros((3, 3))
+def icp(
+    local: Buckets, points: Points, start: Floats, gate: float, prior: Floats, guess: Floats
+) -> Fit:
+    """Slide `points` onto the lines of `local`, beginning at `start`.
+
+    `prior` is the (3, 3) information about `guess`, the pose that odometry expects. It decides
+    where the lines leave a direction open.
+    """
+    pose, hessian = start.copy(), np.zeros((3, 3))
     inliers, squares = 0, 0.0
     nearest = np.full(len(points), -1, np.int32)
     for _ in range(ITERATIONS):
         hessian, gradient = np.zeros((3, 3)), np.zeros(3)
-        inliers, squares = _lay(
-            local, normals, starts, width, origin, points, pose, gate, nearest, hessian, gradient
-        )
+        sums = NormalEquations(hessian, gradient)
+        inliers, squares = _linearize(local, points, pose, gate, nearest, sums)
         off = pose - guess
         off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi
         for row in range(3):  # `@` would call for a BLAS
@@ -333,4 +304,5 @@ def _icp(
         if np.abs(step).max() < STILL and gate <= GATE_LEAST:
             break
         gate = max(gate * SHRINK, GATE_LEAST)
-    return pose, hessian, inliers / max(len(points), 1), np.sqrt(squares / max(inliers, 1))
+    rms = np.sqrt(squares / max(inliers, 1))
+    return Fit(pose, hessian, inliers / max(len(points), 1), rms)
