@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import compose, inverse, wrap
 from gigabrain_zenoh.kernels.jit import kernel
-from gigabrain_zenoh.mapping.keyframes import Points
+from gigabrain_zenoh.mapping.keyframes import Beams, Points
 from gigabrain_zenoh.mapping.likelihood_field import (
     JUDGED,
     FieldFit,
@@ -52,23 +52,22 @@ class Candidate(NamedTuple):
     score: float  # as Fit's
 
 
-def search(
-    field: LikelihoodField, hits: Points, free: Points, sensor: Floats, last: Floats | None = None
-) -> list[Candidate]:
-    """All poses in the map that explain a scan about equally well, the best first.
+def search(field: LikelihoodField, beams: Beams, last: Floats | None = None) -> list[Candidate]:
+    """Return all poses in the map that explain a scan about equally well, the best first.
 
-    Takes the scan as `field.fit` does. The pose (3,) that was known `last` is among them if it
-    explains the scan at all. Meant for a thread in the background.
+    The pose (3,) that was known `last` is among them if it explains the scan at all. Meant for a
+    thread in the background.
     """
+    hits = beams.hits
     if len(hits) < FEWEST_POINTS or not field.free.any():
         return []
     tried = _likely(field, hits)
-    fits = [fit(field, hits, free, sensor, pose, WEAK) for pose in tried]
+    fits = [fit(field, beams, pose, WEAK) for pose in tried]
     stayed = [one for one, pose in zip(fits, tried, strict=True) if _near(one.pose, pose)]
     found = [Candidate(one.pose, one.score) for one in _distinct(field, stayed)]
     if last is None:
         return found
-    here = fit(field, hits, free, sensor, last, WEAK)
+    here = fit(field, beams, last, WEAK)
     if here.score < LEAST or not apart(here.pose, (one.pose for one in found)):
         return found
     return [*found, Candidate(here.pose, here.score)]

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,12 +42,25 @@ class Scan:
         return cls(kept, normals(kept), ends)
 
 
+class Beams(NamedTuple):
+    """Ends of a scan's beams in the body's frame [m]."""
+
+    hits: Points  # (n, 2)
+    free: Points  # (m, 2): how far beams that hit nothing are known to be free
+    sensor: Floats  # (2,): where they start
+
+
 @dataclass(frozen=True, slots=True)
 class View:
     """One scan in the body's frame."""
 
     scan: Scan
     sensor: Floats  # (2,) [m], where the beams start
+
+    @property
+    def beams(self) -> Beams:
+        """The scan without its normals."""
+        return Beams(self.scan.points, self.scan.free, self.sensor)
 
 
 def pairs(name: str, values: NDArray[np.floating]) -> Points:

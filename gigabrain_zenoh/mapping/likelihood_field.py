@@ -4,7 +4,6 @@ Halls are built alike from both ends. Where half of one is mapped, a robot in th
 what it would see at the same place in the first.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.geometry.se2 import inverse, transform
 from gigabrain_zenoh.kernels.jit import kernel
-from gigabrain_zenoh.mapping.keyframes import Points
+from gigabrain_zenoh.mapping.keyframes import Beams, Points
 from gigabrain_zenoh.mapping.scan_matching import solved
 
 OCCUPIED, FREE = 65, 40  # percent: from here on a wall, and up to here free
@@ -35,8 +34,7 @@ MAX_AMID_SHARE = 0.15  # of them, at most, may come to lie amid free ground
 MAX_WALL_CELLS = 4000  # cells of wall are enough
 
 
-@dataclass(frozen=True, slots=True)
-class LikelihoodField:
+class LikelihoodField(NamedTuple):
     """A map as scans are matched to it."""
 
     distance: Distances  # (height, width) [m], from each cell's centre to the nearest wall's
@@ -71,37 +69,30 @@ def field_of(cells: NDArray[np.int8], cell: float, origin: tuple[float, float]) 
     return LikelihoodField(metres, free, shown, np.array(origin, np.float64), cell)
 
 
-def fit(
-    field: LikelihoodField, hits: Points, free: Points, sensor: Floats, guess: Floats, prior: Floats
-) -> FieldFit:
-    """The pose of the body near `guess` (3,) in which the scan fits best.
+def fit(field: LikelihoodField, beams: Beams, guess: Floats, prior: Floats) -> FieldFit:
+    """Return the pose of the body near `guess` (3,) in which the scan fits best.
 
-    `hits` (n, 2) and `free` (m, 2) are ends of beams in the body's frame, `sensor` (2,) is where
-    the beams start. `prior` (3, 3) is the information that holds the pose at its guess.
+    `prior` (3, 3) is the information that holds the pose at its guess.
     """
-    pose, information, likely, judged = _fit(
-        field.distance, field.shown, field.origin, field.cell, hits, guess, prior
-    )
-    pierced = _pierced(field.distance, field.origin, field.cell, hits, free, sensor, pose)
-    amid = _amid(field.distance, field.free, field.origin, field.cell, hits, pose)
+    pose, information, likely, judged = _fit(field, beams.hits, guess, prior)
+    pierced, amid = _contradicted(field, beams, pose)
+    hits = len(beams.hits)
     return FieldFit(
         pose=pose,
         information=information,
-        score=likely / max(judged, JUDGED * len(hits), 1) - pierced,
-        shown=judged / max(len(hits), 1),
+        score=likely / max(judged, JUDGED * hits, 1) - pierced,
+        shown=judged / max(hits, 1),
         likely=likely / max(judged, 1) - pierced,
-        wrong=pierced + amid / max(len(hits) + len(free), 1),
+        wrong=pierced + amid,
     )
 
 
-def contradiction(
-    field: LikelihoodField, hits: Points, free: Points, sensor: Floats, pose: Floats
-) -> float:
-    """The share of beams that the map rules out at `pose` (3,): unknown ground rules out none."""
-    count = len(hits) + len(free)
-    through = _pierced(field.distance, field.origin, field.cell, hits, free, sensor, pose)
-    amid = _amid(field.distance, field.free, field.origin, field.cell, hits, pose)
-    return through + amid / max(count, 1)
+def contradiction(field: LikelihoodField, beams: Beams, pose: Floats) -> float:
+    """Return the share of beams that the map rules out at `pose` (3,); unknown ground rules out
+    none.
+    """
+    pierced, amid = _contradicted(field, beams, pose)
+    return pierced + amid
 
 
 def clearance(field: LikelihoodField, pose: Floats) -> float:
@@ -113,16 +104,16 @@ def clearance(field: LikelihoodField, pose: Floats) -> float:
     return float(field.distance[row, column])
 
 
+def _contradicted(field: LikelihoodField, beams: Beams, pose: Floats) -> tuple[float, float]:
+    """Return the shares of beams that pass through a wall, and that end amid free ground."""
+    amid = _amid(field, beams.hits, pose)
+    return _pierced(field, beams, pose), amid / max(len(beams.hits) + len(beams.free), 1)
+
+
 @kernel
-def _amid(
-    distance: Distances,
-    free: NDArray[np.bool_],
-    origin: Floats,
-    cell: float,
-    hits: Points,
-    pose: Floats,
-) -> int:
-    """How many hits lie amid free ground, far from any wall."""
+def _amid(field: LikelihoodField, hits: Points, pose: Floats) -> int:
+    """Return how many hits lie amid free ground, far from any wall."""
+    distance, free, origin, cell = field.distance, field.free, field.origin, field.cell
     height, width = distance.shape
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     count = 0
@@ -158,15 +149,10 @@ def _is_shown(shown: NDArray[np.bool_], x: float, y: float) -> bool:
 
 @kernel
 def _fit(
-    distance: Distances,
-    shown: NDArray[np.bool_],
-    origin: Floats,
-    cell: float,
-    hits: Points,
-    guess: Floats,
-    prior: Floats,
+    field: LikelihoodField, hits: Points, guess: Floats, prior: Floats
 ) -> tuple[Floats, Floats, float, int]:
     """Gauss and Newton on the distances, each weighted by how small it is."""
+    distance, shown, origin, cell = field.distance, field.shown, field.origin, field.cell
     pose, information, score, judged = guess.copy(), np.zeros((3, 3)), 0.0, 0
     slope, step = np.zeros(3), np.zeros(3)
     for _ in range(ITERATIONS):
@@ -199,16 +185,9 @@ def _fit(
 
 
 @kernel
-def _pierced(
-    distance: Distances,
-    origin: Floats,
-    cell: float,
-    hits: Points,
-    free: Points,
-    sensor: Floats,
-    pose: Floats,
-) -> float:
-    """The share of beams that would have passed through a wall."""
+def _pierced(field: LikelihoodField, beams: Beams, pose: Floats) -> float:
+    """Return the share of beams that would have passed through a wall."""
+    distance, origin, cell, (hits, free, sensor) = field.distance, field.origin, field.cell, beams
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     x0 = pose[0] + cos * sensor[0] - sin * sensor[1]
     y0 = pose[1] + sin * sensor[0] + cos * sensor[1]

@@ -233,7 +233,7 @@ def _followed(into: LikelihoodField, one: Hypothesis, view: View | None) -> Hypo
     if view is None:
         return one
     prior = _inverse(one.covariance)
-    found = fit(into, view.scan.points, view.scan.free, view.sensor, one.pose, prior)
+    found = fit(into, view.beams, one.pose, prior)
     seen = replace(one, score=found.score, shown=found.shown, wrong=found.wrong, good=0)
     if clearance(into, one.pose) < WALL_M:
         seen = replace(seen, against=math.inf)
@@ -296,7 +296,7 @@ class BackgroundLocalizer:
         self._moved = IDENTITY
 
         def work() -> Take:
-            found = search(localizer.map, view.scan.points, view.scan.free, view.sensor, last)
+            found = search(localizer.map, view.beams, last)
 
             def take() -> None:
                 if number == self._lost:
@@ -325,7 +325,7 @@ class KidnapDetector:
         if not cells.size:
             return False
         field = field_of(cells, CELL, corner)
-        share = contradiction(field, view.scan.points, view.scan.free, view.sensor, pose)
+        share = contradiction(field, view.beams, pose)
         if share > self._usual + SUDDEN_INCREASE:
             self.scans += 1
             return True

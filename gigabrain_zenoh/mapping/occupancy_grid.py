@@ -160,15 +160,15 @@ def _draw(
             log_odds[y, x] = min(log_odds[y, x] + HIT, SURE)
     for ends in (hits, free):
         for x, y in ends:
-            _pass(log_odds, stamps, stamp, start[0], start[1], x, y)
+            _pass(log_odds, stamps, stamp, (start[0], start[1]), (x, y))
 
 
 @kernel
 def _pass(
-    log_odds: Cells, stamps: Stamps, stamp: int, x: int, y: int, end_x: int, end_y: int
+    log_odds: Cells, stamps: Stamps, stamp: int, start: tuple[int, int], end: tuple[int, int]
 ) -> None:
-    """The way from a cell to another, without the last (Bresenham's line)."""
-    height, width = log_odds.shape
+    """Free the cells from `start` (x, y) to before `end` (Bresenham's line)."""
+    (height, width), (x, y), (end_x, end_y) = log_odds.shape, start, end
     across, up = abs(end_x - x), -abs(end_y - y)
     step_x, step_y = 1 if x < end_x else -1, 1 if y < end_y else -1
     off = across + up

@@ -128,6 +128,6 @@ def warm_up() -> None:
     drawn = Grid()
     drawn.draw(IDENTITY, scan.points, scan.free)
     field = field_of(drawn.percent(), CELL, (drawn.origin_x, drawn.origin_y))
-    sensor = np.zeros(2)
-    search(field, scan.points, scan.free, sensor)
-    contradiction(field, scan.points, scan.free, sensor, np.zeros(3))
+    beams = View(scan, np.zeros(2)).beams
+    search(field, beams)
+    contradiction(field, beams, np.zeros(3))

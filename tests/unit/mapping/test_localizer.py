@@ -46,11 +46,11 @@ def test_a_scan_is_drawn_to_where_it_belongs(house: SavedMap) -> None:
     field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
     view = Rooms(HOUSE).view(at(3.0, 2.5, 30))
     free = np.eye(3) * 1e-3
-    found = fit(field, view.scan.points, view.scan.free, view.sensor, at(3.12, 2.41, 35), free)
+    found = fit(field, view.beams, at(3.12, 2.41, 35), free)
     assert found.pose[:2] == pytest.approx((3.0, 2.5), abs=0.02)
     assert np.degrees(found.pose[2]) == pytest.approx(30, abs=0.5)
     assert found.score > 0.9
-    elsewhere = fit(field, view.scan.points, view.scan.free, view.sensor, at(6, 4), free)
+    elsewhere = fit(field, view.beams, at(6, 4), free)
     assert elsewhere.score < 0.45
 
 
@@ -61,7 +61,7 @@ def test_one_scan_finds_its_place_in_the_whole_house(pose: object, house: SavedM
     assert isinstance(pose, np.ndarray)
     field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
     view = Rooms(HOUSE).view(pose)
-    best = search(field, view.scan.points, view.scan.free, view.sensor)[0]
+    best = search(field, view.beams)[0]
     assert best.pose[:2] == pytest.approx(pose[:2], abs=0.04)
     assert np.cos(best.pose[2] - pose[2]) == pytest.approx(1.0, abs=2e-4)  # 1 degree
 
@@ -70,10 +70,10 @@ def test_a_scan_of_nothing_and_a_map_of_nothing_give_no_place(house: SavedMap) -
     field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
     view = Rooms([(50, 50, 51, 51)]).view(at(0, 0))
     assert len(view.scan.free) == BEAMS
-    assert search(field, view.scan.points, view.scan.free, view.sensor) == []
+    assert search(field, view.beams) == []
     unknown = field_of(np.full((50, 50), -1, np.int8), 0.05, (0.0, 0.0))
     seen = Rooms(HOUSE).view(at(3.0, 2.5))
-    assert search(unknown, seen.scan.points, seen.scan.free, seen.sensor) == []
+    assert search(unknown, seen.beams) == []
 
 
 def test_it_is_found_from_nothing_and_followed_to_3_cm(house: SavedMap) -> None:
@@ -155,10 +155,10 @@ def test_a_hall_goes_on_as_itself_turned_about() -> None:
 def test_where_it_was_known_to_be_last_stays_a_place_if_it_explains_what_is_seen() -> None:
     saved, view = hall(8), Rooms(HALL).view(at(12.0, 3.0))  # little of what is seen is mapped
     field = field_of(saved.cells, saved.resolution, (saved.origin_x, saved.origin_y))
-    scan = view.scan.points, view.scan.free, view.sensor
-    assert ends(search(field, *scan)) == [4.0, 11.4]  # the other end of the hall, and the next wall
-    assert ends(search(field, *scan, at(12.0, 3.0))) == [4.0, 11.4, 11.9]
-    assert ends(search(field, *scan, at(3.0, 3.0))) == [4.0, 11.4]
+    scan = view.beams
+    assert ends(search(field, scan)) == [4.0, 11.4]  # the other end of the hall, and the next wall
+    assert ends(search(field, scan, at(12.0, 3.0))) == [4.0, 11.4, 11.9]
+    assert ends(search(field, scan, at(3.0, 3.0))) == [4.0, 11.4]
 
 
 def test_in_open_space_it_goes_on_by_odometry_until_that_is_too_vague(house: SavedMap) -> None:
@@ -177,9 +177,9 @@ def test_a_wall_that_stands_in_the_way_of_beams_counts_against_a_place(house: Sa
     field = field_of(house.cells, house.resolution, (house.origin_x, house.origin_y))
     view = Rooms(HOUSE).view(at(3.0, 2.5))
     free = np.eye(3)
-    here = fit(field, view.scan.points, view.scan.free, view.sensor, at(3.0, 2.5), free)
+    here = fit(field, view.beams, at(3.0, 2.5), free)
     long = np.array([[5.0, -1.5]] * len(view.scan.points), np.float32)  # through the inner wall
-    through = fit(field, view.scan.points, long, view.sensor, at(3.0, 2.5), free)
+    through = fit(field, view.beams._replace(free=long), at(3.0, 2.5), free)
     assert here.score - through.score == pytest.approx(0.5, abs=0.06)
 
 
