@@ -1,21 +1,24 @@
 """`gigabrain why`, `doctor` and `log`: what is wrong, and what to do about it."""
 
-import asyncio
 import time
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
 from gigabrain_zenoh import logs
-from gigabrain_zenoh.cli.options import LOCAL, JsonLines, ProcessOrAll, RobotAddress, print_line
+from gigabrain_zenoh.cli.options import (
+    LOCAL,
+    JsonLines,
+    ProcessOrAll,
+    RobotAddress,
+    on_bus,
+    print_line,
+)
 from gigabrain_zenoh.errors import Ambiguous, BusError, ConfigError
-from gigabrain_zenoh.host.signals import run_async, stop_signals
+from gigabrain_zenoh.host.signals import run_async
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from gigabrain_schemas.safety import LogRecord
-    from gigabrain_zenoh.diagnostics.log_reader import Line, LogFilter
+    from gigabrain_zenoh.diagnostics.log_reader import Line
     from gigabrain_zenoh.diagnostics.why import ChainFacts
 
 GRADES = {"ok": "ok  ", "hint": "hint", "bad": "BAD "}
@@ -39,7 +42,7 @@ def why(*, at: RobotAddress = LOCAL, json: bool = False) -> int:
 
     from gigabrain_zenoh.diagnostics.why import judge
 
-    verdict = judge(run_async(_chain_facts(at)))
+    verdict = judge(_chain_facts(at))
     broken, waits = verdict.broken, verdict.waits
     if json:
         summary = {
@@ -66,14 +69,11 @@ def why(*, at: RobotAddress = LOCAL, json: bool = False) -> int:
     return verdict.exit_code
 
 
-async def _chain_facts(at: RobotAddress) -> "ChainFacts":
-    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME
+def _chain_facts(at: RobotAddress) -> "ChainFacts":
     from gigabrain_zenoh.diagnostics.why import ChainFacts, ChainWatcher
-    from gigabrain_zenoh.runtime.connect import joined
 
     try:
-        async with joined(at.where(), CLIENT_NAME) as (bus, _):
-            return await ChainWatcher(bus).collect()
+        return on_bus(at, lambda bus: ChainWatcher(bus).collect())
     except Ambiguous:  # no link is broken: the robot is not chosen
         raise
     except BusError as error:
@@ -133,7 +133,13 @@ def log(
         newest: Number of lines.
         follow: Continue with new lines, of level info and above.
     """
-    from gigabrain_zenoh.diagnostics.log_reader import LogFilter, ago_ns, read, run_folder
+    from gigabrain_zenoh.diagnostics.log_reader import (
+        LogFilter,
+        ago_ns,
+        follow_log,
+        read,
+        run_folder,
+    )
 
     if not 0 < newest <= MAX_LINES:
         raise ConfigError(f"--newest: expected 1 to {MAX_LINES}, got {newest}")
@@ -151,26 +157,4 @@ def log(
         for line in read(run_folder(run), wanted, newest):
             show(line)
     if follow:
-        run_async(_follow(at, wanted, show))
-
-
-async def _follow(at: RobotAddress, wanted: "LogFilter", show: "Callable[[Line], None]") -> None:
-    from gigabrain_schemas.topics import LOG
-    from gigabrain_zenoh.diagnostics.listener import CLIENT_NAME, stop_on_broken_pipe
-    from gigabrain_zenoh.diagnostics.log_reader import as_line
-    from gigabrain_zenoh.runtime.connect import joined
-
-    async with joined(at.where(), CLIENT_NAME) as (bus, _):
-
-        def receive(_key: str, record: "LogRecord") -> None:
-            line = as_line(record)
-            if wanted.accepts(line):
-                show(line)
-
-        bus.subscribe(LOG, receive)
-        with stop_signals() as stop, stop_on_broken_pipe(stop):
-            stopped = asyncio.ensure_future(stop.wait())
-            await asyncio.wait((stopped, bus.failed), return_when=asyncio.FIRST_COMPLETED)
-            stopped.cancel()
-        if bus.failed.done():
-            bus.failed.result()  # raises, as where the reader of the pipe is gone
+        on_bus(at, lambda bus: follow_log(bus, wanted, show))

@@ -17,7 +17,6 @@ from gigabrain_zenoh.cli.options import (
     print_table,
 )
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Refused, unknown
-from gigabrain_zenoh.host.signals import stop_signals
 
 if TYPE_CHECKING:
     from gigabrain_schemas.requests import ParamReply
@@ -126,19 +125,10 @@ def top(*, at: RobotAddress = LOCAL, once: bool = False) -> None:
 
 async def _watch(feed: "Feed") -> None:
     try:
-        from gigabrain_zenoh.diagnostics.top_app import TopApp
+        from gigabrain_zenoh.diagnostics.top_app import watch
     except ModuleNotFoundError as error:
         raise ConfigError(f"{error}; {INSTALL_TOP}") from None
-    app = TopApp(feed)
-    with stop_signals() as stop:
-        running = asyncio.ensure_future(app.run_async())
-        stopped = asyncio.ensure_future(stop.wait())
-        await asyncio.wait((running, stopped), return_when=asyncio.FIRST_COMPLETED)
-        stopped.cancel()
-        while not running.done():  # Textual shows a traceback if cancelled while it starts
-            app.exit()
-            await asyncio.wait((running,), timeout=0.1)
-        running.result()
+    await watch(feed)
 
 
 async def _print_once(feed: "Feed") -> None:

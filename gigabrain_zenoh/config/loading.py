@@ -315,9 +315,12 @@ def _error(source: str, line: int, text: str) -> ConfigError:
 
 
 def _nearest(path: Path) -> str:
-    names = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-    close = difflib.get_close_matches(path.name, names, 1)
-    return f"; did you mean '{path.with_name(close[0])}'?" if close else "; expected a YAML file"
+    there = path.parent.iterdir() if path.parent.is_dir() else ()
+    names = {each.stem: each.name for each in there}
+    close = difflib.get_close_matches(path.stem, names, 1)
+    if not close:
+        return "; expected a YAML file"
+    return f"; did you mean '{path.with_name(names[close[0]])}'?"
 
 
 def located(path: Path, error: ConfigError) -> ConfigError:

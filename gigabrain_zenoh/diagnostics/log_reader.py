@@ -1,18 +1,23 @@
 """Reads the logs of a run from its files, and those on the bus in the same form."""
 
+import asyncio
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from gigabrain_schemas.safety import LogRecord
+from gigabrain_schemas.topics import LOG
+from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.codec import DECODE_ERRORS
+from gigabrain_zenoh.diagnostics.listener import stop_on_broken_pipe
 from gigabrain_zenoh.errors import ConfigError, unknown
 from gigabrain_zenoh.host.files import open_regular
 from gigabrain_zenoh.host.run_folders import state_dir
+from gigabrain_zenoh.host.signals import stop_signals
 from gigabrain_zenoh.logs import FILE_BYTES, LEVELS
 
 LOG_FILES = "*.jsonl*"  # driver.jsonl, and the older driver.jsonl.1
@@ -112,3 +117,20 @@ def as_line(record: LogRecord) -> Line:
         "text": record.text,
     }
     return known | {name: value for name, value in record.data.items() if name not in known}
+
+
+async def follow_log(bus: Bus, wanted: LogFilter, show: Callable[[Line], None]) -> None:
+    """Pass new lines to `show`, until a signal or until the reader of stdout is gone."""
+
+    def receive(_key: str, record: LogRecord) -> None:
+        line = as_line(record)
+        if wanted.accepts(line):
+            show(line)
+
+    bus.subscribe(LOG, receive)
+    with stop_signals() as stop, stop_on_broken_pipe(stop):
+        stopped = asyncio.ensure_future(stop.wait())
+        await asyncio.wait((stopped, bus.failed), return_when=asyncio.FIRST_COMPLETED)
+        stopped.cancel()
+    if bus.failed.done():
+        bus.failed.result()  # raises, as where the reader of the pipe is gone

@@ -1,5 +1,6 @@
 """`gigabrain top` in the terminal: two tables, refreshed once a second."""
 
+import asyncio
 from typing import ClassVar
 
 from rich.text import Text
@@ -16,6 +17,7 @@ from gigabrain_zenoh.diagnostics.top import (
     cell_text,
     sorted_rows,
 )
+from gigabrain_zenoh.host.signals import stop_signals
 
 PERIOD_S = 1.0
 COLUMNS = {"processes": PROCESS_COLUMNS, "topics": TOPIC_COLUMNS}
@@ -123,3 +125,17 @@ class TopApp(App[None]):
 
 def _text(cell: Cell) -> Text:
     return Text(cell_text(cell), justify="left" if isinstance(cell, str) else "right")
+
+
+async def watch(feed: Feed) -> None:
+    """Show the tables until the user quits, or a signal."""
+    app = TopApp(feed)
+    with stop_signals() as stop:
+        running = asyncio.ensure_future(app.run_async())
+        stopped = asyncio.ensure_future(stop.wait())
+        await asyncio.wait((running, stopped), return_when=asyncio.FIRST_COMPLETED)
+        stopped.cancel()
+        while not running.done():  # Textual shows a traceback if cancelled while it starts
+            app.exit()
+            await asyncio.wait((running,), timeout=0.1)
+        running.result()

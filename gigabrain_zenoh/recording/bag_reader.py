@@ -148,7 +148,7 @@ def check_magic(path: Path) -> None:
         version = head[5:6].decode("ascii", "replace")
         raise ConfigError(f"{path} is MCAP of version {version}; version 0 can be read")
     if head != MAGIC:
-        raise ConfigError(f"{path} is not a bag (MCAP)")
+        raise ConfigError(f"{path}: not a recording; expected an MCAP file")
 
 
 def read_records(path: Path) -> Iterator[McapRecord | BagDamage | BagEnd]:

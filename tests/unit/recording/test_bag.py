@@ -77,7 +77,7 @@ def test_it_says_what_is_in_it(whole: Path, capsys: pytest.CaptureFixture[str]) 
         "robot/scan", "LaserScan", 100, 10.0,
     )  # fmt: skip
     assert (state.messages, state.hz, state.missing, state.longest_gap_s) == (500, 50.0, 0, 0.02)
-    assert call("bag", "info", str(whole), "--json") == 0
+    assert call("bag", "info", str(whole), "--json") is None
     assert json.loads(capsys.readouterr().out)["keys"][1]["hz"] == 50.0
     assert call("bag", "check", str(whole)) == 0
     assert "complete, 600 messages in 9.981 s" in capsys.readouterr().out
@@ -125,7 +125,7 @@ def test_what_is_no_message_has_an_empty_header(payload: bytes) -> None:
     ("content", "complaint"),
     [
         (b"", "is empty"),
-        (b"PNG and so on", "is not a bag (MCAP)"),
+        (b"PNG and so on", "not a recording; expected an MCAP file"),
         (b"\x89MCAP1\r\n" + bytes(40), "is MCAP of version 1; version 0 can be read"),
     ],
 )
@@ -137,7 +137,7 @@ def test_a_file_that_is_no_bag_is_refused_in_one_line(
     for command in (["info"], ["check"], ["recover"], ["plot", "state.pose.x"]):
         with pytest.raises(ConfigError, match=r"^[^\n]+$") as error:
             call("bag", command[0], str(path), *command[1:])
-        assert str(error.value) == f"{path} {complaint}"
+        assert str(error.value).endswith(complaint)
     with pytest.raises(ConfigError, match=r"cannot read .*: No such file"):
         call("bag", "info", str(tmp_path / "none.mcap"))
 
@@ -300,7 +300,7 @@ def test_every_schema_is_flat_enough_for_the_viewers(topic: object) -> None:
 
 
 def test_tables_have_a_row_per_message(whole: Path, tmp_path: Path) -> None:
-    assert call("bag", "convert", str(whole), "--csv", str(tmp_path / "csv")) == 0
+    assert call("bag", "convert", str(whole), "--csv", str(tmp_path / "csv")) is None
     rows = (tmp_path / "csv" / "robot_state.csv").read_text().splitlines()
     assert len(rows) == 501
     names, first = rows[0].split(","), rows[1].split(",")
@@ -313,7 +313,9 @@ def test_a_plot_is_a_picture_and_an_unknown_field_names_the_nearest(
     whole: Path, tmp_path: Path
 ) -> None:
     picture = tmp_path / "p.png"
-    assert call("bag", "plot", str(whole), "robot/state.velocity.linear_x", "-o", str(picture)) == 0
+    assert (
+        call("bag", "plot", str(whole), "robot/state.velocity.linear_x", "-o", str(picture)) is None
+    )
     assert picture.read_bytes()[:4] == b"\x89PNG"
     with pytest.raises(ConfigError, match=r"did you mean 'state.velocity.linear_y'\?"):
         call("bag", "plot", str(whole), "state.velocity.linear_z")
