@@ -18,12 +18,12 @@ from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.kinematics.legs import WALKER, Gait
 from gigabrain_drivers.kinematics.wheels import Twist, base_of
+from gigabrain_drivers.sim import STEP_S, Pace
 from gigabrain_drivers.sim.body import SimLidar
 from gigabrain_drivers.sim.locomotion import Charge, Motor, OdometryReading
 from gigabrain_drivers.sim.physics import Simulation, account_of
 from gigabrain_drivers.sim.scene import ROBOT
 from gigabrain_drivers.sim.sensors import ImuSample, Lidar
-from gigabrain_drivers.sim.tick import TICK_S, Pace
 from gigabrain_drivers.sim.world import Stream, generator
 from gigabrain_zenoh.errors import BodyLost
 
@@ -140,7 +140,7 @@ class EmulatedBody:
 
     def _work(self) -> None:
         began = time.thread_time()
-        self._pace = pace = Pace(TICK_S)
+        self._pace = pace = Pace(STEP_S)
         while not self._halt.is_set():
             pace.wait()
             try:
@@ -289,7 +289,7 @@ class Sweep:
         rate_hz, turn_hz, samples = self._rate_hz, self.turn_hz, self._samples
         if not rate_hz or not turn_hz:
             return
-        self._due += rate_hz * TICK_S
+        self._due += rate_hz * STEP_S
         count = int(self._due)
         self._due -= count
         step = 360 * turn_hz / rate_hz

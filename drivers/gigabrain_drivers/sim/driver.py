@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
+from gigabrain_drivers.sim import STEP_NS, STEP_S, Pace
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_drivers.sim.physics import Simulation, account_of
-from gigabrain_drivers.sim.tick import TICK_NS as STEP_NS
-from gigabrain_drivers.sim.tick import Pace
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
@@ -29,7 +28,6 @@ from gigabrain_zenoh.errors import BodyLost, ConfigError
 
 T = TypeVar("T")
 STEPS = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
-STEP_S = STEP_NS / 1e9
 DEAD_MAN_NS = 150_000_000  # of simulated time: as long as a firmware would wait
 SPEEDS = (0.1, 100.0)
 

@@ -11,10 +11,10 @@ import numpy as np
 from gigabrain_drivers.kinematics.legs import JOINT_NAMES, LEGS, Gait, Senses, Vector
 from gigabrain_drivers.kinematics.trot import Trot
 from gigabrain_drivers.kinematics.wheels import Differential, Twist
+from gigabrain_drivers.sim import STEP_S
 from gigabrain_drivers.sim.body import SimBattery, SimBody, SimMotor, SimQuadruped
 from gigabrain_drivers.sim.scene import ROBOT
 from gigabrain_drivers.sim.sensors import ImuSample
-from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_zenoh.errors import Unsupported
 
 HOUR_S = 3600.0
@@ -42,7 +42,7 @@ class Battery:
     def drain(self, drive_current: float) -> None:
         """Take one tick of `drive_current` [A] and the idle current out of it."""
         self._current = self._config.idle_current_a + drive_current
-        self._left_ah = max(self._left_ah - self._current * TICK_S / HOUR_S, 0.0)
+        self._left_ah = max(self._left_ah - self._current * STEP_S / HOUR_S, 0.0)
 
     def read(self) -> Charge:
         """What the board reports now."""
@@ -71,7 +71,7 @@ class MotorHeat:
         current = free_current + abs(torque) / config.torque_per_ampere
         cooling = (self.celsius - config.ambient_celsius) / config.thermal_resistance
         power = current * current * config.resistance_ohm - cooling
-        self.celsius += power * TICK_S / config.heat_capacity
+        self.celsius += power * STEP_S / config.heat_capacity
         return current
 
 
@@ -171,7 +171,7 @@ class Rolling(Locomotion):
 
     def act(self) -> None:
         """Set the wheel speeds of the next tick."""
-        step = self._body.max_wheel_acceleration * TICK_S
+        step = self._body.max_wheel_acceleration * STEP_S
         (left, right), (left_now, right_now) = self._target, self._speed
         self._speed = (
             left_now + min(max(left - left_now, -step), step),
@@ -237,7 +237,7 @@ class Rolling(Locomotion):
     def _speeds(self, per_tick: float) -> tuple[float, float]:
         """The speed of both wheels, in units of `per_tick` a second."""
         (left, right), (left_then, right_then) = self._counts, self._past[0]
-        per_second = per_tick / (VELOCITY_TICKS * TICK_S)
+        per_second = per_tick / (VELOCITY_TICKS * STEP_S)
         return (left - left_then) * per_second, (right - right_then) * per_second
 
 
@@ -281,7 +281,7 @@ class Walking(Locomotion):
     def act(self) -> None:
         """Where the servos shall be at the end of the tick."""
         if self._senses:
-            self._targets = self._trot.step(self._gait, self._senses, TICK_S)
+            self._targets = self._trot.step(self._gait, self._senses, STEP_S)
         self._data.ctrl[self._motors] = _flat(self._targets)
 
     def sense(self, imu: ImuSample) -> None:
@@ -289,7 +289,7 @@ class Walking(Locomotion):
         angles = self._data.qpos[self._angles].tolist()
         counts = [round(angle / self._radians) for angle in angles]
         steps = zip(counts, self._counts, strict=True)
-        rates = [(now - before) * self._radians / TICK_S for now, before in steps]
+        rates = [(now - before) * self._radians / STEP_S for now, before in steps]
         self._counts = counts
         forces = self._data.sensordata[self._touch].tolist()
         self._senses = Senses(
@@ -300,8 +300,8 @@ class Walking(Locomotion):
             angular_velocity=imu.angular_velocity,
             linear_acceleration=imu.linear_acceleration,
         )
-        self._trot.sense(self._senses, TICK_S)
-        self._turned += self._trot.odometry.velocity.angular_z * TICK_S
+        self._trot.sense(self._senses, STEP_S)
+        self._turned += self._trot.odometry.velocity.angular_z * STEP_S
 
     def wear(self) -> float:
         """Torque heats the windings; what the joints do to the world comes on top."""

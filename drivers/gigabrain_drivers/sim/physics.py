@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.kinematics.legs import Gait
 from gigabrain_drivers.kinematics.wheels import Twist
+from gigabrain_drivers.sim import STEP_NS
 from gigabrain_drivers.sim.body import (
     SimBody,
     SimModel,
@@ -25,7 +26,6 @@ from gigabrain_drivers.sim.locomotion import (
 )
 from gigabrain_drivers.sim.scene import PERSON, ROBOT, Person, compile_scene, yaw_quaternion
 from gigabrain_drivers.sim.sensors import Imu, ImuSample, Lidar
-from gigabrain_drivers.sim.tick import TICK_NS
 from gigabrain_drivers.sim.truth import Truth
 from gigabrain_drivers.sim.world import ClosedPath, Stream, World, generator
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
@@ -57,7 +57,7 @@ class Simulation:
     @property
     def time_ns(self) -> int:
         """Simulated time since the start."""
-        return self._ticks * TICK_NS
+        return self._ticks * STEP_NS
 
     @property
     def person_stood(self) -> int:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import mujoco
 
+from gigabrain_drivers.sim import STEP_S
 from gigabrain_drivers.sim.body import SimBody, SimModel
-from gigabrain_drivers.sim.tick import TICK_S
 from gigabrain_drivers.sim.world import Box, ClosedPath, Pose, Shape, World
 from gigabrain_zenoh.errors import ConfigError
 
@@ -96,12 +96,12 @@ class Person:
 
     def advance(self, robot_distance: Callable[[float, float], float]) -> Pose:
         """Walk for one tick; `robot_distance(x, y)` is from a point to the robot's edge [m]."""
-        walked = (self._walked + SPEED * TICK_S) % self._path.length
+        walked = (self._walked + SPEED * STEP_S) % self._path.length
         ahead = self._path.at(walked)
         gap = robot_distance(ahead.x, ahead.y)
         if gap >= KEEP_AWAY_M + RADIUS_M or gap > robot_distance(self.pose.x, self.pose.y):
             self._walked, self.pose = walked, ahead
-            self._since_m += SPEED * TICK_S
+            self._since_m += SPEED * STEP_S
         else:
             self.stood += self._since_m >= ANEW_M
             self._since_m = 0.0
@@ -112,7 +112,7 @@ def compile_scene(body: SimModel, world: World) -> mujoco.MjModel:
     """The model of `body` at the start of `world`. Raises ConfigError for a bad robot model."""
     mujoco.set_mju_user_warning(log.warning)  # instead of a file
     spec = world_spec(world)
-    spec.option.timestep = TICK_S / body.substeps
+    spec.option.timestep = STEP_S / body.substeps
     start = world.start
     try:
         robot = _robot_spec(body)

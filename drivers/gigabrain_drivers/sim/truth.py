@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_drivers.sim import STEP_NS
 from gigabrain_drivers.sim.scene import FLOOR, ROBOT
-from gigabrain_drivers.sim.tick import TICK_NS
 from gigabrain_drivers.sim.world import Footprint, Pose
 
-APART_TICKS = 500_000_000 // TICK_NS  # contact again after half a second is a new contact
-CLEARANCE_TICKS = 100_000_000 // TICK_NS
+APART_TICKS = 500_000_000 // STEP_NS  # contact again after half a second is a new contact
+CLEARANCE_TICKS = 100_000_000 // STEP_NS
 FAR_M = 10.0  # clearances beyond this are not told apart
 
 

@@ -9,7 +9,7 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
 from gigabrain_drivers.lidars.base import ScanSource, carry
 from gigabrain_schemas.arrays import ranges_bytes
-from gigabrain_schemas.base import TICK_NS, Pose, Velocity
+from gigabrain_schemas.base import TICK_NS, TICK_S, Pose, Velocity
 from gigabrain_schemas.body import Battery, RobotState
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.topics import SCAN
@@ -17,7 +17,6 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost
 from gigabrain_zenoh.geometry.limits import ZERO
 
-TICK_S = TICK_NS / 1e9
 ROOM_M = 3.0  # distance to the wall all round
 
 
