@@ -5,7 +5,11 @@ import pytest
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
 from gigabrain_drivers.lidars.rplidar.emulator import RplidarDevice
 from gigabrain_drivers.lidars.rplidar.protocol import EXPRESS, STANDARD, Info, RplidarDecoder
-from gigabrain_drivers.lidars.rplidar.source import RplidarOptions, Trouble, choose
+from gigabrain_drivers.lidars.rplidar.source import (
+    RplidarOptions,
+    StartupError,
+    choose_mode,
+)
 from tests.system.lidars import Wire, run_for, waffle
 
 
@@ -89,12 +93,12 @@ async def test_the_scan_mode_is_one_that_both_sides_know(
 ) -> None:
     info = Info(model, firmware, 7, "00" * 16)
 
-    assert await choose(Scripted(2, A1_MODES), info, scan_mode) == expected
+    assert await choose_mode(Scripted(2, A1_MODES), info, scan_mode) == expected
 
 
 @pytest.mark.parametrize("firmware", [(1, 29), (1, 20)])
 async def test_a_scan_mode_that_the_lidar_has_not_is_refused(firmware: tuple[int, int]) -> None:
     info = Info(0x18, firmware, 7, "00" * 16)
 
-    with pytest.raises(Trouble, match="no scan_mode 'dense'"):
-        await choose(Scripted(2, A1_MODES), info, "dense")
+    with pytest.raises(StartupError, match="no scan_mode 'dense'"):
+        await choose_mode(Scripted(2, A1_MODES), info, "dense")

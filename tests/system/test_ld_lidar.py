@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.emulators.faults import NONE, Faults
-from gigabrain_drivers.lidars.base import Turn, scan_of
+from gigabrain_drivers.lidars.base import SampleBuffer, scan_of
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.ld.emulator import LdDevice
 from gigabrain_drivers.lidars.ld.source import Ld19
@@ -38,11 +38,11 @@ def test_a_bin_holds_its_nearest_sample_inf_without_a_return_and_nan_without_a_s
 
 
 def test_clockwise_degrees_become_counter_clockwise_bins() -> None:
-    turn = Turn(SMALL)
-    turn.clockwise([0.0], [1000], 0, 0)
-    turn.clockwise([90.0], [2000], None, 40 * MS)
-    turn.clockwise([270.0], [2500], None, 80 * MS)
-    scan = turn.clockwise([0.0], [1000], 0, 100 * MS)
+    turn = SampleBuffer(SMALL)
+    turn.add_samples([0.0], [1000], 0, 0)
+    turn.add_samples([90.0], [2000], None, 40 * MS)
+    turn.add_samples([270.0], [2500], None, 80 * MS)
+    scan = turn.add_samples([0.0], [1000], 0, 100 * MS)
 
     assert scan is not None
     got = ranges(scan)
@@ -50,33 +50,33 @@ def test_clockwise_degrees_become_counter_clockwise_bins() -> None:
 
 
 def test_a_turn_whose_start_was_not_seen_is_no_scan() -> None:
-    turn = Turn(SMALL)
-    turn.clockwise([90.0], [2000], None, 0)
+    turn = SampleBuffer(SMALL)
+    turn.add_samples([90.0], [2000], None, 0)
 
-    assert turn.clockwise([0.0], [1000], 0, 50 * MS) is None
+    assert turn.add_samples([0.0], [1000], 0, 50 * MS) is None
 
 
 @pytest.mark.parametrize("took_ms", [20, 301])
 def test_a_turn_that_came_too_fast_or_too_slowly_to_be_true_is_no_scan(took_ms: int) -> None:
-    turn = Turn(SMALL)
+    turn = SampleBuffer(SMALL)
     for n in range(5):
-        turn.clockwise([30.0 * n], [1000], None if n else 0, n * took_ms * MS // 5)
+        turn.add_samples([30.0 * n], [1000], None if n else 0, n * took_ms * MS // 5)
 
-    assert turn.clockwise([0.0], [1000], 0, took_ms * MS) is None
+    assert turn.add_samples([0.0], [1000], 0, took_ms * MS) is None
 
 
 def test_what_came_before_a_turn_of_silence_is_forgotten() -> None:
-    turn = Turn(SMALL)
-    turn.clockwise([0.0], [1000], 0, 0)
-    turn.clockwise([200.0], [1000], None, 101 * MS)
+    turn = SampleBuffer(SMALL)
+    turn.add_samples([0.0], [1000], 0, 0)
+    turn.add_samples([200.0], [1000], None, 101 * MS)
 
-    assert turn.clockwise([0.0], [1000], 0, 150 * MS) is None
+    assert turn.add_samples([0.0], [1000], 0, 150 * MS) is None
 
 
 def test_a_lidar_that_never_ends_a_turn_does_not_fill_the_memory() -> None:
-    turn, most = Turn(SMALL), 0
+    turn, most = SampleBuffer(SMALL), 0
     for n in range(3000):
-        turn.clockwise([1.0] * 12, [1000] * 12, None, n * MS)
+        turn.add_samples([1.0] * 12, [1000] * 12, None, n * MS)
         most = max(most, sum(len(angles) for angles, _ in turn._pieces))
 
     assert most <= 20_000

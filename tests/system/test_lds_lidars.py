@@ -11,7 +11,7 @@ from gigabrain_drivers.emulators.base import Device
 from gigabrain_drivers.emulators.faults import NONE, Faults
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.ld.emulator import Lds02Device, lens_distance
-from gigabrain_drivers.lidars.ld.source import Lds02, from_axis
+from gigabrain_drivers.lidars.ld.source import Lds02, seen_from_axis
 from gigabrain_drivers.lidars.lds import lds01, lds03
 from gigabrain_drivers.lidars.lds.emulator import Lds01Device, Lds03Device
 from gigabrain_drivers.lidars.lds.lds01 import Lds01
@@ -69,26 +69,26 @@ def test_lds01s_last_sample_looks_ahead_and_the_ones_before_to_the_right() -> No
     [(1000, (-5.6258, 1010.77)), (200, (-1.0300, 205.93)), (8000, (-6.6522, 8060.16))],
 )
 def test_lds02_is_corrected_as_the_vendor_does(distance: int, seen: tuple[float, float]) -> None:
-    angles, distances = from_axis(np.array([0.0, 90.0]), np.array([distance, distance]))
+    angles, distances = seen_from_axis(np.array([0.0, 90.0]), np.array([distance, distance]))
     assert angles == pytest.approx([seen[0], 90 + seen[0]], abs=0.01)
     assert distances == pytest.approx([seen[1]] * 2, abs=0.01)
 
 
 def test_no_return_is_left_where_it_is() -> None:
-    angles, distances = from_axis(np.array([12.0]), np.array([0.0]))
+    angles, distances = seen_from_axis(np.array([12.0]), np.array([0.0]))
     assert (angles, distances) == ([12.0], [0.0])
 
 
 @pytest.mark.parametrize("distance", [200.0, 1000.0, 8000.0])
 def test_the_emulated_lens_is_the_corrections_other_side(distance: float) -> None:
-    _, distances = from_axis(np.array([0.0]), np.array([lens_distance(distance)]))
+    _, distances = seen_from_axis(np.array([0.0]), np.array([lens_distance(distance)]))
     assert distances == pytest.approx([distance])
 
 
 def test_lds02_frames_are_ld_frames_with_the_correction() -> None:
     frame = ld.LdFrame(3600, 0, 1100, (1000,) * 6 + (0,) * 6, (200,) * 12, 0)
     lidar = Lds02(options(), COARSE, FakeClock())
-    angles, distances = lidar.place(*ld.points(ld.encode(frame)))
+    angles, distances = lidar.to_axis(*ld.points(ld.encode(frame)))
     assert angles[:2] == pytest.approx([-5.626, -4.626], abs=1e-3)
     assert angles[6] == 6.0
     assert distances == pytest.approx([1010.77] * 6 + [0] * 6, abs=0.01)

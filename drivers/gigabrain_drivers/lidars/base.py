@@ -1,4 +1,4 @@
-"""What every lidar on a line of its own offers, and how a body carries one."""
+"""The base of every lidar on a line of its own, how a body carries one, and its scans."""
 
 import abc
 import itertools
@@ -28,11 +28,11 @@ SHORTEST, LONGEST = 0.25, 3.0  # of the nominal period; less is a backlog, more 
 
 
 class ScanSource(abc.ABC):
-    """A lidar that hands over one LaserScan per turn, as the body's file describes it.
+    """A lidar that emits one LaserScan per turn, as the body's file describes it.
 
     Scans run counter-clockwise in `lidar.beams` equal bins, bin 0 around straight ahead: inf where
-    the sensor saw no return, nan where it measured nothing. A source whose line is down goes on
-    trying for ever; nothing that comes out of it raises.
+    the sensor saw no return, nan where it measured nothing. A source whose line is down keeps on
+    trying; it never raises.
     """
 
     Options: ClassVar[type[ScanOptions]] = ScanOptions  # its part of a robot's file
@@ -45,21 +45,21 @@ class ScanSource(abc.ABC):
 
     @abc.abstractmethod
     def open(self) -> None:
-        """Start; returns at once and connects in the background. Needs a running event loop."""
+        """Start connecting in the background. Needs a running event loop."""
 
     @abc.abstractmethod
     async def close(self) -> None:
-        """Let the lidar come to rest and free its port; any number of times, in any state."""
+        """Bring the lidar to rest and free its port; any number of times, in any state."""
 
     @property
     @abc.abstractmethod
     def health(self) -> LinkHealth:
-        """How the line to the lidar is doing."""
+        """The state of the line to the lidar."""
 
     @property
     @abc.abstractmethod
     def problem(self) -> str:
-        """In one line why there are no scans, or an empty text."""
+        """The reason in one line why there are no scans, or an empty text."""
 
 
 def source_class(name: str) -> type[ScanSource]:
@@ -72,7 +72,7 @@ def source_class(name: str) -> type[ScanSource]:
 
 
 def check_turns(name: str, lidar: Lidar | None) -> None:
-    """Raise ConfigError where the lidar called `name` cannot make the turns that `lidar` says."""
+    """Raise ConfigError where the lidar called `name` cannot make the turns of `lidar`."""
     source = source_class(name)
     turns_hz, samples_hz = source.turns_hz, source.samples_hz
     if lidar and turns_hz and lidar.rate_hz != turns_hz:
@@ -113,7 +113,7 @@ def carry(driver: Driver, clock: Clock) -> ScanSource | None:
     return source
 
 
-class Gathered(abc.ABC, Generic[Piece]):
+class TurnBuffer(abc.ABC, Generic[Piece]):
     """The turn that is being measured, in the pieces that came. Its size is bounded."""
 
     def __init__(self, lidar: Lidar) -> None:
@@ -129,15 +129,15 @@ class Gathered(abc.ABC, Generic[Piece]):
         """
 
     def clear(self) -> None:
-        """Forget what was gathered."""
+        """Drop what was gathered."""
         self._pieces: list[Piece] = []
         self._count = self._began_ns = self._last_ns = 0
         self._whole = False  # whether it was seen from its start
 
     def add(self, piece: Piece, count: int, now_ns: int) -> None:
-        """So many samples more.
+        """Add a piece with `count` samples.
 
-        After a whole turn of silence what was gathered before it is forgotten.
+        After a whole turn of silence what was gathered before is dropped.
         """
         silent = self._count and now_ns - self._last_ns > self._period_ns
         if silent or self._count + count > MOST_SAMPLES:
@@ -149,7 +149,7 @@ class Gathered(abc.ABC, Generic[Piece]):
         self._count += count
 
     def finish(self, now_ns: int) -> LaserScan | None:
-        """The scan of the turn that ends here; a new one begins.
+        """Return the scan of the turn that ends here; a new one begins.
 
         None when its start was not seen, and when its bytes came faster or slower than a lidar
         turns: a process that was held up gets what waited in the port at once, and that is old.
@@ -165,8 +165,8 @@ class Gathered(abc.ABC, Generic[Piece]):
         return scan_of(self._lidar, angles * CLOCKWISE, ranges)
 
 
-class Turn(Gathered[tuple[Sequence[float], Sequence[float]]]):
-    """Of a lidar whose samples come as numbers: angles [deg] clockwise, and distances [mm]."""
+class SampleBuffer(TurnBuffer[tuple[Sequence[float], Sequence[float]]]):
+    """A turn of samples as numbers: angles [deg] clockwise, and distances [mm]."""
 
     def unpack(
         self, pieces: list[tuple[Sequence[float], Sequence[float]]]
@@ -175,14 +175,14 @@ class Turn(Gathered[tuple[Sequence[float], Sequence[float]]]):
         angles, distances = map(itertools.chain.from_iterable, zip(*pieces, strict=True))
         return np.fromiter(angles, np.float64), np.fromiter(distances, np.float64)
 
-    def clockwise(
+    def add_samples(
         self,
         angles_deg: Sequence[float],
         distances_mm: Sequence[float],
         turn_at: int | None,
         now_ns: int,
     ) -> LaserScan | None:
-        """Samples (n,) of a lidar that turns clockwise and says 0 mm where there was no return.
+        """Add samples (n,) of a lidar that turns clockwise and sends 0 mm for no return.
 
         `turn_at` is the index of the first that belongs to a new turn; the scan of the turn that
         ends there is returned.
@@ -199,12 +199,10 @@ class Turn(Gathered[tuple[Sequence[float], Sequence[float]]]):
 
 
 def scan_of(lidar: Lidar, angles: ArrayLike, ranges: ArrayLike) -> LaserScan:
-    """One scan of samples (n,) at `angles` [rad] with `ranges` [m], inf where there was no return.
+    """Return one scan of samples (n,) at `angles` [rad] with `ranges` [m], inf for no return.
 
-    Of samples that share a bin the nearest counts.
-
-    Beyond `range_max` counts as no return; nearer than `range_min`, as in the simulation, as being
-    at `range_min`, which is never free space.
+    Of samples that share a bin the nearest counts. Beyond `range_max` counts as no return; nearer
+    than `range_min`, as in the simulation, as being at `range_min`, which is never free space.
     """
     increment = math.tau / lidar.beams
     index = np.rint(np.asarray(angles) / increment).astype(np.intp) % lidar.beams

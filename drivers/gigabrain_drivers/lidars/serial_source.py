@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Protocol
 
 import serial
 
-from gigabrain_drivers.lidars.base import ScanSource, Turn
+from gigabrain_drivers.lidars.base import SampleBuffer, ScanSource
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.links.serial_link import SerialLink
 from gigabrain_schemas.body import Lidar, LinkHealth
@@ -29,8 +29,8 @@ LAST_WORDS_S = 0.02
 NEWEST = 256  # bytes, kept to say what else may be sending there
 
 
-def who_sends(data: bytes) -> str:
-    """Which known lidar sends such bytes, or an empty text."""
+def identify_lidar(data: bytes) -> str:
+    """Return the known lidar that sends such bytes, or an empty text."""
     if ld.LdDecoder().feed(data):
         return "an LDROBOT lidar (ld06, ld19, lds02)"
     if _LDS01.search(data):
@@ -67,7 +67,7 @@ class SerialSource(ScanSource):
         self.understood = False
         self.link = SerialLink(options.port, baud, clock, probe=self.probe)
         self.link.on_bytes, self.link.on_open = self._on_bytes, self._on_open
-        self.turn = Turn(lidar)
+        self.turn = SampleBuffer(lidar)
         self._newest = b""
         self._scan_ns = self._opened_ns = 0
         self._problem = ""
@@ -75,18 +75,18 @@ class SerialSource(ScanSource):
 
     @abc.abstractmethod
     def received(self, data: bytes) -> None:
-        """Bytes have come."""
+        """Handle bytes from the lidar."""
 
     @abc.abstractmethod
     def connected(self) -> None:
-        """The port was opened, for the first time or again: nothing from before counts."""
+        """Prepare for a newly opened port: nothing from before counts."""
 
     @abc.abstractmethod
     def probe(self, port: serial.Serial) -> bool:
-        """Whether the right lidar is on this port. Runs in a thread; may raise OSError."""
+        """Return whether the right lidar is on this port. In a thread; may raise OSError."""
 
     def open(self) -> None:
-        """Connect in the background, for ever."""
+        """Connect in the background."""
         if self._task is None:
             self._scan_ns = self._opened_ns = self.clock.now_ns()
             self._problem = ""
@@ -94,19 +94,19 @@ class SerialSource(ScanSource):
             self._task = asyncio.create_task(self.run(), name=self.name)
 
     async def close(self) -> None:
-        """Free the port."""
+        """Bring the lidar to rest and free the port."""
         task, self._task = self._task, None
         if task:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await task
-        if self.link.connected and self.farewell():
+        if self.link.connected and self.send_stop():
             await asyncio.sleep(LAST_WORDS_S)  # closing throws away what is not sent by then
         await self.link.close()
 
     @property
     def health(self) -> LinkHealth:
-        """The line's; connected means that scans come."""
+        """The line's state; connected means that scans come."""
         line = self.link.health
         return LinkHealth(
             connected=line.connected and not self.problem,
@@ -117,53 +117,53 @@ class SerialSource(ScanSource):
 
     @property
     def problem(self) -> str:
-        """Why there are no scans; empty while they come, and for two seconds without."""
+        """The reason why there are no scans; empty while they come, and for 2 s without."""
         return self._problem
 
     async def run(self) -> None:
-        """Look after it until cancelled."""
+        """Watch the line until cancelled."""
         async for now_ns in self.clock.every(LOOK_NS):
-            self.look(now_ns)
+            self.watch_scans(now_ns)
             if self.link.connected and now_ns - max(self._scan_ns, self._opened_ns) > REOPEN_NS:
                 self._opened_ns = now_ns
                 self.link.drop(self._problem)
 
-    def look(self, now_ns: int) -> None:
-        """Judge whether all is well, and say so when that has changed."""
+    def watch_scans(self, now_ns: int) -> None:
+        """Find out why there are no scans, and log it when that has changed."""
         before = self._problem
         self._problem = ""
         if now_ns - self._scan_ns > PATIENCE_NS:
-            self._problem = self.trouble() if self.link.connected else self.link.problem
+            self._problem = self.explain() if self.link.connected else self.link.problem
         if self._problem and self._problem != before:
             log.warning("%s: %s", self.name, self._problem)
         elif before and not self._problem:
             log.info("%s: scans come again", self.name)
 
-    def trouble(self) -> str:
-        """Why there are no scans though the port is open."""
+    def explain(self) -> str:
+        """Return why there are no scans though the port is open."""
         if not self.understood:
-            return self.no_answer()
+            return self.explain_silence()
         return f"the {self.name} on {self.link} answers, but does not turn"
 
-    def farewell(self) -> bool:
-        """Let the lidar come to rest before its port is closed; whether anything was sent."""
+    def send_stop(self) -> bool:
+        """Send the lidar to rest before its port is closed; return whether bytes were sent."""
         return False
 
-    def no_answer(self) -> str:
-        """What may be wrong where bytes come that make no sense, or none at all."""
+    def explain_silence(self) -> str:
+        """Return what may be wrong where bytes make no sense, or none come at all."""
         where = f"{self.link} at {self.baud} baud"
         if not self._newest:
             return f"nothing comes from {where}: is the {self.name} powered, and wired both ways?"
-        other = self.stranger()
+        other = self.other_lidar()
         guess = f"it looks like {other}" if other else "another lidar, or another baud rate?"
         return f"what comes from {where} is no {self.name}: {guess}"
 
-    def stranger(self) -> str:
-        """Which other lidar sends what comes, or an empty text."""
-        return who_sends(self._newest)
+    def other_lidar(self) -> str:
+        """Return the name of another lidar that sends such bytes, or an empty text."""
+        return identify_lidar(self._newest)
 
-    def finished(self, scan: LaserScan | None) -> None:
-        """A turn has ended; hands its scan on, if it is one."""
+    def emit_scan(self, scan: LaserScan | None) -> None:
+        """Emit the scan of a turn that has ended, if it is one."""
         if scan:
             self._scan_ns = self.clock.now_ns()
             self.emit(scan)

@@ -1,8 +1,8 @@
-"""How late a device's data come, by the stamps of its own clock, or by what it echoes. Pure.
+"""Lateness of a device's data, by the stamps of its own clock or by what it echoes. Pure.
 
-Where the two clocks began does not matter: the quickest data so far show by how much they differ,
-and what comes later than that is late. Lateness that was there from the first byte on cannot be
-seen in this way; what grows by less than MAX_DRIFT cannot be told from two clocks that differ.
+Where the two clocks began does not matter: the quickest data so far show their offset, and what
+comes later than that is late. Lateness that was there from the first byte on cannot be seen; what
+grows by less than MAX_DRIFT cannot be told from two clocks that differ.
 """
 
 from collections import deque
@@ -21,7 +21,7 @@ ENOUGH_SAMPLES = 10
 
 
 class Window:
-    """Keeps what was seen in the last 0.3 s, to give the least of it."""
+    """Keeps the values of the last 0.3 s, to give the least of them."""
 
     def __init__(self) -> None:
         self._seen = deque[tuple[int, float]]()  # when [ns], and what may still be the least
@@ -29,7 +29,7 @@ class Window:
         self.newest = 0.0
 
     def see(self, value: float, now_ns: int) -> None:
-        """Take one more."""
+        """Add a value."""
         if not self._seen or now_ns - self._seen[-1][0] > WINDOW_NS:
             self._began_ns = now_ns
         while self._seen and self._seen[-1][1] >= value:
@@ -48,9 +48,9 @@ class Window:
 
 
 class EchoClock:
-    """How late a device's data come, where they echo the number of the newest message to it.
+    """Lateness of a device that echoes the number of the newest message to it.
 
-    The way there and back counts, beyond `usual_ms`, and also what was late from the start.
+    The round trip beyond `usual_ms` counts, including what was late from the start.
     """
 
     def __init__(self, usual_ms: float) -> None:
@@ -60,15 +60,15 @@ class EchoClock:
 
     @property
     def late_ms(self) -> float:
-        """By how much all echoes of the last 0.3 s were later than usual."""
+        """The delay beyond the usual that all echoes of the last 0.3 s had [ms]."""
         return self._late.least
 
     def sent(self, number: int, now_ns: int) -> None:
-        """A message is on its way."""
+        """Note that a message was sent."""
         self._sent.append((number, now_ns))
 
     def echoed(self, number: int, now_ns: int) -> None:
-        """Data have come that echo this message; only the first of them tell how long it took."""
+        """Note data that echo this message; only the first echo of each is timed."""
         numbers = [waiting for waiting, _ in self._sent]
         if number not in numbers:
             return
@@ -78,10 +78,10 @@ class EchoClock:
 
 
 class DeviceClock:
-    """Takes the stamps of data as they arrive; `wrap_ms` is where the device's count begins anew.
+    """Lateness by the stamps of a device's clock, which wraps at `wrap_ms`.
 
-    Jitter is no lateness: of 0.3 s the quickest data count. While data are late, the clocks are
-    taken to drift as they did before.
+    Jitter does not count: of 0.3 s the quickest data do. While data are late, the clocks are
+    assumed to drift as they did before.
     """
 
     def __init__(self, wrap_ms: int) -> None:
@@ -89,7 +89,7 @@ class DeviceClock:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all: another device, or a new start of the same."""
+        """Start again: another device, or a restart of the same."""
         self._last: tuple[int, int] | None = None  # newest stamp [ms], and when it came [ns]
         self._device_ms = self._floor_ms = 0.0  # the unwrapped count; least offset of the clocks
         self._odd = 0
@@ -98,11 +98,11 @@ class DeviceClock:
 
     @property
     def late_ms(self) -> float:
-        """By how much all data of the last 0.3 s came later than the quickest ones ever."""
+        """The delay of all data of the last 0.3 s against the quickest ever [ms]."""
         return self._excess.least
 
     def arrived(self, stamp_ms: int, now_ns: int) -> None:
-        """Data with this stamp have come."""
+        """Note data with this stamp."""
         if self._last is None:
             self._begin(stamp_ms, now_ns)
             return
@@ -134,7 +134,7 @@ class DeviceClock:
             self._floors.append((now_ns, self._floor_ms))
 
     def _drift(self) -> float:
-        """By how much the device's clock is slower than the host's, as far as that is known."""
+        """The drift of the device's clock against the host's, 0 until it is known."""
         if len(self._floors) < ENOUGH_SAMPLES:
             return 0.0
         (then_ns, then_ms), (now_ns, now_ms) = self._floors[0], self._floors[-1]

@@ -1,4 +1,4 @@
-"""Frames in a stream of bytes: found by binary protocols, and put into words for the log."""
+"""Frames in a stream of bytes: found by binary protocols, and described for the log."""
 
 import abc
 import functools
@@ -32,7 +32,7 @@ def crc_table(polynomial: int, bits: int) -> tuple[int, ...]:
 
 
 class FrameDecoder(abc.ABC, Generic[Frame]):
-    """Finds frames by their header, length and check. `errors` counts stretches that were none.
+    """Finds frames by their header, length and check. `errors` counts skipped stretches.
 
     A broken frame costs no more than itself: the search goes on right behind its header.
     """
@@ -45,12 +45,12 @@ class FrameDecoder(abc.ABC, Generic[Frame]):
         self.errors = 0
 
     def clear(self) -> None:
-        """Forget what has begun to come in."""
+        """Forget a frame that has begun to arrive."""
         self._buffer.clear()
         self._lost = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that `data` completes, in order."""
+        """Return the frames that `data` completes, in order."""
         buffer, frames = self._buffer, list[Frame]()
         buffer += data
         while self._at_header():
@@ -68,14 +68,14 @@ class FrameDecoder(abc.ABC, Generic[Frame]):
 
     @abc.abstractmethod
     def _size(self, buffer: bytearray) -> int | None:
-        """Bytes of the frame that begins here; 0: it cannot be one, None: not known yet."""
+        """Return the size of the frame that begins here; 0 if none does, None if unknown."""
 
     @abc.abstractmethod
     def _frame(self, data: bytes) -> Frame | None:
-        """The frame in so many bytes, or None where its check is wrong."""
+        """Return the frame in these bytes, or None where its check is wrong."""
 
     def _at_header(self) -> bool:
-        """Drop what is before the next header; whether there is one."""
+        """Drop what is before the next header; return whether there is one."""
         at = self._buffer.find(self.HEADER)
         if at < 0:
             at = len(self._buffer) - self._begun()
@@ -84,7 +84,7 @@ class FrameDecoder(abc.ABC, Generic[Frame]):
         return len(self._buffer) >= len(self.HEADER)
 
     def _begun(self) -> int:
-        """How many bytes at the end may be the beginning of a header."""
+        """Return how many bytes at the end may be the beginning of a header."""
         parts = range(len(self.HEADER) - 1, 0, -1)
         return next((n for n in parts if self._buffer.endswith(self.HEADER[:n])), 0)
 
@@ -95,7 +95,7 @@ class FrameDecoder(abc.ABC, Generic[Frame]):
 
 
 class Spelling:
-    """One way of a line. The decoder gets byte after byte, so that each frame's own are known.
+    """One direction of a line. The decoder gets byte after byte, so that a frame's own are known.
 
     A decoder that waits for what follows a frame shows it with those bytes.
     """
@@ -105,7 +105,7 @@ class Spelling:
         self._held = bytearray()
 
     def spell(self, data: bytes) -> list[str]:
-        """A line of text for each frame that `data` completes."""
+        """Return a line of text for each frame that `data` completes."""
         told = []
         for value in data:
             self._held.append(value)
@@ -119,24 +119,24 @@ class Spelling:
 
 
 class Wording:
-    """Both ways of a line; without spellings, bytes alone."""
+    """Both directions of a line in words; without spellings, bytes alone."""
 
     def __init__(self, sent: Spelling | None = None, received: Spelling | None = None) -> None:
         self._ways = {"tx": sent, "rx": received}
 
     def lines(self, way: str, data: bytes) -> list[str]:
-        """Lines of text for what went `tx` or came `rx`."""
+        """Return lines of text for bytes that were sent (`tx`) or received (`rx`)."""
         spelling = self._ways[way]
         return [f"{way} {line}" for line in (spelling.spell(data) if spelling else [data.hex(" ")])]
 
 
 def whole(data: bytes) -> list[bytes]:
-    """The feed of a line on which every byte is a command of its own."""
+    """Return the bytes as one frame, for a line on which every write is a command."""
     return [data]
 
 
 def of_command(asked: Velocity, sent: Velocity) -> str:
-    """A command as it was received, and as it was converted for the body."""
+    """Describe a command as it was received, and as it was sent to the body."""
     return f"command {_speeds(asked)} -> sent {_speeds(sent)}"
 
 

@@ -27,7 +27,7 @@ PATIENCE_NS = 500_000_000  # without a word from the body, before something is s
 
 
 class LinkProblem(Exception):
-    """Why a port cannot be opened, in one line for people."""
+    """The reason why a port cannot be opened, in one line for people."""
 
 
 class Link(abc.ABC):
@@ -59,17 +59,17 @@ class Link(abc.ABC):
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open. What it means for the body, only its bytes can tell."""
+        """Whether the port is open, which does not mean that the body answers."""
         return self._fd is not None
 
     @property
     def age_ns(self) -> int:
-        """Since the newest bytes came, or since the link was opened where none came yet."""
+        """Time since the newest bytes, or since the link was opened [ns]."""
         return self._clock.now_ns() - self._heard_ns
 
     @property
     def health(self) -> LinkHealth:
-        """For `robot/state`."""
+        """The state of the link for `robot/state`."""
         return LinkHealth(
             connected=self.connected,
             age_ms=self.age_ns / 1e6,
@@ -78,13 +78,13 @@ class Link(abc.ABC):
         )
 
     def open(self) -> None:
-        """Connect in the background, and again after every loss. Returns at once."""
+        """Connect in the background, and again after every loss. Return at once."""
         if self._keeper is None:
             self.problem, self._heard_ns = "connecting", self._clock.now_ns()
             self._keeper = asyncio.create_task(self._keep_open(), name=f"link {self}")
 
     def write(self, data: bytes) -> bool:
-        """Send now, or not at all: False when not all of it could be. Never blocks or raises."""
+        """Send now or not at all. Return whether all was sent. Never block or raise."""
         if self._fd is None:
             return False
         try:
@@ -101,7 +101,7 @@ class Link(abc.ABC):
         return True
 
     def drop(self, reason: str) -> None:
-        """Give the present connection up, with all that is queued in it, and connect anew."""
+        """Close the present connection, discard what is queued in it, and connect again."""
         if self._fd is None:
             return
         fd, self._fd, self.problem = self._fd, None, reason
@@ -113,7 +113,7 @@ class Link(abc.ABC):
         self._call(self.on_lost, reason)
 
     async def close(self) -> None:
-        """Let go of the port. Any number of times."""
+        """Close the port. May be called any number of times."""
         keeper, self._keeper = self._keeper, None
         if keeper:
             keeper.cancel()
@@ -132,7 +132,7 @@ class Link(abc.ABC):
 
     @abc.abstractmethod
     def _cut_short(self) -> None:
-        """A write went out in part; see to it that the rest never goes out later."""
+        """Make sure that the rest of a write that went out in part is never sent."""
 
     def _tell(self, way: str, data: bytes) -> None:
         if self.trace:
@@ -162,7 +162,7 @@ class Link(abc.ABC):
             await self._clock.sleep_ns(retry_ns)
 
     def _call(self, callback: Callable[[T], None], value: T) -> None:
-        """Call the owner; a connection on which it fails is given up, and a new one made."""
+        """Call the owner; if that fails, drop the connection and open a new one."""
         try:
             callback(value)
         except Exception as error:  # noqa: BLE001 - its fault must not end the link
@@ -208,7 +208,7 @@ class Link(abc.ABC):
         self._gathering = loop.call_later(self.gather_s, self._gathered)
 
     def _gathered(self) -> None:
-        """Take what has come, and go on like that for as long as something does."""
+        """Read what has come, and go on while something does."""
         if self._fd is None:
             return
         if self._read(self._fd):
@@ -217,7 +217,7 @@ class Link(abc.ABC):
             asyncio.get_running_loop().add_reader(self._fd, self._readable)
 
     def _read(self, fd: int) -> bool:
-        """Whether there was anything."""
+        """Read once; return whether anything came."""
         try:
             data = os.read(fd, READ_BYTES)
         except BlockingIOError:
@@ -235,7 +235,7 @@ class Link(abc.ABC):
 
 
 def why(error: Exception) -> str:
-    """In words; asyncio puts its own before the system's."""
+    """Describe an exception in words; asyncio puts its own before the system's."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     return str(error) or type(error).__name__
@@ -250,10 +250,10 @@ def _nothing() -> None:
 
 
 class Liveness:
-    """Keeps when the body was heard last; says once that it is not, and once that it is again.
+    """Watches whether a body that reports by itself is still heard; logs each change once.
 
-    `silent_ns` without a word, and it counts as lost. `senseless` is what to say where the line
-    itself is in order. What is wrong for a moment only, the gate says.
+    It counts as lost after `silent_ns` without a message. `senseless` is logged where the line
+    itself is in order. Silence of a moment is not logged; the gate reports it.
     """
 
     def __init__(
@@ -267,21 +267,21 @@ class Liveness:
 
     @property
     def received(self) -> bool:
-        """Whether there was a word since the line was opened."""
+        """Whether a message has come since the line was opened."""
         return self._heard_ns is not None
 
     def mark_received(self) -> bool:
-        """A word has come; whether it is the first on this line."""
+        """Note a message; return whether it is the first on this line."""
         first, self._heard_ns = self._heard_ns is None, self._clock.now_ns()
         return first
 
     def reset(self) -> None:
-        """The line is lost, or new: nothing from before counts."""
+        """Forget all messages: the line is lost or new."""
         if self._heard_ns is not None:
             self._heard_ns, self._hoping_ns = None, self._clock.now_ns()
 
     def alive(self) -> bool:
-        """Whether the body has been heard lately."""
+        """Whether the newest message is recent enough."""
         silent_ns = self._clock.now_ns() - (self._heard_ns or self._hoping_ns)
         alive = self._heard_ns is not None and silent_ns <= self._silent_ns
         if alive:

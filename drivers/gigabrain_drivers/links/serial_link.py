@@ -28,7 +28,7 @@ NO_MODEM_LINES = (errno.ENOTTY, errno.EINVAL)  # ptys have none, nor have some U
 
 
 def check_port(name: str) -> None:
-    """Raises ValueError, as `port: ...`, for what can be no serial port."""
+    """Raise ValueError, as `port: ...`, for what cannot be a serial port."""
     if not name.strip() or "://" in name:
         raise ValueError(
             f"port: expected a path such as /dev/ttyUSB0, usb:VID:PID or auto, got {name!r}"
@@ -45,7 +45,7 @@ def check_port(name: str) -> None:
 
 
 def usb_id(port: str) -> tuple[int, int, str]:
-    """(vendor, product, serial number or "") of `usb:VID:PID[:SERIAL]`. Raises ValueError."""
+    """Return (vendor, product, serial or "") of `usb:VID:PID[:SERIAL]`. Raises ValueError."""
     parts = port.removeprefix(USB).split(":", 2)
     if len(parts) < 2:
         raise ValueError(f"expected usb:VID:PID or usb:VID:PID:SERIAL, got {port!r}")
@@ -55,7 +55,7 @@ def usb_id(port: str) -> tuple[int, int, str]:
 
 
 def candidate_paths(port: str) -> list[str]:
-    """The paths that `port` (a path, `usb:VID:PID[:SERIAL]` or `auto`) may stand for."""
+    """Return the paths that `port` (a path, `usb:VID:PID[:SERIAL]`, `auto`) may stand for."""
     if port == AUTO:
         return sorted(p.device for p in list_ports.comports() if p.vid is not None)
     if not port.startswith(USB):
@@ -69,7 +69,7 @@ def candidate_paths(port: str) -> list[str]:
 
 
 def describe_missing(port: str) -> str:
-    """What to say when there is no such device."""
+    """Return the text for a device that is not there."""
     if port == AUTO:
         return "no serial port at all: is it plugged in?"
     what = "USB device " if port.startswith(USB) else ""
@@ -77,14 +77,14 @@ def describe_missing(port: str) -> str:
 
 
 def describe_absent(port: str) -> str:
-    """What to say of a port that is not there now; nothing where it is. Raises ValueError."""
+    """Return the text for a port that is not there, empty where it is. Raises ValueError."""
     return (
         "" if any(Path(path).exists() for path in candidate_paths(port)) else describe_missing(port)
     )
 
 
 def describe_refusal(path: str, error: OSError) -> str:
-    """What to say when the device is there but cannot be opened."""
+    """Return the text for a device that is there but cannot be opened."""
     if error.errno in (errno.EACCES, errno.EPERM):
         return (
             f"no permission to open {path}; add yourself to its group (dialout on Debian), or "
@@ -101,7 +101,7 @@ def describe_refusal(path: str, error: OSError) -> str:
 
 
 def _holders(path: str) -> list[int]:
-    """Who has the device open, as far as we may look (Linux)."""
+    """Return the processes that have the device open, as far as we may look (Linux)."""
     device, found = os.path.realpath(path), []
     for entry in Path("/proc").glob("[0-9]*/fd/*"):
         try:
@@ -113,9 +113,9 @@ def _holders(path: str) -> list[int]:
 
 
 class SerialLink(Link):
-    """`port` is a path, `usb:VID:PID[:SERIAL]`, or `auto` with a probe that knows its device.
+    """A serial line. `port` is a path, `usb:VID:PID[:SERIAL]`, or `auto` with a probe.
 
-    The probe gets an open port with a short read timeout, in a thread, and says whether it is
+    The probe gets an open port with a short read timeout, in a thread, and returns whether it is
     the right one. Half of a line that could not be sent is discarded, not sent later.
     """
 
@@ -130,11 +130,11 @@ class SerialLink(Link):
         return self._port
 
     def set_dtr(self, on: bool) -> None:
-        """Drive the data-terminal-ready line, where there is one."""
+        """Set the data-terminal-ready line, where there is one."""
         self._set_line("dtr", on)
 
     def set_rts(self, on: bool) -> None:
-        """Drive the request-to-send line, where there is one."""
+        """Set the request-to-send line, where there is one."""
         self._set_line("rts", on)
 
     def _set_line(self, name: str, on: bool) -> None:
@@ -156,7 +156,7 @@ class SerialLink(Link):
         return self._serial.fileno()
 
     def _open(self) -> serial.Serial:
-        """In a thread: some adapters take tens of milliseconds."""
+        """Open the port, in a thread: some adapters take tens of milliseconds."""
         paths = candidate_paths(self._port)
         if not paths:
             raise LinkProblem(describe_missing(self._port))
@@ -169,7 +169,7 @@ class SerialLink(Link):
         raise LinkProblem(f"none of {', '.join(paths)} answers like this device")
 
     def _probed(self, path: str) -> serial.Serial | None:
-        """The port, if it is the right one; others are left as they were."""
+        """Return the port if it is the right one; leave others as they were."""
         try:
             port = open_port(path, self.baud)
         except LinkProblem:
@@ -199,7 +199,7 @@ class SerialLink(Link):
 
 
 def open_port(path: str, baud: int) -> serial.Serial:
-    """Open a serial port for us alone. Raises LinkProblem saying what to do about it."""
+    """Open a serial port exclusively. Raises LinkProblem with what to do about it."""
     if not Path(path).exists():
         raise LinkProblem(describe_missing(path))
     try:
@@ -211,7 +211,7 @@ def open_port(path: str, baud: int) -> serial.Serial:
 
 
 def ready(port: serial.Serial) -> serial.Serial:
-    """Ready an open port for the event loop: nothing old in it, and a read tells an unplugging.
+    """Prepare an open port for the event loop: nothing old in it, and unplugging ends a read.
 
     Raises LinkProblem, with the port closed.
     """

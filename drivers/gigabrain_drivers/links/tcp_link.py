@@ -23,7 +23,7 @@ MOST_BYTES = 256  # of a file that says where to call
 
 
 class TcpLink(Link):
-    """Judged by what comes in: a peer that says nothing for `quiet_ns` is dropped."""
+    """A TCP connection. A peer that sends nothing for `quiet_ns` is dropped."""
 
     def __init__(
         self, host: str, port: int, clock: Clock, *, quiet_ns: int | None = QUIET_NS
@@ -64,9 +64,9 @@ class TcpLink(Link):
 
 
 class AddressLink(TcpLink):
-    """As TcpLink, to `HOST:PORT` or to what a file says, which is read for every connection.
+    """A TCP connection to `HOST:PORT`, or to what a file holds, read for every connection.
 
-    An emulator takes whichever port is free, and another one when it starts anew.
+    An emulator uses whichever port is free, and another one after a restart.
     """
 
     def __init__(self, where: str, clock: Clock) -> None:
@@ -85,7 +85,7 @@ class AddressLink(TcpLink):
 
 
 def address(text: str) -> tuple[str, int]:
-    """(host, port) of `HOST:PORT`. Raises ConfigError."""
+    """Return (host, port) of `HOST:PORT`. Raises ConfigError."""
     host, _, port = text.strip().rpartition(":")
     if not host or not port.isdecimal() or not 0 < int(port) < 65536:
         raise ConfigError(f"port: expected HOST:PORT, such as 192.168.1.10:8080, got {text!r}")
@@ -93,7 +93,7 @@ def address(text: str) -> tuple[str, int]:
 
 
 def written(path: Path) -> tuple[str, int]:
-    """(host, port) in a file. Raises LinkProblem."""
+    """Return (host, port) in a file. Raises LinkProblem."""
     try:
         return address(read_bounded(path, MOST_BYTES).decode("ascii"))
     except OSError:

@@ -1,4 +1,4 @@
-"""An LDROBOT lidar: turns and sends from the moment it has power, and listens to nobody."""
+"""Emulated LDROBOT lidars: they turn and send from power-on, and have no input."""
 
 import math
 from collections import deque
@@ -29,20 +29,20 @@ class LdDevice(Device):
         self._turn_hz = body.robot.lidar.rate_hz if body.robot.lidar else 10.0
 
     def feed(self, data: bytes) -> None:
-        """It has no input."""
+        """Ignore bytes: it has no input."""
 
     def reset(self) -> None:
-        """It starts to turn."""
+        """Start to turn."""
         self._sweep.start(self.samples_hz, self._turn_hz)
 
     def step(self, now_ns: int) -> None:
-        """All whole frames that were measured meanwhile."""
+        """Send all whole frames that were measured since the last step."""
         while samples := self._sweep.take(ld.POINTS):
             if self.sag_volts <= LEAST_VOLTS:
                 self.wire.write(ld.encode(self._frame([self.measured(s) for s in samples])))
 
     def measured(self, sample: Sample) -> Sample:
-        """A sample as this model sends it, before any correction by the host."""
+        """Return a sample as this model sends it, before any correction by the host."""
         return sample
 
     def _frame(self, samples: list[Sample]) -> ld.LdFrame:
@@ -58,20 +58,20 @@ class LdDevice(Device):
 
 
 class Lds02Device(LdDevice):
-    """Sends LD frames of what its lens sees, which stands beside the axis and looks across."""
+    """Sends LD frames of its lens, which is beside the axis and looks across."""
 
     baud = 115_200
     samples_hz = 2300
     reach = 0.16, 8.0
 
     def reset(self) -> None:
-        """It starts to turn."""
+        """Start to turn."""
         self._rays = deque[Sample](maxlen=KEPT)
         self._frame_of: list[Sample] = []
         self._sweep.start(self.samples_hz * FINE, self._turn_hz)
 
     def step(self, now_ns: int) -> None:
-        """All whole frames that were measured meanwhile."""
+        """Send all whole frames that were measured since the last step."""
         while rays := self._sweep.take(FINE):
             self._rays += rays
             if len(self._rays) == KEPT:
@@ -82,7 +82,7 @@ class Lds02Device(LdDevice):
                     self.wire.write(ld.encode(frame))
 
     def _by_the_lens(self, angle: float) -> Sample:
-        """What the lens measures when the lidar says `angle` [deg]."""
+        """Return the lens's measurement for the `angle` [deg] that it reports."""
         distance, seen_at = 0.0, angle
         for _ in range(4):  # where it looks depends on how far it sees; this settles quickly
             distance = self._ray(seen_at).distance
@@ -91,13 +91,13 @@ class Lds02Device(LdDevice):
         return Sample(angle, lens_distance(distance) if distance else 0.0)
 
     def _ray(self, angle: float) -> Sample:
-        """The ray that was cast nearest to `angle` [deg]."""
+        """Return the ray that was cast nearest to `angle` [deg]."""
         step = 360 * self._turn_hz / self.samples_hz / FINE
         back = (self._rays[-1].angle - angle) % 360
         return self._rays[-1 - min(round(back / step), KEPT - 1)]
 
 
 def lens_distance(distance: float) -> float:
-    """What LDS-02's lens measures of something `distance` [mm] from the axis."""
+    """Return the distance that LDS-02's lens measures to a point `distance` [mm] from the axis."""
     a, b = 1 + SLANT**2, LENS_X + SLANT * LENS_Y
     return (math.sqrt(max(b * b - a * (LENS_X**2 + LENS_Y**2 - distance**2), 0.0)) - b) / a

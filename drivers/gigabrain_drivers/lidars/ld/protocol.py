@@ -57,7 +57,7 @@ class LdFrame(NamedTuple):
 
 
 def encode(frame: LdFrame) -> bytes:
-    """The 47 bytes of `frame`."""
+    """Return the 47 bytes of `frame`."""
     points = [
         part for pair in zip(frame.distances, frame.confidences, strict=True) for part in pair
     ]
@@ -67,7 +67,7 @@ def encode(frame: LdFrame) -> bytes:
 
 
 class RawFrame(NamedTuple):
-    """A frame as it came, and where it starts and ends."""
+    """A frame's bytes, and where it starts and ends."""
 
     start: int  # [0.01 deg], clockwise
     end: int  # [0.01 deg], of the last point
@@ -76,9 +76,9 @@ class RawFrame(NamedTuple):
 
 
 def whole(data: bytes) -> RawFrame | None:
-    """The frame in exactly 47 bytes, or None when they cannot be one.
+    """Return the frame in exactly 47 bytes, or None when they cannot be one.
 
-    CRC-8 lets one in 256 heavily damaged frames through, so what a turning lidar cannot say is
+    CRC-8 lets one in 256 heavily damaged frames through, so what a turning lidar cannot send is
     refused as well: angles beyond a turn, and points further apart than its speed allows. Of a
     million frames with 0.1 % of all bytes wrong, 954060 came out right and 4 wrong; with 5 %, of
     60000 frames 5225 right and 144 wrong. A wrong frame bends twelve samples of one turn.
@@ -94,7 +94,7 @@ def whole(data: bytes) -> RawFrame | None:
 
 
 def decode(data: bytes) -> LdFrame | None:
-    """The same, with all that it says."""
+    """Return all fields of the frame in exactly 47 bytes, or None when they cannot be one."""
     if whole(data) is None:
         return None
     fields = _LAYOUT.unpack(data)
@@ -104,7 +104,7 @@ def decode(data: bytes) -> LdFrame | None:
 
 
 def points(frames: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """All points of whole frames, one after the other.
+    """Return all points of whole frames, one after the other.
 
     Angles (n,) [deg], clockwise, each frame's from its start on and so up to 720, and distances
     (n,) [mm].
@@ -117,7 +117,7 @@ def points(frames: bytes) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def describe(frame: LdFrame) -> str:
-    """A frame in words."""
+    """Describe a frame for the log."""
     seen = [distance for distance in frame.distances if distance]
     span = f"{min(seen)} to {max(seen)} mm" if seen else "no return"
     return (
@@ -135,11 +135,11 @@ class LdDecoder:
         self.errors = 0  # how often a frame was thrown away
 
     def feed(self, data: bytes) -> list[LdFrame]:
-        """The frames that `data` completes. Fewer than 47 bytes are kept for the next call."""
+        """Return the frames that `data` completes. Fewer than 47 bytes are kept."""
         return [frame for raw in self.cut(data) if (frame := decode(raw.data))]
 
     def cut(self, data: bytes) -> list[RawFrame]:
-        """The same, as they came."""
+        """Return the frames that `data` completes as raw bytes, for decoding a turn at once."""
         buffer, frames, at = self._buffer, list[RawFrame](), 0
         buffer += data
         while (found := self._find(at)) >= 0:
@@ -165,12 +165,12 @@ class LdDecoder:
         return frames
 
     def clear(self) -> None:
-        """Forget what came so far: what comes next is another connection's."""
+        """Forget what came so far: what comes next is from another connection."""
         self._buffer.clear()
         self._in_step = False
 
     def _find(self, at: int) -> int:
-        """Where the next frame may begin, from `at` on; -1 for nowhere in what has come."""
+        """Return where the next frame may begin, from `at` on; -1 if nowhere."""
         buffer = self._buffer
         while (at := buffer.find(HEADER, at)) >= 0:
             if at + 1 == len(buffer) or buffer[at + 1] in VERSIONS:

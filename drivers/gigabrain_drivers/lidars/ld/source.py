@@ -8,7 +8,7 @@ import numpy as np
 import serial
 from msgspec.structs import replace
 
-from gigabrain_drivers.lidars.base import Gathered, Samples
+from gigabrain_drivers.lidars.base import Samples, TurnBuffer
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.serial_source import SerialSource
 from gigabrain_drivers.links.device_clock import DeviceClock
@@ -17,7 +17,7 @@ from gigabrain_schemas.body import Lidar
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import Clock
 
-Place = Callable[[Samples, Samples], tuple[Samples, Samples]]
+Correction = Callable[[Samples, Samples], tuple[Samples, Samples]]
 
 POINTS, WHOLE = np.arange(ld.POINTS), slice(None)
 PROBE_BYTES = 300  # at least five frames
@@ -27,21 +27,21 @@ OFFSET_X, OFFSET_Y = 5.9, -20.14  # [mm], of the lens
 SLANT = 0.11923  # of the beam against the direction that the lidar tells
 
 
-class Frames(Gathered[tuple[bytes, slice]]):
+class FrameBuffer(TurnBuffer[tuple[bytes, slice]]):
     """A turn in frames; of the first and of the last one perhaps a part only."""
 
-    def __init__(self, lidar: Lidar, place: Place) -> None:
+    def __init__(self, lidar: Lidar, place: Correction) -> None:
         super().__init__(lidar)
         self._place = place
 
     def unpack(self, pieces: list[tuple[bytes, slice]]) -> tuple[Samples, Samples]:
-        """All frames at once."""
+        """Unpack all frames at once."""
         angles, distances = self._place(*ld.points(b"".join(raw for raw, _ in pieces)))
         kept = np.concatenate([POINTS[part] + n * ld.POINTS for n, (_, part) in enumerate(pieces)])
         return angles[kept], distances[kept]
 
     def take(self, raw: bytes, turn_at: int | None, now_ns: int) -> LaserScan | None:
-        """A frame more; `turn_at` is its first point in a new turn, whose end is a scan."""
+        """Add a frame; `turn_at` is its first point in a new turn, whose end returns a scan."""
         if turn_at is None:
             self.add((raw, WHOLE), ld.POINTS, now_ns)
             return None
@@ -55,8 +55,8 @@ class Frames(Gathered[tuple[bytes, slice]]):
 class Ld(SerialSource):
     """A lidar that sends LD frames. Subclasses name the model, its baud rate and its corrections.
 
-    It has no way of saying whether a 0 means free space or nothing measurable, so a body's file
-    says `no_return: unknown` of it where that matters.
+    Its 0 means free space or nothing measurable, so a body's file has `no_return: unknown` for it
+    where that matters.
     """
 
     samples_hz = 4500.0
@@ -66,32 +66,32 @@ class Ld(SerialSource):
         self._decoder = ld.LdDecoder()
         super().__init__(options, lidar, clock, self.rate_baud, self._decoder)
         self.link.wording = Wording(received=Spelling(ld.LdDecoder().feed, ld.describe))
-        self._frames = Frames(lidar, self.place)
+        self._frames = FrameBuffer(lidar, self.to_axis)
         self._stamps = DeviceClock(ld.CLOCK_MS)
         self._last: int | None = None  # [0.01 deg], of the newest sample
 
-    def place(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
-        """Angles (n,) [deg], clockwise, and distances (n,) [mm], as they are seen from the axis."""
+    def to_axis(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
+        """Return angles (n,) [deg] and distances (n,) [mm] as they are seen from the axis."""
         return angles, distances
 
     def connected(self) -> None:
-        """A new stream."""
+        """Expect a new stream."""
         self._frames.clear()
         self._stamps.clear()
         self._last = None
 
     def received(self, data: bytes) -> None:
-        """Frames, or parts of them."""
+        """Decode frames, or parts of them."""
         now_ns = self.clock.now_ns()
         for raw in self._decoder.cut(data):
             self.understood = True
             self._stamps.arrived(raw.time_ms, now_ns)
             turn_at, self._last = turn_start(raw, self._last), raw.end
             scan = self._frames.take(raw.data, turn_at, now_ns)
-            self.finished(replace(scan, late_ms=self._stamps.late_ms) if scan else None)
+            self.emit_scan(replace(scan, late_ms=self._stamps.late_ms) if scan else None)
 
     def probe(self, port: serial.Serial) -> bool:
-        """Whether frames come from this port."""
+        """Return whether frames come from this port."""
         return len(ld.LdDecoder().feed(port.read(PROBE_BYTES))) >= PROBE_FRAMES
 
 
@@ -108,7 +108,7 @@ class Ld19(Ld):
 
 
 def turn_start(raw: ld.RawFrame, last: int | None) -> int | None:
-    """Index of the first point of a frame that is in another turn than `last` [0.01 deg]."""
+    """Return the first point of a frame that is in another turn than `last` [0.01 deg], or None."""
     if last is not None and raw.start < last - ld.TURN // 2:
         return 0
     if raw.end >= raw.start:
@@ -118,18 +118,18 @@ def turn_start(raw: ld.RawFrame, last: int | None) -> int | None:
 
 
 class Lds02(Ld):
-    """Starts with its power. It measures from its lens, which goes round the axis."""
+    """LDS-02 (LDROBOT LD08), the lidar of most TurtleBot3. Its lens is beside the axis."""
 
     name, rate_baud = "LDS-02", 115_200
     samples_hz = 2300.0
 
-    def place(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
-        """Both seen from the axis."""
-        return from_axis(angles, distances)
+    def to_axis(self, angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
+        """Convert measurements from the lens to the axis."""
+        return seen_from_axis(angles, distances)
 
 
-def from_axis(angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
-    """Measurements (n,) from the lens ([deg] clockwise, [mm]) as they are seen from the axis.
+def seen_from_axis(angles: Samples, distances: Samples) -> tuple[Samples, Samples]:
+    """Convert measurements (n,) of the lens ([deg] clockwise, [mm]) to how the axis sees them.
 
     Source: the vendor's ld08_driver, `SlTransform`. No return (0 mm) stays where it is.
     """

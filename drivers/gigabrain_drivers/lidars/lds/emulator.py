@@ -32,11 +32,11 @@ class Lds01Device(Device):
             self._sweep.stop()
 
     def reset(self) -> None:
-        """At rest."""
+        """Come to rest."""
         self._sweep.stop()
 
     def step(self, now_ns: int) -> None:
-        """All whole packets that were measured meanwhile; the first begins where one does."""
+        """Send all whole packets that were measured; the first begins where one does."""
         while samples := self._sweep.take(lds01.SAMPLES):
             first = round(samples[0].angle) - 1
             while first % lds01.SAMPLES:
@@ -59,7 +59,7 @@ class Lds03Device(Device):
         self.reset()
 
     def reset(self) -> None:
-        """At rest."""
+        """Come to rest."""
         self._heard = b""
         self._waiting: list[Sample] = []
         self._begins = False
@@ -76,7 +76,7 @@ class Lds03Device(Device):
         self._heard = b"" if max(start, stop) >= 0 else self._heard[-LONGEST_COMMAND:]
 
     def step(self, now_ns: int) -> None:
-        """All whole packets that were measured meanwhile; none goes across 0 degrees."""
+        """Send all whole packets that were measured; none crosses 0 degrees."""
         while samples := self._sweep.take(1):
             wraps = bool(self._waiting) and samples[0].angle < self._waiting[-1].angle
             if wraps or len(self._waiting) == LDS03_POINTS:

@@ -1,6 +1,6 @@
 """LDS-01 (Hitachi-LG HLS-LFCD2), the lidar of early TurtleBot3: 60 packets of 42 bytes a turn.
 
-Source: the vendor's driver hls_lfcd_lds_driver. It does not look at the checksum, whose rule is not
+Source: the vendor's driver hls_lfcd_lds_driver. It ignores the checksum, whose rule is not
 published; so a packet is known by its structure, and counts when the next one follows it at once.
 """
 
@@ -37,7 +37,7 @@ class Lds01Packet(NamedTuple):
 
 
 def encode(packet: Lds01Packet) -> bytes:
-    """The bytes of a packet; the checksum is the one that other drivers report, unverified."""
+    """Return the bytes of a packet. The checksum is the one that other drivers report."""
     frame = struct.pack("<BBH", _SYNC, _FIRST + packet.number, round(packet.rpm * 10))
     for intensity, distance in zip(packet.intensities, packet.ranges, strict=True):
         frame += struct.pack("<HHH", intensity, distance, 0)
@@ -45,7 +45,7 @@ def encode(packet: Lds01Packet) -> bytes:
 
 
 def describe(packet: Lds01Packet) -> str:
-    """A packet in words."""
+    """Describe a packet for the log."""
     first = packet.number * SAMPLES
     return (
         f"samples {first} to {first + SAMPLES - 1} of 360: {' '.join(map(str, packet.ranges))} mm, "
@@ -54,7 +54,7 @@ def describe(packet: Lds01Packet) -> str:
 
 
 def describe_command(command: bytes) -> str:
-    """A command to the lidar in words."""
+    """Describe a command for the log."""
     return {START: "start", STOP: "stop"}.get(command, "unknown command")
 
 
@@ -100,30 +100,30 @@ class Lds01(SerialSource):
         self._start()
 
     def received(self, data: bytes) -> None:
-        """Packets, or parts of them."""
+        """Decode packets, or parts of them."""
         now_ns = self.clock.now_ns()
         for packet in self._decoder.feed(data):
             turn_at = 0 if self._last is not None and packet.number <= self._last else None
             self.understood, self._last, self._told_ns = True, packet.number, now_ns
             first = packet.number * SAMPLES + 1  # the vendor's driver puts sample 0 at 359
             angles = range(first, first + SAMPLES)
-            self.finished(self.turn.clockwise(angles, packet.ranges, turn_at, now_ns))
+            self.emit_scan(self.turn.add_samples(angles, packet.ranges, turn_at, now_ns))
 
-    def look(self, now_ns: int) -> None:
+    def watch_scans(self, now_ns: int) -> None:
         """Start it again where it does not turn: it may have had no power before."""
-        super().look(now_ns)
+        super().watch_scans(now_ns)
         if now_ns - self._told_ns > RESTART_NS:
             self._start()
 
     def probe(self, port: serial.Serial) -> bool:
-        """Whether packets come from this port once it is told to start."""
+        """Return whether packets come from this port after a start command."""
         port.write(START)
         found = len(Lds01Decoder().feed(port.read(PROBE_BYTES))) >= PROBE_PACKETS
         if not found:
             port.write(STOP)
         return found
 
-    def farewell(self) -> bool:
+    def send_stop(self) -> bool:
         """Stop it."""
         return self.link.write(STOP)
 

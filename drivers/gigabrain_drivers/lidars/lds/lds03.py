@@ -1,4 +1,4 @@
-"""LDS-03 (COIN-D4), the lidar of late TurtleBot3: packets with their own first and last angle.
+"""LDS-03 (COIN-D4), the lidar of late TurtleBot3: packets with a first and last angle.
 
 Source: the vendor's driver coin_d4_driver.
 """
@@ -29,7 +29,7 @@ MIRROR_QUALITY = 255
 
 
 def command(code: int) -> bytes:
-    """A command to the lidar."""
+    """Return the bytes of a command."""
     return bytes([0xAA, 0x55, code, 0xAA ^ 0x55 ^ code])
 
 
@@ -54,7 +54,7 @@ class Lds03Packet(NamedTuple):
 
 
 def encode(packet: Lds03Packet) -> bytes:
-    """The bytes of a packet of at least one sample; angles in between are spread evenly."""
+    """Return the bytes of a packet of at least one sample; angles in between are spread evenly."""
     first, last = packet.samples[0].angle, packet.samples[-1].angle
     kind = packet.begins | round(packet.rate * 10) << 1
     head = struct.pack("<BBHH", kind, len(packet.samples), _angle(first), _angle(last))
@@ -63,7 +63,7 @@ def encode(packet: Lds03Packet) -> bytes:
 
 
 def describe(packet: Lds03Packet) -> str:
-    """A packet in words."""
+    """Describe a packet for the log."""
     first, last = packet.samples[0], packet.samples[-1]
     turn = f"a turn begins at {packet.rate:.1f} Hz, " if packet.begins else ""
     return (
@@ -79,7 +79,7 @@ class CommandDecoder:
         self._newest = b""
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The commands that `data` completes."""
+        """Return the commands that `data` completes."""
         found = []
         for value in data:
             self._newest = self._newest[-3:] + bytes((value,))
@@ -89,7 +89,7 @@ class CommandDecoder:
 
 
 def describe_command(command: bytes) -> str:
-    """A command to the lidar in words."""
+    """Describe a command for the log."""
     return {START: "start", STOP: "stop"}.get(command, "unknown command")
 
 
@@ -110,7 +110,7 @@ class Lds03Decoder(FrameDecoder[Lds03Packet]):
 
 
 def _check(head: bytes, body: bytes) -> int:
-    """The exclusive or of the packet's 16-bit words; of each sample its first byte by itself."""
+    """Return the XOR of the packet's 16-bit words; each sample's first byte counts alone."""
     low = xor_of(head[0::2]) ^ xor_of(body[0::3]) ^ xor_of(body[1::3])
     high = xor_of(head[1::2]) ^ xor_of(body[2::3])
     return 0x55AA ^ (low | high << 8)
@@ -121,7 +121,7 @@ def _angle(degrees: float) -> int:
 
 
 def _sample(sample: Lds03Sample) -> bytes:
-    """`0bQQQQQQ0R 0bDDDDDDQQ 0bDDDDDDDD`, the lowest bits of quality and distance first."""
+    """Pack `0bQQQQQQ0R 0bDDDDDDQQ 0bDDDDDDDD`, the lowest bits of quality and distance first."""
     return bytes(
         [
             (sample.quality & 0x3F) << 2 | sample.reflective,
@@ -166,23 +166,23 @@ class Lds03(SerialSource):
         self._told_ns = 0  # when it was last told something, or last seen to turn
 
     def connected(self) -> None:
-        """Leave it alone for a second; then it is started by `look`."""
+        """Leave it alone for a second; then `look` starts it."""
         self._cleared = self._started = False
         self._told_ns = self.clock.now_ns()
 
     def received(self, data: bytes) -> None:
-        """Packets, or parts of them."""
+        """Decode packets, or parts of them."""
         now_ns = self.clock.now_ns()
         for packet in self._decoder.feed(data):
             self.understood, self._told_ns = True, now_ns
             angles = [sample.angle for sample in packet.samples]
             distances = [trusted(sample) for sample in packet.samples]
             turn_at = 0 if packet.begins else None
-            self.finished(self.turn.clockwise(angles, distances, turn_at, now_ns))
+            self.emit_scan(self.turn.add_samples(angles, distances, turn_at, now_ns))
 
-    def look(self, now_ns: int) -> None:
-        """Start it when it is ready for that, and once more where it does not turn."""
-        super().look(now_ns)
+    def watch_scans(self, now_ns: int) -> None:
+        """Start it when it is ready for that, and again where it does not turn."""
+        super().watch_scans(now_ns)
         since = now_ns - self._told_ns
         if not self._cleared and since >= DTR_NS:
             self.link.set_dtr(False)
@@ -195,14 +195,14 @@ class Lds03(SerialSource):
             self._tell(START)
 
     def probe(self, port: serial.Serial) -> bool:
-        """Whether packets come from this port once it is told to start."""
+        """Return whether packets come from this port after a start command."""
         port.write(START)
         found = bool(Lds03Decoder().feed(port.read(PROBE_BYTES)))
         if not found:
             port.write(STOP)
         return found
 
-    def farewell(self) -> bool:
+    def send_stop(self) -> bool:
         """Stop it."""
         return self.link.write(STOP)
 
@@ -212,7 +212,7 @@ class Lds03(SerialSource):
 
 
 def trusted(sample: Lds03Sample) -> float:
-    """The distance [mm] of a sample, nan where it is too near and too weak to be believed.
+    """Return the distance [mm] of a sample, nan where it is too near and too weak.
 
     Source: the vendor's coin_d4_driver.
     """

@@ -1,4 +1,4 @@
-"""A Slamtec RPLIDAR: answers requests, and streams standard, express or dense samples."""
+"""An emulated RPLIDAR: answers requests, and streams standard, express or dense samples."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -29,7 +29,7 @@ SERIAL = "0123456789ABCDEF" * 2
 
 
 class Mode(NamedTuple):
-    """One scan mode, as GET_CONF tells it."""
+    """One scan mode, as in answers to GET_CONF."""
 
     name: str
     kind: int  # answer type
@@ -37,7 +37,7 @@ class Mode(NamedTuple):
 
 
 class Unit(NamedTuple):
-    """What is particular to a model."""
+    """The figures of one model."""
 
     info: Info
     reach: tuple[float, float]  # [m]
@@ -72,7 +72,7 @@ LEGACY = Mode("Express", EXPRESS, 250)  # what an express request for mode 0 has
 
 
 class RplidarDevice(Device):
-    """The model that the options name; A1 where they leave it open.
+    """An RPLIDAR of the model in the options; an A1 where they leave it open.
 
     A pty has no DTR line: the motors that hang on it turn all the time.
     """
@@ -98,12 +98,12 @@ class RplidarDevice(Device):
         return Pty(Path(options.port), baud)
 
     def feed(self, data: bytes) -> None:
-        """Requests, or parts of them."""
+        """Obey requests, or collect parts of them."""
         for request in self._requests.feed(data):
             self._obey(request)
 
     def reset(self) -> None:
-        """It boots: the motor turns, unless a board powers it, and it says its name."""
+        """Boot: the motor turns, unless a board powers it, and the banner is sent."""
         self._halt()
         self.health = Health(0, 0)
         self._turn_hz = 0.0 if self.unit.board else self._nominal_hz
@@ -113,7 +113,7 @@ class RplidarDevice(Device):
         self.wire.write(banner.encode())
 
     def step(self, now_ns: int) -> None:
-        """All whole blocks that were measured meanwhile; nodes in one piece."""
+        """Send all whole blocks that were measured; nodes in one piece."""
         mode = self._mode
         if mode is None:
             return
@@ -162,7 +162,7 @@ class RplidarDevice(Device):
         self.wire.write(rplidar.answer(kind, data))
 
     def _conf(self, key: int, number: int) -> bytes:
-        """The value of a setting, empty where there is none."""
+        """Return the value of a setting, empty where there is none."""
         modes = self.unit.modes
         if key == rplidar.MODE_COUNT:
             return len(modes).to_bytes(2, "little")
@@ -210,7 +210,7 @@ class RplidarDevice(Device):
 
 
 def unit_of(options: RplidarOptions) -> Unit:
-    """The model that is emulated; those without an entry of their own are like the A1 or the S2."""
+    """Return the emulated model; those without an entry of their own are like the A1 or the S2."""
     if options.model in UNITS:
         return UNITS[options.model]
     return UNITS["s2" if options.model == "s3" else "a1"]

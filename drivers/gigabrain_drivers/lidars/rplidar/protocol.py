@@ -38,7 +38,7 @@ _BEFORE_CHECKSUM = 3  # bytes of a request with a payload before the payload
 
 
 def request(command: int, payload: bytes = b"") -> bytes:
-    """The bytes of a request. Commands from 0x80 carry a payload and a checksum."""
+    """Return the bytes of a request. Commands from 0x80 carry a payload and a checksum."""
     if command < 0x80:
         return bytes([0xA5, command])
     head = bytes([0xA5, command, len(payload)]) + payload
@@ -46,28 +46,28 @@ def request(command: int, payload: bytes = b"") -> bytes:
 
 
 def express_request(mode: int = 0) -> bytes:
-    """Ask for the stream of scan mode `mode`; 0 is the express mode of old firmware."""
+    """Request the stream of scan mode `mode`; 0 is the express mode of old firmware."""
     return request(EXPRESS_SCAN, struct.pack("<BHH", mode, 0, 0))
 
 
 def conf_request(key: int, mode: int | None = None) -> bytes:
-    """Ask for a setting, some of which belong to a scan mode."""
+    """Request a setting, some of which belong to a scan mode."""
     payload = struct.pack("<I", key) if mode is None else struct.pack("<IH", key, mode)
     return request(GET_CONF, payload)
 
 
 def answer(kind: int, data: bytes) -> bytes:
-    """A single answer with its descriptor."""
+    """Return a single answer with its descriptor."""
     return descriptor(kind, len(data)) + data
 
 
 def descriptor(kind: int, size: int, *, endless: bool = False) -> bytes:
-    """What comes before an answer, or before a stream of blocks of `size` bytes."""
+    """Return the descriptor of an answer, or of a stream of blocks of `size` bytes."""
     return _DESCRIPTOR.pack(_SYNC, size | endless * _ENDLESS, kind)
 
 
 class Info(NamedTuple):
-    """Who the lidar is."""
+    """Model, versions and serial number of a lidar."""
 
     model: int  # high nibble: 1 A1, 2 A2, 3 A3, 4 C1, 6 S1, 7 S2, 8 S3
     firmware: tuple[int, int]  # major, minor
@@ -76,28 +76,28 @@ class Info(NamedTuple):
 
     @classmethod
     def read(cls, data: bytes) -> Self:
-        """From the 20 bytes of its answer."""
+        """Decode the 20 bytes of its answer."""
         return cls(data[0], (data[2], data[1]), data[3], data[4:].hex().upper())
 
     def pack(self) -> bytes:
-        """As the lidar sends it."""
+        """Encode it as the lidar does."""
         major, minor = self.firmware
         return bytes([self.model, minor, major, self.hardware]) + bytes.fromhex(self.serial)
 
 
 class Health(NamedTuple):
-    """How the lidar feels."""
+    """The lidar's judgement of itself."""
 
     status: int  # 0 good, 1 warning, 2 error: it will not scan
     code: int
 
     @classmethod
     def read(cls, data: bytes) -> Self:
-        """From the 3 bytes of its answer."""
+        """Decode the 3 bytes of its answer."""
         return cls(*struct.unpack("<BH", data))
 
     def pack(self) -> bytes:
-        """As the lidar sends it."""
+        """Encode it as the lidar does."""
         return struct.pack("<BH", *self)
 
 
@@ -109,21 +109,21 @@ class Answer(NamedTuple):
 
 
 class RplidarDecoder:
-    """The host's side: answers and samples out of a stream of bytes. Keeps less than 200 bytes."""
+    """The host's side: answers and samples in a stream of bytes. Keeps less than 200 bytes."""
 
     def __init__(self) -> None:
         self.errors = 0  # how often something was thrown away
         self.clear()
 
     def clear(self) -> None:
-        """Expect a descriptor next: the lidar was told to stop, or this is another connection."""
+        """Expect a descriptor next: after a stop request, or on another connection."""
         self._buffer = bytearray()
         self._answer: tuple[int, int] | None = None  # kind and size of the one that is coming
         self._format: ScanFormat | None = None  # of the stream that has begun
         self._in_step = True
 
     def feed(self, data: bytes) -> list[Answer | Samples]:
-        """What `data` completes, in order."""
+        """Return the answers and samples that `data` completes, in order."""
         self._buffer += data
         found: list[Answer | Samples] = []
         while self._format is None and self._next_answer(found):
@@ -133,7 +133,7 @@ class RplidarDecoder:
         return found
 
     def _next_answer(self, found: list[Answer | Samples]) -> bool:
-        """One descriptor, or the answer that it announced. False when more has to come first."""
+        """Read one descriptor or announced answer. Return False if more has to come."""
         buffer = self._buffer
         if self._answer:
             kind, size = self._answer
@@ -168,7 +168,7 @@ class RplidarDecoder:
         del self._buffer[: _DESCRIPTOR.size]
 
     def _blocks(self, format: ScanFormat, found: list[Answer | Samples]) -> None:
-        """All whole blocks of the stream; out of step, several in a row must agree first."""
+        """Read all whole blocks of the stream; out of step, several in a row must agree."""
         buffer, size, at = self._buffer, format.size, 0
         while len(buffer) - at >= size * (1 if self._in_step else format.confirm):
             block = bytes(buffer[at : at + size])
@@ -185,7 +185,7 @@ class RplidarDecoder:
         del buffer[:at]
 
     def _confirmed(self, format: ScanFormat, at: int) -> bool:
-        """Whether the blocks from `at` on follow each other, judged on a format of its own."""
+        """Return whether the blocks from `at` on follow each other, by a fresh format."""
         trial, size = type(format)(), format.size
         for n in range(format.confirm):
             block = bytes(self._buffer[at + n * size : at + (n + 1) * size])
@@ -196,7 +196,7 @@ class RplidarDecoder:
 
 
 def describe(item: "Answer | Samples") -> str:
-    """What the lidar sent, in words; samples are those of the block before."""
+    """Describe an answer or samples for the log; samples are those of the block before."""
     if isinstance(item, Samples):
         seen = [distance for distance in item.distances if distance]
         span = f"{min(seen):.0f} to {max(seen):.0f} mm" if seen else "no return"
@@ -210,27 +210,27 @@ def describe(item: "Answer | Samples") -> str:
 
 
 class Request(NamedTuple):
-    """What a host asks for."""
+    """A host's request."""
 
     command: int
     payload: bytes = b""
 
 
 def describe_request(request: Request) -> str:
-    """What a host asks for, in words."""
+    """Describe a request for the log."""
     name = REQUESTS.get(request.command, f"request {request.command:#04x}")
     return f"{name} {request.payload.hex(' ')}".strip()
 
 
 class RequestDecoder:
-    """The lidar's side: requests out of a stream of bytes. Keeps less than 260 bytes."""
+    """The lidar's side: requests in a stream of bytes. Keeps less than 260 bytes."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self.errors = 0
 
     def feed(self, data: bytes) -> list[Request]:
-        """The requests that `data` completes."""
+        """Return the requests that `data` completes."""
         buffer, found = self._buffer, list[Request]()
         buffer += data
         while True:

@@ -1,10 +1,10 @@
-"""How Slamtec RPLIDARs pack their samples: standard nodes, express and dense capsules.
+"""Sample formats of Slamtec RPLIDARs: standard nodes, express and dense capsules.
 
 Little-endian; angles run clockwise, in 1/64 degree (q6). Sources: Slamtec's interface protocol
 document and the public rplidar_sdk. Both ways, so that an emulator speaks what the driver reads.
 
-What a noisy line lets through, measured with 0.1 % of all bytes wrong: of a million standard nodes,
-which have no checksum, 0.25 % come out wrong; of 200000 capsules 15 % are lost and 3 or 4 wrong.
+On a line with 0.1 % of all bytes wrong, of a million standard nodes, which have no checksum,
+0.25 % come out wrong; of 200000 capsules 15 % are lost and 3 or 4 wrong.
 """
 
 import abc
@@ -33,7 +33,7 @@ class Samples(NamedTuple):
 
 
 class ScanFormat(abc.ABC):
-    """Samples out of blocks of `size` bytes. Which bytes are a block is the caller's search."""
+    """Decodes samples in blocks of `size` bytes. The caller finds the blocks."""
 
     size: ClassVar[int]
     kind: ClassVar[int]  # its answer type
@@ -41,15 +41,15 @@ class ScanFormat(abc.ABC):
 
     @abc.abstractmethod
     def is_block(self, block: bytes) -> bool:
-        """Whether these bytes can be a block that follows the last."""
+        """Return whether these bytes can be a block that follows the last."""
 
     @abc.abstractmethod
     def take(self, block: bytes) -> Samples | None:
-        """The samples that this block completes."""
+        """Return the samples that this block completes."""
 
     @abc.abstractmethod
     def lose(self) -> None:
-        """Bytes were lost: the next block does not follow the last."""
+        """Note that bytes were lost: the next block does not follow the last."""
 
 
 class Standard(ScanFormat):
@@ -62,14 +62,14 @@ class Standard(ScanFormat):
         self._travelled = 0.0  # [deg], since the turn began
 
     def is_block(self, block: bytes) -> bool:
-        """By its sync bits, and by how far the angle has gone on."""
+        """Judge by the sync bits, and by how far the angle has gone on."""
         first, raw, _ = _NODE.unpack(block)
         if not (first ^ first >> 1) & 1 or not raw & 1 or raw >> 1 >= TURN_Q6:
             return False
         return self._last is None or abs(_advance(self._last, (raw >> 1) / 64)) < MOST_JUMP_DEG
 
     def take(self, block: bytes) -> Samples:
-        """One sample. A turn begins with the node that says so."""
+        """Return one sample. A turn begins with the node that is marked so."""
         first, raw, distance = _NODE.unpack(block)
         angle = (raw >> 1) / 64
         if self._last is not None:
@@ -81,7 +81,7 @@ class Standard(ScanFormat):
         return Samples((angle,), (distance / 4,), 0 if begins else None)
 
     def lose(self) -> None:
-        """Any angle may come next."""
+        """Accept any angle next."""
         self._last = None
 
 
@@ -95,13 +95,13 @@ class Capsule(ScanFormat):
         self._width: float | None = None  # [deg], of the last capsule
 
     def is_block(self, block: bytes) -> bool:
-        """By its two sync nibbles and its checksum, the XOR of all after them."""
+        """Judge by two sync nibbles and a checksum, the XOR of all after them."""
         if block[0] >> 4 != 0xA or block[1] >> 4 != 0x5 or _start(block) >= 360:
             return False
         return capsule_checksum(block) == (block[0] & 0xF | (block[1] & 0xF) << 4)
 
     def take(self, block: bytes) -> Samples | None:
-        """The samples of the capsule before this one, where nothing is missing between them."""
+        """Return the samples of the capsule before, where nothing is missing in between."""
         held, self._held = self._held, block
         if held is None or block[3] & 0x80:  # this one begins a new stream
             self._width = None
@@ -118,7 +118,7 @@ class Capsule(ScanFormat):
         return Samples(angles, self._distances(held), turn_at)
 
     def lose(self) -> None:
-        """The capsule that waits for the next one waits in vain."""
+        """Drop the capsule that waits for the next one."""
         self._held = self._width = None
 
     @abc.abstractmethod
@@ -163,12 +163,12 @@ FORMATS: dict[int, type[ScanFormat]] = {f.kind: f for f in (Standard, Express, D
 
 
 def capsule_checksum(block: bytes) -> int:
-    """The XOR of all bytes but the first two."""
+    """Return the XOR of all bytes but the first two."""
     return xor_of(block[2:])
 
 
 def node(angle_deg: float, distance_mm: float, *, quality: int, begins: bool) -> bytes:
-    """A standard node; `quality` 0-63."""
+    """Return a standard node; `quality` 0-63."""
     first = quality << 2 | (not begins) << 1 | begins
     angle_q6 = round(angle_deg * 64) % TURN_Q6
     return _NODE.pack(first, angle_q6 << 1 | 1, min(0xFFFF, round(distance_mm * 4)))
@@ -181,7 +181,7 @@ def express_capsule(
     *,
     begins: bool,
 ) -> bytes:
-    """An express capsule of 32 samples, the angle of each less by its shift [deg/8], 0-63."""
+    """Return an express capsule of 32 samples, each angle less by its shift [deg/8], 0-63."""
     words = [
         min(0x3FFF, round(d)) << 2 | s >> 4 for d, s in zip(distances_mm, shifts_q3, strict=True)
     ]
@@ -191,7 +191,7 @@ def express_capsule(
 
 
 def dense_capsule(start_deg: float, distances_mm: Sequence[float], *, begins: bool) -> bytes:
-    """A dense capsule of 40 samples."""
+    """Return a dense capsule of 40 samples."""
     return _capsule(start_deg, _DENSE.pack(*(min(0xFFFF, round(d)) for d in distances_mm)), begins)
 
 
@@ -206,5 +206,5 @@ def _start(block: bytes) -> float:
 
 
 def _advance(before: float, after: float) -> float:
-    """From one angle to the next [deg], -180 to 180."""
+    """Return the way from one angle to the next [deg], -180 to 180."""
     return (after - before + 180) % 360 - 180

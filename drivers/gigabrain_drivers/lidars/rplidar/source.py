@@ -52,12 +52,12 @@ class RplidarOptions(ScanOptions, frozen=True, kw_only=True, forbid_unknown_fiel
     scan_mode: ScanMode = "auto"  # the lidar's own choice, where it is one of the other three
 
 
-class Trouble(Exception):
-    """Why it does not scan, in one line for people."""
+class StartupError(Exception):
+    """The reason in one line why it does not scan."""
 
 
 class ModelFigures(NamedTuple):
-    """What a model's name says of it."""
+    """Baud rate and family of a model."""
 
     baud: int
     family: int  # high nibble of the model that it reports
@@ -76,38 +76,41 @@ MODELS = {
 
 
 class Line(Protocol):
-    """What the start-up needs of whoever has the port."""
+    """The operations of a port that the start-up needs."""
 
     def send(self, data: bytes) -> None:
-        """To the lidar."""
+        """Send bytes to the lidar."""
 
     async def ask(self, request: bytes, kind: int) -> bytes:
-        """The single answer to a request. Raises Trouble."""
+        """Return the single answer to a request. Raises StartupError."""
 
     def motor(self, *, on: bool) -> None:
-        """Let it turn, or stop."""
+        """Start or stop the motor."""
 
     def known(self, info: Info, *, pwm: bool) -> None:
-        """It has said who it is, and whether a board powers its motor."""
+        """Note the lidar's identity, and whether a board powers its motor."""
 
 
 async def start(line: Line, scan_mode: str) -> None:
-    """From any state to a stream of samples, in the order of the vendor's SDK. Raises Trouble."""
+    """Bring the lidar from any state to a stream of samples. Raises StartupError.
+
+    The order is that of the vendor's SDK.
+    """
     await _stop(line)
     info = Info.read(await line.ask(rplidar.request(rplidar.GET_INFO), rplidar.INFO))
     line.known(info, pwm=await _on_board(line, info))
     await _check_health(line)
     line.motor(on=True)
     await _stop(line)
-    kind, mode = await choose(line, info, scan_mode)
+    kind, mode = await choose_mode(line, info, scan_mode)
     if kind == rplidar.STANDARD:
         line.send(rplidar.request(rplidar.SCAN))
     else:
         line.send(rplidar.express_request(mode))
 
 
-async def choose(line: Line, info: Info, scan_mode: str) -> tuple[int, int]:
-    """The answer type and number of the scan mode to use. Raises Trouble.
+async def choose_mode(line: Line, info: Info, scan_mode: str) -> tuple[int, int]:
+    """Return the answer type and number of the scan mode to use. Raises StartupError.
 
     `auto` is the lidar's typical mode, or the fastest of those that are understood here.
     """
@@ -124,18 +127,18 @@ async def choose(line: Line, info: Info, scan_mode: str) -> tuple[int, int]:
             period = _number(await _conf(line, rplidar.MODE_MICROSECONDS, mode))
             fitting.append((period, kind, mode))
     if not fitting:
-        raise Trouble(f"this RPLIDAR has no scan_mode {scan_mode!r} that is understood here")
+        raise StartupError(f"this RPLIDAR has no scan_mode {scan_mode!r} that is understood here")
     return min(fitting)[1:]
 
 
 def _old_mode(info: Info, scan_mode: str) -> int:
-    """The answer type of firmware that cannot be asked for its modes."""
+    """Return the answer type of firmware that cannot be asked for its modes."""
     has = {"standard": rplidar.STANDARD}
     if info.firmware >= EXPRESS_FIRMWARE:
         has |= {"auto": rplidar.EXPRESS, "express": rplidar.EXPRESS}
     if scan_mode not in {*has, "auto"}:
         version = ".".join(map(str, info.firmware))
-        raise Trouble(f"this RPLIDAR's firmware {version} has no scan_mode {scan_mode!r}")
+        raise StartupError(f"this RPLIDAR's firmware {version} has no scan_mode {scan_mode!r}")
     return has.get(scan_mode, rplidar.STANDARD)
 
 
@@ -149,7 +152,7 @@ async def _on_board(line: Line, info: Info) -> bool:
         return False
     try:
         flags = await line.ask(rplidar.request(rplidar.GET_BOARD, bytes(4)), rplidar.BOARD)
-    except Trouble:  # there is nobody to answer where there is no board
+    except StartupError:  # there is nobody to answer where there is no board
         return False
     return bool(flags[0] & 1)
 
@@ -159,7 +162,9 @@ async def _check_health(line: Line) -> None:
     if health.status == 2:
         line.send(rplidar.request(rplidar.RESET))
         await asyncio.sleep(RESET_S)
-        raise Trouble(f"the RPLIDAR has stopped to protect itself, code {health.code}; was reset")
+        raise StartupError(
+            f"the RPLIDAR has stopped to protect itself, code {health.code}; was reset"
+        )
 
 
 async def _kind(line: Line, mode: int) -> int:
@@ -167,10 +172,10 @@ async def _kind(line: Line, mode: int) -> int:
 
 
 async def _conf(line: Line, key: int, mode: int | None = None) -> bytes:
-    """The value of a setting, at least one byte. Raises Trouble."""
+    """Return the value of a setting, at least one byte. Raises StartupError."""
     data = await line.ask(rplidar.conf_request(key, mode), rplidar.CONF)
     if int.from_bytes(data[:4], "little") != key or len(data) < 5:
-        raise Trouble(f"the RPLIDAR does not say its setting 0x{key:02x}")
+        raise StartupError(f"the RPLIDAR does not say its setting 0x{key:02x}")
     return data[4:]
 
 
@@ -181,8 +186,8 @@ def _number(data: bytes) -> int:
 class Rplidar(SerialSource):
     """An RPLIDAR of the A, C or S series.
 
-    A 0 in what it sends may be free space or nothing measurable: a body's file says
-    `no_return: unknown` of it where that matters.
+    Its 0 may be free space or nothing measurable: a body's file has `no_return: unknown` for it
+    where that matters.
     """
 
     Options = RplidarOptions
@@ -206,40 +211,40 @@ class Rplidar(SerialSource):
         self._pwm = False  # whether an accessory board powers its motor
 
     def connected(self) -> None:
-        """The start-up may begin."""
+        """Let the start-up begin."""
         self._connected.set()
 
     def received(self, data: bytes) -> None:
-        """Answers and samples, or parts of them."""
+        """Decode is_rplidar and samples, or parts of them."""
         now_ns = self.clock.now_ns()
         for item in self._decoder.feed(data):
             self.understood = True
             if isinstance(item, Samples):
                 self._samples_ns = now_ns
-                scan = self.turn.clockwise(*item, now_ns)
-                self.finished(scan)
+                scan = self.turn.add_samples(*item, now_ns)
+                self.emit_scan(scan)
             elif self._asked and self._asked[0] == item.kind and not self._asked[1].done():
                 self._asked[1].set_result(item.data)
 
-    def trouble(self) -> str:
-        """What the last start-up failed for."""
-        return self._trouble or super().trouble()
+    def explain(self) -> str:
+        """Return why the last start-up failed."""
+        return self._trouble or super().explain()
 
-    def no_answer(self) -> str:
-        """The same text for all baud rates that are tried, so that it is said once."""
+    def explain_silence(self) -> str:
+        """Return the same text for all baud rates that are tried, so that it is logged once."""
         model = self.options.model
         if model != "auto":
-            return f"{super().no_answer()} (model: {model})"
-        self._stranger = self.stranger() or self._stranger
+            return f"{super().explain_silence()} (model: {model})"
+        self._stranger = self.other_lidar() or self._stranger
         guess = f"it looks like {self._stranger}" if self._stranger else "is it powered?"
         bauds = ", ".join(map(str, BAUDS))
-        return f"no {self.name} answers on {self.link} at any of {bauds} baud: {guess}"
+        return f"no {self.name} is_rplidar on {self.link} at any of {bauds} baud: {guess}"
 
     def probe(self, port: serial.Serial) -> bool:
-        """Whether an RPLIDAR answers here, at any of the baud rates that are tried."""
+        """Return whether an RPLIDAR is_rplidar here, at any of the baud rates that are tried."""
         for baud in self._bauds:
             port.baudrate = baud
-            if answers(port):
+            if is_rplidar(port):
                 self._use(baud)
                 return True
         return False
@@ -249,9 +254,9 @@ class Rplidar(SerialSource):
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._keep_scanning())
             async for now_ns in self.clock.every(LOOK_NS):
-                self.look(now_ns)
+                self.watch_scans(now_ns)
 
-    def farewell(self) -> bool:
+    def send_stop(self) -> bool:
         """Stop measuring and turning."""
         self.send(rplidar.request(rplidar.STOP))
         self.motor(on=False)
@@ -260,12 +265,12 @@ class Rplidar(SerialSource):
     # What the start-up needs.
 
     def send(self, data: bytes) -> None:
-        """To the lidar, if it is there. What comes back begins with a descriptor."""
+        """Send bytes to the lidar, if it is there. What comes back begins with a descriptor."""
         self._decoder.clear()
         self.link.write(data)
 
     async def ask(self, request: bytes, kind: int) -> bytes:
-        """The single answer to a request. Raises Trouble."""
+        """Return the single answer to a request. Raises StartupError."""
         future: asyncio.Future[bytes] = asyncio.get_running_loop().create_future()
         self._asked = kind, future
         self.send(request)
@@ -274,15 +279,15 @@ class Rplidar(SerialSource):
                 return await future
         except TimeoutError:
             if self.understood:
-                raise Trouble(
+                raise StartupError(
                     f"the {self.name} on {self.link} does not answer request {request.hex(' ')}"
                 ) from None
-            raise Trouble(self.no_answer()) from None
+            raise StartupError(self.explain_silence()) from None
         finally:
             self._asked = None
 
     def motor(self, *, on: bool) -> None:
-        """By whatever this model has: the DTR line (cleared: it turns), PWM, or a speed."""
+        """Switch the motor by this model's means: DTR line (cleared: it turns), PWM or a speed."""
         self.link.set_dtr(not on)
         family = self._info.model >> 4 if self._info else 0
         if self._pwm:
@@ -292,7 +297,7 @@ class Rplidar(SerialSource):
             self.send(rplidar.request(rplidar.SET_SPEED, rpm.to_bytes(2, "little")))
 
     def known(self, info: Info, *, pwm: bool) -> None:
-        """It has said who it is."""
+        """Keep the lidar's identity, and log it when it is new."""
         if self._info != info:
             major, minor = info.firmware
             model = FAMILIES.get(info.model >> 4, f"model 0x{info.model:02x}")
@@ -312,13 +317,13 @@ class Rplidar(SerialSource):
             try:
                 await start(self, self.options.scan_mode)
                 await self._follow(connection)
-            except Trouble as trouble:
+            except StartupError as trouble:
                 self._trouble = str(trouble)
                 self._next_baud()
                 self.link.drop(self._trouble)
 
     async def _follow(self, connection: int) -> None:
-        """While samples come over the same connection. Raises Trouble."""
+        """Return when the connection is lost. Raises StartupError when samples stop."""
         limit, began_ns = SPIN_UP_NS, self.clock.now_ns()
         async for now_ns in self.clock.every(LOOK_NS):
             if not self.link.connected or self.link.reconnects != connection:
@@ -326,10 +331,10 @@ class Rplidar(SerialSource):
             if self._samples_ns > began_ns:
                 limit, self._trouble = SILENT_NS, ""
             if now_ns - max(self._samples_ns, began_ns) > limit:
-                raise Trouble(f"the {self.name} on {self.link} answered, but sends no samples")
+                raise StartupError(f"the {self.name} on {self.link} answered, but sends no samples")
 
     def _next_baud(self) -> None:
-        """Where the model is not known and nothing was understood, try the next baud rate."""
+        """Try the next baud rate, where the model is not known and nothing was understood."""
         if not self.understood:
             self._use(self._bauds[1 % len(self._bauds)])
 
@@ -341,11 +346,11 @@ class Rplidar(SerialSource):
     def _lost(self, why: str) -> None:
         self._connected.clear()
         if self._asked and not self._asked[1].done():
-            self._asked[1].set_exception(Trouble(why))
+            self._asked[1].set_exception(StartupError(why))
 
 
-def answers(port: serial.Serial) -> bool:
-    """Whether an RPLIDAR says who it is, at the port's present baud rate."""
+def is_rplidar(port: serial.Serial) -> bool:
+    """Return whether an RPLIDAR is_rplidar at the port's present baud rate."""
     port.write(rplidar.request(rplidar.STOP))
     time.sleep(STOP_S)
     port.reset_input_buffer()
