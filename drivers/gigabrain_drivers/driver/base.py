@@ -72,7 +72,7 @@ class Driver(abc.ABC):
 
     @abc.abstractmethod
     async def read_state(self) -> RobotState:
-        """What the body measures; header and gate are filled in later. Raises BodyLost."""
+        """Return the body's measurements; header and gate are added later. Raises BodyLost."""
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
         """Yield whenever time has gone on, and by how many ticks of 20 ms of the body's time."""
@@ -96,7 +96,7 @@ class Driver(abc.ABC):
         raise Unsupported(f"{type(self).__name__} cannot let go of its body's joints")
 
     def can(self, state: SafeState) -> bool:
-        """Whether this driver can bring its body into a safe state."""
+        """Return whether this driver can bring its body into a safe state."""
         return getattr(type(self), state) is not getattr(Driver, state) or state == "hold"
 
     async def make_safe(self) -> None:
@@ -150,5 +150,5 @@ class Driver(abc.ABC):
         return self.sensors[sensor_name]
 
     def report(self) -> Mapping[str, float | int | str | None]:
-        """Figures for reports that only this driver knows, such as a simulation's truth."""
+        """Return figures that only this driver knows, such as a simulation's truth."""
         return {}

@@ -46,7 +46,7 @@ class EchoLoop:
         self._good_ns = None
 
     def question(self, now_ns: int) -> bytes:
-        """What to send now."""
+        """Return the bytes to send now."""
         if now_ns < self._deaf_until_ns:
             return b""
         while self._expected and now_ns - self._expected[0][1] > LATE_NS:
@@ -56,7 +56,7 @@ class EchoLoop:
         return data
 
     def heard(self, data: bytes, now_ns: int) -> None:
-        """What has come back. After a wrong byte nothing is believed until the line is quiet."""
+        """Check bytes that came back. After a wrong byte none count until the line is quiet."""
         for byte in data:
             if now_ns < self._deaf_until_ns:
                 return
@@ -68,7 +68,7 @@ class EchoLoop:
                 self._good_ns = sent_ns
 
     def problem(self, now_ns: int) -> str:
-        """Why the contact does not count as closed, or an empty text."""
+        """Return why the contact does not count as closed, or an empty text."""
         if now_ns < self._deaf_until_ns:
             return "what comes back is not what was sent"
         if self._good_ns is None or now_ns - self._good_ns > LATE_NS:
@@ -77,7 +77,7 @@ class EchoLoop:
 
 
 class Button:
-    """Sends, listens, and says on `robot/button` what it knows of the contact."""
+    """Sends and listens, and publishes the state of the contact on `robot/button`."""
 
     def __init__(self, config: ButtonConfig, bus: Bus) -> None:
         self._bus, self._loop = bus, EchoLoop()
@@ -111,7 +111,7 @@ class Button:
                 self._bus.publish(BUTTON, state)
 
     def _look(self, now_ns: int) -> bool:
-        """Whether what is known of the contact has changed."""
+        """Update the state of the contact; return whether it has changed."""
         before, now = self._problem, self._problem_at(now_ns)
         starting = before is None and now_ns - self._began_ns < START_NS
         if now == before or (starting and now):
@@ -152,8 +152,8 @@ async def run(config: ButtonConfig, bus: Bus, ready: Callable[[], None]) -> None
 class ButtonWatch:
     """Holds the gate shut while the button is pressed, or silent for 200 ms.
 
-    `on_press` is called as soon as it is pressed. Until the button has been heard for the first
-    time its silence does not latch.
+    `on_press` is called as soon as it is pressed. Until its first message the button's silence does
+    not latch.
     """
 
     def __init__(self, bus: Bus, on_press: Callable[[str], object]) -> None:
@@ -162,7 +162,7 @@ class ButtonWatch:
         self._newest = bus.latest(BUTTON, self._take)
 
     def faults(self) -> tuple[Cause, ...]:
-        """What speaks against moving now."""
+        """Return the causes that forbid moving now."""
         state = self._newest.fresh()
         if state is None:
             return (why.BUTTON_LOST if self._heard else why.BUTTON_AWAITED,)

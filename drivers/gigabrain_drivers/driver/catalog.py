@@ -51,7 +51,7 @@ def known_drivers() -> list[str]:
 
 
 def robot_path(name: str) -> Path:
-    """The file of a robot: a known name, or a path to somebody's own. Raises ConfigError."""
+    """Return the file of a robot: a known name, or a path to a file. Raises ConfigError."""
     if name.endswith((".yaml", ".yml")):
         return Path(name)
     known = robot_files()
@@ -71,12 +71,12 @@ def load_robot(name: str) -> RobotFile:
 
 
 def ports_folder(name: str) -> Path:
-    """Where the emulator of a robot (name or file) puts its ports, and its driver looks."""
+    """Return the folder of the ports of a robot's emulator (by name or file)."""
     return state_dir() / "ports" / robot_path(name).absolute().parent.name
 
 
 def links_of(robot: RobotFile) -> list[LinkName]:
-    """By which links a robot can be reached; what is real and has physics can be emulated."""
+    """Return the links of a robot; what is real and has physics can be emulated."""
     known = {name for name in LINKS if getattr(robot, name) is not None}
     if robot.real is not None and (robot.sim or {}).get("driver") == "mujoco":
         known.add("emulated")
@@ -191,7 +191,7 @@ def at_emulator(options: Options, folder: str) -> Options:
 
 
 def link_options(driver: type[Driver], robot: RobotFile, link: dict[str, Any]) -> type[LinkOptions]:
-    """What a link of `driver` may hold, down to the lidar that it carries, on this very body."""
+    """Return the type of a link's options, with those of its lidar and checks for this body."""
     scan = link.get("scan")
     name = scan.get("driver") if isinstance(scan, dict) else None
     # where the lidar is not named, the driver's own options refuse it, with the line

@@ -55,7 +55,7 @@ class LatchFile:
         self._written = Latched()
 
     def read(self) -> Latched:
-        """What was latched when the driver ended; a file that cannot be read counts as latched.
+        """Return what was latched when the driver ended; an unreadable file counts as latched.
 
         Raises ConfigError when the folder cannot be written.
         """
@@ -128,9 +128,9 @@ def raised(state: GateState) -> Raised:
 
 
 class Gatekeeper:
-    """Steps the gate, and answers for it. An e-stop is on disk before it is confirmed.
+    """Steps the gate, and serves requests to it. An e-stop is on disk before it is confirmed.
 
-    `changed` is called whenever the body has to be told something new.
+    `changed` is called whenever there is a new command for the body.
     """
 
     def __init__(
@@ -192,7 +192,7 @@ class Gatekeeper:
         return outcome
 
     def ticks(self, passed: int, tick: gate.Tick) -> None:
-        """So many ticks have passed since the last call, all but one of them missed."""
+        """Step the gate by `passed` ticks since the last call, all but one of them missed."""
         for _ in range(passed):
             late = self._is_late(tick.wall_ns)
             self._bus.counters["late_ticks"] += late
@@ -200,7 +200,7 @@ class Gatekeeper:
             self._look_after_disk()
 
     def _is_late(self, wall_ns: int | None) -> bool:
-        """Whether a tick comes in the wake of another one, to make up for lost time."""
+        """Return whether a tick only makes up for lost time, right after another one."""
         if wall_ns is None:
             return False
         late = wall_ns - self._on_time_ns < STEP_NS
@@ -236,7 +236,7 @@ class Gatekeeper:
         self._latched, self._on_disk = latched, self._scribe.put(latched)
 
     async def _remembered(self) -> str:
-        """Wait for the disk; what is to be said when it did not take it."""
+        """Wait for the disk; return the text to add to a reply if it failed."""
         problem = await self._on_disk
         if not problem:
             self._forgetful.end("what latches the gate is remembered again")
@@ -249,7 +249,7 @@ class Gatekeeper:
         self._told_to_stop(EstopRequest(source="button", reason=text))
 
     def _told_to_stop(self, said: EstopRequest) -> None:
-        """Stop where nobody waits for an answer."""
+        """Latch and stop, where nothing waits for an answer."""
         outcome = self.step(gate.Estop(said.source))
         self._output_changed()
         log.warning("e-stop by %s %s", said.source, said.reason)
@@ -294,7 +294,7 @@ class Gatekeeper:
 
 
 def _differs(before: gate.GateState, now: gate.GateState) -> bool:
-    """Whether anybody may want to know; nearly all ticks and commands change none of this."""
+    """Return whether a change matters to anybody; nearly all ticks and commands change nothing."""
     return (
         now.mode != before.mode
         or now.estop_generation != before.estop_generation

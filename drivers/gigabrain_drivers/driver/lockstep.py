@@ -19,15 +19,15 @@ WAITING = 1_000  # scans that may be unanswered; a brain that is away answers no
 
 
 class Lockstep:
-    """Knows whether all that a tick waits for has come.
+    """Tracks whether everything that a tick waits for has arrived.
 
     A tick waits for a command that echoes it. A tick with a scan waits for the command, and for the
     verdict of safety, that rest on that scan. Between scans safety is waited for as well: a verdict
     that is old by the robot's clock would stop it, where only the machine is slow. So decisions do
     not depend on how fast a machine is.
 
-    A verdict that misses a part of the brain does not count: safety has begun to listen when that
-    part had answered already, and when it hears the next answer would be left to chance.
+    A verdict that misses a part of the brain does not count: that part answered before safety
+    listened, and whether safety gets its next answer in time would be left to chance.
     """
 
     def __init__(self, period_ticks: int = 1, timeout_s: float = TIMEOUT_S) -> None:
@@ -46,7 +46,7 @@ class Lockstep:
         self._wake.clear()
 
     def command(self, command: CmdVel) -> None:
-        """A command has come. One without a basis comes from somebody who needs no scan.
+        """Note a command. One without a basis comes from a commander that needs no scan.
 
         One that echoes a tick that has not been sent out yet answers nothing.
         """
@@ -68,12 +68,12 @@ class Lockstep:
 
     @property
     def complete(self) -> bool:
-        """Whether the tick has been answered."""
+        """True once the tick has been answered."""
         rested = min(self._echo_basis, self._judged) >= self._basis
         return rested and self._echo >= self._tick and self._seen >= self._wanted
 
     async def wait(self, timeout_s: float) -> bool:
-        """Wait for the answer; says whether it came in time."""
+        """Wait for the answer; return whether it came in time."""
         try:
             async with asyncio.timeout(timeout_s):
                 while not self.complete:
@@ -106,7 +106,7 @@ class RoundTrip:
         self._waiting.append((tick, now_ns))
 
     def answered(self, basis: int, now_ns: int, *, counts: bool) -> None:
-        """A command that rests on `basis` has come; while the brain still starts none counts."""
+        """Note a command that rests on `basis`; only those with `counts` are timed."""
         while self._waiting and self._waiting[0][0] <= basis:
             _, sent_ns = self._waiting.popleft()
             if counts:

@@ -174,7 +174,7 @@ class DriverProcess:
             await self._obey()
 
     def report(self) -> Mapping[str, float | int | str | None]:
-        """What the body and this process can say of the whole run."""
+        """Return the figures of the whole run, of the body and of this process."""
         figures: dict[str, float | int | str | None] = {
             "stale_commands_executed": self._bus.counters["stale_commands_executed"],
             "lockstep_timeouts": self._lockstep.timeouts if self._lockstep else 0,
@@ -202,7 +202,7 @@ class DriverProcess:
         await self._obey()
 
     def _emit(self, topic: Topic[Any], message: Message) -> None:
-        """A sensor has something: it waits for nobody's period, unless time waits for the brain."""
+        """Publish a sensor's message at once, or with the next tick in lock-step."""
         message = clipped(message)
         if self._lockstep or not self._gate.tick:
             self._sensors.append((topic, message))
@@ -299,7 +299,7 @@ class DriverProcess:
             self._lockstep.verdict(said)
 
     def _wall_ns(self) -> int | None:
-        """The host's clock; none where time is lock-stepped and the wall says nothing."""
+        """Return the host's clock; None in lock-step, where it means nothing."""
         return None if self._lockstep else self._bus.clock.now_ns()
 
     def _measure(self) -> None:

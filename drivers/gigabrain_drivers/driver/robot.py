@@ -14,7 +14,7 @@ LINKS: tuple[LinkName, ...] = ("sim", "emulated", "real")
 
 
 class JointLimits(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """How far and how fast one joint may go."""
+    """Range and speed of one joint."""
 
     name: Name
     lower: Finite  # [rad] or [m]
@@ -34,7 +34,7 @@ class RobotFile(BodyDescription, frozen=True, kw_only=True, forbid_unknown_field
     real: dict[str, Any] | None = None
 
     def description(self) -> BodyDescription:
-        """The part that the brain goes by."""
+        """Return the part that the brain uses."""
         names = BodyDescription.__struct_fields__
         return BodyDescription(**{name: getattr(self, name) for name in names})
 
@@ -50,7 +50,7 @@ class ScanOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class LinkOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What every link has; drivers add their own fields."""
+    """Options of every link; drivers add their own fields."""
 
     driver: str
     scan: ScanOptions | None = None  # a lidar that the driver carries, see lidars.base.carry
@@ -58,7 +58,7 @@ class LinkOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
 
 class Run(Struct, frozen=True, kw_only=True):
-    """How a driver is run this time."""
+    """Settings of one run of a driver."""
 
     folder: Path  # where the robot's file and its models are
     link: LinkName = "sim"

@@ -35,7 +35,7 @@ KEPT_S = 0.5  # samples of so long are kept when nobody takes them
 
 
 class Snapshot(NamedTuple):
-    """What the body's parts measured at the end of a step of 10 ms."""
+    """Measurements of the body's parts at the end of a step of 10 ms."""
 
     time_ns: int  # by the electronics' own clock
     odometry: OdometryReading
@@ -48,7 +48,7 @@ class Snapshot(NamedTuple):
 
 
 class Broken(NamedTuple):
-    """What is wrong with the body itself, whatever its electronics do."""
+    """Faults of the body itself, whatever its electronics do."""
 
     runaway: float = 0.0  # [m/s], what the wheels do whatever they are told
     stuck_wheel: bool = False  # the first one does not turn
@@ -56,9 +56,9 @@ class Broken(NamedTuple):
 
 
 class EmulatedBody:
-    """Physics in a thread of its own, 10 ms a step; everything else may be called on the loop.
+    """A body in MuJoCo, in a thread of its own, 10 ms a step. All methods belong on the loop.
 
-    `command` is what the motors are told; stopping when nobody tells them is the devices' part.
+    `command` sets the motors' targets; stopping when no commands come is up to the devices.
     """
 
     def __init__(self, robot: RobotFile, simulation: Simulation, run: Run) -> None:
@@ -92,16 +92,16 @@ class EmulatedBody:
             await asyncio.to_thread(thread.join)
 
     def command(self, linear_x: float, linear_y: float, angular_z: float) -> None:
-        """What the motors aim for from the next step on [m/s, m/s, rad/s]."""
+        """Set the velocity that the motors aim for from the next step on."""
         self._commanded, self._gait = (linear_x, linear_y, angular_z), None
 
     def walk(self, gait: Gait) -> None:
-        """What the legs of a quadruped aim for from the next step on."""
+        """Set the gait that a quadruped aims for from the next step on."""
         self._gait = gait
 
     @property
     def commanded(self) -> tuple[float, float, float]:
-        """What the motors aim for; of a gait, the velocity that its steps amount to."""
+        """The velocity that the motors aim for; of a gait, that of its steps."""
         gait = self._gait
         if gait is None:
             return self._commanded
@@ -109,7 +109,7 @@ class EmulatedBody:
         return linear_x, linear_y, angular_z
 
     def fresh(self) -> list[Snapshot]:
-        """What was measured since this was last asked for, oldest first; of a quarter of a second.
+        """Return the snapshots since the last call, oldest first, of a quarter of a second.
 
         A device that reports every step must not leave out those in which the loop was held up.
         """
@@ -174,7 +174,7 @@ class EmulatedBody:
             tell(snapshot)
 
     def _disobeyed(self, commanded: tuple[float, float, float]) -> tuple[float, float, float]:
-        """What broken motors do when they are told this [m/s, m/s, rad/s]."""
+        """Return the velocity of broken motors under this command."""
         base = base_of(self.robot)
         if self._broken.runaway or base is None:
             return self._broken.runaway, 0.0, 0.0
@@ -196,10 +196,10 @@ class EmulatedBody:
 
 
 class Wire(Protocol):
-    """Where a device's bytes go."""
+    """The host's end of a device's line."""
 
     def write(self, data: bytes) -> bool:
-        """To the host; False when nobody takes it."""
+        """Send to the host. Return False when it is not connected."""
 
 
 class Port(Wire, Protocol):
@@ -211,13 +211,13 @@ class Port(Wire, Protocol):
         """Make it appear. Nothing if it is there."""
 
     def unplug(self) -> None:
-        """Make it disappear under whoever uses it. Nothing if it is gone."""
+        """Make it disappear, even while it is in use. Nothing if it is gone."""
 
 
 class Device(abc.ABC):
     """The electronics on one link: answers bytes, moves the body, reports what it measures.
 
-    Everything is called on the loop. There is no clock inside: `step` says what time it is.
+    Everything is called on the loop. There is no clock inside: `step` gets the time.
     """
 
     Options: ClassVar[type[Struct]]  # those of the driver or scan source that it answers
@@ -232,20 +232,20 @@ class Device(abc.ABC):
 
     @classmethod
     def port(cls, options: Any) -> Port:
-        """What it is plugged into: the pty that the options of its driver name."""
+        """Return the port that it is plugged into: the pty in its driver's options."""
         return Pty(Path(options.port), cls.baud)
 
     @abc.abstractmethod
     def feed(self, data: bytes) -> None:
-        """Bytes have come from the host, in pieces of any size."""
+        """Handle bytes from the host, in pieces of any size."""
 
     @abc.abstractmethod
     def step(self, now_ns: int) -> None:
-        """What the firmware does by itself every `period_s`: telemetry, and its watchdog."""
+        """Do what the firmware does every `period_s`: telemetry, and its watchdog."""
 
     @abc.abstractmethod
     def reset(self) -> None:
-        """Power has come: all as at the start, motors at rest, the banner where it has one."""
+        """Power on: all as at the start, motors at rest, the banner where it has one."""
 
 
 class Sample(NamedTuple):
@@ -281,7 +281,7 @@ class Sweep:
         self._samples.clear()
 
     def take(self, count: int) -> list[Sample]:
-        """The next `count` samples, or none when there are not so many yet."""
+        """Return the next `count` samples, or none when there are not enough yet."""
         samples = self._samples
         return [samples.popleft() for _ in range(count)] if len(samples) >= count else []
 

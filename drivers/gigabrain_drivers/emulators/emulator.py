@@ -80,7 +80,7 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 def no_ports(folder: Path, error: OSError) -> ConfigError:
-    """What to say when ports cannot be made."""
+    """Return the error for ports that cannot be made."""
     return ConfigError(f"no ports can be made in {folder}: {error.strerror}; expected a folder")
 
 
@@ -133,9 +133,9 @@ class Station:
 
 
 class Emulator:
-    """The robot called `name`. Used as `async with`; its ports are there inside.
+    """The emulated robot called `name`. Used as `async with`; its ports exist inside.
 
-    `run` says in which world, with which seed, and in which folder its ports appear.
+    `run` names the world, the seed, and the folder of its ports.
     """
 
     def __init__(self, name: str, run: Run) -> None:
@@ -215,7 +215,7 @@ def device_class(driver: str) -> type[Device]:
 
 
 def wire_of(name: str) -> Literal["serial", "tcp", ""]:
-    """What an emulated robot's base is plugged into; nothing where it cannot be emulated.
+    """Return the kind of line to an emulated robot's base; empty where it cannot be emulated.
 
     Raises ConfigError, and UnknownName.
     """
@@ -233,5 +233,5 @@ def _parts(options: LinkOptions) -> dict[str, Any]:
 
 
 def _ports(options: LinkOptions) -> dict[str, str]:
-    """Where each station is to be found."""
+    """Return the path or address of each station."""
     return {name: str(getattr(its, "port", "")) for name, its in _parts(options).items()}

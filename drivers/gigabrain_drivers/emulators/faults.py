@@ -25,7 +25,7 @@ NUMBERS = {  # what is expected of those that take one
 
 
 class Faults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is wrong with a device at present. Written as JSON, or as words such as `silence`."""
+    """The present faults of a device. Written as JSON, or as words such as `silence`."""
 
     silence: bool = False  # nothing that it sends arrives; it still hears
     deaf: bool = False  # nothing that is sent to it arrives; it still talks
@@ -54,7 +54,7 @@ NONE = Faults()
 
 
 def faults_in(words: Iterable[str], stations: Iterable[str]) -> Faults:
-    """The faults that words such as `silence` and `garbage=0.1` ask for. Raises ConfigError."""
+    """Return the faults of words such as `silence` and `garbage=0.1`. Raises ConfigError."""
     faults = NONE
     for word in words:
         name, given, value = word.partition("=")
@@ -93,7 +93,7 @@ class FaultyWire:
         return self._wire.write(self._flipped(data))
 
     def incoming(self, data: bytes) -> bytes:
-        """What reaches the device of what the host sent, and of what had to wait."""
+        """Return the bytes that reach the device, with those that had to wait."""
         faults = self.faults
         if faults.deaf or faults.reboot:
             return b""

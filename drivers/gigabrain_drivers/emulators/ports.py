@@ -32,7 +32,7 @@ class Pty:
 
     @property
     def plugged(self) -> bool:
-        """Whether the port exists."""
+        """True while the port exists."""
         return self._master is not None
 
     def plug(self) -> None:
@@ -54,7 +54,7 @@ class Pty:
         os.replace(fresh, self.path)
 
     def unplug(self) -> None:
-        """Make the port disappear under whoever has it open. Nothing if it is gone."""
+        """Make the port disappear, even while it is open. Nothing if it is gone."""
         if self._master is None or self._slave is None:
             return
         asyncio.get_running_loop().remove_reader(self._master)
@@ -105,18 +105,18 @@ class Pty:
 
 
 def _lasting(terminal: int) -> str:
-    """A path of the terminal that leads nowhere once this process is dead, where there is one.
+    """Return a path of the terminal that is dead once this process is, where there is one.
 
-    The name of a terminal is given away again: a driver must not write to somebody's shell.
+    The name of a terminal is reused: a driver must not write to another user's shell.
     """
     of_process = f"/proc/{os.getpid()}/fd/{terminal}"  # Linux
     return of_process if os.path.exists(of_process) else os.ttyname(terminal)
 
 
 class TcpPort:
-    """The device's end. `path` says where it is: a file that holds HOST:PORT.
+    """The device's end of a TCP connection; the file `path` holds its HOST:PORT.
 
-    The usual `port` where it is free, and any other where it is not.
+    It listens on the usual `port` where that is free, and on any other where it is not.
     """
 
     def __init__(self, path: Path, port: int) -> None:
@@ -157,7 +157,7 @@ class TcpPort:
             self.path.unlink(missing_ok=True)
 
     def write(self, data: bytes) -> bool:
-        """To the client; False when there is none. One who does not read is dropped."""
+        """Send to the client. False when there is none. A client that does not read is dropped."""
         if self._client is None:
             return False
         sent = 0

@@ -1,4 +1,4 @@
-"""The emulator's process: beside a driver under a supervisor, or by itself for whoever likes."""
+"""The emulator's process: beside a driver under a supervisor, or by itself."""
 
 import asyncio
 import logging
@@ -64,7 +64,7 @@ async def _until(stop: asyncio.Event, work: Coroutine[None, None, None]) -> None
 
 
 def where(port: str) -> str:
-    """What to connect to: the port itself, or the address that is written there."""
+    """Return what to connect to: the port itself, or the address that its file holds."""
     path = Path(port)
     return path.read_text(encoding="ascii").strip() if path.is_file() else port
 
@@ -84,7 +84,7 @@ def emulator_of(config: EmulatorConfig) -> Emulator:
 
 
 async def watch(emulator: Emulator, path: Path) -> None:
-    """Have the faults that the file asks for, for ever. Raises BodyLost with the physics."""
+    """Apply the faults in the file whenever it changes. Raises BodyLost with the physics."""
     seen = None
     while not emulator.body.lost:
         stamp = _changed_ns(path)

@@ -58,7 +58,7 @@ class Leg:
         return math.remainder(abduction, math.tau) * side, math.atan2(-x, drop) - lean, knee
 
     def foot(self, joints: Vector) -> Vector:
-        """Where the middle of the foot is."""
+        """Return the middle of the foot."""
         abduction, hip, knee = joints
         x = -self.thigh * math.sin(hip) - self.calf * math.sin(hip + knee)
         z = -self.thigh * math.cos(hip) - self.calf * math.cos(hip + knee)
@@ -66,7 +66,7 @@ class Leg:
         return self.hip_x + x, self.hip_y + self.out * cos - z * sin, self.out * sin + z * cos
 
     def jacobian(self, joints: Vector) -> tuple[Vector, Vector, Vector]:
-        """By how much the foot moves per radian [m]: of the abduction, of the hip, of the knee."""
+        """Return the foot's motion per radian [m] of the abduction, of the hip, of the knee."""
         abduction, hip, knee = joints
         sin, cos = math.sin(abduction), math.cos(abduction)
         knee_x, knee_z = -self.calf * math.cos(hip + knee), self.calf * math.sin(hip + knee)
@@ -128,7 +128,7 @@ class Senses(NamedTuple):
 
 
 class Gait(NamedTuple):
-    """How a quadruped walks: each foot is on the ground for `duty` of a cycle."""
+    """The gait of a quadruped: each foot is on the ground for `duty` of a cycle."""
 
     stride_x: float  # [m], by which the body moves in one cycle
     stride_y: float  # [m]
@@ -180,7 +180,7 @@ WALKER = Walker(frequency=3.6, max_frequency=4.2, duty=0.6)
 
 
 def sound(gait: Gait) -> bool:
-    """Whether these are numbers, and within what the legs can do."""
+    """Return whether all values are numbers, and within what the legs can do."""
     values = (gait.stride_x, gait.stride_y, gait.turn, gait.frequency, gait.duty, gait.height)
     if not all(map(math.isfinite, (*values, *gait.phases))):
         return False

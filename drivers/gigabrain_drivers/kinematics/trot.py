@@ -153,7 +153,7 @@ class Trot:
         return tuple(targets)
 
     def _braced(self, foot: Vector) -> Vector:
-        """Where a standing foot goes to slow down what the body is too fast by."""
+        """Return the target of a standing foot that slows down a body that is too fast."""
         pairs = zip(self.odometry.velocity, self._command, strict=True)
         ahead, left, turning = (BRACE_S * (now - to) for now, to in pairs)
         x, y, z = foot

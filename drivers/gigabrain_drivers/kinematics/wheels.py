@@ -37,11 +37,11 @@ class Base(abc.ABC):
 
     @abc.abstractmethod
     def to_wheels(self, twist: Twist) -> tuple[float, ...]:
-        """What each wheel has to do; what the base cannot do is left out."""
+        """Return the speed of each wheel; what the base cannot do is left out."""
 
     @abc.abstractmethod
     def to_body(self, wheels: tuple[float, ...]) -> Twist:
-        """What the body does when its wheels do this without slipping."""
+        """Return the velocity of the body when its wheels do not slip."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def base_of(robot: RobotFile) -> Base | None:
 
 
 def advanced(pose: Pose, moved: Twist) -> Pose:
-    """Where a body is after a small step in its own frame, taken at the mid heading."""
+    """Return the pose after a small step in the body's frame, taken at the mid heading."""
     middle = pose.yaw + moved.angular_z / 2
     cos, sin = math.cos(middle), math.sin(middle)
     return Pose(
@@ -204,7 +204,7 @@ class WheelOdometry:
         self.pose = Pose(x=0.0, y=0.0, yaw=0.0)
 
     def add(self, wheels: tuple[float, ...]) -> None:
-        """The wheels have turned by so much [rad], in the order of `base.wheels`."""
+        """Add the angles by which the wheels have turned [rad], as in `base.wheels`."""
         self.pose = advanced(self.pose, self._base.to_body(wheels))
 
 
@@ -216,13 +216,13 @@ class Encoders:
         self._last: tuple[int, ...] | None = None
 
     def turned(self, counts: tuple[int, ...]) -> tuple[float, ...]:
-        """By how much [rad] since the last look; nothing at the first."""
+        """Return the angles since the last call [rad]; zero at the first."""
         last, self._last = self._last or counts, counts
         pairs = zip(counts, last, strict=True)
         return tuple(self._radians * self._wrapped(now - before) for now, before in pairs)
 
     def restart(self) -> None:
-        """The counters may have been set anew: what comes next counts from there."""
+        """Count from the next values on: the counters may have been reset."""
         self._last = None
 
     def _wrapped(self, difference: int) -> int:

@@ -59,7 +59,7 @@ class Link(abc.ABC):
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open, which does not mean that the body answers."""
+        """True while the port is open, which does not mean that the body answers."""
         return self._fd is not None
 
     @property
@@ -267,7 +267,7 @@ class Liveness:
 
     @property
     def received(self) -> bool:
-        """Whether a message has come since the line was opened."""
+        """True if a message has come since the line was opened."""
         return self._heard_ns is not None
 
     def mark_received(self) -> bool:

@@ -18,7 +18,7 @@ class Pace:
         self.dropped_s = 0.0  # all together
 
     def wait(self, steps: int = 1) -> None:
-        """Sleep until the deadline that lies so many steps behind the last one."""
+        """Sleep until the deadline that lies `steps` behind the last one."""
         self._done += steps
         wait = self._start_s + self._done * self._step_s - time.perf_counter()
         if wait > 0:

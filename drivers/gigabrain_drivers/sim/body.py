@@ -53,7 +53,7 @@ class SimMotor:
 
 @dataclass(frozen=True, kw_only=True)
 class SimModel:
-    """What every body has. Its model's base body is `base`, with the free joint `free`.
+    """The figures of every body. Its model's base body is `base`, with the free joint `free`.
 
     Geoms of the base that are called `hull_...` make up the body's outline.
     """

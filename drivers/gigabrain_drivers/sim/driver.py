@@ -33,7 +33,7 @@ SPEEDS = (0.1, 100.0)
 
 
 def state_of(simulation: Simulation, robot_type: str) -> RobotState:
-    """By the body's own sensors, as it is now."""
+    """Return the body's state by its own sensors."""
     odometry, charge, imu = simulation.odometry(), simulation.battery(), simulation.imu()
     return RobotState(
         robot_type=robot_type,
@@ -64,7 +64,7 @@ def scan_of(lidar: Lidar, ranges: NDArray[np.float32]) -> LaserScan:
 
 
 class Reading(NamedTuple):
-    """What the physics thread hands over after each step of 10 ms."""
+    """The results of one step of 10 ms, passed from the physics thread to the loop."""
 
     imu: Imu
     scan: LaserScan | None = None  # when the lidar has finished a turn, between two states
@@ -100,7 +100,7 @@ class MujocoDriver(Driver):
         self.sensors = dict.fromkeys(("imu", "scan") if robot.lidar else ("imu",))
 
     async def open(self) -> None:
-        """Take the first readings; time stands still until somebody asks for ticks."""
+        """Take the first readings; time stands still until `ticks` is iterated."""
         self._state = self._look()
         self.sensors["imu"] = self._imu()
         if self.robot.lidar:
@@ -121,11 +121,11 @@ class MujocoDriver(Driver):
         self._simulation.command(0.0, 0.0)
 
     async def park(self) -> None:
-        """As it stands: the physics ends with this process, and the body with it."""
+        """Stop: the physics ends with this process, and the body with it."""
         await self.stop()
 
     async def limp(self) -> None:
-        """As it stands, see `park`."""
+        """Stop, see `park`."""
         await self.stop()
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
@@ -183,7 +183,7 @@ class MujocoDriver(Driver):
             self._post(error)
 
     def _simulate(self) -> None:
-        """Step until the run's seconds are over, or until told to stop."""
+        """Step until the run's seconds are over, or until closed."""
         pace = Pace(STEP_S / self.run.speed)
         while not self._halt.is_set():
             if self.lockstep:
@@ -216,7 +216,7 @@ class MujocoDriver(Driver):
         return Reading(self._imu(), scan=self._scan() if due else None)
 
     def _timed(self, work: Callable[[], T]) -> T:
-        """The result of a piece of physics, its CPU time added to what the report tells."""
+        """Run a piece of physics and add its CPU time to the report."""
         began = time.thread_time()
         result = work()
         self._physics_s += time.thread_time() - began

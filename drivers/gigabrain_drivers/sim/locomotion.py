@@ -1,4 +1,4 @@
-"""How a simulated body moves: on wheels or on legs, behind one interface; and how it wears."""
+"""Motion of a simulated body, on wheels or on legs, and the wear of its battery and motors."""
 
 import abc
 import math
@@ -45,7 +45,7 @@ class Battery:
         self._left_ah = max(self._left_ah - self._current * STEP_S / HOUR_S, 0.0)
 
     def read(self) -> Charge:
-        """What the board reports now."""
+        """Return what the board reports."""
         config, share = self._config, self._left_ah / self._config.capacity_ah
         if share > 0.5:
             rest = config.nominal_voltage
@@ -86,7 +86,7 @@ class Motor(NamedTuple):
 
 
 class OdometryReading(NamedTuple):
-    """Where the body's own sensors say that it is, from (0, 0, 0) at the start."""
+    """Pose and velocity by the body's own sensors, from (0, 0, 0) at the start."""
 
     x: float  # [m]
     y: float  # [m]
@@ -129,14 +129,14 @@ class Locomotion(abc.ABC):
 
     @abc.abstractmethod
     def velocity(self) -> Twist:
-        """As measured, sideways as well."""
+        """Return the measured velocity, sideways as well."""
 
     @abc.abstractmethod
     def motors(self) -> tuple[Motor, ...]:
         """All driven joints."""
 
     def contacts(self) -> tuple[bool, ...]:
-        """Which feet bear weight; none for a body without feet."""
+        """Return which feet bear weight; none for a body without feet."""
         return ()
 
 
@@ -208,13 +208,13 @@ class Rolling(Locomotion):
         return current
 
     def odometry(self) -> OdometryReading:
-        """By the wheel encoders alone."""
+        """Return pose and velocity by the wheel encoders alone."""
         left, right = self._speeds(self._metres_per_tick)
         turn = (right - left) / self._body.wheel_separation
         return OdometryReading(self._x, self._y, self._yaw, (left + right) / 2, turn)
 
     def velocity(self) -> Twist:
-        """By the wheel encoders alone."""
+        """Return the velocity by the wheel encoders alone."""
         odometry = self.odometry()
         return Twist(odometry.linear_x, 0.0, odometry.angular_z)
 
@@ -266,11 +266,11 @@ class Walking(Locomotion):
 
     @property
     def fallen(self) -> bool:  # type: ignore[override]
-        """Whether it lies on the floor, by its own attitude."""
+        """True once the body lies on the floor, by its own attitude."""
         return self._trot.fallen
 
     def command(self, twist: Twist) -> Twist:
-        """By the walker's gait for it."""
+        """Aim for the walker's gait for a velocity."""
         self._gait = self._body.walker.to_gait(twist)
         return self._body.walker.to_body(self._gait)
 
@@ -279,7 +279,7 @@ class Walking(Locomotion):
         self._gait = gait
 
     def act(self) -> None:
-        """Where the servos shall be at the end of the tick."""
+        """Set the servos' targets for the end of the step."""
         if self._senses:
             self._targets = self._trot.step(self._gait, self._senses, STEP_S)
         self._data.ctrl[self._motors] = _flat(self._targets)
@@ -313,12 +313,12 @@ class Walking(Locomotion):
         return power / self._body.battery.nominal_voltage
 
     def odometry(self) -> OdometryReading:
-        """By legs and gyroscope."""
+        """Return pose and velocity by legs and gyroscope."""
         pose, velocity = self._trot.odometry.pose, self._trot.odometry.velocity
         return OdometryReading(pose.x, pose.y, self._turned, velocity.linear_x, velocity.angular_z)
 
     def velocity(self) -> Twist:
-        """By legs, accelerometer and gyroscope."""
+        """Return the velocity by legs, accelerometer and gyroscope."""
         return self._trot.odometry.velocity
 
     def motors(self) -> tuple[Motor, ...]:

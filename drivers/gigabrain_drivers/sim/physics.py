@@ -34,7 +34,7 @@ EDGE_OF_THE_WORLD_M = 1e3
 
 
 class Simulation:
-    """The same body, world, seed and calls give the same numbers, bit for bit."""
+    """A body in a world. The same body, world, seed and calls give the same bits."""
 
     def __init__(self, body: SimModel, world: World, seed: int) -> None:
         self.model = compile_scene(body, world)
@@ -61,7 +61,7 @@ class Simulation:
 
     @property
     def person_stood(self) -> int:
-        """How often the person had to stand for the robot."""
+        """The number of times that the person had to stand for the robot."""
         return self._person.stood if self._person else 0
 
     def command(self, linear_x: float, angular_z: float) -> tuple[float, float]:
@@ -81,7 +81,7 @@ class Simulation:
         self._locomotion.walk(gait)
 
     def advance(self) -> None:
-        """Simulate the next 10 ms. Raises BodyLost when the physics has come apart."""
+        """Simulate the next 10 ms. Raises BodyLost when the physics diverges."""
         if self._person:
             robot = self.truth.pose()
             self._person.advance(lambda x, y: self.truth.footprint.distance(robot, x, y))
@@ -109,7 +109,7 @@ class Simulation:
         return self._locomotion.odometry()
 
     def velocity(self) -> Twist:
-        """By the body's own sensors, sideways as well."""
+        """Return the velocity by the body's own sensors, sideways as well."""
         return self._locomotion.velocity()
 
     def imu(self) -> ImuSample:
@@ -121,12 +121,12 @@ class Simulation:
         return self._locomotion.motors()
 
     def contacts(self) -> tuple[bool, ...]:
-        """Which feet bear weight, by their own sensors; none on wheels."""
+        """Return which feet bear weight, by their own sensors; none on wheels."""
         return self._locomotion.contacts()
 
     @property
     def fallen(self) -> bool:
-        """Whether the body lies on the floor, by its own attitude."""
+        """True once the body lies on the floor, by its own attitude."""
         return self._locomotion.fallen
 
     def battery(self) -> Charge:
@@ -134,7 +134,7 @@ class Simulation:
         return self._battery.read()
 
     def bumper(self) -> bool:
-        """Whether the robot touches anything but the floor right now."""
+        """Return whether the robot touches anything but the floor right now."""
         return self.truth.touching
 
     def _place_person(self) -> None:
@@ -151,7 +151,7 @@ class Simulation:
 
 
 def locomotion_of(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) -> Locomotion:
-    """How this body gets about. Raises ConfigError where that is not known."""
+    """Return the locomotion of a body. Raises ConfigError for an unknown kind."""
     if isinstance(body, SimBody):
         return Rolling(body, model, data)
     if isinstance(body, SimQuadruped):

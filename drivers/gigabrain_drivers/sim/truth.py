@@ -1,4 +1,4 @@
-"""What really happened, by the physics: for reports and tests, never for the robot."""
+"""Ground truth of a run, by the physics: for reports and tests, never for the robot."""
 
 import math
 
@@ -51,7 +51,7 @@ class Truth:
         self._clear()
 
     def pose(self) -> Pose:
-        """Where the base is in the world."""
+        """Return the pose of the base in the world."""
         x, y, _, *quaternion = self._data.qpos[self._place : self._place + 7].tolist()
         a, b, c, d = quaternion
         return Pose(x, y, math.atan2(2 * (a * d + b * c), 1 - 2 * (c * c + d * d)))

@@ -37,7 +37,7 @@ class Box:
     bottom: float = 0.0
 
     def distance(self, x: float, y: float) -> float:
-        """How far the point is from the outline [m]; 0 inside."""
+        """Return the distance of a point from the outline [m]; 0 inside."""
         dx, dy = x - self.x, y - self.y
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         beside_x = max(abs(cos * dx + sin * dy) - self.half_x, 0.0)
@@ -57,7 +57,7 @@ class Cylinder:
     bottom: float = 0.0
 
     def distance(self, x: float, y: float) -> float:
-        """How far the point is from the outline [m]; 0 inside."""
+        """Return the distance of a point from the outline [m]; 0 inside."""
         return max(math.hypot(x - self.x, y - self.y) - self.radius, 0.0)
 
 
@@ -78,7 +78,7 @@ class Footprint:
     half_width: float  # [m]
 
     def distance(self, pose: Pose, x: float, y: float) -> float:
-        """How far a point of the world is from the robot's outer edge [m]; 0 inside."""
+        """Return the distance of a point of the world from the robot's edge [m]; 0 inside."""
         dx, dy = x - pose.x, y - pose.y
         cos, sin = math.cos(pose.yaw), math.sin(pose.yaw)
         ahead, left = cos * dx + sin * dy, cos * dy - sin * dx
@@ -109,7 +109,7 @@ class ClosedPath:
 
 
 class Stream(IntEnum):
-    """What a stream is for. A new use gets a new number, so that old runs stay the same."""
+    """The use of a random stream. A new use gets a new number, so that old runs stay the same."""
 
     LAYOUT = 0
     START = 1

@@ -177,7 +177,7 @@ def _rack(x: tuple[float, float], y: float) -> tuple[Shape, ...]:
 
 
 def warehouse() -> World:
-    """Six racks, aisles of 1.6 m, and a person who walks round the middle row."""
+    """Return six racks, aisles of 1.6 m, and a person that walks round the middle row."""
     racks = [_rack(x, y) for x in ((-4.0, -1.0), (1.0, 4.0)) for y in (-2.125, 0.0, 2.125)]
     path: Corners = ((-5.0, -1.06), (5.0, -1.06), (5.0, 1.06), (-5.0, 1.06))
     return World(
@@ -196,7 +196,7 @@ def warehouse() -> World:
 
 
 def random_world(seed: int) -> World:
-    """10 to 13 obstacles in 7 x 7 m; gaps are none at all or at least 1.15 m."""
+    """Return 10 to 13 obstacles in 7 x 7 m, with gaps of none or at least 1.15 m."""
     random = generator(seed, Stream.LAYOUT)
     placed = _layout(random)
     while len(placed) < LEAST:
@@ -212,7 +212,7 @@ def random_world(seed: int) -> World:
 
 
 def _layout(random: np.random.Generator) -> list[Placed]:
-    """As many obstacles as fit within the attempts; those by the walls first."""
+    """Place as many obstacles as fit within the attempts; those by the walls first."""
     placed: list[Placed] = []
     for attempt in range(ATTEMPTS):
         by_wall = attempt < ATTEMPTS // 4

@@ -1,6 +1,6 @@
-"""Alpha on its real link: a quadruped behind a TCP port, told how to walk fifty times a second.
+"""Alpha on its real link: a quadruped behind a TCP port that gets a gait fifty times a second.
 
-The driver never speaks by itself: when nobody commands, the stream ends, and the firmware stops
+The driver sends only what is commanded: when commands end, the stream ends, and the firmware stops
 the body 100 ms later (docs/firmware_alpha.md).
 """
 
@@ -44,7 +44,7 @@ class AlphaOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields
 
 
 class AlphaDriver(Driver):
-    """Silent until the body has been heard; the first command then is to stop, as after a loss."""
+    """Sends nothing until the body reports; its first command is to stop, as after a loss."""
 
     Options = AlphaOptions
 
@@ -123,7 +123,7 @@ class AlphaDriver(Driver):
         return Velocity(**WALKER.to_body(gait)._asdict())
 
     async def read_state(self) -> RobotState:
-        """What the body said last; `link` says whether that is still so."""
+        """Return the body's newest report; `link` tells whether it is recent."""
         velocity = self._odometry.velocity if self._liveness.received else Twist(0.0, 0.0, 0.0)
         state = RobotState(
             robot_type=self.robot.robot_type,
@@ -162,7 +162,7 @@ class AlphaDriver(Driver):
         self.link.errors = self._decoder.errors + self._unsound
 
     def _take(self, frame: AlphaFrame, state: State) -> None:
-        """One report. Its own clock says how much time has passed since the last."""
+        """Handle one report. Its own clock tells how much time has passed since the last."""
         last, self._last = self._last, (frame.sequence, state.milliseconds)
         if last and not alpha.newer(frame.sequence, last[0]):
             self._last = last
@@ -192,9 +192,9 @@ class AlphaDriver(Driver):
             self._fall.end("the body stands again")
 
     def _health(self) -> LinkHealth:
-        """The connection's; connected means that the body has been heard lately.
+        """Return the connection's health; connected means that reports come.
 
-        A loss is told at least once, however soon the body is back.
+        A loss is reported at least once, however soon the body is back.
         """
         alive = self._liveness.alive()
         told, self._untold = not self._untold, False
@@ -203,7 +203,7 @@ class AlphaDriver(Driver):
 
 
 def _with(state: RobotState, now: State) -> RobotState:
-    """What the body has reported, for `robot/state`."""
+    """Return `state` with what the body has reported."""
     senses = now.senses
     positions = (angle for leg in senses.joints for angle in leg)
     rates = (rate for leg in senses.rates for rate in leg)

@@ -42,7 +42,7 @@ class Alpha(Device):
         return TcpPort(Path(options.port), alpha.PORT)
 
     def reset(self) -> None:
-        """Power has come: it stands."""
+        """Power on: stand."""
         self._decoder = AlphaDecoder()
         self._echo = self._sent = self._refused = 0
         self._last: int | None = None  # sequence of the newest command
@@ -56,11 +56,11 @@ class Alpha(Device):
 
     @property
     def parked(self) -> bool:
-        """Whether it lies, or is on its way down."""
+        """True while it lies, or is on its way down."""
         return self._gait == LYING
 
     def feed(self, data: bytes) -> None:
-        """Bytes from whoever is connected."""
+        """Obey commands, or collect parts of them."""
         if not self._on:
             return
         errors = self._decoder.errors
@@ -90,7 +90,7 @@ class Alpha(Device):
             self.wire.write(alpha.state(self._report(sample), self._sent))
 
     def _wanted(self, frame: AlphaFrame) -> Gait | None:
-        """What a frame asks for, or None where it is not a sound, new and fresh command."""
+        """Return the gait that a frame asks for, None unless it is sound, new and fresh."""
         if frame.type == alpha.STOP:
             return REST
         if frame.type == alpha.PARK:

@@ -51,7 +51,7 @@ class Walk(NamedTuple):
 
 
 class State(NamedTuple):
-    """What the body says of itself, 100 times a second."""
+    """The body's report, 100 times a second."""
 
     milliseconds: int  # since the firmware began, wraps
     echo: int  # sequence of the newest command that was obeyed; 0 for none
@@ -99,7 +99,7 @@ def walk_of(frame: AlphaFrame) -> Walk | None:
 
 
 def stale(seen: int, now: int) -> bool:
-    """Whether a command that has `seen` this time [ms] is too old at `now`, across the wrap."""
+    """Return whether a command with this `seen` time [ms] is too old at `now`, across the wrap."""
     return (now - seen) % SEQUENCES > STALE_MS
 
 
@@ -162,7 +162,7 @@ def state_of(frame: AlphaFrame) -> State | None:
 
 
 def newer(sequence: int, than: int) -> bool:
-    """Whether one sequence number comes after another, across the wrap."""
+    """Return whether one sequence number comes after another, across the wrap."""
     return 0 < (sequence - than) % SEQUENCES < SEQUENCES // 2
 
 

@@ -34,13 +34,13 @@ class LineCommand:
         return self.template.encode(values, toward_zero=True)
 
     def sent(self, wanted: Velocity) -> Velocity:
-        """What is left of a velocity after it was written with the line's digits."""
+        """Return what the line's digits leave of a velocity."""
         values = self._values(wanted).items()
         names, sent = self.template.names, self.template.sent
         return self.means({name: sent(name, value) for name, value in values if name in names})
 
     def means(self, values: Mapping[str, float]) -> Velocity:
-        """What a line with these values tells the body; what it does not say is 0."""
+        """Return the velocity that a line with these values commands; what it omits is 0."""
         twist = Twist(*(values.get(name, 0.0) for name in Twist._fields))
         if self._base and self._by_wheels:
             wheels = zip(self._base.wheels, self._base.to_wheels(twist), strict=True)
@@ -59,7 +59,7 @@ class LineCommand:
 
 
 class SentWording:
-    """What goes out on the line, byte after byte: commands, and strings that have a name."""
+    """Describes what goes out on the line, byte after byte: commands and named strings."""
 
     def __init__(self, template: Template, named: Mapping[bytes, str]) -> None:
         self._decoder, self._named = LineDecoder([template]), named
@@ -108,7 +108,7 @@ class LineReport:
         return int(self._values.get("flags", 0))
 
     def take(self, values: Mapping[str, float], now_ns: int) -> bool:
-        """One line has come; whether it says how the body moves."""
+        """Handle one line; return whether it reports how the body moves."""
         self._values.update(values)
         if self._whole_pose <= values.keys():
             pose = Pose(x=values["x"], y=values["y"], yaw=values["yaw"])
@@ -178,7 +178,7 @@ class LineReport:
         return _scaled(way, 1 / seconds)
 
     def _go_on(self, now_ns: int) -> None:
-        """There are speeds alone: it has gone on as fast as it was said to."""
+        """Integrate the newest speeds, where the lines report nothing else."""
         seconds = min((now_ns - (self._now_ns or now_ns)) / 1e9, LONGEST_S)
         v = self.velocity()
         self._move(_scaled(Twist(v.linear_x, v.linear_y, v.angular_z), seconds), now_ns)
@@ -199,7 +199,7 @@ class LineReport:
                 self._turned[name] = angle if name in ANGLES else self._turned[name] + angle
 
     def _differences(self, now: tuple[float, ...], before: tuple[float, ...]) -> tuple[float, ...]:
-        """By how much each wheel turned; a wheel that steers has an angle of its own."""
+        """Return by how much each wheel turned; a steering wheel has an angle instead."""
         steps = []
         for name, angle, last, span in zip(self._wheels, now, before, self._spans, strict=True):
             way = angle if name in ANGLES else angle - last
@@ -207,9 +207,9 @@ class LineReport:
         return tuple(steps)
 
     def _after_gap(self, now_ns: int) -> bool:
-        """Whether the firmware may have been started anew since the last line.
+        """Return whether the firmware may have restarted since the last line.
 
-        If so, what counts is the shorter way: from where it stopped, or from zero.
+        If so, the shorter way counts: from where it stopped, or from zero.
         """
         return now_ns - (self._now_ns or now_ns) > GAP_NS
 

@@ -1,6 +1,6 @@
 """A body without code: one text line out, text lines in, all described in the robot's file.
 
-The driver never speaks by itself: when nobody commands, the line falls silent, and the firmware
+The driver sends only what is commanded: when commands end, the line falls silent, and the firmware
 stops the body (docs/firmware_line.md).
 """
 
@@ -40,7 +40,7 @@ SEQUENCES = 1 << 16
 
 
 class LineDriver(Driver):
-    """Silent until the body has been heard; the first command then is zero, as after a loss."""
+    """Sends nothing until the body reports; its first command is zero, as after a loss."""
 
     Options = LineOptions
 
@@ -107,7 +107,7 @@ class LineDriver(Driver):
         return self._sent
 
     async def read_state(self) -> RobotState:
-        """What the lines said last; `link` says whether that is still so."""
+        """Return the newest values of the lines; `link` tells whether they are recent."""
         report = self._report
         return RobotState(
             robot_type=self.robot.robot_type,
@@ -126,7 +126,7 @@ class LineDriver(Driver):
             self._started = bool(stop) and not self.link.write(stop)
 
     def _send(self, wanted: Velocity) -> None:
-        """Write a command that is new, or due again; `_sent` is what the body then goes by."""
+        """Write a command that is new, or due again; keep in `_sent` what the body executes."""
         if not self._liveness.received:  # it may still be booting: nothing that could disturb it
             self._sent = ZERO
             return
@@ -147,7 +147,7 @@ class LineDriver(Driver):
         self._started = not start or self.link.write(start)
 
     def _opened(self) -> None:
-        """A new line: nothing from before counts, and nothing is said before the body was heard."""
+        """Start again on a new line; nothing is sent before the body reports."""
         self._decoder.clear()
         self._report.restart()
         self._liveness.reset()
@@ -187,7 +187,7 @@ class LineDriver(Driver):
                 self._flags[bit].end(f"the firmware no longer reports: {name}")
 
     def _is_ours(self, port: serial.Serial) -> bool:
-        """Whether a good line comes from this port. Runs in a thread."""
+        """Return whether a good line comes from this port. Runs in a thread."""
         decoder, until = LineDecoder(self.options.state_templates()), time.monotonic() + PROBE_S
         while time.monotonic() < until:
             if decoder.feed(port.read(max(1, port.in_waiting))):

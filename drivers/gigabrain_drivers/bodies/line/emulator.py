@@ -100,7 +100,7 @@ class LineBase(Device):
             self.body.command(wanted.linear_x, wanted.linear_y, wanted.angular_z)
 
     def _silent(self) -> bool:
-        """Whether the last command will be too old by the next step."""
+        """Return whether the last command will be too old by the next step."""
         if self._obeyed_ns is None:
             return True
         return self._now_ns + self.period_s * 1e9 - self._obeyed_ns > self.watchdog_ns
@@ -110,7 +110,7 @@ class LineBase(Device):
         return voltage - self.sag_volts < BROWN_OUT_SHARE * voltage
 
     def _measured(self, fields: tuple[Field, ...]) -> dict[str, float]:
-        """What the sensors say, in SI units; counters wrap."""
+        """Return the sensors' values in SI units; counters wrap."""
         shot = self.body.snapshot
         values: dict[str, float] = shot.odometry._asdict()
         values["yaw"] = math.remainder(values["yaw"], math.tau)
@@ -132,7 +132,7 @@ class LineBase(Device):
         return sum(1 << bit for bit, name in names if conditions.get(name, False))
 
     def _wrapped(self, field: Field, value: float) -> float:
-        """As an encoder's counter of so many bits has it."""
+        """Return the value as an encoder's counter of `tick_bits` has it."""
         if not field.unit.endswith("tick"):
             return value
         span = 1 << self._options.tick_bits

@@ -32,7 +32,7 @@ POSE = ("x", "y", "yaw")
 
 
 class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is said to the body and what it says; see docs/firmware_line.md."""
+    """The lines to and from the body; see docs/firmware_line.md."""
 
     port: str = AUTO  # a path, usb:VID:PID[:SERIAL], or auto
     baud: Annotated[int, Meta(ge=1200, le=4_000_000)] = 115200
@@ -61,18 +61,18 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
         self._check_baud(command, state)
 
     def command_template(self) -> Template:
-        """How a velocity is written."""
+        """Return the template of the command line."""
         return _template("command", self.command, COMMAND, self.ticks_per_turn)
 
     def state_templates(self) -> tuple[Template, ...]:
-        """How what the body measures is read."""
+        """Return the templates of the state lines."""
         turn = self.ticks_per_turn
         return tuple(
             _template(f"state[{i}]", text, STATE, turn) for i, text in enumerate(self.state)
         )
 
     def strings(self) -> dict[bytes, str]:
-        """What is sent as it is, and what it is called."""
+        """Return the strings that are sent as they are, with their names."""
         both = {self.start.encode(): "start", self.stop.encode(): "stop"}
         return {text: name for text, name in both.items() if text}
 
@@ -125,7 +125,7 @@ def _template(field: str, text: str, known: dict[str, str], turn: float | None) 
 
 
 def check_lines(options: LineOptions, robot: RobotFile) -> None:
-    """All that the options alone cannot tell."""
+    """Check the lines against the body: its wheels, steps, odometry and lidar."""
     base, command, state = base_of(robot), options.command_template(), options.state_templates()
     for field, template in {"command": command, **_numbered(state)}.items():
         _check_wheels(field, template, robot, base)
@@ -208,7 +208,7 @@ def _check_steps(command: Template, robot: RobotFile, base: Base | None) -> None
 
 
 def _check_odometry(state: tuple[Template, ...], base: Base | None) -> None:
-    """Where there is a pose or a wheel's position, all of it stands in one line."""
+    """Check that a pose, or all wheels' positions, stand in one line where there are any."""
     for whole in (POSE, positions_of(base) if base else ()):
         telling = {
             n for n in whole if n.removeprefix("wheel_").removesuffix("_position") not in ANGLES

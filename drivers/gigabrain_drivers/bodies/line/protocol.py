@@ -109,10 +109,10 @@ CHECKS = {
 
 
 def factor(quantity: str, unit: str, ticks_per_turn: float | None) -> float:
-    """What the number on the wire is multiplied with to get SI units (volts, degrees C, percent).
+    """Return the factor from a number on the wire to SI units (volts, degrees C, percent).
 
-    A unit may have a number before it: in `0.1C` or `-tick`, the wire counts tenths of degrees,
-    or ticks backwards. Raises ValueError saying what was expected.
+    A unit may have a number before it: in `0.1C` or `-tick`, the wire counts tenths of degrees, or
+    ticks backwards. Raises ValueError naming what was expected.
     """
     known = UNITS[quantity]
     match = _UNIT.fullmatch(unit)
@@ -147,7 +147,7 @@ class Field:
 
     @property
     def counts(self) -> bool:
-        """Whether it is a counter or a set of flags, which may be as large as they like."""
+        """True for a counter or a set of flags, which may be as large as they like."""
         return self.unit.endswith("tick") or self.format[-1] in "xX"
 
     @property
@@ -176,7 +176,7 @@ class Field:
 def field_of(
     name: str, unit: str | None, form: str | None, known: Mapping[str, str], turn: float | None
 ) -> Field:
-    """What stands between two braces. Raises ValueError naming the field."""
+    """Return the field between two braces. Raises ValueError naming the field."""
     if name in CHECKS:
         raise ValueError(f"the checksum {{{name}}} must stand last in the line")
     if name not in known:
@@ -204,7 +204,7 @@ def _places(form: str) -> int:
 
 
 def _pattern(form: str) -> str:
-    """What a number of this format looks like, and nothing else."""
+    """Return the expression for numbers of this format, and nothing else."""
     sign = "[-+]" if form.startswith("+") else "-?"
     padding = " *" if len(form.rstrip("fdxX").partition(".")[0].lstrip("+0")) else ""
     if form[-1] in "xX":
@@ -256,7 +256,7 @@ class Template:
         return (text + self._tail).encode("ascii")
 
     def decode(self, line: bytes) -> dict[str, float] | None:
-        """The values of a line without its end, in SI units; None when it is no such line."""
+        """Return the values of a line without its end, in SI units; None for another line."""
         if len(line) > LONGEST or not line.isascii():
             return None
         text = line.decode("ascii")
@@ -274,14 +274,14 @@ class Template:
         return {f.name: value for f, value in read}
 
     def sent(self, name: str, value: float) -> float:
-        """What is left of a commanded value [SI]: it is rounded towards zero."""
+        """Return what is left of a commanded value [SI]: it is rounded towards zero."""
         for field in self.fields:
             if field.name == name:
                 return field.read(field.write(value, toward_zero=True))
         return value
 
     def reads_all_of(self, other: "Template") -> bool:
-        """Whether lines of the other template can be read as lines of this one."""
+        """Return whether lines of the other template can be read as lines of this one."""
         nothing = other.encode({}).strip(b"\r\n")
         return self.decode(nothing) is not None
 
@@ -290,7 +290,7 @@ class Template:
         return len(self.encode({field.name: -5.0 * field.factor for field in self.fields}))
 
     def _check_gaps(self) -> None:
-        """Numbers that touch cannot be told apart."""
+        """Refuse fields whose numbers touch: they cannot be told apart."""
         pairs = zip(self.fields, self.fields[1:], self._texts[1:], strict=False)
         for before, after, between in pairs:
             if not between.strip(DIGITS) and not after.format.startswith("+"):

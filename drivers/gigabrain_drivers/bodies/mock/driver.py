@@ -27,7 +27,7 @@ class MockOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
 
 
 class MockBody(Driver):
-    """Goes at once as fast as it is told. Its room goes with it."""
+    """Moves at the commanded speed at once. Its room goes with it."""
 
     Options = MockOptions
 
@@ -62,7 +62,7 @@ class MockBody(Driver):
         self._velocity = ZERO
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
-        """By the host's clock, or as fast as the brain answers when time is lock-stepped."""
+        """Tick by the host's clock, or in lock-step as fast as the brain answers."""
         if self.lockstep:
             while True:
                 self._turn()
@@ -88,7 +88,7 @@ class MockBody(Driver):
         return to
 
     async def read_state(self) -> RobotState:
-        """Where it has driven to."""
+        """Return the pose that it has driven to."""
         if not self._open:
             raise BodyLost("the mock is not open")
         return RobotState(

@@ -56,7 +56,7 @@ MOST_ACCELERATION = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit 
 
 
 class Board:
-    """Each question carries a new heartbeat, and its answer brings that back.
+    """The OpenCR board on its line. Each question has a new heartbeat, which its answer returns.
 
     So a late answer is never taken for a fresh one; and nothing counts that came before the answer
     to the first ping on a newly opened port. Every connection begins with zero velocity.
@@ -84,7 +84,7 @@ class Board:
 
     @property
     def ready(self) -> bool:
-        """Whether commands reach an OpenCR."""
+        """True while commands reach an OpenCR."""
         return self._firmware is not None
 
     @property
@@ -108,7 +108,7 @@ class Board:
         return self._fault()
 
     def halt(self) -> bool:
-        """Zero velocity, whoever may be listening."""
+        """Send zero velocity, whether or not a board has answered."""
         return self.link.write(opencr.velocity(0.0, 0.0).frame)
 
     def let_go(self) -> bool:
@@ -136,7 +136,7 @@ class Board:
                     await self._answered.wait()
 
     def look(self, now_ns: int) -> None:
-        """To be called often: knocks where nobody has answered, gives up where nobody will."""
+        """Knock where no board has answered, give up where none will. To be called often."""
         self._speak_up(now_ns)
         if not self.link.connected:
             return
@@ -163,7 +163,7 @@ class Board:
             log.info("OpenCR on %s answers, firmware %s", self.link, self._firmware)
 
     def _fault(self) -> str:
-        """What the board itself says is wrong with it."""
+        """Return what the board itself reports as wrong, or an empty text."""
         newest = self._newest
         if newest and newest.device_status == opencr.MOTORS_SILENT:
             return "OpenCR reaches no motors: switch their power on, then press its reset button"
@@ -181,7 +181,7 @@ class Board:
         self._firmware = self._waiting_ns = None
 
     def _knock(self) -> None:
-        """Ask who is there; zero goes first, and so ends whatever may still be queued there."""
+        """Ping the board; zero goes first, and so ends whatever may still be queued there."""
         self._knocked_ns = self._clock.now_ns()
         self.halt()
         self.link.write(opencr.ping(opencr.ID))
@@ -214,7 +214,7 @@ class Board:
 
 
 def is_opencr(port: serial.Serial) -> bool:
-    """Whether an OpenCR answers on this port. Runs in a thread; may raise OSError."""
+    """Return whether an OpenCR answers on this port. Runs in a thread; may raise OSError."""
     port.write(opencr.ping(opencr.ID))
     answers = opencr.DynamixelDecoder().feed(port.read(ANSWER_BYTES))
     models = [opencr.model_of(packet.params[1:]) for packet in answers]
@@ -323,7 +323,7 @@ class OpenCrDriver(Driver):
         return replace(self._state, link=self._board.health)
 
     async def _look_after(self) -> None:
-        """Zero where nobody commands, again and again; a single frame may get lost."""
+        """Send zero while no commands come, repeatedly: a single frame may get lost."""
         async for now_ns in self._clock.every(GUARD_NS):
             if now_ns - self._commanded_ns >= SILENT_NS and self._board.ready:
                 self._board.halt()
@@ -360,7 +360,7 @@ class OpenCrDriver(Driver):
 
 
 def imu_of(now: Readings) -> ImuData | None:
-    """The board's inertial unit, or None while it says what cannot be: starting, or broken."""
+    """Return the board's inertial unit, or None while its values are impossible."""
     rates = (*now.angular_velocity, *now.linear_acceleration)
     norm = math.hypot(*now.orientation)
     if not 0.9 < norm < 1.1 or not all(abs(value) < MOST_ACCELERATION for value in rates):

@@ -60,7 +60,7 @@ class ControlTable:
             self[address + place * size] = value
 
     def read(self, address: int, length: int) -> bytes:
-        """What a READ of this range answers."""
+        """Return the answer to a READ of this range."""
         answer = bytearray(length)
         for at in self._inside(address, length):
             size = self._codes[at].size
@@ -98,7 +98,7 @@ class OpenCr(Device):
         self.reset()
 
     def reset(self) -> None:
-        """As after power-on; it says nothing by itself."""
+        """Start as after power-on; it sends nothing by itself."""
         self._decoder = opencr.DynamixelDecoder(BUFFER)
         self._table = ControlTable(ITEMS)
         self._goal = (0.0, 0.0)
@@ -171,7 +171,7 @@ class OpenCr(Device):
         self.wire.write(opencr.status(opencr.ID, data))
 
     def _watch_host(self, now_ns: int) -> None:
-        """Whether somebody is there. Without the host there is no goal, whatever was written."""
+        """Watch the heartbeat. Without a host there is no goal, whatever was written."""
         table = self._table
         if table[opencr.HEARTBEAT] != self._beat:
             self._beat, self._changed_ns = table[opencr.HEARTBEAT], now_ns

@@ -75,7 +75,7 @@ def encode(packet: DynamixelPacket) -> bytes:
 
 
 def ping(device: int) -> bytes:
-    """Ask who is there; the answer is model number u16 and firmware version u8."""
+    """Return a ping; the answer is model number u16 and firmware version u8."""
     return encode(DynamixelPacket(device, PING))
 
 
@@ -157,7 +157,7 @@ def model_of(answer: bytes) -> tuple[int, int] | None:
 
 
 def readings(data: bytes) -> Readings:
-    """What the answer's `data` (172 bytes) says. Raises ValueError when it is not that long."""
+    """Decode the answer's `data` (172 bytes). Raises ValueError for another length."""
     if len(data) != LENGTH:
         raise ValueError(f"expected {LENGTH} bytes of the control table, got {len(data)}")
     v = _TABLE.unpack(data)
