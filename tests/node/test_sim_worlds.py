@@ -27,7 +27,7 @@ def test_a_mistyped_world_suggests_the_right_one() -> None:
 
 @pytest.mark.parametrize("name", ["random:abc", "random:", "random:-1", "random:1.5"])
 def test_a_random_world_without_a_whole_number_says_what_is_wanted(name: str) -> None:
-    with pytest.raises(UnknownName, match="random:SEED wants a whole number"):
+    with pytest.raises(UnknownName, match="random:SEED needs a whole number"):
         load_world(name, 0)
 
 

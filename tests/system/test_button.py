@@ -25,7 +25,7 @@ from gigabrain_zenoh.testing.in_memory import Net, RobotInMemory
 
 MS = 1_000_000
 OPEN = "the contact is open, or its wire is broken"
-WRONG = "what comes back is not what was sent"
+WRONG = "other bytes come back than were sent"
 
 
 def counting() -> Callable[[int], bytes]:

@@ -171,7 +171,7 @@ async def test_an_ld19_that_was_left_out_says_nothing_comes(tmp_path: Path) -> N
         async with Listener(Ld19(options(tmp_path), LIDAR, Clock())) as listener:
             await until(lambda: listener.source.problem)
             assert listener.source.problem == (
-                f"nothing comes from {tmp_path}/scan at 230400 baud: "
+                f"no data comes from {tmp_path}/scan at 230400 baud: "
                 "is the LD19 powered, and wired both ways?"
             )
 

@@ -228,5 +228,5 @@ def test_what_is_wrong_with_a_port_says_what_to_do() -> None:
 async def test_what_is_no_serial_port_is_called_so(path: str) -> None:
     link = SerialLink(path, 115200, Clock())
     link.open()
-    await until(lambda: link.problem == f"{path} is no serial port")
+    await until(lambda: link.problem == f"{path} is not a serial port")
     await link.close()

@@ -230,7 +230,7 @@ def test_faults_are_words(tmp_path: Path) -> None:
         ("bit_errors=2", "bit_errors needs a number from 0 to 1, such as bit_errors=0.001"),
         ("garbage", "garbage needs a number from 0 to 1, such as garbage=0.1"),
         ("brown_out=x", "brown_out needs a number of volts from 0, such as brown_out=6"),
-        ("silence=3", "silence takes no number: say silence, and off to end it"),
+        ("silence=3", "silence takes no number: write silence, and off to end it"),
     ):
         with pytest.raises(ConfigError, match=f"^{said}$"):
             emulator.faults_of(words)

@@ -143,7 +143,7 @@ async def test_a_wrong_model_means_a_wrong_baud_rate_and_so_silence_which_is_tol
         async with listen(its) as listener:
             await until(lambda: listener.source.problem)
             assert listener.source.problem == (
-                f"nothing comes from {tmp_path}/scan at 115200 baud: "
+                f"no data comes from {tmp_path}/scan at 115200 baud: "
                 "is the RPLIDAR powered, and wired both ways? (model: a1)"
             )
 

@@ -45,7 +45,7 @@ async def test_a_tcp_peer_that_falls_silent_is_dropped_and_gets_nothing_old() ->
         while not heard.lost:
             link.write(b"old")
             await asyncio.sleep(0.01)
-        assert "nothing heard for" in heard.lost[0]
+        assert "no data for" in heard.lost[0]
         peer, _ = await asyncio.to_thread(listening.accept)
         peer.sendall(b"alive")
         await until(lambda: heard.data)
@@ -65,13 +65,13 @@ async def test_a_tcp_peer_that_takes_nothing_is_dropped_in_the_middle_of_a_frame
         await until(lambda: link.connected)
         while link.write(b"x" * 65536):
             pass
-        assert heard.lost == ["it does not take what is sent to it"]
+        assert heard.lost == ["it does not read what is sent to it"]
         await link.close()
         peer.close()
 
 
 @pytest.mark.parametrize(
-    ("host", "complaint"), [("127.0.0.1", "nobody listens"), ("no.such.host.invalid", "no host")]
+    ("host", "complaint"), [("127.0.0.1", "nothing listens"), ("no.such.host.invalid", "no host")]
 )
 async def test_a_tcp_port_that_cannot_be_reached_says_so(host: str, complaint: str) -> None:
     with server() as listening:

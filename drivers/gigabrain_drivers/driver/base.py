@@ -93,7 +93,7 @@ class Driver(abc.ABC):
 
     async def limp(self) -> None:
         """Let go of all joints, so that a person can move them. Raises BodyLost."""
-        raise Unsupported(f"{type(self).__name__} cannot let go of its body's joints")
+        raise Unsupported(f"{type(self).__name__} cannot release its body's joints")
 
     def can(self, state: SafeState) -> bool:
         """Return whether this driver can bring its body into a safe state."""

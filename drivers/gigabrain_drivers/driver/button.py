@@ -70,7 +70,7 @@ class EchoLoop:
     def problem(self, now_ns: int) -> str:
         """Return why the contact does not count as closed, or an empty text."""
         if now_ns < self._deaf_until_ns:
-            return "what comes back is not what was sent"
+            return "other bytes come back than were sent"
         if self._good_ns is None or now_ns - self._good_ns > LATE_NS:
             return "the contact is open, or its wire is broken"
         return ""
@@ -121,7 +121,7 @@ class Button:
             log.warning("e-stop button pressed: %s", self._problem)
             self._pressed.set()
         else:
-            log.info("e-stop button let go: the contact is closed")
+            log.info("e-stop button released: the contact is closed")
             self._pressed.clear()
         return True
 

@@ -28,7 +28,7 @@ from gigabrain_zenoh.runtime.audit import AuditTrail
 MOST_BYTES = 65_536
 UNREADABLE = Cause(
     code="latch_unreadable",
-    text="the file that remembers what latched the gate cannot be read",
+    text="the file with the gate's latched causes cannot be read",
     latching=True,
     remedy="look at the robot, then release it",
 )
@@ -239,10 +239,10 @@ class Gatekeeper:
         """Wait for the disk; return the text to add to a reply if it failed."""
         problem = await self._on_disk
         if not problem:
-            self._forgetful.end("what latches the gate is remembered again")
+            self._forgetful.end("latched causes are stored again")
             return ""
         self._forgetful.begin(problem)
-        return f"; but a restart would forget it: {problem}"
+        return f"; but a restart would lose it: {problem}"
 
     def press(self, text: str) -> None:
         """The e-stop button of this robot is pressed."""

@@ -164,7 +164,7 @@ class DriverProcess:
         async for passed in self._driver.ticks(self._bus.clock):
             await self._tick(passed)
         self._measure()
-        log.info("the simulation has come to its end", extra={"data": {"event": "finished"}})
+        log.info("the simulation has ended", extra={"data": {"event": "finished"}})
         await self._bus.failed
 
     async def _obeying(self) -> None:

@@ -71,8 +71,7 @@ def claimed(folder: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise ConfigError(
-                f"another emulator has its ports in {folder}; end it, or take another folder "
-                "(--ports)"
+                f"another emulator uses {folder}; end it, or take another folder (--ports)"
             ) from None
         except OSError as error:
             raise no_ports(folder, error) from None
@@ -81,7 +80,7 @@ def claimed(folder: Path) -> Iterator[None]:
 
 def no_ports(folder: Path, error: OSError) -> ConfigError:
     """Return the error for ports that cannot be made."""
-    return ConfigError(f"no ports can be made in {folder}: {error.strerror}; expected a folder")
+    return ConfigError(f"cannot create ports in {folder}: {error.strerror}; expected a folder")
 
 
 class Station:

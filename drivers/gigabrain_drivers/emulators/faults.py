@@ -63,7 +63,7 @@ def faults_in(words: Iterable[str], stations: Iterable[str]) -> Faults:
         if name not in Faults.__struct_fields__:
             raise unknown("fault", name, [*Faults.__struct_fields__, *stations, "off"])
         if name not in NUMBERS and given:
-            raise ConfigError(f"{name} takes no number: say {name}, and off to end it")
+            raise ConfigError(f"{name} takes no number: write {name}, and off to end it")
         try:
             change = msgspec.convert({name: value if given else True}, Faults, strict=False)
         except msgspec.ValidationError:

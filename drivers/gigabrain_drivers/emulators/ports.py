@@ -47,7 +47,9 @@ class Pty:
         asyncio.get_running_loop().add_reader(self._master, self._readable)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.path.exists() and not self.path.is_symlink():
-            raise OSError(errno.EEXIST, f"{self.path.name} is there and is no emulator's")
+            raise OSError(
+                errno.EEXIST, f"{self.path.name} exists and does not belong to an emulator"
+            )
         fresh = self.path.with_name(f".{self.path.name}.new")
         fresh.unlink(missing_ok=True)
         fresh.symlink_to(_lasting(self._slave))

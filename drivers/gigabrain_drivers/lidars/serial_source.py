@@ -137,7 +137,7 @@ class SerialSource(ScanSource):
         if self._problem and self._problem != before:
             log.warning("%s: %s", self.name, self._problem)
         elif before and not self._problem:
-            log.info("%s: scans come again", self.name)
+            log.info("%s: scans are back", self.name)
 
     def explain(self) -> str:
         """Return why there are no scans though the port is open."""
@@ -153,7 +153,7 @@ class SerialSource(ScanSource):
         """Return what may be wrong where bytes make no sense, or none come at all."""
         where = f"{self.link} at {self.baud} baud"
         if not self._newest:
-            return f"nothing comes from {where}: is the {self.name} powered, and wired both ways?"
+            return f"no data comes from {where}: is the {self.name} powered, and wired both ways?"
         other = self.other_lidar()
         guess = f"it looks like {other}" if other else "another lidar, or another baud rate?"
         return f"what comes from {where} is no {self.name}: {guess}"

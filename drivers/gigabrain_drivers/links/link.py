@@ -167,7 +167,7 @@ class Link(abc.ABC):
             callback(value)
         except Exception as error:  # noqa: BLE001 - its fault must not end the link
             self._report(error)
-            self.drop(f"what it brings cannot be handled: {why(error)}")
+            self.drop(f"received data could not be handled: {why(error)}")
 
     def _report(self, error: Exception) -> None:
         """Log an exception that is a fault of a program and not of a port, once each."""
@@ -192,7 +192,7 @@ class Link(abc.ABC):
                 async with asyncio.timeout(LOOK_S):
                     await self._ended.wait()
             if self.quiet_ns is not None and self.age_ns > self.quiet_ns:
-                self.drop(f"nothing heard for {self.age_ns / 1e6:.0f} ms")
+                self.drop(f"no data for {self.age_ns / 1e6:.0f} ms")
 
     def _readable(self) -> None:
         if self._fd is None:
@@ -285,7 +285,7 @@ class Liveness:
         silent_ns = self._clock.now_ns() - (self._heard_ns or self._hoping_ns)
         alive = self._heard_ns is not None and silent_ns <= self._silent_ns
         if alive:
-            self._fault.end(f"{self._link}: heard again")
+            self._fault.end(f"{self._link}: reports again")
         elif silent_ns > PATIENCE_NS:
             self._fault.begin(self._problem())
         return alive

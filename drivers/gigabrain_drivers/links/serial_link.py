@@ -36,7 +36,7 @@ def check_port(name: str) -> None:
     for word in (AUTO, USB):
         if name.lower().startswith(word) and not name.startswith(word):
             right = word + name[len(word) :]
-            raise ValueError(f"port: expected small letters; did you mean {right!r}?")
+            raise ValueError(f"port: expected lower case; did you mean {right!r}?")
     if name.startswith(USB):
         try:
             usb_id(name)
@@ -96,7 +96,7 @@ def describe_refusal(path: str, error: OSError) -> str:
     cause = error.__context__  # of pyserial's errors without a number
     number = cause.args[0] if isinstance(cause, termios.error) else error.errno
     if number in NO_PORT:
-        return f"{path} is no serial port"
+        return f"{path} is not a serial port"
     return f"{path}: {error.strerror or error}"
 
 

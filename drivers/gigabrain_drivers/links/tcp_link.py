@@ -47,7 +47,7 @@ class TcpLink(Link):
             raise LinkProblem(f"no host {self._host!r}: {error.args[-1]}") from None
         except OSError as error:
             if error.errno == errno.ECONNREFUSED:
-                raise LinkProblem(f"nobody listens at {self}: is its program running?") from None
+                raise LinkProblem(f"nothing listens at {self}: is its program running?") from None
             raise LinkProblem(f"{self}: {why(error)}") from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, DISCARD)
@@ -60,7 +60,7 @@ class TcpLink(Link):
             self._socket = None
 
     def _cut_short(self) -> None:
-        self.drop("it does not take what is sent to it")
+        self.drop("it does not read what is sent to it")
 
 
 class AddressLink(TcpLink):

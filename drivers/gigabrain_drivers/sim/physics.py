@@ -147,7 +147,7 @@ class Simulation:
         """A diverging simulation shows as NaN, or as a robot that flies away."""
         x, y, z = self.data.qpos[self._height - 2 : self._height + 1].tolist()
         if not (abs(x) < EDGE_OF_THE_WORLD_M and abs(y) < EDGE_OF_THE_WORLD_M and abs(z) < 1):
-            raise BodyLost(f"the simulation came apart after {self.time_ns / 1e9:.2f} s")
+            raise BodyLost(f"the simulation diverged after {self.time_ns / 1e9:.2f} s")
 
 
 def locomotion_of(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) -> Locomotion:

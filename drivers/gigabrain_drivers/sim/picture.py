@@ -85,7 +85,7 @@ def _graphics(width: int, height: int) -> Iterator[None]:
         context = backend.GLContext(width, height)
     except (ImportError, AttributeError, RuntimeError) as error:
         raise ConfigError(
-            f"no picture without OpenGL ({error}): pip install 'gigabrain-zenoh[view]' and, on "
+            f"cannot draw without OpenGL ({error}): pip install 'gigabrain-zenoh[view]' and, on "
             "Debian, apt-get install libegl1 libgl1-mesa-dri"
         ) from error
     try:

@@ -141,7 +141,7 @@ async def test_a_disk_that_takes_nothing_stops_no_e_stop_and_is_told(tmp_path: P
         (tmp_path / ".latch.json.new").mkdir()  # where the file would be written first
         [reply] = await robot.operator.ask(ESTOP, EstopRequest(source="ann"))
         assert reply.gate.mode == "latched"
-        assert "; but a restart would forget it: cannot write" in reply.text
+        assert "; but a restart would lose it: cannot write" in reply.text
         assert await robot.go(100) == [0.0] * 100
         (tmp_path / ".latch.json.new").rmdir()
         await robot.go(100)  # tried again once a second

@@ -102,11 +102,11 @@ def test_a_command_that_fits_the_body_is_taken(tmp_path: Path, command: str) -> 
 @pytest.mark.parametrize(
     ("state", "complaint"),
     [
-        (["{battery_percentage}"], r": nothing in it says how the body moves; expected \{linear_x"),
-        (["{linear_x}"], r": nothing in it says \{angular_z\}"),
+        (["{battery_percentage}"], r": no field reports how the body moves; expected \{linear_x"),
+        (["{linear_x}"], r": no field reports \{angular_z\}"),
         (["{wheel_left_position}", "B,{wheel_right_position}"], r"\[0\]: .*in one line"),
         (["{x},{y}", "B,{yaw}"], r"\[0\]: \{x\}, \{y\} and \{yaw\} must stand in one line"),
-        (["{linear_x},{angular_z}", "{x},{y},{yaw}", "{_}"], r"\[2\]: \{_\} alone says nothing"),
+        (["{linear_x},{angular_z}", "{x},{y},{yaw}", "{_}"], r"\[2\]: \{_\} alone reports nothing"),
         (["{linear_x},{angular_z}", "{x},{y}"], r"\[1\]: its lines look like those of state\[0"),
         (["{linear_x}{angular_z}"], r"\[0\]: \{linear_x\} and \{angular_z\} touch"),
     ],

@@ -63,4 +63,4 @@ async def test_the_end_of_a_silence_is_told_as_well(caplog: pytest.LogCaptureFix
     await body.alive_after(501)
     body.liveness.mark_received()
     assert body.liveness.alive()
-    assert caplog.messages == ["/dev/ttyUSB9: it talks nonsense", "/dev/ttyUSB9: heard again"]
+    assert caplog.messages == ["/dev/ttyUSB9: it talks nonsense", "/dev/ttyUSB9: reports again"]

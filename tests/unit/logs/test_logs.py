@@ -243,14 +243,14 @@ def test_a_fault_is_logged_once_when_it_begins_and_once_when_it_ends(stderr: Sai
     for age_ms in (310, 320, 330):
         fault.begin(f"scan is {age_ms} ms old", {"age_ms": age_ms})
     assert fault.active
-    fault.end("scans come again")
-    fault.end("scans come again")
+    fault.end("scans are back")
+    fault.end("scans are back")
     assert not fault.active
     fault.begin("scan is 300 ms old")
     said = [json.loads(line) for line in stderr.getvalue().splitlines()]
     assert [(s["level"], s["event"], s["text"], s.get("times")) for s in said] == [
         ("warning", "fault", "scan is 310 ms old", None),
-        ("info", "fault ended", "scans come again", 3),
+        ("info", "fault ended", "scans are back", 3),
         ("warning", "fault", "scan is 300 ms old", None),
     ]
     assert said[0]["age_ms"] == 310

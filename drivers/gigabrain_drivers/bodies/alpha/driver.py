@@ -30,7 +30,7 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
-SENSELESS = "nothing that makes sense comes: is this the right port?"
+SENSELESS = "no valid frame comes: is this the right port?"
 SILENT_NS = 100_000_000  # without a state, and the body counts as lost
 LAST_WORD_NS = 10_000_000  # for the last command to arrive before the connection is closed
 MILLISECONDS = 1 << 32  # after which the firmware's clock begins anew
@@ -187,7 +187,7 @@ class AlphaDriver(Driver):
         self.sensors["imu"] = imu
         self.emit(IMU, imu)
         if self._fallen:
-            self._fall.begin("the body has fallen over; it stands up when its firmware starts anew")
+            self._fall.begin("the body has fallen over; it stands up when its firmware restarts")
         else:
             self._fall.end("the body stands again")
 

@@ -81,7 +81,9 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
             if template.end != state[0].end:
                 raise ValueError(f"state[{i}]: it must end as the first one does")
             if not template.names:
-                raise ValueError(f"state[{i}]: {{{IGNORED}}} alone says nothing; expected a field")
+                raise ValueError(
+                    f"state[{i}]: {{{IGNORED}}} alone reports nothing; expected a field"
+                )
             for earlier in range(i):
                 if state[earlier].reads_all_of(template):
                     raise ValueError(
@@ -233,7 +235,7 @@ def _check_motion(state: tuple[Template, ...], robot: RobotFile, base: Base | No
     if lacking:
         what = _braced(lacking) if len(lacking) < len(ways) else "how the body moves"
         choices = ", or ".join(_braced(whole) for whole in (ways, *wholes))
-        raise ValueError(f"state: nothing in it says {what}; expected {choices}")
+        raise ValueError(f"state: no field reports {what}; expected {choices}")
 
 
 def _ways(robot: RobotFile) -> list[str]:

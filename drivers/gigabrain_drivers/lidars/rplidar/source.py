@@ -175,7 +175,7 @@ async def _conf(line: Line, key: int, mode: int | None = None) -> bytes:
     """Return the value of a setting, at least one byte. Raises StartupError."""
     data = await line.ask(rplidar.conf_request(key, mode), rplidar.CONF)
     if int.from_bytes(data[:4], "little") != key or len(data) < 5:
-        raise StartupError(f"the RPLIDAR does not say its setting 0x{key:02x}")
+        raise StartupError(f"the RPLIDAR does not report setting 0x{key:02x}")
     return data[4:]
 
 
@@ -215,7 +215,7 @@ class Rplidar(SerialSource):
         self._connected.set()
 
     def received(self, data: bytes) -> None:
-        """Decode is_rplidar and samples, or parts of them."""
+        """Decode answers and samples, or parts of them."""
         now_ns = self.clock.now_ns()
         for item in self._decoder.feed(data):
             self.understood = True
@@ -238,10 +238,10 @@ class Rplidar(SerialSource):
         self._stranger = self.other_lidar() or self._stranger
         guess = f"it looks like {self._stranger}" if self._stranger else "is it powered?"
         bauds = ", ".join(map(str, BAUDS))
-        return f"no {self.name} is_rplidar on {self.link} at any of {bauds} baud: {guess}"
+        return f"no {self.name} answers on {self.link} at any of {bauds} baud: {guess}"
 
     def probe(self, port: serial.Serial) -> bool:
-        """Return whether an RPLIDAR is_rplidar here, at any of the baud rates that are tried."""
+        """Return whether an RPLIDAR answers here, at any of the baud rates that are tried."""
         for baud in self._bauds:
             port.baudrate = baud
             if is_rplidar(port):
@@ -350,7 +350,7 @@ class Rplidar(SerialSource):
 
 
 def is_rplidar(port: serial.Serial) -> bool:
-    """Return whether an RPLIDAR is_rplidar at the port's present baud rate."""
+    """Return whether an RPLIDAR answers at the port's present baud rate."""
     port.write(rplidar.request(rplidar.STOP))
     time.sleep(STOP_S)
     port.reset_input_buffer()
