@@ -112,7 +112,7 @@ async def test_where_the_model_is_left_open_the_baud_rates_are_tried_in_turn(
     [
         (
             {"model": "s2"},
-            "what comes from {}/scan at 1000000 baud is no RPLIDAR: "
+            "{}/scan at 1000000 baud sends no RPLIDAR data: "
             "it looks like an LDROBOT lidar (ld06, ld19, lds02) (model: s2)",
         ),
         (

@@ -156,7 +156,7 @@ class SerialSource(ScanSource):
             return f"no data comes from {where}: is the {self.name} powered, and wired both ways?"
         other = self.other_lidar()
         guess = f"it looks like {other}" if other else "another lidar, or another baud rate?"
-        return f"what comes from {where} is no {self.name}: {guess}"
+        return f"{where} sends no {self.name} data: {guess}"
 
     def other_lidar(self) -> str:
         """Return the name of another lidar that sends such bytes, or an empty text."""
