@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import pytest
-from tests.unit.drivers.lidars import agree, emulated, truth
 
 from gigabrain_drivers.driver.catalog import make_driver
 from gigabrain_drivers.driver.robot import Run
@@ -12,6 +11,7 @@ from gigabrain_drivers.lidars.base import source_class
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.testing.waiting import until
+from tests.system.lidars import agree, emulated, truth
 
 NAME = "foreign_lidar"
 SOURCE = '''"""A lidar on a serial line, and the lidar itself."""
