@@ -179,11 +179,11 @@ def robots() -> None:
 
     Example: gigabrain robots
     """
-    from gigabrain_drivers.driver.catalog import links_of, load_robot, robot_files
+    from gigabrain_drivers.driver.catalog import load_robot, robot_files, robot_links
 
     for name, path in robot_files().items():
         robot = load_robot(name)
-        links = ", ".join(links_of(robot))
+        links = ", ".join(robot_links(robot))
         print(f"{name:<20} {robot.summary} ({links})  {path}")
 
 

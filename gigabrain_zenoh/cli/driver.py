@@ -63,12 +63,12 @@ def test(
     from rich.console import Console
     from rich.table import Table
 
-    from gigabrain_drivers.driver.catalog import links_of, load_robot
+    from gigabrain_drivers.driver.catalog import load_robot, robot_links
     from gigabrain_zenoh.qa.conformance import kit
     from gigabrain_zenoh.qa.judging import COLOURS
 
     check_positive(repeat=repeat)
-    links = links_of(load_robot(name))
+    links = robot_links(load_robot(name))
     chosen: LinkName = link or ("emulated" if "emulated" in links else "sim")
     table = Table(title=f"{name}, link {chosen}")
     for title in ("check", "criterion", "measured", "verdict"):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gigabrain_drivers.driver.catalog import make_driver
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import sim_body
-from gigabrain_drivers.sim.driver import STEPS, MujocoDriver, scan_of, state_of
+from gigabrain_drivers.sim.driver import STEPS, MujocoDriver, scan_message, state_message
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.world import Cylinder, Pose, World
 from gigabrain_drivers.sim.worlds import load_world
@@ -58,11 +58,11 @@ class _SimulatedBody:
         self.scan_ticks = round(1e9 / robot.lidar.rate_hz / TICK_NS)
 
     def state(self, tick: int) -> RobotState:
-        state = state_of(self.simulation, self.body.robot_type)
+        state = state_message(self.simulation, self.body.robot_type)
         return replace(state, boot=BOOT, tick=tick, basis=tick)
 
     def scan(self, tick: int, sees: Sight = np.copy) -> LaserScan:
-        scan = scan_of(self.lidar, sees(self.simulation.scan()))
+        scan = scan_message(self.lidar, sees(self.simulation.scan()))
         return replace(scan, boot=BOOT, tick=tick, basis=tick)
 
 

@@ -14,7 +14,7 @@ from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.emulators.base import Snapshot
 from gigabrain_drivers.emulators.emulator import Station
 from gigabrain_drivers.emulators.faults import NONE
-from gigabrain_drivers.kinematics.wheels import Twist, advanced, base_of
+from gigabrain_drivers.kinematics.wheels import Twist, advance_pose, wheels_of
 from gigabrain_drivers.sim.locomotion import Charge, Motor, OdometryReading
 from gigabrain_drivers.sim.sensors import ImuSample
 from gigabrain_schemas.base import TICK_S, Pose
@@ -46,7 +46,7 @@ class IdealBody:
 
     def __init__(self, robot: RobotFile) -> None:
         self.robot, self.bumper = robot, False
-        self._base = base_of(robot)
+        self._base = wheels_of(robot)
         self._pose, self._yaw = Pose(x=0.0, y=0.0, yaw=0.0), 0.0
         self._angles = [0.0] * (len(self._base.wheels) if self._base else 0)
         self.commanded = (0.0, 0.0, 0.0)
@@ -78,7 +78,7 @@ class IdealBody:
         now_ns = Clock().now_ns()
         seconds, self._then_ns = (now_ns - self._then_ns) / 1e9, now_ns
         step = Twist(*(part * seconds for part in self.commanded))
-        self._pose = advanced(self._pose, step)
+        self._pose = advance_pose(self._pose, step)
         self._yaw += step.angular_z
         if self._base:
             for i, angle in enumerate(self._base.to_wheels(step)):

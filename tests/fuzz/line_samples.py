@@ -9,7 +9,7 @@ from gigabrain_drivers.kinematics.legs import Senses
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.lds import lds01, lds03
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
-from gigabrain_drivers.lidars.rplidar.scan_formats import dense_capsule, express_capsule, node
+from gigabrain_drivers.lidars.rplidar.scan_formats import encode_dense, encode_express, encode_node
 
 TWELVE = (1.0,) * 12
 
@@ -29,14 +29,14 @@ def samples(template: Template) -> dict[str, bytes]:
     """What each kind of device sends when all is well."""
     ranges = tuple(range(500, 512))
     five = tuple(lds03.Lds03Sample(float(n), 500 + n, 80, False) for n in range(5))
-    nodes = [node(n * 10.0, 500.0, quality=20, begins=n % 36 == 0) for n in range(80)]
-    dense = [dense_capsule(n * 40.0 % 360, (500,) * 40, begins=n == 0) for n in range(12)]
-    express = [express_capsule(n * 40.0 % 360, (500,) * 32, begins=n == 0) for n in range(12)]
+    nodes = [encode_node(n * 10.0, 500.0, quality=20, begins=n % 36 == 0) for n in range(80)]
+    dense = [encode_dense(n * 40.0 % 360, (500,) * 40, begins=n == 0) for n in range(12)]
+    express = [encode_express(n * 40.0 % 360, (500,) * 32, begins=n == 0) for n in range(12)]
     status = opencr.status(opencr.ID, bytes(opencr.LENGTH))
     return {
         "alpha": b"".join(
-            alpha.state(state_of_alpha(milliseconds=1000 + 10 * n), n + 1) for n in range(3)
-        ) + alpha.stop(4),
+            alpha.encode_state(state_of_alpha(milliseconds=1000 + 10 * n), n + 1) for n in range(3)
+        ) + alpha.encode_stop(4),
         "dynamixel": status + opencr.velocity(0.1, 0.2).frame + opencr.ping(opencr.ID),
         "ld": b"".join(
             ld.encode(

@@ -132,7 +132,7 @@ def sealed(name: str, data: bytes) -> None:
     driver.emit = lambda _topic, message: valid(message)
     for frame in frames:
         if isinstance(driver, OpenCrDriver):
-            driver._take(opencr.readings(frame))
+            driver._take(opencr.decode_readings(frame))
         else:
             driver.link.on_bytes(frame)
         valid(said(driver))

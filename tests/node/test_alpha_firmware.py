@@ -56,13 +56,13 @@ class Firmware:
         self.body.snapshot = STANDING._replace(time_ns=self.now_ns)
         self.device.step(self.now_ns)
         frames, self.bytes = self._decoder.feed(bytes(self.bytes)), bytearray()
-        state = alpha.state_of(frames[-1])
+        state = alpha.decode_state(frames[-1])
         assert state
         return state
 
     def walk(self, sequence: int, gait: Gait = FORWARD, seen: int | None = None) -> None:
         now = self.now_ns // MS if seen is None else seen
-        self.device.feed(alpha.walk(Walk(now, gait), sequence))
+        self.device.feed(alpha.encode_walk(Walk(now, gait), sequence))
 
 
 def test_it_starts_standing_and_reports_what_it_measures() -> None:
@@ -78,7 +78,7 @@ def test_steps_in_which_it_was_held_up_are_reported_all_the_same() -> None:
     firmware.untaken = [STANDING._replace(time_ns=ms * MS) for ms in (10, 20, 30)]
     firmware.device.step(30 * MS)
     frames = AlphaDecoder().feed(bytes(firmware.bytes))
-    reports = [alpha.state_of(frame) for frame in frames]
+    reports = [alpha.decode_state(frame) for frame in frames]
     assert [report.milliseconds for report in reports if report] == [10, 20, 30]
     assert [frame.sequence for frame in frames] == [2, 3, 4]
 
@@ -89,7 +89,7 @@ def test_its_clock_stands_still_while_its_body_does() -> None:
     firmware.bytes.clear()
     firmware.device.step(90 * MS)
     [frame] = AlphaDecoder().feed(bytes(firmware.bytes))
-    report = alpha.state_of(frame)
+    report = alpha.decode_state(frame)
     assert report
     assert report.milliseconds == 10
 
@@ -118,7 +118,7 @@ def test_what_is_refused_does_not_keep_it_walking() -> None:
     firmware.walk(4)
     firmware.walk(6, FORWARD._replace(frequency=9.0))
     firmware.walk(7, FORWARD._replace(stride_x=math.nan))
-    firmware.device.feed(alpha.walk(Walk(60, FORWARD), 8)[:-1] + b"\x00")
+    firmware.device.feed(alpha.encode_walk(Walk(60, FORWARD), 8)[:-1] + b"\x00")
     state = firmware.step(40)
     assert (state.flags, state.echo, state.refused) == (alpha.SILENT, 5, 5)
 
@@ -135,7 +135,7 @@ def test_a_command_that_knows_only_an_old_state_is_refused() -> None:
 def test_stop_is_always_obeyed() -> None:
     firmware = Firmware()
     firmware.walk(100)
-    firmware.device.feed(alpha.stop(3))
+    firmware.device.feed(alpha.encode_stop(3))
     assert firmware.gaits[-1] == REST
 
 
@@ -160,7 +160,7 @@ def test_no_bytes_make_it_walk_or_end(pieces: list[bytes]) -> None:
 def test_it_parks_through_silence_and_stands_up_before_it_walks() -> None:
     firmware = Firmware()
     firmware.walk(1)
-    firmware.device.feed(alpha.park(2))
+    firmware.device.feed(alpha.encode_park(2))
     assert firmware.gaits[-1].height == 0.13
     assert firmware.step(200).flags == alpha.SILENT | alpha.PARKED
     assert firmware.gaits[-1].height == 0.13

@@ -10,7 +10,7 @@ import pytest
 from gigabrain_drivers.bodies.line.conversion import LineCommand
 from gigabrain_drivers.bodies.line.protocol import COMMAND, Template
 from gigabrain_drivers.driver import catalog
-from gigabrain_drivers.driver.catalog import links_of, load_robot, robot_path
+from gigabrain_drivers.driver.catalog import load_robot, robot_links, robot_path
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import emulated_body
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
@@ -47,7 +47,7 @@ def test_an_emulated_battery_has_the_voltages_of_the_bodys_own_file(tmp_path: Pa
 
 def test_a_body_without_physics_is_not_said_to_be_emulated(tmp_path: Path) -> None:
     own = mine(tmp_path, ("sim: {driver: mujoco, battery_capacity: 10.0}", "sim: {driver: mock}"))
-    assert links_of(load_robot(own)) == ["sim", "real"]
+    assert robot_links(load_robot(own)) == ["sim", "real"]
     with pytest.raises(ConfigError, match="has no link 'emulated'; it has: sim, real"):
         CheckedRobot(own, "emulated", tmp_path)
 

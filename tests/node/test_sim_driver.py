@@ -10,7 +10,7 @@ from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim import driver as sim_driver
 from gigabrain_drivers.sim.driver import MujocoDriver
-from gigabrain_drivers.sim.physics import Simulation, account_of
+from gigabrain_drivers.sim.physics import Simulation, run_report
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError, Unsupported
 
@@ -32,7 +32,7 @@ async def test_a_report_reads_nothing_that_the_physics_is_at_work_on(
 
     def account(simulation: Simulation, robot: RobotFile, run: Run) -> dict[str, object]:
         readers.add(threading.current_thread().name)
-        return account_of(simulation, robot, run)
+        return run_report(simulation, robot, run)
 
     monkeypatch.setattr(sim_driver, "account_of", account)
     driver = make(seconds=1.0)
@@ -75,7 +75,7 @@ async def test_stop_and_close_work_in_any_state_and_the_rest_wants_an_open_body(
 async def test_it_says_which_sensors_it_has() -> None:
     async with make() as driver:
         assert await driver.get_sensor_data("scan") is not None
-        with pytest.raises(Unsupported, match="scan, imu"):
+        with pytest.raises(Unsupported, match="imu, scan"):
             await driver.get_sensor_data("camera")
         with pytest.raises(Unsupported, match="no joints"):
             await driver.set_joint_position("arm", 1.0)

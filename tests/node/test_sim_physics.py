@@ -198,7 +198,7 @@ def test_a_stalled_motor_gets_warmer_than_a_free_one() -> None:
         simulation.command(0.2, 0.0)
         run(simulation, 10)
     assert free.motors()[0].temperature == pytest.approx(25.6, abs=0.5)
-    assert stalled.motors()[0].temperature > free.wheels()[0].temperature + 0.5
+    assert stalled.motors()[0].temperature > free.motors()[0].temperature + 0.5
     assert abs(stalled.motors()[0].effort) > 0.2
 
 

@@ -210,7 +210,7 @@ def test_the_robot_has_all_three_links() -> None:
     assert driver is AlphaDriver
     assert isinstance(options, AlphaOptions)
     assert options.port == "192.168.123.10:8080"
-    assert catalog.links_of(robot) == ["sim", "emulated", "real"]
+    assert catalog.robot_links(robot) == ["sim", "emulated", "real"]
     run = Run(folder=Path(), link="emulated", emulator="/ports")
     assert catalog.load_link("alpha", run)[2].port == "/ports/base"  # type: ignore[attr-defined]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.driver.catalog import links_of, load_robot, robot_files
+from gigabrain_drivers.driver.catalog import load_robot, robot_files, robot_links
 from gigabrain_zenoh.qa.conformance import kit
 
 pytestmark = pytest.mark.alone
@@ -27,7 +27,7 @@ NEEDS_A_PEER = {
 async def test_every_robot_passes_the_kit(
     name: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    links = [link for link in links_of(load_robot(name)) if link != "real"]
+    links = [link for link in robot_links(load_robot(name)) if link != "real"]
     checked = await asyncio.gather(
         *(kit.check(name, link, tmp_path / link, lambda result: None) for link in links)
     )

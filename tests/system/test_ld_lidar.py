@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.emulators.faults import NONE, Faults
-from gigabrain_drivers.lidars.base import SampleBuffer, scan_of
+from gigabrain_drivers.lidars.base import SampleBuffer, bin_scan
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.ld.emulator import LdDevice
 from gigabrain_drivers.lidars.ld.source import Ld19
@@ -29,7 +29,7 @@ def options(folder: Path) -> ScanOptions:
 def test_a_bin_holds_its_nearest_sample_inf_without_a_return_and_nan_without_a_sample() -> None:
     eighth = math.tau / 8
     angles = [0.1, -0.1, eighth, 2 * eighth, 3 * eighth, 4 * eighth, 5 * eighth]
-    scan = scan_of(SMALL, angles, [1.0, 0.9, math.inf, 9.0, 0.02, math.nan, -0.0])
+    scan = bin_scan(SMALL, angles, [1.0, 0.9, math.inf, 9.0, 0.02, math.nan, -0.0])
 
     np.testing.assert_allclose(
         ranges(scan), [0.9, math.inf, math.inf, 0.1, math.nan, 0.1, math.nan, math.nan], rtol=1e-6

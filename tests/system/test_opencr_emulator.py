@@ -237,7 +237,7 @@ def _by_the_sdk(path: str, body: EmulatedBody) -> None:
 
     def readings() -> opencr.Readings:
         (data,) = _told(sdk.readTxRx(line, 200, 10, 172))
-        return opencr.readings(bytes(data))
+        return opencr.decode_readings(bytes(data))
 
     try:
         assert _told(sdk.ping(line, 200)) == [0x5000]

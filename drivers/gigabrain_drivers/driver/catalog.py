@@ -75,7 +75,7 @@ def ports_folder(name: str) -> Path:
     return state_dir() / "ports" / robot_path(name).absolute().parent.name
 
 
-def links_of(robot: RobotFile) -> list[LinkName]:
+def robot_links(robot: RobotFile) -> list[LinkName]:
     """Return the links of a robot; what is real and has physics can be emulated."""
     known = {name for name in LINKS if getattr(robot, name) is not None}
     if robot.real is not None and (robot.sim or {}).get("driver") == "mujoco":
@@ -89,7 +89,7 @@ def simulated(link: LinkName) -> list[str]:
     return [
         name
         for name, robot in known.items()
-        if link in links_of(robot) and robot.sim and robot.sim.get("driver") == "mujoco"
+        if link in robot_links(robot) and robot.sim and robot.sim.get("driver") == "mujoco"
     ]
 
 
@@ -121,8 +121,8 @@ def load_link(name: str, run: Run) -> tuple[RobotFile, type[Driver], LinkOptions
     """
     path = robot_path(name)
     robot = config.load(path, RobotFile)
-    if run.link not in links_of(robot):
-        has = ", ".join(links_of(robot)) or "none"
+    if run.link not in robot_links(robot):
+        has = ", ".join(robot_links(robot)) or "none"
         raise ConfigError(f"{robot.robot_type} has no link {run.link!r}; it has: {has}")
     borrowed = run.link == "emulated" and robot.emulated is None
     section: LinkName = "real" if borrowed else run.link

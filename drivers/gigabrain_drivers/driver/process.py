@@ -18,7 +18,7 @@ from gigabrain_drivers.driver.catalog import make_driver, ports_folder
 from gigabrain_drivers.driver.gatekeeper import Gatekeeper
 from gigabrain_drivers.driver.lockstep import REPEAT_S, Lockstep, RoundTrip
 from gigabrain_drivers.driver.robot import RobotFile, Run
-from gigabrain_drivers.links.frames import of_command
+from gigabrain_drivers.links.frames import describe_command
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import Body, RobotState, SafeState
@@ -270,7 +270,7 @@ class DriverProcess:
             sent = await self._driver.set_base_velocity(to.linear_x, to.linear_y, to.angular_z)
             self._sent = sent
             if log.isEnabledFor(logging.DEBUG):
-                log.debug("%s", of_command(to, sent))
+                log.debug("%s", describe_command(to, sent))
         if now.mode == "enabled" and now.command and to != ZERO:
             late = gate.age_ns(now, now.command.tick, self._wall_ns()) > STALE_NS
             self._bus.counters["stale_commands_executed"] += late

@@ -53,7 +53,7 @@ class LinkOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     """Options of every link; drivers add their own fields."""
 
     driver: str
-    scan: ScanOptions | None = None  # a lidar that the driver carries, see lidars.base.carry
+    scan: ScanOptions | None = None  # a lidar that the driver carries, see lidars.base.open_lidar
     lidar: Lidar | None = None  # what it measures, where that is not what the body's file says
 
 

@@ -17,11 +17,11 @@ from msgspec import Struct
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.kinematics.legs import WALKER, Gait
-from gigabrain_drivers.kinematics.wheels import Twist, base_of
+from gigabrain_drivers.kinematics.wheels import Twist, wheels_of
 from gigabrain_drivers.sim import STEP_S, Pace
 from gigabrain_drivers.sim.body import SimLidar
 from gigabrain_drivers.sim.locomotion import Charge, Motor, OdometryReading
-from gigabrain_drivers.sim.physics import Simulation, account_of
+from gigabrain_drivers.sim.physics import Simulation, run_report
 from gigabrain_drivers.sim.scene import ROBOT
 from gigabrain_drivers.sim.sensors import ImuSample, Lidar
 from gigabrain_drivers.sim.world import Stream, generator
@@ -76,7 +76,7 @@ class EmulatedBody:
         self._faulted_ns = 0  # when what is wrong with it last changed
         self._broken = Broken()
         self.snapshot = self._look()
-        self._account = account_of(self._simulation, robot, run)  # as of the newest step
+        self._account = run_report(self._simulation, robot, run)  # as of the newest step
         self._untaken: deque[Snapshot] = deque(maxlen=KEPT_STEPS)
 
     def start(self) -> None:
@@ -166,7 +166,7 @@ class EmulatedBody:
             self._simulation.drive(*commanded)
         self._simulation.advance()
         snapshot = self._look()
-        self._account = account_of(self._simulation, self.robot, self.run)
+        self._account = run_report(self._simulation, self.robot, self.run)
         if not broken.frozen_values:
             self.snapshot = snapshot
             self._untaken.append(snapshot)
@@ -175,7 +175,7 @@ class EmulatedBody:
 
     def _disobeyed(self, commanded: tuple[float, float, float]) -> tuple[float, float, float]:
         """Return the velocity of broken motors under this command."""
-        base = base_of(self.robot)
+        base = wheels_of(self.robot)
         if self._broken.runaway or base is None:
             return self._broken.runaway, 0.0, 0.0
         _, *others = base.to_wheels(Twist(*commanded))

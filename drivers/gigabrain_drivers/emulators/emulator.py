@@ -74,11 +74,11 @@ def claimed(folder: Path) -> Iterator[None]:
                 f"another emulator uses {folder}; end it, or take another folder (--ports)"
             ) from None
         except OSError as error:
-            raise no_ports(folder, error) from None
+            raise ports_error(folder, error) from None
         yield
 
 
-def no_ports(folder: Path, error: OSError) -> ConfigError:
+def ports_error(folder: Path, error: OSError) -> ConfigError:
     """Return the error for ports that cannot be made."""
     return ConfigError(f"cannot create ports in {folder}: {error.strerror}; expected a folder")
 
@@ -158,7 +158,7 @@ class Emulator:
                 station.start()
         except OSError as error:
             await self._end()
-            raise no_ports(folder, error) from None
+            raise ports_error(folder, error) from None
         self.body.start()
         return self
 
@@ -213,12 +213,12 @@ def device_class(driver: str) -> type[Device]:
     return cast("type[Device]", device)
 
 
-def wire_of(name: str) -> Literal["serial", "tcp", ""]:
+def wire_kind(name: str) -> Literal["serial", "tcp", ""]:
     """Return the kind of line to an emulated robot's base; empty where it cannot be emulated.
 
     Raises ConfigError, and UnknownName.
     """
-    if "emulated" not in catalog.links_of(catalog.load_robot(name)):
+    if "emulated" not in catalog.robot_links(catalog.load_robot(name)):
         return ""
     run = Run(folder=Path(), link="emulated")
     _, _, options, _ = catalog.load_link(name, run)

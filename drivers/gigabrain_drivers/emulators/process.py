@@ -25,7 +25,7 @@ FAULTS_FILE = "faults.json"  # {STATION: {FAULT: VALUE}}, in the folder of the p
 
 async def run(config: EmulatorConfig, bus: Bus, ready: Callable[[], None]) -> None:
     """Be the body until the process ends; its truth is in `describe`."""
-    async with emulator_of(config) as emulator:
+    async with make_emulator(config) as emulator:
         bus.report = emulator.report
         physics = emulator.body.simulation
         bus.progress = Progress(lambda: (bus.clock.now_ns(),), lambda: physics.time_ns)
@@ -36,7 +36,7 @@ async def run(config: EmulatorConfig, bus: Bus, ready: Callable[[], None]) -> No
 async def emulate(config: EmulatorConfig, say: Callable[[str], None]) -> None:
     """Be the body until it is asked to end; faults are read from standard input, line by line."""
     with stop_signals() as stop:
-        async with emulator_of(config) as emulator:
+        async with make_emulator(config) as emulator:
             await _until(stop, _obeying(emulator, config, say))
 
 
@@ -69,7 +69,7 @@ def where(port: str) -> str:
     return path.read_text(encoding="ascii").strip() if path.is_file() else port
 
 
-def emulator_of(config: EmulatorConfig) -> Emulator:
+def make_emulator(config: EmulatorConfig) -> Emulator:
     """The emulated robot of the settings. Raises ConfigError."""
     return Emulator(
         config.body,

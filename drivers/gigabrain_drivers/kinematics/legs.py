@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
-from gigabrain_drivers.kinematics.wheels import Twist, advanced
+from gigabrain_drivers.kinematics.wheels import Twist, advance_pose
 from gigabrain_schemas.base import Pose
 
 Vector = tuple[float, float, float]
@@ -179,7 +179,7 @@ class Walker:
 WALKER = Walker(frequency=3.6, max_frequency=4.2, duty=0.6)
 
 
-def sound(gait: Gait) -> bool:
+def is_sound(gait: Gait) -> bool:
     """Return whether all values are numbers, and within what the legs can do."""
     values = (gait.stride_x, gait.stride_y, gait.turn, gait.frequency, gait.duty, gait.height)
     if not all(map(math.isfinite, (*values, *gait.phases))):
@@ -227,7 +227,7 @@ class LegOdometry:
         self._velocity, self._stood = velocity, senses.contacts
         self.velocity = Twist(*_level(tilt, velocity), senses.angular_velocity[2])
         x, y, turn = self.velocity
-        self.pose = advanced(self.pose, Twist(x * passed_s, y * passed_s, turn * passed_s))
+        self.pose = advance_pose(self.pose, Twist(x * passed_s, y * passed_s, turn * passed_s))
 
     def _by_foot(self, senses: Senses, number: int) -> Vector:
         """The body's velocity if this foot stands still where it touches the floor [m/s]."""

@@ -163,7 +163,7 @@ def missing_measures(robot: RobotFile) -> list[str]:
     return [name for name in MEASURES.get(robot.drive_type, ()) if not getattr(robot, name)]
 
 
-def base_of(robot: RobotFile) -> Base | None:
+def wheels_of(robot: RobotFile) -> Base | None:
     """The wheels of a robot's file, or None where it has none or does not give their measures."""
     if robot.drive_type not in MEASURES or missing_measures(robot):
         return None
@@ -177,7 +177,7 @@ def base_of(robot: RobotFile) -> Base | None:
     return Ackermann(radius, along)
 
 
-def advanced(pose: Pose, moved: Twist) -> Pose:
+def advance_pose(pose: Pose, moved: Twist) -> Pose:
     """Return the pose after a small step in the body's frame, taken at the mid heading."""
     middle = pose.yaw + moved.angular_z / 2
     cos, sin = math.cos(middle), math.sin(middle)
@@ -188,7 +188,7 @@ def advanced(pose: Pose, moved: Twist) -> Pose:
     )
 
 
-def between(start: Pose, end: Pose) -> Twist:
+def step_between(start: Pose, end: Pose) -> Twist:
     """The small step, in the body's own frame, that leads from one pose to another."""
     turn = math.remainder(end.yaw - start.yaw, math.tau)
     middle, x, y = start.yaw + turn / 2, end.x - start.x, end.y - start.y
@@ -205,7 +205,7 @@ class WheelOdometry:
 
     def add(self, wheels: tuple[float, ...]) -> None:
         """Add the angles by which the wheels have turned [rad], as in `base.wheels`."""
-        self.pose = advanced(self.pose, self._base.to_body(wheels))
+        self.pose = advance_pose(self.pose, self._base.to_body(wheels))
 
 
 class Encoders:

@@ -87,7 +87,7 @@ def check_turns(name: str, lidar: Lidar | None) -> None:
         )
 
 
-def carry(driver: Driver, clock: Clock) -> ScanSource | None:
+def open_lidar(driver: Driver, clock: Clock) -> ScanSource | None:
     """Open the lidar of `driver`'s link, whose scans become the driver's own; None without one.
 
     For a driver's `open`; its `close` awaits the `close` of what this returns. Raises ConfigError
@@ -162,7 +162,7 @@ class TurnBuffer(abc.ABC, Generic[Piece]):
             return None
         angles, distances = self.unpack(pieces)
         ranges = np.where(distances == 0.0, np.inf, distances / 1000)
-        return scan_of(self._lidar, angles * CLOCKWISE, ranges)
+        return bin_scan(self._lidar, angles * CLOCKWISE, ranges)
 
 
 class SampleBuffer(TurnBuffer[tuple[Sequence[float], Sequence[float]]]):
@@ -198,7 +198,7 @@ class SampleBuffer(TurnBuffer[tuple[Sequence[float], Sequence[float]]]):
         return scan
 
 
-def scan_of(lidar: Lidar, angles: ArrayLike, ranges: ArrayLike) -> LaserScan:
+def bin_scan(lidar: Lidar, angles: ArrayLike, ranges: ArrayLike) -> LaserScan:
     """Return one scan of samples (n,) at `angles` [rad] with `ranges` [m], inf for no return.
 
     Of samples that share a bin the nearest counts. Beyond `range_max` counts as no return; nearer

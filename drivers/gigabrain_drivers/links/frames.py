@@ -130,12 +130,12 @@ class Wording:
         return [f"{way} {line}" for line in (spelling.spell(data) if spelling else [data.hex(" ")])]
 
 
-def whole(data: bytes) -> list[bytes]:
+def as_one_frame(data: bytes) -> list[bytes]:
     """Return the bytes as one frame, for a line on which every write is a command."""
     return [data]
 
 
-def of_command(asked: Velocity, sent: Velocity) -> str:
+def describe_command(asked: Velocity, sent: Velocity) -> str:
     """Describe a command as it was received, and as it was sent to the body."""
     return f"command {_speeds(asked)} -> sent {_speeds(sent)}"
 

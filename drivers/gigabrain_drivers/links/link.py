@@ -92,7 +92,7 @@ class Link(abc.ABC):
         except BlockingIOError:
             sent = 0
         except OSError as error:
-            self.drop(why(error))
+            self.drop(describe_error(error))
             return False
         if sent < len(data):
             self._cut_short()
@@ -148,7 +148,7 @@ class Link(abc.ABC):
                 fd = await self._connect()
             except Exception as error:  # noqa: BLE001 - the port may be good in a moment
                 self._report(error)
-                self.problem = why(error)
+                self.problem = describe_error(error)
                 await self._clock.sleep_ns(retry_ns)
                 retry_ns = min(2 * retry_ns, LONGEST_RETRY_NS)
                 continue
@@ -158,7 +158,7 @@ class Link(abc.ABC):
                 await self._until_ended()
             except Exception as error:  # noqa: BLE001 - of this connection; the next may be good
                 self._report(error)
-                self.drop(why(error))
+                self.drop(describe_error(error))
             await self._clock.sleep_ns(retry_ns)
 
     def _call(self, callback: Callable[[T], None], value: T) -> None:
@@ -167,7 +167,7 @@ class Link(abc.ABC):
             callback(value)
         except Exception as error:  # noqa: BLE001 - its fault must not end the link
             self._report(error)
-            self.drop(f"received data could not be handled: {why(error)}")
+            self.drop(f"received data could not be handled: {describe_error(error)}")
 
     def _report(self, error: Exception) -> None:
         """Log an exception that is a fault of a program and not of a port, once each."""
@@ -223,7 +223,7 @@ class Link(abc.ABC):
         except BlockingIOError:
             return False
         except OSError as error:
-            self.drop(why(error))
+            self.drop(describe_error(error))
             return False
         if not data:  # the other end is gone; left in the loop, this would spin
             self.drop("the other end is gone: unplugged?")
@@ -234,7 +234,7 @@ class Link(abc.ABC):
         return True
 
 
-def why(error: Exception) -> str:
+def describe_error(error: Exception) -> str:
     """Describe an exception in words; asyncio puts its own before the system's."""
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from aiohappyeyeballs import start_connection
 
-from gigabrain_drivers.links.link import Link, LinkProblem, why
+from gigabrain_drivers.links.link import Link, LinkProblem, describe_error
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
@@ -48,7 +48,7 @@ class TcpLink(Link):
         except OSError as error:
             if error.errno == errno.ECONNREFUSED:
                 raise LinkProblem(f"nothing listens at {self}: is its program running?") from None
-            raise LinkProblem(f"{self}: {why(error)}") from None
+            raise LinkProblem(f"{self}: {describe_error(error)}") from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, DISCARD)
         return self._socket.fileno()

@@ -15,7 +15,7 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.sim import STEP_NS, STEP_S, Pace
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
-from gigabrain_drivers.sim.physics import Simulation, account_of
+from gigabrain_drivers.sim.physics import Simulation, run_report
 from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import TICK_NS, Pose, Velocity
@@ -32,7 +32,7 @@ DEAD_MAN_NS = 150_000_000  # of simulated time: as long as a firmware would wait
 SPEEDS = (0.1, 100.0)
 
 
-def state_of(simulation: Simulation, robot_type: str) -> RobotState:
+def state_message(simulation: Simulation, robot_type: str) -> RobotState:
     """Return the body's state by its own sensors."""
     odometry, charge, imu = simulation.odometry(), simulation.battery(), simulation.imu()
     return RobotState(
@@ -52,7 +52,7 @@ def state_of(simulation: Simulation, robot_type: str) -> RobotState:
     )
 
 
-def scan_of(lidar: Lidar, ranges: NDArray[np.float32]) -> LaserScan:
+def scan_message(lidar: Lidar, ranges: NDArray[np.float32]) -> LaserScan:
     """One turn of `lidar` with these `ranges` (beams,) [m]."""
     return LaserScan(
         angle_min=0.0,
@@ -95,7 +95,7 @@ class MujocoDriver(Driver):
         self._thread: threading.Thread | None = None
         self._bridge: Bridge | None = None
         self._readings: asyncio.Queue[Reading | Exception | None] = asyncio.Queue()
-        self._account = account_of(self._simulation, robot, run)  # as of the newest tick
+        self._account = run_report(self._simulation, robot, run)  # as of the newest tick
         self._state: RobotState | None = None
         self.sensors = dict.fromkeys(("imu", "scan") if robot.lidar else ("imu",))
 
@@ -207,7 +207,7 @@ class MujocoDriver(Driver):
         if self._simulation.fallen:
             raise BodyLost(f"fell over after {self._simulation.time_ns / 1e9:.2f} s")
         if last:
-            self._account = account_of(self._simulation, self.robot, self.run)
+            self._account = run_report(self._simulation, self.robot, self.run)
             return Reading(self._imu(), state=self._look())
         # a lidar keeps no step with the states: between two of them nobody else needs a core
         due = self._ticks >= self._next_scan
@@ -229,7 +229,7 @@ class MujocoDriver(Driver):
                 bridge.post(self._readings.put_nowait, reading)
 
     def _look(self) -> RobotState:
-        return state_of(self._simulation, self.robot.robot_type)
+        return state_message(self._simulation, self.robot.robot_type)
 
     def _imu(self) -> Imu:
         return Imu(**self._simulation.imu()._asdict())
@@ -237,4 +237,4 @@ class MujocoDriver(Driver):
     def _scan(self) -> LaserScan:
         lidar = self.robot.lidar
         assert lidar is not None
-        return scan_of(lidar, self._timed(self._simulation.scan))
+        return scan_message(lidar, self._timed(self._simulation.scan))

@@ -40,7 +40,7 @@ class Simulation:
         self.model = compile_scene(body, world)
         self.data = mujoco.MjData(self.model)
         self._ticks, self._substeps = 0, body.substeps
-        self._locomotion = locomotion_of(body, self.model, self.data)
+        self._locomotion = make_locomotion(body, self.model, self.data)
         self._height = int(self.model.joint(f"{ROBOT}free").qposadr[0]) + 2
         self._battery = Battery(body.battery)
         self._person = Person(ClosedPath(world.path), world.person_start) if world.path else None
@@ -150,7 +150,7 @@ class Simulation:
             raise BodyLost(f"the simulation diverged after {self.time_ns / 1e9:.2f} s")
 
 
-def locomotion_of(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) -> Locomotion:
+def make_locomotion(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) -> Locomotion:
     """Return the locomotion of a body. Raises ConfigError for an unknown kind."""
     if isinstance(body, SimBody):
         return Rolling(body, model, data)
@@ -159,7 +159,7 @@ def locomotion_of(body: SimModel, model: mujoco.MjModel, data: mujoco.MjData) ->
     raise ConfigError(f"{type(body).__name__} has neither wheels nor legs")
 
 
-def account_of(simulation: Simulation, robot: RobotFile, run: Run) -> dict[str, Any]:
+def run_report(simulation: Simulation, robot: RobotFile, run: Run) -> dict[str, Any]:
     """The truth of the run so far, by the physics itself."""
     truth = simulation.truth
     pose = truth.pose()

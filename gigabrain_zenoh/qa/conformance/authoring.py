@@ -17,7 +17,7 @@ from gigabrain_drivers.driver.catalog import known_drivers, robot_files
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import BASE, SCAN, Emulator
 from gigabrain_drivers.links import link as links
-from gigabrain_drivers.links.frames import of_command
+from gigabrain_drivers.links.frames import describe_command
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import LinkName
@@ -130,7 +130,7 @@ async def _drive_traced(
         await driver.read_state()
         shown.show(say)
         sent = await driver.set_base_velocity(wanted.linear_x, wanted.linear_y, wanted.angular_z)
-        text = of_command(wanted, sent)
+        text = describe_command(wanted, sent)
         if text != told:
             told = text
             say(text)

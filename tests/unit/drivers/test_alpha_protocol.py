@@ -56,11 +56,11 @@ def a_state(**changes: object) -> State:
 
 
 def test_the_vectors_of_the_firmware_page() -> None:
-    assert alpha.stop(1) == STOP_1
-    assert alpha.walk(Walk(1000, FORWARD), 2) == WALK_2
+    assert alpha.encode_stop(1) == STOP_1
+    assert alpha.encode_walk(Walk(1000, FORWARD), 2) == WALK_2
     frames = AlphaDecoder().feed(STOP_1 + WALK_2)
     assert [(frame.type, frame.sequence) for frame in frames] == [(0x02, 1), (0x01, 2)]
-    command = alpha.walk_of(frames[1])
+    command = alpha.decode_walk(frames[1])
     assert command
     assert command.seen == 1000
     assert command.gait[:3] == pytest.approx((0.1, 0.0, 0.0))
@@ -68,12 +68,12 @@ def test_the_vectors_of_the_firmware_page() -> None:
 
 def test_crc_and_lengths_are_those_of_the_firmware_page() -> None:
     assert zlib.crc32(b"123456789") == 0xCBF43926
-    assert len(alpha.state(a_state(), 1)) == 248
-    assert alpha.state(a_state(), 0x01020304)[:10] == bytes.fromhex("a55aea00810104030201")
+    assert len(alpha.encode_state(a_state(), 1)) == 248
+    assert alpha.encode_state(a_state(), 0x01020304)[:10] == bytes.fromhex("a55aea00810104030201")
 
 
 def test_each_number_of_a_state_is_where_the_firmware_page_says() -> None:
-    data = alpha.state(a_state(), 5)
+    data = alpha.encode_state(a_state(), 5)
     assert struct.unpack_from("<III", data, 10) == (1000, 7, 3)
     assert (data[22], data[23]) == (1, 0b1001)
     assert struct.unpack_from("<3f", data, 24) == (25.5, 3.75, 87.5)
@@ -88,27 +88,31 @@ def test_each_number_of_a_state_is_where_the_firmware_page_says() -> None:
 
 @given(gaits, st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
 def test_a_command_there_and_back(gait: Gait, seen: int, sequence: int) -> None:
-    (frame,) = AlphaDecoder().feed(alpha.walk(Walk(seen, gait), sequence))
+    (frame,) = AlphaDecoder().feed(alpha.encode_walk(Walk(seen, gait), sequence))
     assert frame.sequence == sequence
-    assert alpha.walk_of(frame) == Walk(seen, gait)
+    assert alpha.decode_walk(frame) == Walk(seen, gait)
 
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.2, 0.2), st.floats(-1, 1))
 def test_a_velocity_survives_the_wire_to_a_millionth(x: float, y: float, turn: float) -> None:
-    (frame,) = AlphaDecoder().feed(alpha.walk(Walk(0, WALKER.to_gait(Twist(x, y, turn))), 1))
-    command = alpha.walk_of(frame)
+    (frame,) = AlphaDecoder().feed(alpha.encode_walk(Walk(0, WALKER.to_gait(Twist(x, y, turn))), 1))
+    command = alpha.decode_walk(frame)
     assert command
     assert WALKER.to_body(command.gait) == pytest.approx((x, y, turn), abs=1e-6)
 
 
 def test_a_state_there_and_back() -> None:
-    (frame,) = AlphaDecoder().feed(alpha.state(a_state(), 9))
-    assert alpha.state_of(frame) == a_state()
+    (frame,) = AlphaDecoder().feed(alpha.encode_state(a_state(), 9))
+    assert alpha.decode_state(frame) == a_state()
 
 
 @given(st.lists(st.integers(1, 60), max_size=40))
 def test_frames_are_found_however_they_are_cut(cuts: list[int]) -> None:
-    stream = alpha.stop(1) + alpha.walk(Walk(0, FORWARD), 2) + alpha.state(a_state(), 3)
+    stream = (
+        alpha.encode_stop(1)
+        + alpha.encode_walk(Walk(0, FORWARD), 2)
+        + alpha.encode_state(a_state(), 3)
+    )
     decoder, found = AlphaDecoder(), list[AlphaFrame]()
     for cut in cuts:
         found += decoder.feed(stream[:cut])
@@ -129,13 +133,13 @@ def test_no_bytes_make_the_decoder_raise_or_keep_more_than_a_frame(noise: bytes)
 
 @given(st.binary(min_size=44, max_size=44))
 def test_no_payload_makes_a_command_raise(payload: bytes) -> None:
-    command = alpha.walk_of(AlphaFrame(alpha.WALK, 1, payload))
+    command = alpha.decode_walk(AlphaFrame(alpha.WALK, 1, payload))
     assert command is None or all(map(math.isfinite, command.gait.phases))
 
 
 @given(st.binary(min_size=234, max_size=234))
 def test_no_payload_makes_a_state_raise(payload: bytes) -> None:
-    state = alpha.state_of(AlphaFrame(alpha.STATE, 1, payload))
+    state = alpha.decode_state(AlphaFrame(alpha.STATE, 1, payload))
     assert state is None or 0.99 < math.hypot(*state.senses.orientation) < 1.01
 
 
@@ -160,20 +164,20 @@ def test_another_version_is_not_obeyed() -> None:
 
 
 def test_what_is_not_a_number_is_no_command_and_no_state() -> None:
-    walk = alpha.walk(Walk(0, FORWARD._replace(turn=math.nan)), 1)
-    assert alpha.walk_of(AlphaDecoder().feed(walk)[0]) is None
-    state = alpha.state(a_state(voltage=math.inf), 1)
-    assert alpha.state_of(AlphaDecoder().feed(state)[0]) is None
+    walk = alpha.encode_walk(Walk(0, FORWARD._replace(turn=math.nan)), 1)
+    assert alpha.decode_walk(AlphaDecoder().feed(walk)[0]) is None
+    state = alpha.encode_state(a_state(voltage=math.inf), 1)
+    assert alpha.decode_state(AlphaDecoder().feed(state)[0]) is None
 
 
 def test_sequences_and_times_wrap() -> None:
-    assert alpha.newer(2, 1)
-    assert alpha.newer(3, 2**32 - 1)
-    assert not alpha.newer(1, 1)
-    assert not alpha.newer(2**32 - 1, 3)
-    assert not alpha.stale(2**32 - 50, 100)
-    assert alpha.stale(2**32 - 50, 101)
-    assert alpha.stale(100, 99)  # from the future: from another start of the firmware
+    assert alpha.is_newer(2, 1)
+    assert alpha.is_newer(3, 2**32 - 1)
+    assert not alpha.is_newer(1, 1)
+    assert not alpha.is_newer(2**32 - 1, 3)
+    assert not alpha.is_stale(2**32 - 50, 100)
+    assert alpha.is_stale(2**32 - 50, 101)
+    assert alpha.is_stale(100, 99)  # from the future: from another start of the firmware
 
 
 @pytest.mark.parametrize(("rate", "least"), [(0.001, 0.9), (0.05, 0.03)])
@@ -182,12 +186,12 @@ def test_byte_errors_make_no_wrong_command(rate: float, least: float) -> None:
     decoder, right = AlphaDecoder(), 0
     for sequence in range(count):
         gait = FORWARD._replace(stride_x=struct.unpack("<f", struct.pack("<f", sequence))[0])
-        data = bytearray(alpha.walk(Walk(sequence, gait), sequence))
+        data = bytearray(alpha.encode_walk(Walk(sequence, gait), sequence))
         for place in range(len(data)):
             if noise.random() < rate:
                 data[place] ^= noise.randint(1, 255)
         for frame in decoder.feed(bytes(data)):
-            command = alpha.walk_of(frame)
+            command = alpha.decode_walk(frame)
             assert command
             assert frame.sequence == command.seen == command.gait.stride_x
             right += 1

@@ -16,7 +16,7 @@ from gigabrain_drivers.kinematics.wheels import (
     Mecanum,
     Omni,
     Twist,
-    base_of,
+    wheels_of,
 )
 
 speeds = st.floats(-3.0, 3.0, allow_subnormal=False)
@@ -127,5 +127,5 @@ def test_a_trot_that_is_too_fast_slows_all_its_parts_alike() -> None:
 
 def test_the_waffle_is_differential_and_the_robot_without_measures_has_no_wheels() -> None:
     waffle = catalog.load_robot("turtlebot3_waffle")
-    assert base_of(waffle) == Differential(0.033, 0.287)
-    assert base_of(replace(waffle, wheel_radius=0.0)) is None
+    assert wheels_of(waffle) == Differential(0.033, 0.287)
+    assert wheels_of(replace(waffle, wheel_radius=0.0)) is None

@@ -69,7 +69,7 @@ async def test_alpha_says_how_late_its_states_are(
                 then_ms = clock.now_ns() // MS - late_ms
                 echo = sum(ms <= then_ms for ms in said_ms)
                 state = a_state(milliseconds=then_ms + 1000, echo=echo)
-                driver.link.on_bytes(alpha.state(state, clock.now_ns() // (10 * MS)))
+                driver.link.on_bytes(alpha.encode_state(state, clock.now_ns() // (10 * MS)))
         return (await driver.read_state()).link.late_ms
 
     if not from_the_start:

@@ -14,7 +14,7 @@ from gigabrain_drivers.kinematics.legs import (
     LegOdometry,
     Senses,
     Vector,
-    sound,
+    is_sound,
 )
 from gigabrain_drivers.kinematics.wheels import Twist
 
@@ -54,7 +54,7 @@ def test_the_jacobian_is_how_the_foot_moves(data: st.DataObject, number: int) ->
 @given(twists)
 def test_a_velocity_is_a_gait_and_a_gait_a_velocity(twist: Twist) -> None:
     gait = WALKER.to_gait(twist)
-    assert sound(gait)
+    assert is_sound(gait)
     assert WALKER.to_body(gait) == pytest.approx(twist, abs=1e-9)
 
 
@@ -111,7 +111,7 @@ def test_a_foot_out_of_reach_is_approached_as_far_as_the_leg_goes() -> None:
     ],
 )
 def test_a_gait_that_legs_cannot_walk_is_not_sound(wrong: dict[str, object]) -> None:
-    assert not sound(WALKER.to_gait(Twist(0.3, 0.0, 0.0))._replace(**wrong))  # type: ignore[arg-type]
+    assert not is_sound(WALKER.to_gait(Twist(0.3, 0.0, 0.0))._replace(**wrong))  # type: ignore[arg-type]
 
 
 def walked(twist: Twist, seconds: float, lifted: tuple[int, ...] = ()) -> LegOdometry:

@@ -182,7 +182,7 @@ def test_a_third_base_takes_fewer_than_twenty_lines() -> None:
     assert len(THIRD.read_text().splitlines()) < 20
     robot, driver = catalog.make_driver(str(THIRD), Run(folder=THIRD.parent, link="real"))
     assert isinstance(driver, LineDriver)
-    assert catalog.links_of(robot) == ["sim", "emulated", "real"]
+    assert catalog.robot_links(robot) == ["sim", "emulated", "real"]
 
 
 def test_the_third_base_stands_in_the_docs_as_it_is_here() -> None:

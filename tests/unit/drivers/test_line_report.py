@@ -10,7 +10,7 @@ from gigabrain_drivers.bodies.line.conversion import LineReport
 from gigabrain_drivers.bodies.line.options import LineOptions
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import Run
-from gigabrain_drivers.kinematics.wheels import Ackermann, Twist, base_of
+from gigabrain_drivers.kinematics.wheels import Ackermann, Twist, wheels_of
 
 MS = 1_000_000
 ROBOT, _, OPTIONS, _ = catalog.load_link("mycustombot", Run(folder=Path(), link="real"))
@@ -19,7 +19,7 @@ TICK = math.tau / 4096
 
 
 def report(options: LineOptions = OPTIONS) -> LineReport:
-    return LineReport(options, ROBOT, base_of(ROBOT))
+    return LineReport(options, ROBOT, wheels_of(ROBOT))
 
 
 def wheels(left: float, right: float) -> dict[str, float]:
@@ -142,7 +142,7 @@ def test_a_car_is_reckoned_by_its_steering_angle() -> None:
     robot = replace(
         ROBOT, drive_type="ackermann", wheel_base=0.5, max_linear_speed=2.0, max_angular_speed=2.0
     )
-    base = base_of(robot)
+    base = wheels_of(robot)
     assert isinstance(base, Ackermann)
     it = LineReport(OPTIONS, robot, base)
     drive, steering = base.to_wheels(Twist(1.0, 0.0, 0.5))

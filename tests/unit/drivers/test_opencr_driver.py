@@ -6,7 +6,7 @@ import struct
 import pytest
 
 from gigabrain_drivers.bodies.turtlebot3 import protocol as opencr
-from gigabrain_drivers.bodies.turtlebot3.driver import imu_of
+from gigabrain_drivers.bodies.turtlebot3.driver import imu_data
 from gigabrain_schemas.sensors import Imu
 from gigabrain_zenoh.errors import BodyLost, Unsupported
 from tests.unit.drivers.opencr import MS, Rig, make_rig  # noqa: F401
@@ -129,7 +129,7 @@ async def test_an_unknown_sensor_is_refused_with_the_known_ones(rig: Rig) -> Non
 def test_an_attitude_that_cannot_be_is_left_out(broken: tuple[float, ...]) -> None:
     data = bytearray(172)
     data[86:102] = struct.pack("<4f", *broken)
-    assert imu_of(opencr.readings(bytes(data))) is None
+    assert imu_data(opencr.decode_readings(bytes(data))) is None
 
 
 async def test_its_motors_can_be_let_go_and_the_next_connection_holds_them_again(

@@ -74,7 +74,7 @@ def test_nothing_that_is_ever_sent_touches_address_14(
 
 
 def test_items_are_where_the_firmware_has_them() -> None:
-    found = opencr.readings(
+    found = opencr.decode_readings(
         table(
             a10=(123456).to_bytes(4, "little"),
             a18=b"\xff\x2a",
@@ -107,7 +107,7 @@ def test_items_are_where_the_firmware_has_them() -> None:
 
 
 def test_a_velocity_register_of_253_is_two_tenths_of_a_metre_per_second() -> None:
-    found = opencr.readings(table(a128=struct.pack("<2i", 253, 1)))
+    found = opencr.decode_readings(table(a128=struct.pack("<2i", 253, 1)))
     assert found.velocities[0] * 0.033 == pytest.approx(0.20021, abs=1e-5)
     assert found.velocities[1] * 0.033 == pytest.approx(7.9136e-4, abs=1e-7)
     assert pytest.approx(0.001533981, abs=1e-9) == opencr.RADIANS_PER_TICK
@@ -121,15 +121,15 @@ def test_a_velocity_register_of_253_is_two_tenths_of_a_metre_per_second() -> Non
 def test_the_charge_is_at_most_full_and_empty_where_its_register_stands_still(
     voltage: int, register: int, percentage: float
 ) -> None:
-    found = opencr.readings(table(a42=struct.pack("<II", voltage, register)))
+    found = opencr.decode_readings(table(a42=struct.pack("<II", voltage, register)))
     assert found.percentage == pytest.approx(percentage)
 
 
 def test_the_switch_of_the_watchdog_is_seen() -> None:
-    assert opencr.readings(table(a14=b"\x01")).watchdog_off
+    assert opencr.decode_readings(table(a14=b"\x01")).watchdog_off
 
 
 @pytest.mark.parametrize("length", [0, 171, 173])
 def test_answers_of_another_length_are_refused(length: int) -> None:
     with pytest.raises(ValueError, match=f"expected 172 bytes of the control table, got {length}"):
-        opencr.readings(bytes(length))
+        opencr.decode_readings(bytes(length))

@@ -17,9 +17,9 @@ from gigabrain_drivers.lidars.rplidar.scan_formats import (
     Express,
     Samples,
     Standard,
-    dense_capsule,
-    express_capsule,
-    node,
+    encode_dense,
+    encode_express,
+    encode_node,
 )
 
 STANDARD = bytes.fromhex("a55a0500004081")
@@ -43,7 +43,7 @@ shifts = st.integers(0, 63)
         (rplidar.descriptor(0x82, 84, endless=True), "a5 5a 54 00 00 40 82"),
         (rplidar.descriptor(rplidar.INFO, 20), "a5 5a 14 00 00 00 04"),
         (rplidar.descriptor(rplidar.HEALTH, 3), "a5 5a 03 00 00 00 06"),
-        (node(10.0, 2000.0, quality=15, begins=True), "3d 01 05 40 1f"),
+        (encode_node(10.0, 2000.0, quality=15, begins=True), "3d 01 05 40 1f"),
     ],
 )
 def test_bytes_are_those_of_the_vendors_document(made: bytes, expected: str) -> None:
@@ -92,7 +92,7 @@ def test_a_request_with_a_wrong_checksum_is_dropped_and_the_next_is_found() -> N
 def test_both_other_clients_read_our_standard_nodes_as_we_do(
     angle: float, distance: float, begins: bool, quality: int
 ) -> None:
-    wire = node(angle, distance, quality=quality, begins=begins)
+    wire = encode_node(angle, distance, quality=quality, begins=begins)
     ours = Standard().take(wire)
     theirs = pyrplidar_protocol.PyRPlidarMeasurement(wire)
 
@@ -110,8 +110,8 @@ def test_pyrplidar_reads_our_express_capsules_as_we_do(
     start: float, width: float, points: list[tuple[int, int]]
 ) -> None:
     mm, q3 = [p[0] for p in points], [p[1] for p in points]
-    first = express_capsule(start, mm, q3, begins=True)
-    second = express_capsule(start + width, mm, q3, begins=False)
+    first = encode_express(start, mm, q3, begins=True)
+    second = encode_express(start + width, mm, q3, begins=False)
     express = Express()
     assert express.take(first) is None
     ours = express.take(second)
@@ -127,7 +127,7 @@ def test_pyrplidar_reads_our_express_capsules_as_we_do(
 def test_rplidar_roboticia_reads_express_one_sample_late_and_otherwise_as_we_do() -> None:
     """Its known fault: the angle of the next sample. Allowed for by shifting by one."""
     mm = list(range(1000, 1320, 10))
-    first, second = (express_capsule(s, mm, begins=False) for s in (40.0, 72.0))
+    first, second = (encode_express(s, mm, begins=False) for s in (40.0, 72.0))
     express = Express()
     express.take(first)
     ours = express.take(second)
@@ -147,8 +147,8 @@ def test_rplidar_roboticia_reads_express_one_sample_late_and_otherwise_as_we_do(
 def test_pyrplidar_reads_our_dense_capsules_as_we_do_but_for_its_swapped_bytes(
     start: float, width: float, mm: list[int]
 ) -> None:
-    first = dense_capsule(start, mm, begins=True)
-    second = dense_capsule(start + width, mm, begins=False)
+    first = encode_dense(start, mm, begins=True)
+    second = encode_dense(start + width, mm, begins=False)
     dense = Dense()
     assert dense.take(first) is None
     ours = dense.take(second)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
 from gigabrain_drivers.lidars.rplidar.protocol import Answer, Info, RequestDecoder, RplidarDecoder
-from gigabrain_drivers.lidars.rplidar.scan_formats import Dense, Samples, dense_capsule, node
+from gigabrain_drivers.lidars.rplidar.scan_formats import Dense, Samples, encode_dense, encode_node
 
 STANDARD = bytes.fromhex("a55a0500004081")
 DENSE = rplidar.descriptor(0x85, 84, endless=True)
@@ -19,7 +19,7 @@ def dense_turns(turns: int) -> bytes:
     """A lidar of 360 samples a turn: nine capsules of 40 degrees, 1 m at 0 deg to 4.59 m at 359."""
     capsules = [[1000 + 10 * (k * 40 + n) for n in range(40)] for k in range(9)]
     return b"".join(
-        dense_capsule(40.0 * k, capsules[k], begins=turn + k == 0)
+        encode_dense(40.0 * k, capsules[k], begins=turn + k == 0)
         for turn in range(turns)
         for k in range(9)
     )
@@ -50,9 +50,9 @@ def test_a_dense_stream_decodes_the_same_however_it_is_cut(data: st.DataObject) 
 def test_a_turn_begins_at_the_sample_that_passes_zero() -> None:
     dense = Dense()
     mm = [1000] * 40
-    dense.take(dense_capsule(350.0, mm, begins=False))
-    passing = dense.take(dense_capsule(30.0, mm, begins=False))
-    after = dense.take(dense_capsule(70.0, mm, begins=False))
+    dense.take(encode_dense(350.0, mm, begins=False))
+    passing = dense.take(encode_dense(30.0, mm, begins=False))
+    after = dense.take(encode_dense(70.0, mm, begins=False))
 
     assert passing is not None
     assert (passing.turn_at, passing.angles[9], passing.angles[10]) == (10, 359.0, 360.0)
@@ -81,7 +81,7 @@ def test_a_lost_capsule_is_noticed_though_every_checksum_is_right() -> None:
 
 def standard_turns(turns: int) -> bytes:
     return b"".join(
-        node(angle, 1000 + 10 * angle, quality=40, begins=angle == 0)
+        encode_node(angle, 1000 + 10 * angle, quality=40, begins=angle == 0)
         for _ in range(turns)
         for angle in range(360)
     )
@@ -132,7 +132,7 @@ def test_what_the_decoders_keep_is_bounded_and_nothing_raises(
 
 
 def test_no_single_wrong_byte_in_a_capsule_is_accepted() -> None:
-    good = dense_capsule(40.0, range(1000, 1400, 10), begins=False)
+    good = encode_dense(40.0, range(1000, 1400, 10), begins=False)
     for at in range(84):
         for pattern in (1, 0x80, 0x55, 0xFF):
             bad = bytearray(good)

@@ -13,7 +13,7 @@ from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.kinematics.legs import WALKER
-from gigabrain_drivers.kinematics.wheels import Twist, base_of
+from gigabrain_drivers.kinematics.wheels import Twist, wheels_of
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.qa.faults.rows.commands import commanded_over, let_through, over
@@ -62,7 +62,7 @@ async def test_a_simulated_base_is_told_just_that() -> None:
 
 @pytest.mark.parametrize("body", ["turtlebot3_burger", "turtlebot3_waffle"])
 def test_an_opencr_is_told_that_to_within_half_of_its_unit(body: str) -> None:
-    base = base_of(catalog.load_robot(body))
+    base = wheels_of(catalog.load_robot(body))
     assert base
     for now in outputs(body):
         wheels = base.to_wheels(Twist(*axes(now)))

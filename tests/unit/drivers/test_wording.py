@@ -15,7 +15,7 @@ from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.lds import lds01, lds03
 from gigabrain_drivers.lidars.rplidar import protocol as rplidar
 from gigabrain_drivers.links import link as links
-from gigabrain_drivers.links.frames import Spelling, Wording, of_command, whole
+from gigabrain_drivers.links.frames import Spelling, Wording, as_one_frame, describe_command
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.cli import driver
 from gigabrain_zenoh.cli.driver import trace
@@ -58,7 +58,7 @@ FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [
         "c7 00 e9 c5 00 e5 c2 00 e5 c0 00 e5 be 82 3a 1a 50",
         "12 points from 324.27 to 334.70 deg clockwise, 192 to 224 mm, 5.98 turns/s",
     ),
-    (whole, lds01.describe_command, "62", "start"),
+    (as_one_frame, lds01.describe_command, "62", "start"),
     (lds03.CommandDecoder().feed, lds03.describe_command, "aa 55 f5 0a", "stop"),
     (
         lds03.Lds03Decoder().feed,
@@ -72,7 +72,7 @@ FRAMES: list[tuple[Callable[[bytes], Any], Callable[[Any], str], str, str]] = [
         "a5 82 05 00 00 00 00 00 22",
         "express scan 00 00 00 00 00",
     ),
-    (alpha.AlphaDecoder().feed, alpha.describe, alpha.stop(7).hex(" "), "7 stop"),
+    (alpha.AlphaDecoder().feed, alpha.describe, alpha.encode_stop(7).hex(" "), "7 stop"),
     (
         LineDecoder([LINE]).feed,
         describe,
@@ -102,7 +102,7 @@ def test_bytes_that_are_no_frame_are_shown_as_they_are() -> None:
 
 def test_a_command_is_told_as_received_and_as_converted() -> None:
     asked, sent = Velocity(linear_x=0.123, angular_z=-0.456), Velocity(linear_x=0.12)
-    assert of_command(asked, sent) == (
+    assert describe_command(asked, sent) == (
         "command linear_x 0.1230 m/s, linear_y 0.0000 m/s, angular_z -0.4560 rad/s -> "
         "sent linear_x 0.1200 m/s, linear_y 0.0000 m/s, angular_z 0.0000 rad/s"
     )

@@ -14,7 +14,7 @@ from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
 from gigabrain_drivers.kinematics.legs import JOINT_NAMES, WALKER, LegGeometry, LegOdometry
 from gigabrain_drivers.kinematics.wheels import Twist
-from gigabrain_drivers.lidars.base import ScanSource, carry
+from gigabrain_drivers.lidars.base import ScanSource, open_lidar
 from gigabrain_drivers.links.device_clock import DeviceClock, EchoClock
 from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Liveness
@@ -75,7 +75,7 @@ class AlphaDriver(Driver):
         """Begin to look for the body and its lidar; neither has to be there yet."""
         self._open = True
         self.link.open()
-        self._lidar = carry(self, self._clock)
+        self._lidar = open_lidar(self, self._clock)
 
     async def close(self) -> None:
         """Stop, and let go of the connection."""
@@ -91,15 +91,15 @@ class AlphaDriver(Driver):
     async def stop(self) -> None:
         """Come to rest and stand; a body that lies goes on lying."""
         if self._liveness.received:
-            say = alpha.park if self._parked else alpha.stop
-            self.link.write(say(self._next()))
+            encode = alpha.encode_park if self._parked else alpha.encode_stop
+            self.link.write(encode(self._next()))
 
     async def park(self) -> None:
         """Lie down; only a step gets it up again."""
         if not self._liveness.received:
             raise BodyLost(f"{self.link}: {self.link.problem or 'the body is silent'}")
         self._parked = True
-        self.link.write(alpha.park(self._next()))
+        self.link.write(alpha.encode_park(self._next()))
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
@@ -113,12 +113,12 @@ class AlphaDriver(Driver):
         if self._untold or self._fallen:
             to = ZERO
         if self._parked and to == ZERO:
-            self.link.write(alpha.park(self._next()))
+            self.link.write(alpha.encode_park(self._next()))
             return ZERO
         self._parked = False
         gait = WALKER.to_gait(Twist(to.linear_x, to.linear_y, to.angular_z))
         seen = self._last[1] if self._last else 0
-        if not self.link.write(alpha.walk(alpha.Walk(seen, gait), self._next())):
+        if not self.link.write(alpha.encode_walk(alpha.Walk(seen, gait), self._next())):
             return ZERO
         return Velocity(**WALKER.to_body(gait)._asdict())
 
@@ -154,7 +154,7 @@ class AlphaDriver(Driver):
 
     def _received(self, data: bytes) -> None:
         for frame in self._decoder.feed(data):
-            state = alpha.state_of(frame) if frame.type == alpha.STATE else None
+            state = alpha.decode_state(frame) if frame.type == alpha.STATE else None
             if state is None:
                 self._unsound += 1
             else:
@@ -164,7 +164,7 @@ class AlphaDriver(Driver):
     def _take(self, frame: AlphaFrame, state: State) -> None:
         """Handle one report. Its own clock tells how much time has passed since the last."""
         last, self._last = self._last, (frame.sequence, state.milliseconds)
-        if last and not alpha.newer(frame.sequence, last[0]):
+        if last and not alpha.is_newer(frame.sequence, last[0]):
             self._last = last
             return
         first, self._state = self._liveness.mark_received(), state
@@ -176,8 +176,8 @@ class AlphaDriver(Driver):
             self._odometry.update(state.senses, passed / 1000)
         if first:  # what lies stays so until somebody wants it to walk
             self._parked = bool(state.flags & alpha.PARKED)
-            say = alpha.park if self._parked else alpha.stop
-            self.link.write(say(self._next()))
+            encode = alpha.encode_park if self._parked else alpha.encode_stop
+            self.link.write(encode(self._next()))
         senses = state.senses
         imu = Imu(
             orientation=senses.orientation,

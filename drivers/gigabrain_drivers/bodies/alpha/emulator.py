@@ -9,7 +9,7 @@ from gigabrain_drivers.bodies.alpha.driver import AlphaOptions
 from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, AlphaFrame, State
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Snapshot, Wire
 from gigabrain_drivers.emulators.ports import TcpPort
-from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, sound
+from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, is_sound
 from gigabrain_drivers.kinematics.wheels import Twist
 
 LYING_M = 0.13  # height of the hips of a body that lies
@@ -87,7 +87,7 @@ class Alpha(Device):
             self._walk(LYING if self.parked else REST)
         for sample in self.body.fresh() or [self.body.snapshot]:
             self._sent += 1
-            self.wire.write(alpha.state(self._report(sample), self._sent))
+            self.wire.write(alpha.encode_state(self._report(sample), self._sent))
 
     def _wanted(self, frame: AlphaFrame) -> Gait | None:
         """Return the gait that a frame asks for, None unless it is sound, new and fresh."""
@@ -95,13 +95,13 @@ class Alpha(Device):
             return REST
         if frame.type == alpha.PARK:
             return LYING
-        command = alpha.walk_of(frame) if frame.type == alpha.WALK else None
-        if command is None or not sound(command.gait):
+        command = alpha.decode_walk(frame) if frame.type == alpha.WALK else None
+        if command is None or not is_sound(command.gait):
             return None
-        if self._last is not None and not alpha.newer(frame.sequence, self._last):
+        if self._last is not None and not alpha.is_newer(frame.sequence, self._last):
             return None
         now_ms = self._milliseconds(self.body.snapshot)
-        return None if alpha.stale(command.seen, now_ms) else command.gait
+        return None if alpha.is_stale(command.seen, now_ms) else command.gait
 
     def _milliseconds(self, sample: Snapshot) -> int:
         """The firmware's clock is the body's: it stands still where a busy host holds both up."""

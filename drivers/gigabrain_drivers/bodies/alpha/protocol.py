@@ -73,24 +73,24 @@ def encode(frame: AlphaFrame) -> bytes:
     return body + _CRC.pack(zlib.crc32(body))
 
 
-def walk(command: Walk, sequence: int) -> bytes:
+def encode_walk(command: Walk, sequence: int) -> bytes:
     """A command to walk."""
     seen, gait = command
     values = (gait.stride_x, gait.stride_y, gait.turn, gait.frequency, gait.duty)
     return encode(AlphaFrame(WALK, sequence, _GAIT.pack(seen, *values, *gait.phases, gait.height)))
 
 
-def stop(sequence: int) -> bytes:
+def encode_stop(sequence: int) -> bytes:
     """A command to come to rest and stand."""
     return encode(AlphaFrame(STOP, sequence))
 
 
-def park(sequence: int) -> bytes:
+def encode_park(sequence: int) -> bytes:
     """A command to come to rest and lie down, and to stay so until the next step is asked for."""
     return encode(AlphaFrame(PARK, sequence))
 
 
-def walk_of(frame: AlphaFrame) -> Walk | None:
+def decode_walk(frame: AlphaFrame) -> Walk | None:
     """The command in a frame, or None where it holds what is not a number."""
     seen, x, y, turn, frequency, duty, a, b, c, d, height = _GAIT.unpack(frame.payload)
     if not all(map(math.isfinite, (x, y, turn, frequency, duty, a, b, c, d, height))):
@@ -98,12 +98,12 @@ def walk_of(frame: AlphaFrame) -> Walk | None:
     return Walk(seen, Gait(x, y, turn, frequency, duty, (a, b, c, d), height))
 
 
-def stale(seen: int, now: int) -> bool:
+def is_stale(seen: int, now: int) -> bool:
     """Return whether a command with this `seen` time [ms] is too old at `now`, across the wrap."""
     return (now - seen) % SEQUENCES > STALE_MS
 
 
-def state(now: State, sequence: int) -> bytes:
+def encode_state(now: State, sequence: int) -> bytes:
     """The body's report."""
     senses = now.senses
     feet = sum(1 << foot for foot, touches in enumerate(senses.contacts) if touches)
@@ -128,7 +128,7 @@ def state(now: State, sequence: int) -> bytes:
     return encode(AlphaFrame(STATE, sequence, payload))
 
 
-def state_of(frame: AlphaFrame) -> State | None:
+def decode_state(frame: AlphaFrame) -> State | None:
     """The report in a frame, or None where it holds what cannot have been measured."""
     milliseconds, echo, refused, flags, feet, *rest = _STATE.unpack(frame.payload)
     numbers, temperatures = rest[:49], rest[49:]
@@ -161,14 +161,14 @@ def state_of(frame: AlphaFrame) -> State | None:
     )
 
 
-def newer(sequence: int, than: int) -> bool:
+def is_newer(sequence: int, than: int) -> bool:
     """Return whether one sequence number comes after another, across the wrap."""
     return 0 < (sequence - than) % SEQUENCES < SEQUENCES // 2
 
 
 def describe(frame: AlphaFrame) -> str:
     """A frame in words."""
-    if frame.type == WALK and (command := walk_of(frame)):
+    if frame.type == WALK and (command := decode_walk(frame)):
         gait = command.gait
         return (
             f"{frame.sequence} walk: stride {gait.stride_x:.4f} {gait.stride_y:.4f} m, "
@@ -179,7 +179,7 @@ def describe(frame: AlphaFrame) -> str:
         return f"{frame.sequence} park"
     if frame.type == STOP:
         return f"{frame.sequence} stop"
-    if frame.type == STATE and (now := state_of(frame)):
+    if frame.type == STATE and (now := decode_state(frame)):
         feet = "".join("x" if touches else "." for touches in now.senses.contacts)
         return (
             f"{frame.sequence} state: {now.milliseconds} ms, echo {now.echo}, refused "

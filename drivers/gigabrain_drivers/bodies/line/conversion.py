@@ -4,9 +4,9 @@ import math
 from collections import deque
 from collections.abc import Mapping
 
-from gigabrain_drivers.bodies.line.options import POSE, LineOptions, positions_of, speeds_of
+from gigabrain_drivers.bodies.line.options import POSE, LineOptions, position_fields, speed_fields
 from gigabrain_drivers.bodies.line.protocol import ANGLES, BODY, LineDecoder, Template, describe
-from gigabrain_drivers.kinematics.wheels import Base, Twist, advanced, between
+from gigabrain_drivers.kinematics.wheels import Base, Twist, advance_pose, step_between
 from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Battery, BodyDescription, Joint
 
@@ -90,8 +90,8 @@ class LineReport:
         self._options, self._body, self._base = options, body, base
         self._wheels = base.wheels if base else ()
         self._spans = _spans(options, self._wheels)
-        self._positions = positions_of(base) if base else ()
-        self._speeds = speeds_of(base) if base else ()
+        self._positions = position_fields(base) if base else ()
+        self._speeds = speed_fields(base) if base else ()
         self._whole_pose = frozenset(POSE)
         self._speaking = {*BODY, *self._speeds}
         self._values: dict[str, float] = {}
@@ -113,9 +113,9 @@ class LineReport:
         if self._whole_pose <= values.keys():
             pose = Pose(x=values["x"], y=values["y"], yaw=values["yaw"])
             last, self._pose = self._pose or pose, pose
-            step = between(last, pose)
-            if self._after_gap(now_ns) and _length(between(ORIGIN, pose)) < _length(step):
-                step = between(ORIGIN, pose)
+            step = step_between(last, pose)
+            if self._after_gap(now_ns) and _length(step_between(ORIGIN, pose)) < _length(step):
+                step = step_between(ORIGIN, pose)
             self._move(step, now_ns)
         elif (angles := _all_of(self._positions, values)) and self._base:
             self._roll(angles, now_ns)
@@ -222,7 +222,7 @@ class LineReport:
         too_far = math.hypot(step.linear_x, step.linear_y) > speed * room + SLACK_M
         if too_far or abs(step.angular_z) > body.max_angular_speed * room + SLACK_M:
             step = STILL
-        self.pose = advanced(self.pose, step)
+        self.pose = advance_pose(self.pose, step)
         self._steps.append((seconds, step))
         while sum(took for took, _ in self._steps) - self._steps[0][0] >= VELOCITY_S:
             self._steps.popleft()

@@ -15,8 +15,8 @@ from gigabrain_drivers.bodies.line.options import BITS_PER_BYTE, LineOptions, ch
 from gigabrain_drivers.bodies.line.protocol import LineDecoder, describe
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import RobotFile, Run
-from gigabrain_drivers.kinematics.wheels import base_of
-from gigabrain_drivers.lidars.base import ScanSource, carry
+from gigabrain_drivers.kinematics.wheels import wheels_of
+from gigabrain_drivers.lidars.base import ScanSource, open_lidar
 from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Liveness
 from gigabrain_drivers.links.serial_link import SerialLink
@@ -46,7 +46,7 @@ class LineDriver(Driver):
 
     def __init__(self, robot: RobotFile, options: LineOptions, run: Run) -> None:
         super().__init__(robot, options, run)
-        base = base_of(robot)
+        base = wheels_of(robot)
         self._command = LineCommand(options.command_template(), base)
         self._decoder = LineDecoder(options.state_templates())
         self._clock = Clock()
@@ -79,7 +79,7 @@ class LineDriver(Driver):
         """Begin to look for the body and its lidar; neither has to be there yet."""
         self._open = True
         self.link.open()
-        self._lidar = carry(self, self._clock)
+        self._lidar = open_lidar(self, self._clock)
 
     async def close(self) -> None:
         """Stop, and let go of the ports."""

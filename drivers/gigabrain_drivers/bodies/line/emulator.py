@@ -13,7 +13,7 @@ from gigabrain_drivers.bodies.line.options import LineOptions
 from gigabrain_drivers.bodies.line.protocol import LONGEST, Field
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
 from gigabrain_drivers.emulators.ports import Pty
-from gigabrain_drivers.kinematics.wheels import base_of
+from gigabrain_drivers.kinematics.wheels import wheels_of
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
 
@@ -36,7 +36,7 @@ class LineBase(Device):
         super().__init__(body, options, wire)
         self._options: LineOptions = options
         self._command = options.command_template()
-        self._said = LineCommand(self._command, base_of(body.robot))
+        self._said = LineCommand(self._command, wheels_of(body.robot))
         self._state = options.state_templates()
         self._limits = limits_of(body.robot)
         self._state_ns = round(1e9 / options.state_hz)

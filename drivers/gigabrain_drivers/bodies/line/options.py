@@ -17,7 +17,7 @@ from gigabrain_drivers.bodies.line.protocol import (
     Template,
 )
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile
-from gigabrain_drivers.kinematics.wheels import Ackermann, Base, Twist, base_of, missing_measures
+from gigabrain_drivers.kinematics.wheels import Ackermann, Base, Twist, missing_measures, wheels_of
 from gigabrain_drivers.links.serial_link import AUTO, check_port
 from gigabrain_schemas.base import Name, Positive
 
@@ -128,7 +128,7 @@ def _template(field: str, text: str, known: dict[str, str], turn: float | None) 
 
 def check_lines(options: LineOptions, robot: RobotFile) -> None:
     """Check the lines against the body: its wheels, steps, odometry and lidar."""
-    base, command, state = base_of(robot), options.command_template(), options.state_templates()
+    base, command, state = wheels_of(robot), options.command_template(), options.state_templates()
     for field, template in {"command": command, **_numbered(state)}.items():
         _check_wheels(field, template, robot, base)
     _check_command(command, robot, base)
@@ -142,12 +142,12 @@ def check_lines(options: LineOptions, robot: RobotFile) -> None:
         )
 
 
-def speeds_of(base: Base) -> tuple[str, ...]:
+def speed_fields(base: Base) -> tuple[str, ...]:
     """The state fields from which a base's velocity follows; a wheel that steers has an angle."""
     return tuple(f"wheel_{n}_{'position' if n in ANGLES else 'velocity'}" for n in base.wheels)
 
 
-def positions_of(base: Base) -> tuple[str, ...]:
+def position_fields(base: Base) -> tuple[str, ...]:
     """The state fields by which a base's way is reckoned."""
     return tuple(f"wheel_{name}_position" for name in base.wheels)
 
@@ -211,7 +211,7 @@ def _check_steps(command: Template, robot: RobotFile, base: Base | None) -> None
 
 def _check_odometry(state: tuple[Template, ...], base: Base | None) -> None:
     """Check that a pose, or all wheels' positions, stand in one line where there are any."""
-    for whole in (POSE, positions_of(base) if base else ()):
+    for whole in (POSE, position_fields(base) if base else ()):
         telling = {
             n for n in whole if n.removeprefix("wheel_").removesuffix("_position") not in ANGLES
         }
@@ -227,7 +227,7 @@ def _check_odometry(state: tuple[Template, ...], base: Base | None) -> None:
 def _check_motion(state: tuple[Template, ...], robot: RobotFile, base: Base | None) -> None:
     """Every way in which the body can move is measured."""
     seen = frozenset[str]().union(*(template.names for template in state))
-    wholes = [POSE, *((positions_of(base), speeds_of(base)) if base else ())]
+    wholes = [POSE, *((position_fields(base), speed_fields(base)) if base else ())]
     if any(seen.issuperset(whole) for whole in wholes):
         return
     ways = _ways(robot)

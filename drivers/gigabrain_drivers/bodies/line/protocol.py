@@ -173,7 +173,7 @@ class Field:
         return (int(text, 16) if self.format[-1] in "xX" else float(text)) * self.factor + 0.0
 
 
-def field_of(
+def parse_field(
     name: str, unit: str | None, form: str | None, known: Mapping[str, str], turn: float | None
 ) -> Field:
     """Return the field between two braces. Raises ValueError naming the field."""
@@ -235,7 +235,7 @@ class Template:
             raise ValueError(f"the checksum {{{self.check}}} must stand last in the line")
         if any("{" in part or "}" in part for part in self._texts):
             raise ValueError("a brace without its partner; expected {FIELD|UNIT:FORMAT}")
-        self.fields = tuple(field_of(*triple, known, ticks_per_turn) for triple in triples)
+        self.fields = tuple(parse_field(*triple, known, ticks_per_turn) for triple in triples)
         if not self.fields:
             raise ValueError(f"there is no field in it; known: {', '.join(known)}")
         self._check_gaps()

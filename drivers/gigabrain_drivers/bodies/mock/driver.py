@@ -7,7 +7,7 @@ import numpy as np
 
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import LinkOptions, RobotFile, Run
-from gigabrain_drivers.lidars.base import ScanSource, carry
+from gigabrain_drivers.lidars.base import ScanSource, open_lidar
 from gigabrain_schemas.arrays import ranges_bytes
 from gigabrain_schemas.base import TICK_NS, TICK_S, Pose, Velocity
 from gigabrain_schemas.body import Battery, RobotState
@@ -46,7 +46,7 @@ class MockBody(Driver):
     async def open(self) -> None:
         """Nothing to connect to but a lidar that it may carry; else a scan is there at once."""
         self._open = True
-        self._lidar = carry(self, Clock())
+        self._lidar = open_lidar(self, Clock())
         if self._lidar is None:
             self.sensors["scan"] = self._look()
 

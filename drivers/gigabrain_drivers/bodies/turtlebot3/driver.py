@@ -22,9 +22,9 @@ from gigabrain_drivers.kinematics.wheels import (
     Encoders,
     Twist,
     WheelOdometry,
-    base_of,
+    wheels_of,
 )
-from gigabrain_drivers.lidars.base import ScanSource, carry
+from gigabrain_drivers.lidars.base import ScanSource, open_lidar
 from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_drivers.links.link import Link
 from gigabrain_drivers.links.serial_link import SerialLink, check_port
@@ -191,10 +191,10 @@ class Board:
             if packet.id != opencr.ID or packet.instruction != opencr.STATUS:
                 continue
             answer = packet.params[1:]
-            if model := opencr.model_of(answer):
+            if model := opencr.decode_model(answer):
                 self._recognise(*model)
             elif self.ready and len(answer) == opencr.LENGTH:
-                self._read(opencr.readings(answer))
+                self._read(opencr.decode_readings(answer))
         self.link.errors = self._decoder.errors
 
     def _recognise(self, model: int, firmware: int) -> None:
@@ -217,7 +217,7 @@ def is_opencr(port: serial.Serial) -> bool:
     """Return whether an OpenCR answers on this port. Runs in a thread; may raise OSError."""
     port.write(opencr.ping(opencr.ID))
     answers = opencr.DynamixelDecoder().feed(port.read(ANSWER_BYTES))
-    models = [opencr.model_of(packet.params[1:]) for packet in answers]
+    models = [opencr.decode_model(packet.params[1:]) for packet in answers]
     return any(model is not None and model[0] == opencr.MODEL for model in models)
 
 
@@ -250,7 +250,7 @@ class OpenCrDriver(Driver):
     ) -> None:
         """`link` instead of the serial port that the options name."""
         super().__init__(robot, options, run)
-        base = base_of(robot)
+        base = wheels_of(robot)
         if not isinstance(base, Differential):
             raise ConfigError(
                 f"{robot.robot_type}: OpenCR drives a differential base; expected its "
@@ -278,7 +278,7 @@ class OpenCrDriver(Driver):
 
     async def open(self) -> None:
         """Begin to look for the board and the lidar; neither has to be there yet."""
-        self._lidar = carry(self, self._clock)
+        self._lidar = open_lidar(self, self._clock)
         self.link.open()
         self._guard = asyncio.create_task(self._look_after(), name="opencr guard")
 
@@ -346,7 +346,7 @@ class OpenCrDriver(Driver):
                 for name, ticks, velocity in wheels
             ),
             battery=Battery(voltage=now.voltage, percentage=now.percentage),
-            imu=imu_of(now),
+            imu=imu_data(now),
             bumpers=now.bumpers,
         )
         if imu := self._state.imu:
@@ -359,7 +359,7 @@ class OpenCrDriver(Driver):
             self.emit(IMU, message)
 
 
-def imu_of(now: Readings) -> ImuData | None:
+def imu_data(now: Readings) -> ImuData | None:
     """Return the board's inertial unit, or None while its values are impossible."""
     rates = (*now.angular_velocity, *now.linear_acceleration)
     norm = math.hypot(*now.orientation)

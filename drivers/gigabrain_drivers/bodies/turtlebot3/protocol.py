@@ -151,12 +151,12 @@ def ask() -> bytes:
     return read(ID, FIRST, LENGTH)
 
 
-def model_of(answer: bytes) -> tuple[int, int] | None:
+def decode_model(answer: bytes) -> tuple[int, int] | None:
     """(model number, firmware version) in the answer to a ping; None: it is another answer."""
     return (answer[0] | answer[1] << 8, answer[2]) if len(answer) == 3 else None
 
 
-def readings(data: bytes) -> Readings:
+def decode_readings(data: bytes) -> Readings:
     """Decode the answer's `data` (172 bytes). Raises ValueError for another length."""
     if len(data) != LENGTH:
         raise ValueError(f"expected {LENGTH} bytes of the control table, got {len(data)}")
@@ -238,11 +238,11 @@ def _answer_in_words(params: bytes) -> str:
     error, data = params[0] & 0x7F, params[1:]
     if error:
         return f"status: error {error}"
-    if model := model_of(data):
+    if model := decode_model(data):
         return f"status: model {model[0]:#06x}, firmware {model[1]}"
     if len(data) != LENGTH:
         return f"status: ok, {len(data)} bytes" if data else "status: ok"
-    now = readings(data)
+    now = decode_readings(data)
     left, right = now.velocities
     return (
         f"state: heartbeat {now.heartbeat}, {now.voltage:.2f} V, wheels {left:.3f} {right:.3f} "

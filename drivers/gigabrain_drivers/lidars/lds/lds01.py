@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import serial
 
 from gigabrain_drivers.lidars.serial_source import SerialSource
-from gigabrain_drivers.links.frames import FrameDecoder, Spelling, Wording, whole
+from gigabrain_drivers.links.frames import FrameDecoder, Spelling, Wording, as_one_frame
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock
 
@@ -89,7 +89,7 @@ class Lds01(SerialSource):
         self._decoder = Lds01Decoder()
         super().__init__(options, lidar, clock, BAUD, self._decoder)
         self.link.wording = Wording(
-            Spelling(whole, describe_command), Spelling(Lds01Decoder().feed, describe)
+            Spelling(as_one_frame, describe_command), Spelling(Lds01Decoder().feed, describe)
         )
         self._last: int | None = None  # number of the newest packet
         self._told_ns = 0  # when it was last told to start, or last seen to turn

@@ -17,9 +17,9 @@ from gigabrain_drivers.lidars.rplidar.protocol import (
 )
 from gigabrain_drivers.lidars.rplidar.scan_formats import (
     FORMATS,
-    dense_capsule,
-    express_capsule,
-    node,
+    encode_dense,
+    encode_express,
+    encode_node,
 )
 from gigabrain_drivers.lidars.rplidar.source import MODELS, RplidarOptions
 
@@ -81,7 +81,7 @@ class RplidarDevice(Device):
 
     def __init__(self, body: EmulatedBody, options: RplidarOptions, wire: Wire) -> None:
         super().__init__(body, options, wire)
-        self.unit = unit_of(options)
+        self.unit = emulated_unit(options)
         self.health = Health(0, 0)
         self._requests = RequestDecoder()
         self._sweep = Sweep(body, *self.unit.reach)
@@ -202,14 +202,16 @@ class RplidarDevice(Device):
         first, self._first = self._first, False
         start, distances = samples[0].angle, [sample.distance for sample in samples]
         if kind == DENSE:
-            return dense_capsule(start, distances, begins=first)
+            return encode_dense(start, distances, begins=first)
         if kind == EXPRESS:
-            return express_capsule(start, distances, begins=first)
+            return encode_express(start, distances, begins=first)
         begins, self._last_angle = start < self._last_angle, start
-        return node(start, distances[0], quality=QUALITY if distances[0] else 0, begins=begins)
+        return encode_node(
+            start, distances[0], quality=QUALITY if distances[0] else 0, begins=begins
+        )
 
 
-def unit_of(options: RplidarOptions) -> Unit:
+def emulated_unit(options: RplidarOptions) -> Unit:
     """Return the emulated model; those without an entry of their own are like the A1 or the S2."""
     if options.model in UNITS:
         return UNITS[options.model]

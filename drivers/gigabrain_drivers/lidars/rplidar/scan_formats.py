@@ -167,14 +167,14 @@ def capsule_checksum(block: bytes) -> int:
     return xor_of(block[2:])
 
 
-def node(angle_deg: float, distance_mm: float, *, quality: int, begins: bool) -> bytes:
+def encode_node(angle_deg: float, distance_mm: float, *, quality: int, begins: bool) -> bytes:
     """Return a standard node; `quality` 0-63."""
     first = quality << 2 | (not begins) << 1 | begins
     angle_q6 = round(angle_deg * 64) % TURN_Q6
     return _NODE.pack(first, angle_q6 << 1 | 1, min(0xFFFF, round(distance_mm * 4)))
 
 
-def express_capsule(
+def encode_express(
     start_deg: float,
     distances_mm: Sequence[float],
     shifts_q3: Sequence[int] = (0,) * 32,
@@ -190,7 +190,7 @@ def express_capsule(
     return _capsule(start_deg, _CABINS.pack(*(part for cabin in cabins for part in cabin)), begins)
 
 
-def dense_capsule(start_deg: float, distances_mm: Sequence[float], *, begins: bool) -> bytes:
+def encode_dense(start_deg: float, distances_mm: Sequence[float], *, begins: bool) -> bytes:
     """Return a dense capsule of 40 samples."""
     return _capsule(start_deg, _DENSE.pack(*(min(0xFFFF, round(d)) for d in distances_mm)), begins)
 

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple, Self
 from msgspec import structs
 
 from gigabrain_drivers.driver.catalog import load_robot
-from gigabrain_drivers.emulators.emulator import wire_of
+from gigabrain_drivers.emulators.emulator import wire_kind
 from gigabrain_schemas.base import TICK_MS, Message
 from gigabrain_schemas.body import BodyDescription, RobotState
 from gigabrain_schemas.brain import CmdVel
@@ -167,7 +167,7 @@ def deployment_of(options: Options, stage: Stage, resume: Resume = "manual") -> 
     """Return the deployment of a stage. Raises Skipped where the chosen body has no such link."""
     body = options.body or BODIES[stage]
     link: LinkName = "sim" if stage in ("sim", "auto") else "emulated"
-    wire: Literal["serial", "tcp", ""] = wire_of(body) if link == "emulated" else ""
+    wire: Literal["serial", "tcp", ""] = wire_kind(body) if link == "emulated" else ""
     if link == "emulated" and not (wire == stage or (wire and stage == "line")):
         raise Skipped(f"{body} has no {stage} line" if stage != "line" else f"{body} has no line")
     return Deployment(
