@@ -37,7 +37,7 @@ def counting() -> Callable[[int], bytes]:
 def closed(loop: EchoLoop, begin_ms: int, end_ms: int) -> None:
     """The contact is closed for a while."""
     for now in range(begin_ms, end_ms, 20):
-        loop.heard(loop.question(now * MS), (now + 5) * MS)
+        loop.check_echo(loop.next_bytes(now * MS), (now + 5) * MS)
 
 
 def test_a_closed_contact_gives_back_what_was_sent() -> None:
@@ -51,24 +51,24 @@ def test_an_open_contact_is_noticed_after_200_ms_and_not_before() -> None:
     loop = EchoLoop(counting())
     closed(loop, 0, 100)  # the last question left at 80 ms
     for now in range(100, 281, 20):
-        loop.question(now * MS)
+        loop.next_bytes(now * MS)
     assert loop.problem(280 * MS) == ""
     assert loop.problem(281 * MS) == OPEN
 
 
 def test_an_echo_that_comes_late_does_not_count() -> None:
     loop = EchoLoop(counting())
-    loop.heard(loop.question(0), 201 * MS)
+    loop.check_echo(loop.next_bytes(0), 201 * MS)
     assert loop.problem(201 * MS) == OPEN
 
 
 def test_a_wrong_byte_counts_as_pressed_and_200_ms_must_pass_before_anything_is_believed() -> None:
     loop = EchoLoop(counting())
     closed(loop, 0, 100)
-    data = loop.question(100 * MS)
-    loop.heard(bytes([data[0] ^ 1, data[1]]), 105 * MS)
+    data = loop.next_bytes(100 * MS)
+    loop.check_echo(bytes([data[0] ^ 1, data[1]]), 105 * MS)
     assert loop.problem(105 * MS) == WRONG
-    assert loop.question(120 * MS) == b""
+    assert loop.next_bytes(120 * MS) == b""
     assert loop.problem(304 * MS) == WRONG
     assert loop.problem(305 * MS) == OPEN
     closed(loop, 305, 330)
@@ -78,7 +78,7 @@ def test_a_wrong_byte_counts_as_pressed_and_200_ms_must_pass_before_anything_is_
 def test_bytes_that_nobody_sent_count_as_pressed() -> None:
     loop = EchoLoop(counting())
     closed(loop, 0, 100)
-    loop.heard(b"\x00", 110 * MS)
+    loop.check_echo(b"\x00", 110 * MS)
     assert loop.problem(110 * MS) == WRONG
 
 
@@ -91,7 +91,7 @@ def test_a_new_line_has_to_be_closed_anew() -> None:
 
 def test_what_is_sent_cannot_be_guessed() -> None:
     loop = EchoLoop()
-    assert len({loop.question(now) for now in range(100)}) > 90
+    assert len({loop.next_bytes(now) for now in range(100)}) > 90
 
 
 class Rig:
@@ -100,10 +100,10 @@ class Rig:
     def __init__(self, folder: Path) -> None:
         network, clock = LocalNetwork(), Clock()
         self.robot = Bus(network.transport(), clock, "driver")
-        self.heard: list[ButtonState] = []
+        self.check_echo: list[ButtonState] = []
         self.asked: list[EstopRequest] = []
         self.latches = True
-        self.robot.subscribe(BUTTON, lambda _key, state: self.heard.append(state))
+        self.robot.subscribe(BUTTON, lambda _key, state: self.check_echo.append(state))
         self.robot.serve(ESTOP, self._stop)
         self.pty = Pty(folder / "button")
         self.closed = True
@@ -129,14 +129,14 @@ class Rig:
 
     async def says(self, text: str) -> None:
         """Wait until it says this, and that it is pressed where there is a text."""
-        await self.until(lambda: self.heard and text in self.heard[-1].text)
-        await self.until(lambda: self.heard[-1].pressed == bool(text))
+        await self.until(lambda: self.check_echo and text in self.check_echo[-1].text)
+        await self.until(lambda: self.check_echo[-1].pressed == bool(text))
 
 
 @pytest.fixture
 async def rig(tmp_path: Path) -> AsyncIterator[Rig]:
     rig = Rig(tmp_path)
-    await rig.until(lambda: rig.heard and not rig.heard[-1].pressed)
+    await rig.until(lambda: rig.check_echo and not rig.check_echo[-1].pressed)
     rig.asked.clear()
     yield rig
     rig.task.cancel()
@@ -150,7 +150,7 @@ async def test_an_open_contact_stops_the_robot_and_a_closed_one_only_permits(rig
     await rig.until(lambda: rig.asked)
     assert (rig.asked[0].source, rig.asked[0].reason) == ("button", OPEN)
     rig.closed = True
-    await rig.until(lambda: not rig.heard[-1].pressed)
+    await rig.until(lambda: not rig.check_echo[-1].pressed)
 
 
 async def test_an_error_in_what_presses_ends_the_process_and_lets_go_of_the_port(
@@ -176,10 +176,10 @@ async def test_it_asks_until_somebody_confirms(rig: Rig) -> None:
 
 async def test_an_unplugged_adapter_is_a_press(rig: Rig) -> None:
     rig.pty.unplug()
-    await rig.until(lambda: rig.heard[-1].pressed)
+    await rig.until(lambda: rig.check_echo[-1].pressed)
     await rig.until(lambda: rig.asked)
     rig.pty.plug()
-    await rig.until(lambda: not rig.heard[-1].pressed)
+    await rig.until(lambda: not rig.check_echo[-1].pressed)
 
 
 async def test_something_else_on_the_line_is_a_press(rig: Rig) -> None:

@@ -220,12 +220,12 @@ async def test_a_broken_body_does_not_do_what_it_is_told(pair: Pair) -> None:
 
 def test_faults_are_words(tmp_path: Path) -> None:
     emulator = Emulator("mycustombot", Run(folder=Path(), link="emulated", emulator=str(tmp_path)))
-    both = emulator.faults_of("silence bit_errors=0.01")
+    both = emulator.parse_faults("silence bit_errors=0.01")
     assert both == dict.fromkeys(("base", "scan"), Faults(silence=True, bit_errors=0.01))
-    assert emulator.faults_of("scan unplugged") == {"base": NONE, "scan": Faults(unplugged=True)}
-    assert emulator.faults_of("off") == {"base": NONE, "scan": NONE}
+    assert emulator.parse_faults("scan unplugged") == {"base": NONE, "scan": Faults(unplugged=True)}
+    assert emulator.parse_faults("off") == {"base": NONE, "scan": NONE}
     with pytest.raises(ConfigError, match="no fault 'silense'; did you mean 'silence'"):
-        emulator.faults_of("silense")
+        emulator.parse_faults("silense")
     for words, said in (
         ("bit_errors=2", "bit_errors needs a number from 0 to 1, such as bit_errors=0.001"),
         ("garbage", "garbage needs a number from 0 to 1, such as garbage=0.1"),
@@ -233,7 +233,7 @@ def test_faults_are_words(tmp_path: Path) -> None:
         ("silence=3", "silence takes no number: write silence, and off to end it"),
     ):
         with pytest.raises(ConfigError, match=f"^{said}$"):
-            emulator.faults_of(words)
+            emulator.parse_faults(words)
 
 
 def test_a_robot_without_a_model_cannot_be_emulated(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ class EchoLoop:
         self._expected.clear()
         self._good_ns = None
 
-    def question(self, now_ns: int) -> bytes:
+    def next_bytes(self, now_ns: int) -> bytes:
         """Return the bytes to send now."""
         if now_ns < self._deaf_until_ns:
             return b""
@@ -55,7 +55,7 @@ class EchoLoop:
         self._expected.extend((byte, now_ns) for byte in data)
         return data
 
-    def heard(self, data: bytes, now_ns: int) -> None:
+    def check_echo(self, data: bytes, now_ns: int) -> None:
         """Check bytes that came back. After a wrong byte none count until the line is quiet."""
         for byte in data:
             if now_ns < self._deaf_until_ns:
@@ -83,7 +83,7 @@ class Button:
         self._bus, self._loop = bus, EchoLoop()
         self._link = SerialLink(config.port, BAUD, bus.clock)
         self._link.on_open = self._loop.opened
-        self._link.on_bytes = lambda data: self._loop.heard(data, bus.clock.now_ns())
+        self._link.on_bytes = lambda data: self._loop.check_echo(data, bus.clock.now_ns())
         self._states = bus.latest(STATE)
         self._problem: str | None = None  # not known yet
         self._began_ns = bus.clock.now_ns()
@@ -95,7 +95,7 @@ class Button:
         ready()
         try:
             async with asyncio.TaskGroup() as tasks:  # an error in either ends both
-                tasks.create_task(self._press())
+                tasks.create_task(self._keep_latched())
                 await self._watch()
         finally:
             await self._link.close()
@@ -103,14 +103,14 @@ class Button:
     async def _watch(self) -> None:
         count = 0
         async for now_ns in self._bus.clock.every(PERIOD_NS):
-            self._link.write(self._loop.question(now_ns))
-            changed = self._look(now_ns)
+            self._link.write(self._loop.next_bytes(now_ns))
+            changed = self._update(now_ns)
             count += 1
             if self._problem is not None and (changed or count % TELL_EVERY == 0):
                 state = ButtonState(pressed=bool(self._problem), text=self._problem[:500])
                 self._bus.publish(BUTTON, state)
 
-    def _look(self, now_ns: int) -> bool:
+    def _update(self, now_ns: int) -> bool:
         """Update the state of the contact; return whether it has changed."""
         before, now = self._problem, self._problem_at(now_ns)
         starting = before is None and now_ns - self._began_ns < START_NS
@@ -130,7 +130,7 @@ class Button:
             return self._link.problem
         return self._loop.problem(now_ns)
 
-    async def _press(self) -> None:
+    async def _keep_latched(self) -> None:
         """For as long as the contact is open the robot has to be latched."""
         while True:
             await self._pressed.wait()
@@ -158,18 +158,18 @@ class ButtonWatch:
 
     def __init__(self, bus: Bus, on_press: Callable[[str], object]) -> None:
         self._on_press = on_press
-        self._pressed = self._heard = False
-        self._newest = bus.latest(BUTTON, self._take)
+        self._pressed = self._was_seen = False
+        self._newest = bus.latest(BUTTON, self._on_state)
 
     def faults(self) -> tuple[Cause, ...]:
         """Return the causes that forbid moving now."""
         state = self._newest.fresh()
         if state is None:
-            return (why.BUTTON_LOST if self._heard else why.BUTTON_AWAITED,)
-        self._heard = True
+            return (why.BUTTON_LOST if self._was_seen else why.BUTTON_AWAITED,)
+        self._was_seen = True
         return (why.button(state.text),) if state.pressed else ()
 
-    def _take(self, state: ButtonState) -> None:
+    def _on_state(self, state: ButtonState) -> None:
         pressed, self._pressed = self._pressed, state.pressed
         if state.pressed and not pressed:
             self._on_press(state.text)

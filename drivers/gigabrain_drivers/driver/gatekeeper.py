@@ -71,7 +71,7 @@ class LatchFile:
         self.write(found)
         return found
 
-    def keep(self, latched: Latched) -> str:
+    def try_write(self, latched: Latched) -> str:
         """Write; the problem in one line, or an empty text. From one thread at a time."""
         try:
             self.write(latched)
@@ -104,7 +104,7 @@ class CauseWatch:
         self._trail = trail
         self._known: Raised = {}
 
-    def look(self, state: GateState) -> None:
+    def audit_changes(self, state: GateState) -> None:
         """Write down what is new, and what is gone."""
         before = self._known
         now = {code: before.get(code, found) for code, found in raised(state).items()}
@@ -145,12 +145,12 @@ class Gatekeeper:
         self._output_changed = changed
         file = LatchFile(folder)
         latched = file.read()
-        self._scribe: BackgroundWriter[Latched] = BackgroundWriter(
-            lambda newest: file.keep(newest[-1]), room=1
+        self._writer: BackgroundWriter[Latched] = BackgroundWriter(
+            lambda newest: file.try_write(newest[-1]), room=1
         )
-        self._latched, self._on_disk = latched, self._scribe.put(latched)
+        self._latched, self._on_disk = latched, self._writer.put(latched)
         self._on_time_ns = -STEP_NS  # when the newest tick came that was not late
-        self._forgetful = Fault(log, logging.ERROR)
+        self._disk_fault = Fault(log, logging.ERROR)
         self.state = gate.GateState(
             boot=secrets.randbits(47) + 1,
             causes=latched.causes or (why.BOOT,),
@@ -165,7 +165,9 @@ class Gatekeeper:
         """Answer requests from now on; `stop` brings the body to rest."""
         self._stop = stop
         self._bus.serve(ESTOP, self._on_estop)
-        self._bus.subscribe(ESTOP_SAID, lambda _, said: self._told_to_stop(said), self._no_request)
+        self._bus.subscribe(
+            ESTOP_SAID, lambda _, said: self._stop_without_reply(said), self._on_undecodable_estop
+        )
         self._bus.serve(RELEASE, self._on_release)
         self._bus.serve(ENABLE, self._on_enable)
 
@@ -197,7 +199,7 @@ class Gatekeeper:
             late = self._is_late(tick.wall_ns)
             self._bus.counters["late_ticks"] += late
             self.step(replace(tick, late=True) if late else tick)
-            self._look_after_disk()
+            self._retry_disk()
 
     def _is_late(self, wall_ns: int | None) -> bool:
         """Return whether a tick only makes up for lost time, right after another one."""
@@ -207,24 +209,24 @@ class Gatekeeper:
         self._on_time_ns = self._on_time_ns if late else wall_ns
         return late
 
-    def _look_after_disk(self) -> None:
+    def _retry_disk(self) -> None:
         if self.state.tick % EVERY_TICKS == 0:
             self._trail.flush()
             if self._on_disk.done() and self._on_disk.result():
-                self._remember(self._latched)
+                self._store(self._latched)
 
     async def close(self) -> None:
         """Have all written down."""
         self._trail.note("end", self._bus.process, "the driver ends")
         await self._trail.close()
-        await self._scribe.close()
+        await self._writer.close()
 
     def _note_change(self, before: gate.GateState) -> None:
         now = self.state
         latched = Latched(causes=why.latching(now.causes), estop_generation=now.estop_generation)
         if latched != self._latched:
-            self._remember(latched)
-        self._causes.look(now)
+            self._store(latched)
+        self._causes.audit_changes(now)
         if now.mode != before.mode:
             reason = why.in_words(now.causes) or f"commander {now.commander or 'nobody'}"
             data = {"event": "gate", "mode": now.mode, "tick": now.tick, "reason": reason}
@@ -232,44 +234,44 @@ class Gatekeeper:
             who = now.commander or before.commander or "gate"
             self._trail.note("mode", who, f"{before.mode} -> {now.mode}: {reason}", code=now.mode)
 
-    def _remember(self, latched: Latched) -> None:
-        self._latched, self._on_disk = latched, self._scribe.put(latched)
+    def _store(self, latched: Latched) -> None:
+        self._latched, self._on_disk = latched, self._writer.put(latched)
 
-    async def _remembered(self) -> str:
+    async def _stored(self) -> str:
         """Wait for the disk; return the text to add to a reply if it failed."""
         problem = await self._on_disk
         if not problem:
-            self._forgetful.end("latched causes are stored again")
+            self._disk_fault.end("latched causes are stored again")
             return ""
-        self._forgetful.begin(problem)
+        self._disk_fault.begin(problem)
         return f"; but a restart would lose it: {problem}"
 
     def press(self, text: str) -> None:
         """The e-stop button of this robot is pressed."""
-        self._told_to_stop(EstopRequest(source="button", reason=text))
+        self._stop_without_reply(EstopRequest(source="button", reason=text))
 
-    def _told_to_stop(self, said: EstopRequest) -> None:
+    def _stop_without_reply(self, said: EstopRequest) -> None:
         """Latch and stop, where nothing waits for an answer."""
         outcome = self.step(gate.Estop(said.source))
         self._output_changed()
         log.warning("e-stop by %s %s", said.source, said.reason)
         self._audit("estop", said.source, outcome, said.reason)
 
-    def _no_request(self, payload: bytes) -> None:
+    def _on_undecodable_estop(self, payload: bytes) -> None:
         if not payload:
-            self._told_to_stop(EstopRequest())
+            self._stop_without_reply(EstopRequest())
 
     async def _on_estop(self, request: EstopRequest) -> GateReply:
         outcome = self.step(gate.Estop(request.source))
         await self._stop()  # before disk and log
         log.warning("e-stop by %s %s", request.source, request.reason)
         self._audit("estop", request.source, outcome, request.reason)
-        return self._reply(outcome, await self._remembered())
+        return self._reply(outcome, await self._stored())
 
     async def _on_release(self, request: ReleaseRequest) -> GateReply:
         outcome = self.step(gate.Release(request.estop_generation))
         self._audit("release", request.source, outcome)
-        return self._reply(outcome, await self._remembered())
+        return self._reply(outcome, await self._stored())
 
     async def _on_enable(self, request: EnableRequest) -> GateReply:
         before = self.state.commander

@@ -157,21 +157,21 @@ class DriverProcess:
         bus.publish(BODY, self._body)
         ready()
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(self._live())
-            tasks.create_task(self._obeying())
+            tasks.create_task(self._run_ticks())
+            tasks.create_task(self._apply_commands())
 
-    async def _live(self) -> None:
+    async def _run_ticks(self) -> None:
         async for passed in self._driver.ticks(self._bus.clock):
             await self._tick(passed)
-        self._measure()
+        self._update_figures()
         log.info("the simulation has ended", extra={"data": {"event": "finished"}})
         await self._bus.failed
 
-    async def _obeying(self) -> None:
+    async def _apply_commands(self) -> None:
         """Between two ticks as well: a command need not wait for anybody's period."""
         while True:
             await self._wake.wait()
-            await self._obey()
+            await self._apply_command()
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """Return the figures of the whole run, of the body and of this process."""
@@ -190,16 +190,16 @@ class DriverProcess:
         """20 ms of the body's time, or several where the process was held up."""
         state = clipped(await self._driver.read_state())
         if self._wake.is_set():
-            await self._obey()  # the gate goes on from what the body has been told
+            await self._apply_command()  # the gate goes on from what the body has been told
         button = self._button.faults() if self._button else ()
         faults = button if state.link.connected else (why.LINK_LOST, *button)
         self._gatekeeper.ticks(passed, gate.Tick(state.velocity, self._wall_ns(), faults))
         self._bus.time.tick = self._gate.tick
         if self._lockstep:
-            await self._in_step(self._lockstep, state)
+            await self._step_in_lockstep(self._lockstep, state)
         else:
-            self._announce(state)
-        await self._obey()
+            self._publish_tick(state)
+        await self._apply_command()
 
     def _emit(self, topic: Topic[Any], message: Message) -> None:
         """Publish a sensor's message at once, or with the next tick in lock-step."""
@@ -215,7 +215,7 @@ class DriverProcess:
             self._round_trip.sent(tick, self._bus.clock.now_ns())
         self._bus.publish(topic, message, basis=tick)
 
-    def _announce(self, state: RobotState) -> None:
+    def _publish_tick(self, state: RobotState) -> None:
         bus, tick = self._bus, self._gate.tick
         state = replace(state, gate=gate.status(self._gate), sent=self._sent)
         bus.publish(STATE, state, basis=tick)
@@ -225,9 +225,9 @@ class DriverProcess:
         if tick - self._body_tick >= BODY_EVERY_TICKS:
             self._body_tick = tick
             bus.publish(BODY, self._body)
-            self._measure()
+            self._update_figures()
 
-    async def _in_step(self, lockstep: Lockstep, state: RobotState) -> None:
+    async def _step_in_lockstep(self, lockstep: Lockstep, state: RobotState) -> None:
         """Announce the tick and wait until it is answered.
 
         The first one waits until the whole brain has answered a scan, so that runs can be repeated.
@@ -248,7 +248,7 @@ class DriverProcess:
         tick = self._gate.tick
         with_scan = any(topic is SCAN for topic, _ in self._sensors)
         lockstep.begin(tick, tick if with_scan else self._round_trip.scan_tick)
-        self._announce(state)
+        self._publish_tick(state)
 
     async def _newest_scan(self) -> Message | None:
         return await self._driver.get_sensor_data("scan") if self._robot.lidar else None
@@ -257,7 +257,7 @@ class DriverProcess:
     def _gate(self) -> gate.GateState:
         return self._gatekeeper.state
 
-    async def _obey(self) -> None:
+    async def _apply_command(self) -> None:
         """Have the body do what the gate lets through."""
         async with self._line:
             self._wake.clear()
@@ -302,7 +302,7 @@ class DriverProcess:
         """Return the host's clock; None in lock-step, where it means nothing."""
         return None if self._lockstep else self._bus.clock.now_ns()
 
-    def _measure(self) -> None:
+    def _update_figures(self) -> None:
         figures = self._round_trip.report()
         for name in ("scan_to_cmd_p50", "scan_to_cmd_p99"):
             value = figures[f"{name}_ms"]

@@ -75,7 +75,7 @@ class EmulatedBody:
         self._moved_ns = 0  # when the motors were last told to move
         self._faulted_ns = 0  # when what is wrong with it last changed
         self._broken = Broken()
-        self.snapshot = self._look()
+        self.snapshot = self._measure_all()
         self._account = run_report(self._simulation, robot, run)  # as of the newest step
         self._untaken: deque[Snapshot] = deque(maxlen=KEPT_STEPS)
 
@@ -108,14 +108,14 @@ class EmulatedBody:
         linear_x, linear_y, angular_z = WALKER.to_body(gait)
         return linear_x, linear_y, angular_z
 
-    def fresh(self) -> list[Snapshot]:
+    def take_snapshots(self) -> list[Snapshot]:
         """Return the snapshots since the last call, oldest first, of a quarter of a second.
 
         A device that reports every step must not leave out those in which the loop was held up.
         """
         return [self._untaken.popleft() for _ in range(len(self._untaken))]
 
-    def break_down(self, broken: "Broken") -> None:
+    def set_broken(self, broken: "Broken") -> None:
         """Have its motors or sensors fail from the next step on; `Broken()` mends them."""
         self._broken, self._faulted_ns = broken, self._simulation.time_ns
 
@@ -159,13 +159,13 @@ class EmulatedBody:
         if any(commanded):
             self._moved_ns = self._simulation.time_ns
         if broken.runaway or broken.stuck_wheel:
-            self._simulation.drive(*self._disobeyed(commanded))
+            self._simulation.drive(*self._faulty_velocity(commanded))
         elif self._gait:
             self._simulation.walk(self._gait)
         else:
             self._simulation.drive(*commanded)
         self._simulation.advance()
-        snapshot = self._look()
+        snapshot = self._measure_all()
         self._account = run_report(self._simulation, self.robot, self.run)
         if not broken.frozen_values:
             self.snapshot = snapshot
@@ -173,7 +173,7 @@ class EmulatedBody:
         for tell in self.on_step:
             tell(snapshot)
 
-    def _disobeyed(self, commanded: tuple[float, float, float]) -> tuple[float, float, float]:
+    def _faulty_velocity(self, commanded: tuple[float, float, float]) -> tuple[float, float, float]:
         """Return the velocity of broken motors under this command."""
         base = wheels_of(self.robot)
         if self._broken.runaway or base is None:
@@ -181,7 +181,7 @@ class EmulatedBody:
         _, *others = base.to_wheels(Twist(*commanded))
         return base.to_body((0.0, *others))
 
-    def _look(self) -> Snapshot:
+    def _measure_all(self) -> Snapshot:
         simulation = self._simulation
         return Snapshot(
             time_ns=self.clock_ns,
@@ -280,7 +280,7 @@ class Sweep:
         self._rate_hz = 0.0
         self._samples.clear()
 
-    def take(self, count: int) -> list[Sample]:
+    def next_samples(self, count: int) -> list[Sample]:
         """Return the next `count` samples, or none when there are not enough yet."""
         samples = self._samples
         return [samples.popleft() for _ in range(count)] if len(samples) >= count else []

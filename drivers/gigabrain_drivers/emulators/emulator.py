@@ -178,18 +178,18 @@ class Emulator:
             if wanted != station.faults:
                 station.set(wanted)
         body = faults.get(BASE, NONE)
-        self.body.break_down(Broken(body.runaway, body.stuck_wheel, body.frozen_values))
+        self.body.set_broken(Broken(body.runaway, body.stuck_wheel, body.frozen_values))
 
     def report(self) -> Mapping[str, float | int | str | None]:
         """The truth of the run so far, and whether this machine has kept the body waiting."""
         return self.body.report()
 
-    def told(self) -> str:
-        """The faults that it has now, in the words of `faults_of`."""
+    def describe_faults(self) -> str:
+        """The faults that it has now, in the words of `parse_faults`."""
         parts = [f"{name} {s.faults}" for name, s in self.stations.items() if s.faults != NONE]
         return "; ".join(parts) or "none"
 
-    def faults_of(self, words: str) -> dict[str, Faults]:
+    def parse_faults(self, words: str) -> dict[str, Faults]:
         """The faults in `[STATION] FAULT[=VALUE] ...`; for all stations where none is named.
 
         Nothing, or `off`, is no fault. Raises ConfigError naming what there is.

@@ -37,16 +37,18 @@ async def emulate(config: EmulatorConfig, say: Callable[[str], None]) -> None:
     """Be the body until it is asked to end; faults are read from standard input, line by line."""
     with stop_signals() as stop:
         async with make_emulator(config) as emulator:
-            await _until(stop, _obeying(emulator, config, say))
+            await _until(stop, _serve_terminal(emulator, config, say))
 
 
-async def _obeying(emulator: Emulator, config: EmulatorConfig, say: Callable[[str], None]) -> None:
+async def _serve_terminal(
+    emulator: Emulator, config: EmulatorConfig, say: Callable[[str], None]
+) -> None:
     """For ever. Raises BodyLost with the physics."""
     for name, port in emulator.ports.items():
         say(f"{config.body} in {config.world}: {name} at {where(port)}")
     say(f"faults, one line each: [{'|'.join(emulator.stations)}] "
         f"{' '.join(Faults.__struct_fields__)}; off ends them")  # fmt: skip
-    with typed_lines(lambda line: _told(emulator, line, say)):
+    with typed_lines(lambda line: _apply_line(emulator, line, say)):
         await watch(emulator, Path(config.folder) / FAULTS_FILE)
 
 
@@ -111,9 +113,9 @@ def _from_file(emulator: Emulator, path: Path) -> None:
     log.info("faults: %s", faults or "none")
 
 
-def _told(emulator: Emulator, line: str, say: Callable[[str], None]) -> None:
+def _apply_line(emulator: Emulator, line: str, say: Callable[[str], None]) -> None:
     try:
-        emulator.set(emulator.faults_of(line))
+        emulator.set(emulator.parse_faults(line))
     except ConfigError as error:
         say(str(error))
-    say(f"faults now: {emulator.told()}")
+    say(f"faults now: {emulator.describe_faults()}")

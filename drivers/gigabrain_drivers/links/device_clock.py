@@ -28,7 +28,7 @@ class Window:
         self._began_ns = 0
         self.newest = 0.0
 
-    def see(self, value: float, now_ns: int) -> None:
+    def add(self, value: float, now_ns: int) -> None:
         """Add a value."""
         if not self._seen or now_ns - self._seen[-1][0] > WINDOW_NS:
             self._began_ns = now_ns
@@ -74,7 +74,7 @@ class EchoClock:
             return
         for _ in range(numbers.index(number) + 1):
             _, sent_ns = self._sent.popleft()
-        self._late.see((now_ns - sent_ns) / 1e6 - self._usual_ms, now_ns)
+        self._late.add((now_ns - sent_ns) / 1e6 - self._usual_ms, now_ns)
 
 
 class DeviceClock:
@@ -129,7 +129,7 @@ class DeviceClock:
         self._floor_ms += elapsed_ms * (self._drift() if late else MAX_DRIFT)
         offset_ms = now_ns / 1e6 - self._device_ms
         self._floor_ms = min(self._floor_ms, offset_ms)
-        self._excess.see(offset_ms - self._floor_ms, now_ns)
+        self._excess.add(offset_ms - self._floor_ms, now_ns)
         if not late and (not self._floors or now_ns - self._floors[-1][0] >= SAMPLE_NS):
             self._floors.append((now_ns, self._floor_ms))
 

@@ -97,7 +97,7 @@ class Link(abc.ABC):
         if sent < len(data):
             self._cut_short()
             return False
-        self._tell("tx", data)
+        self._trace("tx", data)
         return True
 
     def drop(self, reason: str) -> None:
@@ -134,7 +134,7 @@ class Link(abc.ABC):
     def _cut_short(self) -> None:
         """Make sure that the rest of a write that went out in part is never sent."""
 
-    def _tell(self, way: str, data: bytes) -> None:
+    def _trace(self, way: str, data: bytes) -> None:
         if self.trace:
             self.trace(way, data)
         if log.isEnabledFor(logging.DEBUG):
@@ -229,7 +229,7 @@ class Link(abc.ABC):
             self.drop("the other end is gone: unplugged?")
             return False
         self._heard_ns = self._clock.now_ns()
-        self._tell("rx", data)
+        self._trace("rx", data)
         self._call(self.on_bytes, data)
         return True
 

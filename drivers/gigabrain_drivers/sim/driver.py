@@ -101,7 +101,7 @@ class MujocoDriver(Driver):
 
     async def open(self) -> None:
         """Take the first readings; time stands still until `ticks` is iterated."""
-        self._state = self._look()
+        self._state = self._read_state()
         self.sensors["imu"] = self._imu()
         if self.robot.lidar:
             self.sensors["scan"] = self._scan()
@@ -131,7 +131,7 @@ class MujocoDriver(Driver):
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
         """One tick per 20 ms of simulated time; ends when the run's seconds are over."""
         self._bridge = Bridge()
-        self._thread = threading.Thread(target=self._work, name="physics", daemon=True)
+        self._thread = threading.Thread(target=self._run_physics, name="physics", daemon=True)
         self._thread.start()
         self._permits.release()
         while True:
@@ -141,7 +141,7 @@ class MujocoDriver(Driver):
                 return
             if isinstance(reading, Exception):
                 raise reading
-            self._take(reading)
+            self._publish(reading)
             if reading.state:
                 yield 1
                 self._permits.release()
@@ -167,7 +167,7 @@ class MujocoDriver(Driver):
         """The truth of the run so far."""
         return self._account | {"physics_cpu_s": round(self._physics_s, 3)}
 
-    def _take(self, reading: Reading) -> None:
+    def _publish(self, reading: Reading) -> None:
         self._state = reading.state or self._state
         self.sensors["imu"] = reading.imu
         self.emit(IMU, reading.imu)
@@ -175,7 +175,7 @@ class MujocoDriver(Driver):
             self.sensors["scan"] = reading.scan
             self.emit(SCAN, reading.scan)
 
-    def _work(self) -> None:
+    def _run_physics(self) -> None:
         """The physics thread. Whatever ends it is raised from `ticks`."""
         try:
             self._simulate()
@@ -208,7 +208,7 @@ class MujocoDriver(Driver):
             raise BodyLost(f"fell over after {self._simulation.time_ns / 1e9:.2f} s")
         if last:
             self._account = run_report(self._simulation, self.robot, self.run)
-            return Reading(self._imu(), state=self._look())
+            return Reading(self._imu(), state=self._read_state())
         # a lidar keeps no step with the states: between two of them nobody else needs a core
         due = self._ticks >= self._next_scan
         if due:
@@ -228,7 +228,7 @@ class MujocoDriver(Driver):
             with contextlib.suppress(RuntimeError):  # the loop is gone
                 bridge.post(self._readings.put_nowait, reading)
 
-    def _look(self) -> RobotState:
+    def _read_state(self) -> RobotState:
         return state_message(self._simulation, self.robot.robot_type)
 
     def _imu(self) -> Imu:

@@ -128,7 +128,7 @@ class CheckedRobot:
 
     def break_peer(self, words: str) -> None:
         """Have these faults at the base's end of the line; none for an empty text."""
-        self.peer.set(self.peer.faults_of(f"{BASE} {words}"))
+        self.peer.set(self.peer.parse_faults(f"{BASE} {words}"))
 
     @property
     def promise(self) -> str:

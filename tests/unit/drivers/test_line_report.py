@@ -28,9 +28,9 @@ def wheels(left: float, right: float) -> dict[str, float]:
 
 def test_wheels_that_turn_alike_go_straight() -> None:
     it = report()
-    it.take(wheels(1.0, 1.0), 20 * MS)
+    it.update(wheels(1.0, 1.0), 20 * MS)
     for n in range(1, 11):
-        it.take(wheels(1.0 + 0.05 * n, 1.0 + 0.05 * n), (20 + 20 * n) * MS)
+        it.update(wheels(1.0 + 0.05 * n, 1.0 + 0.05 * n), (20 + 20 * n) * MS)
     assert (it.pose.x, it.pose.y, it.pose.yaw) == pytest.approx((0.04, 0.0, 0.0))
     assert it.velocity().linear_x == pytest.approx(0.2)
     assert it.joints()[0].position == pytest.approx(0.5)
@@ -38,49 +38,49 @@ def test_wheels_that_turn_alike_go_straight() -> None:
 
 def test_counts_that_wrap_go_on() -> None:
     it = report(replace(OPTIONS, tick_bits=16))
-    it.take(wheels(32760 * TICK, 32760 * TICK), 20 * MS)
-    it.take(wheels(-32760 * TICK, -32760 * TICK), 40 * MS)
+    it.update(wheels(32760 * TICK, 32760 * TICK), 20 * MS)
+    it.update(wheels(-32760 * TICK, -32760 * TICK), 40 * MS)
     assert it.pose.x == pytest.approx(16 * TICK * 0.08)
 
 
 def test_counts_that_jump_are_no_way() -> None:
     it = report()
-    it.take(wheels(10.0, 10.0), 20 * MS)
-    it.take(wheels(0.0, 0.0), 40 * MS)
-    it.take(wheels(0.05, 0.05), 60 * MS)
+    it.update(wheels(10.0, 10.0), 20 * MS)
+    it.update(wheels(0.0, 0.0), 40 * MS)
+    it.update(wheels(0.05, 0.05), 60 * MS)
     assert it.pose.x == pytest.approx(0.004)
 
 
 def test_after_a_gap_the_shorter_way_counts() -> None:
     rolled, restarted = report(), report()
     for it in (rolled, restarted):
-        it.take(wheels(5.0, 5.0), 20 * MS)
-    rolled.take(wheels(5.5, 5.5), 320 * MS)
-    restarted.take(wheels(0.1, 0.1), 320 * MS)
+        it.update(wheels(5.0, 5.0), 20 * MS)
+    rolled.update(wheels(5.5, 5.5), 320 * MS)
+    restarted.update(wheels(0.1, 0.1), 320 * MS)
     assert rolled.pose.x == pytest.approx(0.04)
     assert restarted.pose.x == pytest.approx(0.008)
 
 
 def test_the_firmwares_own_pose_is_followed_from_where_it_begins() -> None:
     it = report()
-    it.take({"x": 5.0, "y": 1.0, "yaw": math.pi / 2}, 20 * MS)
-    it.take({"x": 5.0, "y": 1.01, "yaw": math.pi / 2}, 40 * MS)
+    it.update({"x": 5.0, "y": 1.0, "yaw": math.pi / 2}, 20 * MS)
+    it.update({"x": 5.0, "y": 1.01, "yaw": math.pi / 2}, 40 * MS)
     assert (it.pose.x, it.pose.y) == pytest.approx((0.01, 0.0))
-    it.take({"x": 0.0, "y": 0.0, "yaw": 0.0}, 500 * MS)  # started anew
+    it.update({"x": 0.0, "y": 0.0, "yaw": 0.0}, 500 * MS)  # started anew
     assert (it.pose.x, it.pose.y) == pytest.approx((0.01, 0.0))
 
 
 def test_a_reported_velocity_is_integrated_where_there_is_no_position() -> None:
     it = report()
     for n in range(1, 52):
-        it.take({"linear_x": 0.1, "angular_z": 0.0}, 20 * n * MS)
+        it.update({"linear_x": 0.1, "angular_z": 0.0}, 20 * n * MS)
     assert it.pose.x == pytest.approx(0.1)
     assert it.velocity().linear_x == 0.1
 
 
 def test_the_wheels_speeds_are_the_velocity() -> None:
     it = report()
-    it.take({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * MS)
+    it.update({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * MS)
     assert it.velocity().linear_x == pytest.approx(0.12)
     assert it.velocity().angular_z == pytest.approx(0.16)
 
@@ -88,7 +88,7 @@ def test_the_wheels_speeds_are_the_velocity() -> None:
 def test_where_there_are_wheel_speeds_alone_the_pose_is_their_integral() -> None:
     it = report()
     for n in range(1, 52):
-        it.take({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * n * MS)
+        it.update({"wheel_left_velocity": 1.0, "wheel_right_velocity": 2.0}, 20 * n * MS)
     assert it.pose.yaw == pytest.approx(0.16)
     assert it.pose.x == pytest.approx(0.75 * math.sin(0.16), abs=1e-4)  # 0.12 / 0.16 m of radius
     assert it.joints()[1].position == pytest.approx(2.0)
@@ -97,24 +97,24 @@ def test_where_there_are_wheel_speeds_alone_the_pose_is_their_integral() -> None
 def test_wheel_speeds_may_come_line_by_line() -> None:
     it = report()
     for n in range(1, 52):
-        it.take({"wheel_left_velocity": 1.0}, (20 * n - 10) * MS)
-        it.take({"wheel_right_velocity": 1.0}, 20 * n * MS)
+        it.update({"wheel_left_velocity": 1.0}, (20 * n - 10) * MS)
+        it.update({"wheel_right_velocity": 1.0}, 20 * n * MS)
     assert (it.pose.x, it.pose.yaw) == pytest.approx((0.08, 0.0), abs=0.001)
 
 
 def test_each_part_of_the_velocity_comes_from_where_it_is_known() -> None:
     it = report()
     for n in range(11):
-        it.take({"linear_x": 0.25, **wheels(0.0, 0.05 * n)}, (20 + 20 * n) * MS)
+        it.update({"linear_x": 0.25, **wheels(0.0, 0.05 * n)}, (20 + 20 * n) * MS)
     assert it.velocity().linear_x == 0.25
     assert it.velocity().angular_z == pytest.approx(0.4)  # 2.5 rad/s * 0.08 / 0.5
 
 
 def test_a_line_that_says_nothing_of_motion_is_told_apart() -> None:
     it = report()
-    assert not it.take({"battery_voltage": 12.0}, 20 * MS)
-    assert it.take(wheels(0.0, 0.0), 40 * MS)
-    assert it.take({"wheel_left_velocity": 0.0}, 60 * MS)
+    assert not it.update({"battery_voltage": 12.0}, 20 * MS)
+    assert it.update(wheels(0.0, 0.0), 40 * MS)
+    assert it.update({"wheel_left_velocity": 0.0}, 60 * MS)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +123,7 @@ def test_a_line_that_says_nothing_of_motion_is_told_apart() -> None:
 def test_the_battery_by_its_voltage(volts: float, percent: float) -> None:
     it = report()
     assert it.battery() is None
-    it.take({"battery_voltage": volts}, 20 * MS)
+    it.update({"battery_voltage": volts}, 20 * MS)
     battery = it.battery()
     assert battery is not None
     assert (battery.voltage, battery.percentage) == pytest.approx((volts, percent))
@@ -131,7 +131,7 @@ def test_the_battery_by_its_voltage(volts: float, percent: float) -> None:
 
 def test_temperatures_belong_to_their_wheels() -> None:
     it = report()
-    it.take({"wheel_left_temperature": 31.5, "wheel_right_temperature": 30.0}, 20 * MS)
+    it.update({"wheel_left_temperature": 31.5, "wheel_right_temperature": 30.0}, 20 * MS)
     assert [(j.name, j.temperature) for j in it.joints()] == [
         ("wheel_left_joint", 31.5),
         ("wheel_right_joint", 30.0),
@@ -148,7 +148,7 @@ def test_a_car_is_reckoned_by_its_steering_angle() -> None:
     drive, steering = base.to_wheels(Twist(1.0, 0.0, 0.5))
     for n in range(51):
         line = {"wheel_drive_position": drive * 0.02 * n, "wheel_steering_position": steering}
-        it.take(line, 20 * (n + 1) * MS)
+        it.update(line, 20 * (n + 1) * MS)
     assert it.pose.yaw == pytest.approx(0.5)
     assert it.pose.x == pytest.approx(2.0 * math.sin(0.5), abs=1e-4)
     assert it.joints()[1].position == pytest.approx(steering)

@@ -93,7 +93,7 @@ def test_both_other_clients_read_our_standard_nodes_as_we_do(
     angle: float, distance: float, begins: bool, quality: int
 ) -> None:
     wire = encode_node(angle, distance, quality=quality, begins=begins)
-    ours = Standard().take(wire)
+    ours = Standard().decode(wire)
     theirs = pyrplidar_protocol.PyRPlidarMeasurement(wire)
 
     assert ours == Samples((theirs.angle,), (theirs.distance,), 0 if theirs.start_flag else None)
@@ -113,8 +113,8 @@ def test_pyrplidar_reads_our_express_capsules_as_we_do(
     first = encode_express(start, mm, q3, begins=True)
     second = encode_express(start + width, mm, q3, begins=False)
     express = Express()
-    assert express.take(first) is None
-    ours = express.take(second)
+    assert express.decode(first) is None
+    ours = express.decode(second)
     capsule = pyrplidar_protocol.PyRPlidarScanCapsule
     theirs = capsule._parse_capsule(capsule(first), capsule(second))
 
@@ -129,8 +129,8 @@ def test_rplidar_roboticia_reads_express_one_sample_late_and_otherwise_as_we_do(
     mm = list(range(1000, 1320, 10))
     first, second = (encode_express(s, mm, begins=False) for s in (40.0, 72.0))
     express = Express()
-    express.take(first)
-    ours = express.take(second)
+    express.decode(first)
+    ours = express.decode(second)
     packet = roboticia.ExpressPacket.from_string(first)
     theirs = [roboticia._process_express_scan(packet, 72.0, n + 1) for n in range(32)]
 
@@ -150,8 +150,8 @@ def test_pyrplidar_reads_our_dense_capsules_as_we_do_but_for_its_swapped_bytes(
     first = encode_dense(start, mm, begins=True)
     second = encode_dense(start + width, mm, begins=False)
     dense = Dense()
-    assert dense.take(first) is None
-    ours = dense.take(second)
+    assert dense.decode(first) is None
+    ours = dense.decode(second)
     capsule = pyrplidar_protocol.PyRPlidarScanDenseCapsule
     theirs = capsule._parse_capsule(capsule(first), capsule(second))
 

@@ -50,9 +50,9 @@ def test_a_dense_stream_decodes_the_same_however_it_is_cut(data: st.DataObject) 
 def test_a_turn_begins_at_the_sample_that_passes_zero() -> None:
     dense = Dense()
     mm = [1000] * 40
-    dense.take(encode_dense(350.0, mm, begins=False))
-    passing = dense.take(encode_dense(30.0, mm, begins=False))
-    after = dense.take(encode_dense(70.0, mm, begins=False))
+    dense.decode(encode_dense(350.0, mm, begins=False))
+    passing = dense.decode(encode_dense(30.0, mm, begins=False))
+    after = dense.decode(encode_dense(70.0, mm, begins=False))
 
     assert passing is not None
     assert (passing.turn_at, passing.angles[9], passing.angles[10]) == (10, 359.0, 360.0)

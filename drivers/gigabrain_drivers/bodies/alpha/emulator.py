@@ -48,7 +48,7 @@ class Alpha(Device):
         self._last: int | None = None  # sequence of the newest command
         self._obeyed_ns: int | None = None  # when it came
         self._now_ns = 0
-        self.body.fresh()  # what was measured before is none of its business
+        self.body.take_snapshots()  # what was measured before is none of its business
         self._began_ns = self.body.snapshot.time_ns
         self._silent, self._on = True, True
         self._gait, self._up_ns = REST, 0
@@ -65,11 +65,11 @@ class Alpha(Device):
             return
         errors = self._decoder.errors
         for frame in self._decoder.feed(data):
-            gait = self._wanted(frame)
+            gait = self._requested_gait(frame)
             if gait is None:
                 self._refused += 1
             else:
-                self._obey(gait, frame.sequence)
+                self._execute(gait, frame.sequence)
         self._refused += self._decoder.errors - errors
 
     def step(self, now_ns: int) -> None:
@@ -85,11 +85,11 @@ class Alpha(Device):
         if self._obeyed_ns is None or now_ns - self._obeyed_ns >= self.watchdog_ns:
             self._silent, self._last = True, None
             self._walk(LYING if self.parked else REST)
-        for sample in self.body.fresh() or [self.body.snapshot]:
+        for sample in self.body.take_snapshots() or [self.body.snapshot]:
             self._sent += 1
             self.wire.write(alpha.encode_state(self._report(sample), self._sent))
 
-    def _wanted(self, frame: AlphaFrame) -> Gait | None:
+    def _requested_gait(self, frame: AlphaFrame) -> Gait | None:
         """Return the gait that a frame asks for, None unless it is sound, new and fresh."""
         if frame.type == alpha.STOP:
             return REST
@@ -107,7 +107,7 @@ class Alpha(Device):
         """The firmware's clock is the body's: it stands still where a busy host holds both up."""
         return max(0, sample.time_ns - self._began_ns) // 1_000_000
 
-    def _obey(self, gait: Gait, sequence: int) -> None:
+    def _execute(self, gait: Gait, sequence: int) -> None:
         self._last = self._echo = sequence
         self._obeyed_ns, self._silent = self._now_ns, False
         self.executed.append(gait)

@@ -107,7 +107,7 @@ class LineReport:
         """The bits that the firmware reports."""
         return int(self._values.get("flags", 0))
 
-    def take(self, values: Mapping[str, float], now_ns: int) -> bool:
+    def update(self, values: Mapping[str, float], now_ns: int) -> bool:
         """Handle one line; return whether it reports how the body moves."""
         self._values.update(values)
         if self._whole_pose <= values.keys():
@@ -122,7 +122,7 @@ class LineReport:
         elif not self._speaking & values.keys():
             return False
         elif self._pose is None and self._angles is None:
-            self._go_on(now_ns)
+            self._integrate(now_ns)
         return True
 
     def restart(self) -> None:
@@ -177,7 +177,7 @@ class LineReport:
         way = Twist(*map(sum, zip(*(step for _, step in self._steps), strict=True)))
         return _scaled(way, 1 / seconds)
 
-    def _go_on(self, now_ns: int) -> None:
+    def _integrate(self, now_ns: int) -> None:
         """Integrate the newest speeds, where the lines report nothing else."""
         seconds = min((now_ns - (self._now_ns or now_ns)) / 1e9, LONGEST_S)
         v = self.velocity()

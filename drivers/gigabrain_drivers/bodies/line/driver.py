@@ -65,7 +65,7 @@ class LineDriver(Driver):
         self._wanted = self._as_sent = self._sent = ZERO  # the second is what the line keeps of it
         self._sent_ns = self._seq = 0
         self._open = False
-        self._told_flags = 0
+        self._logged_flags = 0
         self._flags = {bit: Fault(log) for bit in range(len(options.flags))}
         self._lidar: ScanSource | None = None
         self.sensors = {"scan": None} if robot.lidar else {}
@@ -95,7 +95,7 @@ class LineDriver(Driver):
 
     async def stop(self) -> None:
         """A command of zero, and the stop string where the body has one and may be going."""
-        self._still()
+        self._send_zero()
 
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
@@ -119,7 +119,7 @@ class LineDriver(Driver):
             link=replace(self.link.health, connected=self._liveness.alive()),
         )
 
-    def _still(self) -> None:
+    def _send_zero(self) -> None:
         self._send(ZERO)
         if self._started and self._liveness.received:
             stop = self.options.stop.encode()
@@ -159,13 +159,13 @@ class LineDriver(Driver):
     def _received(self, data: bytes) -> None:
         now_ns = self._clock.now_ns()
         for values in self._decoder.feed(data):
-            moves = self._report.take(values, now_ns)
+            moves = self._report.update(values, now_ns)
             if (
                 moves and self._liveness.mark_received()
             ):  # after a boot or a loss: at rest, whatever it was told
                 self._sent_ns = 0
-                self._still()
-            self._tell_flags()
+                self._send_zero()
+            self._log_flags()
         self.link.errors = self._decoder.errors
 
     def _bumpers(self) -> tuple[bool, ...]:
@@ -173,11 +173,11 @@ class LineDriver(Driver):
         names = enumerate(self.options.flags)
         return tuple(bool(self._report.flags >> bit & 1) for bit, name in names if BUMPER in name)
 
-    def _tell_flags(self) -> None:
+    def _log_flags(self) -> None:
         """Say once when a flag is raised and once when it falls."""
-        if self._report.flags == self._told_flags:
+        if self._report.flags == self._logged_flags:
             return
-        self._told_flags = self._report.flags
+        self._logged_flags = self._report.flags
         for bit, name in enumerate(self.options.flags):
             if BUMPER in name:
                 continue

@@ -69,7 +69,7 @@ class LineBase(Device):
         if self._booted_ns is None or self._now_ns < self._booted_ns:
             return
         for line in lines:
-            self._obey(line.strip(b"\r\n"))
+            self._execute(line.strip(b"\r\n"))
 
     def step(self, now_ns: int) -> None:
         """Watch the time since the last command, and report."""
@@ -87,7 +87,7 @@ class LineBase(Device):
             for template in self._state:
                 self.wire.write(template.encode(self._measured(template.fields)))
 
-    def _obey(self, line: bytes) -> None:
+    def _execute(self, line: bytes) -> None:
         if self._start and line == self._start:
             self._enabled = True
         elif self._stop and line == self._stop:

@@ -111,7 +111,7 @@ class Board:
         """Send zero velocity, whether or not a board has answered."""
         return self.link.write(opencr.velocity(0.0, 0.0).frame)
 
-    def let_go(self) -> bool:
+    def release_motors(self) -> bool:
         """Motors without torque, until the driver finds the board again."""
         return self.link.write(opencr.torque(on=False))
 
@@ -135,9 +135,9 @@ class Board:
                 async with asyncio.timeout(patience_s):
                     await self._answered.wait()
 
-    def look(self, now_ns: int) -> None:
+    def supervise(self, now_ns: int) -> None:
         """Knock where no board has answered, give up where none will. To be called often."""
-        self._speak_up(now_ns)
+        self._log_problem(now_ns)
         if not self.link.connected:
             return
         if self._waiting_ns and now_ns - self._waiting_ns > GIVE_UP_NS:
@@ -147,7 +147,7 @@ class Board:
         elif not self.ready and now_ns - self._knocked_ns >= KNOCK_NS:
             self._knock()
 
-    def _speak_up(self, now_ns: int) -> None:
+    def _log_problem(self, now_ns: int) -> None:
         """A problem that stays is logged once when it begins and once when it ends."""
         problem, before = self.problem, self._complaint
         if not problem:
@@ -280,7 +280,7 @@ class OpenCrDriver(Driver):
         """Begin to look for the board and the lidar; neither has to be there yet."""
         self._lidar = open_lidar(self, self._clock)
         self.link.open()
-        self._guard = asyncio.create_task(self._look_after(), name="opencr guard")
+        self._guard = asyncio.create_task(self._guard_motion(), name="opencr guard")
 
     async def close(self) -> None:
         """Stop, and let go of the ports."""
@@ -302,7 +302,7 @@ class OpenCrDriver(Driver):
 
     async def limp(self) -> None:
         """Wheels that turn freely; the next start of a driver holds them again."""
-        if not self._board.let_go():
+        if not self._board.release_motors():
             raise BodyLost(self.problem or f"{self.link} takes no commands")
 
     async def set_base_velocity(
@@ -322,12 +322,12 @@ class OpenCrDriver(Driver):
         await self._board.ask()
         return replace(self._state, link=self._board.health)
 
-    async def _look_after(self) -> None:
+    async def _guard_motion(self) -> None:
         """Send zero while no commands come, repeatedly: a single frame may get lost."""
         async for now_ns in self._clock.every(GUARD_NS):
             if now_ns - self._commanded_ns >= SILENT_NS and self._board.ready:
                 self._board.halt()
-            self._board.look(now_ns)
+            self._board.supervise(now_ns)
 
     def _take(self, now: Readings) -> None:
         turned = self._encoders.turned(now.ticks)

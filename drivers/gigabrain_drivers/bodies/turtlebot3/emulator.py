@@ -124,7 +124,7 @@ class OpenCr(Device):
             return
         for packet in self._decoder.feed(data):
             if packet.id == opencr.ID:
-                self._obey(packet)
+                self._execute(packet)
 
     def step(self, now_ns: int) -> None:
         """One pass of the firmware's main loop."""
@@ -143,7 +143,7 @@ class OpenCr(Device):
         self._refresh(now_ns - self._began_ns)
         self._drive()
 
-    def _obey(self, packet: DynamixelPacket) -> None:
+    def _execute(self, packet: DynamixelPacket) -> None:
         kind, params = packet.instruction, packet.params
         if kind == opencr.PING:
             self._answer(opencr.MODEL.to_bytes(2, "little") + bytes([FIRMWARE]))

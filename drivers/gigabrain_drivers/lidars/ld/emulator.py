@@ -37,7 +37,7 @@ class LdDevice(Device):
 
     def step(self, now_ns: int) -> None:
         """Send all whole frames that were measured since the last step."""
-        while samples := self._sweep.take(ld.POINTS):
+        while samples := self._sweep.next_samples(ld.POINTS):
             if self.sag_volts <= LEAST_VOLTS:
                 self.wire.write(ld.encode(self._frame([self.measured(s) for s in samples])))
 
@@ -72,7 +72,7 @@ class Lds02Device(LdDevice):
 
     def step(self, now_ns: int) -> None:
         """Send all whole frames that were measured since the last step."""
-        while rays := self._sweep.take(FINE):
+        while rays := self._sweep.next_samples(FINE):
             self._rays += rays
             if len(self._rays) == KEPT:
                 self._frame_of.append(self._by_the_lens((rays[-1].angle - BEHIND) % 360))

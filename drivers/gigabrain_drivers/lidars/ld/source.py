@@ -40,7 +40,7 @@ class FrameBuffer(TurnBuffer[tuple[bytes, slice]]):
         kept = np.concatenate([POINTS[part] + n * ld.POINTS for n, (_, part) in enumerate(pieces)])
         return angles[kept], distances[kept]
 
-    def take(self, raw: bytes, turn_at: int | None, now_ns: int) -> LaserScan | None:
+    def add_frame(self, raw: bytes, turn_at: int | None, now_ns: int) -> LaserScan | None:
         """Add a frame; `turn_at` is its first point in a new turn, whose end returns a scan."""
         if turn_at is None:
             self.add((raw, WHOLE), ld.POINTS, now_ns)
@@ -87,7 +87,7 @@ class Ld(SerialSource):
             self.understood = True
             self._stamps.arrived(raw.time_ms, now_ns)
             turn_at, self._last = turn_start(raw, self._last), raw.end
-            scan = self._frames.take(raw.data, turn_at, now_ns)
+            scan = self._frames.add_frame(raw.data, turn_at, now_ns)
             self.emit_scan(replace(scan, late_ms=self._stamps.late_ms) if scan else None)
 
     def probe(self, port: serial.Serial) -> bool:

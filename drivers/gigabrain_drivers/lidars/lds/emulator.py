@@ -37,10 +37,10 @@ class Lds01Device(Device):
 
     def step(self, now_ns: int) -> None:
         """Send all whole packets that were measured; the first begins where one does."""
-        while samples := self._sweep.take(lds01.SAMPLES):
+        while samples := self._sweep.next_samples(lds01.SAMPLES):
             first = round(samples[0].angle) - 1
             while first % lds01.SAMPLES:
-                samples = samples[1:] + self._sweep.take(1)
+                samples = samples[1:] + self._sweep.next_samples(1)
                 first += 1
             if len(samples) == lds01.SAMPLES and self.sag_volts <= LEAST_VOLTS:
                 number = first // lds01.SAMPLES % lds01.PACKETS
@@ -77,7 +77,7 @@ class Lds03Device(Device):
 
     def step(self, now_ns: int) -> None:
         """Send all whole packets that were measured; none crosses 0 degrees."""
-        while samples := self._sweep.take(1):
+        while samples := self._sweep.next_samples(1):
             wraps = bool(self._waiting) and samples[0].angle < self._waiting[-1].angle
             if wraps or len(self._waiting) == LDS03_POINTS:
                 self._send()

@@ -92,7 +92,7 @@ class Lds01(SerialSource):
             Spelling(as_one_frame, describe_command), Spelling(Lds01Decoder().feed, describe)
         )
         self._last: int | None = None  # number of the newest packet
-        self._told_ns = 0  # when it was last told to start, or last seen to turn
+        self._active_ns = 0  # when it was last told to start, or last seen to turn
 
     def connected(self) -> None:
         """Start it."""
@@ -104,7 +104,7 @@ class Lds01(SerialSource):
         now_ns = self.clock.now_ns()
         for packet in self._decoder.feed(data):
             turn_at = 0 if self._last is not None and packet.number <= self._last else None
-            self.understood, self._last, self._told_ns = True, packet.number, now_ns
+            self.understood, self._last, self._active_ns = True, packet.number, now_ns
             first = packet.number * SAMPLES + 1  # the vendor's driver puts sample 0 at 359
             angles = range(first, first + SAMPLES)
             self.emit_scan(self.turn.add_samples(angles, packet.ranges, turn_at, now_ns))
@@ -112,7 +112,7 @@ class Lds01(SerialSource):
     def watch_scans(self, now_ns: int) -> None:
         """Start it again where it does not turn: it may have had no power before."""
         super().watch_scans(now_ns)
-        if now_ns - self._told_ns > RESTART_NS:
+        if now_ns - self._active_ns > RESTART_NS:
             self._start()
 
     def probe(self, port: serial.Serial) -> bool:
@@ -128,5 +128,5 @@ class Lds01(SerialSource):
         return self.link.write(STOP)
 
     def _start(self) -> None:
-        self._told_ns = self.clock.now_ns()
+        self._active_ns = self.clock.now_ns()
         self.link.write(START)

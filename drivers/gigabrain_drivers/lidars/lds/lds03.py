@@ -163,18 +163,18 @@ class Lds03(SerialSource):
             Spelling(Lds03Decoder().feed, describe),
         )
         self._cleared = self._started = False
-        self._told_ns = 0  # when it was last told something, or last seen to turn
+        self._active_ns = 0  # when it was last told something, or last seen to turn
 
     def connected(self) -> None:
         """Leave it alone for a second; then `look` starts it."""
         self._cleared = self._started = False
-        self._told_ns = self.clock.now_ns()
+        self._active_ns = self.clock.now_ns()
 
     def received(self, data: bytes) -> None:
         """Decode packets, or parts of them."""
         now_ns = self.clock.now_ns()
         for packet in self._decoder.feed(data):
-            self.understood, self._told_ns = True, now_ns
+            self.understood, self._active_ns = True, now_ns
             angles = [sample.angle for sample in packet.samples]
             distances = [trusted(sample) for sample in packet.samples]
             turn_at = 0 if packet.begins else None
@@ -183,16 +183,16 @@ class Lds03(SerialSource):
     def watch_scans(self, now_ns: int) -> None:
         """Start it when it is ready for that, and again where it does not turn."""
         super().watch_scans(now_ns)
-        since = now_ns - self._told_ns
+        since = now_ns - self._active_ns
         if not self._cleared and since >= DTR_NS:
             self.link.set_dtr(False)
             self._cleared = True
         if not self._started and since >= START_NS:
-            self._tell(START)
+            self._send_command(START)
             self._started = True
         elif self._started and since >= RESTART_NS:
-            self._tell(STOP)
-            self._tell(START)
+            self._send_command(STOP)
+            self._send_command(START)
 
     def probe(self, port: serial.Serial) -> bool:
         """Return whether packets come from this port after a start command."""
@@ -206,8 +206,8 @@ class Lds03(SerialSource):
         """Stop it."""
         return self.link.write(STOP)
 
-    def _tell(self, command: bytes) -> None:
-        self._told_ns = self.clock.now_ns()
+    def _send_command(self, command: bytes) -> None:
+        self._active_ns = self.clock.now_ns()
         self.link.write(command)
 
 

@@ -100,7 +100,7 @@ class RplidarDevice(Device):
     def feed(self, data: bytes) -> None:
         """Obey requests, or collect parts of them."""
         for request in self._requests.feed(data):
-            self._obey(request)
+            self._handle_request(request)
 
     def reset(self) -> None:
         """Boot: the motor turns, unless a board powers it, and the banner is sent."""
@@ -118,7 +118,7 @@ class RplidarDevice(Device):
         if mode is None:
             return
         nodes = b""
-        while samples := self._sweep.take(SAMPLES[mode.kind]):
+        while samples := self._sweep.next_samples(SAMPLES[mode.kind]):
             block = self._block(mode.kind, samples)
             if mode.kind == STANDARD:
                 nodes += block
@@ -127,7 +127,7 @@ class RplidarDevice(Device):
         if nodes:
             self.wire.write(nodes)
 
-    def _obey(self, request: Request) -> None:
+    def _handle_request(self, request: Request) -> None:
         command, payload = request
         match command:
             case rplidar.STOP:
@@ -146,19 +146,21 @@ class RplidarDevice(Device):
             case rplidar.EXPRESS_SCAN if payload and payload[0] < len(self.unit.modes):
                 self._scan(self.unit.modes[payload[0]] if payload[0] else LEGACY)
             case rplidar.GET_INFO:
-                self._say(rplidar.INFO, self.unit.info.pack())
+                self._send_answer(rplidar.INFO, self.unit.info.pack())
             case rplidar.GET_HEALTH:
-                self._say(rplidar.HEALTH, self.health.pack())
+                self._send_answer(rplidar.HEALTH, self.health.pack())
             case rplidar.GET_SAMPLERATE:
                 periods = (round(self.unit.modes[0].period_us), round(LEGACY.period_us))
-                self._say(rplidar.SAMPLERATE, b"".join(p.to_bytes(2, "little") for p in periods))
+                self._send_answer(
+                    rplidar.SAMPLERATE, b"".join(p.to_bytes(2, "little") for p in periods)
+                )
             case rplidar.GET_BOARD:
-                self._say(rplidar.BOARD, int(self.unit.board).to_bytes(4, "little"))
+                self._send_answer(rplidar.BOARD, int(self.unit.board).to_bytes(4, "little"))
             case rplidar.GET_CONF if len(payload) >= 4:
                 value = self._conf(payload[0], int.from_bytes(payload[4:6], "little"))
-                self._say(rplidar.CONF, payload[:4] + value)
+                self._send_answer(rplidar.CONF, payload[:4] + value)
 
-    def _say(self, kind: int, data: bytes) -> None:
+    def _send_answer(self, kind: int, data: bytes) -> None:
         self.wire.write(rplidar.answer(kind, data))
 
     def _conf(self, key: int, number: int) -> bytes:

@@ -174,13 +174,13 @@ class RplidarDecoder:
             block = bytes(buffer[at : at + size])
             if format.is_block(block) and (self._in_step or self._confirmed(format, at)):
                 self._in_step = True
-                if samples := format.take(block):
+                if samples := format.decode(block):
                     found.append(samples)
                 at += size
             else:
                 self.errors += self._in_step
                 self._in_step = False
-                format.lose()
+                format.resync()
                 at += 1
         del buffer[:at]
 
@@ -191,7 +191,7 @@ class RplidarDecoder:
             block = bytes(self._buffer[at + n * size : at + (n + 1) * size])
             if not trial.is_block(block):
                 return False
-            trial.take(block)
+            trial.decode(block)
         return True
 
 

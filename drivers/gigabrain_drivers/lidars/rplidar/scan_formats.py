@@ -44,11 +44,11 @@ class ScanFormat(abc.ABC):
         """Return whether these bytes can be a block that follows the last."""
 
     @abc.abstractmethod
-    def take(self, block: bytes) -> Samples | None:
+    def decode(self, block: bytes) -> Samples | None:
         """Return the samples that this block completes."""
 
     @abc.abstractmethod
-    def lose(self) -> None:
+    def resync(self) -> None:
         """Note that bytes were lost: the next block does not follow the last."""
 
 
@@ -68,7 +68,7 @@ class Standard(ScanFormat):
             return False
         return self._last is None or abs(_advance(self._last, (raw >> 1) / 64)) < MOST_JUMP_DEG
 
-    def take(self, block: bytes) -> Samples:
+    def decode(self, block: bytes) -> Samples:
         """Return one sample. A turn begins with the node that is marked so."""
         first, raw, distance = _NODE.unpack(block)
         angle = (raw >> 1) / 64
@@ -80,7 +80,7 @@ class Standard(ScanFormat):
             self._travelled = 0.0
         return Samples((angle,), (distance / 4,), 0 if begins else None)
 
-    def lose(self) -> None:
+    def resync(self) -> None:
         """Accept any angle next."""
         self._last = None
 
@@ -100,7 +100,7 @@ class Capsule(ScanFormat):
             return False
         return capsule_checksum(block) == (block[0] & 0xF | (block[1] & 0xF) << 4)
 
-    def take(self, block: bytes) -> Samples | None:
+    def decode(self, block: bytes) -> Samples | None:
         """Return the samples of the capsule before, where nothing is missing in between."""
         held, self._held = self._held, block
         if held is None or block[3] & 0x80:  # this one begins a new stream
@@ -117,7 +117,7 @@ class Capsule(ScanFormat):
         turn_at = min(count - 1, -int((start - 360) * count // width)) if passed else None
         return Samples(angles, self._distances(held), turn_at)
 
-    def lose(self) -> None:
+    def resync(self) -> None:
         """Drop the capsule that waits for the next one."""
         self._held = self._width = None
 

@@ -87,7 +87,7 @@ class Line(Protocol):
     def motor(self, *, on: bool) -> None:
         """Start or stop the motor."""
 
-    def known(self, info: Info, *, pwm: bool) -> None:
+    def identified(self, info: Info, *, pwm: bool) -> None:
         """Note the lidar's identity, and whether a board powers its motor."""
 
 
@@ -98,7 +98,7 @@ async def start(line: Line, scan_mode: str) -> None:
     """
     await _stop(line)
     info = Info.read(await line.ask(rplidar.request(rplidar.GET_INFO), rplidar.INFO))
-    line.known(info, pwm=await _on_board(line, info))
+    line.identified(info, pwm=await _on_board(line, info))
     await _check_health(line)
     line.motor(on=True)
     await _stop(line)
@@ -296,7 +296,7 @@ class Rplidar(SerialSource):
             rpm = on * round(60 * self.lidar.rate_hz)
             self.send(rplidar.request(rplidar.SET_SPEED, rpm.to_bytes(2, "little")))
 
-    def known(self, info: Info, *, pwm: bool) -> None:
+    def identified(self, info: Info, *, pwm: bool) -> None:
         """Keep the lidar's identity, and log it when it is new."""
         if self._info != info:
             major, minor = info.firmware
