@@ -159,7 +159,7 @@ async def test_an_error_in_what_presses_ends_the_process_and_lets_go_of_the_port
     async def broken(*_: object) -> None:
         raise RuntimeError("a fault of ours")
 
-    monkeypatch.setattr(button, "press", broken)
+    monkeypatch.setattr(button, "press_estop", broken)
     rig.closed = False
     with pytest.raises(ExceptionGroup) as raised:
         await asyncio.wait_for(rig.task, 20)

@@ -142,7 +142,7 @@ async def test_a_port_that_is_another_emulators_by_now_is_left(tmp_path: Path) -
 async def test_a_file_that_is_no_port_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "base").write_text("somebody's")
     run = Run(folder=Path(), link="emulated", emulator=str(tmp_path))
-    with pytest.raises(ConfigError, match=r"cannot create ports in .*base is there"):
+    with pytest.raises(ConfigError, match=r"cannot create ports in .*base exists"):
         async with Emulator("mycustombot", run):
             pass
     assert (tmp_path / "base").read_text() == "somebody's"
