@@ -141,7 +141,7 @@ def _print_trace(
             part=part,
             seconds=seconds,
             wanted=Velocity(**speeds),
-            say=print_line,
+            print_line=print_line,
         )
         try:
             return bool(run_async(tracing))

@@ -210,8 +210,8 @@ class RobotUnderTest(ProcessGroup):
         try:
             await super().__aenter__()
             await self.until_ready()
-            endpoint = client_endpoint(self.deployment, "operator")
-            self.probe = await self._stack.enter_async_context(probing(endpoint, "suite"))
+            operator = client_endpoint(self.deployment, "operator")
+            self.probe = await self._stack.enter_async_context(probing(operator, "suite"))
             self.person = Robot(self.probe.bus)
         except BaseException:
             await self.close()
@@ -230,6 +230,11 @@ class RobotUnderTest(ProcessGroup):
     def reusable(self) -> bool:
         """Whether another test can use this robot."""
         return bool(self._running and not (self.supervisor.given_up or self._running.done()))
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """The endpoint of a client without keys."""
+        return client_endpoint(self.deployment)
 
     @property
     def ports(self) -> Path:
@@ -272,12 +277,16 @@ class RobotUnderTest(ProcessGroup):
                 os.kill(pid, signal.SIGCONT)
         self._frozen.clear()
 
-    async def restarted(self, name: str, pid: int) -> None:
+    async def until_restarted(self, name: str, pid: int) -> None:
         """Wait until the process that had this pid is ready under another one."""
         status = self.supervisor.statuses[name]
         await until(
             lambda: status.state == "ready" and status.pid != pid, f"{name}'s restart", START_S
         )
+
+    async def kill_and_restart(self, name: str) -> None:
+        """Send SIGKILL, and wait until the supervisor has restarted the process."""
+        await self.until_restarted(name, self.kill(name))
 
     async def break_body(self, **faults: Mapping[str, Any]) -> None:
         """Set the faults of an emulated body, by station; returns once the emulator has them."""

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import msgspec
 from msgspec import Struct
 
 from gigabrain_schemas.body import RobotState
@@ -19,7 +18,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.bounded import percentile
-from gigabrain_zenoh.qa.faults.rig.cpu_load import PROGRAM
+from gigabrain_zenoh.qa.faults.rig.cpu_load import PROGRAM, endpoint_text
 from gigabrain_zenoh.qa.judging import limited, table_of
 from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, ProcessGroup, measured_robot
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
@@ -61,7 +60,7 @@ async def measure_estop(body: str, driving: int, latched: int, say: Say) -> Esto
     deployment = with_free_port(
         Deployment(body=body, resume="manual", router=LOOPBACK, decision=decision)
     )
-    endpoint = msgspec.json.encode(client_endpoint(deployment)).decode()
+    endpoint = endpoint_text(client_endpoint(deployment))
     say(f"starting {body}")
     async with measured_robot(deployment) as (group, bus):
         operator = _Operator(bus, group)

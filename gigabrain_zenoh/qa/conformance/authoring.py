@@ -26,7 +26,7 @@ from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.qa.conformance.robot import link_of
 
 PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]*[a-z0-9]")
-TEMPLATES = {  # where each text goes
+TEMPLATES = {  # source and target of each file
     "pyproject.toml.txt": "pyproject.toml",
     "readme.md.txt": "README.md",
     "init.py.txt": "${name}_driver/__init__.py",
@@ -37,13 +37,13 @@ TEMPLATES = {  # where each text goes
 
 
 def write_package(name: str, folder: Path) -> Path:
-    """Make `folder`/gigabrain-`name`; returns it. Raises ConfigError, also when it exists."""
+    """Create the folder gigabrain-NAME and return it. Raises ConfigError if it exists."""
     if not PACKAGE_NAME.fullmatch(name) or keyword.iskeyword(name):
         raise ConfigError(
             f"{name!r}: expected lower-case letters, digits and underscores, such as my_robot"
         )
     if name in robot_files() or name in known_drivers():
-        raise ConfigError(f"there is a robot or a driver {name!r} already; choose another name")
+        raise ConfigError(f"a robot or a driver is called {name!r} already; choose another name")
     path = folder / f"gigabrain-{name.replace('_', '-')}"
     words = {
         "name": name,
@@ -68,26 +68,26 @@ PARTS = (BASE, SCAN)
 
 
 class _LineLog(logging.Handler):
-    """Keeps what the lines log, until it is shown: the body's own line, or that of its lidar."""
+    """Keeps the frames of one line: the base's, or the lidar's."""
 
     def __init__(self, driver: Driver, part: str) -> None:
         super().__init__(logging.DEBUG)
         self._base, self._wanted = link_of(driver), part == BASE
         self.lines: deque[str] = deque()
-        self.received = False  # whether anything has come
+        self.received = False  # True once a frame was received
 
     def emit(self, record: logging.LogRecord) -> None:
-        """One frame."""
+        """Keep one frame."""
         if isinstance(record.args, tuple) and len(record.args) == 2:
             line, text = record.args
             if (line is self._base) is self._wanted:
                 self.lines.append(str(text))
                 self.received |= str(text).startswith("rx")
 
-    def show(self, say: Callable[[str], None]) -> None:
-        """All that has come since the last time."""
+    def show(self, print_line: Callable[[str], None]) -> None:
+        """Print the frames since the last call."""
         while self.lines:
-            say(self.lines.popleft())
+            print_line(self.lines.popleft())
 
 
 async def trace_line(
@@ -98,12 +98,11 @@ async def trace_line(
     part: str,
     seconds: float,
     wanted: Velocity,
-    say: Callable[[str], None],
+    print_line: Callable[[str], None],
 ) -> bool:
-    """Open the driver and command `wanted` for so long; whether anything was received.
+    """Command `wanted` for `seconds` and print the frames; return whether any was received.
 
-    Raises ConfigError.
-    `folder` is for the ports of the emulator, which runs here as well where the link is emulated.
+    `folder` holds the ports of the emulator, which runs in this process. Raises ConfigError.
     """
     if link == "real" and wanted != ZERO:
         raise ConfigError("a real body is not moved without its gate; trace it at speed 0")
@@ -117,28 +116,28 @@ async def trace_line(
         await stack.enter_async_context(driver)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
-                await _drive_traced(driver, wanted, shown, say)
-    shown.show(say)
+                await _drive_traced(driver, wanted, shown, print_line)
+    shown.show(print_line)
     return shown.received
 
 
 async def _drive_traced(
-    driver: Driver, wanted: Velocity, shown: _LineLog, say: Callable[[str], None]
+    driver: Driver, wanted: Velocity, shown: _LineLog, print_line: Callable[[str], None]
 ) -> None:
-    told = ""
+    newest = ""
     async for _ in driver.ticks(Clock()):
         await driver.read_state()
-        shown.show(say)
+        shown.show(print_line)
         sent = await driver.set_base_velocity(wanted.linear_x, wanted.linear_y, wanted.angular_z)
         text = describe_command(wanted, sent)
-        if text != told:
-            told = text
-            say(text)
+        if text != newest:
+            newest = text
+            print_line(text)
 
 
 @contextlib.contextmanager
 def _logged(handler: logging.Handler) -> Iterator[None]:
-    """Listen to the lines alone, and leave all as it was."""
+    """Send the frames of all lines to `handler` alone while the block runs."""
     before, propagates = links.log.level, links.log.propagate
     links.log.addHandler(handler)
     links.log.setLevel(logging.DEBUG)

@@ -15,22 +15,22 @@ RAMP_TICKS = 75  # 1.5 s, to get to a speed
 HOLD_TICKS = 15
 TOLERANCE = 0.1  # of the wanted speed, and
 UNIT = 0.02  # [m/s], [rad/s]: the coarsest step in which a body may take its commands
-NEVER_S = 2.0  # that `stop` and `close` may take
-OPENED_S = 0.1
+MAX_CALL_S = 2.0  # of `stop` and `close`
+OPEN_S = 0.1
 CALLS = ("stop", "stop", "close", "stop", "close")
-FAR = 10.0  # times more than the body can
+EXCESS = 10.0  # times the greatest speed
 
 
 async def opens(checked: CheckedRobot) -> Finding:
-    """The body is heard after `open`."""
+    """Open the driver, and wait until the body is received."""
     begin = time.monotonic()
     async with DriverSession(checked) as it:
         await it.connected()
-    return Finding(True, f"heard after {(time.monotonic() - begin) * 1e3:.0f} ms")
+    return Finding(True, f"received after {(time.monotonic() - begin) * 1e3:.0f} ms")
 
 
 async def obeys(checked: CheckedRobot) -> Finding:
-    """Forwards, then turning: the measured speed is the commanded one."""
+    """Drive forward, then turn: the measured speed reaches the commanded one."""
     robot, measured_texts = checked.file, []
     wishes = (
         ("linear_x", Velocity(linear_x=0.5 * robot.max_linear_speed)),
@@ -58,35 +58,35 @@ def _near(it: DriverSession, axis: str, wanted: float, slack: float) -> bool:
 
 
 async def limits(checked: CheckedRobot) -> Finding:
-    """What is asked of it ten times too fast is sent no faster than the body's file allows."""
+    """Command ten times the greatest speed: the driver sends at most the greatest speed."""
     robot = checked.file
     most = Velocity(linear_x=robot.max_linear_speed, angular_z=robot.max_angular_speed)
     worst = 0.0
     async with DriverSession(checked) as it:
         await it.connected()
         for asked in (
-            Velocity(linear_x=FAR * most.linear_x),
-            Velocity(angular_z=-FAR * most.angular_z),
-            Velocity(linear_x=-FAR * most.linear_x, angular_z=FAR * most.angular_z),
+            Velocity(linear_x=EXCESS * most.linear_x),
+            Velocity(angular_z=-EXCESS * most.angular_z),
+            Velocity(linear_x=-EXCESS * most.linear_x, angular_z=EXCESS * most.angular_z),
         ):
             it.wanted = asked
             await it.run_for(HOLD_TICKS)
             sent = it.sent or Velocity()
-            told = checked.commanded(it.state)
+            commanded = checked.commanded(it.state)
             worst = max(
                 worst,
                 abs(sent.linear_x) / most.linear_x,
                 abs(sent.angular_z) / most.angular_z,
-                abs(told[0]) / (most.linear_x * (1 + TOLERANCE)),
-                abs(told[2]) / (most.angular_z * (1 + TOLERANCE)),
+                abs(commanded[0]) / (most.linear_x * (1 + TOLERANCE)),
+                abs(commanded[2]) / (most.angular_z * (1 + TOLERANCE)),
             )
     return Finding(worst <= 1.001, f"at most {worst:.2f} of max speed")
 
 
 async def returns(checked: CheckedRobot) -> Finding:
-    """What it returns is what the body was told, rounded and clamped as it was.
+    """Compare the returned velocity with the one that the body was commanded.
 
-    Without a peer, what the body does has to show what it was told.
+    Without a peer, the measured velocity stands for the commanded one.
     """
     robot = checked.file
     most = (robot.max_linear_speed, robot.max_lateral_speed, robot.max_angular_speed)
@@ -100,7 +100,7 @@ async def returns(checked: CheckedRobot) -> Finding:
 
         def off() -> list[float]:
             pairs = zip(_axes(it.sent or Velocity()), checked.commanded(it.state), strict=True)
-            return [abs(sent - told) for sent, told in pairs]
+            return [abs(sent - commanded) for sent, commanded in pairs]
 
         def close() -> bool:
             return all(error <= most for error, most in zip(off(), slack, strict=True))
@@ -111,7 +111,9 @@ async def returns(checked: CheckedRobot) -> Finding:
     within = _axes(clamp(asked, limits_of(robot)))
     honest = all(abs(a - b) <= UNIT for a, b in zip(_axes(sent), within, strict=True) if b)
     speeds = ", ".join(f"{speed:.4f}" for speed in _axes(sent))
-    return Finding(honest and ticks is not None, f"returned {speeds}; told differs by {worst:.4f}")
+    return Finding(
+        honest and ticks is not None, f"returned {speeds}; commanded differs by {worst:.4f}"
+    )
 
 
 def _axes(velocity: Velocity) -> tuple[float, float, float]:
@@ -119,7 +121,7 @@ def _axes(velocity: Velocity) -> tuple[float, float, float]:
 
 
 async def refuses_nan(checked: CheckedRobot) -> Finding:
-    """What is not a number never reaches the body, also without the gate before it."""
+    """Command NaN and infinity without a gate: the driver sends zero."""
     async with DriverSession(checked) as it:
         await it.connected()
         for bad in (math.nan, math.inf, -math.inf):
@@ -131,14 +133,14 @@ async def refuses_nan(checked: CheckedRobot) -> Finding:
 
 
 async def never_raises(checked: CheckedRobot) -> Finding:
-    """`stop` and `close`: before open, twice, after close, and with the line cut or frozen."""
+    """Call `stop` and `close` before open, twice, after close, with the line cut or frozen."""
     states = ("never opened", "opened", *(("unplugged", "frozen") if checked.has_peer else ()))
     raised: list[str] = []
     for state in states:
         driver = checked.driver()
         if state != "never opened":
             await driver.open()
-            await asyncio.sleep(OPENED_S)
+            await asyncio.sleep(OPEN_S)
         if state in ("unplugged", "frozen"):
             checked.break_peer(state)
         for what in CALLS:
@@ -152,12 +154,12 @@ async def never_raises(checked: CheckedRobot) -> Finding:
 
 
 async def _raised(call: Callable[[], Awaitable[None]]) -> str:
-    """What `call` raised, or an empty text."""
+    """Return the error that `call` raised; empty for none."""
     try:
-        async with asyncio.timeout(NEVER_S):
+        async with asyncio.timeout(MAX_CALL_S):
             await call()
     except TimeoutError:
-        return f"took over {NEVER_S:g} s"
-    except Exception as error:  # noqa: BLE001 - the very thing that is looked for
+        return f"took over {MAX_CALL_S:g} s"
+    except Exception as error:  # noqa: BLE001 - any error of the driver is a finding
         return repr(error)
     return ""

@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import msgspec
@@ -15,14 +15,20 @@ from gigabrain_schemas.base import TICK_MS, TICK_NS, TICK_S, Velocity
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.host import this_process
-from gigabrain_zenoh.qa.conformance.gated_driver import ATTEMPTS, SHARE, GatedDriver, stop_ticks
+from gigabrain_zenoh.qa.conformance.gated_driver import (
+    ATTEMPTS,
+    SPEED_SHARE,
+    GatedDriver,
+    stop_ticks,
+)
 from gigabrain_zenoh.qa.conformance.robot import CheckedRobot, DriverSession, link_of
 from gigabrain_zenoh.qa.judging import Failed, Finding
+from gigabrain_zenoh.qa.probe import TICK_MS, until
 
-SILENCE_TICKS = 7  # ticks: 100 ms without a command, told in the next tick
+SILENCE_TICKS = 7  # 100 ms without a command, applied in the next tick
 AT_ONCE_TICKS = 2
 DISORDER_TICKS = 35
-LATE_TICKS = 100  # for which a body that still moves is watched, to say how late it is
+LATE_TICKS = 100  # for which a body that still moves is watched, to measure how late it is
 COMMANDER = "import time\nwhile True:\n print(flush=True)\n time.sleep(0.02)\n"
 
 
@@ -34,61 +40,56 @@ MAX_AGE_MS = 100.0
 SAMPLES = 40
 MID_TICK_S = 0.008
 MAX_LATENCY_MS = 1.0
-PULLED_MS = 100.0  # until the gate knows that the line is cut
-FROZEN_MS = 250.0  # until it knows that the peer hangs
-SLACK_MS = 100.0  # on top of these, for a machine that others use as well
-NOTICED = 12  # ticks, for the gate to know, where it is not what is judged
+UNPLUGGED_MS = 100.0  # until the gate reports a cut line
+FROZEN_MS = 250.0  # until it reports a frozen peer
+SLACK_MS = 100.0  # on top of these, for a shared machine
+NOTICED_TICKS = 12  # until the gate reports a loss, where that is not judged
 BACK_TICKS = 250
 QUIET_TICKS = 15
 START_S = 20.0  # for a driver in a process of its own, on a busy machine
-LOOK_S = 0.005
-KNOWN, TOLD, RESTS = "known", "motors told zero", "at rest"  # from the fault on
+REPORTED, ZEROED, RESTS = "reported", "motors at zero", "at rest"  # since the fault
 
 
 async def silence(gated: GatedDriver) -> Finding:
-    """The commander falls silent at full drive."""
+    """Stop commanding at full speed."""
     await gated.drive()
     gated.wanted = None
     return await _stopped(gated, stop_ticks(gated, SILENCE_TICKS))
 
 
 async def not_a_number(gated: GatedDriver) -> Finding:
-    """The commander sends NaN: zero at once, without a ramp."""
+    """Command NaN: the gate sends zero at once, without a ramp."""
     await gated.drive()
     gated.wanted = None
-    last, calls = gated.last, len(gated.tap.calls)
+    last, calls = gated.last, len(gated.tap.asked)
     if last is None:
         raise Failed("nothing was commanded")
-    with _unsaid("gigabrain_zenoh.bus.bus"):
+    with _silenced("gigabrain_zenoh.bus.bus"):
         gated.deliver({**msgspec.structs.asdict(last), "linear_x": math.nan, "seq": last.seq + 1})
-        told = await gated.until(lambda: gated.tap.calls[calls:], AT_ONCE_TICKS)
-    zero = told is not None and gated.tap.calls[calls].asked == ZERO
+        in_time = await gated.until(lambda: gated.tap.asked[calls:], AT_ONCE_TICKS)
+    zero = in_time is not None and gated.tap.asked[calls] == ZERO
     found = await _stopped(gated, stop_ticks(gated, AT_ONCE_TICKS))
-    said = "zero at once" if zero else "not zero at once"
-    return Finding(found.ok and zero, f"{said}; {found.measured}")
+    text = "zero at once" if zero else "not zero at once"
+    return Finding(found.ok and zero, f"{text}; {found.measured}")
 
 
 @contextlib.contextmanager
-def _unsaid(name: str) -> Iterator[None]:
-    """What the kit does wrong on purpose is not logged by the logger of that name."""
+def _silenced(name: str) -> Iterator[None]:
+    """Silence a logger while the kit sends bad messages on purpose."""
     logger = logging.getLogger(name)
-    logger.addFilter(_nothing)
+    logger.disabled = True
     try:
         yield
     finally:
-        logger.removeFilter(_nothing)
-
-
-def _nothing(_: logging.LogRecord) -> bool:
-    return False
+        logger.disabled = False
 
 
 async def disorder(gated: GatedDriver) -> Finding:
-    """Old, duplicated and reordered commands: none is obeyed, and none counts as being alive."""
+    """Send old, duplicated and reordered commands: none is obeyed or keeps the gate open."""
     wanted = await gated.drive()
     earlier = gated.last
     await gated.run_for(12)
-    gated.wanted, last, calls = None, gated.last, len(gated.tap.calls)
+    gated.wanted, last, calls = None, gated.last, len(gated.tap.asked)
     if earlier is None or last is None:
         raise Failed("nothing was commanded")
     before, end = sum(gated.refused.values()), gated.tick + DISORDER_TICKS
@@ -108,7 +109,7 @@ async def disorder(gated: GatedDriver) -> Finding:
             at_rest = gated.tick - begin
         await gated.run_for(1)
     refused = sum(gated.refused.values()) - before
-    backward = sum(1 for call in gated.tap.calls[calls:] if call.asked.linear_x * back > 0)
+    backward = sum(1 for asked in gated.tap.asked[calls:] if asked.linear_x * back > 0)
     text = f"{refused} refused, {backward} obeyed; "
     if at_rest is None:
         return Finding(False, text + "never at rest")
@@ -118,7 +119,7 @@ async def disorder(gated: GatedDriver) -> Finding:
 
 
 async def killed(gated: GatedDriver) -> Finding:
-    """The commander is a process, and ends by SIGKILL."""
+    """Kill a commander that is a process, by SIGKILL."""
     for _ in range(ATTEMPTS):
         await gated.drive()
         async with _commander(gated):
@@ -133,7 +134,7 @@ async def killed(gated: GatedDriver) -> Finding:
 
 @contextlib.asynccontextmanager
 async def _commander(gated: GatedDriver) -> AsyncIterator[None]:
-    """A process that commands what the gated commanded; killed at the end."""
+    """Run a process that takes over the commands; it is killed at the end."""
     commander = await asyncio.create_subprocess_exec(
         sys.executable, "-S", "-c", COMMANDER, stdout=asyncio.subprocess.PIPE
     )
@@ -147,7 +148,7 @@ async def _commander(gated: GatedDriver) -> AsyncIterator[None]:
 
 
 async def _relay(gated: GatedDriver, commander: asyncio.subprocess.Process) -> None:
-    """A command for each line of the commander, which takes over from the gated with its first."""
+    """Command once per line of the commander's output; the first line takes over."""
     assert commander.stdout
     velocity = gated.wanted or ZERO
     while await commander.stdout.readline():
@@ -164,7 +165,7 @@ async def _stopped(gated: GatedDriver, most: int) -> Finding:
 
 
 async def reports(gated: GatedDriver) -> Finding:
-    """A state per tick, fresh; scans as often as the body's file says."""
+    """Check for a fresh state per tick, and for scans at the rate of the robot's file."""
     lidar = gated.robot.lidar
     if await gated.until(lambda: gated.state and (gated.scan or not lidar), SCAN_TICKS) is None:
         if gated.state and gated.states >= MIN_SHARE_OF_TICKS * SCAN_TICKS:
@@ -174,13 +175,13 @@ async def reports(gated: GatedDriver) -> Finding:
     assert gated.state
     begin, states, scans, oldest = gated.tick, gated.states, gated.scans, 0.0
 
-    def look() -> bool:
+    def track_age() -> bool:
         nonlocal oldest
         assert gated.state
         oldest = max(oldest, gated.state.link.age_ms)
         return False
 
-    await gated.until(look, RATE_TICKS)
+    await gated.until(track_age, RATE_TICKS)
     ticks, states, scans = gated.tick - begin, gated.states - states, gated.scans - scans
     late_ms = max((MIN_SHARE_OF_TICKS * ticks - states) * TICK_NS / 1e6, oldest - MAX_AGE_MS, 0.0)
     good = late_ms == 0
@@ -196,17 +197,17 @@ async def reports(gated: GatedDriver) -> Finding:
 
 
 async def latency(gated: GatedDriver) -> Finding:
-    """From a command on the bus, through the gate and the driver, to its bytes on the line.
+    """Measure from a command on the bus, through gate and driver, to its bytes on the line.
 
-    Less what the loop's thread waited for a core in between.
+    The time for which the loop's thread waited for a core is subtracted.
     """
-    link, clock = link_of(gated.tap.inner), Clock()
+    link, clock = link_of(gated.tap.driver), Clock()
     times: list[float] = []
     asked_ns, waited_ms = 0, 0.0
 
     def trace(way: str, _: bytes) -> None:
         nonlocal asked_ns
-        if way == "tx" and gated.tap.speaking and asked_ns:
+        if way == "tx" and gated.tap.sending and asked_ns:
             took_ms = (clock.now_ns() - asked_ns) / 1e6
             times.append(took_ms - (this_process.own_waited_ms() - waited_ms))
             asked_ns = 0
@@ -234,23 +235,23 @@ async def latency(gated: GatedDriver) -> Finding:
 
 
 async def unplugged(gated: GatedDriver) -> Finding:
-    """The line is cut at full drive: the gate knows, and the body stops by itself."""
-    return await _cut(gated, "unplugged", PULLED_MS)
+    """Cut the line at full speed: the gate reports it, and the body stops by itself."""
+    return await _cut(gated, "unplugged", UNPLUGGED_MS)
 
 
 async def frozen(gated: GatedDriver) -> Finding:
-    """The peer hangs with its line open."""
+    """Freeze the peer with its line open."""
     return await _cut(gated, "frozen", FROZEN_MS)
 
 
 async def reconnects(gated: GatedDriver) -> Finding:
-    """The line comes back by itself, and nothing from before moves the body."""
+    """Mend the line: it reconnects by itself, and nothing old moves the body."""
     await gated.drive()
     gated.checked.break_peer("unplugged")
     try:
-        if await gated.until(lambda: "link_lost" in gated.causes, NOTICED) is None:
+        if await gated.until(lambda: "link_lost" in gated.causes, NOTICED_TICKS) is None:
             raise Failed("the loss was not noticed")
-        # before it stands: what moves it afterwards would be old bytes
+        # before it stands: only old bytes could move it afterwards
         if await gated.until(lambda: gated.rests, _rest_ticks(gated)) is None:
             raise Failed("the body did not stop by itself")
     finally:
@@ -262,14 +263,14 @@ async def reconnects(gated: GatedDriver) -> Finding:
     reconnects = gated.state.link.reconnects if gated.state else 0
     await gated.drive()
     await gated.pause()
-    old = "nothing moved it" if moved is None else "it moved before anybody enabled it"
+    old = "nothing moved it" if moved is None else "it moved before it was enabled"
     return Finding(
         moved is None and reconnects > 0, f"after {back} ticks, reconnects {reconnects}; {old}"
     )
 
 
 async def driver_killed(robot: CheckedRobot) -> Finding:
-    """The driver itself ends by SIGKILL: the body stops by its own watchdog."""
+    """Kill the driver by SIGKILL: the body stops by its own watchdog."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     child = await asyncio.create_subprocess_exec(
         *(sys.executable, "-P", "-m", __name__),
@@ -278,32 +279,32 @@ async def driver_killed(robot: CheckedRobot) -> Finding:
     )
     loop = asyncio.get_running_loop()
     try:
-        await _until(lambda: any(robot.commanded(None)), START_S, "the driver did not drive")
+        await until(lambda: any(robot.commanded(None)), "the driver drives", START_S)
         await asyncio.sleep(0.3)
         begin = loop.time()
     finally:
         child.kill()
         await child.wait()
-    await _until(lambda: not any(robot.commanded(None)), 2.0, "the motors ran on for 2 s")
+    await until(lambda: not any(robot.commanded(None)), "the motors stop", 2.0)
     took = (loop.time() - begin) * 1e3
     late = took - robot.promised_ms - SLACK_MS
-    told = f"motors told zero after {took:.0f} ms"
-    return Finding(late <= 0, told, {"motors told zero": took}, max(late, 0.0))
+    text = f"{ZEROED} after {took:.0f} ms"
+    return Finding(late <= 0, text, {ZEROED: took}, max(late, 0.0))
 
 
 def _rest_ticks(gated: GatedDriver) -> int:
-    """The most ticks until a body that is left to itself stands."""
+    """Return the ticks within which the body must stop by itself."""
     return stop_ticks(gated, round((gated.checked.promised_ms + SLACK_MS) * 1e6 / TICK_NS))
 
 
-async def _cut(gated: GatedDriver, fault: str, known_ms: float) -> Finding:
+async def _cut(gated: GatedDriver, fault: str, reported_ms: float) -> Finding:
     await gated.drive()
     gated.checked.break_peer(fault)
     try:
         times = await gated.firsts(
             {
-                KNOWN: lambda: "link_lost" in gated.causes,
-                TOLD: lambda: not any(gated.checked.commanded(gated.state)),
+                REPORTED: lambda: "link_lost" in gated.causes,
+                ZEROED: lambda: not any(gated.checked.commanded(gated.state)),
                 RESTS: lambda: gated.rests,
             },
             _rest_ticks(gated) + LATE_TICKS,
@@ -314,38 +315,29 @@ async def _cut(gated: GatedDriver, fault: str, known_ms: float) -> Finding:
         gated.checked.break_peer("")
     thawed = await gated.until(lambda: any(gated.checked.commanded(gated.state)), QUIET_TICKS)
     if await gated.until(lambda: gated.state and gated.state.link.connected, BACK_TICKS) is None:
-        raise Failed(f"not heard again after {BACK_TICKS} ticks")
+        raise Failed(f"not received again after {BACK_TICKS} ticks")
     limits = {
-        KNOWN: known_ms + SLACK_MS,
-        TOLD: gated.checked.promised_ms + SLACK_MS,
+        REPORTED: reported_ms + SLACK_MS,
+        ZEROED: gated.checked.promised_ms + SLACK_MS,
         RESTS: _rest_ticks(gated) * TICK_NS / 1e6,
     }
     late = max(times.get(name, math.inf) - most for name, most in limits.items())
-    told = [f"{n} after {times[n]:.0f} ms" if n in times else f"never {n}" for n in limits]
-    again = "; then what had piled up moved it" if thawed is not None else ""
+    texts = [f"{n} after {times[n]:.0f} ms" if n in times else f"never {n}" for n in limits]
+    again = "; then old commands moved it" if thawed is not None else ""
     missed = late if math.isfinite(late) and not again else 0.0
-    return Finding(late <= 0 and not again, ", ".join(told) + again, times, max(missed, 0.0))
+    return Finding(late <= 0 and not again, ", ".join(texts) + again, times, max(missed, 0.0))
 
 
-async def _until(condition: Callable[[], bool], within_s: float, what: str) -> None:
-    loop = asyncio.get_running_loop()
-    end = loop.time() + within_s
-    while not condition():
-        if loop.time() > end:
-            raise Failed(what)
-        await asyncio.sleep(LOOK_S)
-
-
-async def drive_for_ever(name: str, folder: Path, way: int) -> None:
-    """In a process of its own: half speed, until somebody kills it."""
+async def drive_until_killed(name: str, folder: Path, way: int) -> None:
+    """Drive at half speed until the process is killed."""
     robot = CheckedRobot(name, "emulated", folder)
     async with DriverSession(robot) as it:
         await it.connected()
-        it.wanted = Velocity(linear_x=way * SHARE * robot.file.max_linear_speed)
+        it.wanted = Velocity(linear_x=way * SPEED_SHARE * robot.file.max_linear_speed)
         while True:
             await it.run_for(50)
 
 
 if __name__ == "__main__":
-    logging.getLogger().addHandler(logging.NullHandler())  # what it warns of is the kit's doing
-    asyncio.run(drive_for_ever(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])))
+    logging.getLogger().addHandler(logging.NullHandler())  # the kit itself causes the warnings
+    asyncio.run(drive_until_killed(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])))

@@ -1,20 +1,19 @@
 """A driver in its real process, behind the real gate, on a network inside this program."""
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import msgspec
 
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.process import DriverProcess
-from gigabrain_schemas.base import TICK_S, Message, Velocity
-from gigabrain_schemas.body import Joint, RobotState
+from gigabrain_schemas.base import TICK_S, Velocity
+from gigabrain_schemas.body import RobotState
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.requests import EnableRequest, ReleaseRequest
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.sensors import LaserScan
-from gigabrain_schemas.topics import ENABLE, RELEASE, SAFETY, SCAN, STATE, Topic, command_topic
+from gigabrain_schemas.topics import ENABLE, RELEASE, SAFETY, SCAN, STATE, command_topic
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork
@@ -25,98 +24,36 @@ from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.qa.conformance.robot import CheckedRobot, Timeline
 from gigabrain_zenoh.qa.judging import Failed
 
-
-class TappedCall(NamedTuple):
-    """One command, as the gate let it through and as the driver sent it."""
-
-    asked: Velocity
-    sent: Velocity
-
-
-class DriverTap(Driver):
-    """Between the driver's process and `inner`, which it does not change."""
-
-    def __init__(self, inner: Driver) -> None:
-        super().__init__(inner.robot, inner.options, inner.run)
-        self.inner, self.lockstep = inner, inner.lockstep
-        self.calls: list[TappedCall] = []
-        self.speaking = False  # whether a command is on its way through the driver now
-        inner.emit = self._hand_on
-
-    async def open(self) -> None:
-        """Of the inner one, as all that follows."""
-        await self.inner.open()
-
-    async def close(self) -> None:
-        """Let go of the body."""
-        await self.inner.close()
-
-    async def stop(self) -> None:
-        """Bring the body to rest."""
-        await self.inner.stop()
-
-    async def hold(self) -> None:
-        """Keep the present position."""
-        await self.inner.hold()
-
-    async def park(self) -> None:
-        """Take up the inner one's posture for being left alone."""
-        await self.inner.park()
-
-    async def limp(self) -> None:
-        """Let go of the inner one's joints."""
-        await self.inner.limp()
-
-    async def read_state(self) -> RobotState:
-        """What the body measures."""
-        return await self.inner.read_state()
-
-    async def ticks(self, clock: Clock) -> AsyncIterator[int]:
-        """The inner one's."""
-        async for passed in self.inner.ticks(clock):
-            yield passed
-
-    async def set_base_velocity(
-        self, linear_x: float, linear_y: float, angular_z: float
-    ) -> Velocity:
-        """Drive, and remember it."""
-        self.speaking = True
-        try:
-            sent = await self.inner.set_base_velocity(linear_x, linear_y, angular_z)
-        finally:
-            self.speaking = False
-        asked = Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z)
-        self.calls.append(TappedCall(asked, sent))
-        return sent
-
-    async def set_joint_position(self, joint_name: str, position: float) -> float:
-        """Move one joint."""
-        return await self.inner.set_joint_position(joint_name, position)
-
-    async def get_joint_states(self) -> tuple[Joint, ...]:
-        """All joints as measured."""
-        return await self.inner.get_joint_states()
-
-    async def get_sensor_data(self, sensor_name: str) -> Message | None:
-        """The newest reading of a sensor."""
-        return await self.inner.get_sensor_data(sensor_name)
-
-    def report(self) -> Mapping[str, float | int | str | None]:
-        """The inner one's figures."""
-        return self.inner.report()
-
-    def _hand_on(self, topic: Topic[Any], message: Message) -> None:
-        self.emit(topic, message)
-
-
 KIT = "kit"  # the commander
 ENABLE_TICKS = 250
 MOVE_TICKS = 100
 SETTLE_TICKS = 15  # of the body, after the ramp of its commands
 STEP_TICKS = 30  # of a body that walks
-ATTEMPTS = 3  # a machine that stands still for 100 ms has the gate shut
-SHARE = 0.5  # of the body's greatest speed, which the checks drive at
+ATTEMPTS = 3  # the gate shuts when the machine stands still for 100 ms
+SPEED_SHARE = 0.5  # of the body's greatest speed
 MOVING = 0.6  # of the wanted speed, from which the body counts as moving
+
+
+class DriverTap:
+    """Records the velocities that the gate lets through to a driver.
+
+    It replaces the driver's `set_base_velocity` by a method that records and calls it.
+    """
+
+    def __init__(self, driver: Driver) -> None:
+        self.driver = driver
+        self.asked: list[Velocity] = []
+        self.sending = False  # while a command passes through the driver
+        self._set_base_velocity = driver.set_base_velocity
+        driver.set_base_velocity = self._recorded  # type: ignore[method-assign]
+
+    async def _recorded(self, linear_x: float, linear_y: float, angular_z: float) -> Velocity:
+        self.asked.append(Velocity(linear_x=linear_x, linear_y=linear_y, angular_z=angular_z))
+        self.sending = True
+        try:
+            return await self._set_base_velocity(linear_x, linear_y, angular_z)
+        finally:
+            self.sending = False
 
 
 class GatedDriver(Timeline):
@@ -125,7 +62,7 @@ class GatedDriver(Timeline):
     def __init__(self, robot: CheckedRobot) -> None:
         super().__init__()
         self.checked, self.robot = robot, robot.file
-        self.speed = SHARE * self.robot.max_linear_speed
+        self.speed = SPEED_SHARE * self.robot.max_linear_speed
         self.wanted: Velocity | None = None
         self.state: RobotState | None = None
         self.states = self.scans = 0
@@ -134,15 +71,15 @@ class GatedDriver(Timeline):
         self.network, clock = LocalNetwork(), Clock()
         self.topic = command_topic(self.robot)
         self._bus = Bus(self.network.transport(), clock, KIT)
-        self._bus.subscribe(STATE, self._see)
-        self._bus.subscribe(SCAN, self._scanned)
+        self._bus.subscribe(STATE, self._on_state)
+        self._bus.subscribe(SCAN, self._on_scan)
         self._driver_bus = Bus(self.network.transport(), clock, "driver")
         config = DriverConfig(
             body=robot.name, link=robot.link, state_dir=str(robot.folder / "state")
         )
-        self._process = DriverProcess(config, self.robot, self.tap, self._driver_bus)
+        self._process = DriverProcess(config, self.robot, self.tap.driver, self._driver_bus)
         self._running: asyncio.Task[None] | None = None
-        self.last: CmdVel | None = None  # what was commanded last, as it went out
+        self.last: CmdVel | None = None  # newest command, as it was published
 
     async def __aenter__(self) -> Self:
         self._running = asyncio.create_task(self._process.run(lambda: None), name="driver process")
@@ -152,12 +89,12 @@ class GatedDriver(Timeline):
         self.wanted = None
         if self._running:
             self._running.cancel()
-            await asyncio.gather(self._running, return_exceptions=True)  # told by `check_alive`
+            await asyncio.gather(self._running, return_exceptions=True)  # `check_alive` raises them
         for bus in (self._bus, self._driver_bus):
             await bus.close()
 
     def check_alive(self) -> None:
-        """Raise what has ended the driver's process."""
+        """Raise the error that ended the driver's process."""
         for ended in (self._running, self._driver_bus.failed, self._bus.failed):
             if ended and ended.done():
                 ended.result()
@@ -165,39 +102,36 @@ class GatedDriver(Timeline):
 
     @property
     def causes(self) -> list[str]:
-        """Why the gate holds the body back, as codes."""
+        """Codes of the causes for which the gate is shut."""
         return [cause.code for cause in self.state.gate.causes] if self.state else []
 
     @property
     def mode(self) -> str:
-        """The gate's."""
+        """The gate's mode."""
         return self.state.gate.mode if self.state else ""
 
     @property
     def rests(self) -> bool:
-        """Whether the body stands still."""
+        """True while the body stands still."""
         return self.checked.rests(self.state)
 
     @property
     def refused(self) -> dict[str, int]:
-        """Commands that the gate did not let through, by reason."""
+        """Number of commands that the gate refused, by reason."""
         counters = self._driver_bus.counters
         return {k.removeprefix("refused_"): n for k, n in counters.items() if "refused_" in k}
 
     def command(self, velocity: Velocity) -> None:
-        """One command, as a brain sends it."""
+        """Publish a command as a brain does."""
         fields: dict[str, Any] = msgspec.structs.asdict(velocity)
         self.last = self._bus.publish(self.topic, CmdVel(**fields, source=KIT))
 
     def deliver(self, command: CmdVel | dict[str, Any]) -> None:
-        """A command as it is, header and all."""
+        """Deliver a command with the header that it has."""
         self.network.deliver(self.topic.at(), codec.encode(command))
 
     async def drive(self) -> Velocity:
-        """Have the gate opened and the body moving, to and fro in turn.
-
-        Returns the velocity that is commanded from then on.
-        """
+        """Open the gate and drive, forward and backward in turn; return the commanded velocity."""
         wanted = Velocity(linear_x=self.checked.next_direction() * self.speed)
         for _ in range(ATTEMPTS):
             self.wanted = ZERO
@@ -224,7 +158,7 @@ class GatedDriver(Timeline):
                 why = await self._ask(self.state)
             if self.tick - begin > ENABLE_TICKS:
                 raise Failed(f"the gate did not open: {why}")
-            await self.until(lambda: False, 5)
+            await self.run_for(5)
 
     async def _ask(self, state: RobotState) -> str:
         try:
@@ -239,11 +173,11 @@ class GatedDriver(Timeline):
         return replies[0].text if replies else "the driver does not answer"
 
     def _moves(self, wanted: Velocity) -> bool:
-        told = self.checked.commanded(self.state)[0]
+        commanded = self.checked.commanded(self.state)[0]
         measured = self.state.velocity.linear_x if self.state else 0.0
-        return min(told / wanted.linear_x, measured / wanted.linear_x) >= MOVING
+        return min(commanded / wanted.linear_x, measured / wanted.linear_x) >= MOVING
 
-    def _see(self, _key: str, state: RobotState) -> None:
+    def _on_state(self, _key: str, state: RobotState) -> None:
         self.state, self.tick = state, state.tick
         self.states += 1
         self._bus.time.see(state)
@@ -252,14 +186,14 @@ class GatedDriver(Timeline):
         if self.wanted is not None:
             self.command(self.wanted)
 
-    def _scanned(self, _key: str, scan: LaserScan) -> None:
+    def _on_scan(self, _key: str, scan: LaserScan) -> None:
         self.scan, self.scans = scan, self.scans + 1
 
 
 def stop_ticks(gated: GatedDriver, reaction: int) -> int:
-    """The most ticks from a cause to standstill: until it is seen, the ramp, and the body's own.
+    """Return the ticks within which the body must stand still, `reaction` included.
 
-    What walks has to end its step, and to settle.
+    They are the gate's reaction, its ramp and the body's own lag. A leg ends its step first.
     """
     ramp = gated.speed / gated.robot.max_linear_deceleration / TICK_S
     own = STEP_TICKS if gated.robot.drive_type == "quadruped" else SETTLE_TICKS

@@ -21,7 +21,7 @@ ATTEMPTS = 3  # where the machine may have made a check late
 STARVED_SHARE = 0.1  # of a check's time, waited for a core: then the machine may be to blame
 
 
-class Check(NamedTuple):
+class DriverCheck(NamedTuple):
     """A check of a driver by itself, or of a driver in its process behind the gate."""
 
     name: str
@@ -33,21 +33,23 @@ class Check(NamedTuple):
 
 CUT = "motors at zero {promise}; both + 100; at rest 15 ticks (legs: 30) later"
 ALONE = (
-    Check("opens", "received within 5 s", driver_checks.opens),
-    Check("obeys", "measured speed within 10 % + 0.02", driver_checks.obeys),
-    Check(
+    DriverCheck("opens", "received within 5 s", driver_checks.opens),
+    DriverCheck("obeys", "measured speed within 10 % + 0.02", driver_checks.obeys),
+    DriverCheck(
         "obeys within limits",
         "asked for 10 times its speed: at most its max speeds",
         driver_checks.limits,
     ),
-    Check(
+    DriverCheck(
         "returns what it sent",
         "the body's commands, to 0.02; without a peer, its motion",
         driver_checks.returns,
     ),
-    Check("refuses NaN itself", "all zero, nothing raised", driver_checks.refuses_nan),
-    Check("never raises", "stop and close, in any state, within 2 s", driver_checks.never_raises),
-    Check(
+    DriverCheck("refuses NaN itself", "all zero, nothing raised", driver_checks.refuses_nan),
+    DriverCheck(
+        "never raises", "stop and close, in any state, within 2 s", driver_checks.never_raises
+    ),
+    DriverCheck(
         "stops when it is killed",
         "motors at zero {promise} + 100",
         gate_checks.driver_killed,
@@ -56,37 +58,43 @@ ALONE = (
     ),
 )
 GATED = (
-    Check("reports at its rate", "9 of 10 ticks, 100 ms old; scans to 25 %", gate_checks.reports),
-    Check(
+    DriverCheck(
+        "reports at its rate", "9 of 10 ticks, 100 ms old; scans to 25 %", gate_checks.reports
+    ),
+    DriverCheck(
         "stops on silence",
         "7 ticks, its ramp, 15 of the body (legs: 30)",
         gate_checks.silence,
         repeated=True,
     ),
-    Check("stops on NaN", "zero in 2 ticks, 15 of the body (legs: 30)", gate_checks.not_a_number),
-    Check("stops on disorder", "nothing obeyed; as on silence", gate_checks.disorder),
-    Check("stops on SIGKILL", "of the commander; as on silence", gate_checks.killed, repeated=True),
-    Check(
+    DriverCheck(
+        "stops on NaN", "zero in 2 ticks, 15 of the body (legs: 30)", gate_checks.not_a_number
+    ),
+    DriverCheck("stops on disorder", "nothing obeyed; as on silence", gate_checks.disorder),
+    DriverCheck(
+        "stops on SIGKILL", "of the commander; as on silence", gate_checks.killed, repeated=True
+    ),
+    DriverCheck(
         "stops unplugged",
         f"reported in 100 ms, {CUT}",
         gate_checks.unplugged,
         with_peer=True,
         repeated=True,
     ),
-    Check(
+    DriverCheck(
         "stops on a frozen peer",
         f"reported in 250 ms, {CUT}",
         gate_checks.frozen,
         with_peer=True,
         repeated=True,
     ),
-    Check(
+    DriverCheck(
         "reconnects",
         "by itself in 5 s; still until enabled, then drives",
         gate_checks.reconnects,
         with_peer=True,
     ),
-    Check("command to byte", "p50 at most 1 ms", gate_checks.latency),
+    DriverCheck("command to byte", "p50 at most 1 ms", gate_checks.latency),
 )
 
 
@@ -142,7 +150,7 @@ class SharedGate:
 
 
 async def _judged(
-    check: Check,
+    check: DriverCheck,
     robot: CheckedRobot,
     call: Callable[[], Awaitable[Finding]],
     progress: Callable[[str], None],

@@ -5,8 +5,7 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.base import Driver
@@ -22,22 +21,22 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO, at_rest
 from gigabrain_zenoh.qa.judging import Failed, Skipped
 
-LOOK_S = 0.004
+POLL_S = 0.004
 PATIENCE_S = 10.0  # of wall time without a single tick
 
 
 class Timeline(abc.ABC):
-    """Somebody who lives by a driver's ticks."""
+    """Waits in ticks of a driver."""
 
     def __init__(self) -> None:
         self.tick = 0
 
     @abc.abstractmethod
     def check_alive(self) -> None:
-        """Raise what has ended the driver, if anything has."""
+        """Raise the error that ended the driver, if any."""
 
     async def until(self, condition: Callable[[], object], ticks: int) -> int | None:
-        """Wait for `condition`, at most so many ticks; after how many it held, or None."""
+        """Wait at most `ticks` for `condition`; return how many passed, None if it never held."""
         loop, begin = asyncio.get_running_loop(), self.tick
         seen, seen_s = self.tick, loop.time()
         while not condition():
@@ -48,27 +47,27 @@ class Timeline(abc.ABC):
                 seen, seen_s = self.tick, loop.time()
             elif loop.time() - seen_s > PATIENCE_S:
                 raise Failed(f"no tick for {PATIENCE_S:.0f} s")
-            await asyncio.sleep(LOOK_S)
+            await asyncio.sleep(POLL_S)
         return self.tick - begin
 
     async def firsts(
         self, conditions: Mapping[str, Callable[[], object]], ticks: int
     ) -> dict[str, float]:
-        """After how long each condition first held [ms]; ends with the last, or after `ticks`."""
+        """Return when each condition first held [ms]; ends with the last one, or after `ticks`."""
         loop = asyncio.get_running_loop()
         begin_s, found = loop.time(), dict[str, float]()
 
-        def look() -> bool:
+        def all_held() -> bool:
             for name, holds in conditions.items():
                 if name not in found and holds():
                     found[name] = (loop.time() - begin_s) * 1e3
             return len(found) == len(conditions)
 
-        await self.until(look, ticks)
+        await self.until(all_held, ticks)
         return found
 
     async def run_for(self, ticks: int) -> None:
-        """Let so many ticks pass."""
+        """Let `ticks` pass."""
         await self.until(lambda: False, ticks)
 
 
@@ -79,12 +78,12 @@ WORLD = "arena"
 class CheckedRobot:
     """A robot by name or by its file. Used as `async with`; its emulator runs inside.
 
-    `folder` is for ports and for what the gate remembers.
+    `folder` holds the ports and the gate's saved state.
     """
 
     def __init__(self, name: str, link: LinkName, folder: Path) -> None:
         if link == "real":
-            raise ConfigError("the kit drives at once; it is for the links sim and emulated")
+            raise ConfigError("the kit moves the body at once; choose link sim or emulated")
         self.name, self.link, self.folder = name, link, folder
         self.run = Run(folder=folder, link=link, world=WORLD, emulator=str(folder / "ports"))
         self.file, _, _, _ = catalog.load_link(name, self.run)
@@ -96,60 +95,55 @@ class CheckedRobot:
             self._emulator = await Emulator(self.name, self.run).__aenter__()
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *error: Any) -> None:
         if self._emulator:
-            await self._emulator.__aexit__(kind, error, traceback)
+            await self._emulator.__aexit__(*error)
 
     def driver(self) -> Driver:
-        """A new driver, not opened yet."""
+        """Return a new driver, not opened yet."""
         return catalog.make_driver(self.name, self.run)[1]
 
     def next_direction(self) -> int:
-        """1 or -1, the other one each time: who drives to and fro does not come to a wall."""
+        """Return 1 and -1 in turn, so that the body never comes to a wall."""
         self._way = -self._way
         return self._way
 
     @property
     def has_peer(self) -> bool:
-        """Whether there is somebody at the other end of a line."""
+        """True where an emulated peer is at the other end of the line."""
         return self._emulator is not None
 
     @property
     def peer(self) -> Emulator:
-        """The other end of the line. Raises Skipped where there is none."""
+        """The emulated peer. Raises Skipped where there is none."""
         if self._emulator is None:
             raise Skipped(f"link {self.link} has no peer that could fail")
         return self._emulator
 
     def break_peer(self, words: str) -> None:
-        """Have these faults at the base's end of the line; none for an empty text."""
+        """Set the faults of the base's end of the line; an empty text clears them."""
         self.peer.set(self.peer.parse_faults(f"{BASE} {words}"))
 
     @property
     def promise(self) -> str:
-        """After how long without a command the body's own firmware stops its motors."""
+        """Time after which the firmware stops the motors without a command, with its source."""
         device = type(self._emulator.stations[BASE].device) if self._emulator else Device
         return f"{device.watchdog_ns / 1e6:.0f} ms ({device.promised_in})"
 
     @property
     def promised_ms(self) -> float:
-        """The same as a number [ms]."""
+        """The same time [ms]."""
         return self.peer.stations[BASE].device.watchdog_ns / 1e6
 
     def commanded(self, state: RobotState | None) -> tuple[float, float, float]:
-        """What the motors are told now, as the peer knows it, or as the body moves without one."""
+        """Return the velocity commanded to the motors; without a peer, the measured one."""
         if self._emulator:
             return self._emulator.body.commanded
         velocity = state.velocity if state else None
         return (velocity.linear_x, velocity.linear_y, velocity.angular_z) if velocity else (0, 0, 0)
 
     def rests(self, state: RobotState | None) -> bool:
-        """Whether the body stands still in truth, or as it says where nobody knows the truth."""
+        """Return whether the body stands still: truly, or as measured where there is no peer."""
         if self._emulator is None:
             return state is not None and at_rest(state.velocity)
         speed = self._emulator.body.report().get("true_speed")
@@ -158,7 +152,7 @@ class CheckedRobot:
 
 
 def link_of(driver: Driver) -> Link:
-    """The line of a driver, which it keeps in `link`. Raises Skipped."""
+    """Return the line that a driver keeps in `link`. Raises Skipped."""
     link = getattr(driver, "link", None)
     if not isinstance(link, Link):
         raise Skipped("the driver keeps no Link in `link`: no bytes to look at")
@@ -169,13 +163,13 @@ OPEN_TICKS = 250  # 5 s
 
 
 class DriverSession(Timeline):
-    """Commands `wanted` in every tick and keeps what came of it. Used as `async with`."""
+    """Commands `wanted` in every tick, and keeps the newest state. Used as `async with`."""
 
     def __init__(self, robot: CheckedRobot) -> None:
         super().__init__()
         self.driver = robot.driver()
         self.wanted = ZERO
-        self.sent: Velocity | None = None  # what the driver returned last
+        self.sent: Velocity | None = None  # newest velocity that the driver returned
         self.state: RobotState | None = None
         self._live: asyncio.Task[None] | None = None
 
@@ -184,27 +178,22 @@ class DriverSession(Timeline):
         self._live = asyncio.create_task(self._run(), name="conformance session")
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *error: Any) -> None:
         if self._live:
             self._live.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await self._live
-        await self.driver.__aexit__(kind, error, traceback)
+        await self.driver.__aexit__(*error)
 
     async def connected(self) -> int:
-        """Wait for the body; after how many ticks it was heard."""
+        """Wait until the body is received; return the number of ticks."""
         ticks = await self.until(lambda: self.state and self.state.link.connected, OPEN_TICKS)
         if ticks is None:
-            raise Failed(f"the body was not heard within {OPEN_TICKS} ticks")
+            raise Failed(f"the body was not received within {OPEN_TICKS} ticks")
         return ticks
 
     def check_alive(self) -> None:
-        """Raise what the driver raised."""
+        """Raise the error of the driver, if any."""
         if self._live and self._live.done():
             self._live.result()
             raise Failed("its ticks have ended")

@@ -117,7 +117,7 @@ async def test_a_trace_shows_both_ways_and_leaves_the_log_as_it_was(tmp_path: Pa
         part="base",
         seconds=1.5,
         wanted=Velocity(linear_x=0.1),
-        say=lines.append,
+        print_line=lines.append,
     )
     assert (
         "tx 56 2c 30 2e 31 30 30 2c 30 2e 30 30 30 0a  linear_x 0.1 m/s, angular_z 0 rad/s" in lines
@@ -146,7 +146,7 @@ async def test_a_real_body_is_not_moved_by_a_trace(tmp_path: Path) -> None:
             part="base",
             seconds=1.0,
             wanted=Velocity(linear_x=0.1),
-            say=print,
+            print_line=print,
         )
 
 
@@ -155,7 +155,7 @@ async def test_a_trace_says_whether_anything_was_received(tmp_path: Path) -> Non
     (tmp_path / "robot.yaml").write_text(text)
     name, said = str(tmp_path / "robot.yaml"), list[str]()
     received = await trace_line(
-        name, "real", tmp_path, part="base", seconds=0.1, wanted=Velocity(), say=said.append
+        name, "real", tmp_path, part="base", seconds=0.1, wanted=Velocity(), print_line=said.append
     )
     assert not received
 

@@ -79,7 +79,7 @@ def flood(rate_hz: str, large_bytes: str, endpoint: str) -> None:
 
 
 async def _flood(rate_hz: int, large: bytes, endpoint: str) -> None:
-    transport = await ZenohTransport.open(msgspec.json.decode(endpoint, type=Endpoint))
+    transport = await ZenohTransport.open(_decoded(endpoint))
     bus = Bus(transport, Clock(), FLOODER)
     bus.latest(STATE)
     print("up", flush=True)
@@ -101,7 +101,7 @@ async def _flood(rate_hz: int, large: bytes, endpoint: str) -> None:
 
 def pictures(endpoint: str) -> None:
     """Send 100 pictures of 1 MB and 1000 commands a second, as the e-stop benchmark defines it."""
-    asyncio.run(_pictures(msgspec.json.decode(endpoint, type=Endpoint)))
+    asyncio.run(_pictures(_decoded(endpoint)))
 
 
 async def _pictures(endpoint: Endpoint) -> None:
@@ -116,8 +116,30 @@ async def _pictures(endpoint: Endpoint) -> None:
             bus.publish(CMD_VEL, command)
 
 
+def view(endpoint: str) -> None:
+    """Subscribe to everything, as a viewer does."""
+    asyncio.run(_view(_decoded(endpoint)))
+
+
+async def _view(endpoint: Endpoint) -> None:
+    transport = await ZenohTransport.open(endpoint)
+    for key in ("robot/*", "robot/*/*"):
+        transport.subscribe(key, lambda _key, _payload: None, 16)
+    print("up", flush=True)
+    await asyncio.Event().wait()
+
+
+def endpoint_text(endpoint: Endpoint) -> str:
+    """Return an endpoint in the form that these programs take."""
+    return msgspec.json.encode(endpoint).decode()
+
+
+def _decoded(endpoint: str) -> Endpoint:
+    return msgspec.json.decode(endpoint, type=Endpoint)
+
+
 KINDS: dict[str, Callable[..., None]] = {
-    one.__name__: one for one in (spin, fill, litter, parse, flood, pictures)
+    one.__name__: one for one in (spin, fill, litter, parse, flood, pictures, view)
 }
 
 

@@ -42,21 +42,18 @@ async def kill_recorder(rig: Rig) -> tuple[float, int, float]:
 
     Returns the recording lost [s], earlier messages that cannot be read, and control's delay [ms].
     """
-    await rig.give_up()
     folder, chance = rig.fresh_folder(), random.Random(0)
     recorder = RecorderConfig(folder=str(folder), keep_free_mb=0)
     deployment = msgspec.structs.replace(
         deployment_of(rig.options, "sim"), hosts={"robot": PROCESSES}, recorder=recorder
     )
     lost_s, unreadable, late_ms = 0.0, 0, 0.0
-    async with rig.new(deployment) as robot:
-        await robot.settle()
+    async with rig.own_robot(deployment) as robot:
         arrivals = _watch(robot)
         for _ in range(LONG_KILLS if rig.long else KILLS):
             lost, absent, late = await _killed(robot, folder, arrivals, chance)
             lost_s, late_ms = max(lost_s, lost), max(late_ms, late)
             unreadable += absent
-        await robot.check()
     cuts = LONG_CUTS if rig.long else CUTS
     unreadable += await asyncio.to_thread(_cut, _newest(folder), cuts, chance)
     for disk in (SlowDisk, FullDisk):
@@ -87,7 +84,7 @@ async def _killed(
     newest, start = _newest(folder), probe.state
     pid, killed_ns = robot.kill("recorder"), time.time_ns()
     samples = list(Bag(newest))
-    await robot.restarted("recorder", pid)
+    await robot.until_restarted("recorder", pid)
     ticks = [c.tick for c in probe.commands if c.boot == start.boot and c.tick >= start.tick]
     late_ms = (max(b - a for a, b in itertools.pairwise(ticks)) - 1) * TICK_MS
     if not samples:

@@ -136,14 +136,24 @@ class Rig:
         self, deployment: Deployment, change: Change | None = None,
         backoff: Backoff = NEVER_GIVE_UP, *, keep_stuck: bool = True,
     ) -> RobotUnderTest:  # fmt: skip
-        """Return a test's own robot, not started yet; to be used as `async with`.
-
-        Call `give_up` first, so that two robots do not share the machine.
-        """
+        """Return a robot that is not started yet. To be used as `async with`, after `give_up`."""
         folder = self.fresh_folder()
         robot = RobotUnderTest(deployment, folder, change, backoff, keep_stuck=keep_stuck)
         self._robots.append(robot)
         return robot
+
+    @asynccontextmanager
+    async def own_robot(
+        self, deployment: Deployment, change: Change | None = None,
+        backoff: Backoff = NEVER_GIVE_UP, *, keep_stuck: bool = True, checked: bool = True,
+    ) -> AsyncIterator[RobotUnderTest]:  # fmt: skip
+        """Run a robot for one test alone; contacts and deaths fail the test if `checked`."""
+        await self.give_up()
+        async with self.new(deployment, change, backoff, keep_stuck=keep_stuck) as robot:
+            await robot.settle()
+            yield robot
+            if checked:
+                await robot.check()
 
     def fresh_folder(self) -> Path:
         """Return a new, empty folder."""
@@ -201,12 +211,9 @@ def broken(names: tuple[str, ...], kind: str) -> Change:
 @asynccontextmanager
 async def tampered(rig: Rig, *kinds: str) -> AsyncIterator[RobotUnderTest]:
     """Boot a robot whose driver publishes what `kinds` of `broken_process.TAMPERINGS` say."""
-    await rig.give_up()
     change = broken(("driver",), ",".join(kinds))
-    async with rig.new(deployment_of(rig.options, "sim"), change) as robot:
-        await robot.settle()
+    async with rig.own_robot(deployment_of(rig.options, "sim"), change) as robot:
         yield robot
-        await robot.check()
 
 
 def next_step(robot: RobotUnderTest) -> None:
@@ -283,7 +290,6 @@ async def behind_proxy(
     rig: Rig, *names: str, resume: Resume = "manual"
 ) -> AsyncIterator[tuple[RobotUnderTest, TcpProxy]]:
     """Boot a robot whose named processes reach the others through a proxy."""
-    await rig.give_up()
     deployment = with_free_port(deployment_of(rig.options, "sim", resume))
     async with TcpProxy(address_of(client_endpoint(deployment))) as proxy:
 
@@ -294,19 +300,16 @@ async def behind_proxy(
         def change(specs: list[ProcessSpec]) -> list[ProcessSpec]:
             return [reconfigured(s, through) if s.name in names else s for s in specs]
 
-        async with rig.new(deployment, change) as robot:
-            await robot.settle()
+        async with rig.own_robot(deployment, change) as robot:
             yield robot, proxy
             proxy.set()
-            await robot.check()
 
 
 @asynccontextmanager
 async def proxy_to(robot: RobotUnderTest) -> AsyncIterator[tuple[TcpProxy, Endpoint]]:
     """Put a proxy before a robot's router; yields it and the endpoint of clients behind it."""
-    endpoint = client_endpoint(robot.deployment)
-    async with TcpProxy(address_of(endpoint)) as proxy:
-        yield proxy, structs.replace(endpoint, connect=(proxy.endpoint,))
+    async with TcpProxy(address_of(robot.endpoint)) as proxy:
+        yield proxy, structs.replace(robot.endpoint, connect=(proxy.endpoint,))
 
 
 def address_of(endpoint: Endpoint) -> tuple[str, int]:

@@ -56,14 +56,9 @@ STUCK_NOTICED = Figure("stuck wheel noticed after", "ms")
 
 
 @fault_row(
-    12,
-    "serial",
-    REPORTED.at_most(100),
-    MOTORS_ZERO.at_most(150),
-    BACK.at_most(2),
-    STAYS_STILL,
+    12, "serial", REPORTED.at_most(100), MOTORS_ZERO.at_most(150), BACK.at_most(2), STAYS_STILL,
     DEATHS.at_most(0),
-)
+)  # fmt: skip
 async def serial_unplugged(rig: Rig) -> Measured:
     """Unplug the adapter while it drives, and plug it in again."""
     robot = await rig.robot("serial")
@@ -161,14 +156,9 @@ async def tcp_frozen(rig: Rig) -> Measured:
 
 
 @fault_row(
-    15,
-    "tcp",
-    SAFE["RST"].at_most(100),
-    SAFE["FIN"].at_most(100),
-    SAFE["half-open"].at_most(250),
-    BACK.at_most(1),
-    STAYS_STILL,
-)
+    15, "tcp", SAFE["RST"].at_most(100), SAFE["FIN"].at_most(100),
+    SAFE["half-open"].at_most(250), BACK.at_most(1), STAYS_STILL,
+)  # fmt: skip
 async def tcp_cut(rig: Rig) -> Measured:
     """End the connection with RST, with FIN, or leave it open while nothing comes through."""
     await rig.give_up()

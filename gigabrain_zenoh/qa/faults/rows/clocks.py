@@ -24,7 +24,6 @@ from gigabrain_zenoh.qa.faults.rig.rig import (
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import NODES, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
-from gigabrain_zenoh.runtime.deployment import client_endpoint
 
 BRAIN_HOST = ("perception", "decision")
 JUMP_TICKS, LONG_JUMP_TICKS = 500, 3000  # 10 s, a minute
@@ -53,15 +52,12 @@ async def wall_clock_jumps(rig: Rig) -> Measured:
 
 async def _stops_with(rig: Rig, kind: str, names: tuple[str, ...], ticks: int) -> int:
     """Count unexplained stops of a robot whose processes have such clocks."""
-    await rig.give_up()
-    async with rig.new(deployment_of(rig.options, "sim"), broken(names, kind)) as robot:
-        await robot.settle()
+    async with rig.own_robot(deployment_of(rig.options, "sim"), broken(names, kind)) as robot:
         await robot.drive()
         stopped = await _stops_within(robot, ticks)
         stamps = [s.stamp_ns for s in robot.probe.states]
         if "driver" in names and max(stamps) - min(stamps) < HOUR_NS:
             raise Failed("the driver's clock has not jumped")
-        await robot.check()
     return stopped
 
 
@@ -103,7 +99,7 @@ async def _commands_of_other_times(robot: RobotUnderTest) -> int:
     All else of these commands is right; the good ones, which ask for rest, keep the gate open.
     """
     probe, fresh = robot.probe, 0
-    async with forging(client_endpoint(robot.deployment)) as forger:
+    async with forging(robot.endpoint) as forger:
         for offset in TICK_OFFSETS:
             await robot.drive(0.8)  # so that nothing speaks against moving
             await robot.person.enable(probe.bus.process, take=True)

@@ -34,7 +34,6 @@ from gigabrain_zenoh.qa.faults.rig.rig import (
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import Probe, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
-from gigabrain_zenoh.runtime.deployment import client_endpoint
 from gigabrain_zenoh.safety.step import SafetyInputs, SafetyMemory, step
 
 COMMANDS, LONG_COMMANDS = 20_000, 1_000_000
@@ -161,12 +160,10 @@ async def _flooded(rig: Rig, ticks: int) -> int:
 
     In lockstep, where time waits for the brain, however slow the machine is.
     """
-    await rig.give_up()
     deployment = msgspec.structs.replace(
         deployment_of(rig.options, "sim"), speed=LOCKSTEP, lockstep_timeout_s=LOCKSTEP_TIMEOUT_S
     )
-    async with rig.new(deployment) as robot:
-        await robot.settle()
+    async with rig.own_robot(deployment) as robot:
         probe = robot.probe
         await robot.drive()
         body = probe.bodies.current
@@ -174,7 +171,6 @@ async def _flooded(rig: Rig, ticks: int) -> int:
         start, fastest = probe.state, 1.2 * body.description.max_linear_speed
         await _flood(robot, ticks)
         states = probe.since(start)[1:]
-        await robot.check()
     fast = sum(not abs(s.velocity.linear_x) <= fastest for s in states)
     return fast + len(probe.stops(start))
 
@@ -183,7 +179,7 @@ async def _flood(robot: RobotUnderTest, ticks: int) -> None:
     """Send hostile bytes on each key for `ticks`."""
     probe, start = robot.probe, robot.probe.state
     endless = [(topic, hostile_payloads(topic.type, n)) for n, topic in enumerate(TOPICS)]
-    async with forging(client_endpoint(robot.deployment)) as forger:
+    async with forging(robot.endpoint) as forger:
         while probe.state.tick - start.tick < ticks:
             for topic, payloads in endless:
                 for payload in itertools.islice(payloads, PER_TICK):
@@ -195,7 +191,7 @@ async def _nan_of_commander(robot: RobotUnderTest, speed: float) -> float:
     """Return the time until the gate is at zero after a non-finite command of the brain [ms]."""
     probe = robot.probe
     await robot.drive()
-    async with forging(client_endpoint(robot.deployment)) as forger:
+    async with forging(robot.endpoint) as forger:
         await probe.ticks(1)
         begin, records, time = probe.state.tick, len(robot.records), probe.bus.time
         command = {
@@ -280,7 +276,7 @@ async def _on_robot(robot: RobotUnderTest) -> tuple[float, float]:
     assert body
     await robot.person.enable(probe.bus.process, take=True)
     start = probe.state
-    async with forging(client_endpoint(robot.deployment)) as forger:
+    async with forging(robot.endpoint) as forger:
         for hold in HOLDS:
             await _shake(probe, forger, hold, body.description)
     states = probe.since(start)[1:]

@@ -19,7 +19,6 @@ from gigabrain_zenoh.qa.faults.rig.rig import TRAVEL, Rig
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
-from gigabrain_zenoh.runtime.deployment import client_endpoint
 
 PRESSES, LONG_PRESSES = 100, 300  # from each endpoint
 DRIVES, LONG_DRIVES = 2, 20  # presses while it drives
@@ -91,22 +90,15 @@ def _p99(times_ms: list[float]) -> float:
 
 
 @fault_row(
-    43,
-    "sim",
-    UNLATCHED.at_most(0),
-    LATCHED.at_most(100),
-    ANSWER_P99.at_most(50),
-    ANSWER.at_most(100),
-    ZERO_P99.at_most(50),
-    ZERO_MAX.at_most(100),
-    TRAVEL.at_most(0.06),
+    43, "sim", UNLATCHED.at_most(0), LATCHED.at_most(100), ANSWER_P99.at_most(50),
+    ANSWER.at_most(100), ZERO_P99.at_most(50), ZERO_MAX.at_most(100), TRAVEL.at_most(0.06),
     FROZEN_CONFIRMED.at_most(0),
-)
+)  # fmt: skip
 async def e_stop_pressed(rig: Rig) -> Measured:
     """Press while it drives, stops, stands and is latched; from client, foreign client and CLI."""
     robot = await rig.robot("sim")
     presses, travel_m = PressLog(robot), 0.0
-    endpoint = client_endpoint(robot.deployment)
+    endpoint = robot.endpoint
     transport = await ZenohTransport.open(endpoint)
 
     async def ours() -> None:
@@ -172,7 +164,7 @@ async def _while_stopping(robot: RobotUnderTest, presses: PressLog, press: Press
     pid = robot.kill("control")
     await until(lambda: probe.state.gate.mode != "enabled", "it stops", within_s=5.0)
     await presses.press(press)
-    await robot.restarted("control", pid)
+    await robot.until_restarted("control", pid)
 
 
 async def _confirmed_while_frozen(robot: RobotUnderTest) -> int:

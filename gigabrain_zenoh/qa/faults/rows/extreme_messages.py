@@ -51,7 +51,6 @@ from gigabrain_zenoh.qa.faults.rows.goal_recovery import (
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import moving, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, rss_mb
-from gigabrain_zenoh.runtime.deployment import client_endpoint
 
 # messages that may stop, take or cancel by their purpose: they are undone as a person would
 UNDONE = (
@@ -99,20 +98,15 @@ class MessageEffect(Struct, frozen=True, kw_only=True):
 
 
 @fault_row(
-    49,
-    "",
-    UNRESPONSIVE.at_most(0),
-    MEMORY_GROWN.at_most(GROWN_MB),
-    DRIVES_AGAIN_WALL.at_most(AGAIN_S),
-    AGAIN_AFTER_DEATH.at_most(AGAIN_AFTER_DEATH_S),
-    needs=("nav",),
-    loads=True,
-)
+    49, "", UNRESPONSIVE.at_most(0), MEMORY_GROWN.at_most(GROWN_MB),
+    DRIVES_AGAIN_WALL.at_most(AGAIN_S), AGAIN_AFTER_DEATH.at_most(AGAIN_AFTER_DEATH_S),
+    needs=("nav",), loads=True,
+)  # fmt: skip
 async def extreme_messages(rig: Rig) -> Measured:
     """Send a fixed set of extremes, one after the other, to a robot that drives between goals."""
     needs_navigation()
-    await rig.give_up()
-    async with rig.new(waiting_robot(rig.options)) as robot, sending(robot) as sender:
+    deployment = waiting_robot(rig.options)
+    async with rig.own_robot(deployment, checked=False) as robot, sending(robot) as sender:
         effects = [await sender.effect_of(message) for message in chosen_extremes()]
     harmful = [one for one in effects if one.silent or one.grown_mb > GROWN_MB]
     if harmful:  # a figure would not name them
@@ -135,7 +129,7 @@ def figures(effects: Sequence[MessageEffect]) -> dict[Figure, float]:
 @asynccontextmanager
 async def sending(robot: RobotUnderTest) -> AsyncIterator["ExtremeSender"]:
     """Join the robot's network, and wait until the robot drives."""
-    transport = await ZenohTransport.open(client_endpoint(robot.deployment))
+    transport = await ZenohTransport.open(robot.endpoint)
     try:
         sender = ExtremeSender(robot, transport)
         await sender.begin()

@@ -38,20 +38,13 @@ FOUND = Figure("found after", "s")
 
 
 @fault_row(
-    46,
-    "",
-    TRAVEL.at_most(0.15),
-    MOVED_WITHOUT.at_most(0.005),
-    GOES_ON.at_most(5),
-    GIVEN_UP.at_most(0),
-    OFF_GOAL.at_most(0.2),
-    needs=("nav",),
-)
+    46, "", TRAVEL.at_most(0.15), MOVED_WITHOUT.at_most(0.005), GOES_ON.at_most(5),
+    GIVEN_UP.at_most(0), OFF_GOAL.at_most(0.2), needs=("nav",),
+)  # fmt: skip
 async def goal_recovery(rig: Rig) -> Measured:
     """Kill decision, then perception: the robot stops, and then goes on to its goal by itself."""
     needs_navigation()
-    await rig.give_up()
-    async with rig.new(waiting_robot(rig.options)) as robot:
+    async with rig.own_robot(waiting_robot(rig.options)) as robot:
         tasks, truth = Tasks(robot.probe.bus), await robot.truth()
         place = max(PLACES, key=lambda one: _distance(truth, one))
         task = await tasks.go_to(*in_map(truth, place))
@@ -62,7 +55,6 @@ async def goal_recovery(rig: Rig) -> Measured:
             ended = await tasks.result(task)
         await robot.probe.at_rest()
         off_m = _distance(await robot.truth(), place)
-        await robot.check()
     return {**worst, GIVEN_UP: float(ended.state != "succeeded"), OFF_GOAL: off_m}
 
 
@@ -72,13 +64,11 @@ async def goal_recovery(rig: Rig) -> Measured:
 async def map_recovery(rig: Rig) -> Measured:
     """Kill perception while the robot explores: the map made so far must be restored."""
     needs_navigation()
-    await rig.give_up()
     options = replace(rig.options, behaviour="navigate", world="house")
     worst = dict[Figure, float]()
-    async with rig.new(deployment_of(options, "auto")) as robot:
+    async with rig.own_robot(deployment_of(options, "auto")) as robot:
         for _ in range(KILLS if rig.long else 2):
             worst = worse_of(worst, await _map_death(robot))
-        await robot.check()
     return worst
 
 
@@ -96,7 +86,7 @@ async def _map_death(robot: RobotUnderTest) -> Measured:
     robot.kill("perception")
     await probe.at_rest()
     poses.clear()
-    await robot.restarted("perception", pid)
+    await robot.until_restarted("perception", pid)
     await until(lambda: poses and poses[-1].localized, "it is localized")
     first, found = poses[0].basis, next(pose.basis for pose in poses if pose.localized)
     await until(lambda: _under_way(probe.state), "it drives again")
@@ -145,7 +135,7 @@ async def _death(robot: RobotUnderTest, victim: str, start: RobotState, far_m: f
     robot.kill(victim)
     await probe.at_rest()
     rest_m = await robot.travelled()
-    await robot.restarted(victim, pid)
+    await robot.until_restarted(victim, pid)
     back, back_m = probe.state.tick, await robot.travelled()
     await until(under_way, f"it goes on after the death of {victim}")
     return {

@@ -10,7 +10,6 @@ from collections.abc import Awaitable, Callable, Iterable
 from contextlib import AsyncExitStack
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from gigabrain_schemas.audit import AuditRequest
@@ -26,7 +25,6 @@ from gigabrain_zenoh.qa.faults.rows.estop import LATCHED, ZERO_P99, PressLog
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest, open_files, rss_mb
-from gigabrain_zenoh.runtime.deployment import client_endpoint
 
 SPINNERS_PER_CORE = 4
 OTHER_LOADS = ("fill", "litter", "parse")
@@ -87,14 +85,9 @@ class TickLateness:
 
 
 @fault_row(
-    37,
-    "sim",
-    TICK_LATE.at_most(40),
-    BRAKES.at_most(250),
-    ZERO.at_most(610),
-    MISSED_ESTOPS.at_most(0),
-    loads=True,
-)
+    37, "sim", TICK_LATE.at_most(40), BRAKES.at_most(250), ZERO.at_most(610),
+    MISSED_ESTOPS.at_most(0), loads=True,
+)  # fmt: skip
 async def busy_machine(rig: Rig) -> Measured:
     """Run four busy processes per core, and others that fill memory, make garbage and parse."""
     robot = await rig.robot("sim")
@@ -109,7 +102,7 @@ async def busy_machine(rig: Rig) -> Measured:
         while not stops or asyncio.get_running_loop().time() < end_s:
             pid = robot.pid("decision")
             stops.append(await stop_by(robot, lambda: robot.kill("decision"), "decision"))
-            await robot.restarted("decision", pid)
+            await robot.until_restarted("decision", pid)
             missed += await _missed(robot, ESTOPS)
         late.close()
     return {
@@ -137,19 +130,13 @@ async def _missed(robot: RobotUnderTest, count: int) -> int:
 
 
 @fault_row(
-    38,
-    "sim",
-    DRIVER_CPU.at_most(50),
-    MEMORY_GROWN.at_most(50),
-    LATCHED.at_most(100),
-    ESTOP_P99.at_most(50),
-    UNNAMED.at_most(0),
-    loads=True,
-)
+    38, "sim", DRIVER_CPU.at_most(50), MEMORY_GROWN.at_most(50), LATCHED.at_most(100),
+    ESTOP_P99.at_most(50), UNNAMED.at_most(0), loads=True,
+)  # fmt: skip
 async def flood(rig: Rig) -> Measured:
     """Send 2 kHz of commands, queries and 1 MB messages; 10 kHz and 10 MB in the long form."""
     robot = await rig.robot("sim")
-    endpoint = msgspec.json.encode(client_endpoint(robot.deployment)).decode()
+    endpoint = cpu_load.endpoint_text(robot.endpoint)
     pid, seconds = robot.pid("driver"), LONG_FLOODED_S if rig.long else FLOODED_S
     rate_hz = LONG_RATE_HZ if rig.long else RATE_HZ
     presses = PressLog(robot)
@@ -197,13 +184,9 @@ async def _in_audit_log(robot: RobotUnderTest, source: str) -> bool:
 
 
 @fault_row(
-    39,
-    "sim",
-    STOPS.at_most(0),
-    FILES_GROWN.at_most(0),
-    LOST.at_most(0),
+    39, "sim", STOPS.at_most(0), FILES_GROWN.at_most(0), LOST.at_most(0),
     *(figure.at_most(1) for figure in GROWS.values()),
-)
+)  # fmt: skip
 async def soak(rig: Rig) -> Measured:
     """Drive for twenty seconds; in the long form for 70 min with deaths, e-stops and viewers."""
     robot = await rig.robot("sim")
@@ -285,7 +268,7 @@ class SoakEvents:
 
     async def _death(self) -> None:
         victim = self._chance.choice(VICTIMS)
-        await self._robot.restarted(victim, self._robot.kill(victim))
+        await self._robot.kill_and_restart(victim)
         self._pids[victim] = self._robot.pid(victim)
 
     async def _estop(self) -> None:
@@ -293,13 +276,13 @@ class SoakEvents:
         await self._robot.probe.at_rest()
 
     async def _viewer(self) -> None:
-        viewer = await ZenohTransport.open(client_endpoint(self._robot.deployment))
+        viewer = await ZenohTransport.open(self._robot.endpoint)
         viewer.subscribe("robot/**", lambda key, payload: None, 16)
         await asyncio.sleep(VIEWED_S)
         await viewer.close()
 
     async def _recording(self) -> None:
-        endpoint = client_endpoint(self._robot.deployment).connect[0]
+        endpoint = self._robot.endpoint.connect[0]
         file = self._folder / f"{self._chance.getrandbits(32):08x}.mcap"
         command = (*RECORD, "--connect", endpoint, "-o", str(file))
         process = await asyncio.create_subprocess_exec(sys.executable, *command)

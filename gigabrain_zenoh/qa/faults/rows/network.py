@@ -6,13 +6,10 @@ import functools
 import itertools
 import random
 import signal
-import sys
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-
-import msgspec
 
 from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.body import RobotState
@@ -25,6 +22,8 @@ from gigabrain_zenoh.client.robot import connect
 from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.host.bounded import percentile
+from gigabrain_zenoh.qa.faults.rig import cpu_load
+from gigabrain_zenoh.qa.faults.rig.cpu_load import endpoint_text
 from gigabrain_zenoh.qa.faults.rig.rig import (
     BRAKES,
     HOLE,
@@ -47,7 +46,7 @@ from gigabrain_zenoh.qa.probe import PATIENCE_S, until
 from gigabrain_zenoh.qa.proxy.chaos import Chaos
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
-from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
+from gigabrain_zenoh.runtime.deployment import Deployment, with_free_port
 from gigabrain_zenoh.safety.health import HALF_SPEED
 from gigabrain_zenoh.security.acl import Role
 from gigabrain_zenoh.security.authority import issue, new_fleet
@@ -91,18 +90,6 @@ HEALTH_TICKS = 75  # until the driver has published its counters
 FIRST_EXECUTED = Figure("commands of the first executed")
 PUT_P99 = Figure("put p99", "ms", wall=True)
 COPY_EFFECTS = Figure("effects beyond the first copy")
-VIEWER = """
-import asyncio, signal, sys, msgspec
-from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
-async def main():
-    transport = await ZenohTransport.open(msgspec.json.decode(sys.argv[1], type=Endpoint))
-    for key in ("robot/*", "robot/*/*"):
-        transport.subscribe(key, lambda key, payload: None, 16)
-    print("up", flush=True)
-    await asyncio.sleep(3600)
-asyncio.run(main())
-"""
 
 
 @fault_row(18, "sim", BRAKES.at_most(120), SESSION.at_most(3), STAYS_STILL)
@@ -113,7 +100,7 @@ async def router_killed(rig: Rig) -> Measured:
     await robot.drive()
     start, records = probe.state, len(robot.records)
     pid = robot.kill("router")
-    await robot.restarted("router", pid)
+    await robot.until_restarted("router", pid)
     back_s = loop.time()
     await until(lambda: probe.state.tick > start.tick + NO_GAP_TICKS, "the robot is received again")
     session_s = loop.time() - back_s
@@ -305,7 +292,7 @@ def make_fleet(folder: Path) -> Path:
 async def two_commanders_across_a_partition(rig: Rig) -> Measured:
     """Cut the first commander off while it drives, let the second take over, heal the network."""
     robot = await rig.robot("sim")
-    probe, near = robot.probe, client_endpoint(robot.deployment)
+    probe, near = robot.probe, robot.endpoint
     await robot.drive()  # all is well, and a client may take over
     async with (
         proxy_to(robot) as (proxy, far),
@@ -342,7 +329,11 @@ async def viewer_frozen(rig: Rig) -> Measured:
     """
     robot = await rig.robot("sim")
     calm_ms, _ = await _filmed(robot, None)
-    async with _frozen_viewer(client_endpoint(robot.deployment)):
+    async with cpu_load.running("view", endpoint_text(robot.endpoint)) as viewer:
+        assert viewer.stdout
+        await viewer.stdout.readline()
+        await asyncio.sleep(0.2)  # until the others know its subscriptions
+        viewer.send_signal(signal.SIGSTOP)
         period_ms, puts_ms = await _filmed(robot, PICTURE)
     return {
         PERIOD_ADDED: period_ms - calm_ms,
@@ -364,24 +355,6 @@ async def _filmed(robot: RobotUnderTest, picture: Image | None) -> tuple[float, 
     return probe.control_period_ms(start), puts_ms
 
 
-@asynccontextmanager
-async def _frozen_viewer(endpoint: Endpoint) -> AsyncIterator[None]:
-    """Run a process that has subscribed to everything and is frozen."""
-    viewer = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-P", "-c", VIEWER, msgspec.json.encode(endpoint).decode()),
-        stdout=asyncio.subprocess.PIPE,
-    )
-    try:
-        assert viewer.stdout
-        await viewer.stdout.readline()
-        await asyncio.sleep(0.2)  # until the others know its subscriptions
-        viewer.send_signal(signal.SIGSTOP)
-        yield
-    finally:
-        viewer.kill()
-        await viewer.wait()
-
-
 @fault_row(25, "sim", COPY_EFFECTS.at_most(0))
 async def duplicated_and_reordered(rig: Rig) -> Measured:
     """Send everything that drives the robot twice more, in another order."""
@@ -389,7 +362,7 @@ async def duplicated_and_reordered(rig: Rig) -> Measured:
     probe = robot.probe
     await robot.drive()
     before, start = await _refused(robot), probe.state
-    async with _copies(client_endpoint(robot.deployment)) as sent:
+    async with _copies(robot.endpoint) as sent:
         await probe.ticks(WATCH_TICKS)
     refused = await _refused(robot) - before
     copies = sent.count(CMD_VEL.key)

@@ -33,7 +33,6 @@ from gigabrain_zenoh.qa.faults.rig.rig import (
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, Skipped, Stage, fault_row, worse_of
 from gigabrain_zenoh.qa.probe import moving, until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
-from gigabrain_zenoh.runtime.deployment import client_endpoint
 from gigabrain_zenoh.runtime.managed_process import Backoff
 
 FROZEN_TICKS, LONG_FROZEN_TICKS = 250, 3000  # 5 s, 60 s
@@ -112,14 +111,9 @@ async def perception_killed_or_frozen(rig: Rig) -> Measured:
 
 
 @fault_row(
-    6,
-    "sim",
-    BRAKES.at_most(250),
-    ZERO.at_most(610),
-    TRAVEL.at_most(0.1),
-    STAYS_STILL,
+    6, "sim", BRAKES.at_most(250), ZERO.at_most(610), TRAVEL.at_most(0.1), STAYS_STILL,
     ENABLED_WITHOUT.at_most(0),
-)
+)  # fmt: skip
 async def safety_killed_or_frozen(rig: Rig) -> Measured:
     """Kill and freeze safety: the gate must not open without it."""
     robot = await rig.robot("sim")
@@ -133,38 +127,29 @@ async def safety_killed_or_frozen(rig: Rig) -> Measured:
 @fault_row(9, "", BRAKES.at_most(300), ZERO.at_most(660), TRAVEL.at_most(0.15))
 async def decision_loop_hangs(rig: Rig) -> Measured:
     """Hang decision's planning while it repeats its last intent 50 times a second."""
-    await rig.give_up()
     change = broken(("decision",), "hanging")
-    async with rig.new(deployment_of(rig.options, "sim"), change) as robot:
+    async with rig.own_robot(deployment_of(rig.options, "sim"), change) as robot:
         stop = await stop_by(robot, lambda: robot.signal("decision", signal.SIGUSR1))
-        await robot.check()
     return stop.figures()
 
 
 @fault_row(48, "", DRIVES_AGAIN_WALL.at_most(12), NONE_STALE)
 async def frozen_until_restarted(rig: Rig) -> Measured:
     """Send SIGSTOP without SIGCONT: the supervisor kills and restarts the process."""
-    await rig.give_up()
     longest_s, stale = 0.0, 0.0
     for stage, victims in NEVER_THAWED.items():
         deployment = deployment_of(rig.options, stage, "auto")
-        async with rig.new(deployment, backoff=Backoff(), keep_stuck=False) as robot:
-            await robot.settle()
+        async with rig.own_robot(deployment, backoff=Backoff(), keep_stuck=False) as robot:
             for victim in victims:
                 longest_s = max(longest_s, await _restart_s(robot, victim))
             stale += float((await robot.probe.truth())["stale_commands_executed"])
-            await robot.check()
     return {DRIVES_AGAIN_WALL: longest_s, STALE: stale}
 
 
 @fault_row(
-    32,
-    "",
-    RECORDING_LOST.at_most(0.5),
-    UNREADABLE.at_most(0),
-    CONTROL_DELAYED.at_most(20),
+    32, "", RECORDING_LOST.at_most(0.5), UNREADABLE.at_most(0), CONTROL_DELAYED.at_most(20),
     needs=("recorder",),
-)
+)  # fmt: skip
 async def recorder_killed(rig: Rig) -> Measured:
     """Kill the recorder, and treat its files and its disk badly, where a recorder is installed."""
     try:
@@ -182,7 +167,7 @@ async def _restart_s(robot: RobotUnderTest, victim: str) -> float:
     pid = robot.pid(victim)
     robot.freeze(victim)
     frozen_s = loop.time()
-    await robot.restarted(victim, pid)
+    await robot.until_restarted(victim, pid)
     await robot.release()
     probe = robot.probe
     await until(
@@ -195,7 +180,7 @@ async def _restart_s(robot: RobotUnderTest, victim: str) -> float:
 async def _killed(robot: RobotUnderTest, victim: str) -> Measured:
     pid = robot.pid(victim)
     stop = await stop_by(robot, lambda: robot.kill(victim), victim)
-    await robot.restarted(victim, pid)
+    await robot.until_restarted(victim, pid)
     await robot.probe.ticks(RESTED_TICKS)
     return _figures(stop, await robot.travelled() - stop.distance_m)
 
@@ -220,14 +205,9 @@ def _figures(stop: Stop, again_m: float) -> Measured:
 
 
 @fault_row(
-    7,
-    "line",
-    MOTORS_ZERO.at_most(150),
-    NOT_LATCHED.at_most(0),
-    ENABLED_LATCHED.at_most(0),
-    OLD_OBEYED.at_most(0),
-    STAYS_STILL,
-)
+    7, "line", MOTORS_ZERO.at_most(150), NOT_LATCHED.at_most(0), ENABLED_LATCHED.at_most(0),
+    OLD_OBEYED.at_most(0), STAYS_STILL,
+)  # fmt: skip
 async def gate_killed(rig: Rig) -> Measured:
     """Kill the gate, which is in the driver's process: it starts latched, with a new boot."""
     robot = await rig.robot("line")
@@ -242,7 +222,7 @@ async def gate_killed(rig: Rig) -> Measured:
     await robot.release()
     await robot.person.enable(probe.bus.process)
     before_s = float((await robot.truth())["motors_moved_s"])
-    async with forging(client_endpoint(robot.deployment)) as forger:
+    async with forging(robot.endpoint) as forger:
         for number in range(OLD_COMMANDS):
             tick = probe.state.tick
             command = forged_command(
@@ -276,7 +256,7 @@ async def _without_driver(robot: RobotUnderTest) -> tuple[float, float]:
     pid, before = robot.pid("driver"), await _prompt_truth(robot)
     robot.kill("driver")
     after = await robot.after_simulated(AFTER_S)
-    await robot.restarted("driver", pid)
+    await robot.until_restarted("driver", pid)
     zero_s = float(after["motors_moved_s"]) - float(before["sim_seconds"])
     return zero_s * 1e3, float(after["distance_m"]) - float(before["distance_m"])
 
@@ -320,7 +300,7 @@ async def _group_killed(robot: RobotUnderTest, victims: tuple[str, ...]) -> Meas
     for name in victims:
         robot.kill(name)
     for name, pid in pids.items():
-        await robot.restarted(name, pid)
+        await robot.until_restarted(name, pid)
     newest = probe.states[-1]
     await until(lambda: probe.state is not newest, "states go on")
     await until(lambda: probe.state.gate.mode in ("idle", "latched"), "the gate is shut")
@@ -334,17 +314,13 @@ async def _group_killed(robot: RobotUnderTest, victims: tuple[str, ...]) -> Meas
 
 
 @fault_row(
-    10,
-    "",
-    STARTS.at_most(5),
-    WAIT_TOO_SHORT.at_most(0),
-    ENABLED_WITHOUT.at_most(0),
+    10, "", STARTS.at_most(5), WAIT_TOO_SHORT.at_most(0), ENABLED_WITHOUT.at_most(0),
     CPU_ADDED.at_most(5),
-)
+)  # fmt: skip
 async def crash_loop(rig: Rig) -> Measured:
     """Kill a process at each start: it is given up after five, and the gate stays shut."""
-    await rig.give_up()
-    async with rig.new(deployment_of(rig.options, "sim"), backoff=Backoff()) as robot:
+    deployment = deployment_of(rig.options, "sim")
+    async with rig.own_robot(deployment, backoff=Backoff(), checked=False) as robot:
         await robot.drive()
         usual = await _cpu_percent()
         births, deaths = await _kill_all_starts(robot, "perception")
@@ -407,9 +383,8 @@ async def _recovery_s(robot: RobotUnderTest, victim: str) -> float:
     """Return the time from the victim's return until the brain drives, in the robot's time [s]."""
     probe = robot.probe
     await robot.drive(ROOM_M)
-    pid, start = robot.pid(victim), probe.state
-    robot.kill(victim)
-    await robot.restarted(victim, pid)
+    start = probe.state
+    await robot.kill_and_restart(victim)
     back = probe.state
 
     def drives_on() -> bool:

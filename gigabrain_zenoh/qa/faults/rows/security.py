@@ -71,26 +71,20 @@ ROUTER_DEATHS = Figure("router deaths")
 
 
 @fault_row(
-    40,
-    "",
-    WHEELS_MOVED.at_most(0),
-    DENIALS_UNSEEN.at_most(0),
-    OPEN_PORTS.at_most(0),
+    40, "", WHEELS_MOVED.at_most(0), DENIALS_UNSEEN.at_most(0), OPEN_PORTS.at_most(0),
     needs=("keys",),
-)
+)  # fmt: skip
 async def unauthorised_publisher(rig: Rig) -> Measured:
     """Forge commands as a viewer and as a brain, and knock twice without the right keys.
 
     An operator holds the body still; the forged commands are in its name, and have all else that
     the gate asks for.
     """
-    await rig.give_up()
     folder().mkdir(mode=0o700, parents=True, exist_ok=True)  # for the router's Unix socket
     fleet = make_fleet(rig.fresh_folder() / "fleet")
     other = make_fleet(rig.fresh_folder() / "fleet")
     deployment = replace(deployment_of(rig.options, "sim"), keys=str(fleet))
-    async with rig.new(deployment) as robot:
-        await robot.settle()
+    async with rig.own_robot(deployment, checked=False) as robot:
         await robot.drive()
         await robot.person.enable(take=True)
         await robot.person.set_base_velocity(0.0)
@@ -168,11 +162,11 @@ def _open_ports(robot: RobotUnderTest) -> set[int]:
 async def replayed_traffic(rig: Rig) -> Measured:
     """Record all traffic while an operator drives; send it again at once, and after a restart."""
     robot = await rig.robot("sim")
-    endpoint = client_endpoint(robot.deployment)
+    endpoint = robot.endpoint
     traffic = await _recorded(robot, endpoint, LONG_RECORD_S if rig.long else RECORD_S)
     accepted = await _replayed(robot, endpoint, traffic)
-    boot, pid = robot.probe.state.boot, robot.kill("driver")
-    await robot.restarted("driver", pid)
+    boot = robot.probe.state.boot
+    await robot.kill_and_restart("driver")
     await until(lambda: robot.probe.state.boot != boot, "the driver's new boot")
     accepted += await _replayed(robot, endpoint, traffic)
     refused = await _refused_estops(robot, endpoint)
@@ -242,7 +236,7 @@ async def _refused_estops(robot: RobotUnderTest, endpoint: Endpoint) -> int:
 async def idle_and_random_connections(rig: Rig) -> Measured:
     """Open idle sockets to the router's port, and send it noise and other protocols."""
     robot = await rig.robot("sim")
-    endpoint = client_endpoint(robot.deployment)
+    endpoint = robot.endpoint
     host, port = address_of(endpoint)
     pid, loop = robot.pid("router"), asyncio.get_running_loop()
     await robot.drive()

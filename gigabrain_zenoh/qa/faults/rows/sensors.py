@@ -325,13 +325,9 @@ def _turning(
 
 
 @fault_row(
-    30,
-    "",
-    CONTACTS.at_most(0),
-    GAP_MISSING.at_most(0),
-    FALSE_STOPS.at_most(1),
+    30, "", CONTACTS.at_most(0), GAP_MISSING.at_most(0), FALSE_STOPS.at_most(1),
     RESUMES.at_most(0.3),
-)
+)  # fmt: skip
 async def obstacle_at_stopping_distance(rig: Rig) -> Measured:
     """Have a pillar appear where the body must begin to stop, and vanish again."""
     contacts, missing_m, resumed_s = 0, 0.0, 0.0
