@@ -1,4 +1,4 @@
-"""A robot's nodes in this process, in fake time, with a body that is computed elsewhere."""
+"""A robot's nodes in this process, in fake time, with an external plant as its body."""
 
 import asyncio
 import functools
@@ -23,11 +23,11 @@ from gigabrain_zenoh.runtime.replay import Node
 Q = TypeVar("Q", bound=Message)
 R = TypeVar("R", bound=Message)
 
-ANSWER_S = 30.0  # of wall time: an answer may take work beside the loop
+ANSWER_S = 30.0  # of wall time: an answer may need work in a thread
 
 
 class InMemoryRobot:
-    """Nodes on one network in this process; the last brings the ticks. Used as `async with`."""
+    """Nodes on one network in memory; the last one makes the ticks. Used as `async with`."""
 
     def __init__(self, nodes: Mapping[str, Node]) -> None:
         self._nodes = nodes
@@ -54,13 +54,13 @@ class InMemoryRobot:
         await self.operator.close()
 
     async def tick(self) -> None:
-        """Let 20 ms pass. Raises whatever has ended a node."""
+        """Let 20 ms pass. Raises the error that ended a node."""
         await self._clock.advance(TICK_NS)
         self._network.sent.clear()
         self._check()
 
     async def ask(self, service: Service[Q, R], request: Q) -> list[R]:
-        """What the nodes answer, while time stands still. Raises Refused, with why."""
+        """Ask the nodes while time stands still. Raises Refused."""
         return await self.operator.ask(service, request, timeout_s=ANSWER_S)
 
     def _check(self) -> None:
@@ -70,40 +70,40 @@ class InMemoryRobot:
 
 
 class ExternalPlant(Protocol):
-    """Whoever works it out."""
+    """A body that is computed outside the driver."""
 
     def advance(self, velocity: Velocity) -> None:
-        """Go on by 20 ms."""
+        """Advance by 20 ms."""
         ...
 
     def state(self) -> RobotState:
-        """What the body measures of itself now."""
+        """Return the body's state, as measured."""
         ...
 
     def scan(self) -> LaserScan | None:
-        """What its lidar sees now; None in ticks without a scan."""
+        """Return the lidar's scan; None in ticks without one."""
         ...
 
 
 class ExternalPlantDriver(Driver):
-    """Hands on what the gate lets through, a tick at a time."""
+    """Drives an external plant, a tick at a time."""
 
     def __init__(self, robot: RobotFile, plant: ExternalPlant) -> None:
         super().__init__(robot, None, Run(folder=Path()))
         self._plant, self._velocity = plant, ZERO
 
     async def open(self) -> None:
-        """There is nothing to connect to."""
+        """Do nothing; there is nothing to connect to."""
 
     async def close(self) -> None:
-        """There is nothing to let go of."""
+        """Do nothing; there is nothing to close."""
 
     async def stop(self) -> None:
-        """Be told zero from the next tick on."""
+        """Command zero from the next tick on."""
         self._velocity = ZERO
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
-        """By the clock; a scan comes between two states, as a lidar keeps no step with them."""
+        """Yield ticks by the clock; scans come between two states, as from a real lidar."""
         async for passed in super().ticks(clock):
             for _ in range(passed):
                 self._plant.advance(self._velocity)
@@ -116,17 +116,17 @@ class ExternalPlantDriver(Driver):
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """From the next tick on."""
+        """Command a velocity from the next tick on."""
         self._velocity = self.bounded(linear_x, linear_y, angular_z)
         return self._velocity
 
     async def read_state(self) -> RobotState:
-        """As worked out."""
+        """Return the plant's state."""
         return self._plant.state()
 
 
 def node_of(body: BodyDescription, plant: ExternalPlant, folder: str) -> Node:
-    """The driver's process for a body; what latches its gate is kept in `folder`."""
+    """Return the driver's process of a body; `folder` holds the gate's saved state."""
     names = BodyDescription.__struct_fields__
     robot = RobotFile(summary="", **{name: getattr(body, name) for name in names})
     config = DriverConfig(body=body.robot_type, resume="auto", state_dir=folder)

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from gigabrain_schemas.arrays import hits
 from gigabrain_schemas.base import TICK_S, Velocity
 from gigabrain_schemas.body import GateStatus, RobotState
-from gigabrain_schemas.brain import CmdVel, Intent, PoseInMap, WorldModel
+from gigabrain_schemas.brain import CmdVel, Intent, WorldModel
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_schemas.tasks import Goal, GoalRequest
 from gigabrain_schemas.topics import GOAL, MAP, POSE, STATE
@@ -66,17 +66,17 @@ class BarnResult(Struct, frozen=True, kw_only=True):
     trials: tuple[BarnTrial, ...]
 
     def share(self, result: str) -> float:
-        """Of the trials, how many ended so."""
+        """Return the share of the trials with this result."""
         return sum(one.result == result for one in self.trials) / len(self.trials)
 
     @property
     def score(self) -> float:
-        """By the rules of 2024 and later, 0.5 at most."""
+        """The mean score by the rules of 2024 and later, 0.5 at most."""
         return statistics.fmean(one.score for one in self.trials)
 
     @property
     def seconds(self) -> float | None:
-        """Mean time of those that arrived, unclipped."""
+        """Mean time of the successes, unclipped [s]."""
         times = [one.seconds for one in self.trials if one.result == "success"]
         return statistics.fmean(times) if times else None
 
@@ -87,7 +87,7 @@ class BarnResult(Struct, frozen=True, kw_only=True):
         return min(least), statistics.median(least)
 
     def cycle_ms(self, share: float) -> float | None:
-        """Percentile of what planning took."""
+        """Return a percentile of the planning times [ms]."""
         return percentile(sorted(ms for one in self.trials for ms in one.cycles_ms), share)
 
 
@@ -101,13 +101,13 @@ def measure_barn(
     *,
     nodes: bool,
 ) -> BarnResult:
-    """Drive `trials` times in each of `worlds`, in so many processes.
+    """Drive `trials` times in each of `worlds`, in `jobs` processes.
 
-    With the robot's own `nodes`, or with the functions that they call.
+    With the robot's own `nodes`, or only with the functions that they call.
     """
     drive = drive_nodes if nodes else drive_functions
     done = []
-    with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_get_ready) as pool:
+    with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_warm_up) as pool:
         waiting = [
             pool.submit(drive, world, trial, PLANTS[plant], samples)
             for world in worlds
@@ -120,8 +120,8 @@ def measure_barn(
     return BarnResult(plant=PLANTS[plant], samples=samples, trials=tuple(done))
 
 
-def _get_ready() -> None:
-    """As a robot's process before it drives: all is compiled, and what is there no garbage."""
+def _warm_up() -> None:
+    """Compile and freeze existing objects, as a robot's process does before it drives."""
     local_planner.warm_up(JACKAL)
     gc.collect()
     gc.freeze()
@@ -130,36 +130,25 @@ def _get_ready() -> None:
 WAKING_TICKS = 500  # until the gate is open and the robot knows where it is
 
 
-class WatchedCourse:
-    """A course, looked at in each tick. It stands still once the trial is over."""
-
-    def __init__(self, course: BarnCourse) -> None:
-        self._course = course
+class JudgedCourse(BarnCourse):
+    """A course that judges each tick. It stands still once the trial is over."""
 
     def advance(self, velocity: Velocity) -> None:
-        """See Plant in gigabrain_zenoh.qa.in_memory_robot."""
-        if not self._course.result:
-            self._course.advance(velocity)
-            self._course.look()
-
-    def state(self) -> RobotState:
-        """See Plant."""
-        return self._course.state()
-
-    def scan(self) -> LaserScan | None:
-        """See Plant."""
-        return self._course.scan()
+        """Drive for a tick, and judge the trial."""
+        if not self.result:
+            super().advance(velocity)
+            self.judge()
 
 
 def drive_nodes(world: BarnWorld, trial: int, conditions: Conditions, samples: int) -> BarnTrial:
-    """One trial in one world; the same arguments give the same result."""
+    """Drive one trial with the nodes; equal arguments give equal results."""
     with tempfile.TemporaryDirectory(prefix="barn-") as folder:
-        return asyncio.run(_drive(BarnCourse(world, trial, conditions), samples, folder))
+        return asyncio.run(_drive(JudgedCourse(world, trial, conditions), samples, folder))
 
 
-async def _drive(course: BarnCourse, samples: int, folder: str) -> BarnTrial:
-    async with InMemoryRobot(_nodes(WatchedCourse(course), samples, folder)) as robot:
-        await _awake(robot)
+async def _drive(course: JudgedCourse, samples: int, folder: str) -> BarnTrial:
+    async with InMemoryRobot(_nodes(course, samples, folder)) as robot:
+        await _until_awake(robot)
         goal = GoalRequest(x=course.goal.x, y=course.goal.y, source="bench")
         (reply,) = await robot.ask(GOAL, goal)
         if not reply.ok:
@@ -169,8 +158,8 @@ async def _drive(course: BarnCourse, samples: int, folder: str) -> BarnTrial:
     return course.ended()
 
 
-def _nodes(plant: WatchedCourse, samples: int, folder: str) -> dict[str, Node]:
-    """With the settings of a robot that drives where nobody has been."""
+def _nodes(course: JudgedCourse, samples: int, folder: str) -> dict[str, Node]:
+    """Return the nodes of a robot that may drive through unknown space."""
     anywhere = DecisionConfig(
         behaviour="navigate", settings={"unknown_space": "allow", "samples": samples}
     )
@@ -179,29 +168,25 @@ def _nodes(plant: WatchedCourse, samples: int, folder: str) -> dict[str, Node]:
         "decision": functools.partial(decision.run, anywhere),
         "control": control.run,
         "safety": _safety,
-        "driver": node_of(JACKAL, plant, folder),
+        "driver": node_of(JACKAL, course, folder),
     }
 
 
 async def _safety(bus: Bus, ready: Callable[[], None]) -> None:
-    """No outcome may depend on how busy this computer is."""
+    """Run safety without watching this machine's load, so that results do not depend on it."""
     await safety.run(bus, ready, lambda _now_ns: Host())
 
 
-async def _awake(robot: InMemoryRobot) -> None:
-    """Let time pass until it can be sent. Raises Refused when it never can."""
+async def _until_awake(robot: InMemoryRobot) -> None:
+    """Wait until the robot is localized and enabled. Raises Refused when it never is."""
     states, places = robot.operator.latest(STATE), robot.operator.latest(POSE)
     maps = robot.operator.latest(MAP)
     for _ in range(WAKING_TICKS):
         await robot.tick()
         state, place = states.current, places.current
-        if state and state.gate.mode == "enabled" and _known(place) and maps.current:
+        if state and state.gate.mode == "enabled" and (place and place.localized) and maps.current:
             return
-    raise Refused("the robot has not woken up")
-
-
-def _known(place: PoseInMap | None) -> bool:
-    return place is not None and place.localized
+    raise Refused("the robot was not enabled and localized in time")
 
 
 BOOT = 1
@@ -210,7 +195,7 @@ DRIVING = GateStatus(mode="enabled", commander=BRAIN, enables=1)
 
 
 class BarnBrain:
-    """The robot's nodes in one piece."""
+    """The functions that the robot's nodes call, without nodes."""
 
     def __init__(self, goal: Goal, settings: LocalSettings) -> None:
         self._goal = goal
@@ -223,7 +208,7 @@ class BarnBrain:
         self.cycles_ms: list[float] = []
 
     def tick(self, state: RobotState, scan: LaserScan | None) -> CmdVel:
-        """The command of one tick."""
+        """Return the command of one tick."""
         self._response.state(state)
         if scan is not None:
             world = perception.step(self._perception, JACKAL, scan)
@@ -238,7 +223,7 @@ class BarnBrain:
     def _decide(self, state: RobotState, world: WorldModel) -> Intent:
         began = time.thread_time()
         sent = self._response.sent(state.tick - SENT_TICKS, state.tick - 1)
-        moment = PlanRequest(
+        request = PlanRequest(
             tick=state.tick,
             pose=state.pose,
             velocity=state.velocity,
@@ -248,13 +233,13 @@ class BarnBrain:
             response=self._response.response,
             sent=tuple(SentCommand(tick, velocity) for tick, velocity in sent),
         )
-        plan = self._planner.plan(moment)
+        plan = self._planner.plan(request)
         self.cycles_ms.append((time.thread_time() - began) * 1e3)
         return Intent(
             twist=plan.twist,
             trajectory=plan.trajectory,
             follow=bool(plan.trajectory),
-            response=moment.response,
+            response=request.response,
             behaviour="navigate",
             reason=plan.reason,
             basis=state.tick,
@@ -264,12 +249,12 @@ class BarnBrain:
 def drive_functions(
     world: BarnWorld, trial: int, conditions: Conditions, samples: int
 ) -> BarnTrial:
-    """One trial in one world; the same arguments give the same result."""
+    """Drive one trial with the nodes; equal arguments give equal results."""
     course = BarnCourse(world, trial, conditions)
     brain = BarnBrain(course.goal, LocalSettings(samples=samples))
     limits, output = limits_of(JACKAL), ZERO
     while True:
-        course.look()
+        course.judge()
         if course.result:
             return course.ended(tuple(brain.cycles_ms))
         scan, tick = course.scan(), course.tick

@@ -1,13 +1,15 @@
-"""A Jackal among posts: a plant that answers late and slowly, slips, drifts and sees with noise.
+"""The worlds of BARN and DynaBARN, a Jackal in them, and one trial.
 
-It knows the truth, which the robot never hears of.
+The Jackal reacts late and slowly, slips, drifts, and its lidar is noisy. The robot never sees the
+true pose.
 """
 
+import abc
 import json
 import math
 from collections import deque
 from pathlib import Path
-from typing import NamedTuple, Protocol, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from msgspec import Struct
@@ -44,14 +46,12 @@ JACKAL = BodyDescription(
     max_linear_deceleration=ACCELERATION,
     max_angular_acceleration=ANGULAR_ACCELERATION,
     lidar=LIDAR,
-    # from a scan to its brake: till the next, a tick on the bus, the hard plant's delay and most of
-    # its lag, of which a body that brakes from a low speed feels the less; and told to stop at
-    # 2 m/s in a turn it goes on for 0.65 s until delay and lag are over
+    # reaction: the time to the next scan, a tick on the bus, the hard plant's delay and most of its
+    # lag, which matters less at low speed. A stop from 2 m/s in a turn begins after up to 0.65 s.
     thresholds=Thresholds(reaction_time=0.26, follow_sustain=0.5),
 )
 
 
-FASTEST = 2.0  # [m/s], which the optimal time goes by
 DYNAMIC_LENGTH = 20.0  # [m], of every path in DynaBARN
 PATH_CELL, PATH_X, PATH_Y = 0.15, -4.575, 5.075  # [m], from a cell of the path to the world
 SCAN_TICKS = 2  # from scan to scan
@@ -62,15 +62,15 @@ SEED = 1000
 
 
 class Conditions(Struct, frozen=True, kw_only=True):
-    """How hard it is made."""
+    """Faults of the plant."""
 
     delay: float = 0.1  # [s], before a command has any effect
     lag: float = 0.15  # [s], time constant
-    slip: float = 0.6  # the least share of the yaw rate that the floor lets through
-    drift: float = 0.02  # of the odometry, of the way and of the turns
+    slip: float = 0.6  # least share of the commanded yaw rate that is reached
+    drift: float = 0.02  # share of odometry's error, in distance and in angle
     noise: float = 0.03  # [m], standard deviation of a range
     dropouts: float = 0.1  # share of the beams that see nothing
-    physics: bool = False  # MuJoCo's: what slips, and how quickly it speeds up, follows from it
+    physics: bool = False  # MuJoCo's, which determines slip and acceleration
 
 
 HARD = Conditions()
@@ -78,63 +78,71 @@ MUJOCO = Conditions(slip=1.0, physics=True)
 IDEAL = Conditions(delay=0.0, lag=0.0, slip=1.0, drift=0.0, noise=0.01, dropouts=0.0)
 
 
-class JackalBody(Protocol):
-    """One trial's body, in whatever world."""
-
-    x: float  # [m], the truth
-    y: float  # [m]
-    yaw: float  # [rad]
-    odometry: Pose
-
-    @property
-    def velocity(self) -> Velocity:
-        """As measured."""
-        ...
-
-    def tick(self, command: Velocity) -> None:
-        """20 ms with `command`."""
-        ...
-
-    def scan(self, lidar: Lidar, discs: Floats) -> NDArray[np.float32]:
-        """One turn of the lidar among `discs` (n, 3): (beams,) [m], inf where nothing is."""
-        ...
-
-    def clearance(self, discs: Floats) -> float:
-        """How far it is from the nearest of `discs`, exactly [m]; 0 or less in contact."""
-        ...
-
-
-class KinematicJackal:
-    """One trial's body, by kinematics alone."""
+class JackalBody(abc.ABC):
+    """The body of one trial: commands take effect late, odometry drifts."""
 
     def __init__(
-        self, conditions: Conditions, start: tuple[float, float, float], seed: int
+        self, conditions: Conditions, start: tuple[float, float, float], random: np.random.Generator
     ) -> None:
-        self._random = np.random.default_rng(seed)
-        self._conditions = conditions
-        self._gain = float(self._random.uniform(conditions.slip, 1.0))
-        way, turn = self._random.uniform(-conditions.drift, conditions.drift, 2).tolist()
-        self._way, self._turn = 1.0 + way, 1.0 + turn
-        waits = round(conditions.delay / TICK_S * SUBSTEPS)
-        self._queue = deque([ZERO] * waits)
-        self.x, self.y, self.yaw = start  # the truth
-        self.v = self.w = 0.0
+        self._random, self._conditions = random, conditions
+        linear, angular = random.uniform(-conditions.drift, conditions.drift, 2).tolist()
+        self._linear_scale, self._angular_scale = 1.0 + linear, 1.0 + angular
+        self._queue = deque([ZERO] * round(conditions.delay / TICK_S * SUBSTEPS))
+        self.x, self.y, self.yaw = start  # the true pose [m, m, rad]
         self.odometry = Pose(x=0.0, y=0.0, yaw=0.0)
 
     @property
+    @abc.abstractmethod
     def velocity(self) -> Velocity:
-        """As measured."""
-        return Velocity(linear_x=self.v * self._way, angular_z=self.w * self._turn)
+        """The velocity, as measured."""
 
     def tick(self, command: Velocity) -> None:
-        """20 ms with `command`."""
+        """Drive for 20 ms with `command`."""
         for _ in range(SUBSTEPS):
             self._queue.append(command)
             self._substep(self._queue.popleft(), TICK_S / SUBSTEPS)
 
-    def _substep(self, command: Velocity, dt: float) -> None:
+    @abc.abstractmethod
+    def _substep(self, command: Velocity, dt: float) -> None: ...
+
+    @abc.abstractmethod
+    def scan(self, lidar: Lidar, discs: Floats) -> NDArray[np.float32]:
+        """Return a scan among `discs` (n, 3): (beams,) [m], inf where nothing is hit."""
+
+    def _lag_share(self, dt: float) -> float:
+        """Return the share of a change of speed that happens within `dt` [s]."""
         lag = self._conditions.lag
-        share = 1.0 - math.exp(-dt / lag) if lag > 0 else 1.0
+        return 1.0 - math.exp(-dt / lag) if lag > 0 else 1.0
+
+    def clearance(self, discs: Floats) -> float:
+        """Return the exact distance from the nearest of `discs` [m]; 0 or less in contact."""
+        dx, dy = discs[:, 0] - self.x, discs[:, 1] - self.y
+        cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
+        corners = np.array(JACKAL.footprint)
+        here = np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx], axis=1)
+        return float((_to_polygon(corners, here) - discs[:, 2]).min(initial=np.inf))
+
+
+class KinematicJackal(JackalBody):
+    """A body that moves by kinematics alone."""
+
+    def __init__(
+        self, conditions: Conditions, start: tuple[float, float, float], seed: int
+    ) -> None:
+        random = np.random.default_rng(seed)
+        self._gain = float(random.uniform(conditions.slip, 1.0))
+        super().__init__(conditions, start, random)
+        self.v = self.w = 0.0
+
+    @property
+    def velocity(self) -> Velocity:
+        """The velocity, as measured."""
+        return Velocity(
+            linear_x=self.v * self._linear_scale, angular_z=self.w * self._angular_scale
+        )
+
+    def _substep(self, command: Velocity, dt: float) -> None:
+        share = self._lag_share(dt)
         most, turning = ACCELERATION * dt, ANGULAR_ACCELERATION * dt
         change = share * (command.linear_x - self.v)
         self.v += max(-most, min(most, change))
@@ -144,16 +152,17 @@ class KinematicJackal:
         self.x += self.v * math.cos(middle) * dt
         self.y += self.v * math.sin(middle) * dt
         self.yaw = math.remainder(self.yaw + self.w * dt, math.tau)
-        seen, way = self.odometry, self.v * self._way * dt
-        middle = seen.yaw + 0.5 * self.w * self._turn * dt
+        before, distance = self.odometry, self.v * self._linear_scale * dt
+        turn = self.w * self._angular_scale * dt
+        middle = before.yaw + 0.5 * turn
         self.odometry = Pose(
-            x=seen.x + way * math.cos(middle),
-            y=seen.y + way * math.sin(middle),
-            yaw=math.remainder(seen.yaw + self.w * self._turn * dt, math.tau),
+            x=before.x + distance * math.cos(middle),
+            y=before.y + distance * math.sin(middle),
+            yaw=math.remainder(before.yaw + turn, math.tau),
         )
 
     def scan(self, lidar: Lidar, discs: Floats) -> NDArray[np.float32]:
-        """One turn of the lidar among `discs` (n, 3): (beams,) [m], inf where nothing is."""
+        """Return a scan among `discs` (n, 3): (beams,) [m], inf where nothing is hit."""
         cosine, sine = math.cos(self.yaw), math.sin(self.yaw)
         eye = self.x + cosine * lidar.x, self.y + sine * lidar.x
         ranges = np.full(lidar.beams, np.inf)
@@ -164,22 +173,9 @@ class KinematicJackal:
         seen: NDArray[np.float32] = np.maximum(ranges, lidar.range_min).astype(np.float32)
         return seen
 
-    def clearance(self, discs: Floats) -> float:
-        """How far the body is from the nearest of `discs`, exactly [m]; 0 or less in contact."""
-        return clearance(self, discs)
-
-
-def clearance(body: JackalBody, discs: Floats) -> float:
-    """How far a body is from the nearest of `discs`, exactly [m]; 0 or less in contact."""
-    dx, dy = discs[:, 0] - body.x, discs[:, 1] - body.y
-    cosine, sine = math.cos(body.yaw), math.sin(body.yaw)
-    corners = np.array(JACKAL.footprint)
-    here = np.stack([cosine * dx + sine * dy, cosine * dy - sine * dx], axis=1)
-    return float((_to_polygon(corners, here) - discs[:, 2]).min(initial=np.inf))
-
 
 def _to_polygon(corners: Floats, points: Floats) -> Floats:
-    """Distances [m] of `points` (n, 2) from a convex polygon, counter-clockwise; 0 inside it."""
+    """Return the distances [m] of `points` (n, 2) from a convex polygon, which is 0 inside."""
     along = np.roll(corners, -1, axis=0) - corners
     off = points[:, None, :] - corners
     share = np.clip((off * along).sum(-1) / (along * along).sum(-1), 0.0, 1.0)
@@ -191,7 +187,7 @@ def _to_polygon(corners: Floats, points: Floats) -> Floats:
 
 @kernel
 def _cast(eye: tuple[float, float], yaw: float, view: float, discs: Floats, ranges: Floats) -> None:
-    """The nearest disc along each beam, over `view` [rad] from right to left."""
+    """Shorten `ranges` to the nearest disc per beam, over `view` [rad] from right to left."""
     beams = ranges.shape[0]
     step = view / (beams - 1)
     for d in range(discs.shape[0]):
@@ -214,7 +210,7 @@ def _cast(eye: tuple[float, float], yaw: float, view: float, discs: Floats, rang
 
 
 class MovingDisc(NamedTuple):
-    """A disc on its way between key frames, over and over."""
+    """A disc that moves between key frames, in a loop."""
 
     duration: float  # [s]
     keys: Floats  # (k, 3): time [s], x, y [m]
@@ -222,7 +218,7 @@ class MovingDisc(NamedTuple):
 
 
 class BarnWorld(NamedTuple):
-    """One world."""
+    """One world: obstacles, start and goal."""
 
     number: int  # in the original set
     posts: Floats  # (n, 3): x, y, radius [m]
@@ -232,7 +228,7 @@ class BarnWorld(NamedTuple):
     length: float  # [m], of the reference path
 
     def discs(self, at: float) -> Floats:
-        """All obstacles at a time [s]: (n, 3), x, y, radius [m]."""
+        """Return all obstacles at a time [s]: (n, 3), x, y, radius [m]."""
         if not self.movers:
             return self.posts
         rows = [(*_position(mover, at), mover.radius) for mover in self.movers]
@@ -246,7 +242,7 @@ def _position(mover: MovingDisc, at: float) -> tuple[float, float]:
 
 
 def read_worlds(file: Path, dynamic: bool) -> list[BarnWorld]:
-    """The worlds in `file`. Raises ConfigError for what is no such file."""
+    """Return the worlds in `file`. Raises ConfigError."""
     try:
         return _read_dynamic(file) if dynamic else _read_static(file)
     except OSError as error:
@@ -287,7 +283,7 @@ def _read_dynamic(file: Path) -> list[BarnWorld]:
 
 
 def choose_worlds(worlds: list[BarnWorld], only: str) -> list[BarnWorld]:
-    """Those whose numbers are in `only`, separated by commas; all where that is empty."""
+    """Return the worlds whose numbers are in `only`, separated by commas. Default: all."""
     if not only:
         return worlds
     known = {world.number: world for world in worlds}
@@ -301,7 +297,7 @@ def choose_worlds(worlds: list[BarnWorld], only: str) -> list[BarnWorld]:
 
 
 class BarnTrial(Struct, frozen=True, kw_only=True):
-    """How one trial ended."""
+    """The result of one trial."""
 
     world: int
     trial: int
@@ -313,7 +309,7 @@ class BarnTrial(Struct, frozen=True, kw_only=True):
 
 
 class BarnCourse:
-    """A trial under way. The same arguments and commands give the same readings."""
+    """A trial under way. Equal arguments and commands give equal readings."""
 
     def __init__(self, world: BarnWorld, trial: int, conditions: Conditions) -> None:
         self._world, self._trial = world, trial
@@ -324,13 +320,13 @@ class BarnCourse:
 
     @property
     def goal(self) -> Goal:
-        """As the robot knows it: where its odometry begins, there is its origin."""
+        """The goal in the frame of odometry, whose origin is the start [m]."""
         x, y, yaw = self._world.start
         goal_x, goal_y = to_frame(Pose(x=x, y=y, yaw=yaw), *self._world.goal)
         return Goal(x=goal_x, y=goal_y)
 
-    def look(self) -> None:
-        """A tick begins: judge how it stands."""
+    def judge(self) -> None:
+        """Begin a tick, and judge the trial."""
         self.tick += 1
         body, world = self._body, self._world
         self._discs = world.discs(APART_S * self._trial + self.tick * TICK_S)
@@ -345,13 +341,13 @@ class BarnCourse:
             self.result = "timeout"
 
     def state(self) -> RobotState:
-        """What the body measures of itself."""
+        """Return the body's state, as measured."""
         return RobotState(
             robot_type=JACKAL.robot_type, pose=self._body.odometry, velocity=self._body.velocity
         )
 
     def scan(self) -> LaserScan | None:
-        """What its lidar sees; None in ticks without a scan."""
+        """Return the lidar's scan; None in ticks without one."""
         if self.tick % SCAN_TICKS:
             return None
         return LaserScan(
@@ -363,11 +359,11 @@ class BarnCourse:
         )
 
     def advance(self, velocity: Velocity) -> None:
-        """To the next tick with a command."""
+        """Drive for a tick with a command."""
         self._body.tick(velocity)
 
     def ended(self, cycles_ms: tuple[float, ...] = ()) -> BarnTrial:
-        """What came of it."""
+        """Return the result."""
         best = self._world.length / 2.0
         clipped = min(max(self._seconds, 2 * best), 8 * best)
         return BarnTrial(
@@ -386,7 +382,7 @@ class BarnCourse:
 
 
 def body_in(world: BarnWorld, conditions: Conditions, seed: int) -> JackalBody:
-    """A MujocoJackal at the start of a world. Raises ConfigError where there is no simulator."""
+    """Return the Jackal at the start of a world. Raises ConfigError without a simulator."""
     if not conditions.physics:
         return KinematicJackal(conditions, world.start, seed)
     try:

@@ -1,11 +1,10 @@
 """The BARN bench's Jackal in MuJoCo: four wheels that skid in every turn, among solid posts.
 
-It replaces `plant.KinematicJackal`, with the same delay, lag, and errors of odometry and lidar.
-Slip and acceleration are the physics' own.
+It replaces `KinematicJackal`, with the same delay, lag, and errors of odometry and lidar. Slip and
+acceleration follow from the physics.
 """
 
 import math
-from collections import deque
 from importlib.resources import files
 
 import mujoco
@@ -18,31 +17,26 @@ from gigabrain_drivers.sim.sensors import Lidar
 from gigabrain_drivers.sim.world import Cylinder, World
 from gigabrain_drivers.sim.world import Pose as Place
 from gigabrain_schemas.arrays import Floats
-from gigabrain_schemas.base import TICK_S, Pose, Velocity
+from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Lidar as LidarDescription
-from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.qa.bench.barn_course import FIELD_OF_VIEW_RAD, Conditions, clearance
+from gigabrain_zenoh.qa.bench.barn_course import FIELD_OF_VIEW_RAD, Conditions, JackalBody
 
 SUBSTEPS = 4  # of a tick: as often the motors are told something new
 PHYSICS_STEPS = 4  # in 10 ms: two for each time that the motors are told
 WHEEL_RADIUS_M, TRACK_M = 0.098, 0.37559  # [m]
-TRACK_FACTOR = 1.5  # its maker's: by so much it has to turn its wheels more than if they rolled
+TRACK_FACTOR = 1.5  # of its maker: the wheels turn more than rolling wheels would
 POST_HEIGHT_M, WALLS_M = 1.0, 50.0  # [m], of the posts, and to the walls that every world has
 LEFT = (f"{ROBOT}front_left", f"{ROBOT}rear_left")
 RIGHT = (f"{ROBOT}front_right", f"{ROBOT}rear_right")
 
 
-class MujocoJackal:
-    """One trial's body. It knows the truth, which the robot never hears of."""
+class MujocoJackal(JackalBody):
+    """The body of one trial, with MuJoCo's physics."""
 
     def __init__(
         self, conditions: Conditions, start: tuple[float, float, float], posts: Floats, seed: int
     ) -> None:
-        self._random = np.random.default_rng(seed)
-        self._conditions = conditions
-        way, turn = self._random.uniform(-conditions.drift, conditions.drift, 2).tolist()
-        self._way, self._turn = 1.0 + way, 1.0 + turn
-        self._queue = deque([ZERO] * round(conditions.delay / TICK_S * SUBSTEPS))
+        super().__init__(conditions, start, np.random.default_rng(seed))
         model = (files("gigabrain_drivers") / "sim" / "jackal.xml").read_text(encoding="utf-8")
         body = SimModel(model=model, substeps=PHYSICS_STEPS)
         self._model = compile_scene(body, _world(start, posts))
@@ -54,47 +48,42 @@ class MujocoJackal:
         self._place = int(self._model.joint(f"{ROBOT}free").qposadr[0])
         self._gyro = int(self._model.sensor(f"{ROBOT}gyro").adr[0]) + 2
         self._lidar: Lidar | None = None
-        self._told = (0.0, 0.0)  # what the motors aim for: forward [m/s], turning [rad/s]
-        self.x, self.y, self.yaw = start  # the truth
-        self.odometry = Pose(x=0.0, y=0.0, yaw=0.0)
+        self._target = (0.0, 0.0)  # of the motors: forward [m/s], turning [rad/s]
         mujoco.mj_forward(self._model, self._data)
 
     @property
     def velocity(self) -> Velocity:
-        """By the wheels and the gyro."""
+        """The velocity, as measured by wheels and gyro."""
         v = WHEEL_RADIUS_M * float(self._data.qvel[self._wheels].mean())
         w = float(self._data.sensordata[self._gyro])
-        return Velocity(linear_x=v * self._way, angular_z=w * self._turn)
+        return Velocity(linear_x=v * self._linear_scale, angular_z=w * self._angular_scale)
 
     def tick(self, command: Velocity) -> None:
-        """20 ms with `command`."""
-        for _ in range(SUBSTEPS):
-            self._queue.append(command)
-            self._substep(self._queue.popleft(), TICK_S / SUBSTEPS)
+        """Drive for 20 ms with `command`."""
+        super().tick(command)
         x, y, _, a, b, c, d = self._data.qpos[self._place : self._place + 7].tolist()
         self.x, self.y = x, y
         self.yaw = math.atan2(2 * (a * d + b * c), 1 - 2 * (c * c + d * d))
 
     def _substep(self, command: Velocity, dt: float) -> None:
-        lag = self._conditions.lag
-        share = 1.0 - math.exp(-dt / lag) if lag > 0 else 1.0
-        v, w = self._told
+        share = self._lag_share(dt)
+        v, w = self._target
         v, w = v + share * (command.linear_x - v), w + share * (command.angular_z - w)
-        self._told = v, w
+        self._target = v, w
         across = w * TRACK_FACTOR * TRACK_M / 2
         self._data.ctrl[self._left] = (v - across) / WHEEL_RADIUS_M
         self._data.ctrl[self._right] = (v + across) / WHEEL_RADIUS_M
         mujoco.mj_step(self._model, self._data, nstep=round(dt / self._model.opt.timestep))
-        seen, measured = self.odometry, self.velocity
-        middle = seen.yaw + 0.5 * measured.angular_z * dt
+        before, measured = self.odometry, self.velocity
+        middle = before.yaw + 0.5 * measured.angular_z * dt
         self.odometry = Pose(
-            x=seen.x + measured.linear_x * math.cos(middle) * dt,
-            y=seen.y + measured.linear_x * math.sin(middle) * dt,
-            yaw=math.remainder(seen.yaw + measured.angular_z * dt, math.tau),
+            x=before.x + measured.linear_x * math.cos(middle) * dt,
+            y=before.y + measured.linear_x * math.sin(middle) * dt,
+            yaw=math.remainder(before.yaw + measured.angular_z * dt, math.tau),
         )
 
     def scan(self, lidar: LidarDescription, _discs: Floats) -> NDArray[np.float32]:
-        """One turn of the lidar among the posts: (beams,) [m], inf where nothing is."""
+        """Return a scan among the posts: (beams,) [m], inf where nothing is hit."""
         if self._lidar is None:
             config = SimLidar(
                 beams=lidar.beams,
@@ -108,10 +97,6 @@ class MujocoJackal:
         ranges = self._lidar.cast(self._data, ways)
         ranges[self._random.random(lidar.beams) < self._conditions.dropouts] = np.inf
         return ranges
-
-    def clearance(self, discs: Floats) -> float:
-        """How far the body is from the nearest of `discs`, exactly [m]; 0 or less in contact."""
-        return clearance(self, discs)
 
 
 def _world(start: tuple[float, float, float], posts: Floats) -> World:

@@ -1,4 +1,4 @@
-"""Faults of a link, how they are written, and what they do to its bytes."""
+"""Faults of a link: their words, and their effect on its bytes."""
 
 import math
 import random
@@ -11,47 +11,47 @@ from gigabrain_schemas.base import NonNegative
 from gigabrain_zenoh.errors import ConfigError, unknown
 
 Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
-Way = Literal["up", "down"]  # towards what the proxy stands in front of, and back from it
+Way = Literal["up", "down"]  # towards the target of the proxy, and back
 
 WAYS: tuple[Way, ...] = ("up", "down")
 S = TypeVar("S", bound=Struct)
 
 
 class Chaos(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What is wrong with one way of a link at present. A piece is what was read at once."""
+    """Faults of one direction of a link. A piece is the bytes of one read."""
 
-    hole: bool = False  # nothing is taken from the sender; what it sent comes when this ends
-    delay_ms: NonNegative = 0.0  # later than it came
-    jitter_ms: NonNegative = 0.0  # up to so much later still; pieces keep their order
-    loss: Chance = 0.0  # of each piece to be lost and come 200 ms late, as TCP sends it again
+    hole: bool = False  # nothing is read from the sender; its bytes arrive when this ends
+    delay_ms: NonNegative = 0.0  # added to every piece
+    jitter_ms: NonNegative = 0.0  # at most added to the delay; pieces keep their order
+    loss: Chance = 0.0  # of each piece to arrive 200 ms late, as TCP resends it
     bytes_s: NonNegative = 0.0  # [bytes/s] at most; 0 for no limit
     corrupt: Chance = 0.0  # of each byte to arrive with one bit flipped
     drop: Chance = 0.0  # of each piece to vanish
     garbage: Chance = 0.0  # of each piece to be preceded by random bytes
     split: Chance = 0.0  # of each piece to come in two halves, 2 ms apart
-    merge_ms: NonNegative = 0.0  # what comes within so long is handed on as one piece
+    merge_ms: NonNegative = 0.0  # pieces within this time are forwarded as one
 
 
 CALM = Chaos()
 
 
 class ProxyCommand(Struct, frozen=True, kw_only=True):
-    """What a line of words asks of a proxy."""
+    """A typed line, parsed."""
 
     ways: tuple[Way, ...] = ()
     chaos: Chaos = CALM
-    cut: Literal["", "fin", "rst"] = ""  # end what is open now
-    unplugged: bool | None = None  # nobody can connect; None leaves that as it is
-    figures: bool = False  # say how it goes
+    cut: Literal["", "fin", "rst"] = ""  # close all open connections
+    unplugged: bool | None = None  # no client can connect; None changes nothing
+    figures: bool = False  # print the counters
 
 
 COMMANDS = ("cut", "cut=rst", "unplug", "plug", "figures", "off", *WAYS)
 
 
 def parse_command(line: str) -> ProxyCommand:
-    """What `[up|down] FAULT[=VALUE] ...`, `cut`, `unplug`, `plug`, `figures` or `off` asks for.
+    """Parse `[up|down] FAULT[=VALUE] ...`, `cut`, `unplug`, `plug`, `figures` or `off`.
 
-    Raises ConfigError naming what there is.
+    Raises ConfigError, which lists the valid words.
     """
     words = line.split()
     if words in (["cut"], ["cut=fin"], ["cut=rst"]):
@@ -61,11 +61,11 @@ def parse_command(line: str) -> ProxyCommand:
     if words == ["figures"]:
         return ProxyCommand(figures=True)
     ways = tuple(way for way in WAYS if words[:1] == [way])
-    return ProxyCommand(ways=ways or WAYS, chaos=of_words(words[len(ways) :], Chaos, COMMANDS))
+    return ProxyCommand(ways=ways or WAYS, chaos=parse_struct(words[len(ways) :], Chaos, COMMANDS))
 
 
-def of_words(words: list[str], kind: type[S], others: tuple[str, ...] = ()) -> S:
-    """`NAME[=VALUE] ...` as a `kind`; nothing, or `off`, is its default. Raises ConfigError."""
+def parse_struct(words: list[str], kind: type[S], others: tuple[str, ...] = ()) -> S:
+    """Return `NAME[=VALUE] ...` as a `kind`; `off` is its default. Raises ConfigError."""
     values = dict(word.partition("=")[::2] for word in words if word != "off")
     for name in values:
         if name not in kind.__struct_fields__:
@@ -77,36 +77,36 @@ def of_words(words: list[str], kind: type[S], others: tuple[str, ...] = ()) -> S
 
 
 LONGEST_GARBAGE = 64  # bytes
-RESENT_S = 0.2  # the least time after which Linux sends a lost segment again
+RESENT_S = 0.2  # least time after which Linux resends a lost segment
 HALVES_S = 0.002  # between the halves of a piece
-FAR = 1e15  # bytes
-SMALLEST_S = 0.02  # a throttled line hands bytes on in pieces of so long
+MAX_INTACT = 1e15  # bytes
+THROTTLED_PIECE_S = 0.02  # length of a piece on a throttled line
 
 
 class WayCounters(Struct, kw_only=True):
-    """What came of one way of a link since the proxy was made."""
+    """Counters of one direction of a link, since the proxy was made."""
 
     taken: int = 0  # bytes from the sender
-    handed_on: int = 0  # bytes to the receiver, damaged ones and garbage included
-    waiting: int = 0  # bytes that were taken and not yet handed on
+    handed_on: int = 0  # bytes to the receiver, with damage and garbage
+    waiting: int = 0  # bytes received and not yet forwarded
     flipped: int = 0  # bits
     dropped: int = 0  # bytes
     garbage: int = 0  # bytes
-    late: int = 0  # pieces that were lost and sent again
+    late: int = 0  # pieces that were lost and resent
 
 
 class LinkDamage:
-    """One way of one connection: pieces in, damaged pieces and their times of arrival out."""
+    """Damages one direction of one connection, and sets the arrival times of its pieces."""
 
     def __init__(self, chance: random.Random, figures: WayCounters) -> None:
         self._chance, self.figures = chance, figures
-        self._newest_s = 0.0  # when the last piece arrives; none overtakes it
-        self._free_s = 0.0  # when a throttled line is free again
-        self._rate = 0.0  # chance of a flipped bit for which the next line was drawn
+        self._newest_s = 0.0  # when the last piece arrives; later ones keep the order
+        self._free_s = 0.0  # when a throttled line is free
+        self._rate = 0.0  # chance of a flipped bit with which `_clean` was drawn
         self._clean = 0  # bytes until the next flipped bit
 
     def damaged(self, data: bytes, chaos: Chaos, now_s: float) -> list[tuple[float, bytes]]:
-        """`data`, taken at `now_s`, as pieces with the time [s] at which each arrives."""
+        """Return `data`, received at `now_s`, as (arrival time [s], piece)."""
         self.figures.taken += len(data)
         if self._happens(chaos.drop):
             self.figures.dropped += len(data)
@@ -129,8 +129,8 @@ class LinkDamage:
         return self._sent(data, chaos, arrival_s)
 
     def _sent(self, data: bytes, chaos: Chaos, arrival_s: float) -> list[tuple[float, bytes]]:
-        """In order, as fast as the line is, and as merged as it is."""
-        size = max(1, int(chaos.bytes_s * SMALLEST_S)) if chaos.bytes_s else len(data)
+        """Split and delay by the line's rate and merging; pieces keep their order."""
+        size = max(1, int(chaos.bytes_s * THROTTLED_PIECE_S)) if chaos.bytes_s else len(data)
         pieces = []
         for start in range(0, len(data), size):
             piece = data[start : start + size]
@@ -159,11 +159,11 @@ class LinkDamage:
         return bytes(noisy)
 
     def _drawn(self, rate: float) -> int:
-        """How many bytes arrive whole before one that does not."""
+        """Return the number of intact bytes before the next damaged one."""
         if rate in (0.0, 1.0):
             return 0
         least = 1.0 - self._chance.random()  # in (0, 1]
-        return int(min(FAR, math.log(least) / math.log1p(-rate)))
+        return int(min(MAX_INTACT, math.log(least) / math.log1p(-rate)))
 
     def _happens(self, chance: float) -> bool:
         return chance > 0 and self._chance.random() < chance

@@ -21,7 +21,7 @@ ANY_BAUD = 115200  # a pty takes any
 class LineProxy:
     """A pty at `path` that leads to the serial port `to`. Used as `async with`.
 
-    A wire keeps nothing: what is sent into a hole is lost, and so is what does not fit.
+    A wire keeps nothing: bytes into a hole are lost, and so are bytes that do not fit.
     """
 
     def __init__(self, to: str, path: Path, *, baud: int = ANY_BAUD, seed: int = 0) -> None:
@@ -37,12 +37,12 @@ class LineProxy:
 
     @property
     def connected(self) -> bool:
-        """Whether the port behind is open."""
+        """True while the port behind is open."""
         return self._link.connected
 
     async def __aenter__(self) -> Self:
         if self._pty.path.exists() and not self._pty.path.is_symlink():
-            raise ConfigError(f"{self._pty.path} is there already")
+            raise ConfigError(f"{self._pty.path} exists already; choose another path")
         self._link.open()
         await self.plug()
         return self
@@ -54,28 +54,28 @@ class LineProxy:
             wire.pipe.close()
 
     def set(self, chaos: Chaos = CALM, *ways: Way) -> None:
-        """Have this go wrong, and nothing else, with the named ways; with both when none is."""
+        """Replace the faults of the named directions, or of both."""
         for way, wire in zip(WAYS, self._wires, strict=True):
             if way in (ways or WAYS):
                 self.chaos[way] = chaos
                 wire.pipe.set(chaos)
 
     def cut(self, *, reset: bool = False) -> None:
-        """Pull the plug and put it back at once; a wire has one way to be cut alone."""
+        """Unplug and plug at once; `reset` makes no difference on a wire."""
         self._pty.unplug()
         self._pty.plug()
 
     async def plug(self) -> None:
-        """Have the port. Nothing if it is there."""
+        """Create the port, unless it exists."""
         self._pty.plug()
 
     async def unplug(self) -> None:
-        """Have the port no more. Nothing if it is gone."""
+        """Remove the port, if it exists."""
         self._pty.unplug()
 
 
 class _Wire:
-    """One way; a Pipe whose sender cannot be made to wait."""
+    """One direction: a Pipe whose sender cannot be made to wait."""
 
     def __init__(self, damage: LinkDamage, write: Callable[[bytes], object]) -> None:
         self._figures, self._room = damage.figures, True
@@ -96,9 +96,9 @@ class _Wire:
 async def in_front_of(
     ports: Path, folder: Path, *, seed: int = 0
 ) -> AsyncIterator[dict[str, LineProxy | TcpProxy]]:
-    """A proxy in `folder` for each of an emulator's `ports`, by the port's name.
+    """Run a proxy in `folder` for each of an emulator's `ports`; yields them by name.
 
-    The driver is then told to look there (`--ports`). Raises ConfigError.
+    The driver then takes its ports from `folder` (`--ports`). Raises ConfigError.
     """
     proxies = _proxies(ports, folder, seed)
     async with contextlib.AsyncExitStack() as stack:
@@ -112,7 +112,7 @@ async def in_front_of(
 
 
 def _proxies(ports: Path, folder: Path, seed: int) -> dict[str, LineProxy | TcpProxy]:
-    """A port that is a link leads to a pty; one that is a file says where to call."""
+    """Return a proxy per port: a link leads to a pty, a file names a TCP address."""
     folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, LineProxy | TcpProxy] = {}
     for port in sorted(ports.iterdir()):

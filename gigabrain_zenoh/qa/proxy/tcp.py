@@ -12,21 +12,28 @@ from typing import Self, cast
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.proxy.chaos import CALM, WAYS, Chaos, LinkDamage, Way, WayCounters
 
-MAX_WAITING_BYTES = 4 << 20  # bytes on their way; then the sender has to wait
+Address = tuple[str, int]
+
+RESET = struct.pack("ii", 1, 0)  # linger for 0 s: closing resets the connection
+BACKLOG = 128
+MAX_WAITING_BYTES = 4 << 20  # bytes under way; then the sender waits
 
 
 class Pipe:
-    """From `feed` to `hand_on`, in order. `on_room` is told whether the sender may go on."""
+    """Delays and damages bytes from `feed` to `forward`, in order.
+
+    `on_room` is called with True while the sender may send more.
+    """
 
     def __init__(
         self,
         damage: LinkDamage,
-        hand_on: Callable[[bytes], object],
+        forward: Callable[[bytes], object],
         on_room: Callable[[bool], None],
         on_end: Callable[[], None],
     ) -> None:
         self._damage, self._figures = damage, damage.figures
-        self._hand_on, self._on_room, self._on_end = hand_on, on_room, on_end
+        self._forward, self._on_room, self._on_end = forward, on_room, on_end
         self._chaos = CALM
         self._queue: deque[tuple[float, bytes]] = deque()
         self._waiting = 0
@@ -34,40 +41,37 @@ class Pipe:
         self._timer: asyncio.TimerHandle | None = None
 
     def set(self, chaos: Chaos) -> None:
-        """Be like this from now on; what is under way arrives when it was to arrive."""
+        """Replace the faults; pieces under way keep their arrival times."""
         self._chaos = chaos
-        self._flush()
-
-    def wake(self) -> None:
-        """The ends have changed: hand on what may be, take what may be."""
-        self._flush()
+        self.flush()
 
     def feed(self, data: bytes) -> None:
-        """What the sender has sent."""
+        """Accept bytes from the sender."""
         now_s = asyncio.get_running_loop().time()
         pieces = self._damage.damaged(data, self._chaos, now_s)
         self._queue.extend(pieces)
         self._count(sum(len(piece) for _, piece in pieces))
-        self._flush()
+        self.flush()
 
     def end(self) -> None:
-        """The sender sends no more; the receiver is told when the last byte has arrived."""
+        """End the stream: `on_end` is called once the last byte has arrived."""
         self._ended = True
-        self._flush()
+        self.flush()
 
     def stick(self, stuck: bool) -> None:
-        """Whether the receiver takes no more at present."""
+        """Set whether the receiver accepts no bytes at present."""
         self._stuck = stuck
-        self._flush()
+        self.flush()
 
     def close(self) -> None:
-        """Forget what is under way."""
+        """Drop the pieces under way."""
         if self._timer:
             self._timer.cancel()
         self._queue.clear()
         self._count(-self._waiting)
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
+        """Forward all pieces that are due."""
         if self._timer:
             self._timer.cancel()
             self._timer = None
@@ -79,7 +83,7 @@ class Pipe:
             if due:
                 self._deliver(due)
             if self._queue:
-                self._timer = loop.call_at(self._queue[0][0], self._flush)
+                self._timer = loop.call_at(self._queue[0][0], self.flush)
             elif self._ended:
                 self._ended = False
                 self._on_end()
@@ -90,20 +94,15 @@ class Pipe:
         self._count(-size)
         self._figures.handed_on += size
         for piece in [b"".join(pieces)] if self._chaos.merge_ms else pieces:
-            self._hand_on(piece)
+            self._forward(piece)
 
     def _count(self, more: int) -> None:
         self._waiting += more
         self._figures.waiting += more
 
 
-Address = tuple[str, int]
-
-RESET = struct.pack("ii", 1, 0)  # linger for 0 s: what is closed is reset
-
-
 class ProxiedCall:
-    """Two sockets with a pipe each way. `on_gone` hears when both are closed."""
+    """Two sockets with a pipe each way; calls `on_gone` when both are closed."""
 
     def __init__(
         self,
@@ -120,40 +119,40 @@ class ProxiedCall:
         self._calling: asyncio.Task[None] | None = None
 
     def set(self, chaos: Mapping[Way, Chaos]) -> None:
-        """Have this go wrong, by way."""
+        """Replace the faults, by direction."""
         self._through = not any(its.hole for its in chaos.values())
         for end, way in zip((self.caller, self.called), WAYS, strict=True):
             end.out.set(chaos[way])
         self.begin()
 
     def begin(self) -> None:
-        """Call the target, once the caller is there and nothing lies between."""
+        """Connect to the target once the caller is connected and there is no hole."""
         if self._through and self.caller.transport and not self._calling and not self._over:
             self._calling = asyncio.create_task(self._call())
 
     async def _call(self) -> None:
         try:
             await asyncio.get_running_loop().create_connection(lambda: self.called, *self._target)
-        except OSError:  # nobody is there: the caller is told in the only way that is left
+        except OSError:  # no server: reset the caller
             self.cut(reset=True)
 
     def cut(self, reset: bool) -> None:
-        """End both connections, with RST or with FIN."""
+        """Close both connections, with RST or with FIN."""
         self._over = True
         if self._calling and self._calling is not asyncio.current_task():
             self._calling.cancel()
         for end in (self.caller, self.called):
             end.cut(reset)
-        self.look()
+        self.release_if_closed()
 
     async def ended(self) -> None:
-        """Wait until nothing of it is left."""
+        """Wait until both connections are closed."""
         await self._gone.wait()
         if self._calling:
             await asyncio.wait([self._calling])
 
-    def look(self) -> None:
-        """Let go of it when nothing is open any more."""
+    def release_if_closed(self) -> None:
+        """Release the pipes when both connections are closed."""
         if self.caller.transport is None and self.called.transport is None:
             self.caller.out.close()
             self.called.out.close()
@@ -162,67 +161,67 @@ class ProxiedCall:
 
 
 class End(asyncio.Protocol):
-    """One of the two sockets, and the pipe for what comes out of it."""
+    """One of the two sockets, and the pipe for the bytes that it receives."""
 
     def __init__(self, call: ProxiedCall) -> None:
         self.transport: asyncio.Transport | None = None
         self._call = call
-        self._heard_all = self._said_all = False
+        self._received_all = self._sent_all = False
 
     def join(self, other: "End", damage: LinkDamage) -> None:
-        """Have what comes out of this one go into the `other`."""
+        """Forward the bytes of this end into the `other`."""
         self._other = other
         self.out = Pipe(damage, other.write, self.room, other.end)
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """The socket is open (asyncio calls this, and the other ones)."""
+        """Start; called by asyncio, as are the next five."""
         self.transport = cast(asyncio.Transport, transport)
         self.transport.pause_reading()
-        self.out.wake()
-        self._other.out.wake()
+        self.out.flush()
+        self._other.out.flush()
         self._call.begin()
 
     def data_received(self, data: bytes) -> None:
-        """Its peer has sent something."""
+        """Forward the bytes of the peer."""
         self.out.feed(data)
 
     def eof_received(self) -> bool:
-        """Its peer sends no more, but may still listen."""
-        self._heard_all = True
+        """Note that the peer sends no more; it may still receive."""
+        self._received_all = True
         self.out.end()
-        return not self._said_all
+        return not self._sent_all
 
     def pause_writing(self) -> None:
-        """Its peer does not read."""
+        """Note that the peer does not read."""
         self._other.out.stick(True)
 
     def resume_writing(self) -> None:
-        """Its peer reads again."""
+        """Note that the peer reads again."""
         self._other.out.stick(False)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The socket is closed: it was reset, or both have said all."""
+        """Note that the socket is closed: reset, or ended by both."""
         self.transport = None
-        if exc or not self._said_all:
+        if exc or not self._sent_all:
             self._call.cut(reset=True)
-        self._call.look()
+        self._call.release_if_closed()
 
     def write(self, data: bytes) -> None:
-        """To its peer."""
+        """Send bytes to the peer."""
         if self.transport:
             self.transport.write(data)
 
     def end(self) -> None:
-        """Tell its peer that there is no more."""
-        self._said_all = True
-        if self.transport and self._heard_all:
+        """Send FIN to the peer."""
+        self._sent_all = True
+        if self.transport and self._received_all:
             self.transport.close()
         elif self.transport:
             self.transport.write_eof()
 
     def room(self, room: bool) -> None:
-        """Whether what its peer sends may be read."""
-        if self.transport is None or self._heard_all or self.transport.is_closing():
+        """Read from the peer, or pause."""
+        if self.transport is None or self._received_all or self.transport.is_closing():
             return
         if room and self._other.transport:
             self.transport.resume_reading()
@@ -230,7 +229,7 @@ class End(asyncio.Protocol):
             self.transport.pause_reading()
 
     def cut(self, reset: bool) -> None:
-        """Close it at once, with RST or with FIN; what was still to be sent is lost."""
+        """Close at once, with RST or with FIN; unsent bytes are lost."""
         if self.transport is None or self.transport.is_closing():
             return
         sock: socket.socket = self.transport.get_extra_info("socket")
@@ -242,15 +241,11 @@ class End(asyncio.Protocol):
         self.transport.abort()
 
 
-CALLS_WAITING = 128
-
-
 class TcpProxy:
-    """Listens where `listen` says and joins each caller to `target`. Used as `async with`.
+    """Listens at `listen` and connects each caller to `target`. Used as `async with`.
 
-    `set` says what goes wrong from now on, `cut` ends what is open. A hole keeps the bytes with the
-    sender's kernel, as a dead network would, and hands them on when it ends; who calls meanwhile is
-    taken and hears nothing.
+    `set` sets the faults, `cut` closes connections. A hole leaves the bytes in the sender's kernel,
+    as a dead network does, and forwards them when it ends. New callers are accepted meanwhile.
     """
 
     def __init__(
@@ -268,18 +263,18 @@ class TcpProxy:
 
     @property
     def address(self) -> Address:
-        """(host, port) where it listens, also while it is unplugged."""
+        """(host, port) at which it listens, also while it is unplugged."""
         return self._listen
 
     @property
     def endpoint(self) -> str:
-        """The same as a Zenoh endpoint."""
+        """The same address as a Zenoh endpoint."""
         host, port = self._listen
         return f"tcp/[{host}]:{port}" if ":" in host else f"tcp/{host}:{port}"
 
     @property
     def open_calls(self) -> int:
-        """How many connections there are now."""
+        """Number of open connections."""
         return len(self._open)
 
     async def __aenter__(self) -> Self:
@@ -290,32 +285,32 @@ class TcpProxy:
         await self.unplug()
 
     def set(self, chaos: Chaos = CALM, *ways: Way) -> None:
-        """Have this go wrong, and nothing else, with the named ways; with both when none is."""
+        """Replace the faults of the named directions, or of both."""
         for way in ways or WAYS:
             self.chaos[way] = chaos
         for call in list(self._open):
             call.set(self.chaos)
 
     def cut(self, *, reset: bool = False) -> None:
-        """End all that is open, with FIN or with RST; what is under way is lost."""
+        """Close all connections, with FIN or with RST; bytes under way are lost."""
         self.cuts += len(self._open)
         for call in list(self._open):
             call.cut(reset)
 
     async def plug(self) -> None:
-        """Listen, at the same port as before. Nothing if it does. Raises ConfigError."""
+        """Listen, always at the same port. Raises ConfigError."""
         if self._server:
             return
         host, port = self._listen
         loop = asyncio.get_running_loop()
         try:
-            self._server = await loop.create_server(self._take, host, port, backlog=CALLS_WAITING)
+            self._server = await loop.create_server(self._accept, host, port, backlog=BACKLOG)
         except OSError as error:
             raise ConfigError(f"cannot listen on {host}:{port}: {error.strerror}") from None
         self._listen = (host, self._server.sockets[0].getsockname()[1])
 
     async def unplug(self) -> None:
-        """Reset all that is open and listen no more. Nothing if it is unplugged."""
+        """Reset all connections and stop listening."""
         server, self._server = self._server, None
         if server:
             server.close()
@@ -324,8 +319,8 @@ class TcpProxy:
         for call in calls:
             await call.ended()
 
-    def _take(self) -> asyncio.Protocol:
-        """Each caller has a chance of its own, so that it does not matter who sends first."""
+    def _accept(self) -> asyncio.Protocol:
+        """Accept a caller. Each has its own random numbers, so that their order does not matter."""
         self.calls += 1
         chances = (random.Random(f"{self._seed} {self.calls} {way}") for way in WAYS)
         damages = [LinkDamage(c, f) for c, f in zip(chances, self.figures.values(), strict=True)]
