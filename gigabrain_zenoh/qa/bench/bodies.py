@@ -43,7 +43,7 @@ class BodyFigures(Struct, frozen=True, kw_only=True):
     latency_ticks: float | None  # median from a command of motion to the motion measured
     motions: int  # over which this median is taken
     reconnects: int
-    stops: int  # how often the gate was shut meanwhile
+    stops: int  # number of times that the gate was shut
     driver_cpu: float | None  # [%] of a core; includes a body that the driver simulates
 
 
@@ -59,7 +59,7 @@ class BodiesResult(Struct, frozen=True, kw_only=True):
 
     @property
     def ok(self) -> bool:
-        """Whether there was no contact, and no process of the brain was restarted."""
+        """True without contact and without a restart in the brain."""
         return self.brain_restarts == 0 and all(body.contacts == 0 for body in self.bodies)
 
 
@@ -68,11 +68,11 @@ async def measure_bodies(
     deployment: Deployment,
     seconds: float,
     folder: Path,
-    say: Callable[[str], None],
+    show: Callable[[str], None],
 ) -> BodiesResult:
     """Drive each body for `seconds` of its time. Raises GigabrainError.
 
-    `deployment` says all but the body.
+    `deployment` holds all settings but the body.
     """
     deployment = with_free_port(deployment)
     specs = process_specs(deployment, "robot", folder / "brain", folder / "state")
@@ -82,7 +82,7 @@ async def measure_bodies(
         pids = brain.pids
         figures = []
         for name in names:
-            say(name)
+            show(name)
             one = msgspec.structs.replace(deployment, body=name)
             figures.append(await _drive(one, seconds, folder / Path(name).stem, brain))
         statuses = brain.supervisor.statuses
@@ -126,7 +126,7 @@ def _independent(spec: ProcessSpec) -> ProcessSpec:
 async def _until_driven(
     motion: "MotionProbe", seconds: float, body: ProcessGroup, brain: ProcessGroup
 ) -> None:
-    """Wait until the gate has been open for `seconds`. Raises BodyLost when nothing goes on."""
+    """Wait until the gate has been open for `seconds`. Raises BodyLost when it stalls."""
     loop = asyncio.get_running_loop()
     seen, seen_s = motion.enabled_ticks, loop.time()
     while motion.enabled_ticks * TICK_S < seconds:
@@ -137,7 +137,7 @@ async def _until_driven(
             seen, seen_s = motion.enabled_ticks, loop.time()
         elif loop.time() - seen_s > (STALL_S if seen else START_S):
             gate = motion.state.gate if motion.state else None
-            raise BodyLost(f"nothing goes on; gate: {gate}")
+            raise BodyLost(f"the robot has stalled; gate: {gate}")
 
 
 def _figures(

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from rich.console import Group
 
 T = TypeVar("T")
-Say = Callable[[str], None]
+Progress = Callable[[str], None]
 MAX_P50_RATIO, MAX_P99_RATIO = 1.5, 2.0  # of the bare relay's
 LISTEN_S = 4.0
 SETTLE_S = 1.0  # of the relay; the chain counts from when the gate opens
@@ -64,7 +64,7 @@ PAUSE_S = TICK_NS / 1e9
 
 
 class RateComparison(Struct, frozen=True, kw_only=True):
-    """One rate: rounds of chain and relay in turns, and one run without a router."""
+    """Rounds of chain and relay in turns at one rate, and one run without a router."""
 
     rate_hz: float
     chain: tuple[Latencies, ...]
@@ -99,7 +99,7 @@ class Hop(Struct, frozen=True, kw_only=True):
 
 
 class ChainResult(Struct, frozen=True, kw_only=True):
-    """The whole benchmark."""
+    """Figures of the whole benchmark."""
 
     seconds: float  # of each run
     payload_bytes: tuple[int, ...]  # scan, world, intent, command
@@ -109,16 +109,16 @@ class ChainResult(Struct, frozen=True, kw_only=True):
 
 
 async def measure_chain(
-    seconds: float, rounds: int, rates_hz: Sequence[float], say: Say
+    seconds: float, rounds: int, rates_hz: Sequence[float], show: Progress
 ) -> ChainResult:
     """Run the benchmark. Raises GigabrainError when a process dies."""
     with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as name:
         folder = Path(name)
-        say(f"listening to the chain at {rates_hz[0]:g} Hz")
+        show(f"listening to the chain at {rates_hz[0]:g} Hz")
         heard, overheard = await listen_to_chain(rates_hz[0], min(seconds, LISTEN_S), folder)
         sizes = heard.sizes()
-        compared = [await _compare(rate, seconds, rounds, sizes, folder, say) for rate in rates_hz]
-        say("timing what each hop does")
+        compared = [await _compare(rate, seconds, rounds, sizes, folder, show) for rate in rates_hz]
+        show("timing what each hop does")
         hops = await measure_hops(heard, overheard)
     return ChainResult(
         seconds=seconds,
@@ -130,15 +130,20 @@ async def measure_chain(
 
 
 async def _compare(
-    rate_hz: float, seconds: float, rounds: int, sizes: Sequence[int], folder: Path, say: Say
+    rate_hz: float,
+    seconds: float,
+    rounds: int,
+    sizes: Sequence[int],
+    folder: Path,
+    show: Progress,
 ) -> RateComparison:
     chain, relay = [], []
     for i in range(1, rounds + 1):
-        say(f"{rate_hz:g} Hz, round {i} of {rounds}: chain")
+        show(f"{rate_hz:g} Hz, round {i} of {rounds}: chain")
         chain.append(await time_chain(rate_hz, seconds, folder))
-        say(f"{rate_hz:g} Hz, round {i} of {rounds}: bare relay")
+        show(f"{rate_hz:g} Hz, round {i} of {rounds}: bare relay")
         relay.append(await time_relay(rate_hz, seconds, sizes, folder))
-    say(f"{rate_hz:g} Hz: bare relay without a router")
+    show(f"{rate_hz:g} Hz: bare relay without a router")
     peers = await time_peers(rate_hz, seconds, sizes)
     return RateComparison(rate_hz=rate_hz, chain=tuple(chain), relay=tuple(relay), peers=peers)
 
@@ -244,8 +249,8 @@ async def _run_relay(router: Sequence[ProcessSpec], roles: Sequence[RelayRole]) 
         return msgspec.convert(found[0], Latencies)
 
 
-class Stopwatch:
-    """Durations by name."""
+class HopTimer:
+    """Measures durations by name."""
 
     def __init__(self) -> None:
         self._ms: defaultdict[str, list[float]] = defaultdict(list)
@@ -268,7 +273,7 @@ class Stopwatch:
 
 async def measure_hops(heard: ChainMonitor, total: Latencies) -> list[Hop]:
     """Time the work of each hop by itself, and set it against the time in the running chain."""
-    timed = Stopwatch()
+    timed = HopTimer()
     deployment = with_free_port(ROUTER_ONLY)
     async with (
         measured_robot(deployment) as (_, sender),
@@ -281,8 +286,8 @@ async def measure_hops(heard: ChainMonitor, total: Latencies) -> list[Hop]:
     return [_hop(heard, total, timed, topic) for topic in HOPS]
 
 
-async def _take_turns(heard: ChainMonitor, bus: Bus, timed: Stopwatch) -> None:
-    """In each turn do once what one scan makes all nodes do."""
+async def _take_turns(heard: ChainMonitor, bus: Bus, timed: HopTimer) -> None:
+    """In each turn, do the work of all nodes for one scan."""
     first, loop = heard.get(STATE).tick, DecisionLoop(DecisionConfig())
     payloads = {topic.key: codec.encode(heard.get(topic)) for topic in HOPS}
     decoders = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in HOPS}
@@ -312,7 +317,7 @@ def _steps_at(
     }
 
 
-async def _time_bridge(timed: Stopwatch) -> None:
+async def _time_bridge(timed: HopTimer) -> None:
     """Time the way from a thread like Zenoh's to the event loop."""
     bridge = Bridge()
 
@@ -329,7 +334,7 @@ async def _time_bridge(timed: Stopwatch) -> None:
     bridge.close()
 
 
-def _hop(heard: ChainMonitor, total: Latencies, timed: Stopwatch, topic: Topic[Any]) -> Hop:
+def _hop(heard: ChainMonitor, total: Latencies, timed: HopTimer, topic: Topic[Any]) -> Hop:
     """Return the hop that begins with `topic`. The last ends where the driver stops its clock."""
     after = HOPS[HOPS.index(topic) + 1] if topic is not HOPS[-1] else None
     took = heard.between(topic, after) if after else total.p50_ms - heard.between(HOPS[0], topic)

@@ -27,7 +27,7 @@ from gigabrain_zenoh.runtime.managed_process import ProcessSpec
 if TYPE_CHECKING:
     from rich.console import Group
 
-Say = Callable[[str], None]
+Progress = Callable[[str], None]
 SPEED = 0.26  # [m/s]
 FAST = 0.9  # share of it, from which the robot counts as driving
 STILL = 0.005  # [m/s]
@@ -54,20 +54,20 @@ class EstopResult(Struct, frozen=True, kw_only=True):
     rounds: tuple[PressTimes, ...]
 
 
-async def measure_estop(body: str, driving: int, latched: int, say: Say) -> EstopResult:
+async def measure_estop(body: str, driving: int, latched: int, show: Progress) -> EstopResult:
     """Press while it drives and while it is latched, on an idle and on a flooded network."""
     decision = DecisionConfig(settings={"max_linear_speed": SPEED})
     deployment = with_free_port(
         Deployment(body=body, resume="manual", router=LOOPBACK, decision=decision)
     )
     endpoint = endpoint_text(client_endpoint(deployment))
-    say(f"starting {body}")
+    show(f"starting {body}")
     async with measured_robot(deployment) as (group, bus):
         operator = _Operator(bus, group)
-        idle = await operator.presses("idle", driving, latched, say)
+        idle = await operator.presses("idle", driving, latched, show)
         async with ProcessGroup([ProcessSpec("flood", (*PROGRAM, "pictures", endpoint))]) as flood:
             await flood.until_ready()
-            flooded = await operator.presses("flooded", driving, latched, say)
+            flooded = await operator.presses("flooded", driving, latched, show)
     return EstopResult(body=body, rounds=(idle, flooded))
 
 
@@ -80,11 +80,11 @@ class _Operator:
         self._enabling = False  # whether a request to enable is under way
         self._state = bus.latest(STATE, self._trail.append)
 
-    async def presses(self, name: str, driving: int, latched: int, say: Say) -> PressTimes:
+    async def presses(self, name: str, driving: int, latched: int, show: Progress) -> PressTimes:
         """Press `driving` times while it drives, and `latched` times while it is latched."""
         times, travels = [], []
         for count in range(driving):
-            say(f"{name}: press {count + 1} of {driving} while it drives")
+            show(f"{name}: press {count + 1} of {driving} while it drives")
             await self._group.until(self._fast, "the robot drives")
             start = self._trail[-1]
             self._trail.clear()

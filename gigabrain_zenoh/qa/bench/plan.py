@@ -19,9 +19,9 @@ from gigabrain_zenoh.navigation.global_planner import GlobalPlanner, Path, Point
 from gigabrain_zenoh.navigation.grid_search import GridSearch, Ints
 
 RULES = Inflation(fits=0.2, turns=0.3)
-ROUNDS = 7  # of what is timed on one and the same map
-GOALS = 4  # from one start: they share the Dijkstra that finds and checks them
-SHARE, SPREAD = 0.75, 0.1  # of the map's side a path costs, more or less
+ROUNDS = 7  # of each operation on the same map
+GOALS = 4  # from one start; they share its Dijkstra
+SHARE, SPREAD = 0.75, 0.1  # cost of a path as a share of the map's side, and its tolerance
 
 
 RESOLUTION = 0.05  # [m]
@@ -32,38 +32,38 @@ Cells = NDArray[np.int8]
 
 
 class Timing(Struct, frozen=True, kw_only=True):
-    """How long one thing took."""
+    """Times of one operation."""
 
     what: str
     n: int
     p50_ms: float
     p95_ms: float
-    cpu_p50_ms: float  # what it would take on a core of its own
+    cpu_p50_ms: float
 
 
 class SizeFigures(Struct, frozen=True, kw_only=True):
-    """One size of map."""
+    """Figures of one size of map."""
 
     size: int  # cells a side
     path_m: float  # mean length of the paths
     timings: tuple[Timing, ...]
-    ratio: float  # the worst of A* to Dijkstra, over all queries: 1 is optimal
+    ratio: float  # worst cost of A* over Dijkstra's; 1 is optimal
 
 
 class PlanResult(Struct, frozen=True, kw_only=True):
-    """All sizes."""
+    """Figures of all sizes."""
 
     seed: int
     sizes: tuple[SizeFigures, ...]
 
     @property
     def ok(self) -> bool:
-        """Whether every path was optimal."""
+        """True if every path is optimal."""
         return all(abs(one.ratio - 1) < 1e-6 for one in self.sizes)
 
 
 class Query(NamedTuple):
-    """A start and a goal, and what Dijkstra pays."""
+    """A start and a goal, and the cost of Dijkstra's path."""
 
     begin: tuple[int, int]  # row, column
     end: tuple[int, int]
@@ -72,8 +72,8 @@ class Query(NamedTuple):
     cheapest: float
 
 
-class Stopwatch:
-    """Times of one thing, again and again."""
+class OperationTimer:
+    """Measures one operation repeatedly. Used as `with`."""
 
     def __init__(self) -> None:
         self.wall_ms: list[float] = []
@@ -87,7 +87,7 @@ class Stopwatch:
         self.cpu_ms.append((time.thread_time() - self._cpu) * 1e3)
 
     def timing(self, what: str) -> Timing:
-        """The figures so far."""
+        """Return the figures so far."""
         wall, cpu = sorted(self.wall_ms), sorted(self.cpu_ms)
         return Timing(
             what=what,
@@ -99,13 +99,17 @@ class Stopwatch:
 
 
 def measure_plan(
-    sizes: tuple[int, ...], queries: int, seed: int, png: File | None, say: Callable[[str], None]
+    sizes: tuple[int, ...],
+    queries: int,
+    seed: int,
+    png: File | None,
+    show: Callable[[str], None],
 ) -> PlanResult:
-    """Measure maps of so many cells a side. The last is drawn into `png`. Raises ConfigError."""
+    """Measure maps of these sizes [cells]; draw the last one into `png`. Raises ConfigError."""
     warm_up()
     figures = []
     for size in sizes:
-        say(f"{size} x {size} cells")
+        show(f"{size} x {size} cells")
         one, made, paths = _measure(size, queries, np.random.default_rng(seed))
         figures.append(one)
     if png is not None and not cv2.imwrite(str(png), _drawing(made, paths)):
@@ -118,18 +122,19 @@ def _measure(
 ) -> tuple[SizeFigures, Costmap, list[Path]]:
     cells = office(size, rng)
     grid, planner = grid_of(cells), GlobalPlanner()
-    made, anew, changed, first = costmap(grid, RULES), Stopwatch(), Stopwatch(), Stopwatch()
+    made = costmap(grid, RULES)
+    anew, changed, first = OperationTimer(), OperationTimer(), OperationTimer()
     asked = list(itertools.islice(_queries(made, planner.search, rng), queries))
     for i in range(ROUNDS):
         with anew:
             costmap(grid, RULES)
-        now = grid_of(something_new(cells, rng))
+        now = grid_of(with_new_furniture(cells, rng))
         with changed:
             costmap(now, RULES, None, made)
         one = asked[i % len(asked)]
         with first:
             planner.plan(costmap(now, RULES, None, made), one.start, one.goal)
-    searching, planning, ratios, paths = Stopwatch(), Stopwatch(), [], []
+    searching, planning, ratios, paths = OperationTimer(), OperationTimer(), [], []
     for one in asked:
         with searching:
             cells_on = planner.search.path(made.cost, one.begin, one.end)
@@ -151,7 +156,7 @@ def _measure(
 
 
 def _queries(made: Costmap, search: GridSearch, rng: np.random.Generator) -> Iterator[Query]:
-    """Starts and goals as far apart as wanted, by Dijkstra."""
+    """Yield starts and goals at the wanted distance, by Dijkstra."""
     wanted = SHARE * len(made.cost)
     open_ = np.argwhere(made.cost < 2)
     while True:
@@ -176,8 +181,8 @@ def _middle(made: Costmap, cell: tuple[int, int]) -> Point:
 def _corner_to_corner(
     size: int, rng: np.random.Generator, ratios: list[float]
 ) -> tuple[Timing, Timing]:
-    """A* and a whole field of Dijkstra's over a random map; their ratio joins `ratios`."""
-    cost, search, one, all_ = scattered(size, rng), GridSearch(), Stopwatch(), Stopwatch()
+    """Time A* and Dijkstra over a random map; append the ratio of their costs to `ratios`."""
+    cost, search, one, all_ = scattered(size, rng), GridSearch(), OperationTimer(), OperationTimer()
     goal = (size - 1, size - 1)
     for _ in range(ROUNDS):
         with one:
@@ -191,7 +196,7 @@ def _corner_to_corner(
 
 
 def _paid(cost: Costs, cells: Ints | None) -> float:
-    """What a way over cells costs; inf for none."""
+    """Return the cost of a path over cells; inf for none."""
     if cells is None:
         return float("inf")
     on = cost[cells[:, 0], cells[:, 1]].astype(np.float64)
@@ -199,7 +204,7 @@ def _paid(cost: Costs, cells: Ints | None) -> float:
 
 
 def _drawing(made: Costmap, paths: list[Path]) -> NDArray[np.uint8]:
-    """The costs, the dearer the darker, and the paths in colours; y goes up."""
+    """Return a picture of the costs, dark where high, and of the paths in colours."""
     grey = (255 - 12 * made.cost.clip(1, 14)).astype(np.uint8)
     grey[made.cells > 0] = 0
     picture = np.repeat(grey[:, :, np.newaxis], 3, axis=2)
@@ -212,7 +217,7 @@ def _drawing(made: Costmap, paths: list[Path]) -> NDArray[np.uint8]:
 
 
 def office(size: int, rng: np.random.Generator) -> Cells:
-    """Rooms of 4.8 m with a door of 1 m each, furniture, and corridors of 2.4 m between them."""
+    """Return rooms of 4.8 m with a door of 1 m each, furniture, and corridors of 2.4 m."""
     cells = np.zeros((size, size), np.int8)
     for top in range(0, size, PITCH):
         for left in range(0, size, PITCH):
@@ -225,7 +230,7 @@ def office(size: int, rng: np.random.Generator) -> Cells:
 
 
 def _add_room(room: Cells, rng: np.random.Generator) -> None:
-    """Walls, a door in each of two sides, and furniture, in a part of a map."""
+    """Add walls, doors and furniture to a part of a map."""
     room[:WALL] = room[-WALL:] = room[:, :WALL] = room[:, -WALL:] = 100
     for side in (room[:WALL], room[-WALL:], room[:, :WALL].T, room[:, -WALL:].T):
         door = rng.integers(WALL, ROOM - DOOR - WALL)
@@ -238,14 +243,14 @@ def _add_room(room: Cells, rng: np.random.Generator) -> None:
 
 
 def scattered(size: int, rng: np.random.Generator) -> Costs:
-    """A random map, costs of 1 and lethal cells, as planners are compared on; free corners."""
+    """Return a random map of free and lethal cells, with free corners."""
     taken = rng.random((size, size)) < DENSITY
     taken[:3, :3] = taken[-3:, -3:] = False
     return np.where(taken, np.float32(2 * LETHAL), np.float32(1))
 
 
-def something_new(cells: Cells, rng: np.random.Generator) -> Cells:
-    """The map with a piece of furniture more."""
+def with_new_furniture(cells: Cells, rng: np.random.Generator) -> Cells:
+    """Return the map with one more piece of furniture."""
     row, column = rng.integers(0, len(cells) - 10, 2)
     now = cells.copy()
     now[row : row + 10, column : column + 10] = 100
@@ -253,7 +258,7 @@ def something_new(cells: Cells, rng: np.random.Generator) -> Cells:
 
 
 def grid_of(cells: Cells) -> OccupancyGrid:
-    """The map as it goes over the bus."""
+    """Return the map as a message."""
     height, width = cells.shape
     return OccupancyGrid(
         resolution=RESOLUTION,

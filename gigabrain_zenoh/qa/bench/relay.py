@@ -1,9 +1,9 @@
-"""The bare relay: four plain Zenoh processes that pass on what they get. The chain's yardstick.
+"""The bare relay: four plain Zenoh processes that forward messages, as a reference for the chain.
 
     source ──scan──► first ──world──► second ──intent──► third ──cmd──► source
 
-A callback puts at once: no asyncio, no decoding, no work. Each has the Zenoh threads and the
-niceness of the process that it stands for. Started as `python -m gigabrain_zenoh.qa.bench.relay
+A callback publishes at once: no asyncio, no decoding, no work. Each process has the Zenoh threads
+and the niceness of the one that it stands for. Started as `python -m gigabrain_zenoh.qa.bench.relay
 ROLE`, with a RelayRole in JSON.
 """
 
@@ -27,7 +27,7 @@ from gigabrain_zenoh.host.this_process import go_first
 from gigabrain_zenoh.qa.judging import latencies
 
 STAMP_BYTES = 8
-LOST_S = 0.3  # what has not come back by then never will
+LOST_S = 0.3  # later messages count as lost
 ENDS = {signal.SIGTERM, signal.SIGINT}
 
 
@@ -62,8 +62,8 @@ def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
     )
 
 
-def pass_on(session: zenoh.Session, role: RelayRole) -> None:
-    """Put what arrives, cut or filled up to this hop's size, until a signal ends the process."""
+def forward(session: zenoh.Session, role: RelayRole) -> None:
+    """Forward messages, cut or padded to this hop's size, until a signal ends the process."""
     put, filler = publisher(session, role.puts).put, bytes(role.size)
 
     def relay(sample: zenoh.Sample) -> None:
@@ -71,13 +71,13 @@ def pass_on(session: zenoh.Session, role: RelayRole) -> None:
         put(payload[: role.size] + filler[len(payload) :])
 
     subscriber = session.declare_subscriber(role.gets, relay)
-    say({"event": "ready"})
+    print_record({"event": "ready"})
     signal.sigwait(ENDS)
     subscriber.undeclare()
 
 
 def measure(session: zenoh.Session, role: RelayRole) -> None:
-    """Send at a steady rate, and report how long each message took to come round."""
+    """Send at a steady rate, and report the time of each round trip."""
     put, filler = publisher(session, role.puts).put, bytes(role.size - STAMP_BYTES)
     times_ms: list[float] = []
     settled = threading.Event()
@@ -91,12 +91,12 @@ def measure(session: zenoh.Session, role: RelayRole) -> None:
         put(time.monotonic_ns().to_bytes(STAMP_BYTES, "little") + filler)
 
     subscriber = session.declare_subscriber(role.gets, back)
-    say({"event": "ready"})
+    print_record({"event": "ready"})
     paced(role.rate_hz, role.settle_s, send)
     settled.set()
     paced(role.rate_hz, role.seconds, send)
     time.sleep(LOST_S)
-    say({"event": "figures", "figures": msgspec.to_builtins(latencies(times_ms))})
+    print_record({"event": "figures", "figures": msgspec.to_builtins(latencies(times_ms))})
     signal.sigwait(ENDS)
     subscriber.undeclare()
 
@@ -109,7 +109,7 @@ def paced(rate_hz: float, seconds: float, act: Callable[[], None]) -> None:
         act()
 
 
-def say(record: Mapping[str, Any]) -> None:
+def print_record(record: Mapping[str, Any]) -> None:
     """Print a line that the supervisor reads."""
     print(msgspec.json.encode(record).decode(), flush=True)
 
@@ -126,7 +126,7 @@ def main() -> None:
     if role.rate_hz:
         measure(session, role)
     else:
-        pass_on(session, role)
+        forward(session, role)
     session.close()
     os._exit(0)  # Zenoh's threads must not keep a finished process alive
 

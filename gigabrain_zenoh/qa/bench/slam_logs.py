@@ -1,16 +1,17 @@
 """`gigabrain bench slam --log`: maps recorded laser logs, and compares them with reference poses.
 
 R. Kümmerle et al., On measuring the accuracy of SLAM algorithms, Autonomous Robots 2009: a map is
-judged by how poses that are near one another lie to each other, not by where they are. The
-reference of some logs is wrong in places, so crispness judges a map by its own scans: a wall that
-is drawn twice fills twice as many cells."""
+judged by the relations of nearby poses, not by the poses themselves. The reference of some logs is
+wrong in places, so crispness judges a map by its own scans: a wall that is drawn twice fills twice
+as many cells.
+"""
 
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -25,6 +26,7 @@ from gigabrain_zenoh.mapping.keyframes import Scan, from_beams
 from gigabrain_zenoh.mapping.slam import Estimate, Slam
 from gigabrain_zenoh.qa.judging import Latencies, latencies
 
+T = TypeVar("T")
 RANGE_MIN, RANGE_MAX = 0.1, 25.0  # [m], beyond them a beam says nothing
 NEAR_M = 3.0  # [m], poses of a relation
 DENSE_M = 0.3  # [m], a median step below it makes a dense log
@@ -36,7 +38,7 @@ FIELDS = ("ranges", "ref", "odom")
 
 @dataclass(frozen=True, slots=True)
 class LaserLog:
-    """Scans and odometry in the order of recording, and poses that somebody corrected."""
+    """Scans and odometry in the order of recording, and corrected reference poses."""
 
     name: str
     ranges: Floats  # [m], (n, beams)
@@ -44,14 +46,14 @@ class LaserLog:
     odometry: Floats  # (n, 3)
 
     def scan(self, at: int) -> Scan:
-        """One scan; beam i points to -90° + i 180°/beams."""
+        """Return one scan; beam i points to -90° + i 180°/beams."""
         beams = self.ranges.shape[1]
         angles = np.radians(-90.0 + np.arange(beams) * 180.0 / beams)
         return from_beams(angles, self.ranges[at], RANGE_MIN, RANGE_MAX)
 
 
 class RelationErrors(Struct, frozen=True, kw_only=True):
-    """How far relations are from the reference."""
+    """Errors of relations against the reference."""
 
     mean_m: float
     std_m: float
@@ -60,7 +62,7 @@ class RelationErrors(Struct, frozen=True, kw_only=True):
 
 
 def load(path: Path) -> LaserLog:
-    """The log in an .npz file: `ranges` [cm], `ref` and `odom`. Raises ConfigError."""
+    """Load an .npz file: `ranges` [cm], `ref` and `odom`. Raises ConfigError."""
     arrays = map_file.read_arrays(path, "no laser log")
     if missing := set(FIELDS) - arrays.keys():
         raise ConfigError(f"{path}: no {', '.join(sorted(missing))}; expected {', '.join(FIELDS)}")
@@ -75,7 +77,7 @@ def load(path: Path) -> LaserLog:
 
 
 def relations(log: LaserLog, seed: int = SEED) -> NDArray[np.intp]:
-    """Pairs of scans (k, 2) at places that were passed twice. Raises ConfigError without any."""
+    """Return pairs of scans (k, 2) at places passed twice. Raises ConfigError without any."""
     places = log.reference[:, :2]
     step = float(np.median(np.hypot(*np.diff(places, axis=0).T)))
     gap = DENSE_GAP if step < DENSE_M else GAP
@@ -98,7 +100,7 @@ def _near(places: Floats, first: int, start: int) -> NDArray[np.intp]:
 
 
 def errors(log: LaserLog, poses: Floats, pairs: NDArray[np.intp]) -> RelationErrors:
-    """How `poses` (n, 3) compare with the reference over `pairs`."""
+    """Return the errors of `poses` (n, 3) over `pairs`."""
     first, second = pairs.T
     wanted = between(log.reference[first], log.reference[second])
     off = between(wanted, between(poses[first], poses[second]))
@@ -167,7 +169,7 @@ Progress = Callable[[], None]  # called after each scan
 
 
 class LogResult(Struct, frozen=True, kw_only=True):
-    """One log. Times are of the CPU, which is what a free core would take."""
+    """Figures of one log. Times are CPU times."""
 
     log: str
     scans: int
@@ -179,7 +181,7 @@ class LogResult(Struct, frozen=True, kw_only=True):
     front_end: RelationErrors
     graph: RelationErrors
     crispness: float  # cells filled, per cell that the reference fills
-    unmatched: int  # scans that were put where odometry or a search had them
+    unmatched: int  # scans placed by odometry or by a search
     breaks: int  # in the sequence
     scan: Latencies
     loop: Latencies
@@ -187,32 +189,32 @@ class LogResult(Struct, frozen=True, kw_only=True):
 
 
 class SlamResult(Struct, frozen=True, kw_only=True):
-    """All logs."""
+    """Figures of all logs."""
 
     logs: tuple[LogResult, ...]
     mean_m: float  # of the graphs' errors, over the logs
-    peak_mb: float  # of this process, with everything that it has imported
+    peak_mb: float  # of this process, imports included
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappedLog:
-    """A log mapped."""
+    """A mapped log."""
 
     slam: Slam
     estimates: list[Estimate]
-    smooth: Floats  # (n, 3), where the front end alone puts the scans
+    smooth: Floats  # (n, 3), poses of the front end alone
     scan_ms: list[float]
     loop_ms: list[float]
     loops: int
 
     def poses(self) -> Floats:
-        """Where the graph has put all scans in the end, (n, 3)."""
+        """Return the poses of all scans in the final graph (n, 3)."""
         keyframes = self.slam.poses[[estimate.keyframe for estimate in self.estimates]]
         return compose(keyframes, np.array([estimate.relative for estimate in self.estimates]))
 
 
 def map_log(log: LaserLog, progress: Progress) -> MappedLog:
-    """Map the log, loops being searched after each scan."""
+    """Map the log; loops are searched after each scan."""
     steps = between(log.odometry[:-1], log.odometry[1:])
     steps = np.concatenate((np.zeros((1, 3)), steps))
     slam, loops = Slam(), 0
@@ -267,7 +269,7 @@ def judge_log(log: LaserLog, driven: MappedLog) -> LogResult:
 
 
 def total(logs: list[LogResult]) -> SlamResult:
-    """The logs together."""
+    """Return the figures of all logs together."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return SlamResult(
         logs=tuple(logs),
@@ -284,39 +286,45 @@ DOTS_PER_INCH = 130  # per inch
 WALLS, DRIVEN, REFERENCE = "#1d2733", "#d9480f", "#1c7ed6"
 
 
-def draw_logs(drives: Sequence[tuple[LaserLog, MappedLog]], to: Path) -> None:
-    """Draw each map with the way that was driven, side by side. Raises ConfigError."""
+def draw_side_by_side(
+    items: Sequence[T], columns: int, draw: Callable[["Axes", T], None], to: Path
+) -> None:
+    """Draw each item into a picture of its own in a PNG file. Raises ConfigError."""
     try:
         from matplotlib.figure import Figure
     except ModuleNotFoundError:
         raise ConfigError(
             "pictures need matplotlib: pip install 'gigabrain-zenoh[record]'"
         ) from None
-    columns = min(len(drives), 2)
-    rows = -(-len(drives) // columns)
+    rows = -(-len(items) // columns)
     figure = Figure(figsize=(SIDE_INCHES * columns, SIDE_INCHES * rows), layout="constrained")
     cells = list(figure.subplots(rows, columns, squeeze=False).flat)
-    for axes in cells:
+    for axes, item in zip(cells, items, strict=False):
+        draw(axes, item)
+        axes.set_xlabel("x [m]")
+        axes.set_ylabel("y [m]")
+        axes.legend(loc="best")
+    for axes in cells[len(items) :]:
         axes.set_axis_off()
-    for axes, (log, driven) in zip(cells, drives, strict=False):
-        _draw_log(axes, log, driven)
     try:
         figure.savefig(to, format="png", dpi=DOTS_PER_INCH)
     except OSError as error:
         raise ConfigError(f"cannot write {to}: {error.strerror}") from None
 
 
-def _draw_log(axes: "Axes", log: LaserLog, driven: MappedLog) -> None:
+def draw_logs(drives: Sequence[tuple[LaserLog, MappedLog]], to: Path) -> None:
+    """Draw each map with its path, two in a row. Raises ConfigError."""
+    draw_side_by_side(drives, min(len(drives), 2), _draw_log, to)
+
+
+def _draw_log(axes: "Axes", drive: tuple[LaserLog, MappedLog]) -> None:
+    log, driven = drive
     keyframes = zip(driven.slam.poses, driven.slam.keyframes, strict=True)
     walls = np.concatenate([transform(pose, keyframe.points) for pose, keyframe in keyframes])
     poses = driven.poses()
     reference = laid_onto(log.reference, poses)
-    axes.set_axis_on()
     axes.plot(*walls.T, ",", color=WALLS, alpha=0.3)
     axes.plot(*reference[:, :2].T, color=REFERENCE, linewidth=1.2, label="reference")
     axes.plot(*poses[:, :2].T, color=DRIVEN, linewidth=0.8, label="as mapped")
     axes.set_title(log.name)
     axes.set_aspect("equal")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    axes.legend(loc="best")

@@ -5,6 +5,7 @@ from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from msgspec import Struct
@@ -21,9 +22,12 @@ from gigabrain_zenoh.mapping.likelihood_field import OCCUPIED
 from gigabrain_zenoh.mapping.odometry import Fusion, Moment, way
 from gigabrain_zenoh.mapping.slam_map import GrowingMap
 from gigabrain_zenoh.perception.mapper import view_of
-from gigabrain_zenoh.qa.bench.slam_logs import DOTS_PER_INCH, DRIVEN, REFERENCE, SIDE_INCHES
+from gigabrain_zenoh.qa.bench.slam_logs import DRIVEN, REFERENCE, draw_side_by_side
 from gigabrain_zenoh.qa.judging import Latencies, latencies
 from gigabrain_zenoh.runtime.services import rss_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 CLOSE_LOOPS_S = 60.0  # so that a slow machine makes the same map
 COLD = 20  # scans before anything is timed
@@ -38,7 +42,7 @@ MINUTES_PER_HOUR = 60  # minutes
 
 
 class MapGrowth(Struct, frozen=True, kw_only=True):
-    """One process that makes a map."""
+    """Memory of a process that makes a map, and the size of the map."""
 
     memory_mb: tuple[float, ...]  # each minute of the robot's time
     mb_an_hour: float  # slope of the memory after the first quarter
@@ -46,12 +50,12 @@ class MapGrowth(Struct, frozen=True, kw_only=True):
 
     @property
     def most_mb(self) -> float:
-        """The most memory of any minute."""
+        """The greatest memory of any minute [MB]."""
         return max(self.memory_mb, default=0.0)
 
 
 class GrowthSampler:
-    """Takes the samples."""
+    """Samples memory and map, minute by minute."""
 
     def __init__(self) -> None:
         self._memory: list[float] = []
@@ -59,7 +63,7 @@ class GrowthSampler:
 
     @property
     def minutes(self) -> int:
-        """How many minutes were sampled."""
+        """Number of minutes sampled."""
         return len(self._memory)
 
     def minute(self, rss_mb: float, grid: OccupancyGrid) -> None:
@@ -69,7 +73,7 @@ class GrowthSampler:
             self._walls.append(occupied(grid))
 
     def growth(self, grid: OccupancyGrid) -> MapGrowth:
-        """Return what the samples come to, the map being `grid` in the end."""
+        """Return the figures of all samples; `grid` is the map at the end."""
         return MapGrowth(
             memory_mb=tuple(round(one, 1) for one in self._memory),
             mb_an_hour=slope(self._memory[int(len(self._memory) * WARM_UP) :]) * MINUTES_PER_HOUR,
@@ -78,17 +82,17 @@ class GrowthSampler:
 
 
 def slope(values: Sequence[float]) -> float:
-    """Return how much the values grow from one to the next, by linear regression."""
+    """Return the growth from one value to the next, by linear regression."""
     return float(np.polyfit(np.arange(len(values)), values, 1)[0]) if len(values) > 1 else 0.0
 
 
 def occupied(grid: OccupancyGrid) -> int:
-    """Return how many cells are occupied: a wall that is drawn twice has more of them."""
+    """Count the occupied cells; a wall that is drawn twice has more of them."""
     return int((cells(grid) >= OCCUPIED).sum())
 
 
 class PoseErrors(Struct, frozen=True, kw_only=True):
-    """How far poses are from the truth, both having begun in the same place."""
+    """Errors of poses against the truth, both from the same start."""
 
     mean_m: float
     max_m: float
@@ -97,7 +101,7 @@ class PoseErrors(Struct, frozen=True, kw_only=True):
 
 
 class WorldResult(Struct, frozen=True, kw_only=True):
-    """One world. Times are of the CPU, which is what a free core would take."""
+    """Figures of one world. Times are CPU times."""
 
     world: str
     body: str
@@ -118,14 +122,14 @@ class WorldResult(Struct, frozen=True, kw_only=True):
 
 
 class WorldsResult(Struct, frozen=True, kw_only=True):
-    """All worlds."""
+    """Figures of all worlds."""
 
     worlds: tuple[WorldResult, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MappedWorld:
-    """A world that was mapped, with all that it takes to draw it."""
+    """A mapped world, with all that drawing it needs."""
 
     result: WorldResult
     grid: OccupancyGrid
@@ -134,7 +138,7 @@ class MappedWorld:
 
 
 def map_world(body: str, world: str, seed: int, minutes: float, progress: Progress) -> MappedWorld:
-    """Let the body roam the world for so long. Raises ConfigError."""
+    """Let the body explore the world for `minutes`. Raises ConfigError."""
     from gigabrain_zenoh.qa.simulated_drives import ExploreRun  # needs MuJoCo
 
     roaming = ExploreRun(body, world, seed)
@@ -179,17 +183,17 @@ def map_world(body: str, world: str, seed: int, minutes: float, progress: Progre
 
 
 class _MappingRun:
-    """What perception does with scans and states, and what came of it."""
+    """Maps scans and states as perception does, and keeps the poses."""
 
     def __init__(self, chart: GrowingMap) -> None:
         self.chart, self.fusion, self.not_localized = chart, Fusion(), 0
-        # flat, so that an hour of them is next to nothing in the memory that is measured
+        # flat arrays, so that an hour of them hardly counts in the measured memory
         self.took_ms, self._poses, self._fused = array("d"), array("d"), array("d")
         self._truth = array("d")  # in the world
         self._last: Moment | None = None
 
     def scan(self, lidar: Lidar, scan: LaserScan, truth: Floats) -> None:
-        """One scan, taken at `truth` (3,)."""
+        """Add a scan, taken at the pose `truth` (3,)."""
         moment = self.fusion.at(scan.basis)
         if moment is None:
             return
@@ -205,16 +209,16 @@ class _MappingRun:
 
     @property
     def poses(self) -> Floats:
-        """As mapped (n, 3)."""
+        """Poses in the map (n, 3)."""
         return np.array(self._poses).reshape(-1, 3)
 
     @property
     def fused(self) -> Floats:
-        """By odometry and gyro (n, 3)."""
+        """Poses by odometry and gyro (n, 3)."""
         return np.array(self._fused).reshape(-1, 3)
 
     def in_map(self) -> Floats:
-        """The truth (n, 3), as seen from where the map began."""
+        """Return the true poses (n, 3) in the map's frame."""
         truth = np.array(self._truth).reshape(-1, 3)
         return compose(compose(self.poses[0], inverse(truth[0])), truth)
 
@@ -231,28 +235,17 @@ def _errors(off: Floats) -> PoseErrors:
 
 def draw_worlds(worlds: Sequence[MappedWorld], to: Path) -> None:
     """Draw the maps side by side. Raises ConfigError."""
-    try:
-        from matplotlib.figure import Figure
-    except ModuleNotFoundError:
-        raise ConfigError(
-            "pictures need matplotlib: pip install 'gigabrain-zenoh[record]'"
-        ) from None
-    figure = Figure(figsize=(SIDE_INCHES * len(worlds), SIDE_INCHES), layout="constrained")
-    for axes, one in zip(figure.subplots(1, len(worlds), squeeze=False).flat, worlds, strict=True):
-        grid, shown = one.grid, cells(one.grid).astype(np.int16)
-        shown[shown < 0] = UNKNOWN
-        left, low = grid.origin_x, grid.origin_y
-        right, high = left + grid.width * grid.resolution, low + grid.height * grid.resolution
-        axes.imshow(
-            100 - shown, "gray", origin="lower", extent=(left, right, low, high), vmin=0, vmax=100
-        )
-        axes.plot(*one.truth[:, :2].T, color=REFERENCE, linewidth=1.2, label="true")
-        axes.plot(*one.poses[:, :2].T, color=DRIVEN, linewidth=0.8, label="as mapped")
-        axes.set_title(one.result.world)
-        axes.set_xlabel("x [m]")
-        axes.set_ylabel("y [m]")
-        axes.legend(loc="best")
-    try:
-        figure.savefig(to, format="png", dpi=DOTS_PER_INCH)
-    except OSError as error:
-        raise ConfigError(f"cannot write {to}: {error.strerror}") from None
+    draw_side_by_side(worlds, len(worlds), _draw_world, to)
+
+
+def _draw_world(axes: "Axes", one: MappedWorld) -> None:
+    grid, shown = one.grid, cells(one.grid).astype(np.int16)
+    shown[shown < 0] = UNKNOWN
+    left, low = grid.origin_x, grid.origin_y
+    right, high = left + grid.width * grid.resolution, low + grid.height * grid.resolution
+    axes.imshow(
+        100 - shown, "gray", origin="lower", extent=(left, right, low, high), vmin=0, vmax=100
+    )
+    axes.plot(*one.truth[:, :2].T, color=REFERENCE, linewidth=1.2, label="true")
+    axes.plot(*one.poses[:, :2].T, color=DRIVEN, linewidth=0.8, label="as mapped")
+    axes.set_title(one.result.world)

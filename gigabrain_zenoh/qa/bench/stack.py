@@ -78,7 +78,7 @@ class StackResult(Struct, frozen=True, kw_only=True):
         return sum(process.cpu for process in self.processes) - (self.physics_cpu or 0.0)
 
 
-class Target(NamedTuple):
+class StackTarget(NamedTuple):
     """A limit and the value that was measured."""
 
     limit: Limit
@@ -90,31 +90,31 @@ class Target(NamedTuple):
         return self.limit.allows(self.value)
 
 
-def targets(result: StackResult) -> list[Target]:
+def targets(result: StackResult) -> list[StackTarget]:
     """Return the figures that have a limit. Memory counts in processes without MuJoCo."""
-    found = [Target(READY, result.ready_s), Target(CPU, 100 * result.cpu_without_physics)]
+    found = [StackTarget(READY, result.ready_s), StackTarget(CPU, 100 * result.cpu_without_physics)]
     if result.physics_cpu is not None:
-        found.append(Target(PHYSICS, 100 * result.physics_cpu))
+        found.append(StackTarget(PHYSICS, 100 * result.physics_cpu))
     if goal := result.first_goal:
-        found.append(Target(FIRST_GOAL, goal.accepted_s))
+        found.append(StackTarget(FIRST_GOAL, goal.accepted_s))
     small = [p for p in result.processes if p.name != SIMULATOR or result.physics_cpu is None]
     largest = max(small, key=lambda process: process.rss_bytes)
     memory = Figure(f"largest without MuJoCo ({largest.name})", "MB").at_most(MAX_RSS_MB)
-    return [*found, Target(memory, largest.rss_bytes / MB)]
+    return [*found, StackTarget(memory, largest.rss_bytes / MB)]
 
 
 async def measure_stack(
-    body: str, world: str, seconds: float, say: Callable[[str], None], *, goal: bool = False
+    body: str, world: str, seconds: float, show: Callable[[str], None], *, goal: bool = False
 ) -> StackResult:
     """Run a robot that avoids obstacles; with `goal` also one that navigates, for its first goal.
 
     Raises GigabrainError when a process dies.
     """
     deployment = Deployment(body=body, world=world, resume="auto", router=LOOPBACK)
-    say(f"starting {body} in {world}")
+    show(f"starting {body} in {world}")
     async with measured_robot(deployment) as (group, bus):
         await group.run_for(SETTLE_S)
-        say(f"ready after {group.ready_s:.2f} s; measuring for {seconds:g} s")
+        show(f"ready after {group.ready_s:.2f} s; measuring for {seconds:g} s")
         names = list(group.supervisor.statuses)
         healths: defaultdict[str, list[Health]] = defaultdict(list)
         close = bus.subscribe(HEALTH, lambda _key, health: healths[health.process].append(health))
@@ -123,7 +123,7 @@ async def measure_stack(
         close()
         after, ended_ns = await driver_report(bus), bus.clock.now_ns()
         await group.until(lambda: len(healths) >= len(names), "health of all processes")
-    first_goal = await measure_first_goal(body, world, say) if goal else None
+    first_goal = await measure_first_goal(body, world, show) if goal else None
     return StackResult(
         body=body,
         world=world,
@@ -153,7 +153,7 @@ def _cost(name: str, healths: Sequence[Health]) -> ProcessCost:
     )
 
 
-async def measure_first_goal(body: str, world: str, say: Callable[[str], None]) -> FirstGoal:
+async def measure_first_goal(body: str, world: str, show: Callable[[str], None]) -> FirstGoal:
     """Start a robot that makes a map, and send it a goal until it accepts and drives.
 
     Compiles first. Raises ConfigError where navigation is not installed, and GigabrainError when a
@@ -165,7 +165,7 @@ async def measure_first_goal(body: str, world: str, say: Callable[[str], None]) 
         body=body, world=world, resume="auto", router=LOOPBACK,
         perception=PerceptionConfig(mapping="slam"), decision=DecisionConfig(behaviour="navigate"),
     )  # fmt: skip
-    say(f"starting {body} in {world} for a first goal")
+    show(f"starting {body} in {world} for a first goal")
     async with measured_robot(deployment, ready_s=None) as (group, bus):
         follows = asyncio.Event()
 

@@ -11,7 +11,7 @@ from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.diagnostics.topic_stats import ChainMonitor, median_ms
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host.bounded import NewestValues, percentile
-from gigabrain_zenoh.qa.bench.chain import Hop, Stopwatch, relay_roles
+from gigabrain_zenoh.qa.bench.chain import Hop, HopTimer, relay_roles
 from gigabrain_zenoh.qa.judging import latencies, over_rounds
 from tests.unit.qa.figures import compared, one
 
@@ -72,7 +72,7 @@ def test_what_a_hop_does_not_do_itself_is_the_rest() -> None:
 
 
 def test_work_is_timed_by_name_and_its_result_handed_on() -> None:
-    timed = Stopwatch()
+    timed = HopTimer()
     assert timed("step", lambda: 7) == 7
     assert timed.median("step") >= 0.0
     for duration_ns in (MS, 5 * MS, 2 * MS):
