@@ -1,6 +1,6 @@
 """A short drive in each world, and one with a map, for the process replay in the tests.
 
-`python -m gigabrain_zenoh.qa.drives FOLDER` records them anew after a change that is meant.
+`python -m gigabrain_zenoh.qa.drives FOLDER` records them again after an intended change.
 """
 
 import asyncio
@@ -22,8 +22,8 @@ NAVIGATES = (*AVOIDS, "pose", "map", "task", "granted", "heard")
 ATTEMPTS = 5
 
 
-class Drive(Struct, frozen=True):
-    """What is driven, and what is recorded of it."""
+class RecordedDrive(Struct, frozen=True):
+    """World, duration and topics of a recorded drive."""
 
     world: str
     seed: int
@@ -33,27 +33,27 @@ class Drive(Struct, frozen=True):
     decision: DecisionConfig = DecisionConfig()
 
 
-EXPLORES = Drive(
+EXPLORES = RecordedDrive(
     "house", 1, 3.2, NAVIGATES,
     PerceptionConfig(mapping="slam"),
     DecisionConfig(behaviour="navigate", settings={"start": "explore"}),
 )  # fmt: skip
-DRIVES = {  # each of the first four meets something to turn away from
-    "arena": Drive("arena", 10),
-    "house": Drive("house", 1),
-    "warehouse": Drive("warehouse", 10),
-    "random_1": Drive("random:1", 6),
+DRIVES = {  # in each of the first four, the robot meets an obstacle
+    "arena": RecordedDrive("arena", 10),
+    "house": RecordedDrive("house", 1),
+    "warehouse": RecordedDrive("warehouse", 10),
+    "random_1": RecordedDrive("random:1", 6),
     "exploring": EXPLORES,
 }
 
 
 def file_of(folder: Path, name: str) -> Path:
-    """Where a drive is kept."""
+    """Return the path of a recorded drive."""
     return folder / f"{name}.mcap"
 
 
-def record(drive: Drive, to: Path) -> int:
-    """Drive, faster than in real time, and record what the brain hears and says; the exit code."""
+def record(drive: RecordedDrive, to: Path) -> int:
+    """Drive at twice real time, and record the brain's messages; return the exit code."""
     file = str(to.absolute())
     recorder = RecorderConfig(file=file, topics=drive.topics, viewers=False, flush_s=10.0)
     deployment = Deployment(
@@ -71,24 +71,24 @@ def record(drive: Drive, to: Path) -> int:
 
 
 def repeats(path: Path) -> bool:
-    """Whether every process does the same again: no tick was given up on a busy machine."""
+    """Return whether a replay gives the same outputs; a busy machine may skip ticks."""
     replays = (replay_process(path, p, settings_for(path, p, None), node_of) for p in OUTPUTS)
     return all(asyncio.run(replayed).same for replayed in replays)
 
 
 def renew(folder: Path, name: str) -> None:
-    """Record one drive anew. Raises GigabrainError when it never went well."""
+    """Record one drive again. Raises GigabrainError if no attempt can be replayed."""
     fresh = file_of(folder, name).with_suffix(".new")
     for _ in range(ATTEMPTS):
         fresh.unlink(missing_ok=True)
         if record(DRIVES[name], fresh) == 0 and repeats(fresh):
             fresh.replace(file_of(folder, name))
             return
-    raise GigabrainError(f"{name}: none of {ATTEMPTS} drives can be repeated")
+    raise GigabrainError(f"{name}: none of {ATTEMPTS} drives can be replayed")
 
 
 def main(folder: Path) -> int:
-    """Record all of them anew; the exit code."""
+    """Record all drives again; return the exit code."""
     for name in DRIVES:
         renew(folder, name)
     return 0

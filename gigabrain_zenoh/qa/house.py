@@ -109,7 +109,7 @@ def broken(root: Path) -> list[str]:
 
 
 class Size(NamedTuple):
-    """How much code a room holds."""
+    """Files and lines of a room."""
 
     files: int
     lines: int

@@ -39,6 +39,7 @@ STOP_S = 1.5
 BENCH_START_S = 30.0  # longer than anything takes to start on a busy machine
 START_S = 300.0  # far more than it takes to compile what a navigating robot calls
 ASK_S = 0.5
+POLL_S = 0.02
 # turn rate that counts as straight [rad/s], and share of the speed that counts as full
 STRAIGHT_RAD_S, FULL_SPEED = 0.1, 0.96
 STRAIGHT_ON_ROUTE_RAD_S, FULL_SPEED_ON_ROUTE = 0.3, 0.6  # routes bend; a busy host drives slower
@@ -106,7 +107,7 @@ class ProcessGroup:
 
     @property
     def ready(self) -> bool:
-        """Whether all processes are ready."""
+        """True while all processes are ready."""
         return all(status.state == "ready" for status in self.supervisor.statuses.values())
 
     def check_processes(self) -> None:
@@ -138,16 +139,16 @@ class ProcessGroup:
         """Wait until every process is ready. Raises like `until`."""
         await self.until(lambda: self.ready, "all processes are ready", within_s)
 
-    async def look(self, seconds: float = 0.02) -> None:
-        """Wait a little. Raises like `until`."""
-        await asyncio.sleep(seconds)
+    async def poll(self) -> None:
+        """Wait 20 ms. Raises like `until`."""
+        await asyncio.sleep(POLL_S)
         self.check_processes()
 
     async def run_for(self, seconds: float) -> None:
         """Let the processes run. Raises like `until`."""
         end_s = asyncio.get_running_loop().time() + seconds
         while asyncio.get_running_loop().time() < end_s:
-            await self.look()
+            await self.poll()
 
 
 @asynccontextmanager
@@ -204,7 +205,7 @@ class RobotUnderTest(ProcessGroup):
         self._frozen: set[int] = set()
         self._faulty = False
         self._contacts = 0
-        self._judged = 0  # records that `check` has seen
+        self._judged = 0  # records that `check` has judged
 
     async def __aenter__(self) -> Self:
         try:
@@ -228,7 +229,7 @@ class RobotUnderTest(ProcessGroup):
 
     @property
     def reusable(self) -> bool:
-        """Whether another test can use this robot."""
+        """True if another test can use this robot."""
         return bool(self._running and not (self.supervisor.given_up or self._running.done()))
 
     @property
@@ -296,12 +297,12 @@ class RobotUnderTest(ProcessGroup):
         fresh.replace(path)
         self._faulty = bool(faults)
 
-        def taken() -> bool:
+        def applied() -> bool:
             texts = (str(record.get("text", "")) for record in self.records[begin:])
             logged = [text for text in texts if text.startswith("faults: ")]
             return bool(logged) and (logged[-1] == "faults: none") != bool(faults)
 
-        await until(taken, "the emulator takes its faults")
+        await until(applied, "the emulator applies its faults")
 
     async def truth(self) -> dict[str, Any]:
         """Return the physics' own values: contacts, distance_m, true_speed and more."""

@@ -1,1 +1,1 @@
-"""What `gigabrain bench` measures, and against what."""
+"""The benchmarks of `gigabrain bench`. They start robots or call libraries; `cli` uses them."""

@@ -115,16 +115,16 @@ async def measure_chain(
     with tempfile.TemporaryDirectory(prefix="gigabrain-bench-") as name:
         folder = Path(name)
         show(f"listening to the chain at {rates_hz[0]:g} Hz")
-        heard, overheard = await listen_to_chain(rates_hz[0], min(seconds, LISTEN_S), folder)
-        sizes = heard.sizes()
+        monitor, monitored = await listen_to_chain(rates_hz[0], min(seconds, LISTEN_S), folder)
+        sizes = monitor.sizes()
         compared = [await _compare(rate, seconds, rounds, sizes, folder, show) for rate in rates_hz]
         show("timing what each hop does")
-        hops = await measure_hops(heard, overheard)
+        hops = await measure_hops(monitor, monitored)
     return ChainResult(
         seconds=seconds,
         payload_bytes=tuple(sizes),
         rates=tuple(compared),
-        overheard=overheard,
+        overheard=monitored,
         hops=tuple(hops),
     )
 
@@ -157,7 +157,7 @@ async def brain(rate_hz: float, folder: Path) -> AsyncIterator[tuple[ProcessGrou
     deployment = Deployment(body=str(_mock_body(rate_hz, folder)), resume="auto", router=LOOPBACK)
     async with measured_robot(deployment, folder) as (group, bus):
         while not (await driver_report(bus)).get("scan_to_cmd_n"):
-            await group.look()
+            await group.poll()
         yield group, bus
 
 
@@ -182,10 +182,10 @@ async def listen_to_chain(
 ) -> tuple[ChainMonitor, Latencies]:
     """Measure with a subscriber on every hop, which slows the chain a little."""
     async with brain(rate_hz, folder) as (group, bus):
-        heard = monitor_chain(bus)
+        monitor = monitor_chain(bus)
         await group.run_for(seconds)
-        await group.until(lambda: heard.complete, "a message of every hop")
-        return heard, await _chain_latencies(bus)
+        await group.until(lambda: monitor.complete, "a message of every hop")
+        return monitor, await _chain_latencies(bus)
 
 
 async def _chain_latencies(bus: Bus) -> Latencies:
@@ -271,7 +271,7 @@ class HopTimer:
         return statistics.median(self._ms.get(name, (0.0,)))
 
 
-async def measure_hops(heard: ChainMonitor, total: Latencies) -> list[Hop]:
+async def measure_hops(monitor: ChainMonitor, total: Latencies) -> list[Hop]:
     """Time the work of each hop by itself, and set it against the time in the running chain."""
     timed = HopTimer()
     deployment = with_free_port(ROUTER_ONLY)
@@ -281,28 +281,28 @@ async def measure_hops(heard: ChainMonitor, total: Latencies) -> list[Hop]:
     ):
         for topic in HOPS:  # without a subscriber a message is not even sent
             receiver.subscribe(topic, lambda _key, _message: None)
-        await _take_turns(heard, sender, timed)
+        await _take_turns(monitor, sender, timed)
     await _time_bridge(timed)
-    return [_hop(heard, total, timed, topic) for topic in HOPS]
+    return [_hop(monitor, total, timed, topic) for topic in HOPS]
 
 
-async def _take_turns(heard: ChainMonitor, bus: Bus, timed: HopTimer) -> None:
+async def _take_turns(monitor: ChainMonitor, bus: Bus, timed: HopTimer) -> None:
     """In each turn, do the work of all nodes for one scan."""
-    first, loop = heard.get(STATE).tick, DecisionLoop(DecisionConfig())
-    payloads = {topic.key: codec.encode(heard.get(topic)) for topic in HOPS}
+    first, loop = monitor.get(STATE).tick, DecisionLoop(DecisionConfig())
+    payloads = {topic.key: codec.encode(monitor.get(topic)) for topic in HOPS}
     decoders = {topic.key: Codec(topic.type, topic.max_bytes).decode for topic in HOPS}
     for tick in range(first, first + TURNS):
-        steps = _steps_at(tick, heard, loop)
+        steps = _steps_at(tick, monitor, loop)
         await asyncio.sleep(PAUSE_S)
         for topic in HOPS:
-            timed(f"put {topic.key}", partial(bus.publish, topic, heard.get(topic), basis=tick))
+            timed(f"put {topic.key}", partial(bus.publish, topic, monitor.get(topic), basis=tick))
             timed(f"decode {topic.key}", partial(decoders[topic.key], payloads[topic.key]))
             if topic.key in steps:
                 timed(f"step {topic.key}", steps[topic.key])
 
 
 def _steps_at(
-    tick: int, heard: ChainMonitor, loop: DecisionLoop
+    tick: int, monitor: ChainMonitor, loop: DecisionLoop
 ) -> dict[str, Callable[[], object]]:
     """Return the work of each message's receiver in a tick."""
     body, scan = heard.get(BODY).description, heard.get(SCAN)
@@ -334,10 +334,12 @@ async def _time_bridge(timed: HopTimer) -> None:
     bridge.close()
 
 
-def _hop(heard: ChainMonitor, total: Latencies, timed: HopTimer, topic: Topic[Any]) -> Hop:
+def _hop(monitor: ChainMonitor, total: Latencies, timed: HopTimer, topic: Topic[Any]) -> Hop:
     """Return the hop that begins with `topic`. The last ends where the driver stops its clock."""
     after = HOPS[HOPS.index(topic) + 1] if topic is not HOPS[-1] else None
-    took = heard.between(topic, after) if after else total.p50_ms - heard.between(HOPS[0], topic)
+    took = (
+        monitor.between(topic, after) if after else total.p50_ms - monitor.between(HOPS[0], topic)
+    )
     return Hop(
         name=f"{_short(topic)} → {_short(after) if after else 'driver'}",
         took=took,

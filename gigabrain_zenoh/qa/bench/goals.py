@@ -37,50 +37,55 @@ from gigabrain_zenoh.qa.robot_under_test import (
 from gigabrain_zenoh.runtime.deployment import Deployment
 
 START_S = 600.0  # a robot's processes and its first map, on a busy machine
-REACHED = 0.99  # of all goals
-CAPACITY_AH = 1000.0  # of a body that drives for hours: in two, a burger's own battery is empty
+MIN_REACHED = 0.99  # share of all goals
+CAPACITY_AH = 1000.0  # of a body that drives for hours; a burger's own battery lasts two
+MAX_GOAL_COST = 5.0  # so that the body can turn at a goal
+MAX_SILENCE_S = 60.0  # of the tasks; a busy host may stand still for seconds
+MIN_DISTANCE_M = 1.0  # from the robot to its next goal
+REACHED_M, REACHED_RAD = 0.5, math.radians(15)  # by the physics
 
-Say = Callable[[str], None]
+Progress = Callable[[str], None]
+T = TypeVar("T")
 
 
 class GoalCourse(Struct, frozen=True, kw_only=True):
-    """What a robot has to go through."""
+    """Goals and duration of a run."""
 
     goals: int
-    meetings: int = 0  # it is sent on until it has met the person so often
-    hours: float = 0.0  # and for so long, of the robot's time
+    meetings: int = 0  # with the person, at least
+    hours: float = 0.0  # of the robot's time, at least
     speed: float = 5.0
     seed: int = 0
-    logs: Path | None = None  # where the processes' logs are kept
+    logs: Path | None = None  # folder of the processes' logs
 
 
 class GoalFailure(Struct, frozen=True, kw_only=True):
     """A goal that was not reached."""
 
     goal: Goal
-    at: Pose  # where the robot thinks that it is
+    at: Pose  # estimated pose of the robot
     seconds: float  # of the robot's time, since its start
     reason: str
 
 
 class GoalError(Struct, frozen=True):
-    """How far from a goal the robot came to rest, by the physics."""
+    """Distance and angle from a goal at rest, by the physics."""
 
     m: float
-    rad: float | None  # None where any heading would do
+    rad: float | None  # None without a wanted heading
 
 
 def missed_by(off: GoalError) -> str:
-    """Why a robot that says that it is there is not; nothing if it is."""
-    if off.m > THERE_M:
-        return f"it said that it is there, {off.m:.2f} m from it"
-    if off.rad is not None and off.rad > THERE_RAD:
-        return f"it said that it is there, turned by {math.degrees(off.rad):.0f} degrees"
+    """Return why a reported goal was not reached; empty if it was."""
+    if off.m > REACHED_M:
+        return f"reported as reached, {off.m:.2f} m from the goal"
+    if off.rad is not None and off.rad > REACHED_RAD:
+        return f"reported as reached, {math.degrees(off.rad):.0f} degrees from the heading"
     return ""
 
 
 class GoalFigures(Struct, frozen=True, kw_only=True):
-    """How one body fared in one world."""
+    """Figures of one body in one world."""
 
     body: str
     world: str
@@ -90,51 +95,51 @@ class GoalFigures(Struct, frozen=True, kw_only=True):
     explored_s: float  # of the robot's time
     goals: int
     reached: int
-    off: tuple[GoalError, ...]  # wherever it said that it was there
+    off: tuple[GoalError, ...]  # of all goals reported as reached
     contacts: int
     min_clearance_m: float
-    met: int  # how often the person had to stand for the robot
+    met: int  # stops of the person for the robot
     distance_m: float
     seconds: float  # of the robot's time, in all
-    alone: int  # ticks that went on without the brain, on a host too busy for the speed
+    alone: int  # ticks without the brain, on a host too busy for the speed
     failures: tuple[GoalFailure, ...]
     growth: MapGrowth  # of perception
 
     @property
     def worst_m(self) -> float:
-        """How far from a goal it came to rest at most [m]."""
+        """Greatest distance from a goal at rest [m]."""
         return max((off.m for off in self.off), default=0.0)
 
     @property
     def worst_rad(self) -> float:
-        """How far from a wanted heading it came to rest at most [rad]."""
+        """Greatest angle from a wanted heading at rest [rad]."""
         return max((off.rad for off in self.off if off.rad is not None), default=0.0)
 
     @property
     def seconds_per_goal(self) -> float:
-        """Mean of the robot's time from one goal to the next [s]."""
+        """Mean time from one goal to the next, by the robot's clock [s]."""
         return (self.seconds - self.explored_s) / self.goals
 
     @property
     def ok(self) -> bool:
-        """Whether it touched nothing and got to nearly all of its goals."""
-        return self.contacts == 0 and self.reached >= REACHED * self.goals
+        """True without contacts and with nearly all goals reached."""
+        return self.contacts == 0 and self.reached >= MIN_REACHED * self.goals
 
 
 class GoalsResult(Struct, frozen=True, kw_only=True):
-    """All bodies in all worlds."""
+    """Figures of all bodies in all worlds."""
 
     seed: int
     runs: tuple[GoalFigures, ...]
 
     @property
     def ok(self) -> bool:
-        """Whether all did well."""
+        """True if every run is ok."""
         return all(run.ok for run in self.runs)
 
 
 async def measure_goals(
-    bodies: Sequence[str], worlds: Sequence[str], course: GoalCourse, say: Say
+    bodies: Sequence[str], worlds: Sequence[str], course: GoalCourse, show: Progress
 ) -> GoalsResult:
     """Send each body through each world, on the same course.
 
@@ -154,29 +159,29 @@ async def measure_goals(
                 perception=PerceptionConfig(mapping="slam"),
                 decision=DecisionConfig(behaviour="navigate"),
             )
-            runs.append(await _run(deployment, course, say))
+            runs.append(await _run(deployment, course, show))
     return GoalsResult(seed=course.seed, runs=tuple(runs))
 
 
-async def _run(deployment: Deployment, course: GoalCourse, say: Say) -> GoalFigures:
-    """One body in one world, from its start to its end."""
+async def _run(deployment: Deployment, course: GoalCourse, show: Progress) -> GoalFigures:
+    """Run one body in one world."""
     who = deployment.body
     name = f"{who} in {deployment.world}"
     with _folder(course, name.replace(" ", "-")) as folder:
         if course.hours:
             body = str(with_capacity(robot_path(deployment.body), folder / "body"))
             deployment = msgspec.structs.replace(deployment, body=body)
-        say(f"{name}: starting")
+        show(f"{name}: starting")
         began_s = asyncio.get_running_loop().time()
         async with measured_robot(deployment, folder, START_S) as (group, bus):
             sender = GoalSender(bus, group, deployment.seed)
             await group.until(lambda: sender.is_localized, "a map, and the robot in it", START_S)
-            say(f"{name}: exploring")
+            show(f"{name}: exploring")
             explored = await sender.explore()
             explored_s = sender.seconds
             while not await sender.done(course.goals, course.meetings, course.hours):
                 await sender.send()
-                say(f"{name}: {sender.reached} of {sender.sent} reached")
+                show(f"{name}: {sender.reached} of {sender.sent} reached")
             report, growth = await sender.report(), sender.growth()
     return GoalFigures(
         body=who,
@@ -211,7 +216,7 @@ def with_capacity(robot: Path, folder: Path) -> Path:
 
 @contextlib.contextmanager
 def _folder(course: GoalCourse, name: str) -> Iterator[Path]:
-    """Where the logs of one run go."""
+    """Yield the folder for the logs of one run."""
     if course.logs:
         folder = course.logs / name
         folder.mkdir(parents=True, exist_ok=True)
@@ -221,28 +226,20 @@ def _folder(course: GoalCourse, name: str) -> Iterator[Path]:
         yield Path(temporary)
 
 
-MAX_GOAL_COST = 5.0  # a goal's cost at most: the body turns there as well
-MAX_SILENCE_S = 60.0  # without an answer or a word of the tasks: a host may stand still for seconds
-MIN_DISTANCE_M = 1.0  # from the robot to its next goal, at least
-THERE_M, THERE_RAD = 0.5, math.radians(15)  # by the physics; farther off it is not there
-
-T = TypeVar("T")
-
-
 class GoalSender:
-    """Sends a robot about. Every other goal has a heading."""
+    """Sends a robot to random goals; every other one has a heading."""
 
     def __init__(self, bus: Bus, group: ProcessGroup, seed: int) -> None:
         self._bus, self._group, self._tasks = bus, group, Tasks(bus, silent_s=MAX_SILENCE_S)
         self._maps, self._poses, self._bodies = bus.latest(MAP), bus.latest(POSE), bus.latest(BODY)
-        self._states = bus.latest(STATE)  # also: which start of the driver all else has to be of
+        self._states = bus.latest(STATE)  # also sets the boot that all other messages must have
         self._random, self._search = np.random.default_rng(seed), GridSearch()
         self._world_from_map: Pose | None = None
         self._watch = GrowthSampler()
         self.sent = self.reached = 0
-        self.accepted_s = 0.0  # when, by the host's clock, the first task was
+        self.accepted_s = 0.0  # of the first task, by the host's clock
         self.failures: list[GoalFailure] = []
-        self.off: list[GoalError] = []  # wherever it said that it was there
+        self.off: list[GoalError] = []  # of all goals reported as reached
 
     @property
     def seconds(self) -> float:
@@ -251,22 +248,23 @@ class GoalSender:
 
     @property
     def is_localized(self) -> bool:
-        """Whether there is a map, and the robot in it."""
+        """True once the robot is localized in a map."""
         pose = self._poses.current
         return bool(self._maps.current and self._bodies.current and pose and pose.localized)
 
     async def explore(self) -> str:
-        """Have it explore; in words, how that ended. It has to stand where its map begins."""
+        """Explore from the origin of the map; return how that ended, in words."""
         truth = await self._true_pose()
         self._world_from_map = compose(truth, inverse(self._here()))
         task = await self._tasks.explore()
         self.accepted_s = asyncio.get_running_loop().time()
-        ended = await self._while_all_live(self._tasks.result(task))
+        ended = await self._while_running(self._tasks.result(task))
         return f"{ended.state}: {ended.reason}"
 
     async def send(self) -> None:
-        """Send it to the next place, and wait until it is there or has given up."""
-        x, y = await self._somewhere()
+        """Send it to a random goal, and wait for the result."""
+        # a person who blocks all ways walks on after a while
+        x, y = await self._retried(GigabrainError, self._random_place)
         yaw = float(self._random.uniform(-math.pi, math.pi)) if self.sent % 2 else None
         goal = Goal(x=x, y=y, yaw=yaw)
         self.sent += 1
@@ -282,51 +280,55 @@ class GoalSender:
             self.reached += 1
 
     async def done(self, goals: int, meetings: int, hours: float) -> bool:
-        """Whether it was sent often and long enough, and has met the person often enough."""
+        """Return whether goals, time and meetings are enough."""
         if self.sent < goals or self.seconds < hours * 3600:
             return False
         return not meetings or (await self.report())["person_stood"] >= meetings
 
     def growth(self) -> MapGrowth:
-        """What perception's memory and map have come to."""
+        """Return the growth of perception's memory and map."""
         assert self._maps.current
         return self._watch.growth(self._maps.current)
 
     def _sample(self) -> None:
-        """Take a sample of perception each minute of the robot's time."""
+        """Sample perception once per minute of the robot's time."""
         pid, grid = self._group.supervisor.statuses["perception"].pid, self._maps.current
         if pid and grid and self.seconds >= (self._watch.minutes + 1) * 60:
             self._watch.minute(rss_mb(pid), grid)
 
     async def report(self) -> dict[str, float]:
-        """The simulation's truth so far. Raises GigabrainError where it does not come."""
-        told: dict[str, float] = {}
-        while not told:
-            await self._group.look()
+        """Return the simulation's truth. Raises GigabrainError if it never arrives."""
+        truth: dict[str, float] = {}
+        while not truth:
+            await self._group.poll()
             report = await driver_report(self._bus)
-            told = {k: float(v) for k, v in report.items() if isinstance(v, int | float)}
-        return told
+            truth = {k: float(v) for k, v in report.items() if isinstance(v, int | float)}
+        return truth
 
     async def _go(self, goal: Goal) -> str:
-        """Why it did not get there; nothing if it did."""
+        """Drive to a goal; return why it was not reached, empty if it was."""
         try:
-            task = await self._order(goal)
-            ended = await self._while_all_live(self._tasks.result(task))
+            task = await self._send_goal(goal)
+            ended = await self._while_running(self._tasks.result(task))
         except Refused as refusal:
             return f"refused: {refusal}"
         return "" if ended.state == "succeeded" else f"{ended.state}: {ended.reason}"
 
-    async def _order(self, goal: Goal) -> str:
-        """The task's name. A question that a host has slept through is asked again."""
-        now = asyncio.get_running_loop().time
-        until = now() + MAX_SILENCE_S
+    async def _send_goal(self, goal: Goal) -> str:
+        """Send a goal and return the task's name; repeat while a busy host does not answer."""
+        return await self._retried(BodyLost, lambda: self._tasks.go_to(goal.x, goal.y, goal.yaw))
+
+    async def _retried(self, error: type[GigabrainError], work: Callable[[], Awaitable[T]]) -> T:
+        """Repeat `work` for up to a minute while it raises `error`."""
+        loop = asyncio.get_running_loop()
+        end_s = loop.time() + MAX_SILENCE_S
         while True:
             try:
-                return await self._tasks.go_to(goal.x, goal.y, goal.yaw)
-            except BodyLost:
-                if now() > until:
+                return await work()
+            except error:
+                if loop.time() > end_s:
                     raise
-            await self._group.look()
+            await self._group.poll()
 
     async def _off(self, goal: Goal) -> GoalError:
         assert self._world_from_map
@@ -336,51 +338,39 @@ class GoalSender:
         return GoalError(math.hypot(truth.x - there.x, truth.y - there.y), turn)
 
     async def _true_pose(self) -> Pose:
-        told = await self.report()
-        return Pose(x=told["true_x"], y=told["true_y"], yaw=told["true_yaw"])
+        truth = await self.report()
+        return Pose(x=truth["true_x"], y=truth["true_y"], yaw=truth["true_yaw"])
 
     def _here(self) -> Pose:
         pose = self._poses.current
         assert pose
         return Pose(x=pose.x, y=pose.y, yaw=pose.yaw)
 
-    async def _somewhere(self) -> Point:
-        """A place to go to; a person who has shut the robot in goes on after a while."""
-        now = asyncio.get_running_loop().time
-        until = now() + MAX_SILENCE_S
-        while True:
-            try:
-                return self._anywhere()
-            except GigabrainError:
-                if now() > until:
-                    raise
-            await self._group.look()
-
-    def _anywhere(self) -> Point:
-        """A place in the known map that can be reached and where the body can turn."""
+    async def _random_place(self) -> Point:
+        """Return a reachable place in the map where the body can turn."""
         grid, body, here = self._maps.current, self._bodies.current, self._here()
         assert grid
         assert body
         made = costmap(grid, inflation(body.description, "forbid"))
         start = made.cell(here.x, here.y)
         if start is None:
-            raise GigabrainError("the robot has left its map: nowhere to send it")
+            raise GigabrainError("the robot is outside its map, so it has no goal")
         way = self._search.field(made.cost, start, "from") * made.resolution
         rows, columns = np.nonzero(
             (made.cost < MAX_GOAL_COST) & (way > MIN_DISTANCE_M) & np.isfinite(way)
         )
         if not len(rows):
-            raise GigabrainError("no place can be reached from where the robot is")
+            raise GigabrainError("no place can be reached from the robot's pose")
         one = int(self._random.integers(len(rows)))
         x, y = made.points(rows[one : one + 1], columns[one : one + 1])[0].tolist()
         return x, y
 
-    async def _while_all_live(self, work: Awaitable[T]) -> T:
+    async def _while_running(self, work: Awaitable[T]) -> T:
         """Wait for `work`. Raises GigabrainError when a process dies or the gate latches."""
         waiting = asyncio.ensure_future(work)
         try:
             while not waiting.done():
-                await self._group.look()
+                await self._group.poll()
                 self._refuse_latched()
                 self._sample()
             return await waiting

@@ -86,7 +86,7 @@ class StackTarget(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """Whether the value is within the limit."""
+        """True if the value is within the limit."""
         return self.limit.allows(self.value)
 
 

@@ -1,1 +1,1 @@
-"""The driver author's kit: what every driver has to do, checked on any of them by name."""
+"""The driver author's kit: checks that every driver must pass, and templates for a new one."""

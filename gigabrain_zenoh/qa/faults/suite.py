@@ -1,9 +1,9 @@
 """Runs fault tests one after the other, those that share a robot together, and judges them.
 
 Speeds are 0.26 m/s unless a row says otherwise. Times are the robot's own (ticks of 20 ms) or the
-simulation's; those marked `wall` are wall time. Travel and contacts are the physics' truth. A body
-that brakes at 1 m/s2 from 0.26 m/s is at rest 260 ms later, and its own lag adds 100 ms: so much
-later than it brakes it is at zero. No run that counts may exceed a limit.
+simulation's; those marked `wall` are wall time. Travel and contacts are the physics' truth. From
+0.26 m/s at 1 m/s2 a body brakes for 260 ms, and its own lag adds 100 ms: limits of zero are 360 ms
+above those of braking. No run that counts may exceed a limit.
 """
 
 import asyncio
@@ -118,7 +118,7 @@ async def _run(row: FaultRow, rig: Rig) -> FaultRun:
     watch.start()
     began_s = loop.time()
     try:
-        with uncollected():
+        with without_garbage_collection():
             judged = await _judged(row, rig)
     finally:
         watch.close()
@@ -131,11 +131,10 @@ async def _run(row: FaultRow, rig: Rig) -> FaultRun:
 
 
 @contextlib.contextmanager
-def uncollected() -> Iterator[None]:
+def without_garbage_collection() -> Iterator[None]:
     """Collect garbage before the block, and none in it.
 
-    The suite plays the network and the operators. One collection of all its objects took 35 ms and
-    more, and that delay was taken for a fault of the robot.
+    A collection takes 35 ms and more, and that delay of the suite would count against the robot.
     """
     gc.collect()
     gc.disable()
@@ -169,8 +168,8 @@ def failed(results: Sequence[FaultResult]) -> bool:
 class RunQueueWatch:
     """Measures the longest that one thread of some processes has waited for a core within 0.1 s.
 
-    A core that a virtual machine's host gave to others counts as a thread that waited for it. A
-    delay of this program's own event loop counts too: it plays the network and the operators.
+    A core that the host of a virtual machine gave to others counts as a waiting thread. A delay of
+    this program's own event loop counts too: it plays the network and the operators.
     """
 
     def __init__(self, processes: Callable[[], Iterable[int | str]]) -> None:
@@ -180,16 +179,16 @@ class RunQueueWatch:
         self.longest_ms = 0.0
 
     def start(self) -> None:
-        """Begin to look, ten times a second."""
+        """Start to sample, ten times a second."""
         self._task = asyncio.create_task(self._watch())
 
     def close(self) -> None:
-        """Stop looking."""
+        """Stop sampling."""
         if self._task:
             self._task.cancel()
 
-    def look(self) -> None:
-        """Compare with the last look; threads that are new since then are not judged."""
+    def sample(self) -> None:
+        """Compare with the last sample; new threads are not judged."""
         now = {
             (process, thread): waited_ns
             for process in self._processes()
@@ -206,7 +205,7 @@ class RunQueueWatch:
     async def _watch(self) -> None:
         loop = asyncio.get_running_loop()
         while True:
-            self.look()
+            self.sample()
             due_s = loop.time() + POLL_S
             await asyncio.sleep(POLL_S)
             self.longest_ms = max(self.longest_ms, (loop.time() - due_s) * 1e3)

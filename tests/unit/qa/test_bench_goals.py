@@ -62,8 +62,8 @@ def test_one_goal_in_a_hundred_may_be_missed_and_nothing_may_be_touched() -> Non
 
 
 def test_whoever_is_not_there_has_not_reached_it_whatever_it_says() -> None:
-    assert missed_by(GoalError(9.8, None)) == "it said that it is there, 9.80 m from it"
-    assert missed_by(GoalError(0.1, 3.0)) == "it said that it is there, turned by 172 degrees"
+    assert missed_by(GoalError(9.8, None)) == "reported as reached, 9.80 m from the goal"
+    assert missed_by(GoalError(0.1, 3.0)) == "reported as reached, 172 degrees from the heading"
     assert not missed_by(GoalError(0.3, None))
     assert not missed_by(GoalError(0.3, 0.2))
 
@@ -80,12 +80,12 @@ async def test_a_question_that_the_host_has_slept_through_is_asked_again(
         return "goal-1"
 
     class Alive:
-        async def look(self) -> None:
+        async def poll(self) -> None:
             pass
 
     monkeypatch.setattr(Tasks, "go_to", go_to)
     sender = GoalSender(Net().two, cast("ProcessGroup", Alive()), seed=0)
-    assert await sender._order(Goal(x=2.0, y=1.0)) == "goal-1"
+    assert await sender._send_goal(Goal(x=2.0, y=1.0)) == "goal-1"
     assert asked == [2.0, 2.0, 2.0]
 
 
@@ -98,30 +98,30 @@ async def test_a_robot_that_a_person_has_shut_in_is_sent_on_when_the_person_has_
         (1.0, 2.0),
     ]
 
-    def anywhere(_: GoalSender) -> tuple[float, float]:
+    async def random_place(_: GoalSender) -> tuple[float, float]:
         found = looks.pop(0)
         if isinstance(found, GigabrainError):
             raise found
         return found
 
     class Alive:
-        async def look(self) -> None:
+        async def poll(self) -> None:
             pass
 
-    monkeypatch.setattr(GoalSender, "_anywhere", anywhere)
+    monkeypatch.setattr(GoalSender, "_random_place", random_place)
     sender = GoalSender(Net().two, cast("ProcessGroup", Alive()), seed=0)
-    assert await sender._somewhere() == (1.0, 2.0)
+    assert await sender._retried(GigabrainError, sender._random_place) == (1.0, 2.0)
     monkeypatch.setattr(goals, "MAX_SILENCE_S", 0.0)
     looks.extend([GigabrainError("none")] * 100)
     with pytest.raises(GigabrainError, match="none"):
-        await sender._somewhere()
+        await sender._retried(GigabrainError, sender._random_place)
 
 
 async def test_a_robot_that_latches_ends_the_course() -> None:
     net = Net()
 
     class Alive:
-        async def look(self) -> None:
+        async def poll(self) -> None:
             await settle()
 
     sender = GoalSender(net.two, cast("ProcessGroup", Alive()), seed=0)

@@ -294,8 +294,8 @@ async def test_the_longest_wait_of_one_thread_between_two_looks_is_told(
     monkeypatch.setattr(this_process, "waited_ns_by_thread", lambda process: next(looks))
     monkeypatch.setattr(this_process, "stolen_ns_by_core", dict)
     watch = RunQueueWatch(lambda: [7])
-    watch.look()
-    watch.look()
+    watch.sample()
+    watch.sample()
     assert watch.longest_ms == 31.0  # of the second; the third was not there before
 
 
@@ -315,8 +315,8 @@ async def test_a_core_that_the_host_gave_to_others_was_waited_for(
     looks = iter([{"cpu0": 900_000_000, "cpu1": 0}, {"cpu0": 940_000_000, "cpu1": 10_000_000}])
     monkeypatch.setattr(this_process, "stolen_ns_by_core", lambda: next(looks))
     watch = RunQueueWatch(list)
-    watch.look()
-    watch.look()
+    watch.sample()
+    watch.sample()
     assert watch.longest_ms == 40.0
 
 

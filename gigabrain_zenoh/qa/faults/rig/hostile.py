@@ -258,7 +258,7 @@ class ExtremeMessage:
 
     @property
     def kind(self) -> Literal["topic", "service"]:
-        """Whether it is published or asked."""
+        """`topic` if it is published, `service` if it is asked."""
         return "topic" if isinstance(self.to, Topic) else "service"
 
     def payload(self, base: Mapping[str, Any] | None, header: Mapping[str, int]) -> bytes:

@@ -99,7 +99,7 @@ class Rig:
 
     @property
     def long(self) -> bool:
-        """Whether to run the long forms."""
+        """True for the long forms."""
         return self.options.long
 
     @property

@@ -289,8 +289,7 @@ async def _until_noticed(robot: RobotUnderTest, *codes: str, **fault: Any) -> li
 def first_disobeyed(states: Sequence[RobotState]) -> int:
     """Return the first tick in which the body turns unlike all recent commands.
 
-    Recent commands are those of 0.3 s, the longest lag of a body. A body that turns as one of them
-    said obeys.
+    Recent commands are those of 0.3 s, the longest lag of a body.
     """
     for k, state in enumerate(states):
         recent = [one.sent.angular_z for one in states[max(0, k - WINDOW_TICKS) : k + 1]]
