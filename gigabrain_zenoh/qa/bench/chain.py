@@ -305,10 +305,10 @@ def _steps_at(
     tick: int, monitor: ChainMonitor, loop: DecisionLoop
 ) -> dict[str, Callable[[], object]]:
     """Return the work of each message's receiver in a tick."""
-    body, scan = heard.get(BODY).description, heard.get(SCAN)
-    state = replace(heard.get(STATE), tick=tick)
-    world = replace(heard.get(WORLD), tick=tick, basis=tick)
-    intent = replace(heard.get(INTENT), tick=tick, basis=tick)
+    body, scan = monitor.get(BODY).description, monitor.get(SCAN)
+    state = replace(monitor.get(STATE), tick=tick)
+    world = replace(monitor.get(WORLD), tick=tick, basis=tick)
+    intent = replace(monitor.get(INTENT), tick=tick, basis=tick)
     inputs = control.ControlInputs(state=state, intent=intent)
     return {
         SCAN.key: partial(perception.step, PerceptionConfig(), body, scan),

@@ -21,8 +21,7 @@ from gigabrain_schemas.base import Pose, Velocity
 from gigabrain_schemas.body import Lidar as LidarDescription
 from gigabrain_zenoh.qa.bench.barn_course import FIELD_OF_VIEW_RAD, Conditions, JackalBody
 
-SUBSTEPS = 4  # of a tick: as often the motors are told something new
-PHYSICS_STEPS = 4  # in 10 ms: two for each time that the motors are told
+PHYSICS_STEPS = 4  # in 10 ms: two for each new command of the motors
 WHEEL_RADIUS_M, TRACK_M = 0.098, 0.37559  # [m]
 TRACK_FACTOR = 1.5  # of its maker: the wheels turn more than rolling wheels would
 POST_HEIGHT_M, WALLS_M = 1.0, 50.0  # [m], of the posts, and to the walls that every world has

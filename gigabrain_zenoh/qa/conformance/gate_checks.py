@@ -23,7 +23,7 @@ from gigabrain_zenoh.qa.conformance.gated_driver import (
 )
 from gigabrain_zenoh.qa.conformance.robot import CheckedRobot, DriverSession, link_of
 from gigabrain_zenoh.qa.judging import Failed, Finding
-from gigabrain_zenoh.qa.probe import TICK_MS, until
+from gigabrain_zenoh.qa.probe import until
 
 SILENCE_TICKS = 7  # 100 ms without a command, applied in the next tick
 AT_ONCE_TICKS = 2
