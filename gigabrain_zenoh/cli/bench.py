@@ -1,6 +1,5 @@
 """`gigabrain bench chain`, `stack`, `estop`, `bodies` and `plan`: what this machine achieves."""
 
-import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -227,21 +226,21 @@ def plan(
     if any(one < MIN_CELLS for one in size):
         raise ConfigError(f"--size: expected at least {MIN_CELLS}, got {min(size)}")
     files.check_result_path(json)
-    result = measure_plan(size, queries, seed, png, lambda text: print(text, file=sys.stderr))
+    result = measure_plan(size, queries, seed, png, print_progress)
     finish(_plan_table(result), result, json)
     return 0 if result.ok else 1
 
 
 def _plan_table(result: "PlanResult") -> Table:
-    table = Table(caption="Published figures are of other maps on other machines.")
-    for name in ("map", "what", "n", "p50 [ms]", "p95 [ms]", "CPU p50 [ms]"):
-        table.add_column(Text(name), justify="left" if name in ("map", "what") else "right")
+    from gigabrain_zenoh.qa.judging import table_of
+
+    table = table_of("map", "what", "n", "p50 [ms]", "p95 [ms]", "CPU p50 [ms]", left=2)
+    table.caption = "Published figures are of other maps on other machines."
     for one in result.sizes:
         for timing in one.timings:
             times = (timing.p50_ms, timing.p95_ms, timing.cpu_p50_ms)
             what = timing.what.replace("office", f"office, {one.path_m:.0f} m")
-            row = (f"{one.size}²", what, str(timing.n), *(f"{ms:.1f}" for ms in times))
-            table.add_row(*row)
+            table.add_row(f"{one.size}²", what, str(timing.n), *(f"{ms:.1f}" for ms in times))
         table.add_row(f"{one.size}²", "cost over Dijkstra's, worst", "", f"{one.ratio:.6f}", "", "")
         table.add_section()
     for what, ms in PUBLISHED_MS:

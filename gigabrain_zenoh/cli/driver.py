@@ -65,7 +65,7 @@ def test(
 
     from gigabrain_drivers.driver.catalog import load_robot, robot_links
     from gigabrain_zenoh.qa.conformance import kit
-    from gigabrain_zenoh.qa.judging import COLOURS
+    from gigabrain_zenoh.qa.judging import coloured
 
     check_positive(repeat=repeat)
     links = robot_links(load_robot(name))
@@ -79,8 +79,7 @@ def test(
     with warnings, place as folder, console.status("") as status:
         results = run_async(kit.check(name, chosen, Path(folder), status.update, repeat))
     for result in results:
-        colour = COLOURS[result.verdict]
-        table.add_row(*result[:-1], f"[{colour}]{result.verdict}[/]")
+        table.add_row(*result[:-1], coloured(result.verdict))
     if warnings.texts:
         console.print(f"warnings during the checks: {warnings}", markup=False, soft_wrap=True)
     console.print(table)

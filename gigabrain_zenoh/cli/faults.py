@@ -5,10 +5,9 @@ import logging
 import re
 import tempfile
 from collections.abc import Sequence
-from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 from cyclopts import Parameter
@@ -24,10 +23,7 @@ from gigabrain_zenoh.host.terminal import typed_lines
 from gigabrain_zenoh.qa.proxy.chaos import (
     CALM,
     WAYS,
-    Chaos,
     ProxyCommand,
-    Way,
-    WayCounters,
     parse_command,
 )
 from gigabrain_zenoh.qa.proxy.tcp import Address, TcpProxy
@@ -37,6 +33,9 @@ if TYPE_CHECKING:
 
     from gigabrain_zenoh.qa.faults.rig.rig import Options
     from gigabrain_zenoh.qa.judging import FaultResult, FaultRow, FaultRun
+    from gigabrain_zenoh.qa.proxy.serial import LineProxy
+
+    FaultyLine = LineProxy | TcpProxy
 
 ENDPOINT = re.compile(r"(?:(?:tcp|tls|ws)/)?(?P<host>\[[^\]]+\]|[^/:\[\]]+):(?P<port>\d+)")
 
@@ -153,30 +152,33 @@ def _line(fault: "FaultRow", run: "FaultRun") -> str:
 
 
 def _plan(chosen: "Sequence[FaultRow]") -> "Table":
-    from rich.table import Table
-
-    table = Table(title="fault tests")
-    for name in ("no.", "fault", "group", "criterion", "needs"):
-        table.add_column(name, overflow="fold", no_wrap=name == "fault")
+    table = _fault_table("fault tests", "group", "criterion", "needs")
     for fault in chosen:
         needs = ", ".join(fault.needs)
         table.add_row(str(fault.number), fault.name, fault.group, fault.criterion, needs)
     return table
 
 
-def _table(results: "Sequence[FaultResult]", chosen: "Sequence[FaultRow]") -> "Table":
-    from rich.markup import escape
+def _fault_table(title: str, *columns: str) -> "Table":
     from rich.table import Table
 
-    from gigabrain_zenoh.qa.judging import COLOURS, in_words
+    table = Table(title=title)
+    for name in ("no.", "fault", *columns):
+        table.add_column(name, overflow="fold", no_wrap=name == "fault")
+    return table
+
+
+def _table(results: "Sequence[FaultResult]", chosen: "Sequence[FaultRow]") -> "Table":
+    from rich.markup import escape
+
+    from gigabrain_zenoh.qa.judging import coloured, in_words
 
     rows = {fault.number: fault for fault in chosen}
     passed = sum(result.verdict == "passed" for result in results)
-    table = Table(title=f"{passed} of {len(results)} passed")
-    for name in ("no.", "fault", "criterion", "worst", "tries", "waited", "verdict"):
-        table.add_column(name, overflow="fold", no_wrap=name == "fault")
+    title = f"{passed} of {len(results)} passed"
+    table = _fault_table(title, "criterion", "worst", "tries", "waited", "verdict")
     for result in results:
-        verdict = f"[{COLOURS[result.verdict]}]{result.verdict}[/]"
+        verdict = coloured(result.verdict)
         if result.reason:
             verdict += f": {escape(result.reason)}"
         worst = in_words(rows[result.number], result.worst)
@@ -190,8 +192,8 @@ def _tries(tries: "Sequence[FaultRun]") -> str:
     """Return how many runs passed: `9 of 10, disturbed: 1 of 2`."""
     counted = [one.verdict == "passed" for one in tries if not one.disturbed]
     disturbed = [one.verdict == "passed" for one in tries if one.disturbed]
-    beside = f", disturbed: {sum(disturbed)} of {len(disturbed)}" if disturbed else ""
-    return f"{sum(counted)} of {len(counted)}{beside}"
+    also = f", disturbed: {sum(disturbed)} of {len(disturbed)}" if disturbed else ""
+    return f"{sum(counted)} of {len(counted)}{also}"
 
 
 def proxy(
@@ -231,25 +233,7 @@ def proxy(
     return 0
 
 
-class FaultyLine(AbstractAsyncContextManager[object], Protocol):
-    """Proxy of a network or serial line."""
-
-    figures: dict[Way, WayCounters]
-
-    def set(self, chaos: Chaos = CALM, *ways: Way) -> None:
-        """Set the faults of one direction or both."""
-
-    def cut(self, *, reset: bool = False) -> None:
-        """Close all connections."""
-
-    async def plug(self) -> None:
-        """Listen."""
-
-    async def unplug(self) -> None:
-        """Stop listening, and close all connections."""
-
-
-async def _run_proxy(proxy: FaultyLine, begin: ProxyCommand, to: str) -> None:
+async def _run_proxy(proxy: "FaultyLine", begin: ProxyCommand, to: str) -> None:
     async with proxy:
         await obey(proxy, begin)
         print_line(f"{proxy} forwards to {to}")
@@ -264,7 +248,7 @@ async def _run_proxy(proxy: FaultyLine, begin: ProxyCommand, to: str) -> None:
                     print_line(str(error))
 
 
-async def obey(proxy: FaultyLine, command: ProxyCommand) -> None:
+async def obey(proxy: "FaultyLine", command: ProxyCommand) -> None:
     """Execute a typed line."""
     if command.cut:
         proxy.cut(reset=command.cut == "rst")

@@ -1,4 +1,4 @@
-"""Figures, limits, verdicts and tables: what faults, benchmarks and driver checks are judged by."""
+"""Figures, limits, verdicts and tables of faults, benchmarks and driver checks."""
 
 import math
 import statistics
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 Verdict = Literal["passed", "FAILED", "skipped"]
 COLOURS: dict[Verdict, str] = {"passed": "green", "FAILED": "bold red", "skipped": "yellow"}
-
-
 Stage = Literal["sim", "auto", "line", "serial", "tcp", ""]
 
 
@@ -63,6 +61,11 @@ class Limit(NamedTuple):
 
 Measured = Mapping[Figure, float]
 FaultTest = Callable[["Rig"], Awaitable[Measured]]
+
+
+def coloured(verdict: Verdict) -> str:
+    """Return a verdict with its colour, as markup."""
+    return f"[{COLOURS[verdict]}]{verdict}[/]"
 
 
 def worse_of(one: Measured, other: Measured) -> dict[Figure, float]:
@@ -126,7 +129,7 @@ class Finding(NamedTuple):
     late_ms: float = 0.0  # by how much it missed a time, where nothing else is wrong
 
 
-class CheckResult(NamedTuple):
+class DriverCheckResult(NamedTuple):
     """One line of a driver's table."""
 
     check: str

@@ -14,7 +14,7 @@ from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.qa.conformance import driver_checks, gate_checks
 from gigabrain_zenoh.qa.conformance.gated_driver import GatedDriver
 from gigabrain_zenoh.qa.conformance.robot import CheckedRobot
-from gigabrain_zenoh.qa.judging import CheckResult, Failed, Finding, Skipped, summary
+from gigabrain_zenoh.qa.judging import DriverCheckResult, Failed, Finding, Skipped, summary
 
 MAX_CHECK_S = 60.0  # of one check
 ATTEMPTS = 3  # where the machine may have made a check late
@@ -100,7 +100,7 @@ GATED = (
 
 async def check(
     name: str, link: LinkName, folder: Path, progress: Callable[[str], None], repeat: int = 1
-) -> list[CheckResult]:
+) -> list[DriverCheckResult]:
     """Run all checks on the robot called `name`. Raises ConfigError when it cannot be had."""
     async with CheckedRobot(name, link, folder) as robot:
         return await run(robot, progress, repeat)
@@ -108,12 +108,12 @@ async def check(
 
 async def run(
     robot: CheckedRobot, progress: Callable[[str], None], repeat: int = 1
-) -> list[CheckResult]:
+) -> list[DriverCheckResult]:
     """Run all checks on an entered robot, in order, and its stops `repeat` times.
 
     `progress` is called with the name of each check.
     """
-    results: list[CheckResult] = []
+    results: list[DriverCheckResult] = []
     call: Callable[[], Awaitable[Finding]]
     for alone in ALONE:
         call = functools.partial(alone.run, robot)
@@ -155,20 +155,20 @@ async def _judged(
     call: Callable[[], Awaitable[Finding]],
     progress: Callable[[str], None],
     repeat: int,
-) -> CheckResult:
+) -> DriverCheckResult:
     criterion = check.criterion.format(promise=robot.promise)
     if check.with_peer and not robot.has_peer:
         text = f"link {robot.link} has no peer that could fail"
-        return CheckResult(check.name, criterion, text, "skipped")
+        return DriverCheckResult(check.name, criterion, text, "skipped")
     times, findings = repeat if check.repeated else 1, list[Finding]()
     try:
         for count in range(1, times + 1):
             progress(f"{check.name}, {count} of {times}" if times > 1 else check.name)
             findings.append(await _found(call))
     except Skipped as error:
-        return CheckResult(check.name, criterion, str(error), "skipped")
+        return DriverCheckResult(check.name, criterion, str(error), "skipped")
     ok = all(finding.ok for finding in findings)
-    return CheckResult(check.name, criterion, summary(findings), "passed" if ok else "FAILED")
+    return DriverCheckResult(check.name, criterion, summary(findings), "passed" if ok else "FAILED")
 
 
 async def _found(call: Callable[[], Awaitable[Finding]]) -> Finding:
