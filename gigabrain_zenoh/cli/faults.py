@@ -31,7 +31,7 @@ from gigabrain_zenoh.qa.proxy.tcp import Address, TcpProxy
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from gigabrain_zenoh.qa.faults.rig.rig import Options
+    from gigabrain_zenoh.qa.faults.rig import Options
     from gigabrain_zenoh.qa.judging import FaultResult, FaultRow, FaultRun
     from gigabrain_zenoh.qa.proxy.serial import LineProxy
 
@@ -70,7 +70,7 @@ class SuiteOptions:
 
     def options(self) -> "Options":
         """Return the options in the form that the suite takes."""
-        from gigabrain_zenoh.qa.faults.rig.rig import Options
+        from gigabrain_zenoh.qa.faults.rig import Options
 
         return Options(self.body, self.world, self.behaviour, self.long)
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-    from gigabrain_zenoh.qa.faults.rig.rig import Rig
+    from gigabrain_zenoh.qa.faults.rig import Rig
 
 Verdict = Literal["passed", "FAILED", "skipped"]
 COLOURS: dict[Verdict, str] = {"passed": "green", "FAILED": "bold red", "skipped": "yellow"}

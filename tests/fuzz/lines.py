@@ -26,7 +26,7 @@ from gigabrain_schemas.base import Message
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.codec import encode
-from gigabrain_zenoh.qa.faults.rig.hostile import codec_of
+from gigabrain_zenoh.qa.faults.hostile import codec_of
 from tests.fuzz.harness import split
 from tests.fuzz.line_samples import samples
 from tests.fuzz.messages import finite

@@ -14,7 +14,7 @@ from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.sensors import Image, LaserScan
 from gigabrain_schemas.topics import messages
 from gigabrain_zenoh.codec import TOLD
-from gigabrain_zenoh.qa.faults.rig.hostile import codec_of, hostile_payloads, leaves
+from gigabrain_zenoh.qa.faults.hostile import codec_of, hostile_payloads, leaves
 from tests.fuzz.harness import split
 
 CODECS = {message.__name__: codec_of(message) for message in messages()}

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from gigabrain_schemas.topics import BUTTON, ESTOP_SAID, SAFETY, TELEOP
-from gigabrain_zenoh.qa.faults.rig.hostile import ExtremeMessage, chosen_extremes
+from gigabrain_zenoh.qa.faults.hostile import ExtremeMessage, chosen_extremes
 from gigabrain_zenoh.testing.in_memory import RobotInMemory
 
 STOPS = (ESTOP_SAID, BUTTON, TELEOP, SAFETY)  # by their purpose

@@ -10,7 +10,7 @@ from gigabrain_schemas.topics import BODY, CMD_VEL, GOAL
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.decision.behaviours import NavigationConfig
 from gigabrain_zenoh.decision.navigator import Navigator
-from gigabrain_zenoh.qa.faults.rig.hostile import chosen_extremes
+from gigabrain_zenoh.qa.faults.hostile import chosen_extremes
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import body, state
 from gigabrain_zenoh.testing.waiting import settle

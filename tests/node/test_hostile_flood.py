@@ -11,7 +11,7 @@ import pytest
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, ENABLE, ESTOP, RELEASE, TOPICS, Service
 from gigabrain_zenoh.config.settings import Resume
-from gigabrain_zenoh.qa.faults.rig.hostile import codec_of, hostile_payloads, hostile_values
+from gigabrain_zenoh.qa.faults.hostile import codec_of, hostile_payloads, hostile_values
 from gigabrain_zenoh.testing.in_memory import RobotInMemory
 
 TICKS = 200

@@ -19,7 +19,7 @@ from gigabrain_drivers.sim.worlds import load_world
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.conformance import gate_checks
-from gigabrain_zenoh.qa.conformance.robot import CheckedRobot
+from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 from gigabrain_zenoh.qa.judging import Failed
 from gigabrain_zenoh.testing.samples import state
 

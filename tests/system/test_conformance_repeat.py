@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_zenoh.qa.conformance import kit
-from gigabrain_zenoh.qa.conformance.robot import CheckedRobot
+from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 from gigabrain_zenoh.qa.judging import Finding, summary
 
 pytestmark = pytest.mark.alone

@@ -9,7 +9,7 @@ from gigabrain_drivers import links
 from gigabrain_drivers.driver import catalog
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.qa.conformance import authoring, driver_checks, kit
-from gigabrain_zenoh.qa.conformance.robot import CheckedRobot
+from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 
 
 def installed(folder: Path, site: Path) -> Path:

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from gigabrain_zenoh.qa.faults.rig.rig import Options
+from gigabrain_zenoh.qa.faults.rig import Options
 from gigabrain_zenoh.qa.faults.suite import FAULTS, run_suite
 from gigabrain_zenoh.qa.judging import FaultResult, FaultRow
 

@@ -9,7 +9,7 @@ from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import device_class
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import UnknownName
-from gigabrain_zenoh.qa.conformance.robot import CheckedRobot, DriverSession
+from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot, DriverSession
 
 NAME = "foreign_base"
 DRIVER = '''"""Somebody's driver, and the board that it talks to."""

@@ -28,7 +28,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint
-from gigabrain_zenoh.qa.faults.rig.hostile import replaced
+from gigabrain_zenoh.qa.faults.hostile import replaced
 from gigabrain_zenoh.qa.probe import NODES, Probe, probing
 from gigabrain_zenoh.testing.processes import AVOID, Home, endpoint_of, robot_of
 from gigabrain_zenoh.testing.waiting import until

@@ -18,7 +18,7 @@ from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.gate import BRAIN
 from gigabrain_zenoh.host.bounded import percentile
-from gigabrain_zenoh.qa.faults.rig.cpu_load import PROGRAM, endpoint_text
+from gigabrain_zenoh.qa.faults.cpu_load import PROGRAM, endpoint_text
 from gigabrain_zenoh.qa.judging import limited, table_of
 from gigabrain_zenoh.qa.robot_under_test import LOOPBACK, ProcessGroup, measured_robot
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port

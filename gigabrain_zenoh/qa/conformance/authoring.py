@@ -23,7 +23,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.qa.conformance.robot import link_of
+from gigabrain_zenoh.qa.conformance.driver_checks import link_of
 
 PACKAGE_NAME = re.compile(r"[a-z][a-z0-9_]*[a-z0-9]")
 TEMPLATES = {  # source and target of each file

@@ -1,16 +1,36 @@
-"""Checks of a driver by itself: opens, obeys within limits, returns what it sent, never raises."""
+"""The checked robot, its emulated peer, and checks of its driver without a gate."""
 
+import abc
 import asyncio
+import contextlib
 import functools
 import math
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import Any, Self
 
+from gigabrain_drivers.driver import catalog
+from gigabrain_drivers.driver.base import Driver
+from gigabrain_drivers.driver.robot import Run
+from gigabrain_drivers.emulators.base import Device
+from gigabrain_drivers.emulators.emulator import BASE, Emulator
+from gigabrain_drivers.links.link import Link
 from gigabrain_schemas.base import Velocity
-from gigabrain_zenoh.geometry.limits import clamp, limits_of
-from gigabrain_zenoh.qa.conformance.robot import CheckedRobot, DriverSession
-from gigabrain_zenoh.qa.judging import Finding
+from gigabrain_schemas.body import RobotState
+from gigabrain_zenoh.clock import Clock
+from gigabrain_zenoh.config.settings import LinkName
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.geometry.limits import ZERO, at_rest, clamp, limits_of
+from gigabrain_zenoh.qa.judging import Failed, Finding, Skipped
 
+POLL_S = 0.004
+PATIENCE_S = 10.0  # of wall time without a single tick
+
+
+REST_SPEED = 0.02  # [m/s], of the true body, below which it stands
+WORLD = "arena"
+OPEN_TICKS = 250  # 5 s
 RAMP_TICKS = 75  # 1.5 s, to get to a speed
 HOLD_TICKS = 15
 TOLERANCE = 0.1  # of the wanted speed, and
@@ -19,6 +39,180 @@ MAX_CALL_S = 2.0  # of `stop` and `close`
 OPEN_S = 0.1
 CALLS = ("stop", "stop", "close", "stop", "close")
 EXCESS = 10.0  # times the greatest speed
+
+
+class Timeline(abc.ABC):
+    """Waits in ticks of a driver."""
+
+    def __init__(self) -> None:
+        self.tick = 0
+
+    @abc.abstractmethod
+    def check_alive(self) -> None:
+        """Raise the error that ended the driver, if any."""
+
+    async def until(self, condition: Callable[[], object], ticks: int) -> int | None:
+        """Wait at most `ticks` for `condition`; return how many passed, None if it never held."""
+        loop, begin = asyncio.get_running_loop(), self.tick
+        seen, seen_s = self.tick, loop.time()
+        while not condition():
+            self.check_alive()
+            if self.tick - begin >= ticks:
+                return None
+            if self.tick != seen:
+                seen, seen_s = self.tick, loop.time()
+            elif loop.time() - seen_s > PATIENCE_S:
+                raise Failed(f"no tick for {PATIENCE_S:.0f} s")
+            await asyncio.sleep(POLL_S)
+        return self.tick - begin
+
+    async def firsts(
+        self, conditions: Mapping[str, Callable[[], object]], ticks: int
+    ) -> dict[str, float]:
+        """Return when each condition first held [ms]; ends with the last one, or after `ticks`."""
+        loop = asyncio.get_running_loop()
+        begin_s, found = loop.time(), dict[str, float]()
+
+        def all_held() -> bool:
+            for name, holds in conditions.items():
+                if name not in found and holds():
+                    found[name] = (loop.time() - begin_s) * 1e3
+            return len(found) == len(conditions)
+
+        await self.until(all_held, ticks)
+        return found
+
+    async def run_for(self, ticks: int) -> None:
+        """Let `ticks` pass."""
+        await self.until(lambda: False, ticks)
+
+
+class CheckedRobot:
+    """A robot by name or by its file. Used as `async with`; its emulator runs inside.
+
+    `folder` holds the ports and the gate's saved state.
+    """
+
+    def __init__(self, name: str, link: LinkName, folder: Path) -> None:
+        if link == "real":
+            raise ConfigError("the kit moves the body at once; choose link sim or emulated")
+        self.name, self.link, self.folder = name, link, folder
+        self.run = Run(folder=folder, link=link, world=WORLD, emulator=str(folder / "ports"))
+        self.file, _, _, _ = catalog.load_link(name, self.run)
+        self._emulator: Emulator | None = None
+        self._way = -1
+
+    async def __aenter__(self) -> Self:
+        if self.link == "emulated":
+            self._emulator = await Emulator(self.name, self.run).__aenter__()
+        return self
+
+    async def __aexit__(self, *error: Any) -> None:
+        if self._emulator:
+            await self._emulator.__aexit__(*error)
+
+    def driver(self) -> Driver:
+        """Return a new driver, not opened yet."""
+        return catalog.make_driver(self.name, self.run)[1]
+
+    def next_direction(self) -> int:
+        """Return 1 and -1 in turn, so that the body never comes to a wall."""
+        self._way = -self._way
+        return self._way
+
+    @property
+    def has_peer(self) -> bool:
+        """True where an emulated peer is at the other end of the line."""
+        return self._emulator is not None
+
+    @property
+    def peer(self) -> Emulator:
+        """The emulated peer. Raises Skipped where there is none."""
+        if self._emulator is None:
+            raise Skipped(f"link {self.link} has no peer that could fail")
+        return self._emulator
+
+    def break_peer(self, words: str) -> None:
+        """Set the faults of the base's end of the line; an empty text clears them."""
+        self.peer.set(self.peer.parse_faults(f"{BASE} {words}"))
+
+    @property
+    def promise(self) -> str:
+        """Time after which the firmware stops the motors without a command, with its source."""
+        device = type(self._emulator.stations[BASE].device) if self._emulator else Device
+        return f"{device.watchdog_ns / 1e6:.0f} ms ({device.promised_in})"
+
+    @property
+    def promised_ms(self) -> float:
+        """The same time [ms]."""
+        return self.peer.stations[BASE].device.watchdog_ns / 1e6
+
+    def commanded(self, state: RobotState | None) -> tuple[float, float, float]:
+        """Return the velocity commanded to the motors; without a peer, the measured one."""
+        if self._emulator:
+            return self._emulator.body.commanded
+        velocity = state.velocity if state else None
+        return (velocity.linear_x, velocity.linear_y, velocity.angular_z) if velocity else (0, 0, 0)
+
+    def rests(self, state: RobotState | None) -> bool:
+        """Return whether the body stands still: truly, or as measured where there is no peer."""
+        if self._emulator is None:
+            return state is not None and at_rest(state.velocity)
+        speed = self._emulator.body.report().get("true_speed")
+        still = isinstance(speed, float | int) and abs(speed) < REST_SPEED
+        return still and not any(self._emulator.body.commanded)
+
+
+def link_of(driver: Driver) -> Link:
+    """Return the line that a driver keeps in `link`. Raises Skipped."""
+    link = getattr(driver, "link", None)
+    if not isinstance(link, Link):
+        raise Skipped("the driver keeps no Link in `link`: no bytes to look at")
+    return link
+
+
+class DriverSession(Timeline):
+    """Commands `wanted` in every tick, and keeps the newest state. Used as `async with`."""
+
+    def __init__(self, robot: CheckedRobot) -> None:
+        super().__init__()
+        self.driver = robot.driver()
+        self.wanted = ZERO
+        self.sent: Velocity | None = None  # newest velocity that the driver returned
+        self.state: RobotState | None = None
+        self._live: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        await self.driver.__aenter__()
+        self._live = asyncio.create_task(self._run(), name="conformance session")
+        return self
+
+    async def __aexit__(self, *error: Any) -> None:
+        if self._live:
+            self._live.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._live
+        await self.driver.__aexit__(*error)
+
+    async def connected(self) -> int:
+        """Wait until the body is received; return the number of ticks."""
+        ticks = await self.until(lambda: self.state and self.state.link.connected, OPEN_TICKS)
+        if ticks is None:
+            raise Failed(f"the body was not received within {OPEN_TICKS} ticks")
+        return ticks
+
+    def check_alive(self) -> None:
+        """Raise the error of the driver, if any."""
+        if self._live and self._live.done():
+            self._live.result()
+            raise Failed("its ticks have ended")
+
+    async def _run(self) -> None:
+        async for passed in self.driver.ticks(Clock()):
+            self.tick += passed
+            self.state = await self.driver.read_state()
+            to = self.wanted
+            self.sent = await self.driver.set_base_velocity(to.linear_x, to.linear_y, to.angular_z)
 
 
 async def opens(checked: CheckedRobot) -> Finding:

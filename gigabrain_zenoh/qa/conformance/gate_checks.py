@@ -15,13 +15,13 @@ from gigabrain_schemas.base import TICK_MS, TICK_NS, TICK_S, Velocity
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.geometry.limits import ZERO
 from gigabrain_zenoh.host import this_process
+from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot, DriverSession, link_of
 from gigabrain_zenoh.qa.conformance.gated_driver import (
     ATTEMPTS,
     SPEED_SHARE,
     GatedDriver,
     stop_ticks,
 )
-from gigabrain_zenoh.qa.conformance.robot import CheckedRobot, DriverSession, link_of
 from gigabrain_zenoh.qa.judging import Failed, Finding
 from gigabrain_zenoh.qa.probe import until
 

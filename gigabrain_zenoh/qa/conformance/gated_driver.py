@@ -21,7 +21,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import DriverConfig
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.geometry.limits import ZERO
-from gigabrain_zenoh.qa.conformance.robot import CheckedRobot, Timeline
+from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot, Timeline
 from gigabrain_zenoh.qa.judging import Failed
 
 KIT = "kit"  # the commander

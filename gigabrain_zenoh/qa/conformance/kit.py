@@ -12,8 +12,8 @@ from gigabrain_zenoh.config.settings import LinkName
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.qa.conformance import driver_checks, gate_checks
+from gigabrain_zenoh.qa.conformance.driver_checks import CheckedRobot
 from gigabrain_zenoh.qa.conformance.gated_driver import GatedDriver
-from gigabrain_zenoh.qa.conformance.robot import CheckedRobot
 from gigabrain_zenoh.qa.judging import DriverCheckResult, Failed, Finding, Skipped, summary
 
 MAX_CHECK_S = 60.0  # of one check

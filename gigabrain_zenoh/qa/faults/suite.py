@@ -24,7 +24,7 @@ from gigabrain_zenoh.errors import ConfigError, GigabrainError, unknown
 from gigabrain_zenoh.host import this_process
 from gigabrain_zenoh.host.files import read_bounded
 from gigabrain_zenoh.qa.faults import rows as row_modules
-from gigabrain_zenoh.qa.faults.rig.rig import Options, Rig
+from gigabrain_zenoh.qa.faults.rig import Options, Rig
 from gigabrain_zenoh.qa.judging import (
     FaultResult,
     FaultRow,

@@ -27,7 +27,7 @@ from gigabrain_zenoh.diagnostics import log_reader
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.mapping import map_file
 from gigabrain_zenoh.qa.bench import slam_logs
-from gigabrain_zenoh.qa.faults.rig.rig import Options
+from gigabrain_zenoh.qa.faults.rig import Options
 from gigabrain_zenoh.qa.faults.suite import RunsFile
 from gigabrain_zenoh.recording.bag_reader import MAGIC, Bag, BagDamage, read_records
 from gigabrain_zenoh.runtime import audit

@@ -7,7 +7,7 @@ import pytest
 
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.topics import CMD_VEL, ESTOP, MAP, SCAN, SERVICES, TOPICS
-from gigabrain_zenoh.qa.faults.rig.hostile import (
+from gigabrain_zenoh.qa.faults.hostile import (
     KNOWN,
     all_extremes,
     as_map,

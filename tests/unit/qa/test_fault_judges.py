@@ -16,7 +16,7 @@ from gigabrain_schemas.topics import BODY, CMD_VEL, STATE
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.qa.faults.rig.rig import first_slower, first_zero
+from gigabrain_zenoh.qa.faults.rig import first_slower, first_zero
 from gigabrain_zenoh.qa.faults.rows import clocks, estop
 from gigabrain_zenoh.qa.faults.rows.body_line import first_disobeyed
 from gigabrain_zenoh.qa.faults.rows.clocks import OtherHost, age_error_ms

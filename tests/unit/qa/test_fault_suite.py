@@ -18,8 +18,8 @@ from gigabrain_zenoh.clock import FakeClock
 from gigabrain_zenoh.config.renames import FAULT_NAMES
 from gigabrain_zenoh.errors import ConfigError, UnknownName
 from gigabrain_zenoh.host import this_process
-from gigabrain_zenoh.qa.faults.rig.broken_process import HangingBus
-from gigabrain_zenoh.qa.faults.rig.rig import Options, Rig, deployment_of
+from gigabrain_zenoh.qa.faults.broken_process import HangingBus
+from gigabrain_zenoh.qa.faults.rig import Options, Rig, deployment_of
 from gigabrain_zenoh.qa.faults.rows.processes import decision_killed
 from gigabrain_zenoh.qa.faults.suite import (
     FAULTS,

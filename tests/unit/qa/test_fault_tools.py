@@ -14,7 +14,7 @@ from gigabrain_schemas.topics import SCAN, STATE
 from gigabrain_zenoh import codec
 from gigabrain_zenoh.bus.transport import LocalNetwork
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.qa.faults.rig.broken_process import (
+from gigabrain_zenoh.qa.faults.broken_process import (
     TamperingSteps,
     jumps,
     other_host,

@@ -5,8 +5,8 @@ from typing import Any
 
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_zenoh.codec import Codec
-from gigabrain_zenoh.qa.faults.rig import hostile
-from gigabrain_zenoh.qa.faults.rig.hostile import Path, codec_of, leaves
+from gigabrain_zenoh.qa.faults import hostile
+from gigabrain_zenoh.qa.faults.hostile import Path, codec_of, leaves
 
 
 def codec(name: str) -> Codec[Any]:

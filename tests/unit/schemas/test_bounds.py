@@ -10,7 +10,7 @@ from msgspec import inspect
 from gigabrain_schemas.body import Body
 from gigabrain_schemas.brain import CmdVel, OccupancyGrid
 from gigabrain_schemas.topics import messages
-from gigabrain_zenoh.qa.faults.rig.hostile import as_map, replaced
+from gigabrain_zenoh.qa.faults.hostile import as_map, replaced
 
 
 def fields(of: Any, where: str) -> Iterator[tuple[str, Any]]:

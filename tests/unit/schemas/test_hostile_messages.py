@@ -10,7 +10,7 @@ from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.topics import MAP, TOPICS, Topic
 from gigabrain_zenoh.codec import Codec
-from gigabrain_zenoh.qa.faults.rig.hostile import leaves, replaced
+from gigabrain_zenoh.qa.faults.hostile import leaves, replaced
 from tests.unit.schemas.plain import as_map, at, codec, dotted, maps, numbers, refuses
 
 # numbers that may be null: nothing measured, nothing in the way, no limit, any yaw, no clock

@@ -11,7 +11,7 @@ from gigabrain_schemas.brain import (
 from gigabrain_schemas.examples import EXAMPLES
 from gigabrain_schemas.golden import export
 from gigabrain_schemas.topics import SERVICES, TOPICS, messages
-from gigabrain_zenoh.qa.faults.rig.hostile import leaves
+from gigabrain_zenoh.qa.faults.hostile import leaves
 from tests.unit.schemas.plain import as_map, codec, dotted, refuses
 
 HEADER = {"stamp_ns", "seq", "boot", "tick", "basis"}

@@ -1,5 +1,5 @@
-"""The fault tests, grouped by subject. Each module lists its rows in `ROWS`.
+"""The fault tests, grouped by subject. `@fault_row` makes a row of each test function.
 
-A row holds its test function and its limits.
+A row holds the test, its number, its robot and its limits.
 Only `faults.suite` and tests may import it.
 """

@@ -13,7 +13,7 @@ from gigabrain_drivers.bodies.line.protocol import COMMAND, LineDecoder, Templat
 from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.body import RobotState
 from gigabrain_zenoh.config.settings import ProcessConfig
-from gigabrain_zenoh.qa.faults.rig.rig import (
+from gigabrain_zenoh.qa.faults.rig import (
     DEATHS,
     MOTORS_ZERO,
     MOVED_AGAIN,

@@ -9,9 +9,9 @@ from gigabrain_schemas.topics import CMD_VEL, STATE
 from gigabrain_zenoh.bus.bus import Bus, Latest
 from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.gate import gate
-from gigabrain_zenoh.qa.faults.rig.broken_process import Shift, drift, other_host
-from gigabrain_zenoh.qa.faults.rig.hostile import OpenGate
-from gigabrain_zenoh.qa.faults.rig.rig import (
+from gigabrain_zenoh.qa.faults.broken_process import Shift, drift, other_host
+from gigabrain_zenoh.qa.faults.hostile import OpenGate
+from gigabrain_zenoh.qa.faults.rig import (
     STOPS,
     Rig,
     broken,

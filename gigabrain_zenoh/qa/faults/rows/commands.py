@@ -20,9 +20,9 @@ from gigabrain_zenoh.gate import gate
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.geometry.limits import clamp, limits_of
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.qa.faults.rig import hostile
-from gigabrain_zenoh.qa.faults.rig.hostile import COMMANDER, OpenGate, codec_of, hostile_payloads
-from gigabrain_zenoh.qa.faults.rig.rig import (
+from gigabrain_zenoh.qa.faults import hostile
+from gigabrain_zenoh.qa.faults.hostile import COMMANDER, OpenGate, codec_of, hostile_payloads
+from gigabrain_zenoh.qa.faults.rig import (
     DEATHS,
     RESTED_TICKS,
     Forger,

@@ -15,7 +15,7 @@ from gigabrain_schemas.requests import EstopRequest, ReleaseRequest
 from gigabrain_schemas.topics import CMD_VEL, ESTOP, RELEASE, TELEOP, Topic
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.errors import GigabrainError, Refused
-from gigabrain_zenoh.qa.faults.rig.rig import TRAVEL, Rig
+from gigabrain_zenoh.qa.faults.rig import TRAVEL, Rig
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest

@@ -40,8 +40,8 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.gate.state import BRAIN
 from gigabrain_zenoh.host.files import read_bounded
-from gigabrain_zenoh.qa.faults.rig.hostile import ExtremeMessage, all_extremes, chosen_extremes
-from gigabrain_zenoh.qa.faults.rig.rig import DRIVES_AGAIN_WALL, MEMORY_GROWN, Options, Rig
+from gigabrain_zenoh.qa.faults.hostile import ExtremeMessage, all_extremes, chosen_extremes
+from gigabrain_zenoh.qa.faults.rig import DRIVES_AGAIN_WALL, MEMORY_GROWN, Options, Rig
 from gigabrain_zenoh.qa.faults.rows.goal_recovery import (
     PLACES,
     in_map,

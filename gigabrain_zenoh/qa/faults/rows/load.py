@@ -19,8 +19,8 @@ from gigabrain_zenoh.bus.headers import SequenceGaps, header_of
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.errors import Refused
 from gigabrain_zenoh.host.bounded import percentile
-from gigabrain_zenoh.qa.faults.rig import cpu_load
-from gigabrain_zenoh.qa.faults.rig.rig import BRAKES, MEMORY_GROWN, STOPS, ZERO, Rig, Stop, stop_by
+from gigabrain_zenoh.qa.faults import cpu_load
+from gigabrain_zenoh.qa.faults.rig import BRAKES, MEMORY_GROWN, STOPS, ZERO, Rig, Stop, stop_by
 from gigabrain_zenoh.qa.faults.rows.estop import LATCHED, ZERO_P99, PressLog
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import until

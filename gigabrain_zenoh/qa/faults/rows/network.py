@@ -22,9 +22,9 @@ from gigabrain_zenoh.client.robot import connect
 from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.host.bounded import percentile
-from gigabrain_zenoh.qa.faults.rig import cpu_load
-from gigabrain_zenoh.qa.faults.rig.cpu_load import endpoint_text
-from gigabrain_zenoh.qa.faults.rig.rig import (
+from gigabrain_zenoh.qa.faults import cpu_load
+from gigabrain_zenoh.qa.faults.cpu_load import endpoint_text
+from gigabrain_zenoh.qa.faults.rig import (
     BRAKES,
     HOLE,
     MOVED_AGAIN,

@@ -9,7 +9,7 @@ from typing import Any
 
 from gigabrain_schemas.base import TICK_MS
 from gigabrain_schemas.topics import CMD_VEL
-from gigabrain_zenoh.qa.faults.rig.rig import (
+from gigabrain_zenoh.qa.faults.rig import (
     BRAKES,
     DRIVES_AGAIN,
     DRIVES_AGAIN_WALL,
@@ -153,7 +153,7 @@ async def frozen_until_restarted(rig: Rig) -> Measured:
 async def recorder_killed(rig: Rig) -> Measured:
     """Kill the recorder, and treat its files and its disk badly, where a recorder is installed."""
     try:
-        from gigabrain_zenoh.qa.faults.rig.recorder_faults import kill_recorder
+        from gigabrain_zenoh.qa.faults.recorder_faults import kill_recorder
     except ModuleNotFoundError as error:
         raise Skipped(f"needs gigabrain-zenoh[record]: {error.name} is missing") from None
     lost_s, unreadable, late_ms = await kill_recorder(rig)

@@ -28,7 +28,7 @@ from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import GigabrainError
 from gigabrain_zenoh.host.posix import resource
-from gigabrain_zenoh.qa.faults.rig.rig import (
+from gigabrain_zenoh.qa.faults.rig import (
     PERIOD_ADDED,
     Rig,
     address_of,

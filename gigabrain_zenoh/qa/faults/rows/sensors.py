@@ -19,8 +19,8 @@ from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.geometry.stopping import brakes
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.qa.faults.rig.hostile import as_map, codec_of
-from gigabrain_zenoh.qa.faults.rig.rig import BRAKES, ZERO, Rig, Stop, next_step, stop_by, tampered
+from gigabrain_zenoh.qa.faults.hostile import as_map, codec_of
+from gigabrain_zenoh.qa.faults.rig import BRAKES, ZERO, Rig, Stop, next_step, stop_by, tampered
 from gigabrain_zenoh.qa.judging import Failed, Figure, Measured, fault_row
 from gigabrain_zenoh.qa.probe import until
 from gigabrain_zenoh.qa.simulated_drives import Ranges, SafetyTrack

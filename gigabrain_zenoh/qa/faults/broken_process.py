@@ -1,6 +1,6 @@
 """Runs a robot's process with a part of it broken: what it publishes, handles, or its clocks.
 
-Started as `python -m gigabrain_zenoh.qa.faults.rig.broken_process KIND CONFIG` in place of the
+Started as `python -m gigabrain_zenoh.qa.faults.broken_process KIND CONFIG` in place of the
 process itself. KIND is `hanging`, a kind of `CLOCK_SKEWS`, or names of `TAMPERINGS` with commas
 between. The machine's own clock is not touched.
 """

@@ -17,7 +17,7 @@ from gigabrain_schemas.topics import CMD_VEL, SCAN, STATE
 from gigabrain_zenoh.bus.headers import header_of
 from gigabrain_zenoh.codec import encode
 from gigabrain_zenoh.config.settings import RecorderConfig
-from gigabrain_zenoh.qa.faults.rig.rig import Rig, deployment_of
+from gigabrain_zenoh.qa.faults.rig import Rig, deployment_of
 from gigabrain_zenoh.qa.judging import Failed
 from gigabrain_zenoh.qa.robot_under_test import RobotUnderTest
 from gigabrain_zenoh.recording.bag_reader import MAGIC, Bag, Sample

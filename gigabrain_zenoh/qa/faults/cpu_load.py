@@ -1,6 +1,6 @@
 """Programs that load a robot's machine or flood its network. For tests and benchmarks only.
 
-Started as `python -m gigabrain_zenoh.qa.faults.rig.cpu_load KIND ...`.
+Started as `python -m gigabrain_zenoh.qa.faults.cpu_load KIND ...`.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.host import this_process
 
-PROGRAM = (sys.executable, "-P", "-m", "gigabrain_zenoh.qa.faults.rig.cpu_load")
+PROGRAM = (sys.executable, "-P", "-m", "gigabrain_zenoh.qa.faults.cpu_load")
 MEMORY_MB = 256
 OBJECTS = 1_000_000
 JSON_NUMBERS = 6_000_000  # about 50 MB of text

@@ -42,7 +42,7 @@ from gigabrain_zenoh.qa.robot_under_test import (
 from gigabrain_zenoh.runtime.deployment import Deployment, client_endpoint, with_free_port
 from gigabrain_zenoh.runtime.managed_process import Backoff, ProcessSpec
 
-BROKEN_PROCESS = (sys.executable, "-P", "-m", "gigabrain_zenoh.qa.faults.rig.broken_process")
+BROKEN_PROCESS = (sys.executable, "-P", "-m", "gigabrain_zenoh.qa.faults.broken_process")
 SPEED = 0.26  # [m/s], of all tests that do not say otherwise
 BODIES: dict[Stage, str] = {
     "sim": "turtlebot3_waffle",
