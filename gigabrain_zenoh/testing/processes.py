@@ -56,7 +56,7 @@ def listens(port: int) -> bool:
         return probe.connect_ex(("127.0.0.1", port)) == 0
 
 
-class Command:
+class CommandProcess:
     """A `gigabrain` command in a process of its own, with its output in files."""
 
     def __init__(
@@ -125,7 +125,7 @@ class Home:
     def __init__(self, folder: Path, inside: tuple[str, ...] = ()) -> None:
         self.folder, self._inside = folder, inside
         folder.mkdir(exist_ok=True)
-        self._commands: list[Command] = []
+        self._commands: list[CommandProcess] = []
         self._numbers = itertools.count(1)
 
     @property
@@ -139,13 +139,15 @@ class Home:
             "COLUMNS": "100",
         }
 
-    def start(self, *arguments: str, stdout: int | None = None) -> Command:
-        """Start a `gigabrain` command; its output goes to `stdout`, or into `Command.out`."""
+    def start(self, *arguments: str, stdout: int | None = None) -> CommandProcess:
+        """Start a `gigabrain` command; its output goes to `stdout`, or a file."""
         out = self.folder / f"command-{next(self._numbers)}"
-        self._commands.append(Command(out, self.environment, arguments, stdout, self._inside))
+        self._commands.append(
+            CommandProcess(out, self.environment, arguments, stdout, self._inside)
+        )
         return self._commands[-1]
 
-    async def run(self, *arguments: str) -> Command:
+    async def run(self, *arguments: str) -> CommandProcess:
         """Start a `gigabrain` command and wait for its end."""
         command = self.start(*arguments)
         await command.ended()
@@ -161,7 +163,7 @@ class Home:
     def processes(self, name: str = "") -> list[int]:
         """Return the pids of the supervised processes that live here, or of those of this name."""
         mine = f'"run_dir":"{self.folder}', f'"name":"{name}"' if name else ""
-        return [pid for pid, told in _processes() if all(part in told for part in mine)]
+        return [pid for pid, arguments in _processes() if all(one in arguments for one in mine)]
 
     def close(self) -> None:
         """End all processes that are left."""
@@ -190,7 +192,7 @@ def endpoint_of(deployment: Path) -> Endpoint:
     return Endpoint(connect=(values["router"],), namespace=values.get("namespace", ""))
 
 
-async def robot_of(home: Home, command: Command) -> Endpoint:
+async def robot_of(home: Home, command: CommandProcess) -> Endpoint:
     """Wait until a command has announced its robot, and return the robot's endpoint."""
     note = home.folder / "run" / "gigabrain" / f"{command.pid}.json"
     await until(note.exists, "the robot is announced")
@@ -284,35 +286,35 @@ async def robot() -> AsyncIterator[ZenohNetwork]:
         await made.close()
 
 
-def under_way() -> set[threading.Thread]:
+def session_threads() -> set[threading.Thread]:
     """Return the threads of this process that open or close a session."""
     return {thread for thread in threading.enumerate() if thread.name == "zenoh-session"}
 
 
-class Ear:
-    """Keeps what arrives on one key."""
+class SampleCollector:
+    """Collects the samples (key, payload) of one key."""
 
     def __init__(self, transport: ZenohTransport, key: str, depth: int = 256) -> None:
-        self.heard: list[tuple[str, bytes]] = []
-        self.close = transport.subscribe(key, self._take, depth)
+        self.samples: list[tuple[str, bytes]] = []
+        self.close = transport.subscribe(key, self._append, depth)
 
-    def _take(self, key: str, payload: bytes) -> None:
-        self.heard.append((key, payload))
+    def _append(self, key: str, payload: bytes) -> None:
+        self.samples.append((key, payload))
 
     @property
     def payloads(self) -> list[bytes]:
         """The payloads that arrived."""
-        return [payload for _, payload in self.heard]
+        return [payload for _, payload in self.samples]
 
 
-async def repeat(send: Callable[[], object], heard: Callable[[], object]) -> None:
+async def repeat(send: Callable[[], object], received: Callable[[], object]) -> None:
     """Send every 50 ms until it is received.
 
     Subscriptions take a while to spread. On a machine that starves a process for the 400 ms of a
     lease, a link is lost for a moment.
     """
     async with asyncio.timeout(30):
-        while not heard():
+        while not received():
             send()
             with contextlib.suppress(TimeoutError):
-                await until(heard, within_s=0.05)
+                await until(received, within_s=0.05)

@@ -26,7 +26,7 @@ async def settle() -> None:
         await asyncio.sleep(0)
 
 
-def in_thread(work: Callable[[], None]) -> threading.Thread:
+def start_thread(work: Callable[[], None]) -> threading.Thread:
     """Return a thread that has just begun to `work`."""
     thread = threading.Thread(target=work)
     thread.start()

@@ -12,7 +12,7 @@ from websockets.asyncio.client import ClientConnection, connect
 
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.runtime.deployment import ROBOT
-from gigabrain_zenoh.testing.processes import Command, Home, endpoint_of, free_port, listens
+from gigabrain_zenoh.testing.processes import CommandProcess, Home, endpoint_of, free_port, listens
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.page import frames
 
@@ -39,7 +39,7 @@ class Robot:
         page = {"port": self.port, "login": True, "tokens": str(tokens)}
         hosts = {"robot": [*ROBOT, "page"]}
         self.file = home.deployment(resume="auto", hosts=hosts, page=page, **values)
-        self.command: Command = home.start("up", str(self.file))
+        self.command: CommandProcess = home.start("up", str(self.file))
 
     @property
     def endpoint(self) -> Endpoint:

@@ -10,7 +10,7 @@ import zenoh
 from gigabrain_schemas.topics import ESTOP_SAID, SERVICES, TOPICS
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.security.authority import issue
-from gigabrain_zenoh.testing.processes import Ear, repeat
+from gigabrain_zenoh.testing.processes import SampleCollector, repeat
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.keys import Site, make_fleet, raw, site
 
@@ -57,21 +57,21 @@ async def asked_until_answered(session: zenoh.Session, key: str) -> None:
 async def test_a_robot_hears_of_each_role_what_it_may_say_and_no_more(net: Site) -> None:
     robot = await net.client("robot@red", "red")
     robot.serve("robot/describe/driver", answer)
-    ear = Ear(robot, "robot/**")
+    ear = SampleCollector(robot, "robot/**")
     for role, expected in SAYS.items():
         session = net.raw(f"{role}@red")
         may = {f"robot/{name}" for name in expected.split()}
-        ear.heard.clear()
+        ear.samples.clear()
 
         def say_all(session: zenoh.Session = session) -> None:
             for key in SAID:
                 session.put(f"red/{key}", b"x")
 
         await asked_until_answered(session, "red/robot/describe/driver")
-        await repeat(say_all, lambda may=may: {key for key, _ in ear.heard} >= may)
+        await repeat(say_all, lambda may=may: {key for key, _ in ear.samples} >= may)
         say_all()
         await asked_until_answered(session, "red/robot/describe/driver")  # after all it has said
-        await until(lambda may=may: {key for key, _ in ear.heard} == may)
+        await until(lambda may=may: {key for key, _ in ear.samples} == may)
 
 
 async def test_each_role_may_ask_its_own_questions_and_no_others(net: Site) -> None:
@@ -122,10 +122,10 @@ async def test_a_hostile_robot_with_keys_of_its_own_cannot_touch_its_neighbour(n
     red.serve("robot/estop", answer)
     red.serve("robot/enable", answer)
     red_ear, viewer_ear = (
-        Ear(red, "robot/**"),
-        Ear(await net.client("viewer@red", "red"), "robot/**"),
+        SampleCollector(red, "robot/**"),
+        SampleCollector(await net.client("viewer@red", "red"), "robot/**"),
     )
-    blue_ear = Ear(await net.client("robot@blue", "blue"), "robot/**")
+    blue_ear = SampleCollector(await net.client("robot@blue", "blue"), "robot/**")
     blue = net.raw("robot@blue")
     commands = [blue.declare_publisher(f"red/robot/{key}") for key in ("cmd_vel", "teleop")]
     for i in range(5000):
@@ -138,14 +138,14 @@ async def test_a_hostile_robot_with_keys_of_its_own_cannot_touch_its_neighbour(n
     assert await ask(blue, "red/robot/estop") == []
     assert await ask(blue, "red/robot/enable") == []
     assert await ask(blue, "*/robot/enable") == []
-    await repeat(lambda: blue.put("blue/robot/cmd_vel", b"own"), lambda: blue_ear.heard)
-    assert red_ear.heard == viewer_ear.heard == []
+    await repeat(lambda: blue.put("blue/robot/cmd_vel", b"own"), lambda: blue_ear.samples)
+    assert red_ear.samples == viewer_ear.samples == []
 
 
 async def test_who_is_unknown_hears_nothing_and_is_not_heard(net: Site) -> None:
     red = await net.client("robot@red", "red")
     red.serve("robot/describe/driver", answer)
-    ear, heard = Ear(await net.client("operator@red", "red"), "robot/**"), list[str]()
+    ear, heard = SampleCollector(await net.client("operator@red", "red"), "robot/**"), list[str]()
     green = net.raw("robot@green")
     green.declare_subscriber(
         "**",
@@ -156,8 +156,8 @@ async def test_who_is_unknown_hears_nothing_and_is_not_heard(net: Site) -> None:
     assert await ask(green, "red/robot/describe/driver") == []
     green.put("green/robot/cmd_vel", b"x")
     topic = TOPICS[0]
-    await repeat(lambda: red.publish(topic, "robot/scan", b"x", ""), lambda: ear.heard)
-    assert {key for key, _ in ear.heard} == {"robot/scan"}
+    await repeat(lambda: red.publish(topic, "robot/scan", b"x", ""), lambda: ear.samples)
+    assert {key for key, _ in ear.samples} == {"robot/scan"}
     assert heard == []
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_zenoh.bus.bridge import WAKER, Bridge, EventFd, SocketPair, Waker
-from gigabrain_zenoh.testing.waiting import in_thread, until
+from gigabrain_zenoh.testing.waiting import start_thread, until
 
 KINDS: list[Callable[[], Waker]] = [SocketPair]
 if hasattr(os, "eventfd"):
@@ -75,7 +75,7 @@ async def test_what_is_posted_runs_on_the_loop_in_order(bench: Bench) -> None:
         for number in range(1000):
             bench.bridge.post(take, number)
 
-    posting = in_thread(post)
+    posting = start_thread(post)
     await bench.until(1000)
     posting.join()
     assert bench.got == list(range(1000))
@@ -99,7 +99,7 @@ async def test_many_threads_lose_nothing_and_keep_the_order_of_each(bench: Bench
             bench.bridge.post(bench.got.append, number)
 
     firsts = (0, 10_000, 20_000, 30_000)
-    threads = [in_thread(functools.partial(post, first)) for first in firsts]
+    threads = [start_thread(functools.partial(post, first)) for first in firsts]
     await bench.until(20_000)
     for thread in threads:
         thread.join()
@@ -121,7 +121,7 @@ async def test_a_post_that_meets_the_end_of_a_drain_is_not_forgotten(bench: Benc
             bench.bridge.post(take, number)
             assert turn.acquire(timeout=20)
 
-    posting = in_thread(post)
+    posting = start_thread(post)
     await bench.until(3000)
     posting.join()
     assert bench.got == list(range(3000))
@@ -196,7 +196,7 @@ async def test_a_close_waits_for_a_signal_that_is_on_its_way() -> None:
             super().close()
 
     bridge = Bridge(Slow)
-    posting = in_thread(lambda: bridge.post(print, "never"))
+    posting = start_thread(lambda: bridge.post(print, "never"))
     assert signalling.wait(20)
     bridge.close()
     posting.join()
@@ -214,7 +214,7 @@ async def closed_while_threads_post() -> None:
                 bench.bridge.post(bench.got.append, number)
                 time.sleep(0)
 
-        threads = [in_thread(post) for _ in range(3)]
+        threads = [start_thread(post) for _ in range(3)]
         await bench.until(10)
         bench.bridge.close()
         for thread in threads:

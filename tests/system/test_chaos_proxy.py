@@ -12,7 +12,7 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.qa.proxy.chaos import CALM, Chaos
 from gigabrain_zenoh.qa.proxy.tcp import TcpProxy
-from gigabrain_zenoh.testing.processes import Ear, repeat, robot
+from gigabrain_zenoh.testing.processes import SampleCollector, repeat, robot
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.server import Server, serving
 
@@ -212,9 +212,9 @@ async def test_zenoh_goes_on_once_the_network_is_well_again(fault: str) -> None:
         host, _, port = net.endpoint.removeprefix("tcp/").rpartition(":")
         async with TcpProxy((host, int(port))) as proxy:
             client = await ZenohTransport.open(Endpoint(connect=(proxy.endpoint,)))
-            ear = Ear(router, "robot/teleop")
+            ear = SampleCollector(router, "robot/teleop")
             say = functools.partial(client.publish, TELEOP, "robot/teleop")
-            await repeat(lambda: say(b"before", ""), lambda: ear.heard)
+            await repeat(lambda: say(b"before", ""), lambda: ear.samples)
             calls = proxy.calls
             if fault == "hole":  # longer than the lease: both ends give the link up
                 proxy.set(Chaos(hole=True))

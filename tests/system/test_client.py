@@ -22,18 +22,18 @@ from gigabrain_zenoh.errors import (
     Unsupported,
 )
 from gigabrain_zenoh.qa.probe import Probe, probing
-from gigabrain_zenoh.testing.processes import AVOID, Command, Home, free_port, robot_of
+from gigabrain_zenoh.testing.processes import AVOID, CommandProcess, Home, free_port, robot_of
 from gigabrain_zenoh.testing.waiting import until
 
 
 @pytest.fixture(scope="module")
-def demo(shared_home: Home) -> Command:
+def demo(shared_home: Home) -> CommandProcess:
     return shared_home.start(*AVOID, "--headless")
 
 
 @pytest.fixture
 async def robot(
-    shared_home: Home, demo: Command, monkeypatch: pytest.MonkeyPatch
+    shared_home: Home, demo: CommandProcess, monkeypatch: pytest.MonkeyPatch
 ) -> AsyncIterator[Probe]:
     """The robot of the demo, driving itself; scripts find it without being told where it is."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(shared_home.folder / "run"))
@@ -152,7 +152,7 @@ async def test_what_there_is_not_is_said_in_words(robot: Probe) -> None:
 
 
 async def test_several_robots_are_listed(
-    robot: Probe, shared_home: Home, demo: Command, home: Home
+    robot: Probe, shared_home: Home, demo: CommandProcess, home: Home
 ) -> None:
     second = shared_home.start(*AVOID, "--headless", "--world", "house")
     first_at, second_at = await robot_of(shared_home, demo), await robot_of(shared_home, second)

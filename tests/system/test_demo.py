@@ -21,7 +21,7 @@ from gigabrain_zenoh.launch.demo import Demo, DemoOptions, newest_fault
 from gigabrain_zenoh.qa.probe import probing
 from gigabrain_zenoh.runtime.deployment import ROBOT, Deployment
 from gigabrain_zenoh.testing.in_memory import Net
-from gigabrain_zenoh.testing.processes import AVOID, Command, Home, robot_of
+from gigabrain_zenoh.testing.processes import AVOID, CommandProcess, Home, robot_of
 from gigabrain_zenoh.testing.waiting import until
 from gigabrain_zenoh.ui.live_view import doing
 from gigabrain_zenoh.ui.run_report import (
@@ -45,7 +45,7 @@ FIELDS = {
 }  # fmt: skip
 
 
-async def run(home: Home, *options: str) -> tuple[Command, dict[str, Any]]:
+async def run(home: Home, *options: str) -> tuple[CommandProcess, dict[str, Any]]:
     """A demo with `options` to its end, and its report."""
     path = home.folder / f"report-{len(list(home.folder.iterdir()))}.json"
     demo = await home.run(*AVOID, "--headless", "--report", str(path), *options)

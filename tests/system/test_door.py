@@ -17,7 +17,7 @@ from gigabrain_zenoh.client.robot import connect
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import NotConfirmed
 from gigabrain_zenoh.runtime import audit
-from gigabrain_zenoh.testing.processes import Command, Home, free_port, robot_of
+from gigabrain_zenoh.testing.processes import CommandProcess, Home, free_port, robot_of
 from gigabrain_zenoh.testing.waiting import until
 from tests.system.keys import make_fleet, raw
 
@@ -34,7 +34,7 @@ class Gate:
             hosts={"robot": ["router"]},
         )
         self._robot = home.folder / "state" / "gigabrain" / "robots" / "red"
-        self.command: Command = home.start("up", str(file))
+        self.command: CommandProcess = home.start("up", str(file))
 
     def as_(self, name: str) -> Endpoint:
         return Endpoint(

@@ -11,7 +11,7 @@ from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.runtime import connect
 from gigabrain_zenoh.runtime.connect import join, unknown_host
-from gigabrain_zenoh.testing.processes import free_endpoint, under_way
+from gigabrain_zenoh.testing.processes import free_endpoint, session_threads
 from gigabrain_zenoh.testing.waiting import until
 
 NOBODY = "nobody here knows a host {!r}; waiting for its name (is it spelt right?)"
@@ -70,7 +70,7 @@ async def test_a_router_waits_for_its_own_name_and_says_so_once(
 async def test_who_waits_for_a_router_that_has_no_known_name_says_which(
     resolver: Resolver, caplog: pytest.LogCaptureFixture
 ) -> None:
-    others, here = under_way(), free_endpoint()
+    others, here = session_threads(), free_endpoint()
     elsewhere = here.replace("127.0.0.1", "localhost")
     joining = asyncio.ensure_future(join(Endpoint(connect=(elsewhere,))))
     await until(lambda: bool(told(caplog)))
@@ -80,7 +80,7 @@ async def test_who_waits_for_a_router_that_has_no_known_name_says_which(
         await joining
     resolver.knows = True
     router = await ZenohTransport.open(Endpoint(listen=(here,)))
-    await until(lambda: under_way() <= others)  # whoever was left waiting would wait for ever
+    await until(lambda: session_threads() <= others)  # whoever was left waiting would wait for ever
     await router.close()
 
 

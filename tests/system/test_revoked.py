@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gigabrain_zenoh.security.authority import issue, revoke
-from gigabrain_zenoh.testing.processes import Ear, Home, repeat
+from gigabrain_zenoh.testing.processes import Home, SampleCollector, repeat
 from tests.system.keys import site
 from tests.system.test_acl import answer, ask, asked_until_answered
 
@@ -25,16 +25,16 @@ async def test_who_was_called_back_can_do_nothing_and_the_next_of_that_role_all(
     async with site(own) as net:
         robot = await net.client("robot@red", "red")
         robot.serve("robot/release", answer)
-        ear = Ear(robot, "robot/teleop")
+        ear = SampleCollector(robot, "robot/teleop")
         old, new, of_red = (net.raw(name) for name in ("operator", "operator-2", "operator@red"))
         await asked_until_answered(new, "red/robot/release")
         assert await ask(old, "red/robot/release") == []
         old.put(HELLO, b"old")
-        await repeat(lambda: new.put(HELLO, b"new"), lambda: ear.heard)
+        await repeat(lambda: new.put(HELLO, b"new"), lambda: ear.samples)
         await repeat(
-            lambda: of_red.put(HELLO, b"red"), lambda: ("robot/teleop", b"red") in ear.heard
+            lambda: of_red.put(HELLO, b"red"), lambda: ("robot/teleop", b"red") in ear.samples
         )
-        assert ("robot/teleop", b"old") not in ear.heard
+        assert ("robot/teleop", b"old") not in ear.samples
 
 
 async def test_keys_are_called_back_by_command(own: Path, home: Home) -> None:

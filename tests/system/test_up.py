@@ -15,7 +15,14 @@ import pytest
 from gigabrain_zenoh.client.robot import Robot
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.qa.probe import probing
-from gigabrain_zenoh.testing.processes import AVOID, Command, Home, endpoint_of, free_port, robot_of
+from gigabrain_zenoh.testing.processes import (
+    AVOID,
+    CommandProcess,
+    Home,
+    endpoint_of,
+    free_port,
+    robot_of,
+)
 from gigabrain_zenoh.testing.waiting import until
 from tests.places import ROOT
 
@@ -23,7 +30,7 @@ ALL = ["router", "driver", "perception", "decision", "control", "safety"]
 READY = re.compile(r"^\S+ (\w+) +info +ready pid=\d+$", re.MULTILINE)
 
 
-def ready(command: Command) -> list[str]:
+def ready(command: CommandProcess) -> list[str]:
     """The processes that have said so, in the order in which they did."""
     return READY.findall(command.out)
 

@@ -25,7 +25,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.zenoh import transport as zenoh_transport
 from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.testing.processes import Ear, ZenohNetwork, repeat, robot
+from gigabrain_zenoh.testing.processes import SampleCollector, ZenohNetwork, repeat, robot
 from gigabrain_zenoh.testing.waiting import until
 
 REPLY = GateReply(ok=True, text="stopped", robot_type="mock", gate=GateStatus())
@@ -40,7 +40,10 @@ async def net() -> AsyncIterator[ZenohNetwork]:
 
 async def test_what_is_sent_arrives_unchanged(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
-    ear, star = Ear(receiver, "robot/teleop"), Ear(receiver, "robot/image/*")
+    ear, star = (
+        SampleCollector(receiver, "robot/teleop"),
+        SampleCollector(receiver, "robot/image/*"),
+    )
     payload = bytes(range(256)) * 3
 
     def send() -> None:
@@ -48,29 +51,29 @@ async def test_what_is_sent_arrives_unchanged(net: ZenohNetwork) -> None:
         sender.publish(IMAGE, "robot/image/front", b"", "application/x")
         sender.publish(IMAGE, "robot/image/rear", payload, "application/x")
 
-    await repeat(send, lambda: ear.heard and len(set(star.heard)) == 2)
-    assert set(ear.heard) == {("robot/teleop", payload)}
-    assert set(star.heard) == {("robot/image/front", b""), ("robot/image/rear", payload)}
+    await repeat(send, lambda: ear.samples and len(set(star.samples)) == 2)
+    assert set(ear.samples) == {("robot/teleop", payload)}
+    assert set(star.samples) == {("robot/image/front", b""), ("robot/image/rear", payload)}
 
 
 async def test_a_message_of_a_megabyte_arrives_whole(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
-    ear = Ear(receiver, "robot/map")
+    ear = SampleCollector(receiver, "robot/map")
     payload = bytes(range(256)) * 4096
-    await repeat(lambda: sender.publish(MAP, "robot/map", payload, ""), lambda: ear.heard)
+    await repeat(lambda: sender.publish(MAP, "robot/map", payload, ""), lambda: ear.samples)
     assert set(ear.payloads) == {payload}
 
 
 async def test_messages_keep_their_order(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
-    ear = Ear(receiver, "robot/cmd_vel")
+    ear = SampleCollector(receiver, "robot/cmd_vel")
     count = itertools.count()
 
     def send() -> None:
         for _ in range(10):
             sender.publish(CMD_VEL, "robot/cmd_vel", b"%d" % next(count), "")
 
-    await repeat(send, lambda: len(ear.heard) >= 100)
+    await repeat(send, lambda: len(ear.samples) >= 100)
     numbers = [int(payload) for payload in ear.payloads]
     assert numbers == sorted(set(numbers))
 
@@ -129,20 +132,23 @@ async def test_a_busy_loop_gets_the_newest_and_not_the_backlog(
 
     monkeypatch.setattr(zenoh_transport, "Mailbox", Watched)
     sender, receiver = await net.client(), await net.client()
-    ear = Ear(receiver, "robot/cmd_vel", depth)
+    ear = SampleCollector(receiver, "robot/cmd_vel", depth)
     publish_200_without_leaving_the_loop(sender, arrived)
     newest = arrived[-depth:]
-    await until(lambda: ear.heard)
+    await until(lambda: ear.samples)
     assert ear.payloads[:depth] == newest
 
 
 async def test_who_has_stopped_listening_hears_nothing(net: ZenohNetwork) -> None:
     sender, receiver = await net.client(), await net.client()
-    ear, other = Ear(receiver, "robot/teleop"), Ear(receiver, "robot/teleop")
+    ear, other = (
+        SampleCollector(receiver, "robot/teleop"),
+        SampleCollector(receiver, "robot/teleop"),
+    )
     ear.close()
     ear.close()
-    await repeat(lambda: sender.publish(TELEOP, "robot/teleop", b"x", ""), lambda: other.heard)
-    assert ear.heard == []
+    await repeat(lambda: sender.publish(TELEOP, "robot/teleop", b"x", ""), lambda: other.samples)
+    assert ear.samples == []
 
 
 async def test_a_message_on_the_bus_is_the_same_over_zenoh(net: ZenohNetwork) -> None:

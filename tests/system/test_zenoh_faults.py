@@ -14,12 +14,12 @@ from gigabrain_zenoh.bus.zenoh.transport import ZenohTransport
 from gigabrain_zenoh.config.settings import Endpoint
 from gigabrain_zenoh.errors import BusError, ConfigError
 from gigabrain_zenoh.testing.processes import (
-    Ear,
+    SampleCollector,
     free_endpoint,
     repeat,
     robot,
     router_process,
-    under_way,
+    session_threads,
 )
 from gigabrain_zenoh.testing.waiting import until
 
@@ -91,7 +91,7 @@ async def test_a_client_waits_for_its_router() -> None:
 
 
 async def test_waiting_for_a_router_may_be_given_up_and_its_session_is_closed() -> None:
-    others = under_way()
+    others = session_threads()
     async with robot() as net:
         opening = asyncio.ensure_future(client_of(net.endpoint))
         await asyncio.sleep(0.1)
@@ -100,11 +100,11 @@ async def test_waiting_for_a_router_may_be_given_up_and_its_session_is_closed() 
             await opening
         await net.router()
         # the thread that was left waiting finds the router, and lets go of it again
-        await until(lambda: under_way() <= others)
+        await until(lambda: session_threads() <= others)
 
 
 async def test_a_session_that_opens_just_as_it_is_given_up_is_closed() -> None:
-    others = under_way()
+    others = session_threads()
     async with robot() as net:
         router = await net.router()
         for turns in range(40):
@@ -116,7 +116,7 @@ async def test_a_session_that_opens_just_as_it_is_given_up_is_closed() -> None:
                 await (await opening).close()
             except asyncio.CancelledError:
                 continue
-        await until(lambda: under_way() <= others)
+        await until(lambda: session_threads() <= others)
         await until(lambda: not router._lines.now.session.info.transports())
 
 
@@ -143,9 +143,9 @@ async def test_a_router_that_is_killed_and_comes_back_carries_data_and_queries_a
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
         sender, receiver = await client_of(endpoint), await client_of(endpoint)
-        ear = Ear(receiver, "robot/scan")
+        ear = SampleCollector(receiver, "robot/scan")
         receiver.serve("robot/goal", echo)
-        await repeat(lambda: sender.publish(SCAN, "robot/scan", b"1", ""), lambda: ear.heard)
+        await repeat(lambda: sender.publish(SCAN, "robot/scan", b"1", ""), lambda: ear.samples)
         router.kill()
         sender.publish(SCAN, "robot/scan", b"lost", "")
         assert await sender.query("robot/goal", b"", "", 0.2, "data") == []
@@ -167,26 +167,26 @@ async def test_a_client_joins_again_with_a_session_of_which_its_router_knows_not
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
         client = await client_of(endpoint)
-        ear = Ear(client, "robot/teleop")
+        ear = SampleCollector(client, "robot/teleop")
         first = client._lines.now
         router.kill()
         await until(lambda: client._lines.now is None)
     with router_process(endpoint):
-        await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: ear.heard)
+        await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: ear.samples)
         second = client._lines.now
         assert first
         assert second
         assert str(first.session.zid()) != str(second.session.zid())
         ear.close()  # ends what was declared on the second
-        heard = len(ear.heard)
-        other = Ear(client, "robot/teleop")
-        await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: other.heard)
-        assert len(ear.heard) == heard
+        heard = len(ear.samples)
+        other = SampleCollector(client, "robot/teleop")
+        await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: other.samples)
+        assert len(ear.samples) == heard
         await client.close()
 
 
 async def test_leaving_does_not_wait_to_join_again() -> None:
-    others = under_way()
+    others = session_threads()
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
         client = await client_of(endpoint)
@@ -198,7 +198,7 @@ async def test_leaving_does_not_wait_to_join_again() -> None:
             await client.close()
             assert await asking == []
     with router_process(endpoint):  # whoever still waits for one finds it, and leaves
-        await until(lambda: under_way() <= others)
+        await until(lambda: session_threads() <= others)
 
 
 def stuck(sender: ZenohTransport) -> None:
@@ -208,12 +208,12 @@ def stuck(sender: ZenohTransport) -> None:
 
 
 async def gone(router_is: str, use: Callable[[ZenohTransport], None]) -> None:
-    others = under_way()
+    others = session_threads()
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
         client = await client_of(endpoint)
-        ear = Ear(client, "robot/teleop")
-        await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: ear.heard)
+        ear = SampleCollector(client, "robot/teleop")
+        await repeat(lambda: client.publish(TELEOP, "robot/teleop", b"", ""), lambda: ear.samples)
         (router.freeze if router_is == "frozen" else router.kill)()
         use(client)
         asking = asyncio.ensure_future(client.query("robot/goal", b"", "", 60.0, "data"))
@@ -221,7 +221,7 @@ async def gone(router_is: str, use: Callable[[ZenohTransport], None]) -> None:
         async with asyncio.timeout(5):  # Zenoh's own close takes ten
             await client.close()
             assert await asking == []
-    await until(lambda: under_way() <= others)
+    await until(lambda: session_threads() <= others)
 
 
 @pytest.mark.parametrize("router_is", ["killed", "frozen"])
@@ -234,7 +234,7 @@ async def test_leaving_does_not_wait_for_a_link_that_is_stuck() -> None:
 
 
 async def test_publishing_into_a_stuck_link_does_not_stop_the_loop() -> None:
-    others = under_way()
+    others = session_threads()
     endpoint = free_endpoint()
     with router_process(endpoint) as router:
         client = await client_of(endpoint)
@@ -243,7 +243,7 @@ async def test_publishing_into_a_stuck_link_does_not_stop_the_loop() -> None:
             stuck(client)
             await asyncio.sleep(0)
         await client.close()
-    await until(lambda: under_way() <= others)
+    await until(lambda: session_threads() <= others)
 
 
 def handles() -> tuple[int, int]:
@@ -255,9 +255,11 @@ async def one_life() -> None:
     async with robot() as net:
         await net.router()
         one, two = await net.client(), await net.client("red")
-        ears = [Ear(one, f"robot/{name}") for name in ("a", "b", "c")] + [Ear(two, "robot/teleop")]
+        ears = [SampleCollector(one, f"robot/{name}") for name in ("a", "b", "c")] + [
+            SampleCollector(two, "robot/teleop")
+        ]
         one.serve("robot/goal", echo)
-        await repeat(lambda: one.publish(TELEOP, "robot/a", b"x", ""), lambda: ears[0].heard)
+        await repeat(lambda: one.publish(TELEOP, "robot/a", b"x", ""), lambda: ears[0].samples)
         await one.query("robot/goal", b"x", "", 5.0, "data")
 
 

@@ -8,7 +8,7 @@ from gigabrain_schemas.safety import Health
 from gigabrain_schemas.topics import DESCRIBE, HEALTH, TELEOP
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.clock import Clock
-from gigabrain_zenoh.testing.processes import Ear, ZenohNetwork, repeat, robot
+from gigabrain_zenoh.testing.processes import SampleCollector, ZenohNetwork, repeat, robot
 from gigabrain_zenoh.testing.waiting import until
 
 
@@ -25,23 +25,26 @@ async def describe(_: DescribeRequest) -> Description:
 async def test_two_robots_on_one_router_do_not_hear_each_other(net: ZenohNetwork) -> None:
     await net.router()
     red, blue = await net.client("red"), await net.client("blue")
-    red_ear, blue_ear = Ear(await net.client("red"), "robot/*"), Ear(blue, "robot/*")
+    red_ear, blue_ear = (
+        SampleCollector(await net.client("red"), "robot/*"),
+        SampleCollector(blue, "robot/*"),
+    )
 
     def send() -> None:
         red.publish(TELEOP, "robot/teleop", b"red", "")
         blue.publish(TELEOP, "robot/teleop", b"blue", "")
 
-    await repeat(send, lambda: red_ear.heard and blue_ear.heard)
-    assert set(red_ear.heard) == {("robot/teleop", b"red")}
-    assert set(blue_ear.heard) == {("robot/teleop", b"blue")}
+    await repeat(send, lambda: red_ear.samples and blue_ear.samples)
+    assert set(red_ear.samples) == {("robot/teleop", b"red")}
+    assert set(blue_ear.samples) == {("robot/teleop", b"blue")}
 
 
 async def test_the_fleet_hears_each_robot_under_its_name(net: ZenohNetwork) -> None:
     await net.router()
     red, fleet = await net.client("red"), await net.client()
-    ear = Ear(fleet, "red/robot/*")
-    await repeat(lambda: red.publish(TELEOP, "robot/teleop", b"x", ""), lambda: ear.heard)
-    assert set(ear.heard) == {("red/robot/teleop", b"x")}
+    ear = SampleCollector(fleet, "red/robot/*")
+    await repeat(lambda: red.publish(TELEOP, "robot/teleop", b"x", ""), lambda: ear.samples)
+    assert set(ear.samples) == {("red/robot/teleop", b"x")}
 
 
 async def test_a_question_stays_within_its_robot(net: ZenohNetwork) -> None:
@@ -62,24 +65,24 @@ async def test_a_router_in_a_namespace_is_one_of_the_robots_processes(net: Zenoh
     red, fleet = Bus(await net.client("red"), Clock()), await net.client()
     heard: list[tuple[str, Health]] = []
     red.subscribe(HEALTH, lambda key, health: heard.append((key, health)))
-    of_fleet = Ear(fleet, "red/robot/health/*")
+    of_fleet = SampleCollector(fleet, "red/robot/health/*")
     await repeat(
         lambda: router.publish(HEALTH, example(Health), name="router"),
-        lambda: heard and of_fleet.heard,
+        lambda: heard and of_fleet.samples,
     )
     assert heard[0][0] == "robot/health/router"
-    assert of_fleet.heard[0][0] == "red/robot/health/router"
+    assert of_fleet.samples[0][0] == "red/robot/health/router"
     router.serve(DESCRIBE, describe, name="router")
     while not await red.ask(DESCRIBE, DescribeRequest(), name="router", timeout_s=20):
         pass
 
-    blue, blue_ear = await net.client("blue"), Ear(await net.client("blue"), "robot/*")
-    await repeat(lambda: blue.publish(TELEOP, "robot/teleop", b"b", ""), lambda: blue_ear.heard)
+    blue, blue_ear = await net.client("blue"), SampleCollector(await net.client("blue"), "robot/*")
+    await repeat(lambda: blue.publish(TELEOP, "robot/teleop", b"b", ""), lambda: blue_ear.samples)
     assert not await Bus(blue, Clock()).ask(DESCRIBE, DescribeRequest(), name="router")
 
 
 async def test_a_router_in_a_namespace_hears_its_robot(net: ZenohNetwork) -> None:
     router, red = await net.router("red"), await net.client("red")
-    ear = Ear(router, "robot/teleop")
-    await repeat(lambda: red.publish(TELEOP, "robot/teleop", b"x", ""), lambda: ear.heard)
-    await until(lambda: ear.heard[0] == ("robot/teleop", b"x"))
+    ear = SampleCollector(router, "robot/teleop")
+    await repeat(lambda: red.publish(TELEOP, "robot/teleop", b"x", ""), lambda: ear.samples)
+    await until(lambda: ear.samples[0] == ("robot/teleop", b"x"))

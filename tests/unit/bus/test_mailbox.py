@@ -4,7 +4,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from gigabrain_zenoh.bus.bridge import Bridge, Mailbox
-from gigabrain_zenoh.testing.waiting import in_thread, until
+from gigabrain_zenoh.testing.waiting import start_thread, until
 
 
 class Hand:
@@ -78,7 +78,7 @@ async def test_a_mailbox_delivers_the_last_of_what_a_thread_puts(hand: Hand) -> 
         for number in range(50_000):
             mailbox.put(number)
 
-    putting = in_thread(put)
+    putting = start_thread(put)
     await until(lambda: hand.got[-1:] == [49_999])
     putting.join()
     assert hand.got == sorted(set(hand.got))

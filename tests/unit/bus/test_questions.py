@@ -11,7 +11,7 @@ from gigabrain_zenoh.bus.bridge import Bridge, QueryQueue
 from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.bus.transport import LocalNetwork, LocalTransport
 from gigabrain_zenoh.clock import FakeClock
-from gigabrain_zenoh.testing.waiting import in_thread, until
+from gigabrain_zenoh.testing.waiting import start_thread, until
 
 
 class Rig:
@@ -87,8 +87,8 @@ async def test_no_more_than_4_queries_are_begun_in_a_turn_of_the_loop(rig: Rig) 
 
 
 async def test_a_flood_from_threads_loses_no_estop_and_tells_each_asker_once(rig: Rig) -> None:
-    flood = in_thread(lambda: ask(rig.describe, 20_000, "describe"))
-    presses = in_thread(lambda: ask(rig.estop, 20, "estop"))
+    flood = start_thread(lambda: ask(rig.describe, 20_000, "describe"))
+    presses = start_thread(lambda: ask(rig.estop, 20, "estop"))
     flood.join()
     presses.join()
     await until(lambda: len(rig.begun) + len(rig.refused) == 20_020)

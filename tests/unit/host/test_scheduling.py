@@ -6,7 +6,7 @@ import pytest
 
 from gigabrain_zenoh.host.this_process import step_aside
 from gigabrain_zenoh.launch.processes import PROCESSES
-from gigabrain_zenoh.testing.waiting import in_thread
+from gigabrain_zenoh.testing.waiting import start_thread
 
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="only Linux has it")
@@ -15,10 +15,10 @@ def test_whoever_steps_aside_does_so_for_all_threads_that_it_starts() -> None:
 
     def work() -> None:
         step_aside()
-        in_thread(lambda: found.append(os.sched_getscheduler(0))).join()
+        start_thread(lambda: found.append(os.sched_getscheduler(0))).join()
 
     before = os.sched_getscheduler(0)
-    in_thread(work).join()
+    start_thread(work).join()
     assert found == [os.SCHED_BATCH]
     assert os.sched_getscheduler(0) == before
 
