@@ -120,7 +120,6 @@ async def test_modem_lines_that_are_not_there_are_no_fault(pty: Pty, link: Seria
     link.open()
     await until(lambda: link.connected)
     link.set_dtr(False)
-    link.set_rts(True)
     assert link.connected
 
 

@@ -5,21 +5,20 @@ hand: abduction about x, hip and knee about y. At zero a leg hangs straight down
 """
 
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
+from gigabrain_drivers.kinematics import Quaternion, Vector
 from gigabrain_drivers.kinematics.wheels import Twist, advance_pose
 from gigabrain_schemas.base import Pose
-
-Vector = tuple[float, float, float]
 
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 JOINTS = ("abduction", "hip", "knee")
 JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
 STRAIGHTEST = 0.999  # of the whole leg; fully stretched it could not be steered
 
-Quaternion = tuple[float, float, float, float]
 FREQUENCY = (1.0, 5.0)  # [Hz]
 DUTY = (0.5, 0.9)
 HEIGHT = (0.20, 0.33)  # [m]
@@ -28,6 +27,17 @@ MOST_TURN = 0.6  # [rad] in one cycle
 GRAVITY = 9.81  # [m/s2]
 TRUST_S = 0.04  # how long the legs need to overrule the accelerometer
 LONGEST_S = 0.1  # a longer gap between two samples counts as so long
+
+
+def by_leg(values: Sequence[float]) -> tuple[Vector, ...]:
+    """Return the values of all joints, leg by leg, as one vector for each leg."""
+    each = iter(values)
+    return tuple(zip(each, each, each, strict=True))
+
+
+def by_joint(legs: Iterable[Vector]) -> list[float]:
+    """Return the values of all joints, leg by leg, in one list."""
+    return [value for leg in legs for value in leg]
 
 
 @dataclass(frozen=True)

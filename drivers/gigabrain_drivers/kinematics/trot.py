@@ -8,13 +8,13 @@ They also lean against what the body is too fast by: servos alone are springs, a
 
 import math
 
+from gigabrain_drivers.kinematics import Vector
 from gigabrain_drivers.kinematics.legs import (
     GRAVITY,
     Gait,
     LegGeometry,
     LegOdometry,
     Senses,
-    Vector,
     Walker,
 )
 from gigabrain_drivers.kinematics.wheels import Twist

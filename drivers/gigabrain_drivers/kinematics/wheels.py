@@ -146,17 +146,6 @@ class Ackermann(Base):
         forward = drive * self.radius
         return Twist(forward, 0.0, forward * math.tan(steering) / self.wheel_base)
 
-    def front_wheels(self, steering: float, separation: float) -> tuple[float, float]:
-        """(left, right) angle [rad] of front wheels `separation` [m] apart, none of them scrubbing.
-
-        The bicycle's front wheel stands between them.
-        """
-        if steering == 0:
-            return 0.0, 0.0
-        turning = self.wheel_base / math.tan(steering)  # radius, positive to the left
-        left = math.atan(self.wheel_base / (turning - separation / 2))
-        return left, math.atan(self.wheel_base / (turning + separation / 2))
-
 
 def missing_measures(robot: RobotFile) -> list[str]:
     """The measures of its wheels that a robot's file does not give."""

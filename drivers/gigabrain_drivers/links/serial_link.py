@@ -131,17 +131,10 @@ class SerialLink(Link):
 
     def set_dtr(self, on: bool) -> None:
         """Set the data-terminal-ready line, where there is one."""
-        self._set_line("dtr", on)
-
-    def set_rts(self, on: bool) -> None:
-        """Set the request-to-send line, where there is one."""
-        self._set_line("rts", on)
-
-    def _set_line(self, name: str, on: bool) -> None:
         if self._serial is None:
             return
         try:
-            setattr(self._serial, name, on)
+            self._serial.dtr = on
         except OSError as error:
             if error.errno not in NO_MODEM_LINES:
                 self.drop(str(error.strerror or error))

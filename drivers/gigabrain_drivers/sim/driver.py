@@ -40,14 +40,8 @@ def state_message(simulation: Simulation, robot_type: str) -> RobotState:
         pose=Pose(x=odometry.x, y=odometry.y, yaw=math.remainder(odometry.yaw, math.tau)),
         velocity=Velocity(**simulation.velocity()._asdict()),
         joints=tuple(Joint(**motor._asdict()) for motor in simulation.motors()),
-        battery=Battery(
-            voltage=charge.voltage, percentage=charge.percentage, current=charge.current
-        ),
-        imu=ImuData(
-            orientation=imu.orientation,
-            angular_velocity=imu.angular_velocity,
-            linear_acceleration=imu.linear_acceleration,
-        ),
+        battery=Battery(**charge._asdict()),
+        imu=ImuData(**imu._asdict()),
         bumpers=(simulation.bumper(),),
     )
 

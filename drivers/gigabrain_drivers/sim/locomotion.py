@@ -8,7 +8,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from gigabrain_drivers.kinematics.legs import JOINT_NAMES, LEGS, Gait, Senses, Vector
+from gigabrain_drivers.kinematics.legs import JOINT_NAMES, LEGS, Gait, Senses, by_joint, by_leg
 from gigabrain_drivers.kinematics.trot import Trot
 from gigabrain_drivers.kinematics.wheels import Differential, Twist
 from gigabrain_drivers.sim import STEP_S
@@ -255,7 +255,7 @@ class Walking(Locomotion):
         self._gait = body.walker.to_gait(REST)
         height = self._gait.height
         self._targets = body.geometry.standing(height)
-        standing = [angle for leg in self._targets for angle in leg]
+        standing = by_joint(self._targets)
         data.qpos[self._angles] = data.ctrl[self._motors] = standing
         self._counts = [round(angle / self._radians) for angle in standing]
         stiffness = float(model.actuator_gainprm[self._motors[0], 0])
@@ -282,7 +282,7 @@ class Walking(Locomotion):
         """Set the servos' targets for the end of the step."""
         if self._senses:
             self._targets = self._trot.step(self._gait, self._senses, STEP_S)
-        self._data.ctrl[self._motors] = _flat(self._targets)
+        self._data.ctrl[self._motors] = by_joint(self._targets)
 
     def sense(self, imu: ImuSample) -> None:
         """Encoders, feet and inertial unit become one sample."""
@@ -293,8 +293,8 @@ class Walking(Locomotion):
         self._counts = counts
         forces = self._data.sensordata[self._touch].tolist()
         self._senses = Senses(
-            joints=_by_leg([count * self._radians for count in counts]),
-            rates=_by_leg(rates),
+            joints=by_leg([count * self._radians for count in counts]),
+            rates=by_leg(rates),
             contacts=tuple(force > self._body.contact_n for force in forces),
             orientation=imu.orientation,
             angular_velocity=imu.angular_velocity,
@@ -306,7 +306,7 @@ class Walking(Locomotion):
     def wear(self) -> float:
         """Torque heats the windings; what the joints do to the world comes on top."""
         power, resistance = 0.0, self._body.motor.resistance_ohm
-        rates = _flat(self._senses.rates) if self._senses else [0.0] * len(self._heat)
+        rates = by_joint(self._senses.rates) if self._senses else [0.0] * len(self._heat)
         for heat, effort, rate in zip(self._heat, self._efforts(), rates, strict=True):
             amperes = heat.warm(0.0, effort)
             power += amperes * amperes * resistance + max(effort * rate, 0.0)
@@ -323,7 +323,7 @@ class Walking(Locomotion):
 
     def motors(self) -> tuple[Motor, ...]:
         """The twelve joints, leg by leg."""
-        rates = _flat(self._senses.rates) if self._senses else [0.0] * len(self._heat)
+        rates = by_joint(self._senses.rates) if self._senses else [0.0] * len(self._heat)
         parts = zip(JOINT_NAMES, self._counts, rates, self._efforts(), self._heat, strict=True)
         return tuple(
             Motor(name, count * self._radians, rate, effort, heat.celsius)
@@ -337,12 +337,3 @@ class Walking(Locomotion):
     def _efforts(self) -> list[float]:
         """Each joint's torque [N m]."""
         return self._data.actuator_force[self._motors].tolist()  # type: ignore[no-any-return]
-
-
-def _flat(legs: tuple[Vector, ...]) -> list[float]:
-    return [angle for leg in legs for angle in leg]
-
-
-def _by_leg(values: list[float]) -> tuple[Vector, ...]:
-    a = iter(values)
-    return tuple(zip(a, a, a, strict=True))

@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from gigabrain_drivers.kinematics import Quaternion, Vector
 from gigabrain_drivers.sim.body import SimLidar
 from gigabrain_drivers.sim.scene import ROBOT
 
@@ -14,8 +15,6 @@ GYRO_NOISE = 0.002  # [rad/s], standard deviations for a sample at 100 Hz
 ACCELEROMETER_NOISE = 0.02  # [m/s2]
 ATTITUDE_NOISE = 0.001  # [rad]
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 
 SEES_GROUPS = np.array([1, 1, 0, 1, 1, 1], np.uint8)  # robots are geom group 2
 

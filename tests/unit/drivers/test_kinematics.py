@@ -107,12 +107,6 @@ def test_ackermann_steers_no_further_than_it_can() -> None:
     assert Ackermann(0.1, 0.5, max_steering=0.6).to_wheels(Twist(0.1, 0.0, 9.0))[1] == 0.6
 
 
-def test_the_inner_front_wheel_steers_more() -> None:
-    left, right = Ackermann(0.1, 0.5).front_wheels(math.atan(0.5), 0.4)  # turning radius 1 m
-    assert (left, right) == pytest.approx((math.atan(0.5 / 0.8), math.atan(0.5 / 1.2)))
-    assert Ackermann(0.1, 0.5).front_wheels(0.0, 0.4) == (0.0, 0.0)
-
-
 def test_a_faster_trot_first_takes_longer_strides_then_more_of_them() -> None:
     walker = Walker()
     slow, fast = walker.to_gait(Twist(0.3, 0.0, 0.0)), walker.to_gait(Twist(0.6, 0.0, 0.0))

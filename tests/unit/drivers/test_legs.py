@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gigabrain_drivers.kinematics import Vector
 from gigabrain_drivers.kinematics.legs import (
     JOINT_NAMES,
     WALKER,
@@ -13,7 +14,6 @@ from gigabrain_drivers.kinematics.legs import (
     LegGeometry,
     LegOdometry,
     Senses,
-    Vector,
     is_sound,
 )
 from gigabrain_drivers.kinematics.wheels import Twist

@@ -9,7 +9,7 @@ from gigabrain_drivers.bodies.alpha.driver import AlphaOptions
 from gigabrain_drivers.bodies.alpha.protocol import AlphaDecoder, AlphaFrame, State
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Snapshot, Wire
 from gigabrain_drivers.emulators.ports import TcpPort
-from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, is_sound
+from gigabrain_drivers.kinematics.legs import WALKER, Gait, Senses, by_leg, is_sound
 from gigabrain_drivers.kinematics.wheels import Twist
 
 LYING_M = 0.13  # height of the hips of a body that lies
@@ -128,8 +128,6 @@ class Alpha(Device):
         flags |= alpha.PARKED if self.parked else 0
         flags |= alpha.FALLEN if now.fallen else 0
         flags |= alpha.WALKING if max(map(abs, WALKER.to_body(self._gait))) > 0 else 0
-        angles = iter([motor.position for motor in now.wheels])
-        rates = iter([motor.velocity for motor in now.wheels])
         return State(
             milliseconds=self._milliseconds(now),
             echo=self._echo,
@@ -139,8 +137,8 @@ class Alpha(Device):
             current=now.battery.current,
             percentage=now.battery.percentage,
             senses=Senses(
-                joints=tuple(zip(angles, angles, angles, strict=True)),
-                rates=tuple(zip(rates, rates, rates, strict=True)),
+                joints=by_leg([motor.position for motor in now.wheels]),
+                rates=by_leg([motor.velocity for motor in now.wheels]),
                 contacts=now.contacts,
                 orientation=now.imu.orientation,
                 angular_velocity=now.imu.angular_velocity,

@@ -14,7 +14,7 @@ import struct
 import zlib
 from typing import NamedTuple
 
-from gigabrain_drivers.kinematics.legs import Gait, Senses
+from gigabrain_drivers.kinematics.legs import Gait, Senses, by_joint, by_leg
 from gigabrain_drivers.links.frames import FrameDecoder
 
 PORT = 8080
@@ -107,8 +107,7 @@ def encode_state(now: State, sequence: int) -> bytes:
     """The body's report."""
     senses = now.senses
     feet = sum(1 << foot for foot, touches in enumerate(senses.contacts) if touches)
-    joints = [angle for leg in senses.joints for angle in leg]
-    rates = [rate for leg in senses.rates for rate in leg]
+    joints, rates = by_joint(senses.joints), by_joint(senses.rates)
     each = zip(joints, rates, now.torques, strict=True)
     payload = _STATE.pack(
         now.milliseconds % SEQUENCES,
@@ -140,8 +139,8 @@ def decode_state(frame: AlphaFrame) -> State | None:
     if not 0.9 < norm < 1.1 or voltage < 0 or not 0 <= percentage <= 100:
         return None
     senses = Senses(
-        joints=_by_leg(joints[0::3]),
-        rates=_by_leg(joints[1::3]),
+        joints=by_leg(joints[0::3]),
+        rates=by_leg(joints[1::3]),
         contacts=tuple(bool(feet >> foot & 1) for foot in range(4)),
         orientation=(x / norm, y / norm, z / norm, w / norm),
         angular_velocity=(rate[0], rate[1], rate[2]),
@@ -206,8 +205,3 @@ class AlphaDecoder(FrameDecoder[AlphaFrame]):
             return None
         _, _, kind, _, sequence = _HEADER.unpack_from(body)
         return AlphaFrame(kind, sequence, body[_HEADER.size :])
-
-
-def _by_leg(values: list[float]) -> tuple[tuple[float, float, float], ...]:
-    each = iter(values)
-    return tuple(zip(each, each, each, strict=True))

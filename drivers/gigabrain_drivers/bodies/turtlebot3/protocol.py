@@ -9,6 +9,7 @@ import math
 import struct
 from typing import NamedTuple
 
+from gigabrain_drivers.kinematics import Quaternion, Vector
 from gigabrain_drivers.links.frames import FrameDecoder, crc_table
 
 HEADER = b"\xff\xff\xfd\x00"
@@ -43,8 +44,6 @@ _TABLE = struct.Struct(
     "??6i2I"  # 148 motors connected, torque; 150 command; 174 profile acceleration
 )
 Pair = tuple[int, int]
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 
 
 class DynamixelPacket(NamedTuple):

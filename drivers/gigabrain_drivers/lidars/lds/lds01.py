@@ -18,7 +18,6 @@ BAUD = 230_400
 START, STOP = b"b", b"e"
 PACKETS, SAMPLES = 60, 6  # per turn, per packet
 SIZE = 42
-NO_RETURN = 0  # [mm]
 
 _SYNC, _FIRST = 0xFA, 0xA0
 
