@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gigabrain_drivers.driver.catalog import make_driver
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.sim.body import sim_body
-from gigabrain_drivers.sim.driver import STEPS, MujocoDriver, scan_message, state_message
+from gigabrain_drivers.sim.driver import STEPS_PER_TICK, MujocoDriver, scan_message, state_message
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.world import Cylinder, Pose, World
 from gigabrain_drivers.sim.worlds import load_world
@@ -98,7 +98,7 @@ class SafetyTrack(_SimulatedBody):
 
     def _tick(self, wish: CmdVel) -> None:
         simulation, now = self.simulation, self.gate.tick
-        for part in range(STEPS):
+        for part in range(STEPS_PER_TICK):
             simulation.advance()
             if part == 0 and now and now % self.scan_ticks == 0:
                 self._scan = self.scan(now, self.sees)
@@ -161,7 +161,7 @@ class ExploreRun(_SimulatedBody):
         for tick in range(1, count + 1):
             scan, simulation = None, self.simulation
             truth = simulation.truth.pose()
-            for part in range(STEPS):
+            for part in range(STEPS_PER_TICK):
                 simulation.advance()
                 if part == 0 and tick % self.scan_ticks == 0:
                     truth = simulation.truth.pose()

@@ -13,7 +13,7 @@ from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import RobotFile, Run
 from gigabrain_drivers.emulators.base import Snapshot
 from gigabrain_drivers.emulators.emulator import Station
-from gigabrain_drivers.emulators.faults import NONE
+from gigabrain_drivers.emulators.faults import NO_FAULTS
 from gigabrain_drivers.kinematics.wheels import Twist, advance_pose, wheels_of
 from gigabrain_drivers.sim.locomotion import Charge, Motor, OdometryReading
 from gigabrain_drivers.sim.sensors import ImuSample
@@ -154,7 +154,7 @@ async def bench(
     it = EmulatedLine(folder, text)
     it.station.start()
     if not plugged:
-        it.station.set(type(NONE)(unplugged=True))
+        it.station.set(type(NO_FAULTS)(unplugged=True))
     try:
         async with it.driver:
             if plugged:

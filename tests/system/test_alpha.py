@@ -17,7 +17,7 @@ from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators import ports
 from gigabrain_drivers.emulators.emulator import Station, emulated_body
-from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults
 from gigabrain_drivers.emulators.ports import TcpPort
 from gigabrain_drivers.kinematics.legs import JOINT_NAMES, WALKER
 from gigabrain_drivers.links.tcp_link import address
@@ -121,7 +121,7 @@ async def test_a_body_that_falls_silent_is_lost_and_comes_back_with_a_stop(rig: 
     assert (await rig.driver.set_base_velocity(0.3, 0.0, 0.0)).linear_x in (0.0, 0.3)
     await until(lambda: rig.driver.link.reconnects > 0)
     rig.device.executed.clear()
-    rig.station.set(NONE)
+    rig.station.set(NO_FAULTS)
     await until(lambda: len(rig.device.executed) > 2)
     assert rig.device.executed[0] == REST
     await until(lambda: rig.connected[-1])
@@ -131,7 +131,7 @@ async def test_unplugged_and_plugged_in_again_it_is_found_again(rig: Rig) -> Non
     rig.station.set(Faults(unplugged=True))
     await until(lambda: not rig.connected[-1])
     assert rig.driver.link.problem
-    rig.station.set(NONE)
+    rig.station.set(NO_FAULTS)
     await until(lambda: rig.connected[-1])
     assert rig.driver.link.reconnects >= 1
 
@@ -144,7 +144,7 @@ async def test_a_frozen_body_is_dropped_and_executes_nothing_old_when_it_thaws(r
     rig.streaming = (0.0, 0.0, 0.0)
     await asyncio.sleep(0.3)
     rig.device.executed.clear()
-    rig.station.set(NONE)
+    rig.station.set(NO_FAULTS)
     await until(lambda: rig.connected[-1] and len(rig.device.executed) > 5)
     assert all(gait.stride_x == 0.0 for gait in rig.device.executed)
 
@@ -167,7 +167,7 @@ async def test_one_client_at_a_time(rig: Rig, monkeypatch: pytest.MonkeyPatch) -
         assert await loop.sock_recv(other, 10) == b""
     assert rig.port.refused == 1
     await until(lambda: rig.connected[-1])
-    monkeypatch.setattr(ports, "SILENT_NS", 0)  # as if the first had been silent for long
+    monkeypatch.setattr(ports, "CLIENT_TIMEOUT_NS", 0)  # as if the first had been silent for long
     with socket.socket() as other:
         other.setblocking(False)
         await loop.sock_connect(other, rig.port.address)

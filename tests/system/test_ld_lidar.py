@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gigabrain_drivers.driver.robot import ScanOptions
-from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults
 from gigabrain_drivers.lidars.base import SampleBuffer, bin_scan
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.ld.emulator import LdDevice
@@ -131,7 +131,7 @@ async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(tmp_path
         assert listener.source.problem == f"no {tmp_path}/scan: is it plugged in?"
         assert not listener.source.health.connected
 
-        station.set(NONE)
+        station.set(NO_FAULTS)
         await listener.more(2)
         assert listener.source.health.reconnects >= 1
         await until(lambda: not listener.source.problem)
@@ -145,7 +145,7 @@ async def test_silence_is_told_in_one_line_and_ends_by_itself(tmp_path: Path) ->
         await listener.more(1)
         station.set(Faults(silence=True))
         await until(lambda: listener.source.problem)
-        station.set(NONE)
+        station.set(NO_FAULTS)
         await listener.more(1)
 
 

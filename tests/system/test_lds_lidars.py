@@ -8,7 +8,7 @@ import pytest
 
 from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.emulators.base import Device
-from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults
 from gigabrain_drivers.lidars.ld import protocol as ld
 from gigabrain_drivers.lidars.ld.emulator import Lds02Device, lens_distance
 from gigabrain_drivers.lidars.ld.source import Lds02, seen_from_axis
@@ -145,7 +145,7 @@ async def test_scans_come_over_a_pty_and_again_after_an_unplugged_cable(
         assert listener.source.health.connected
         station.set(Faults(unplugged=True))
         await until(lambda: not listener.source.health.connected)
-        station.set(NONE)
+        station.set(NO_FAULTS)
         await listener.more(2)
         assert listener.source.health.reconnects >= 1
 
@@ -161,7 +161,7 @@ async def test_noise_costs_frames_and_nothing_else(
         await listener.more(1)
         station.set(Faults(half_frames=0.02, garbage=0.02))
         await until(lambda: listener.source.health.errors > 3)
-        station.set(NONE)
+        station.set(NO_FAULTS)
         await listener.more(2)
 
 

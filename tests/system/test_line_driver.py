@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults
 from gigabrain_drivers.links import serial_link
 from gigabrain_schemas.base import Velocity
 from gigabrain_zenoh.errors import BodyLost
@@ -63,7 +63,7 @@ async def test_nothing_is_written_before_the_body_was_heard_and_then_zero(
         await until(lambda: it.driver.link.connected)
         assert await it.driver.set_base_velocity(0.2, 0.0, 0.0) == ZERO
         assert written == []
-        it.station.set(NONE)
+        it.station.set(NO_FAULTS)
         await until(lambda: written)
         assert written == [b"V,0.000,0.000\n"]
         assert (await it.driver.set_base_velocity(0.2, 0.0, 0.0)).linear_x == 0.2
@@ -87,7 +87,7 @@ async def test_an_unplugged_body_is_lost_at_once_and_comes_back_with_zero(tmp_pa
         assert await it.driver.set_base_velocity(0.2, 0.0, 0.0) == ZERO
         await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
         it.firmware.executed.clear()
-        it.station.set(NONE)
+        it.station.set(NO_FAULTS)
         await it.until_connected()
         await until(lambda: it.firmware.executed)
         assert it.firmware.executed[0] == ZERO
@@ -103,7 +103,7 @@ async def test_a_body_that_falls_silent_is_lost_although_its_port_is_there(
         it.station.set(fault)
         await it.until_connected(False)
         assert it.driver.link.connected
-        it.station.set(NONE)
+        it.station.set(NO_FAULTS)
         await it.until_connected()
 
 
@@ -113,7 +113,7 @@ async def test_garbage_and_half_lines_are_counted_and_nothing_comes_of_them(
     async with bench(tmp_path) as it:
         it.station.set(Faults(garbage=0.3, half_frames=0.2, bit_errors=0.005))
         await it.drive_until(lambda state: state.link.errors > 5, 0.2)
-        it.station.set(NONE)
+        it.station.set(NO_FAULTS)
         await it.until_connected()
         await it.driver.stop()
         await it.at_rest()
@@ -126,7 +126,7 @@ async def test_a_reboot_does_not_move_the_pose(tmp_path: Path) -> None:
         before = (await it.at_rest()).pose.x
         it.station.set(Faults(reboot=True))
         await it.until_connected(False)
-        it.station.set(NONE)  # banner, then counters from zero
+        it.station.set(NO_FAULTS)  # banner, then counters from zero
         await it.until_connected()
         state = await it.driver.read_state()
         assert state.pose.x == pytest.approx(before, abs=0.005)
@@ -139,7 +139,7 @@ async def test_a_brown_out_switches_the_body_off_and_it_comes_back_at_rest(tmp_p
         it.station.set(Faults(brown_out=6.0))
         await until(lambda: it.body.commanded == (0.0, 0.0, 0.0))
         await it.until_connected(False)
-        it.station.set(NONE)
+        it.station.set(NO_FAULTS)
         await it.until_connected()
         assert it.body.commanded == (0.0, 0.0, 0.0)
 
@@ -177,7 +177,7 @@ async def test_a_loss_is_said_once_with_the_reason_and_its_end_once(
         await asyncio.sleep(0.1)
         await it.connected()
         assert caplog.messages == [f"no {tmp_path}/base: is it plugged in?"]
-        it.station.set(NONE)
+        it.station.set(NO_FAULTS)
         await it.until_connected()
         assert "heard again" in caplog.text
 
@@ -235,7 +235,7 @@ async def test_a_started_body_is_stopped_with_its_string_also_after_its_cable_wa
         it.station.set(Faults(unplugged=True))
         await it.until_connected(False)
         await it.driver.stop()
-        it.station.set(NONE)
+        it.station.set(NO_FAULTS)
         await until(lambda: len(written) > 2)
         assert written[:2] == [b"ENABLE\n", b"V,0.200,0.000\n"]
         assert written[2:4] == [b"V,0.000,0.000\n", b"DISABLE\n"]

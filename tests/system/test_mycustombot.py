@@ -14,7 +14,7 @@ from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.base import Driver
 from gigabrain_drivers.driver.robot import Run
 from gigabrain_drivers.emulators.emulator import Emulator
-from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults
 from gigabrain_drivers.sim.body import MujocoOptions, sim_body
 from gigabrain_drivers.sim.physics import Simulation
 from gigabrain_drivers.sim.world import World
@@ -193,7 +193,7 @@ async def test_no_old_bytes_are_obeyed_after_a_freeze(pair: Pair) -> None:
     pair.emulator.set({"base": Faults(unplugged=True)})
     await drive(pair)
     device.executed.clear()
-    pair.emulator.set({"base": NONE})
+    pair.emulator.set({"base": NO_FAULTS})
     await connected(pair)
     await until(lambda: device.executed)
     assert device.executed[0].linear_x == 0.0
@@ -222,8 +222,11 @@ def test_faults_are_words(tmp_path: Path) -> None:
     emulator = Emulator("mycustombot", Run(folder=Path(), link="emulated", emulator=str(tmp_path)))
     both = emulator.parse_faults("silence bit_errors=0.01")
     assert both == dict.fromkeys(("base", "scan"), Faults(silence=True, bit_errors=0.01))
-    assert emulator.parse_faults("scan unplugged") == {"base": NONE, "scan": Faults(unplugged=True)}
-    assert emulator.parse_faults("off") == {"base": NONE, "scan": NONE}
+    assert emulator.parse_faults("scan unplugged") == {
+        "base": NO_FAULTS,
+        "scan": Faults(unplugged=True),
+    }
+    assert emulator.parse_faults("off") == {"base": NO_FAULTS, "scan": NO_FAULTS}
     with pytest.raises(ConfigError, match="no fault 'silense'; did you mean 'silence'"):
         emulator.parse_faults("silense")
     for words, said in (

@@ -9,7 +9,7 @@ import serial
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gigabrain_drivers.emulators.faults import NONE, Faults
+from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults
 from gigabrain_drivers.lidars import serial_source
 from gigabrain_drivers.lidars.ld.emulator import LdDevice
 from gigabrain_drivers.lidars.ld.source import Ld19
@@ -34,7 +34,7 @@ def listen(its: RplidarOptions) -> Listener:
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(serial_source, "PATIENCE_NS", 600_000_000)
+    monkeypatch.setattr(serial_source, "LOG_AFTER_NS", 600_000_000)
     monkeypatch.setattr(rplidar_source, "RESET_S", 0.2)
 
 
@@ -73,7 +73,7 @@ async def test_a_lidar_that_was_rebooted_is_started_again(tmp_path: Path) -> Non
         await listener.more(1)
         station.set(Faults(reboot=True))
         await asyncio.sleep(0.1)
-        station.set(NONE)
+        station.set(NO_FAULTS)
         assert isinstance(station.device, RplidarDevice)
         assert station.device._mode is None
 
@@ -87,7 +87,7 @@ async def test_a_lidar_that_was_unplugged_is_started_again(tmp_path: Path) -> No
         station.set(Faults(unplugged=True))
         await until(lambda: not listener.source.link.connected)
         station.device.reset()  # it has lost its power with its cable
-        station.set(NONE)
+        station.set(NO_FAULTS)
 
         await listener.more(2)
         assert listener.source.health.reconnects >= 1
@@ -103,7 +103,7 @@ async def test_where_the_model_is_left_open_the_baud_rates_are_tried_in_turn(
             source = listener.source
             await until(lambda: source.baud == 460_800)
             await until(lambda: source.baud == 1_000_000)
-            station.set(NONE)
+            station.set(NO_FAULTS)
             await listener.more(1)
 
 

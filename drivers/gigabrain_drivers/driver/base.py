@@ -17,9 +17,9 @@ from gigabrain_zenoh.geometry.limits import ZERO, clamp, limits_of
 
 log = logging.getLogger(__name__)
 
-EARLY_NS = 2_000_000  # before its time an event loop may call, as its own clock is coarse
-STILL = 0.02  # [m/s], [rad/s]
-REST_LOOKS = 40  # 0.8 s: a supervisor that ends this process waits little longer
+TIMER_SLACK_NS = 2_000_000  # before its time an event loop may call, as its own clock is coarse
+AT_REST_SPEED = 0.02  # [m/s], [rad/s]
+MAX_REST_CHECKS = 40  # 0.8 s: a supervisor that ends this process waits little longer
 
 Emit = Callable[[Topic[Any], Message], None]
 
@@ -78,7 +78,7 @@ class Driver(abc.ABC):
         """Yield whenever time has gone on, and by how many ticks of 20 ms of the body's time."""
         start, told = clock.now_ns(), 0
         async for now_ns in clock.every(TICK_NS):
-            passed = (now_ns - start + EARLY_NS) // TICK_NS + 1 - told
+            passed = (now_ns - start + TIMER_SLACK_NS) // TICK_NS + 1 - told
             if passed > 0:
                 told += passed
                 yield passed
@@ -113,9 +113,9 @@ class Driver(abc.ABC):
 
     async def _rest(self) -> None:
         """Wait until the body stands still, but no longer than it may take to brake."""
-        for _ in range(REST_LOOKS):
+        for _ in range(MAX_REST_CHECKS):
             now = (await self.read_state()).velocity
-            if max(abs(now.linear_x), abs(now.linear_y), abs(now.angular_z)) < STILL:
+            if max(abs(now.linear_x), abs(now.linear_y), abs(now.angular_z)) < AT_REST_SPEED:
                 return
             await asyncio.sleep(TICK_NS / 1e9)
 

@@ -16,15 +16,15 @@ from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import NotConfirmed
 from gigabrain_zenoh.gate import causes as why
 
-LATE_NS = 200_000_000  # what has not come back by then counts as never coming
-BYTES = 2  # of each question: none of them can be guessed, nor held over from before
+ECHO_TIMEOUT_NS = 200_000_000  # what has not come back by then counts as never coming
+QUESTION_BYTES = 2  # of each question: none of them can be guessed, nor held over from before
 
 log = logging.getLogger(__name__)
 BAUD = 115_200
 PERIOD_NS = 20_000_000  # between two questions
-TELL_EVERY = 2  # of them: 25 times a second
-START_NS = 1_000_000_000  # for the port to open and the first echo, in which nothing is said
-AGAIN_S = 0.1  # between two looks at whether the robot is latched
+PUBLISH_EVERY = 2  # of them: 25 times a second
+STARTUP_NS = 1_000_000_000  # for the port to open and the first echo, in which nothing is said
+RECHECK_S = 0.1  # between two looks at whether the robot is latched
 
 
 class EchoLoop:
@@ -49,9 +49,9 @@ class EchoLoop:
         """Return the bytes to send now."""
         if now_ns < self._deaf_until_ns:
             return b""
-        while self._expected and now_ns - self._expected[0][1] > LATE_NS:
+        while self._expected and now_ns - self._expected[0][1] > ECHO_TIMEOUT_NS:
             self._expected.popleft()
-        data = self._random(BYTES)
+        data = self._random(QUESTION_BYTES)
         self._expected.extend((byte, now_ns) for byte in data)
         return data
 
@@ -62,16 +62,16 @@ class EchoLoop:
                 return
             expected, sent_ns = self._expected.popleft() if self._expected else (None, 0)
             if byte != expected:
-                self._deaf_until_ns, self._good_ns = now_ns + LATE_NS, None
+                self._deaf_until_ns, self._good_ns = now_ns + ECHO_TIMEOUT_NS, None
                 self._expected.clear()
-            elif now_ns - sent_ns <= LATE_NS:
+            elif now_ns - sent_ns <= ECHO_TIMEOUT_NS:
                 self._good_ns = sent_ns
 
     def problem(self, now_ns: int) -> str:
         """Return why the contact does not count as closed, or an empty text."""
         if now_ns < self._deaf_until_ns:
             return "other bytes come back than were sent"
-        if self._good_ns is None or now_ns - self._good_ns > LATE_NS:
+        if self._good_ns is None or now_ns - self._good_ns > ECHO_TIMEOUT_NS:
             return "the contact is open, or its wire is broken"
         return ""
 
@@ -106,14 +106,14 @@ class Button:
             self._link.write(self._loop.next_bytes(now_ns))
             changed = self._update(now_ns)
             count += 1
-            if self._problem is not None and (changed or count % TELL_EVERY == 0):
+            if self._problem is not None and (changed or count % PUBLISH_EVERY == 0):
                 state = ButtonState(pressed=bool(self._problem), text=self._problem[:500])
                 self._bus.publish(BUTTON, state)
 
     def _update(self, now_ns: int) -> bool:
         """Update the state of the contact; return whether it has changed."""
         before, now = self._problem, self._problem_at(now_ns)
-        starting = before is None and now_ns - self._began_ns < START_NS
+        starting = before is None and now_ns - self._began_ns < STARTUP_NS
         if now == before or (starting and now):
             return False
         self._problem = now
@@ -141,7 +141,7 @@ class Button:
                     log.info("%s: %s", reply.robot_type, reply.text)
                 except NotConfirmed as error:
                     log.error("%s", error)
-            await asyncio.sleep(AGAIN_S)
+            await asyncio.sleep(RECHECK_S)
 
 
 async def run(config: ButtonConfig, bus: Bus, ready: Callable[[], None]) -> None:

@@ -25,7 +25,7 @@ from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.runtime.audit import AuditTrail
 
-MOST_BYTES = 65_536
+MAX_LATCH_BYTES = 65_536
 UNREADABLE = Cause(
     code="latch_unreadable",
     text="the file with the gate's latched causes cannot be read",
@@ -35,8 +35,8 @@ UNREADABLE = Cause(
 
 Raised = dict[str, tuple[str, Cause]]  # by its code: who raised it, and the cause
 log = logging.getLogger(__name__)
-STEP_NS = TICK_NS // 2  # so long after a tick at least, the next one is no longer late
-EVERY_TICKS = 50  # once a second: what the disk did not take is tried again
+ON_TIME_NS = TICK_NS // 2  # so long after a tick at least, the next one is no longer late
+DISK_RETRY_TICKS = 50  # once a second: what the disk did not take is tried again
 Stop = Callable[[], Awaitable[None]]
 
 
@@ -61,7 +61,7 @@ class LatchFile:
         """
         try:
             make_folder(self._folder)
-            found = msgspec.json.decode(read_bounded(self._path, MOST_BYTES), type=Latched)
+            found = msgspec.json.decode(read_bounded(self._path, MAX_LATCH_BYTES), type=Latched)
         except FileNotFoundError:
             found = Latched()
         except (ConfigError, *DECODE_ERRORS):
@@ -149,7 +149,7 @@ class Gatekeeper:
             lambda newest: file.try_write(newest[-1]), room=1
         )
         self._latched, self._on_disk = latched, self._writer.put(latched)
-        self._on_time_ns = -STEP_NS  # when the newest tick came that was not late
+        self._on_time_ns = -ON_TIME_NS  # when the newest tick came that was not late
         self._disk_fault = Fault(log, logging.ERROR)
         self.state = gate.GateState(
             boot=secrets.randbits(47) + 1,
@@ -205,12 +205,12 @@ class Gatekeeper:
         """Return whether a tick only makes up for lost time, right after another one."""
         if wall_ns is None:
             return False
-        late = wall_ns - self._on_time_ns < STEP_NS
+        late = wall_ns - self._on_time_ns < ON_TIME_NS
         self._on_time_ns = self._on_time_ns if late else wall_ns
         return late
 
     def _retry_disk(self) -> None:
-        if self.state.tick % EVERY_TICKS == 0:
+        if self.state.tick % DISK_RETRY_TICKS == 0:
             self._trail.flush()
             if self._on_disk.done() and self._on_disk.result():
                 self._store(self._latched)

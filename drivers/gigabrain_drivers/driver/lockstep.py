@@ -14,8 +14,8 @@ from gigabrain_zenoh.host.bounded import NewestValues
 TIMEOUT_S = 0.15  # of wall time per tick
 REPEAT_S = 0.1  # how often the first tick is announced until the brain is there
 
-MOST = 20_000  # newest times that the figures are drawn from
-WAITING = 1_000  # scans that may be unanswered; a brain that is away answers none
+MAX_TIMES = 20_000  # newest times that the figures are drawn from
+MAX_UNANSWERED = 1_000  # scans that may be unanswered; a brain that is away answers none
 
 
 class Lockstep:
@@ -97,8 +97,8 @@ class RoundTrip:
 
     def __init__(self) -> None:
         self.scan_tick = 0  # newest tick that carried a scan
-        self._waiting: deque[tuple[int, int]] = deque(maxlen=WAITING)  # tick, sent at [ns]
-        self._times_ms = NewestValues(MOST)
+        self._waiting: deque[tuple[int, int]] = deque(maxlen=MAX_UNANSWERED)  # tick, sent at [ns]
+        self._times_ms = NewestValues(MAX_TIMES)
 
     def sent(self, tick: int, now_ns: int) -> None:
         """The scan of `tick` is on its way."""

@@ -29,9 +29,9 @@ from gigabrain_zenoh.errors import BodyLost
 
 log = logging.getLogger(__name__)
 
-KEPT_STEPS = 25  # of 10 ms
+MAX_SNAPSHOTS = 25  # of 10 ms
 
-KEPT_S = 0.5  # samples of so long are kept when nobody takes them
+MAX_SAMPLES_S = 0.5  # samples of so long are kept when nobody takes them
 
 
 class Snapshot(NamedTuple):
@@ -77,7 +77,7 @@ class EmulatedBody:
         self._broken = Broken()
         self.snapshot = self._measure_all()
         self._account = run_report(self._simulation, robot, run)  # as of the newest step
-        self._untaken: deque[Snapshot] = deque(maxlen=KEPT_STEPS)
+        self._untaken: deque[Snapshot] = deque(maxlen=MAX_SNAPSHOTS)
 
     def start(self) -> None:
         """Let time begin."""
@@ -272,7 +272,7 @@ class Sweep:
 
     def start(self, rate_hz: float, turn_hz: float) -> None:
         """Measure `rate_hz` samples a second from now on, at `turn_hz` turns a second."""
-        self._samples = deque(maxlen=math.ceil(rate_hz * KEPT_S))
+        self._samples = deque(maxlen=math.ceil(rate_hz * MAX_SAMPLES_S))
         self.turn_hz, self._rate_hz = turn_hz, rate_hz
 
     def stop(self) -> None:

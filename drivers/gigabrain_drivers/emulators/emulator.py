@@ -17,7 +17,7 @@ from gigabrain_drivers.bodies.line.options import LineOptions
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import LinkOptions, Run
 from gigabrain_drivers.emulators.base import Broken, Device, EmulatedBody, Port, Wire
-from gigabrain_drivers.emulators.faults import NONE, Faults, FaultyWire, faults_in
+from gigabrain_drivers.emulators.faults import NO_FAULTS, Faults, FaultyWire, faults_in
 from gigabrain_drivers.emulators.ports import TcpPort
 from gigabrain_drivers.sim.body import MujocoOptions, SimBattery, sim_body
 from gigabrain_drivers.sim.physics import Simulation
@@ -90,7 +90,7 @@ class Station:
         self._port, self._clock = port, clock
         self._wire = FaultyWire(port)
         self.device = make(self._wire)
-        self.faults = NONE
+        self.faults = NO_FAULTS
         self._task: asyncio.Task[None] | None = None
         port.on_bytes = self._take
 
@@ -174,10 +174,10 @@ class Emulator:
     def set(self, faults: Mapping[str, Faults]) -> None:
         """Have these faults, by station, and no others."""
         for name, station in self.stations.items():
-            wanted = faults.get(name, NONE)
+            wanted = faults.get(name, NO_FAULTS)
             if wanted != station.faults:
                 station.set(wanted)
-        body = faults.get(BASE, NONE)
+        body = faults.get(BASE, NO_FAULTS)
         self.body.set_broken(Broken(body.runaway, body.stuck_wheel, body.frozen_values))
 
     def report(self) -> Mapping[str, float | int | str | None]:
@@ -186,7 +186,7 @@ class Emulator:
 
     def describe_faults(self) -> str:
         """The faults that it has now, in the words of `parse_faults`."""
-        parts = [f"{name} {s.faults}" for name, s in self.stations.items() if s.faults != NONE]
+        parts = [f"{name} {s.faults}" for name, s in self.stations.items() if s.faults != NO_FAULTS]
         return "; ".join(parts) or "none"
 
     def parse_faults(self, words: str) -> dict[str, Faults]:

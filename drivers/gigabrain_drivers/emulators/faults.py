@@ -13,9 +13,9 @@ from gigabrain_zenoh.errors import ConfigError, unknown
 
 Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 
-LONGEST_GARBAGE = 64  # bytes
+MAX_GARBAGE_BYTES = 64  # bytes
 
-NUMBERS = {  # what is expected of those that take one
+VALUE_HINTS = {  # what is expected of those that take one
     "garbage": "from 0 to 1, such as garbage=0.1",
     "bit_errors": "from 0 to 1, such as bit_errors=0.001",
     "half_frames": "from 0 to 1, such as half_frames=0.1",
@@ -50,24 +50,24 @@ class Faults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
         return " ".join(words)
 
 
-NONE = Faults()
+NO_FAULTS = Faults()
 
 
 def faults_in(words: Iterable[str], stations: Iterable[str]) -> Faults:
     """Return the faults of words such as `silence` and `garbage=0.1`. Raises ConfigError."""
-    faults = NONE
+    faults = NO_FAULTS
     for word in words:
         name, given, value = word.partition("=")
         if word == "off":
             continue
         if name not in Faults.__struct_fields__:
             raise unknown("fault", name, [*Faults.__struct_fields__, *stations, "off"])
-        if name not in NUMBERS and given:
+        if name not in VALUE_HINTS and given:
             raise ConfigError(f"{name} takes no number: write {name}, and off to end it")
         try:
             change = msgspec.convert({name: value if given else True}, Faults, strict=False)
         except msgspec.ValidationError:
-            raise ConfigError(f"{name} needs a number {NUMBERS[name]}") from None
+            raise ConfigError(f"{name} needs a number {VALUE_HINTS[name]}") from None
         faults = msgspec.structs.replace(faults, **{name: getattr(change, name)})
     return faults
 
@@ -76,7 +76,7 @@ class FaultyWire:
     """Between a device and its wire: hands bytes on, or does with them what the faults say."""
 
     def __init__(self, wire: Wire, seed: int = 0) -> None:
-        self.faults = NONE
+        self.faults = NO_FAULTS
         self._wire = wire
         self._random = random.Random(seed)
         self._waiting = bytearray()  # what came while the device stood still
@@ -87,7 +87,7 @@ class FaultyWire:
         if faults.silence or faults.frozen or faults.reboot:
             return True
         if self._happens(faults.garbage):
-            data = self._random.randbytes(self._random.randint(1, LONGEST_GARBAGE)) + data
+            data = self._random.randbytes(self._random.randint(1, MAX_GARBAGE_BYTES)) + data
         if self._happens(faults.half_frames):
             data = data[: len(data) // 2]
         return self._wire.write(self._flipped(data))

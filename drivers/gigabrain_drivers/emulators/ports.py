@@ -14,7 +14,7 @@ from gigabrain_zenoh.host.posix import tty
 BITS_PER_BYTE = 10  # 8N1: start, eight, stop
 READ_BYTES = 4096
 HOST = "127.0.0.1"  # an emulated body is nobody else's to drive
-SILENT_NS = 1_000_000_000  # a client that says nothing for so long makes way for another
+CLIENT_TIMEOUT_NS = 1_000_000_000  # a client that says nothing for so long makes way for another
 
 
 class Pty:
@@ -178,7 +178,7 @@ class TcpPort:
         except OSError:
             return
         now_ns = self._clock.now_ns()
-        if self._client and now_ns - self._heard_ns < SILENT_NS:
+        if self._client and now_ns - self._heard_ns < CLIENT_TIMEOUT_NS:
             self.refused += 1
             client.close()
             return

@@ -19,7 +19,7 @@ from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 
-LOOK_S = 0.05  # how often the file with the faults is looked at
+POLL_S = 0.05  # how often the file with the faults is looked at
 FAULTS_FILE = "faults.json"  # {STATION: {FAULT: VALUE}}, in the folder of the ports
 
 
@@ -93,7 +93,7 @@ async def watch(emulator: Emulator, path: Path) -> None:
         if stamp != seen:
             seen = stamp
             _from_file(emulator, path)
-        await asyncio.sleep(LOOK_S)
+        await asyncio.sleep(POLL_S)
     raise BodyLost(emulator.body.lost)
 
 

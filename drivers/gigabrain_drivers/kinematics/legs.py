@@ -17,16 +17,16 @@ from gigabrain_schemas.base import Pose
 LEGS = ("front_left", "front_right", "rear_left", "rear_right")
 JOINTS = ("abduction", "hip", "knee")
 JOINT_NAMES = tuple(f"{leg}_{joint}" for leg in LEGS for joint in JOINTS)
-STRAIGHTEST = 0.999  # of the whole leg; fully stretched it could not be steered
+MAX_REACH = 0.999  # of the whole leg; fully stretched it could not be steered
 
-FREQUENCY = (1.0, 5.0)  # [Hz]
-DUTY = (0.5, 0.9)
-HEIGHT = (0.20, 0.33)  # [m]
-MOST_STRIDE = 0.25  # [m], ahead or sideways, in one cycle
-MOST_TURN = 0.6  # [rad] in one cycle
+FREQUENCY_HZ = (1.0, 5.0)  # [Hz]
+DUTY_RANGE = (0.5, 0.9)
+HEIGHT_M = (0.20, 0.33)  # [m]
+MAX_STRIDE_M = 0.25  # [m], ahead or sideways, in one cycle
+MAX_TURN_RAD = 0.6  # [rad] in one cycle
 GRAVITY = 9.81  # [m/s2]
-TRUST_S = 0.04  # how long the legs need to overrule the accelerometer
-LONGEST_S = 0.1  # a longer gap between two samples counts as so long
+FEET_TIME_CONSTANT_S = 0.04  # how long the legs need to overrule the accelerometer
+MAX_SAMPLE_GAP_S = 0.1  # a longer gap between two samples counts as so long
 
 
 def by_leg(values: Sequence[float]) -> tuple[Vector, ...]:
@@ -61,7 +61,7 @@ class Leg:
         x, y, z = foot[0] - self.hip_x, (foot[1] - self.hip_y) * side, foot[2]
         drop = math.sqrt(max(y * y + z * z - out * out, 1e-6))
         abduction = math.atan2(z, y) - math.atan2(-drop, out)
-        reach = min(math.hypot(x, drop), STRAIGHTEST * (self.thigh + self.calf))
+        reach = min(math.hypot(x, drop), MAX_REACH * (self.thigh + self.calf))
         cosine = (reach**2 - self.thigh**2 - self.calf**2) / (2 * self.thigh * self.calf)
         knee = self.bend * math.acos(min(max(cosine, -1.0), 1.0))
         lean = math.atan2(self.calf * math.sin(knee), self.thigh + self.calf * math.cos(knee))
@@ -195,11 +195,11 @@ def is_sound(gait: Gait) -> bool:
     if not all(map(math.isfinite, (*values, *gait.phases))):
         return False
     return (
-        math.hypot(gait.stride_x, gait.stride_y) <= MOST_STRIDE
-        and abs(gait.turn) <= MOST_TURN
-        and FREQUENCY[0] <= gait.frequency <= FREQUENCY[1]
-        and DUTY[0] <= gait.duty <= DUTY[1]
-        and HEIGHT[0] <= gait.height <= HEIGHT[1]
+        math.hypot(gait.stride_x, gait.stride_y) <= MAX_STRIDE_M
+        and abs(gait.turn) <= MAX_TURN_RAD
+        and FREQUENCY_HZ[0] <= gait.frequency <= FREQUENCY_HZ[1]
+        and DUTY_RANGE[0] <= gait.duty <= DUTY_RANGE[1]
+        and HEIGHT_M[0] <= gait.height <= HEIGHT_M[1]
         and all(0.0 <= phase < 1.0 for phase in gait.phases)
     )
 
@@ -221,13 +221,13 @@ class LegOdometry:
 
     def update(self, senses: Senses, passed_s: float) -> None:
         """Take in a sample, `passed_s` after the one before."""
-        passed_s = min(passed_s, LONGEST_S)
+        passed_s = min(passed_s, MAX_SAMPLE_GAP_S)
         tilt = senses.tilt()
         velocity = self._by_accelerometer(senses, tilt, passed_s)
         firm = zip(senses.contacts, self._stood, strict=True)
         by_feet = [self._by_foot(senses, leg) for leg, both in enumerate(firm) if all(both)]
         if by_feet:
-            share, count = min(1.0, passed_s / TRUST_S), len(by_feet)
+            share, count = min(1.0, passed_s / FEET_TIME_CONSTANT_S), len(by_feet)
             x, y, z = (sum(part) / count for part in zip(*by_feet, strict=True))
             velocity = (
                 velocity[0] + share * (x - velocity[0]),

@@ -21,17 +21,20 @@ from gigabrain_drivers.kinematics.wheels import Twist
 
 ACCELERATION = Twist(1.0, 1.0, 2.0)  # [m/s2], [rad/s2]
 SMOOTH_S = 0.1  # over which the measured velocity is smoothed
-INTEGRAL = 1.0  # [1/s], of the velocity error
-MOST_INTEGRAL = Twist(0.2, 0.2, 0.6)  # [m/s], [rad/s]
+INTEGRAL_GAIN = 1.0  # [1/s], of the velocity error
+MAX_INTEGRAL = Twist(0.2, 0.2, 0.6)  # [m/s], [rad/s]
 BRACE_S = 0.12  # how far, in time, a standing foot leans for each m/s too fast
 LIFT = 0.05  # [m], of a swinging foot
 PRESS = 0.002  # [m], below the floor, where a swinging foot is put down
 CAPTURE_S = 0.12  # how far, in time, a foot is put ahead for each m/s too fast
-FURTHEST = (0.15, 0.10)  # [m], of a foot from its home, ahead and sideways
-LEVEL, DAMP_S = 0.45, 0.02  # how firmly the standing feet hold the body level
+MAX_FOOT_OFFSET = (0.15, 0.10)  # [m], of a foot from its home, ahead and sideways
+LEVEL_GAIN, DAMP_S = 0.45, 0.02  # how firmly the standing feet hold the body level
 FOOT_SPEED = 2.0  # [m/s], up or down, of a standing foot
 HEIGHT_SPEED = 0.1  # [m/s], of the whole body
-STILL, SLOW = 1e-3, 0.15  # [m/s], commanded and measured, below which stepping ends
+AT_REST_COMMAND, AT_REST_SPEED = (
+    1e-3,
+    0.15,
+)  # [m/s], commanded and measured, below which stepping ends
 FALLEN = 0.8  # [rad] of roll or pitch
 
 
@@ -61,7 +64,7 @@ class Trot:
         roll, pitch = senses.tilt()
         twist = self._follow(gait, passed_s)
         rolling, pitching, _ = senses.angular_velocity
-        tilt = (LEVEL * roll + DAMP_S * rolling, LEVEL * pitch + DAMP_S * pitching)
+        tilt = (LEVEL_GAIN * roll + DAMP_S * rolling, LEVEL_GAIN * pitch + DAMP_S * pitching)
         bearing = []
         for leg, phase in enumerate(gait.phases):
             share = (self._phase + phase) % 1.0
@@ -86,10 +89,10 @@ class Trot:
         if not self.stepping:  # an integral that faded would turn a standing body for a second
             self._integral = Twist(0.0, 0.0, 0.0)
             return self._integral
-        errors = zip(self._integral, self._command, self._measured, MOST_INTEGRAL, strict=True)
+        errors = zip(self._integral, self._command, self._measured, MAX_INTEGRAL, strict=True)
         self._integral = Twist(
             *(
-                _within(sum_ + INTEGRAL * passed_s * (to - now), most)
+                _within(sum_ + INTEGRAL_GAIN * passed_s * (to - now), most)
                 for sum_, to, now, most in errors
             )
         )
@@ -98,7 +101,10 @@ class Trot:
     def _pace(self, gait: Gait, passed_s: float) -> None:
         """Go on with the cycle, which ends at rest as soon as no foot is in the air."""
         measured = self.odometry.velocity
-        moving = max(map(abs, self._command)) > STILL or max(map(abs, measured[:2])) > SLOW
+        moving = (
+            max(map(abs, self._command)) > AT_REST_COMMAND
+            or max(map(abs, measured[:2])) > AT_REST_SPEED
+        )
         lifted = any((self._phase + phase) % 1.0 >= gait.duty for phase in gait.phases)
         self.stepping = moving or (self.stepping and lifted)
         self._phase = (self._phase + passed_s * gait.frequency) % 1.0 if self.stepping else 0.0
@@ -128,8 +134,8 @@ class Trot:
         half_s = gait.duty / gait.frequency / 2
         error_x = self._measured.linear_x - self._command.linear_x
         error_y = self._measured.linear_y - self._command.linear_y
-        x = home_x + _within(half_s * speed_x + CAPTURE_S * error_x, FURTHEST[0])
-        y = home_y + _within(half_s * speed_y + CAPTURE_S * error_y, FURTHEST[1])
+        x = home_x + _within(half_s * speed_x + CAPTURE_S * error_x, MAX_FOOT_OFFSET[0])
+        y = home_y + _within(half_s * speed_y + CAPTURE_S * error_y, MAX_FOOT_OFFSET[1])
         swing_s = (1 - gait.duty) / gait.frequency
         self._feet[leg] = (
             _hermite(start[0], x, -speed_x * swing_s, done),

@@ -22,9 +22,12 @@ from gigabrain_zenoh.plugins import load_plugin
 
 Samples = NDArray[np.float64]
 Piece = TypeVar("Piece")
-MOST_SAMPLES = 20_000  # per turn; the fastest lidar here measures 3200
+MAX_SAMPLES = 20_000  # per turn; the fastest lidar here measures 3200
 CLOCKWISE = -math.pi / 180  # from degrees clockwise to radians counter-clockwise
-SHORTEST, LONGEST = 0.25, 3.0  # of the nominal period; less is a backlog, more is two turns mixed
+MIN_PERIODS, MAX_PERIODS = (
+    0.25,
+    3.0,
+)  # of the nominal period; less is a backlog, more is two turns mixed
 
 
 class ScanSource(abc.ABC):
@@ -140,7 +143,7 @@ class TurnBuffer(abc.ABC, Generic[Piece]):
         After a whole turn of silence what was gathered before is dropped.
         """
         silent = self._count and now_ns - self._last_ns > self._period_ns
-        if silent or self._count + count > MOST_SAMPLES:
+        if silent or self._count + count > MAX_SAMPLES:
             self.clear()
         if not self._count:
             self._began_ns = now_ns
@@ -158,7 +161,7 @@ class TurnBuffer(abc.ABC, Generic[Piece]):
         took = (now_ns - self._began_ns) / self._period_ns
         self.clear()
         self._whole = True
-        if not count or not whole or not SHORTEST <= took <= LONGEST:
+        if not count or not whole or not MIN_PERIODS <= took <= MAX_PERIODS:
             return None
         angles, distances = self.unpack(pieces)
         ranges = np.where(distances == 0.0, np.inf, distances / 1000)

@@ -20,13 +20,13 @@ _LDS01 = re.compile(rb"\xfa[\xa0-\xdb].{40}\xfa[\xa0-\xdb]", re.DOTALL)
 _COIN_D4 = re.compile(rb"\xaa\x55.{8}", re.DOTALL)
 
 log = logging.getLogger(__name__)
-LOOK_NS = 100_000_000  # how often it is looked at whether scans come
-PATIENCE_NS = 2_000_000_000  # without a scan, until something is said
+CHECK_PERIOD_NS = 100_000_000  # how often it is looked at whether scans come
+LOG_AFTER_NS = 2_000_000_000  # without a scan, until something is said
 REOPEN_NS = 5_000_000_000  # without a scan, until the port is opened anew
 GATHER_S = 0.01  # a turn takes ten times as long; its bytes come hundreds of times a second
 GATHER_BAUD = 460_800  # what comes faster fills the 4 KB of a port too soon
-LAST_WORDS_S = 0.02
-NEWEST = 256  # bytes, kept to say what else may be sending there
+FLUSH_S = 0.02
+KEPT_BYTES = 256  # bytes, kept to say what else may be sending there
 
 
 def identify_lidar(data: bytes) -> str:
@@ -101,7 +101,7 @@ class SerialSource(ScanSource):
             with contextlib.suppress(asyncio.CancelledError):
                 await task
         if self.link.connected and self.send_stop():
-            await asyncio.sleep(LAST_WORDS_S)  # closing throws away what is not sent by then
+            await asyncio.sleep(FLUSH_S)  # closing throws away what is not sent by then
         await self.link.close()
 
     @property
@@ -122,7 +122,7 @@ class SerialSource(ScanSource):
 
     async def run(self) -> None:
         """Watch the line until cancelled."""
-        async for now_ns in self.clock.every(LOOK_NS):
+        async for now_ns in self.clock.every(CHECK_PERIOD_NS):
             self.watch_scans(now_ns)
             if self.link.connected and now_ns - max(self._scan_ns, self._opened_ns) > REOPEN_NS:
                 self._opened_ns = now_ns
@@ -132,7 +132,7 @@ class SerialSource(ScanSource):
         """Find out why there are no scans, and log it when that has changed."""
         before = self._problem
         self._problem = ""
-        if now_ns - self._scan_ns > PATIENCE_NS:
+        if now_ns - self._scan_ns > LOG_AFTER_NS:
             self._problem = self.explain() if self.link.connected else self.link.problem
         if self._problem and self._problem != before:
             log.warning("%s: %s", self.name, self._problem)
@@ -177,6 +177,6 @@ class SerialSource(ScanSource):
         self.connected()
 
     def _on_bytes(self, data: bytes) -> None:
-        self._newest = (self._newest + data)[-NEWEST:]
+        self._newest = (self._newest + data)[-KEPT_BYTES:]
         self.received(data)
         self.link.errors = self._stream.errors

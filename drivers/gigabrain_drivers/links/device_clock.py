@@ -7,17 +7,17 @@ grows by less than MAX_DRIFT cannot be told from two clocks that differ.
 
 from collections import deque
 
-UNANSWERED = 64  # messages whose echo is waited for
+MAX_UNANSWERED = 64  # messages whose echo is waited for
 WINDOW_NS = 300_000_000  # late is what all data of so long are,
-FULL = 0.8  # once this share of it has been seen
+MIN_WINDOW_SHARE = 0.8  # once this share of it has been seen
 SILENCE_MS = 500.0  # after so long without data the device may have been started anew,
-LONGEST_MS = 1000.0  # and was, if they would else be later by more than this
+RESTART_MS = 1000.0  # and was, if they would else be later by more than this
 LATE_MS = 50.0  # from which on data count as late here, and tell nothing of the clocks' drift
 MAX_DRIFT = 0.01  # of two clocks against each other; an RC oscillator is no better
 EARLY_MS = 100.0  # by which data may come too early, after a host that was held up
 MAX_ODD = 3  # stamps in a row that cannot be, until the clock counts as a new one
 SAMPLE_NS, SAMPLES = 1_000_000_000, 120  # of the drift, while nothing is late
-ENOUGH_SAMPLES = 10
+MIN_DRIFT_SAMPLES = 10
 
 
 class Window:
@@ -42,7 +42,7 @@ class Window:
     @property
     def least(self) -> float:
         """The least of the window, and no less than 0; 0 until the window is full."""
-        if not self._seen or self._seen[-1][0] - self._began_ns < FULL * WINDOW_NS:
+        if not self._seen or self._seen[-1][0] - self._began_ns < MIN_WINDOW_SHARE * WINDOW_NS:
             return 0.0
         return max(0.0, self._seen[0][1])
 
@@ -55,7 +55,7 @@ class EchoClock:
 
     def __init__(self, usual_ms: float) -> None:
         self._usual_ms = usual_ms
-        self._sent = deque[tuple[int, int]](maxlen=UNANSWERED)  # number, and when [ns]
+        self._sent = deque[tuple[int, int]](maxlen=MAX_UNANSWERED)  # number, and when [ns]
         self._late = Window()
 
     @property
@@ -108,7 +108,7 @@ class DeviceClock:
             return
         before_ms, then_ns = self._last
         passed_ms, silent_ms = (stamp_ms - before_ms) % self._wrap_ms, (now_ns - then_ns) / 1e6
-        went_back = stamp_ms < before_ms or silent_ms - passed_ms > LONGEST_MS
+        went_back = stamp_ms < before_ms or silent_ms - passed_ms > RESTART_MS
         if silent_ms > SILENCE_MS and (went_back or 2 * silent_ms > self._wrap_ms):
             self._begin(stamp_ms, now_ns)
         elif passed_ms > silent_ms + self._excess.newest + EARLY_MS:
@@ -135,7 +135,7 @@ class DeviceClock:
 
     def _drift(self) -> float:
         """The drift of the device's clock against the host's, 0 until it is known."""
-        if len(self._floors) < ENOUGH_SAMPLES:
+        if len(self._floors) < MIN_DRIFT_SAMPLES:
             return 0.0
         (then_ns, then_ms), (now_ns, now_ms) = self._floors[0], self._floors[-1]
         return (now_ms - then_ms) / ((now_ns - then_ns) / 1e6)

@@ -10,7 +10,7 @@ from gigabrain_schemas.base import Velocity
 
 Frame = TypeVar("Frame")
 
-LONGEST = 512  # bytes without a frame, after which they are shown as they are
+MAX_UNFRAMED_BYTES = 512  # bytes without a frame, after which they are shown as they are
 Feed = Callable[[bytes], Sequence[Any]]  # of a protocol's decoder
 Describe = Callable[[Any], str]  # a frame of that decoder
 
@@ -112,7 +112,7 @@ class Spelling:
             for frame in self._feed(bytes((value,))):
                 told.append(_line(self._held, self._describe(frame)))
                 self._held.clear()
-        if len(self._held) > LONGEST:
+        if len(self._held) > MAX_UNFRAMED_BYTES:
             told.append(_line(self._held, "no frame"))
             self._held.clear()
         return told

@@ -19,11 +19,11 @@ T = TypeVar("T")
 Trace = Callable[[str, bytes], None]
 
 FIRST_RETRY_NS = 100_000_000
-LONGEST_RETRY_NS = 1_000_000_000
-LOOK_S = 0.02  # how often the age of the newest bytes is looked at, where silence has a limit
+MAX_RETRY_NS = 1_000_000_000
+AGE_CHECK_S = 0.02  # how often the age of the newest bytes is looked at, where silence has a limit
 READ_BYTES = 65536
 
-PATIENCE_NS = 500_000_000  # without a word from the body, before something is said about it
+LOG_AFTER_NS = 500_000_000  # without a word from the body, before something is said about it
 
 
 class LinkProblem(Exception):
@@ -150,7 +150,7 @@ class Link(abc.ABC):
                 self._report(error)
                 self.problem = describe_error(error)
                 await self._clock.sleep_ns(retry_ns)
-                retry_ns = min(2 * retry_ns, LONGEST_RETRY_NS)
+                retry_ns = min(2 * retry_ns, MAX_RETRY_NS)
                 continue
             retry_ns = FIRST_RETRY_NS
             try:
@@ -189,7 +189,7 @@ class Link(abc.ABC):
             await self._ended.wait()
         while not self._ended.is_set():
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(LOOK_S):
+                async with asyncio.timeout(AGE_CHECK_S):
                     await self._ended.wait()
             if self.quiet_ns is not None and self.age_ns > self.quiet_ns:
                 self.drop(f"no data for {self.age_ns / 1e6:.0f} ms")
@@ -286,7 +286,7 @@ class Liveness:
         alive = self._heard_ns is not None and silent_ns <= self._silent_ns
         if alive:
             self._fault.end(f"{self._link}: reports again")
-        elif silent_ns > PATIENCE_NS:
+        elif silent_ns > LOG_AFTER_NS:
             self._fault.begin(self._problem())
         return alive
 

@@ -14,12 +14,14 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
-CONNECT_S = 1.0
-NEXT_S = 0.1  # after which the next address of a name is tried beside the one before
+CONNECT_TIMEOUT_S = 1.0
+HAPPY_EYEBALLS_S = 0.1  # after which the next address of a name is tried beside the one before
 QUIET_NS = 200_000_000  # a frozen peer acknowledges for ever; only what it sends shows it alive
-DISCARD = struct.pack("ii", 1, 0)  # linger on, for 0 s: what is still to be sent is thrown away
+LINGER_DISCARD = struct.pack(
+    "ii", 1, 0
+)  # linger on, for 0 s: what is still to be sent is thrown away
 
-MOST_BYTES = 256  # of a file that says where to call
+MAX_ADDRESS_BYTES = 256  # of a file that says where to call
 
 
 class TcpLink(Link):
@@ -38,9 +40,9 @@ class TcpLink(Link):
     async def _connect(self) -> int:
         loop = asyncio.get_running_loop()
         try:
-            async with asyncio.timeout(CONNECT_S):
+            async with asyncio.timeout(CONNECT_TIMEOUT_S):
                 found = await loop.getaddrinfo(self._host, self._port, type=socket.SOCK_STREAM)
-                self._socket = await start_connection(found, happy_eyeballs_delay=NEXT_S)
+                self._socket = await start_connection(found, happy_eyeballs_delay=HAPPY_EYEBALLS_S)
         except TimeoutError:
             raise LinkProblem(f"no answer from {self}: is it switched on?") from None
         except (socket.gaierror, UnicodeError) as error:
@@ -50,7 +52,7 @@ class TcpLink(Link):
                 raise LinkProblem(f"nothing listens at {self}: is its program running?") from None
             raise LinkProblem(f"{self}: {describe_error(error)}") from None
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, DISCARD)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, LINGER_DISCARD)
         return self._socket.fileno()
 
     def _shut(self) -> None:
@@ -95,7 +97,7 @@ def address(text: str) -> tuple[str, int]:
 def written(path: Path) -> tuple[str, int]:
     """Return (host, port) in a file. Raises LinkProblem."""
     try:
-        return address(read_bounded(path, MOST_BYTES).decode("ascii"))
+        return address(read_bounded(path, MAX_ADDRESS_BYTES).decode("ascii"))
     except OSError:
         raise LinkProblem(f"no {path}: is the emulator running?") from None
     except (ConfigError, UnicodeDecodeError):

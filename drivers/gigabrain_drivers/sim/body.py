@@ -12,7 +12,7 @@ from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
 
 SIMULATED = ("differential", "quadruped")  # drive types
-MOST_MODEL_BYTES = 10_000_000
+MAX_MODEL_BYTES = 10_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +156,7 @@ def sim_body(robot: RobotFile, options: MujocoOptions, run: Run) -> SimModel:
     """The body as the simulation wants it. Raises ConfigError when there is no model."""
     path = run.folder / options.model
     try:
-        model = read_bounded(path, MOST_MODEL_BYTES).decode()
+        model = read_bounded(path, MAX_MODEL_BYTES).decode()
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: expected UTF-8 text") from None
     except OSError as error:

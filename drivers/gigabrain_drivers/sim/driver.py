@@ -27,9 +27,9 @@ from gigabrain_zenoh.clock import Clock
 from gigabrain_zenoh.errors import BodyLost, ConfigError
 
 T = TypeVar("T")
-STEPS = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
-DEAD_MAN_NS = 150_000_000  # of simulated time: as long as a firmware would wait
-SPEEDS = (0.1, 100.0)
+STEPS_PER_TICK = TICK_NS // STEP_NS  # physics steps per tick of the robot's clock
+COMMAND_TIMEOUT_NS = 150_000_000  # of simulated time: as long as a firmware would wait
+SPEED_RANGE = (0.1, 100.0)
 
 
 def state_message(simulation: Simulation, robot_type: str) -> RobotState:
@@ -72,8 +72,10 @@ class MujocoDriver(Driver):
 
     def __init__(self, robot: RobotFile, options: MujocoOptions, run: Run) -> None:
         super().__init__(robot, options, run)
-        if not SPEEDS[0] <= run.speed <= SPEEDS[1]:
-            raise ConfigError(f"speed must be {SPEEDS[0]:g} to {SPEEDS[1]:g}, got {run.speed:g}")
+        if not SPEED_RANGE[0] <= run.speed <= SPEED_RANGE[1]:
+            raise ConfigError(
+                f"speed must be {SPEED_RANGE[0]:g} to {SPEED_RANGE[1]:g}, got {run.speed:g}"
+            )
         self.lockstep = run.speed != 1.0
         world = load_world(run.world, run.seed)
         self._simulation = Simulation(sim_body(robot, options, run), world, run.seed)
@@ -187,15 +189,15 @@ class MujocoDriver(Driver):
                 return
             self._ticks += 1
             scans = self._ticks >= self._next_scan
-            for step in range(STEPS):
+            for step in range(STEPS_PER_TICK):
                 # only a scan needs the thread between two states; waking it costs like a step
-                pace.wait(1 if scans else STEPS * (step == 0))
+                pace.wait(1 if scans else STEPS_PER_TICK * (step == 0))
                 if self._halt.is_set():
                     return
-                self._post(self._step(last=step == STEPS - 1))
+                self._post(self._step(last=step == STEPS_PER_TICK - 1))
 
     def _step(self, *, last: bool) -> Reading:
-        if self._simulation.time_ns - self._commanded_ns >= DEAD_MAN_NS:
+        if self._simulation.time_ns - self._commanded_ns >= COMMAND_TIMEOUT_NS:
             self._simulation.command(0.0, 0.0)
         self._timed(self._simulation.advance)
         if self._simulation.fallen:

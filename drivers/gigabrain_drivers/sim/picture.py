@@ -27,7 +27,7 @@ AIM_HEIGHT_M = 0.22  # above the robot, so that the room is in the picture
 FIELD_OF_VIEW_DEG = 44.0
 SHADOW_REACH_M = 3.5  # shadows are drawn this far round the robot: fewer metres, finer edges
 SUN_M = 4.0  # from the robot to the sun: far enough for the tallest thing near it
-FINER = 2  # drawn this many times as large, then averaged
+SUPERSAMPLING = 2  # drawn this many times as large, then averaged
 
 
 def render(
@@ -36,14 +36,17 @@ def render(
     """Write a PNG of the robot at its start. Raises ConfigError where nothing can be drawn."""
     simulation = Simulation(body, world, seed)
     model, data = simulation.model, simulation.data
-    model.vis.global_.offwidth, model.vis.global_.offheight = width * FINER, height * FINER
+    model.vis.global_.offwidth, model.vis.global_.offheight = (
+        width * SUPERSAMPLING,
+        height * SUPERSAMPLING,
+    )
     model.vis.global_.fovy, model.vis.map.zfar = FIELD_OF_VIEW_DEG, 3.0
     robot = simulation.truth.pose()
     _light(model, robot)
     mujoco.mj_forward(model, data)
-    with _graphics(width * FINER, height * FINER):
+    with _graphics(width * SUPERSAMPLING, height * SUPERSAMPLING):
         fine = _draw(model, data, _camera(world, robot))
-    pixels = fine.reshape(height, FINER, width, FINER, 3).mean(axis=(1, 3)).round()
+    pixels = fine.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 3).mean(axis=(1, 3)).round()
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(png(pixels.astype(np.uint8)))
 

@@ -31,14 +31,14 @@ MATERIALS = {
     "skin": (0.86, 0.66, 0.53),
 }
 
-RADIUS_M = 0.25
-SPEED = 0.8  # [m/s]
-KEEP_AWAY_M = 0.5  # from the person's side to the robot's outer edge
-ANEW_M = 1.0  # walked since it last stood: standing again is another meeting
+PERSON_RADIUS_M = 0.25
+PERSON_SPEED = 0.8  # [m/s]
+PERSON_GAP_M = 0.5  # from the person's side to the robot's outer edge
+NEW_MEETING_M = 1.0  # walked since it last stood: standing again is another meeting
 log = logging.getLogger(__name__)
 ROBOT = "robot/"  # prefix of all names of the robot's model
 PERSON = "person"
-UNLIKE = 0.05  # share by which two measures differ that should be the same
+MAX_MISMATCH = 0.05  # share by which two measures differ that should be the same
 PERSON_HEIGHT_M = 1.45  # to the shoulders
 
 
@@ -92,18 +92,18 @@ class Person:
         self._walked = start
         self.pose = path.at(start)
         self.stood = 0  # how often it had to, for the robot
-        self._since_m = ANEW_M
+        self._since_m = NEW_MEETING_M
 
     def advance(self, robot_distance: Callable[[float, float], float]) -> Pose:
         """Walk for one tick; `robot_distance(x, y)` is from a point to the robot's edge [m]."""
-        walked = (self._walked + SPEED * STEP_S) % self._path.length
+        walked = (self._walked + PERSON_SPEED * STEP_S) % self._path.length
         ahead = self._path.at(walked)
         gap = robot_distance(ahead.x, ahead.y)
-        if gap >= KEEP_AWAY_M + RADIUS_M or gap > robot_distance(self.pose.x, self.pose.y):
+        if gap >= PERSON_GAP_M + PERSON_RADIUS_M or gap > robot_distance(self.pose.x, self.pose.y):
             self._walked, self.pose = walked, ahead
-            self._since_m += SPEED * STEP_S
+            self._since_m += PERSON_SPEED * STEP_S
         else:
-            self.stood += self._since_m >= ANEW_M
+            self.stood += self._since_m >= NEW_MEETING_M
             self._since_m = 0.0
         return self.pose
 
@@ -152,7 +152,7 @@ def _compare_wheels(spec: mujoco.MjSpec, body: SimBody) -> None:
     if body.wheel_scale == 1.0 and body.odometry_wheel_radius is None:  # else it is on purpose
         pairs.append(("wheel_radius", body.wheel_radius, spec.geom(body.wheels[0]).size[0]))
     for name, told, is_in_model in pairs:
-        if abs(told / is_in_model - 1.0) > UNLIKE:
+        if abs(told / is_in_model - 1.0) > MAX_MISMATCH:
             log.warning(
                 "%s: the wheels have a %s of %.3f m here, and of %.3f m in the robot's file",
                 body.path, name, is_in_model, told,
@@ -227,9 +227,9 @@ def _add_person(spec: mujoco.MjSpec) -> None:
     person.add_geom(
         name=PERSON,
         type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        size=(RADIUS_M, 0, 0),
+        size=(PERSON_RADIUS_M, 0, 0),
         material="blue",
-        fromto=(0, 0, 0, 0, 0, PERSON_HEIGHT_M - RADIUS_M),
+        fromto=(0, 0, 0, 0, 0, PERSON_HEIGHT_M - PERSON_RADIUS_M),
     )
     person.add_geom(
         type=mujoco.mjtGeom.mjGEOM_SPHERE,

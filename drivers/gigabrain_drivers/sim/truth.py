@@ -10,9 +10,9 @@ from gigabrain_drivers.sim import STEP_NS
 from gigabrain_drivers.sim.scene import FLOOR, ROBOT
 from gigabrain_drivers.sim.world import Footprint, Pose
 
-APART_TICKS = 500_000_000 // STEP_NS  # contact again after half a second is a new contact
-CLEARANCE_TICKS = 100_000_000 // STEP_NS
-FAR_M = 10.0  # clearances beyond this are not told apart
+NEW_CONTACT_STEPS = 500_000_000 // STEP_NS  # contact again after half a second is a new contact
+CLEARANCE_STEPS = 100_000_000 // STEP_NS
+MAX_CLEARANCE_M = 10.0  # clearances beyond this are not told apart
 
 
 class Truth:
@@ -40,7 +40,7 @@ class Truth:
         self._last_touch: dict[int, int] = {}
         self._ticks = 0
         self.contacts, self.touching = 0, False
-        self.min_clearance_m, self.distance_m = FAR_M, 0.0
+        self.min_clearance_m, self.distance_m = MAX_CLEARANCE_M, 0.0
         mujoco.mj_forward(model, data)
         self.footprint = self._measure_footprint()
         self._reach = math.hypot(
@@ -69,7 +69,7 @@ class Truth:
         self.distance_m += math.hypot(pose.x - self._position.x, pose.y - self._position.y)
         self._position = pose
         self._touch()
-        if self._ticks % CLEARANCE_TICKS == 0:
+        if self._ticks % CLEARANCE_STEPS == 0:
             self._clear()
 
     def _touch(self) -> None:
@@ -82,7 +82,7 @@ class Truth:
         self.min_clearance_m = 0.0
         for pair in pairs[with_obstacle.any(axis=1)]:
             thing = int(pair[self._is_obstacle[pair]][0])
-            if self._ticks - self._last_touch.get(thing, -APART_TICKS) >= APART_TICKS:
+            if self._ticks - self._last_touch.get(thing, -NEW_CONTACT_STEPS) >= NEW_CONTACT_STEPS:
                 self.contacts += 1
             self._last_touch[thing] = self._ticks
 

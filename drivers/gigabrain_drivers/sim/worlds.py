@@ -25,16 +25,16 @@ from gigabrain_drivers.sim.world import (
 )
 from gigabrain_zenoh.errors import UnknownName, unknown
 
-HALF_M = 3.5
+RANDOM_HALF_M = 3.5
 PASSAGE_M = 1.15  # the least gap that a robot may find; narrower ones are closed
-FREE, BY_WALL = 8, 5  # obstacles, at most
-LEAST = 10  # obstacles
-ATTEMPTS = 400  # for one layout
-MATERIALS = ("orange", "teal", "yellow", "blue", "green", "clay")
+MAX_FREE, MAX_BY_WALL = 8, 5  # obstacles, at most
+MIN_OBSTACLES = 10  # obstacles
+LAYOUT_ATTEMPTS = 400  # for one layout
+OBSTACLE_MATERIALS = ("orange", "teal", "yellow", "blue", "green", "clay")
 Placed = tuple[Shape, float]  # a shape and the radius of the circle round it
 __all__ = ["World", "load_world", "world_names"]
-START_CLEAR_M = 0.6  # from the robot's origin to anything that stands
-PERSON_CLEAR_M = 1.5  # from the robot's origin to the person's middle
+START_CLEARANCE_M = 0.6  # from the robot's origin to anything that stands
+PERSON_CLEARANCE_M = 1.5  # from the robot's origin to the person's middle
 RANDOM = "random:"
 
 
@@ -199,13 +199,13 @@ def random_world(seed: int) -> World:
     """Return 10 to 13 obstacles in 7 x 7 m, with gaps of none or at least 1.15 m."""
     random = generator(seed, Stream.LAYOUT)
     placed = _layout(random)
-    while len(placed) < LEAST:
+    while len(placed) < MIN_OBSTACLES:
         placed = _layout(random)
     return World(
         name=f"random:{seed}",
         description="10 to 13 obstacles in 7 x 7 m, drawn from SEED",
-        half_x=HALF_M,
-        half_y=HALF_M,
+        half_x=RANDOM_HALF_M,
+        half_y=RANDOM_HALF_M,
         floor=((0.56, 0.60, 0.55), (0.52, 0.56, 0.51)),
         shapes=tuple(shape for shape, _ in placed),
     )
@@ -214,9 +214,9 @@ def random_world(seed: int) -> World:
 def _layout(random: np.random.Generator) -> list[Placed]:
     """Place as many obstacles as fit within the attempts; those by the walls first."""
     placed: list[Placed] = []
-    for attempt in range(ATTEMPTS):
-        by_wall = attempt < ATTEMPTS // 4
-        if len(placed) >= (BY_WALL if by_wall else BY_WALL + FREE):
+    for attempt in range(LAYOUT_ATTEMPTS):
+        by_wall = attempt < LAYOUT_ATTEMPTS // 4
+        if len(placed) >= (MAX_BY_WALL if by_wall else MAX_BY_WALL + MAX_FREE):
             continue
         shape, radius = _by_wall(random) if by_wall else _free(random)
         if all(_gap(shape, radius, *other) >= PASSAGE_M for other in placed):
@@ -232,8 +232,8 @@ def _gap(shape: Shape, radius: float, other: Shape, other_radius: float) -> floa
 def _free(random: np.random.Generator) -> Placed:
     """A pillar or a box, turned anyhow, with a passage all round it."""
     size, height = float(random.uniform(0.12, 0.22)), float(random.uniform(0.4, 0.8))
-    material = str(random.choice(MATERIALS))
-    reach = HALF_M - PASSAGE_M - 0.22 * math.sqrt(2)
+    material = str(random.choice(OBSTACLE_MATERIALS))
+    reach = RANDOM_HALF_M - PASSAGE_M - 0.22 * math.sqrt(2)
     x, y = (float(value) for value in random.uniform(-reach, reach, 2))
     if random.random() < 0.5:
         return Cylinder(x, y, size, height, material), size
@@ -244,9 +244,9 @@ def _free(random: np.random.Generator) -> Placed:
 def _by_wall(random: np.random.Generator) -> Placed:
     """A cupboard with its back to one of the walls, clear of the corners."""
     width, depth = (float(value) for value in random.uniform((0.25, 0.15), (0.45, 0.25)))
-    height, material = float(random.uniform(0.5, 0.9)), str(random.choice(MATERIALS))
-    reach = HALF_M - PASSAGE_M - width
-    along, off = float(random.uniform(-reach, reach)), HALF_M - depth
+    height, material = float(random.uniform(0.5, 0.9)), str(random.choice(OBSTACLE_MATERIALS))
+    reach = RANDOM_HALF_M - PASSAGE_M - width
+    along, off = float(random.uniform(-reach, reach)), RANDOM_HALF_M - depth
     radius = math.hypot(width, depth)
     side = int(random.integers(4))
     sign = 1.0 if side < 2 else -1.0
@@ -255,12 +255,16 @@ def _by_wall(random: np.random.Generator) -> Placed:
     return Box(sign * off, along, depth, width, height, material), radius
 
 
-DRAWN: dict[str, Callable[[], World]] = {"arena": arena, "house": house, "warehouse": warehouse}
+NAMED_WORLDS: dict[str, Callable[[], World]] = {
+    "arena": arena,
+    "house": house,
+    "warehouse": warehouse,
+}
 
 
 def world_names() -> dict[str, str]:
     """One line about each world, by name."""
-    names = {name: build().description for name, build in DRAWN.items()}
+    names = {name: build().description for name, build in NAMED_WORLDS.items()}
     return {**names, f"{RANDOM}SEED": random_world(0).description}
 
 
@@ -270,10 +274,10 @@ def load_world(name: str, seed: int) -> World:
 
 
 def _build(name: str) -> World:
-    if name in DRAWN:
-        return DRAWN[name]()
+    if name in NAMED_WORLDS:
+        return NAMED_WORLDS[name]()
     if not name.startswith(RANDOM):
-        raise unknown("world", name, [*DRAWN, f"{RANDOM}SEED"])
+        raise unknown("world", name, [*NAMED_WORLDS, f"{RANDOM}SEED"])
     layout = name.removeprefix(RANDOM)
     if not (layout.isascii() and layout.isdigit()):
         text = f"no world {name!r}; random:SEED needs a whole number, as in random:7"
@@ -294,6 +298,6 @@ def _with_start(world: World, seed: int) -> World:
         x = float(random.uniform(-world.half_x, world.half_x))
         y = float(random.uniform(-world.half_y, world.half_y))
         yaw = float(random.uniform(-math.pi, math.pi))
-        far = person is None or math.hypot(x - person.x, y - person.y) >= PERSON_CLEAR_M
-        if far and clearance(shapes, x, y) >= START_CLEAR_M:
+        far = person is None or math.hypot(x - person.x, y - person.y) >= PERSON_CLEARANCE_M
+        if far and clearance(shapes, x, y) >= START_CLEARANCE_M:
             return replace(world, start=Pose(x, y, yaw), person_start=person_start)

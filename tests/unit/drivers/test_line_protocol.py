@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from gigabrain_drivers.bodies.line.protocol import (
     CHECKS,
     COMMAND,
-    LONGEST,
+    MAX_LINE_BYTES,
     STATE,
     UNITS,
     LineDecoder,
@@ -176,7 +176,7 @@ def test_a_line_that_is_too_long_costs_one_error_and_the_next_one_is_read() -> N
     decoder.feed(lines(1)[0])
     for _ in range(50):
         decoder.feed(b"x" * 100)
-    assert len(decoder._rest) <= LONGEST
+    assert len(decoder._rest) <= MAX_LINE_BYTES
     assert decoder.feed(b"\n" + lines(1)[0]) == [{"linear_x": 0.0, "angular_z": 0.5}]
     assert decoder.errors == 1
 
@@ -185,7 +185,7 @@ def test_a_line_that_is_too_long_costs_one_error_and_the_next_one_is_read() -> N
 def test_no_bytes_make_it_raise_or_grow(data: bytes) -> None:
     decoder = LineDecoder((BARE, TICKS))
     decoder.feed(data)
-    assert len(decoder._rest) <= LONGEST
+    assert len(decoder._rest) <= MAX_LINE_BYTES
 
 
 def test_a_crlf_line_and_its_bare_cousin_are_read_alike() -> None:

@@ -66,7 +66,7 @@ def test_an_opencr_is_told_that_to_within_half_of_its_unit(body: str) -> None:
     assert base
     for now in outputs(body):
         wheels = base.to_wheels(Twist(*axes(now)))
-        assert max(map(abs, wheels)) <= opencr.FASTEST_WHEEL  # or its driver would slow it down
+        assert max(map(abs, wheels)) <= opencr.MAX_WHEEL_SPEED  # or its driver would slow it down
         sent = opencr.velocity(now.linear_x, now.angular_z)
         told = (sent.linear_x, sent.angular_z)
         assert told == pytest.approx((now.linear_x, now.angular_z), abs=0.005 + ROUNDING)

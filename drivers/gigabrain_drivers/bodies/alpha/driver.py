@@ -30,11 +30,11 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
-SENSELESS = "no valid frame comes: is this the right port?"
-SILENT_NS = 100_000_000  # without a state, and the body counts as lost
-LAST_WORD_NS = 10_000_000  # for the last command to arrive before the connection is closed
+NO_VALID_FRAME = "no valid frame comes: is this the right port?"
+STATE_TIMEOUT_NS = 100_000_000  # without a state, and the body counts as lost
+FLUSH_NS = 10_000_000  # for the last command to arrive before the connection is closed
 MILLISECONDS = 1 << 32  # after which the firmware's clock begins anew
-USUAL_MS = 30.0  # from a command to the state that echoes it
+USUAL_ROUND_TRIP_MS = 30.0  # from a command to the state that echoes it
 
 
 class AlphaOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -63,8 +63,8 @@ class AlphaDriver(Driver):
         self._unsound = 0  # whole frames without sense
         self._last: tuple[int, int] | None = None  # sequence and milliseconds of the newest state
         self._state: State | None = None
-        self._liveness = Liveness(self.link, self._clock, SILENT_NS, SENSELESS, log)
-        self._stamps, self._echoes = DeviceClock(MILLISECONDS), EchoClock(USUAL_MS)
+        self._liveness = Liveness(self.link, self._clock, STATE_TIMEOUT_NS, NO_VALID_FRAME, log)
+        self._stamps, self._echoes = DeviceClock(MILLISECONDS), EchoClock(USUAL_ROUND_TRIP_MS)
         self._untold = False  # whether a loss has not been reported yet
         self._open = self._parked = False
         self._fall = Fault(log)
@@ -82,7 +82,7 @@ class AlphaDriver(Driver):
         if self._open:
             await self.stop()
             if self.link.connected:
-                await self._clock.sleep_ns(LAST_WORD_NS)
+                await self._clock.sleep_ns(FLUSH_NS)
         self._open = False
         await self.link.close()
         if self._lidar:

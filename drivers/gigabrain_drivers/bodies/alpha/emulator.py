@@ -17,7 +17,7 @@ REST = WALKER.to_gait(Twist(0.0, 0.0, 0.0))
 RISE_NS = 1_800_000_000  # from lying to standing
 LYING = REST._replace(height=LYING_M)
 BROWN_OUT_SHARE = 0.6  # of the battery's voltage, below which the firmware is off
-KEPT = 1000  # commands, for tests to look at
+MAX_EXECUTED = 1000  # commands, for tests to look at
 
 
 class Alpha(Device):
@@ -33,7 +33,7 @@ class Alpha(Device):
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         super().__init__(body, options, wire)
-        self.executed: deque[Gait] = deque(maxlen=KEPT)  # what the legs were told
+        self.executed: deque[Gait] = deque(maxlen=MAX_EXECUTED)  # what the legs were told
         self.reset()
 
     @classmethod

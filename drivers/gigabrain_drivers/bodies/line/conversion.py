@@ -13,10 +13,10 @@ from gigabrain_schemas.body import Battery, BodyDescription, Joint
 WHEEL = "wheel_"
 
 VELOCITY_S = 0.05  # a velocity from positions is taken over so much time: one line is noise
-SLACK = 3.0  # a step so many times longer than the body can go is no step ...
-SLACK_M = 0.05  # ... but the lines' own unevenness is
+MAX_STEP_FACTOR = 3.0  # a step so many times longer than the body can go is no step ...
+STEP_SLACK_M = 0.05  # ... but the lines' own unevenness is
 GAP_NS = 100_000_000  # without a line: the firmware may have restarted
-LONGEST_S = 0.2  # a speed says nothing of a longer time
+MAX_INTEGRATION_S = 0.2  # a speed says nothing of a longer time
 STILL = Twist(0.0, 0.0, 0.0)
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
 
@@ -179,7 +179,7 @@ class LineReport:
 
     def _integrate(self, now_ns: int) -> None:
         """Integrate the newest speeds, where the lines report nothing else."""
-        seconds = min((now_ns - (self._now_ns or now_ns)) / 1e9, LONGEST_S)
+        seconds = min((now_ns - (self._now_ns or now_ns)) / 1e9, MAX_INTEGRATION_S)
         v = self.velocity()
         self._move(_scaled(Twist(v.linear_x, v.linear_y, v.angular_z), seconds), now_ns)
         speeds = _all_of(self._speeds, self._values)
@@ -217,10 +217,10 @@ class LineReport:
         """The body has made a step since the last line, if it can have made it."""
         seconds = (now_ns - (self._now_ns or now_ns)) / 1e9
         self._now_ns = now_ns
-        body, room = self._body, SLACK * seconds
+        body, room = self._body, MAX_STEP_FACTOR * seconds
         speed = max(body.max_linear_speed, body.max_lateral_speed)
-        too_far = math.hypot(step.linear_x, step.linear_y) > speed * room + SLACK_M
-        if too_far or abs(step.angular_z) > body.max_angular_speed * room + SLACK_M:
+        too_far = math.hypot(step.linear_x, step.linear_y) > speed * room + STEP_SLACK_M
+        if too_far or abs(step.angular_z) > body.max_angular_speed * room + STEP_SLACK_M:
             step = STILL
         self.pose = advance_pose(self.pose, step)
         self._steps.append((seconds, step))

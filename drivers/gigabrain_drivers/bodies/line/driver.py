@@ -29,13 +29,13 @@ from gigabrain_zenoh.logs import Fault
 
 log = logging.getLogger(__name__)
 
-MISSED = 3  # state lines in a row, and the body counts as lost
-LEAST_SILENT_NS = 100_000_000
+MISSED_LINES = 3  # state lines in a row, and the body counts as lost
+MIN_TIMEOUT_NS = 100_000_000
 REPEAT_SHARE = 0.9  # of the repetition's period: ticks are not that even
-SENSELESS = "no valid line comes: check firmware, baud rate and wiring"
+NO_VALID_LINE = "no valid line comes: check firmware, baud rate and wiring"
 BUMPER = "bumper"  # flags of such names are bumpers
 PROBE_S = 2.5  # an Arduino that opening has reset takes two seconds to say anything
-LAST_WORD_NS = 10_000_000  # and the time of one line, before a port is closed
+FLUSH_NS = 10_000_000  # and the time of one line, before a port is closed
 SEQUENCES = 1 << 16
 
 
@@ -58,8 +58,8 @@ class LineDriver(Driver):
         self.link.on_bytes, self.link.on_open = self._received, self._opened
         self.link.on_lost = self._lost
         self._report = LineReport(options, robot, base)
-        silent_ns = max(round(MISSED / options.state_hz * 1e9), LEAST_SILENT_NS)
-        self._liveness = Liveness(self.link, self._clock, silent_ns, SENSELESS, log)
+        silent_ns = max(round(MISSED_LINES / options.state_hz * 1e9), MIN_TIMEOUT_NS)
+        self._liveness = Liveness(self.link, self._clock, silent_ns, NO_VALID_LINE, log)
         self._repeat_ns = round(REPEAT_SHARE / options.command_hz * 1e9)
         self._started = False  # whether start went out and no stop since: then a stop is owed
         self._wanted = self._as_sent = self._sent = ZERO  # the second is what the line keeps of it
@@ -87,7 +87,7 @@ class LineDriver(Driver):
             await self.stop()
             if self.link.connected:  # what is still in the port when it is closed is lost
                 bits = self._command.template.longest() * BITS_PER_BYTE
-                await self._clock.sleep_ns(LAST_WORD_NS + round(bits / self.options.baud * 1e9))
+                await self._clock.sleep_ns(FLUSH_NS + round(bits / self.options.baud * 1e9))
         self._open = False
         await self.link.close()
         if self._lidar:

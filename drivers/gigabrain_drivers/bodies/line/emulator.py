@@ -10,7 +10,7 @@ from typing import Any
 
 from gigabrain_drivers.bodies.line.conversion import LineCommand
 from gigabrain_drivers.bodies.line.options import LineOptions
-from gigabrain_drivers.bodies.line.protocol import LONGEST, Field
+from gigabrain_drivers.bodies.line.protocol import MAX_LINE_BYTES, Field
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Port, Wire
 from gigabrain_drivers.emulators.ports import Pty
 from gigabrain_drivers.kinematics.wheels import wheels_of
@@ -20,7 +20,7 @@ from gigabrain_zenoh.geometry.limits import clamp, limits_of
 BOOT_NS = 300_000_000  # from power-on to the first state line
 BROWN_OUT_SHARE = 0.6  # of the battery's voltage; with less the board holds itself in reset
 BANNER = b"\x00\xf8firmware of a base on a text line\r\nready\r\n"
-KEPT = 1000  # commands, for tests to look at
+MAX_EXECUTED = 1000  # commands, for tests to look at
 WATCHDOG = "watchdog"  # the flag that is raised while the motors are stopped for silence
 
 
@@ -42,7 +42,7 @@ class LineBase(Device):
         self._state_ns = round(1e9 / options.state_hz)
         self._start = options.start.encode().strip()
         self._stop = options.stop.encode().strip()
-        self.executed: deque[Velocity] = deque(maxlen=KEPT)  # what the motors were told
+        self.executed: deque[Velocity] = deque(maxlen=MAX_EXECUTED)  # what the motors were told
         self._now_ns = 0
         self.reset()
 
@@ -65,7 +65,7 @@ class LineBase(Device):
     def feed(self, data: bytes) -> None:
         """Lines, or parts of them; what is too long or wrong is dropped up to the next end."""
         *lines, rest = (self._rest + data).split(self._command.end)
-        self._rest = rest if len(rest) <= LONGEST else rest[-LONGEST:]
+        self._rest = rest if len(rest) <= MAX_LINE_BYTES else rest[-MAX_LINE_BYTES:]
         if self._booted_ns is None or self._now_ns < self._booted_ns:
             return
         for line in lines:

@@ -12,7 +12,7 @@ from gigabrain_drivers.bodies.line.protocol import (
     ANGLES,
     COMMAND,
     IGNORED,
-    LONGEST,
+    MAX_LINE_BYTES,
     STATE,
     Template,
 )
@@ -21,12 +21,12 @@ from gigabrain_drivers.kinematics.wheels import Ackermann, Base, Twist, missing_
 from gigabrain_drivers.links.serial_link import AUTO, check_port
 from gigabrain_schemas.base import Name, Positive
 
-Text = Annotated[str, Meta(max_length=LONGEST)]
+Text = Annotated[str, Meta(max_length=MAX_LINE_BYTES)]
 Rate = Annotated[float, Meta(ge=10, le=200)]
 
 BITS_PER_BYTE = 10  # 8N1
 
-COARSEST = 0.1  # of the most that a body can do: the largest step in which it may be told
+MAX_STEP_SHARE = 0.1  # of the most that a body can do: the largest step in which it may be told
 WHEEL_PARTS = ("_position", "_velocity", "_effort", "_temperature")
 POSE = ("x", "y", "yaw")
 
@@ -202,7 +202,7 @@ def _check_steps(command: Template, robot: RobotFile, base: Base | None) -> None
         most["wheel_steering"] = base.max_steering
     for field in command.fields:
         top = most.get(field.name, 0.0)
-        if top and field.step > COARSEST * top:
+        if top and field.step > MAX_STEP_SHARE * top:
             raise ValueError(
                 f"command: {{{field.name}}}: its smallest step is {field.step:.3g}, the most that "
                 f"the body does {top:.3g} (in SI units); expected more decimals or a smaller unit"

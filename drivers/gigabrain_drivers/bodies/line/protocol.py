@@ -66,11 +66,13 @@ STATE = {
 }
 DEFAULT_FORMATS = {"count": "d", "flags": "x"}
 _UNIT = re.compile(r"\s*([-+]?[0-9]*\.?[0-9]*)\s*([A-Za-z%].*?)?\s*")
-EXACT = 1e-6  # of a digit: what binary fractions miss
+ROUNDING = 1e-6  # of a digit: what binary fractions miss
 _FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.[0-9])?f|d|[xX])")
 _ANY_NUMBER = r" *[-+]?[0-9]{1,12}(?:\.[0-9]{0,9})?"
-LONGEST = 256  # bytes of a line
-MOST = 1e8  # in SI units; beyond, either way, no number is a measurement. Counters may count on.
+MAX_LINE_BYTES = 256  # bytes of a line
+MAX_VALUE = (
+    1e8  # in SI units; beyond, either way, no number is a measurement. Counters may count on.
+)
 DIGITS = "0123456789."  # what is no end of a number
 _FIELD = re.compile(r"\{([^{}|:]*)(?:\|([^{}|:]*))?(?::([^{}]*))?\}")
 
@@ -162,7 +164,7 @@ class Field:
         wire = value / self.factor
         if toward_zero:
             places = 10.0 ** _places(self.format) if self.format[-1] == "f" else 1.0
-            wire = math.copysign(math.floor(abs(wire) * places + EXACT), wire) / places
+            wire = math.copysign(math.floor(abs(wire) * places + ROUNDING), wire) / places
         if self.format[-1] != "f":
             return format(round(wire), self.format)
         text = format(wire, self.format)
@@ -257,7 +259,7 @@ class Template:
 
     def decode(self, line: bytes) -> dict[str, float] | None:
         """Return the values of a line without its end, in SI units; None for another line."""
-        if len(line) > LONGEST or not line.isascii():
+        if len(line) > MAX_LINE_BYTES or not line.isascii():
             return None
         text = line.decode("ascii")
         match = self._expression.fullmatch(text)
@@ -269,7 +271,7 @@ class Template:
                 return None
         pairs = zip(self.fields, match.groups(), strict=True)
         read = [(f, f.read(number)) for f, number in pairs if f.name != IGNORED]
-        if any(abs(value) > MOST and not f.counts for f, value in read):
+        if any(abs(value) > MAX_VALUE and not f.counts for f, value in read):
             return None
         return {f.name: value for f, value in read}
 
@@ -320,8 +322,8 @@ def _check_text(text: str) -> None:
         raise ValueError(f"expected a newline (\\n) at its end{quotes}")
     if not text.isascii() or any(ord(c) < 32 for c in text.rstrip("\r\n")):
         raise ValueError("expected printable ASCII")
-    if len(text) > LONGEST:
-        raise ValueError(f"expected at most {LONGEST} characters, got {len(text)}")
+    if len(text) > MAX_LINE_BYTES:
+        raise ValueError(f"expected at most {MAX_LINE_BYTES} characters, got {len(text)}")
 
 
 def describe(values: Mapping[str, float]) -> str:
@@ -359,7 +361,7 @@ class LineDecoder:
                 self._skipping = False
             elif (values := self._read(line)) is not None:
                 found.append(values)
-        if len(rest) > LONGEST:
+        if len(rest) > MAX_LINE_BYTES:
             self.errors += self._begun and not self._skipping
             self._skipping, rest = True, b""
         self._rest = rest

@@ -39,20 +39,20 @@ log = logging.getLogger(__name__)
 
 LOST_NS = 100_000_000  # without an answer it counts as lost,
 GIVE_UP_NS = 160_000_000  # and then its line is closed, with all that is still queued in it
-KNOCK_NS = 100_000_000  # between two attempts to get an answer at all
-PATIENCE_NS = 1_000_000_000  # for the first answer, until the port is opened anew
-SETTLE_NS = 500_000_000  # after which a problem is spoken of
-ANSWER_S = 0.01  # how long the answer to a question is waited for
+PING_PERIOD_NS = 100_000_000  # between two attempts to get an answer at all
+FIRST_ANSWER_TIMEOUT_NS = 1_000_000_000  # for the first answer, until the port is opened anew
+LOG_AFTER_NS = 500_000_000  # after which a problem is spoken of
+ANSWER_TIMEOUT_S = 0.01  # how long the answer to a question is waited for
 ANSWER_BYTES = 14  # of the answer to a ping
 WATCHDOG_FIRMWARE = 5  # before that, the byte of the debug mode was part of a clock
 
-GUARD_NS = 20_000_000  # how often the driver looks after itself
-SILENT_NS = 80_000_000  # without a command; zero is then out by 100 ms
-LAST_WORD_S = 0.05  # how long the last zero is given to arrive before the port is closed
+GUARD_PERIOD_NS = 20_000_000  # how often the driver looks after itself
+COMMAND_TIMEOUT_NS = 80_000_000  # without a command; zero is then out by 100 ms
+FLUSH_S = 0.05  # how long the last zero is given to arrive before the port is closed
 JOINTS = ("wheel_left_joint", "wheel_right_joint")
-PUSHED = 1.5  # times as fast as it can drive a body may be pushed, and
-SLACK = 0.1  # [rad] more between two looks; counters that jump further were set anew
-MOST_ACCELERATION = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit is talking nonsense
+MAX_PUSHED_FACTOR = 1.5  # times as fast as it can drive a body may be pushed, and
+TURN_SLACK_RAD = 0.1  # [rad] more between two looks; counters that jump further were set anew
+MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit is talking nonsense
 
 
 class Board:
@@ -122,7 +122,7 @@ class Board:
             return sent.linear_x, sent.angular_z
         return 0.0, 0.0
 
-    async def ask(self, patience_s: float = ANSWER_S) -> None:
+    async def ask(self, patience_s: float = ANSWER_TIMEOUT_S) -> None:
         """Fetch the table and wait for it; `on_readings` gets it, now or a little later."""
         if not self.ready:
             return
@@ -142,9 +142,9 @@ class Board:
             return
         if self._waiting_ns and now_ns - self._waiting_ns > GIVE_UP_NS:
             self.link.drop("the OpenCR has stopped answering")
-        elif not self.ready and now_ns - self._opened_ns > PATIENCE_NS:
+        elif not self.ready and now_ns - self._opened_ns > FIRST_ANSWER_TIMEOUT_NS:
             self.link.drop(self.problem)
-        elif not self.ready and now_ns - self._knocked_ns >= KNOCK_NS:
+        elif not self.ready and now_ns - self._knocked_ns >= PING_PERIOD_NS:
             self._knock()
 
     def _log_problem(self, now_ns: int) -> None:
@@ -152,7 +152,7 @@ class Board:
         problem, before = self.problem, self._complaint
         if not problem:
             self._well_ns = now_ns
-        elif now_ns - self._well_ns < SETTLE_NS:
+        elif now_ns - self._well_ns < LOG_AFTER_NS:
             return
         if problem == before:
             return
@@ -290,7 +290,7 @@ class OpenCrDriver(Driver):
             guard.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await guard
-            await self._board.ask(LAST_WORD_S)  # once it answers, it has read the zero too
+            await self._board.ask(FLUSH_S)  # once it answers, it has read the zero too
         await self.link.close()
         if self._lidar:
             await self._lidar.close()
@@ -313,7 +313,9 @@ class OpenCrDriver(Driver):
         to = self.bounded(linear_x, linear_y, angular_z)
         wanted = Twist(to.linear_x, 0.0, to.angular_z)
         # the board slows down the faster wheel alone, which would bend the way
-        too_fast = max(1.0, *(abs(w) / opencr.FASTEST_WHEEL for w in self._base.to_wheels(wanted)))
+        too_fast = max(
+            1.0, *(abs(w) / opencr.MAX_WHEEL_SPEED for w in self._base.to_wheels(wanted))
+        )
         forward, turn = self._board.drive(wanted.linear_x / too_fast, wanted.angular_z / too_fast)
         return Velocity(linear_x=forward, angular_z=turn)
 
@@ -324,8 +326,8 @@ class OpenCrDriver(Driver):
 
     async def _guard_motion(self) -> None:
         """Send zero while no commands come, repeatedly: a single frame may get lost."""
-        async for now_ns in self._clock.every(GUARD_NS):
-            if now_ns - self._commanded_ns >= SILENT_NS and self._board.ready:
+        async for now_ns in self._clock.every(GUARD_PERIOD_NS):
+            if now_ns - self._commanded_ns >= COMMAND_TIMEOUT_NS and self._board.ready:
                 self._board.halt()
             self._board.supervise(now_ns)
 
@@ -333,7 +335,10 @@ class OpenCrDriver(Driver):
         turned = self._encoders.turned(now.ticks)
         passed = now.milliseconds - self._milliseconds
         self._milliseconds = now.milliseconds
-        if max(map(abs, turned)) <= PUSHED * opencr.FASTEST_WHEEL * passed / 1000 + SLACK:
+        if (
+            max(map(abs, turned))
+            <= MAX_PUSHED_FACTOR * opencr.MAX_WHEEL_SPEED * passed / 1000 + TURN_SLACK_RAD
+        ):
             self._odometry.add(turned)
         moves = self._base.to_body(now.velocities)
         wheels = zip(JOINTS, now.ticks, now.velocities, strict=True)
@@ -363,7 +368,7 @@ def imu_data(now: Readings) -> ImuData | None:
     """Return the board's inertial unit, or None while its values are impossible."""
     rates = (*now.angular_velocity, *now.linear_acceleration)
     norm = math.hypot(*now.orientation)
-    if not 0.9 < norm < 1.1 or not all(abs(value) < MOST_ACCELERATION for value in rates):
+    if not 0.9 < norm < 1.1 or not all(abs(value) < MAX_IMU_VALUE for value in rates):
         return None
     x, y, z, w = (part / norm for part in now.orientation)
     return ImuData(

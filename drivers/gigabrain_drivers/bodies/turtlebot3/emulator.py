@@ -11,13 +11,13 @@ from gigabrain_drivers.bodies.turtlebot3.protocol import DynamixelPacket
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Wire
 
 FIRMWARE = 5
-BUFFER = 1024  # of the slave library; what does not fit into it is not answered
+BUFFER_BYTES = 1024  # of the slave library; what does not fit into it is not answered
 CALIBRATION_NS = 5_000_000_000  # for which the board does nothing else
 BROWN_OUT_V = 7.0  # below which it is off
 MODELS = {"turtlebot3_burger": (1, 61), "turtlebot3_waffle": (2, 77)}  # number, greatest rpm
 WHEEL_RADIUS = 0.033  # [m], as the firmware has it
 WHEEL_UNITS = 1263.632956882  # of the motors per [m/s]
-MOST_UNITS = 337
+MAX_UNITS = 337
 AMPERES_PER_NM = 1 / 1.07
 FIRST_TICKS = (1234, 3210)  # a motor's absolute encoder does not start at 0
 MODEL, MODEL_INFO, MILLIS, DEBUG, HOST, STATUS = 0, 2, 10, 14, 15, 18
@@ -99,7 +99,7 @@ class OpenCr(Device):
 
     def reset(self) -> None:
         """Start as after power-on; it sends nothing by itself."""
-        self._decoder = opencr.DynamixelDecoder(BUFFER)
+        self._decoder = opencr.DynamixelDecoder(BUFFER_BYTES)
         self._table = ControlTable(ITEMS)
         self._goal = (0.0, 0.0)
         self._on = True
@@ -120,7 +120,7 @@ class OpenCr(Device):
         if not self._on:
             return
         if self._calibrating_ns:
-            self._waiting += data[: BUFFER - len(self._waiting)]
+            self._waiting += data[: BUFFER_BYTES - len(self._waiting)]
             return
         for packet in self._decoder.feed(data):
             if packet.id == opencr.ID:
@@ -149,7 +149,7 @@ class OpenCr(Device):
             self._answer(opencr.MODEL.to_bytes(2, "little") + bytes([FIRMWARE]))
         elif kind == opencr.READ and len(params) == 4:
             address, length = params[0] | params[1] << 8, params[2] | params[3] << 8
-            if length + 11 <= BUFFER:
+            if length + 11 <= BUFFER_BYTES:
                 self._answer(self._table.read(address, length))
         elif kind == opencr.WRITE and len(params) > 2:
             reached = self._table.write(params[0] | params[1] << 8, params[2:])
@@ -226,4 +226,4 @@ def _clamp(value: float, most: float) -> float:
 
 def _units(speed: float) -> int:
     """A wheel's speed [m/s] as the motors take it, which the firmware truncates."""
-    return int(_clamp(speed * WHEEL_UNITS, MOST_UNITS))
+    return int(_clamp(speed * WHEEL_UNITS, MAX_UNITS))

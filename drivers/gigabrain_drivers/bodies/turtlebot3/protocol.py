@@ -14,7 +14,7 @@ from gigabrain_drivers.links.frames import FrameDecoder, crc_table
 
 HEADER = b"\xff\xff\xfd\x00"
 PING, READ, WRITE, STATUS = 0x01, 0x02, 0x03, 0x55
-LONGEST = 1024  # of the length field; nothing here sends as much, so more is noise
+MAX_PACKET_LENGTH = 1024  # of the length field; nothing here sends as much, so more is noise
 
 _PREFIX = len(HEADER) + 3  # header, id, length: what the length does not count
 _CRC = 2
@@ -30,7 +30,7 @@ RUNNING, MOTORS_SILENT = 0, -1  # device status; silent mostly means that their 
 TICKS = 4096  # of a wheel's encoder per turn
 RADIANS_PER_TICK = math.tau / TICKS
 VELOCITY_UNIT = 0.229 * math.tau / 60  # [rad/s]
-FASTEST_WHEEL = 337 * VELOCITY_UNIT  # [rad/s], beyond which the firmware cuts off
+MAX_WHEEL_SPEED = 337 * VELOCITY_UNIT  # [rad/s], beyond which the firmware cuts off
 CURRENT_UNIT = 0.00269  # [A]
 SPEED_UNIT = 0.01  # [m/s] and [rad/s], of a command
 EMPTY_VOLTAGE = 10.5  # [V], below which the percentage stands still
@@ -98,7 +98,7 @@ class DynamixelDecoder(FrameDecoder[DynamixelPacket]):
 
     HEADER = HEADER
 
-    def __init__(self, longest: int = LONGEST) -> None:
+    def __init__(self, longest: int = MAX_PACKET_LENGTH) -> None:
         super().__init__()
         self._longest = longest
 

@@ -8,11 +8,11 @@ from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Sample, Sweep, Wire
 from gigabrain_drivers.lidars.ld import protocol as ld
 
-LEAST_VOLTS = 0.5  # below its 5 V by more than this, the motor does not keep its speed
+MAX_SAG_VOLTS = 0.5  # below its 5 V by more than this, the motor does not keep its speed
 LENS_X, LENS_Y, SLANT = 5.9, -20.14, 0.11923  # [mm], [mm], of LDS-02's beam beside the axis
-FINE = 4  # rays for each of its samples
-BEHIND = 3.0  # [deg] behind the newest ray, as the beam's slant needs rays on both sides
-KEPT = 60  # rays, 23 degrees
+RAYS_PER_SAMPLE = 4  # rays for each of its samples
+RAY_DELAY_DEG = 3.0  # [deg] behind the newest ray, as the beam's slant needs rays on both sides
+MAX_RAYS = 60  # rays, 23 degrees
 
 
 class LdDevice(Device):
@@ -38,7 +38,7 @@ class LdDevice(Device):
     def step(self, now_ns: int) -> None:
         """Send all whole frames that were measured since the last step."""
         while samples := self._sweep.next_samples(ld.POINTS):
-            if self.sag_volts <= LEAST_VOLTS:
+            if self.sag_volts <= MAX_SAG_VOLTS:
                 self.wire.write(ld.encode(self._frame([self.measured(s) for s in samples])))
 
     def measured(self, sample: Sample) -> Sample:
@@ -66,19 +66,19 @@ class Lds02Device(LdDevice):
 
     def reset(self) -> None:
         """Start to turn."""
-        self._rays = deque[Sample](maxlen=KEPT)
+        self._rays = deque[Sample](maxlen=MAX_RAYS)
         self._frame_of: list[Sample] = []
-        self._sweep.start(self.samples_hz * FINE, self._turn_hz)
+        self._sweep.start(self.samples_hz * RAYS_PER_SAMPLE, self._turn_hz)
 
     def step(self, now_ns: int) -> None:
         """Send all whole frames that were measured since the last step."""
-        while rays := self._sweep.next_samples(FINE):
+        while rays := self._sweep.next_samples(RAYS_PER_SAMPLE):
             self._rays += rays
-            if len(self._rays) == KEPT:
-                self._frame_of.append(self._by_the_lens((rays[-1].angle - BEHIND) % 360))
+            if len(self._rays) == MAX_RAYS:
+                self._frame_of.append(self._by_the_lens((rays[-1].angle - RAY_DELAY_DEG) % 360))
             if len(self._frame_of) == ld.POINTS:
                 frame, self._frame_of = self._frame(self._frame_of), []
-                if self.sag_volts <= LEAST_VOLTS:
+                if self.sag_volts <= MAX_SAG_VOLTS:
                     self.wire.write(ld.encode(frame))
 
     def _by_the_lens(self, angle: float) -> Sample:
@@ -92,9 +92,9 @@ class Lds02Device(LdDevice):
 
     def _ray(self, angle: float) -> Sample:
         """Return the ray that was cast nearest to `angle` [deg]."""
-        step = 360 * self._turn_hz / self.samples_hz / FINE
+        step = 360 * self._turn_hz / self.samples_hz / RAYS_PER_SAMPLE
         back = (self._rays[-1].angle - angle) % 360
-        return self._rays[-1 - min(round(back / step), KEPT - 1)]
+        return self._rays[-1 - min(round(back / step), MAX_RAYS - 1)]
 
 
 def lens_distance(distance: float) -> float:

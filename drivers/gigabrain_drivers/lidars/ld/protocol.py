@@ -18,9 +18,9 @@ SIZE = 47  # bytes
 HEADER, VERSIONS = 0x54, (0x2C, 0xEC)  # low five bits of the second byte: 12 points
 TURN = 36_000  # [0.01 deg]
 CLOCK_MS = 30_000  # when its milliseconds begin anew
-LEAST_SAMPLES_HZ = 2300  # of the slowest of these lidars; none spreads its points wider
+MIN_SAMPLES_HZ = 2300  # of the slowest of these lidars; none spreads its points wider
 _POINT = np.dtype([("distance", "<u2"), ("confidence", "u1")])
-SLACK = 1.5  # on the width of a frame, as the vendor's driver allows
+WIDTH_SLACK = 1.5  # on the width of a frame, as the vendor's driver allows
 _LAYOUT = struct.Struct("<BBHH" + "HB" * POINTS + "HHB")
 _HEAD, _END, _END_AT = struct.Struct("<BBHH"), struct.Struct("<HH"), SIZE - 5
 _FRAMES = np.dtype(
@@ -87,7 +87,7 @@ def whole(data: bytes) -> RawFrame | None:
         return None
     _, version, speed, start = _HEAD.unpack_from(data)
     end, time_ms = _END.unpack_from(data, _END_AT)
-    widest = SLACK * speed * 100 * POINTS / LEAST_SAMPLES_HZ
+    widest = WIDTH_SLACK * speed * 100 * POINTS / MIN_SAMPLES_HZ
     if version not in VERSIONS or max(start, end) >= TURN or (end - start) % TURN > widest:
         return None
     return RawFrame(start, end, time_ms, data)

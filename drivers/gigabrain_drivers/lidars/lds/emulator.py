@@ -4,14 +4,14 @@ from typing import Any
 
 from gigabrain_drivers.driver.robot import ScanOptions
 from gigabrain_drivers.emulators.base import Device, EmulatedBody, Sample, Sweep, Wire
-from gigabrain_drivers.lidars.ld.emulator import LEAST_VOLTS
+from gigabrain_drivers.lidars.ld.emulator import MAX_SAG_VOLTS
 from gigabrain_drivers.lidars.lds import lds01, lds03
 
 LDS01_HZ = 5.0  # turns
 LDS03_HZ, LDS03_SAMPLES_HZ = 10.0, 4000.0
 LDS03_POINTS = 20  # in a packet, at most
 INTENSITY, QUALITY = 1000, 60
-LONGEST_COMMAND = 4
+COMMAND_BYTES = 4
 
 
 class Lds01Device(Device):
@@ -42,7 +42,7 @@ class Lds01Device(Device):
             while first % lds01.SAMPLES:
                 samples = samples[1:] + self._sweep.next_samples(1)
                 first += 1
-            if len(samples) == lds01.SAMPLES and self.sag_volts <= LEAST_VOLTS:
+            if len(samples) == lds01.SAMPLES and self.sag_volts <= MAX_SAG_VOLTS:
                 number = first // lds01.SAMPLES % lds01.PACKETS
                 self.wire.write(lds01.encode(_lds01_packet(number, samples)))
 
@@ -73,7 +73,7 @@ class Lds03Device(Device):
             self._sweep.start(LDS03_SAMPLES_HZ, LDS03_HZ)
         elif stop >= 0:
             self._sweep.stop()
-        self._heard = b"" if max(start, stop) >= 0 else self._heard[-LONGEST_COMMAND:]
+        self._heard = b"" if max(start, stop) >= 0 else self._heard[-COMMAND_BYTES:]
 
     def step(self, now_ns: int) -> None:
         """Send all whole packets that were measured; none crosses 0 degrees."""
@@ -91,7 +91,7 @@ class Lds03Device(Device):
             rate=LDS03_HZ if self._begins else 0.0,
             samples=tuple(_lds03_sample(point) for point in points),
         )
-        if self.sag_volts <= LEAST_VOLTS:
+        if self.sag_volts <= MAX_SAG_VOLTS:
             self.wire.write(lds03.encode(packet))
 
 

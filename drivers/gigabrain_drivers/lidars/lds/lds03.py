@@ -24,7 +24,10 @@ PROBE_BYTES = 600
 DTR_NS = 100_000_000  # after opening, until the terminal-ready line is cleared
 START_NS = 1_000_000_000  # after opening, until it listens
 RESTART_NS = 3_000_000_000  # without a packet, until it is stopped and started
-NEAR_MM, WEAK = 150, 65  # up to here, a sample this weak is a reflection of the housing
+REFLECTION_MM, REFLECTION_QUALITY = (
+    150,
+    65,
+)  # up to here, a sample this weak is a reflection of the housing
 MIRROR_QUALITY = 255
 
 
@@ -217,6 +220,6 @@ def trusted(sample: Lds03Sample) -> float:
     Source: the vendor's coin_d4_driver.
     """
     quality = MIRROR_QUALITY if sample.reflective else sample.quality
-    if 0 < sample.distance <= NEAR_MM and quality <= WEAK:
+    if 0 < sample.distance <= REFLECTION_MM and quality <= REFLECTION_QUALITY:
         return math.nan
     return float(sample.distance)

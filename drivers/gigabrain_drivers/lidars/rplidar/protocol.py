@@ -22,7 +22,7 @@ MODE_COUNT, MODE_MICROSECONDS, MODE_DISTANCE = 0x70, 0x71, 0x74  # keys of GET_C
 MODE_ANSWER, MODE_TYPICAL, MODE_NAME = 0x75, 0x7C, 0x7F
 
 _SIZES = {INFO: 20, HEALTH: 3, SAMPLERATE: 4, BOARD: 4}
-_LONGEST_CONF = 64  # bytes
+_MAX_CONF_BYTES = 64  # bytes
 _DESCRIPTOR = struct.Struct("<2sIB")
 _ENDLESS = 1 << 30
 _SYNC = b"\xa5\x5a"
@@ -158,7 +158,7 @@ class RplidarDecoder:
         if endless == 1 and kind in FORMATS and FORMATS[kind].size == size:
             self._format = FORMATS[kind]()
         elif endless == 0 and (
-            _SIZES.get(kind) == size or (kind == CONF and 4 <= size <= _LONGEST_CONF)
+            _SIZES.get(kind) == size or (kind == CONF and 4 <= size <= _MAX_CONF_BYTES)
         ):
             self._answer = kind, size
         else:

@@ -15,9 +15,9 @@ from typing import ClassVar, NamedTuple
 from gigabrain_drivers.links.frames import xor_of
 
 TURN_Q6 = 360 << 6
-MOST_JUMP_DEG = 25.0  # between two nodes in step; their triangulation shifts them by up to 8
+MAX_JUMP_DEG = 25.0  # between two nodes in step; their triangulation shifts them by up to 8
 FULL_TURN_DEG = 400.0  # no start of a turn for so long: its node was lost
-WIDER = 1.5  # a capsule this much wider than the last: one between them was lost
+MAX_WIDENING = 1.5  # a capsule this much wider than the last: one between them was lost
 
 _NODE = struct.Struct("<BHH")
 _CABINS = struct.Struct("<" + "HHB" * 16)
@@ -66,7 +66,7 @@ class Standard(ScanFormat):
         first, raw, _ = _NODE.unpack(block)
         if not (first ^ first >> 1) & 1 or not raw & 1 or raw >> 1 >= TURN_Q6:
             return False
-        return self._last is None or abs(_advance(self._last, (raw >> 1) / 64)) < MOST_JUMP_DEG
+        return self._last is None or abs(_advance(self._last, (raw >> 1) / 64)) < MAX_JUMP_DEG
 
     def decode(self, block: bytes) -> Samples:
         """Return one sample. A turn begins with the node that is marked so."""
@@ -109,7 +109,7 @@ class Capsule(ScanFormat):
         start = _start(held)
         width = (_start(block) - start) % 360
         usual, self._width = self._width, width
-        if usual is not None and width > usual * WIDER + 1:
+        if usual is not None and width > usual * MAX_WIDENING + 1:
             return None
         passed = start + width >= 360
         angles = self._angles(held, start, width)

@@ -17,17 +17,17 @@ from gigabrain_drivers.lidars.rplidar.protocol import (
     describe_request,
 )
 from gigabrain_drivers.lidars.rplidar.scan_formats import FORMATS, Samples
-from gigabrain_drivers.lidars.serial_source import LOOK_NS, SerialSource
+from gigabrain_drivers.lidars.serial_source import CHECK_PERIOD_NS, SerialSource
 from gigabrain_drivers.links.frames import Spelling, Wording
 from gigabrain_schemas.body import Lidar
 from gigabrain_zenoh.clock import Clock
 
 log = logging.getLogger(__name__)
 
-ANSWER_S = 0.5
-SPIN_UP_NS = 4_000_000_000  # from the request to scan to the first sample
+ANSWER_TIMEOUT_S = 0.5
+SPIN_UP_TIMEOUT_NS = 4_000_000_000  # from the request to scan to the first sample
 INFO_BYTES = 27  # its descriptor and itself
-SILENT_NS = 1_000_000_000  # then it is started again
+SAMPLE_TIMEOUT_NS = 1_000_000_000  # then it is started again
 PWM = 660  # of 1023, the vendor's usual motor power
 STOP_S = 0.1  # the vendor waits so long after a stop
 RESET_S = 2.0
@@ -253,7 +253,7 @@ class Rplidar(SerialSource):
         """Start it, and start it again whenever it falls silent; until cancelled."""
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self._keep_scanning())
-            async for now_ns in self.clock.every(LOOK_NS):
+            async for now_ns in self.clock.every(CHECK_PERIOD_NS):
                 self.watch_scans(now_ns)
 
     def send_stop(self) -> bool:
@@ -275,7 +275,7 @@ class Rplidar(SerialSource):
         self._asked = kind, future
         self.send(request)
         try:
-            async with asyncio.timeout(ANSWER_S):
+            async with asyncio.timeout(ANSWER_TIMEOUT_S):
                 return await future
         except TimeoutError:
             if self.understood:
@@ -324,12 +324,12 @@ class Rplidar(SerialSource):
 
     async def _follow(self, connection: int) -> None:
         """Return when the connection is lost. Raises StartupError when samples stop."""
-        limit, began_ns = SPIN_UP_NS, self.clock.now_ns()
-        async for now_ns in self.clock.every(LOOK_NS):
+        limit, began_ns = SPIN_UP_TIMEOUT_NS, self.clock.now_ns()
+        async for now_ns in self.clock.every(CHECK_PERIOD_NS):
             if not self.link.connected or self.link.reconnects != connection:
                 return
             if self._samples_ns > began_ns:
-                limit, self._trouble = SILENT_NS, ""
+                limit, self._trouble = SAMPLE_TIMEOUT_NS, ""
             if now_ns - max(self._samples_ns, began_ns) > limit:
                 raise StartupError(f"the {self.name} on {self.link} answered, but sends no samples")
 
