@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 BAUD = 115_200
 PERIOD_NS = 20_000_000  # between two questions
 PUBLISH_EVERY = 2  # of them: 25 times a second
-STARTUP_NS = 1_000_000_000  # for the port to open and the first echo, in which nothing is said
+STARTUP_NS = 1_000_000_000  # for the port to open and the first echo, in which nothing is published
 RECHECK_S = 0.1  # between two looks at whether the robot is latched
 
 

@@ -35,7 +35,7 @@ UNREADABLE = Cause(
 
 Raised = dict[str, tuple[str, Cause]]  # by its code: who raised it, and the cause
 log = logging.getLogger(__name__)
-ON_TIME_NS = TICK_NS // 2  # so long after a tick at least, the next one is no longer late
+ON_TIME_NS = TICK_NS // 2  # a tick at least this long after the last is not late
 DISK_RETRY_TICKS = 50  # once a second: what the disk did not take is tried again
 Stop = Callable[[], Awaitable[None]]
 

@@ -134,7 +134,7 @@ class DriverProcess:
         self._sensors: list[tuple[Topic[Any], Message]] = []  # that wait for the next tick
         self._round_trip = RoundTrip()
         self._line = asyncio.Lock()  # one call at a time goes out to the body
-        self._sent = ZERO  # what it was told last
+        self._sent = ZERO  # the newest command to the body
         self._body_tick = 0  # when BODY was last published
         driver.emit = self._emit
         bus.report = self.report
@@ -190,7 +190,7 @@ class DriverProcess:
         """20 ms of the body's time, or several where the process was held up."""
         state = clipped(await self._driver.read_state())
         if self._wake.is_set():
-            await self._apply_command()  # the gate goes on from what the body has been told
+            await self._apply_command()  # the gate goes on from the body's newest command
         button = self._button.faults() if self._button else ()
         faults = button if state.link.connected else (why.LINK_LOST, *button)
         self._gatekeeper.ticks(passed, gate.Tick(state.velocity, self._wall_ns(), faults))

@@ -54,7 +54,7 @@ class LinkOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
 
     driver: str
     scan: ScanOptions | None = None  # a lidar that the driver carries, see lidars.base.open_lidar
-    lidar: Lidar | None = None  # what it measures, where that is not what the body's file says
+    lidar: Lidar | None = None  # overrides the lidar of the body's file
 
 
 class Run(Struct, frozen=True, kw_only=True):

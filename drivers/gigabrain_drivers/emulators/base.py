@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 MAX_SNAPSHOTS = 25  # of 10 ms
 
-MAX_SAMPLES_S = 0.5  # samples of so long are kept when nobody takes them
+MAX_SAMPLES_S = 0.5  # samples are kept for this long when no device reads them
 
 
 class Snapshot(NamedTuple):
@@ -50,7 +50,7 @@ class Snapshot(NamedTuple):
 class Broken(NamedTuple):
     """Faults of the body itself, whatever its electronics do."""
 
-    runaway: float = 0.0  # [m/s], what the wheels do whatever they are told
+    runaway: float = 0.0  # [m/s], of the wheels, whatever is commanded
     stuck_wheel: bool = False  # the first one does not turn
     frozen_values: bool = False  # what it measures no longer changes
 
@@ -72,7 +72,7 @@ class EmulatedBody:
         self._commanded = (0.0, 0.0, 0.0)
         self._gait: Gait | None = None  # instead of a velocity
         self._cpu_s = 0.0
-        self._moved_ns = 0  # when the motors were last told to move
+        self._moved_ns = 0  # time of the last command to move
         self._faulted_ns = 0  # when what is wrong with it last changed
         self._broken = Broken()
         self.snapshot = self._measure_all()
@@ -223,7 +223,7 @@ class Device(abc.ABC):
     Options: ClassVar[type[Struct]]  # those of the driver or scan source that it answers
     baud: ClassVar[int | None] = None  # of its line; None: as fast as the host
     period_s: ClassVar[float] = 0.01  # between two steps
-    watchdog_ns: ClassVar[int] = 150_000_000  # without a command, until its motors are told zero
+    watchdog_ns: ClassVar[int] = 150_000_000  # from the last command until its motors stop
     promised_in: ClassVar[str] = "the rule for firmware"  # where its makers say so
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:

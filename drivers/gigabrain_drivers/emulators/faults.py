@@ -27,17 +27,17 @@ VALUE_HINTS = {  # what is expected of those that take one
 class Faults(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The present faults of a device. Written as JSON, or as words such as `silence`."""
 
-    silence: bool = False  # nothing that it sends arrives; it still hears
+    silence: bool = False  # nothing that it sends arrives; it still receives
     deaf: bool = False  # nothing that is sent to it arrives; it still talks
     frozen: bool = False  # its line hangs: no answer, bytes pile up; the motors' watchdog goes on
     garbage: Chance = 0.0  # of each piece that it sends to be preceded by random bytes
     bit_errors: Chance = 0.0  # of each byte, both ways, to arrive with one bit flipped
     half_frames: Chance = 0.0  # of each piece that it sends to be cut in two and lose the rest
     unplugged: bool = False  # the port is gone
-    reboot: bool = False  # held in reset, motors off; afterwards it boots and says its banner
+    reboot: bool = False  # held in reset, motors off; afterwards it boots and sends its banner
     brown_out: NonNegative = 0.0  # [V], by which its supply has fallen
     frozen_values: bool = False  # it reports as ever, but what it measures no longer changes
-    runaway: Finite = 0.0  # [m/s], what the wheels do whatever they are told
+    runaway: Finite = 0.0  # [m/s], of the wheels, whatever is commanded
     stuck_wheel: bool = False  # the first one does not turn
 
     def __str__(self) -> str:

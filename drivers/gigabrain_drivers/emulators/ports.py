@@ -13,8 +13,8 @@ from gigabrain_zenoh.host.posix import tty
 
 BITS_PER_BYTE = 10  # 8N1: start, eight, stop
 READ_BYTES = 4096
-HOST = "127.0.0.1"  # an emulated body is nobody else's to drive
-CLIENT_TIMEOUT_NS = 1_000_000_000  # a client that says nothing for so long makes way for another
+HOST = "127.0.0.1"  # an emulated body is for this machine only
+CLIENT_TIMEOUT_NS = 1_000_000_000  # a client that is silent for longer gives way to another
 
 
 class Pty:

@@ -19,7 +19,7 @@ from gigabrain_zenoh.runtime.heartbeat import Progress
 
 log = logging.getLogger(__name__)
 
-POLL_S = 0.05  # how often the file with the faults is looked at
+POLL_S = 0.05  # between two looks at the file with the faults
 FAULTS_FILE = "faults.json"  # {STATION: {FAULT: VALUE}}, in the folder of the ports
 
 

@@ -26,7 +26,7 @@ MAX_STRIDE_M = 0.25  # [m], ahead or sideways, in one cycle
 MAX_TURN_RAD = 0.6  # [rad] in one cycle
 GRAVITY = 9.81  # [m/s2]
 FEET_TIME_CONSTANT_S = 0.04  # how long the legs need to overrule the accelerometer
-MAX_SAMPLE_GAP_S = 0.1  # a longer gap between two samples counts as so long
+MAX_SAMPLE_GAP_S = 0.1  # a longer gap between two samples counts as this
 
 
 def by_leg(values: Sequence[float]) -> tuple[Vector, ...]:

@@ -60,7 +60,7 @@ class Trot:
     def step(self, gait: Gait, senses: Senses, passed_s: float) -> tuple[Vector, ...]:
         """The position targets of each leg's joints [rad] for the next `passed_s`."""
         if self.fallen:
-            return senses.joints  # limp: legs that go on thrashing help nobody
+            return senses.joints  # limp: legs must not go on thrashing
         roll, pitch = senses.tilt()
         twist = self._follow(gait, passed_s)
         rolling, pitching, _ = senses.angular_velocity

@@ -39,7 +39,7 @@ class ScanSource(abc.ABC):
     """
 
     Options: ClassVar[type[ScanOptions]] = ScanOptions  # its part of a robot's file
-    turns_hz: ClassVar[float | None] = None  # turns a second, where nobody can change them
+    turns_hz: ClassVar[float | None] = None  # turns a second, where they are fixed
     samples_hz: ClassVar[float | None] = None  # samples a second, where that is known
 
     def __init__(self, options: Any, lidar: Lidar, clock: Clock) -> None:

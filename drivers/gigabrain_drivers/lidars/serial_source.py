@@ -20,9 +20,9 @@ _LDS01 = re.compile(rb"\xfa[\xa0-\xdb].{40}\xfa[\xa0-\xdb]", re.DOTALL)
 _COIN_D4 = re.compile(rb"\xaa\x55.{8}", re.DOTALL)
 
 log = logging.getLogger(__name__)
-CHECK_PERIOD_NS = 100_000_000  # how often it is looked at whether scans come
-LOG_AFTER_NS = 2_000_000_000  # without a scan, until something is said
-REOPEN_NS = 5_000_000_000  # without a scan, until the port is opened anew
+CHECK_PERIOD_NS = 100_000_000  # between two checks for scans
+LOG_AFTER_NS = 2_000_000_000  # without a scan, until it is logged
+REOPEN_NS = 5_000_000_000  # without a scan, until the port is reopened
 GATHER_S = 0.01  # a turn takes ten times as long; its bytes come hundreds of times a second
 GATHER_BAUD = 460_800  # what comes faster fills the 4 KB of a port too soon
 FLUSH_S = 0.02

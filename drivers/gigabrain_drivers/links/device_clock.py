@@ -8,11 +8,11 @@ grows by less than MAX_DRIFT cannot be told from two clocks that differ.
 from collections import deque
 
 MAX_UNANSWERED = 64  # messages whose echo is waited for
-WINDOW_NS = 300_000_000  # late is what all data of so long are,
+WINDOW_NS = 300_000_000  # data are late by what all of this window are,
 MIN_WINDOW_SHARE = 0.8  # once this share of it has been seen
-SILENCE_MS = 500.0  # after so long without data the device may have been started anew,
+SILENCE_MS = 500.0  # without data, after which the device may have restarted,
 RESTART_MS = 1000.0  # and was, if they would else be later by more than this
-LATE_MS = 50.0  # from which on data count as late here, and tell nothing of the clocks' drift
+LATE_MS = 50.0  # from which on data are late, and show nothing of the clocks' drift
 MAX_DRIFT = 0.01  # of two clocks against each other; an RC oscillator is no better
 EARLY_MS = 100.0  # by which data may come too early, after a host that was held up
 MAX_ODD = 3  # stamps in a row that cannot be, until the clock counts as a new one

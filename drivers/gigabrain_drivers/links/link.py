@@ -20,10 +20,10 @@ Trace = Callable[[str, bytes], None]
 
 FIRST_RETRY_NS = 100_000_000
 MAX_RETRY_NS = 1_000_000_000
-AGE_CHECK_S = 0.02  # how often the age of the newest bytes is looked at, where silence has a limit
+AGE_CHECK_S = 0.02  # between two checks of the age of the newest bytes
 READ_BYTES = 65536
 
-LOG_AFTER_NS = 500_000_000  # without a word from the body, before something is said about it
+LOG_AFTER_NS = 500_000_000  # of silence, before it is logged
 
 
 class LinkProblem(Exception):
@@ -36,8 +36,8 @@ class Link(abc.ABC):
     A subclass knows how to connect; everything else is here. All callbacks run on the loop.
     """
 
-    quiet_ns: int | None = None  # after so long without a byte, the peer counts as lost
-    gather_s = 0.0  # bytes that come within so long are taken together; each wake-up has its price
+    quiet_ns: int | None = None  # without a byte, after which the peer counts as lost
+    gather_s = 0.0  # bytes within this time are read together; each wake-up costs
 
     def __init__(self, clock: Clock) -> None:
         self.on_bytes: Callable[[bytes], None] = _ignore

@@ -205,7 +205,7 @@ class MujocoDriver(Driver):
         if last:
             self._account = run_report(self._simulation, self.robot, self.run)
             return Reading(self._imu(), state=self._read_state())
-        # a lidar keeps no step with the states: between two of them nobody else needs a core
+        # a lidar is not synchronous with the states; between two of them the cores are idle
         due = self._ticks >= self._next_scan
         if due:
             self._next_scan += self._scan_ticks

@@ -12,7 +12,7 @@ from gigabrain_drivers.sim.world import Footprint, Pose
 
 NEW_CONTACT_STEPS = 500_000_000 // STEP_NS  # contact again after half a second is a new contact
 CLEARANCE_STEPS = 100_000_000 // STEP_NS
-MAX_CLEARANCE_M = 10.0  # clearances beyond this are not told apart
+MAX_CLEARANCE_M = 10.0  # larger clearances count as this
 
 
 class Truth:

@@ -137,7 +137,7 @@ class World:
     wall_height: float = WALL_HEIGHT
     floor: tuple[Colour, Colour] = ((0.62, 0.66, 0.70), (0.58, 0.62, 0.66))  # its two checks
     check: tuple[float, float] = (0.5, 0.5)  # size of one
-    path: Corners = ()  # the person's, closed; empty: nobody is there
+    path: Corners = ()  # the person's, closed; empty: no person
     start: Pose = ORIGIN  # of the robot
     person_start: float = 0.0  # along the path [m]
 

@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 NO_VALID_FRAME = "no valid frame comes: is this the right port?"
 STATE_TIMEOUT_NS = 100_000_000  # without a state, and the body counts as lost
 FLUSH_NS = 10_000_000  # for the last command to arrive before the connection is closed
-MILLISECONDS = 1 << 32  # after which the firmware's clock begins anew
+MILLISECONDS = 1 << 32  # after which the firmware's clock wraps
 USUAL_ROUND_TRIP_MS = 30.0  # from a command to the state that echoes it
 
 
@@ -174,7 +174,7 @@ class AlphaDriver(Driver):
         if last:
             passed = (state.milliseconds - last[1]) % MILLISECONDS
             self._odometry.update(state.senses, passed / 1000)
-        if first:  # what lies stays so until somebody wants it to walk
+        if first:  # a body that lies stays down until a command to walk
             self._parked = bool(state.flags & alpha.PARKED)
             encode = alpha.encode_park if self._parked else alpha.encode_stop
             self.link.write(encode(self._next()))

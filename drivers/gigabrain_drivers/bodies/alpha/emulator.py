@@ -33,7 +33,7 @@ class Alpha(Device):
 
     def __init__(self, body: EmulatedBody, options: Any, wire: Wire) -> None:
         super().__init__(body, options, wire)
-        self.executed: deque[Gait] = deque(maxlen=MAX_EXECUTED)  # what the legs were told
+        self.executed: deque[Gait] = deque(maxlen=MAX_EXECUTED)  # commands to the legs
         self.reset()
 
     @classmethod

@@ -13,10 +13,10 @@ from gigabrain_schemas.body import Battery, BodyDescription, Joint
 WHEEL = "wheel_"
 
 VELOCITY_S = 0.05  # a velocity from positions is taken over so much time: one line is noise
-MAX_STEP_FACTOR = 3.0  # a step so many times longer than the body can go is no step ...
+MAX_STEP_FACTOR = 3.0  # a step this many times longer than the body can go is no step ...
 STEP_SLACK_M = 0.05  # ... but the lines' own unevenness is
 GAP_NS = 100_000_000  # without a line: the firmware may have restarted
-MAX_INTEGRATION_S = 0.2  # a speed says nothing of a longer time
+MAX_INTEGRATION_S = 0.2  # a speed is not integrated over a longer time
 STILL = Twist(0.0, 0.0, 0.0)
 ORIGIN = Pose(x=0.0, y=0.0, yaw=0.0)
 

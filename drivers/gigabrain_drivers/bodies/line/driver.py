@@ -162,7 +162,7 @@ class LineDriver(Driver):
             moves = self._report.update(values, now_ns)
             if (
                 moves and self._liveness.mark_received()
-            ):  # after a boot or a loss: at rest, whatever it was told
+            ):  # after a boot or a loss: at rest, whatever was commanded
                 self._sent_ns = 0
                 self._send_zero()
             self._log_flags()

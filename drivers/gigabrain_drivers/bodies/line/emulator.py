@@ -42,7 +42,7 @@ class LineBase(Device):
         self._state_ns = round(1e9 / options.state_hz)
         self._start = options.start.encode().strip()
         self._stop = options.stop.encode().strip()
-        self.executed: deque[Velocity] = deque(maxlen=MAX_EXECUTED)  # what the motors were told
+        self.executed: deque[Velocity] = deque(maxlen=MAX_EXECUTED)  # commands to the motors
         self._now_ns = 0
         self.reset()
 

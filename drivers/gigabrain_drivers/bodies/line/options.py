@@ -26,7 +26,7 @@ Rate = Annotated[float, Meta(ge=10, le=200)]
 
 BITS_PER_BYTE = 10  # 8N1
 
-MAX_STEP_SHARE = 0.1  # of the most that a body can do: the largest step in which it may be told
+MAX_STEP_SHARE = 0.1  # of the greatest speed: the largest step of a command
 WHEEL_PARTS = ("_position", "_velocity", "_effort", "_temperature")
 POSE = ("x", "y", "yaw")
 

@@ -22,7 +22,7 @@ _CRC8_TABLE = crc_table(0x07, bits=8)
 
 DRIVES = (Differential, Mecanum, Omni, Ackermann)
 WHEELS = tuple(dict.fromkeys(name for drive in DRIVES for name in drive.wheels))
-ANGLES = ("steering",)  # of WHEELS, those that are told an angle and not a speed
+ANGLES = ("steering",)  # of WHEELS, those whose command is an angle and not a speed
 IGNORED = "_"  # a number in a state line that means nothing to us
 UNITS = {
     "length": {"m": 1.0, "cm": 0.01, "mm": 0.001},

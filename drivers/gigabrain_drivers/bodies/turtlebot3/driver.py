@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 LOST_NS = 100_000_000  # without an answer it counts as lost,
 GIVE_UP_NS = 160_000_000  # and then its line is closed, with all that is still queued in it
 PING_PERIOD_NS = 100_000_000  # between two attempts to get an answer at all
-FIRST_ANSWER_TIMEOUT_NS = 1_000_000_000  # for the first answer, until the port is opened anew
+FIRST_ANSWER_TIMEOUT_NS = 1_000_000_000  # for the first answer, until the port is reopened
 LOG_AFTER_NS = 500_000_000  # after which a problem is spoken of
 ANSWER_TIMEOUT_S = 0.01  # how long the answer to a question is waited for
 ANSWER_BYTES = 14  # of the answer to a ping
@@ -51,7 +51,7 @@ COMMAND_TIMEOUT_NS = 80_000_000  # without a command; zero is then out by 100 ms
 FLUSH_S = 0.05  # how long the last zero is given to arrive before the port is closed
 JOINTS = ("wheel_left_joint", "wheel_right_joint")
 MAX_PUSHED_FACTOR = 1.5  # times as fast as it can drive a body may be pushed, and
-TURN_SLACK_RAD = 0.1  # [rad] more between two looks; counters that jump further were set anew
+TURN_SLACK_RAD = 0.1  # [rad] more between two readings; counters that jump further were reset
 MAX_IMU_VALUE = 1000.0  # [m/s2] and [rad/s], beyond which an inertial unit is talking nonsense
 
 

@@ -24,7 +24,7 @@ PROBE_BYTES = 300  # at least five frames
 PROBE_FRAMES = 3
 
 OFFSET_X, OFFSET_Y = 5.9, -20.14  # [mm], of the lens
-SLANT = 0.11923  # of the beam against the direction that the lidar tells
+SLANT = 0.11923  # of the beam against the reported direction
 
 
 class FrameBuffer(TurnBuffer[tuple[bytes, slice]]):

@@ -91,7 +91,7 @@ class Lds01(SerialSource):
             Spelling(as_one_frame, describe_command), Spelling(Lds01Decoder().feed, describe)
         )
         self._last: int | None = None  # number of the newest packet
-        self._active_ns = 0  # when it was last told to start, or last seen to turn
+        self._active_ns = 0  # time of the last start command or packet
 
     def connected(self) -> None:
         """Start it."""

@@ -52,7 +52,7 @@ class Lds03Packet(NamedTuple):
     """Samples in a row; `begins` a turn when the angle passes 0."""
 
     begins: bool
-    rate: float  # [Hz] of turns; only told where a turn begins, else 0
+    rate: float  # [Hz] of turns; only sent where a turn begins, else 0
     samples: tuple[Lds03Sample, ...]
 
 
@@ -166,7 +166,7 @@ class Lds03(SerialSource):
             Spelling(Lds03Decoder().feed, describe),
         )
         self._cleared = self._started = False
-        self._active_ns = 0  # when it was last told something, or last seen to turn
+        self._active_ns = 0  # time of the last command or packet
 
     def connected(self) -> None:
         """Leave it alone for a second; then `look` starts it."""

@@ -136,7 +136,7 @@ class RplidarDevice(Device):
                 self.reset()
             case rplidar.SET_PWM | rplidar.SET_SPEED if len(payload) == 2:
                 self._set_motor(command, int.from_bytes(payload, "little"))
-            case _ if self._mode is None:  # while it scans, it hears nothing else
+            case _ if self._mode is None:  # while it scans, it ignores all else
                 self._answer(command, payload)
 
     def _answer(self, command: int, payload: bytes) -> None:

@@ -16,7 +16,7 @@ from gigabrain_drivers.links.frames import xor_of
 
 TURN_Q6 = 360 << 6
 MAX_JUMP_DEG = 25.0  # between two nodes in step; their triangulation shifts them by up to 8
-FULL_TURN_DEG = 400.0  # no start of a turn for so long: its node was lost
+FULL_TURN_DEG = 400.0  # without the start of a turn: its node was lost
 MAX_WIDENING = 1.5  # a capsule this much wider than the last: one between them was lost
 
 _NODE = struct.Struct("<BHH")
@@ -37,7 +37,7 @@ class ScanFormat(abc.ABC):
 
     size: ClassVar[int]
     kind: ClassVar[int]  # its answer type
-    confirm: ClassVar[int] = 1  # so many blocks in a row make sure that the stream is in step
+    confirm: ClassVar[int] = 1  # blocks in a row that prove that the stream is in step
 
     @abc.abstractmethod
     def is_block(self, block: bytes) -> bool:

@@ -29,7 +29,7 @@ SPIN_UP_TIMEOUT_NS = 4_000_000_000  # from the request to scan to the first samp
 INFO_BYTES = 27  # its descriptor and itself
 SAMPLE_TIMEOUT_NS = 1_000_000_000  # then it is started again
 PWM = 660  # of 1023, the vendor's usual motor power
-STOP_S = 0.1  # the vendor waits so long after a stop
+STOP_S = 0.1  # as the vendor waits after a stop
 RESET_S = 2.0
 PWM_FAMILIES = range(2, 6)  # which may sit on a board that powers the motor
 CONF_FIRMWARE = (1, 24)  # from here on it can be asked for its scan modes; C1 and later always
@@ -48,7 +48,7 @@ KINDS = {"standard": rplidar.STANDARD, "express": rplidar.EXPRESS, "dense": rpli
 class RplidarOptions(ScanOptions, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The RPLIDAR's part of a robot's file."""
 
-    model: ModelName = "auto"  # says the baud rate; auto tries one after the other
+    model: ModelName = "auto"  # sets the baud rate; auto tries one after the other
     scan_mode: ScanMode = "auto"  # the lidar's own choice, where it is one of the other three
 
 
@@ -152,7 +152,7 @@ async def _on_board(line: Line, info: Info) -> bool:
         return False
     try:
         flags = await line.ask(rplidar.request(rplidar.GET_BOARD, bytes(4)), rplidar.BOARD)
-    except StartupError:  # there is nobody to answer where there is no board
+    except StartupError:  # without a board there is no answer
         return False
     return bool(flags[0] & 1)
 
