@@ -88,20 +88,26 @@ def straight(footprint: Corners, points: Floats, margin: float) -> tuple[float |
     front, rear, left, right = box(footprint)
     x, y = points[:, 0], points[:, 1]
     return (
-        _along(x, y, front, rear, right, left, margin),
-        _along(-x, y, -rear, -front, right, left, margin),
-        _along(y, x, left, right, rear, front, margin),
-        _along(-y, x, -right, -left, rear, front, margin),
+        _along(x, y, (rear, front), (right, left), margin),
+        _along(-x, y, (-front, -rear), (right, left), margin),
+        _along(y, x, (right, left), (rear, front), margin),
+        _along(-y, x, (-left, -right), (rear, front), margin),
     )
 
 
 def _along(
-    ahead: Floats, across: Floats, front: float, rear: float, low: float, high: float, margin: float
+    ahead: Floats,
+    across: Floats,
+    length: tuple[float, float],
+    width: tuple[float, float],
+    margin: float,
 ) -> float | None:
-    """Return the shortest distance from `front` to a point in the strip from `low` to `high`.
+    """Return the shortest distance from the body's front to a point in the strip ahead of it.
 
-    A point inside the footprint counts as ahead or behind, by the half that it is in.
+    The body covers `length` along the strip and `width` across. A point inside the footprint counts
+    as ahead or behind, by the half that it is in.
     """
+    (rear, front), (low, high) = length, width
     strip = (across >= low - margin) & (across <= high + margin)
     inside = (ahead > 0) & (ahead <= front) & (across >= low) & (across <= high)
     inside &= ahead >= rear
@@ -120,8 +126,8 @@ def turning(
     angles = _steps(min(reach, math.tau), STEP / outer)
     still = np.zeros_like(angles)
     return (
-        _free(footprint, near, margin, angles, still, still, angles),
-        _free(footprint, near, margin, angles, still, still, -angles),
+        _free(footprint, near, margin, angles, (still, still, angles)),
+        _free(footprint, near, margin, angles, (still, still, -angles)),
     )
 
 
@@ -150,7 +156,7 @@ def arc(
     else:
         sine, cosine = np.sin(yaw) / w, (1.0 - np.cos(yaw)) / w
     x, y = vx * sine - vy * cosine, vx * cosine + vy * sine
-    return _free(footprint, near, margin, ways, x, y, yaw)
+    return _free(footprint, near, margin, ways, (x, y, yaw))
 
 
 def _steps(reach: float, step: float) -> Floats:
@@ -163,17 +169,17 @@ def _free(
     points: Floats,
     margin: float,
     ways: Floats,
-    x: Floats,
-    y: Floats,
-    yaw: Floats,
+    poses: tuple[Floats, Floats, Floats],
 ) -> float | None:
-    """Return the last of `ways` (k,) before the footprint at pose (x, y, yaw) (k,) touches a point.
+    """Return the last of `ways` (k,) before the footprint touches a point.
+
+    Its `poses` there are x, y and yaw, (k,) each.
 
     A point within the margin from the start is touched when the body comes closer to it. Points
     inside the footprint are ignored here, or the body could never turn away from them. The straight
     directions check those.
     """
-    hull = edges(footprint)
+    hull, (x, y, yaw) = edges(footprint), poses
     begin = depth(hull, points)
     points, begin = points[begin > NEARER], begin[begin > NEARER]
     if not len(points):

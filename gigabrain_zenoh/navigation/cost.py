@@ -13,8 +13,9 @@ from gigabrain_zenoh.navigation.footprint import (
     ROOM,
     STRETCH,
     UNSURE,
-    Grid,
+    DistanceGrid,
     Outline,
+    Placement,
     between,
     clearance_of,
     distance_at,
@@ -58,10 +59,10 @@ SPARE = 0.003  # [m], less room than at the start is a contact only from here on
 
 
 class Scene(NamedTuple):
-    """All that is round the body."""
+    """Everything around the body, and the goal."""
 
-    grid: Grid  # distances to what stands still
-    field: Grid  # cost to go [m]
+    grid: DistanceGrid  # distances to what stands still
+    field: DistanceGrid  # cost to go [m]
     discs: Floats  # (m, 6): x, y [m], velocity x, y [m/s], radius [m] and its growth [m/s]
     goal_x: float  # [m]
     goal_y: float
@@ -89,17 +90,44 @@ class Weights(NamedTuple):
     trust: float = 0.0  # [s], over which what is foreseen of them fades; 0 where it does not
 
 
+class Problem(NamedTuple):
+    """Everything that the cost of a plan depends on."""
+
+    model: MotionModel
+    outline: Outline
+    weights: Weights
+    scene: Scene
+    dt: float  # [s], of a step
+
+
+class MotionState(NamedTuple):
+    """Pose and velocity of a body at one step."""
+
+    at: Placement
+    yaw: float  # [rad]
+    vx: float  # [m/s]
+    vy: float
+    w: float  # [rad/s]
+
+
+@lean_kernel
+def motion_of(state: Floats, lane: int) -> MotionState:
+    """Return one lane of a `state` (STATE,)."""
+    at = Placement(state[X + lane], state[Y + lane], state[COSINE + lane], state[SINE + lane])
+    return MotionState(at, state[YAW + lane], state[VX + lane], state[VY + lane], state[W + lane])
+
+
 @lean_kernel
 def of_place(
-    weights: Weights, scene: Scene, room: float, away: float, x: float, y: float, yaw: float
+    weights: Weights, scene: Scene, room: float, away: float, motion: MotionState
 ) -> float:
-    """What it costs to be here for a second, with obstacles and moving things so far away [m]."""
+    """Return the cost of a second here, `room` [m] from obstacles and `away` [m] from discs."""
     cost = 0.0
     if room < ROOM:
         cost += weights.near * exponential((weights.margin - room) / weights.near_over)
     if away < NO_DISC and weights.trust == 0.0:
         cost += weights.disc * math.exp(-away / weights.disc_over)
-    return cost + of_time(scene, x, y, yaw)
+    return cost + of_time(scene, motion.at.x, motion.at.y, motion.yaw)
 
 
 @lean_kernel
@@ -148,18 +176,17 @@ def of_motion(weights: Weights, room: float, vx: float, vy: float, w: float) -> 
 
 
 @lean_kernel
-def of_braking(
-    model: MotionModel, outline: Outline, scene: Scene, room: float, x: float, y: float,
-    cosine: float, sine: float, vx: float, vy: float,
-) -> float:  # fmt: skip
-    """What it costs to be faster for a second than what is ahead allows: safety would step in."""
+def of_braking(problem: Problem, room: float, motion: MotionState) -> float:
+    """Return the cost of a second faster than the free way ahead allows; safety would intervene."""
+    model, vx, vy = problem.model, motion.vx, motion.vy
     speed = math.sqrt(vx * vx + vy * vy)
     brake, t = model.deceleration, model.reaction_time
     needs = speed * t + speed * speed / (2.0 * brake) + model.margin
     if speed < SLOW or room >= needs:
         return 0.0
     sign = 1.0 if vx >= 0.0 else -1.0
-    free = free_ahead(scene.grid, outline, x, y, cosine, sine, sign, model.side_margin, needs)
+    grid, side = problem.scene.grid, model.side_margin
+    free = free_ahead(grid, problem.outline, motion.at, sign, side, needs)
     allowed = math.sqrt((brake * t) ** 2 + 2.0 * brake * max(0.0, free - model.margin)) - brake * t
     over = max(0.0, speed - allowed) / model.forward
     return TOO_FAST * over * over
@@ -174,7 +201,7 @@ def rest(model: MotionModel, scene: Scene, x: float, y: float) -> float:
 
 
 @lean_kernel
-def distance_in(field: Grid, x: float, y: float) -> float:
+def distance_in(field: DistanceGrid, x: float, y: float) -> float:
     """The cost to go from (x, y) [m]; beyond the rim that of the rim."""
     rows, columns = field.distance.shape
     cell = field.cell
@@ -184,14 +211,13 @@ def distance_in(field: Grid, x: float, y: float) -> float:
 
 
 @lean_kernel
-def of_end(
-    model: MotionModel, weights: Weights, scene: Scene, x: float, y: float, yaw: float,
-    cosine: float, sine: float, vx: float, vy: float,
-) -> float:  # fmt: skip
-    """What is left to do after the last step: to turn to the way, to drive it, to turn at its end.
+def of_end(problem: Problem, motion: MotionState) -> float:
+    """Return the cost to go after the last step: turn to the way, drive it, turn at its end.
 
-    A body that has all but arrived only has to stand, with the right yaw.
+    A body that has nearly arrived only has to stop, with the right yaw.
     """
+    model, weights, scene = problem.model, problem.weights, problem.scene
+    (x, y, cosine, sine), yaw, vx, vy = motion.at, motion.yaw, motion.vx, motion.vy
     cost = rest(model, scene, x, y)
     dx, dy = scene.goal_x - x, scene.goal_y - y
     near = math.hypot(dx, dy) < NEAR_GOAL
@@ -241,7 +267,7 @@ def near_discs(
         over = weights.disc_over + weights.disc_lead * math.sqrt(vx * vx + vy * vy)
         room = DECAYS * over if fades else DISC_ROOM
         if _any_near(state, x, y, outline.far + radius + room):
-            _add_disc(outline, x, y, radius, room, 1.0 / over if fades else 0.0, state)
+            _add_disc(outline, (x, y, radius), room, 1.0 / over if fades else 0.0, state)
     if fades:
         for lane in range(LANES):
             state[CLOSE + lane] *= weights.disc
@@ -258,9 +284,10 @@ def _any_near(state: Floats, x: float, y: float, reach: float) -> bool:
 
 @lean_kernel
 def _add_disc(
-    outline: Outline, x: float, y: float, radius: float, room: float, decay: float, state: Floats
+    outline: Outline, disc: tuple[float, float, float], room: float, decay: float, state: Floats
 ) -> None:
-    """One disc more. What is farther from it than `room` [m] takes no notice."""
+    """Add a `disc` (x, y, radius) [m] to AWAY and CLOSE of the bodies within `room` [m] of it."""
+    x, y, radius = disc
     reach = outline.far + radius + room
     for lane in range(LANES):
         dx, dy = x - state[X + lane], y - state[Y + lane]
@@ -276,12 +303,13 @@ def _add_disc(
 
 
 @lean_kernel
-def look_round(weights: Weights, outline: Outline, scene: Scene, dt: float, states: Floats) -> None:
-    """Fill in what is round the bodies in `states` (T + 1, STATE), and what that costs at least.
+def look_round(problem: Problem, states: Floats) -> None:
+    """Fill in the surroundings of the bodies in `states` (T + 1, STATE), and their least cost.
 
-    MIDDLE takes how far an obstacle is from the body's middle [m], SURE what a second there costs
-    without anything that moves, AWAY and CLOSE what `near_discs` says.
+    MIDDLE becomes the distance of the body's middle to an obstacle [m], SURE the cost of a second
+    there without discs, AWAY and CLOSE the results of `near_discs`.
     """
+    _, outline, weights, scene, dt = problem
     grid, per_cell = scene.grid, 1.0 / scene.grid.cell
     for t in range(states.shape[0]):
         state = states[t]
@@ -310,31 +338,24 @@ def rooms_of(scene: Scene, outline: Outline, states: Floats, rooms: Floats) -> N
     for t in range(len(rooms)):
         one = states[t]
         found = clearance_of(
-            scene.grid, outline, one[X], one[Y], one[COSINE], one[SINE], one[MIDDLE], int(NONE)
+            scene.grid, outline, motion_of(one, int(NONE)).at, one[MIDDLE], int(NONE)
         )
         rooms[t] = found[0]
 
 
 @lean_kernel
-def price(
-    model: MotionModel, outline: Outline, weights: Weights, scene: Scene, dt: float, rooms: Floats,
-    states: Floats, lane: int, limit: float,
-) -> float:  # fmt: skip
-    """The cost of going through a lane's `states`, or inf as soon as it is clear that it reaches
-    `limit`. `rooms` are those of `rooms_of`.
+def price(problem: Problem, rooms: Floats, states: Floats, lane: int, limit: float) -> float:
+    """Return the cost of a lane's `states`, or inf as soon as it must reach `limit`.
+
+    `rooms` are the result of `rooms_of`.
     """
+    model, outline, weights, scene, dt = problem
     least = min(weights.margin, rooms[0] - SPARE)
     least_disc = min(weights.disc_margin, states[0, AWAY + lane] - SPARE)
-    last = states[-1]
-    end = of_end(
-        model, weights, scene, last[X + lane], last[Y + lane], last[YAW + lane],
-        last[COSINE + lane], last[SINE + lane], last[VX + lane], last[VY + lane],
-    )  # fmt: skip
+    end = of_end(problem, motion_of(states[-1], lane))
     to_come = -math.inf
     if limit < math.inf:
-        touching, passing = _at_least(
-            model, outline, weights, scene, dt, states, lane, (least, least_disc)
-        )
+        touching, passing = _at_least(problem, states, lane, (least, least_disc))
         to_come = passing + end if touching >= limit else -math.inf
         if min(touching, passing + end) >= limit:
             return math.inf
@@ -345,8 +366,8 @@ def price(
         if cost + to_come >= limit:
             return math.inf
         one = states[t]
-        x, y, vx, vy = one[X + lane], one[Y + lane], one[VX + lane], one[VY + lane]
-        cosine, sine = one[COSINE + lane], one[SINE + lane]
+        motion = motion_of(one, lane)
+        x, y, vx, vy = motion.at.x, motion.at.y, motion.vx, motion.vy
         slack -= one[MOVED + lane]
         looked = slack < 0.0 and not (looked and room - one[MOVED + lane] > least)
         if looked:
@@ -354,7 +375,7 @@ def price(
                 room = rooms[t]
             else:
                 room, touches = clearance_of(
-                    scene.grid, outline, x, y, cosine, sine, one[MIDDLE + lane], touches
+                    scene.grid, outline, motion.at, one[MIDDLE + lane], touches
                 )
             slack = room - AT_EASE
         away = one[AWAY + lane]
@@ -364,12 +385,11 @@ def price(
         if away < least_disc:
             return cost + of_contact(weights, t * dt, t / steps) + rest(model, scene, x, y)
         cost += dt * one[CLOSE + lane]
-        cost += dt * of_place(weights, scene, room, away, x, y, one[YAW + lane])
-        cost += dt * of_motion(weights, room, vx, vy, one[W + lane])
+        cost += dt * of_place(weights, scene, room, away, motion)
+        cost += dt * of_motion(weights, room, vx, vy, motion.w)
         to_come -= dt * (one[SURE + lane] + one[CLOSE + lane])
         if t % BRAKE_EVERY == 1:
-            braking = of_braking(model, outline, scene, room, x, y, cosine, sine, vx, vy)
-            cost += dt * BRAKE_EVERY * braking
+            cost += dt * BRAKE_EVERY * of_braking(problem, room, motion)
     return cost + end
 
 
@@ -381,14 +401,14 @@ def _of_touch(share: float) -> float:
 
 @lean_kernel
 def _at_least(
-    model: MotionModel, outline: Outline, weights: Weights, scene: Scene, dt: float, states: Floats,
-    lane: int, least: tuple[float, float],
-) -> tuple[float, float]:  # fmt: skip
-    """What a lane costs at least with a contact, and without one but for its end; inf for never.
+    problem: Problem, states: Floats, lane: int, least: tuple[float, float]
+) -> tuple[float, float]:
+    """Return lower bounds of a lane's cost with a contact, and without one nor its end.
 
-    A contact is possible where the middle of the body is so near to an obstacle that it may, and
-    comes at the latest where it is well inside: what the plan would be worth behind says nothing.
+    They are inf where that is impossible. A contact may come where the middle of the body is near
+    an obstacle, and must have come where it is well inside one: the plan beyond does not count.
     """
+    model, outline, weights, scene, dt = problem
     may = least[0] + STRETCH * outline.outer + UNSURE * scene.grid.cell
     must = outline.inner + min(0.0, least[0])
     steps = states.shape[0] - 1

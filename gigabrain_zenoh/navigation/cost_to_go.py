@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
-from gigabrain_zenoh.navigation.footprint import Grid, between
+from gigabrain_zenoh.navigation.footprint import DistanceGrid, between
 
 COARSER = 2  # cells of the window per cell of the field, along each axis
 FARTHEST = 1e4  # [m], what cannot be reached
@@ -30,8 +30,8 @@ Units = NDArray[np.int32]
 class Ways(NamedTuple):
     """What passes round the robot makes of the ways there, on a coarse grid that goes farther."""
 
-    price: Grid  # of a metre, 1 where nothing passes
-    field: Grid  # cost to go [m of free way]
+    price: DistanceGrid  # of a metre, 1 where nothing passes
+    field: DistanceGrid  # cost to go [m of free way]
 
 
 class CostToGo:
@@ -45,9 +45,9 @@ class CostToGo:
         self._spans = np.empty((3, side + 2), dtype=np.int32)
 
     def field(
-        self, grid: Grid, half_width: float, goal: tuple[float, float], path: Floats | None,
+        self, grid: DistanceGrid, half_width: float, goal: tuple[float, float], path: Floats | None,
         ways: Ways | None = None,
-    ) -> Grid:  # fmt: skip
+    ) -> DistanceGrid:  # fmt: skip
         """Cost from each place to the goal [m of free way], or to where the path leaves the window.
 
         Without a path, and with the goal outside, every place at the rim counts on free way beyond,
@@ -64,7 +64,7 @@ class CostToGo:
                 _seed_rim(inner, cell, grid.x - ways.price.x, grid.y - ways.price.y, ways)
         sweep(self._halves, self._padded, self._spans)
         np.multiply(self._padded[:, 1:-1], np.float32(UNIT), out=self._field, casting="unsafe")
-        return Grid(self._field, cell, grid.x, grid.y)
+        return DistanceGrid(self._field, cell, grid.x, grid.y)
 
 
 def seed(

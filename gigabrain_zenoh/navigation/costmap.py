@@ -232,7 +232,8 @@ def _fill(cost: Costs, cells: Cells, rules: Inflation, resolution: float, box: B
     wide = _wider(box, reach, cells.shape)
     part = np.ascontiguousarray(cells[wide[0] : wide[1], wide[2] : wide[3]])
     squares, table = squared_distance(part, reach), _table(rules, resolution, reach)
-    _price(cells, squares, wide, box, table, np.float32(UNKNOWN_COSTS[rules.unknown]), cost)
+    unknown = np.float32(UNKNOWN_COSTS[rules.unknown])
+    _look_up(cells, (squares, wide), (table, unknown), box, cost)
 
 
 def _table(rules: Inflation, resolution: float, reach: int) -> Costs:
@@ -249,16 +250,15 @@ def _table(rules: Inflation, resolution: float, reach: int) -> Costs:
 
 
 @kernel
-def _price(
+def _look_up(
     cells: Cells,
-    squares: Singles,
-    wide: Box,
+    squares_in_box: tuple[Singles, Box],
+    prices: tuple[Costs, np.float32],
     box: Box,
-    table: Costs,
-    unknown: np.float32,
     out: Costs,
 ) -> None:
-    """Fill `box` of `out`; `squares` are those of the box `wide`."""
+    """Fill `box` of `out` by squared distances, at `prices` by square and of unknown space."""
+    (squares, wide), (table, unknown) = squares_in_box, prices
     lethal = np.float32(LETHAL)
     for row in range(box[0], box[1]):
         for column in range(box[2], box[3]):

@@ -14,7 +14,7 @@ from gigabrain_schemas.base import TICK_NS
 from gigabrain_zenoh.kernels.jit import kernel
 from gigabrain_zenoh.navigation.cost import Weights
 from gigabrain_zenoh.navigation.cost_to_go import FARTHEST, UNIT, Ways, seed, sweep
-from gigabrain_zenoh.navigation.footprint import Grid
+from gigabrain_zenoh.navigation.footprint import DistanceGrid
 from gigabrain_zenoh.navigation.motion_model import MotionModel
 
 QUICK_BODY_SPEED = 1.0  # [m/s], a body that can go faster is quick
@@ -128,7 +128,7 @@ class TrafficMap:
         seed(self._padded[:, 1:-1], CELL_M, corner, goal, None)
         sweep(self._halves, self._padded, self._spans)
         field = (self._padded[:, 1:-1] * UNIT).astype(np.float32)
-        return Ways(Grid(price, CELL_M, *corner), Grid(field, CELL_M, *corner))
+        return Ways(DistanceGrid(price, CELL_M, *corner), DistanceGrid(field, CELL_M, *corner))
 
     def _follow(self, x: float, y: float) -> None:
         """Keep the robot in the middle; what leaves the map is forgotten."""

@@ -37,7 +37,16 @@ class Outline(NamedTuple):
     far: float  # [m], how far it reaches from the body's origin
 
 
-class Grid(NamedTuple):
+class Placement(NamedTuple):
+    """Pose of a body, its heading as cosine and sine."""
+
+    x: float  # [m]
+    y: float
+    cosine: float
+    sine: float
+
+
+class DistanceGrid(NamedTuple):
     """Distances to the nearest obstacle, bilinear between the centers of cells."""
 
     distance: Singles  # (rows, columns) [m]
@@ -71,7 +80,7 @@ def outline_of(footprint: Corners) -> Outline:
 
 
 @lean_kernel
-def distance_at(grid: Grid, x: float, y: float) -> float:
+def distance_at(grid: DistanceGrid, x: float, y: float) -> float:
     """The distance [m] from (x, y) to the nearest obstacle."""
     per_cell = 1.0 / grid.cell
     return between(grid.distance, (x - grid.x) * per_cell - 0.5, (y - grid.y) * per_cell - 0.5)
@@ -92,66 +101,65 @@ def between(distance: Singles, u: float, v: float) -> float:
 
 
 @lean_kernel
-def clearance(
-    grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float
-) -> float:
-    """How far the outline at a pose is from the nearest obstacle [m]; below 0 with one inside.
+def clearance(grid: DistanceGrid, outline: Outline, at: Placement) -> float:
+    """Return the distance of the outline to the nearest obstacle [m]; below 0 with one inside.
 
     More than ROOM counts as ROOM.
     """
-    middle = middle_of(grid, outline, x, y, cosine, sine)
-    return clearance_of(grid, outline, x, y, cosine, sine, middle, int(NONE))[0]
+    return clearance_of(grid, outline, at, middle_of(grid, outline, at), int(NONE))[0]
 
 
 @lean_kernel
 def clearance_of(
-    grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float, middle: float,
-    first: int,
-) -> tuple[float, int]:  # fmt: skip
-    """The clearance, and the group of points that has it: looked at `first`, it spares others.
+    grid: DistanceGrid, outline: Outline, at: Placement, middle: float, first: int
+) -> tuple[float, int]:
+    """Return the clearance, and the group of points that has it.
 
-    `middle` is that of `middle_of`.
+    Groups are compared from `first` on, so that a good guess spares others. `middle` is the result
+    of `middle_of`.
     """
     if middle >= outline.outer + ROOM:
         return ROOM, first
     nearest = min(ROOM, middle - outline.inner) if middle < outline.inner else ROOM
-    found, group = _nearest(grid, outline, x, y, cosine, sine, np.float32(nearest), first)
+    found, group = _nearest(grid, outline, at, np.float32(nearest), first)
     return min(nearest, found), group
 
 
 @lean_kernel
-def middle_of(
-    grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float
-) -> float:
-    """How far the middle of the body's box is from the nearest obstacle [m]."""
+def middle_of(grid: DistanceGrid, outline: Outline, at: Placement) -> float:
+    """Return the distance of the middle of the body's box to the nearest obstacle [m]."""
+    x, y, cosine, sine = at
     center_x = x + cosine * outline.center_x - sine * outline.center_y
     center_y = y + sine * outline.center_x + cosine * outline.center_y
     return distance_at(grid, center_x, center_y)
 
 
+CellPlacement = tuple[np.float32, np.float32, np.float32, np.float32]  # column, row, cosine, sine
+
+
 @lean_kernel
 def _nearest(
-    grid: Grid, outline: Outline, x: float, y: float, cosine: float, sine: float,
-    nearest: np.float32, first: int,
-) -> tuple[float, int]:  # fmt: skip
-    """The least distance [m] of all points, if below `nearest`, and whose group it is.
+    grid: DistanceGrid, outline: Outline, at: Placement, nearest: np.float32, first: int
+) -> tuple[float, int]:
+    """Return the least distance [m] of all points, if below `nearest`, and its group.
 
-    A group is left out when what its middle says leaves no room for anything nearer.
+    A group is left out when the distance of its middle leaves no room for anything nearer.
     """
+    x, y, cosine, sine = at
     groups, cells, per_cell = outline.groups, grid.distance, 1.0 / grid.cell
     u, v = np.float32((x - grid.x) * per_cell - 0.5), np.float32((y - grid.y) * per_cell - 0.5)
-    c, s = np.float32(cosine * per_cell), np.float32(sine * per_cell)
+    placed = (u, v, np.float32(cosine * per_cell), np.float32(sine * per_cell))
     half, unsure = np.float32(0.5), np.float32(UNSURE * grid.cell)
     best = first
-    nearest = _of_group(cells, groups[first], u, v, c, s, nearest)
+    nearest = _of_group(cells, groups[first], placed, nearest)
     for n in range(len(groups)):
         if n == first:
             continue
         group = groups[n]
-        column, row = _inside(cells, group[1], group[4], u, v, c, s)
+        column, row = _inside(cells, group[1], group[4], placed)
         there = cells[np.uint32(row + half), np.uint32(column + half)]
         if there - np.float32(STRETCH) * group[6] - unsure < nearest:
-            found = _of_group(cells, group, u, v, c, s, nearest)
+            found = _of_group(cells, group, placed, nearest)
             best = n if found < nearest else best
             nearest = found
     return float(nearest), best
@@ -159,16 +167,15 @@ def _nearest(
 
 @lean_kernel
 def _of_group(
-    cells: Singles, group: Singles, u: np.float32, v: np.float32, c: np.float32, s: np.float32,
-    nearest: np.float32,
-) -> np.float32:  # fmt: skip
-    """The least of `nearest` and the distances [m] of the points of a group, for a body at (u, v).
+    cells: Singles, group: Singles, placed: CellPlacement, nearest: np.float32
+) -> np.float32:
+    """Return the least of `nearest` and the distances [m] of the points of a group.
 
     A point beyond the window counts as if it were on its rim.
     """
     one = np.uint32(1)  # unsigned: numba need not look for indices from the end
     for n in range(GROUP):
-        column, row = _inside(cells, group[n], group[n + GROUP], u, v, c, s)
+        column, row = _inside(cells, group[n], group[n + GROUP], placed)
         i, j = np.uint32(row), np.uint32(column)
         a, b = row - np.float32(i), column - np.float32(j)
         low = cells[i, j] + b * (cells[i, j + one] - cells[i, j])
@@ -180,32 +187,25 @@ def _of_group(
 
 @lean_kernel
 def _inside(
-    cells: Singles, x: np.float32, y: np.float32, u: np.float32, v: np.float32, c: np.float32,
-    s: np.float32,
-) -> tuple[np.float32, np.float32]:  # fmt: skip
-    """Where the point (x, y) of a body at (u, v) is, in cells; on the rim for one beyond it."""
-    zero = np.float32(0)
+    cells: Singles, x: np.float32, y: np.float32, placed: CellPlacement
+) -> tuple[np.float32, np.float32]:
+    """Return column and row of the point (x, y) of a body; on the rim for one beyond it."""
+    (u, v, c, s), zero = placed, np.float32(0)
     last_u, last_v = np.float32(cells.shape[1] - 2), np.float32(cells.shape[0] - 2)
     return min(max(u + c * x - s * y, zero), last_u), min(max(v + s * x + c * y, zero), last_v)
 
 
 @lean_kernel
 def free_ahead(
-    grid: Grid,
-    outline: Outline,
-    x: float,
-    y: float,
-    cosine: float,
-    sine: float,
-    sign: float,
-    side_margin: float,
+    grid: DistanceGrid, outline: Outline, at: Placement, sign: float, side_margin: float,
     reach: float,
-) -> float:
-    """How far the body can go straight on, or back for a `sign` of -1, within `reach` [m].
+) -> float:  # fmt: skip
+    """Return the free way straight on, or back for a `sign` of -1, within `reach` [m].
 
-    As wide as the body and `side_margin` [m], followed by discs from the front edge on. It looks no
-    farther than the grid is large, however far `reach` is: beyond it nothing is known.
+    The strip is as wide as the body and `side_margin` [m], and is covered by discs from the front
+    edge on. The search ends at the rim of the grid, however far `reach` is.
     """
+    x, y, cosine, sine = at
     half = (outline.left - outline.right) / 2
     edge = outline.front if sign > 0 else -outline.rear
     begin = edge - half

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gigabrain_schemas.arrays import Floats
 from gigabrain_schemas.base import TICK_NS
 from gigabrain_zenoh.kernels.jit import kernel
-from gigabrain_zenoh.navigation.footprint import FAR, Grid
+from gigabrain_zenoh.navigation.footprint import FAR, DistanceGrid
 
 RIM_CELLS = 2  # cells round the window, from which nothing is near
 UNIT = 1 << 20  # of a cell
@@ -118,11 +118,13 @@ def observe(
     place: Pose2D,
     lidar: tuple[float, float],
     hits: Floats,
-    tick: int,
-    oldest: int,
+    ticks: tuple[int, int],
 ) -> None:
-    """Forget what is older than `oldest`, take back what beams have passed, mark what they hit."""
-    level, seen = cells.level, cells.seen
+    """Mark the hits of a scan, clear cells that its beams have passed, and expire old ones.
+
+    The `ticks` are that of the scan, and the oldest last hit of a cell that does not expire.
+    """
+    level, seen, (tick, oldest) = cells.level, cells.seen, ticks
     cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
     eye_x = place.x + cosine * lidar[0] - sine * lidar[1]
     eye_y = place.y + sine * lidar[0] + cosine * lidar[1]
@@ -256,7 +258,7 @@ class LocalCostmap:
     def see(self, tick: int, place: Pose2D, lidar: tuple[float, float], hits: Floats) -> None:
         """Take in a scan: `hits` (n, 2) [m] in the body's frame, the `lidar` at (x, y) in it."""
         self._follow(place)
-        observe(self._held, _marked(self._held), place, lidar, hits, tick, tick - self._memory)
+        observe(self._held, _marked(self._held), place, lidar, hits, (tick, tick - self._memory))
 
     def moving(self, tick: int, discs: Floats) -> Floats:
         """Those of the `discs` (n, 6), x, y [m] first and the radius fifth, that really move.
@@ -272,7 +274,7 @@ class LocalCostmap:
         for disc in discs:
             take_back(self._held, disc, tick)
 
-    def grid(self, tick: int, known: Floats, moving: Floats) -> Grid:
+    def grid(self, tick: int, known: Floats, moving: Floats) -> DistanceGrid:
         """The distance to the nearest obstacle, seen or among the `known` points (n, 2) [m].
 
         What was hit of late on one of the discs `moving` does not count: it will be elsewhere soon.
@@ -288,7 +290,7 @@ class LocalCostmap:
             cells = np.floor((known - (self.x, self.y)) / CELL_M).astype(np.int64)
             cells = cells[((cells >= 0) & (cells < self.cells)).all(axis=1)]
             free[cells[:, 1], cells[:, 0]] = 0
-        return Grid(self._chamfer.distance(free), CELL_M, self.x, self.y)
+        return DistanceGrid(self._chamfer.distance(free), CELL_M, self.x, self.y)
 
     def _follow(self, place: Pose2D) -> None:
         """Keep the robot in the middle; what leaves the window is forgotten."""

@@ -15,7 +15,7 @@ from gigabrain_schemas.tasks import Goal
 from gigabrain_zenoh.navigation import dynamic_obstacles
 from gigabrain_zenoh.navigation.cost import Scene, Weights, distance_in
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
-from gigabrain_zenoh.navigation.footprint import clearance, outline_of
+from gigabrain_zenoh.navigation.footprint import Placement, clearance, outline_of
 from gigabrain_zenoh.navigation.local_costmap import LocalCostmap, Pose2D
 from gigabrain_zenoh.navigation.motion_model import (
     InitialState,
@@ -289,8 +289,8 @@ class LocalPlanner:
 
     def _answer(self, moment: PlanRequest, scene: Scene, planned: SampledPlan) -> LocalPlan:
         place = moment.pose
-        cosine, sine = math.cos(place.yaw), math.sin(place.yaw)
-        room = clearance(scene.grid, self._outline, place.x, place.y, cosine, sine)
+        at = Placement(place.x, place.y, math.cos(place.yaw), math.sin(place.yaw))
+        room = clearance(scene.grid, self._outline, at)
         left = distance_in(scene.field, place.x, place.y)
         blocked = self._stuck(moment)
         kind = kind_of(self._model, planned.track, self._sampler.dt, moment.goal)

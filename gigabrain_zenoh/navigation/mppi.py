@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import NONE, kernel, lean_kernel
-from gigabrain_zenoh.navigation.cost import Scene, Weights, look_round, price, rooms_of
+from gigabrain_zenoh.navigation.cost import Problem, Scene, Weights, look_round, price, rooms_of
 from gigabrain_zenoh.navigation.footprint import Outline
 from gigabrain_zenoh.navigation.motion_model import (
     LANES,
@@ -109,6 +109,14 @@ class SampledPlan(NamedTuple):
     standing_cost: float  # of braking and staying
 
 
+class Samples(NamedTuple):
+    """Sources of the sampled plans."""
+
+    last: Floats  # (T, 3), the last plan
+    noise: NDArray[np.float32]  # (blocks, T, 3, LANES), added to it
+    simple: Floats  # (samples, 7), see `simple_of`
+
+
 class SamplerBuffers(NamedTuple):
     """Arrays that are used again, plans in lanes."""
 
@@ -163,8 +171,9 @@ class Sampler:
         """The best that was found for a body that can move like `model`."""
         noise, simple = self._noise[self._turn], self._simple[self._turn]
         self._turn = (self._turn + 1) % NOISE_SETS
-        work, given = self._work, (model, outline, weights, scene, start, self.dt)
-        commands, track, cost, standing = _search(*given, self.last, noise, simple, work)
+        problem = Problem(model, outline, weights, scene, self.dt)
+        samples = Samples(self.last, noise, simple)
+        commands, track, cost, standing = _search(problem, start, samples, self._work)
         self.last = commands
         return SampledPlan(commands, track, cost, standing)
 
@@ -180,23 +189,15 @@ def _resampled(plan: Floats, steps: NDArray[np.floating]) -> Floats:
 
 @kernel
 def _search(
-    model: MotionModel,
-    outline: Outline,
-    weights: Weights,
-    scene: Scene,
-    start: InitialState,
-    dt: float,
-    last: Floats,
-    noise: NDArray[np.float32],
-    simple: Floats,
-    work: SamplerBuffers,
+    problem: Problem, start: InitialState, samples: Samples, work: SamplerBuffers
 ) -> tuple[Floats, Floats, float, float]:
-    """The commands (T, 3) and the track (T + 1, 6) that were found, their cost, that of standing.
+    """Return the best commands (T, 3), their track (T + 1, 6), their cost, and that of standing.
 
-    Costs are inf for plans that are worthless beside one before them. The last block holds the mean
-    of all that are not, and the best.
+    The cost is inf for plans that are worthless beside an earlier one. The last block holds the
+    weighted mean of all others, and the best.
     """
-    plans, states, costs = work
+    (plans, states, costs), (last, noise, simple) = work, samples
+    model, outline, dt = problem.model, problem.outline, problem.dt
     blocks, mean, best = len(costs), 0, 1
     rooms = np.empty(min(len(states), len(start.past)))
     found = np.full(LANES, math.inf)
@@ -207,14 +208,14 @@ def _search(
             _gather(plans, costs, found, mean, best)
         make_feasible(model, start, dt, plans[block])
         simulate(model, outline.far, start, dt, plans[block], states)
-        look_round(weights, outline, scene, dt, states)
+        look_round(problem, states)
         if block == 0:
-            rooms_of(scene, outline, states, rooms)
+            rooms_of(problem.scene, outline, states, rooms)
         of = found if block == blocks else costs[block]
         for lane in range(LANES if block < blocks else 2):
             free = block == blocks or (block == 0 and lane == BRAKING_LANE)
             limit = math.inf if free else least + WORTHLESS_MARGIN
-            of[lane] = price(model, outline, weights, scene, dt, rooms, states, lane, limit)
+            of[lane] = price(problem, rooms, states, lane, limit)
             least = min(least, of[lane])
     taken = best if found[mean] > found[best] + MEAN_MARGIN else mean
     commands, track = _of_lane(plans[blocks], states, taken)

@@ -11,7 +11,8 @@ from msgspec.structs import replace
 from gigabrain_schemas.body import BodyDescription
 from gigabrain_zenoh.navigation.cost_to_go import CostToGo
 from gigabrain_zenoh.navigation.footprint import (
-    Grid,
+    DistanceGrid,
+    Placement,
     clearance,
     clearance_of,
     free_ahead,
@@ -100,7 +101,7 @@ def test_clearance_is_the_outlines_distance_to_the_nearest_obstacle() -> None:
     window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), points)
     grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
     for x, y, yaw in random.uniform((-0.3, -0.3, -3.0), (0.3, 0.3, 3.0), (50, 3)).tolist():
-        got = clearance(grid, outline, x, y, math.cos(yaw), math.sin(yaw))
+        got = clearance(grid, outline, Placement(x, y, math.cos(yaw), math.sin(yaw)))
         want = min(0.4, _exact(points, x, y, yaw))
         assert got == pytest.approx(want, abs=0.04)
 
@@ -133,13 +134,14 @@ def test_no_point_of_the_outline_that_is_left_out_would_have_been_nearer(
     random = np.random.default_rng(5)
     free = (random.random((120, 120)) > 0.003).astype(np.uint8)
     distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_5) * np.float32(0.025)
-    grid, outline = Grid(distance, 0.025, -1.5, -1.5), outline_of(body.footprint)
+    grid, outline = DistanceGrid(distance, 0.025, -1.5, -1.5), outline_of(body.footprint)
     points = np.stack([outline.groups[:, :3].ravel(), outline.groups[:, 3:6].ravel()])
     group = 0
     for x, y, yaw in random.uniform((-1.0, -1.0, -3.0), (1.0, 1.0, 3.0), (2000, 3)).tolist():
         cosine, sine = math.cos(yaw), math.sin(yaw)
-        near = middle_of(grid, outline, x, y, cosine, sine)
-        room, group = clearance_of(grid, outline, x, y, cosine, sine, near, group)
+        placed = Placement(x, y, cosine, sine)
+        near = middle_of(grid, outline, placed)
+        room, group = clearance_of(grid, outline, placed, near, group)
         center = np.array([(outline.center_x,), (outline.center_y,)], dtype=np.float32)
         turn = np.array([(cosine, -sine), (sine, cosine)])
         at = turn @ np.hstack([points, center]) + np.array([(x + 1.5,), (y + 1.5,)])
@@ -160,17 +162,17 @@ def _bilinear(distance: np.ndarray, at: np.ndarray) -> np.ndarray:
 def test_what_is_inside_the_body_leaves_no_clearance() -> None:
     distance = np.full((80, 80), 3.0, dtype=np.float32)
     distance[30:50, 30:50] = 0.0
-    grid = Grid(distance, 0.025, -1.0, -1.0)
-    assert clearance(grid, outline_of(WAFFLE.footprint), 0.06, 0.0, 1.0, 0.0) < 0.0
+    grid = DistanceGrid(distance, 0.025, -1.0, -1.0)
+    assert clearance(grid, outline_of(WAFFLE.footprint), Placement(0.06, 0.0, 1.0, 0.0)) < 0.0
 
 
 def test_the_way_straight_on_ends_at_a_wall() -> None:
     window = LocalCostmap(4.0, 10.0)
     window.see(1, Pose2D(0.0, 0.0, 0.0), (0.0, 0.0), wall((0.9, -0.5), (0.9, 0.5)))
     grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
-    free = free_ahead(grid, outline, 0.0, 0.0, 1.0, 0.0, 1.0, 0.03, 2.0)
+    free = free_ahead(grid, outline, Placement(0.0, 0.0, 1.0, 0.0), 1.0, 0.03, 2.0)
     assert free == pytest.approx(0.8, abs=0.05)
-    assert free_ahead(grid, outline, 0.0, 0.0, 1.0, 0.0, -1.0, 0.03, 2.0) == 2.0
+    assert free_ahead(grid, outline, Placement(0.0, 0.0, 1.0, 0.0), -1.0, 0.03, 2.0) == 2.0
 
 
 def test_what_has_moved_leaves_no_ghost() -> None:
@@ -215,7 +217,7 @@ def test_what_leaves_the_window_is_forgotten(x: float, y: float) -> None:
     assert _occupied(window.grid(3, NOTHING, NOBODY)) == kept < there
 
 
-def _occupied(grid: Grid) -> set[tuple[float, float]]:
+def _occupied(grid: DistanceGrid) -> set[tuple[float, float]]:
     """The middles of the occupied cells, in cells from the frame's origin."""
     rows, columns = np.nonzero(grid.distance == 0.0)
     x, y = round(grid.x / 0.025), round(grid.y / 0.025)
@@ -269,7 +271,7 @@ def test_the_way_straight_on_is_looked_at_no_farther_than_the_window_is_large() 
     window = LocalCostmap(4.0, 10.0)
     grid, outline = window.grid(1, NOTHING, NOBODY), outline_of(WAFFLE.footprint)
     found = list[float]()
-    ways = (grid, outline, 0.0, 0.0, 1.0, 0.0, 1.0, 0.03, 1e18)
+    ways = (grid, outline, Placement(0.0, 0.0, 1.0, 0.0), 1.0, 0.03, 1e18)
     asking = threading.Thread(target=lambda: found.append(free_ahead(*ways)), daemon=True)
     asking.start()
     asking.join(60.0)  # it includes the compilation

@@ -8,9 +8,16 @@ import pytest
 
 from gigabrain_schemas.arrays import Floats
 from gigabrain_zenoh.kernels.jit import kernel
-from gigabrain_zenoh.navigation.cost import Scene, Weights, look_round, price, rooms_of
+from gigabrain_zenoh.navigation.cost import (
+    Problem,
+    Scene,
+    Weights,
+    look_round,
+    price,
+    rooms_of,
+)
 from gigabrain_zenoh.navigation.dynamic_obstacles import WEIGHTS
-from gigabrain_zenoh.navigation.footprint import Grid, Outline, outline_of
+from gigabrain_zenoh.navigation.footprint import DistanceGrid, Outline, outline_of
 from gigabrain_zenoh.navigation.motion_model import (
     LANES,
     STATE,
@@ -38,13 +45,12 @@ def prices(
     for block in range(len(plans)):
         make_feasible(model, start, dt, plans[block])
         simulate(model, outline.far, start, dt, plans[block], states)
-        look_round(weights, outline, scene, dt, states)
+        problem = Problem(model, outline, weights, scene, dt)
+        look_round(problem, states)
         rooms_of(scene, outline, states, rooms)
         for n in range(len(limits)):
             for lane in range(LANES):
-                costs[n, block, lane] = price(
-                    model, outline, weights, scene, dt, rooms, states, lane, limits[n]
-                )
+                costs[n, block, lane] = price(problem, rooms, states, lane, limits[n])
 
 
 def scene(discs: Floats) -> Scene:
@@ -59,8 +65,10 @@ def scene(discs: Floats) -> Scene:
     to_go = (np.hypot(x - 3.0, y) * np.where(distance[::2, ::2] < 0.2, 20.0, 1.0)).astype(
         np.float32
     )
-    field = Grid(to_go, 0.05, -4.0, -4.0)
-    return Scene(Grid(distance, 0.025, -4.0, -4.0), field, discs, 3.0, 0.0, math.nan, 0.1, 0.1)
+    field = DistanceGrid(to_go, 0.05, -4.0, -4.0)
+    return Scene(
+        DistanceGrid(distance, 0.025, -4.0, -4.0), field, discs, 3.0, 0.0, math.nan, 0.1, 0.1
+    )
 
 
 @pytest.mark.parametrize(("weights", "discs"), [(Weights(), NOBODY), (WEIGHTS, SOMEBODY)])
