@@ -1,7 +1,6 @@
 """`gigabrain keys`: the authority of a fleet, and identities for its hosts and people."""
 
 import contextlib
-import datetime
 import shlex
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,11 +8,16 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from gigabrain_zenoh.errors import ConfigError, GigabrainError
-from gigabrain_zenoh.security.acl import Role, common_name
-from gigabrain_zenoh.security.identity_files import CA_KEY, CERTIFICATE, INSTALL, generations_in
+from gigabrain_zenoh.errors import ConfigError
+from gigabrain_zenoh.security.acl import Role
+from gigabrain_zenoh.security.identity_files import (
+    CA_KEY,
+    CERTIFICATE,
+    INSTALL,
+    find_fleet,
+    generations_in,
+)
 
-EXPIRES_SOON_DAYS = 30
 FleetFolder = Annotated[
     Path | None, Parameter(help="Folder of the fleet. Default: the only one in this folder.")
 ]
@@ -64,7 +68,7 @@ def issue(
     with _needs_cryptography():
         from gigabrain_zenoh.security import authority
 
-    folder = authority.issue(_fleet(dir), role, robot=robot, name=name, hosts=host, days=days)
+    folder = authority.issue(find_fleet(dir), role, robot=robot, name=name, hosts=host, days=days)
     print(f"{folder}: copy it to its host, and keep others from reading it")
     print(f"next: {_first_use(role, robot, folder)}")
 
@@ -83,7 +87,7 @@ def revoke(role: Role, *, robot: str = "", dir: FleetFolder = None) -> None:
     with _needs_cryptography():
         from gigabrain_zenoh.security import authority
 
-    folder = _fleet(dir)
+    folder = find_fleet(dir)
     lists = authority.revoke(folder, role, robot)
     for path in lists:
         print(f"{path}: copy it to that identity's folder on its host, and restart its router")
@@ -102,9 +106,12 @@ def identities(*, dir: FleetFolder = None) -> int:
     Args:
         dir: Folder of a fleet or of one identity. Default: the only fleet in this folder.
     """
-    folder = dir if dir and (dir / CERTIFICATE).exists() else _fleet(dir)
+    with _needs_cryptography():
+        from gigabrain_zenoh.security.identity import list_identities
+
+    folder = dir if dir and (dir / CERTIFICATE).exists() else find_fleet(dir)
     all_valid = True
-    for line, valid in _listed(folder):
+    for line, valid in list_identities(folder):
         print(line)
         all_valid &= valid
     return 0 if all_valid else 1
@@ -130,7 +137,7 @@ def zenohd(
     with _needs_cryptography():
         from gigabrain_zenoh.bus.zenoh.config import configuration
 
-    generations = generations_in(_fleet(dir)) if dir else {}
+    generations = generations_in(find_fleet(dir)) if dir else {}
     print(configuration(robot or ("",), str(keys), listen, generations), end="")
 
 
@@ -147,49 +154,6 @@ def _first_use(role: Role, robot: str, folder: Path) -> str:
 
 def _quoted(path: Path) -> str:
     return shlex.quote(str(path))
-
-
-def _listed(folder: Path) -> Iterator[tuple[str, bool]]:
-    """Yield a line for each identity of a fleet or a folder, and whether it is valid."""
-    with _needs_cryptography():
-        from gigabrain_zenoh.security import identity as identities
-
-    places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
-    now, generations = datetime.datetime.now(datetime.UTC), generations_in(folder)
-    for place in places:
-        if not (place / CERTIFICATE).exists():
-            continue
-        try:
-            identity = identities.load(place, now)
-        except GigabrainError as error:
-            yield f"{place.name:<20} {error}", False
-            continue
-        if identity.generation < generations.get(common_name(identity.role, identity.robot), 1):
-            yield f"{place.name:<20} {identity.name} was revoked; delete it", False
-            continue
-        days_left = identity.days_left(now)
-        soon = "  SOON" if days_left < EXPIRES_SOON_DAYS else ""
-        name = f"{identity.name} of {identity.fleet}"
-        hosts = f"  ({', '.join(identity.hosts)})" if identity.hosts else ""
-        expires = f"expires {identity.expires:%Y-%m-%d}, in {days_left:.0f} days{soon}"
-        yield f"{place.name:<20} {name:<28} {expires}{hosts}", True
-
-
-def _fleet(dir: Path | None) -> Path:
-    """Return the folder of the fleet. Raises ConfigError if there is none, or several."""
-    if dir:
-        if not (dir / CA_KEY).exists():
-            raise ConfigError(f"{dir}: no {CA_KEY}; create a fleet with `gigabrain keys new`")
-        return dir
-    here = Path()
-    fleets = [place for place in (here, *sorted(here.iterdir())) if (place / CA_KEY).exists()]
-    if not fleets:
-        raise ConfigError("no fleet in this folder; create one with `gigabrain keys new`, "
-                          "or name its folder with --dir")  # fmt: skip
-    if len(fleets) > 1:
-        names = ", ".join(map(str, fleets))
-        raise ConfigError(f"several fleets in this folder; choose one with --dir: {names}")
-    return fleets[0]
 
 
 @contextlib.contextmanager

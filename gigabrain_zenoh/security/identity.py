@@ -1,6 +1,7 @@
 """Whose keys a folder holds, and whether they can be used."""
 
 import datetime
+from collections.abc import Iterator
 from pathlib import Path
 
 from cryptography import x509
@@ -12,7 +13,7 @@ from msgspec import Struct
 
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.host.files import read_bounded
-from gigabrain_zenoh.security.acl import Role, parse
+from gigabrain_zenoh.security.acl import Role, common_name, parse
 from gigabrain_zenoh.security.identity_files import (
     CA,
     CERTIFICATE,
@@ -20,9 +21,11 @@ from gigabrain_zenoh.security.identity_files import (
     REMEDY,
     check_files,
     check_private,
+    generations_in,
     unreadable,
 )
 
+EXPIRES_SOON_DAYS = 30
 MOST_BYTES = 100_000  # of a key or a certificate
 
 
@@ -131,3 +134,25 @@ def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
     except x509.ExtensionNotFound:
         return ()
     return tuple(str(place.value) for place in places)
+
+
+def list_identities(folder: Path) -> Iterator[tuple[str, bool]]:
+    """Yield a line for each identity in a fleet's folder, or in its own, and if it is valid."""
+    places = [folder] if (folder / CERTIFICATE).exists() else sorted(folder.iterdir())
+    now, generations = datetime.datetime.now(datetime.UTC), generations_in(folder)
+    for place in places:
+        if not (place / CERTIFICATE).exists():
+            continue
+        try:
+            one = load(place, now)
+        except ConfigError as error:
+            yield f"{place.name:<20} {error}", False
+            continue
+        if one.generation < generations.get(common_name(one.role, one.robot), 1):
+            yield f"{place.name:<20} {one.name} was revoked; delete it", False
+            continue
+        days_left = one.days_left(now)
+        soon = "  SOON" if days_left < EXPIRES_SOON_DAYS else ""
+        hosts = f"  ({', '.join(one.hosts)})" if one.hosts else ""
+        expires = f"expires {one.expires:%Y-%m-%d}, in {days_left:.0f} days{soon}"
+        yield f"{place.name:<20} {f'{one.name} of {one.fleet}':<28} {expires}{hosts}", True

@@ -175,3 +175,20 @@ def generations_in(folder: Path) -> dict[str, int]:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: {error}; copy it from the fleet's folder again") from None
+
+
+def find_fleet(folder: Path | None) -> Path:
+    """Return `folder`, or the only fleet in the working folder. Raises ConfigError."""
+    if folder:
+        if not (folder / CA_KEY).exists():
+            raise ConfigError(f"{folder}: no {CA_KEY}; create a fleet with `gigabrain keys new`")
+        return folder
+    here = Path()
+    fleets = [place for place in (here, *sorted(here.iterdir())) if (place / CA_KEY).exists()]
+    if not fleets:
+        raise ConfigError("no fleet in this folder; create one with `gigabrain keys new`, "
+                          "or name its folder with --dir")  # fmt: skip
+    if len(fleets) > 1:
+        names = ", ".join(map(str, fleets))
+        raise ConfigError(f"several fleets in this folder; choose one with --dir: {names}")
+    return fleets[0]
