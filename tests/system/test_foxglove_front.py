@@ -49,7 +49,7 @@ def test_pages_of_other_sites_are_refused(origin: str) -> None:
 def test_programs_name_no_origin_and_get_in_but_must_want_a_websocket() -> None:
     assert refusal() == ""
     no_socket = HEAD.format("").replace("Upgrade: websocket\r\n", "")
-    assert Front((), ("", 0)).refusal(no_socket.encode()) == "400 a WebSocket is expected"
+    assert Front((), ("", 0)).refusal(no_socket.encode()) == "400 expected a WebSocket"
 
 
 def test_what_stands_behind_has_an_address_that_differs_each_time() -> None:

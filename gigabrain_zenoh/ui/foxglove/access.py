@@ -1,9 +1,9 @@
-"""Access to the bridge: which viewers may connect, and the secret topic by which one may steer.
+"""Access to the bridge: viewers that may connect, and the secret topic for steering.
 
 The server's library checks no Origin, so a page of any site in a browser of this machine could
-connect, and it keeps whatever a viewer does not read. It therefore listens on a random port of a
-random loopback address (Linux; elsewhere of 127.0.0.1), and `Front` forwards the bytes of viewers
-that may connect.
+connect. It also stores everything that a viewer does not read. It therefore listens on a random
+port of a random loopback address (Linux; elsewhere of 127.0.0.1), and `Front` forwards the bytes of
+viewers that may connect.
 """
 
 import asyncio
@@ -111,7 +111,7 @@ class Front:
                 self._arriving.remove(writer)
         reason = self.refusal(head)
         if not reason and self._viewers >= MAX_VIEWERS:
-            reason = f"503 {MAX_VIEWERS} viewers are connected"
+            reason = f"503 {MAX_VIEWERS} viewers are connected already"
         if not reason:
             return head
         if reason not in self._logged and len(self._logged) < MAX_LOGGED_REASONS:
@@ -131,11 +131,11 @@ class Front:
         fields = [(name.strip().lower(), value.strip().lower())
                   for name, _, value in (line.partition(":") for line in lines)]  # fmt: skip
         if ("upgrade", "websocket") not in fields:
-            return "400 a WebSocket is expected"
+            return "400 expected a WebSocket"
         for origin in (value for name, value in fields if name == "origin"):
             if origin not in self._origins and not OWN_PAGE.fullmatch(origin):
                 shown = re.sub(r"[^\x21-\x7e]", "?", origin)[:100]
-                return f"403 pages of {shown} may not connect; allow it with --origin"
+                return f"403 pages of {shown} may not connect; allow them with --origin"
         return ""
 
     async def _forward(
@@ -179,7 +179,7 @@ def topic_to_steer(config: FoxgloveConfig) -> str:
     secret, _ = made_once(path, secrets.token_urlsafe(SECRET_BYTES).encode())
     if not re.fullmatch(rb"[\w-]{16,200}", secret):
         raise ConfigError(
-            f"{path}: expected a secret of 16 letters or more; remove it, and a new one is made"
+            f"{path}: expected a secret of 16 letters or more; remove the file for a new one"
         )
     return f"/teleop/{secret.decode()}"
 

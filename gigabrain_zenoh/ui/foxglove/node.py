@@ -200,7 +200,7 @@ class FoxgloveSteering(ServerListener):
         if may and len(self._channels) < MAX_CHANNELS:
             self._channels.add((viewer, channel))
         else:
-            self._refuse(viewer, "only the layout file knows the topic for steering")
+            self._refuse(viewer, "it does not publish on the topic of the layout file")
 
     def _close(self, viewer: int, channel: int) -> None:
         if (viewer, channel) in self._channels:

@@ -68,7 +68,7 @@ def tokens(path: Path) -> tuple[Tokens, bool]:
     try:
         return msgspec.json.decode(held, type=Tokens), made
     except DECODE_ERRORS as error:
-        raise ConfigError(f"{path}: {error}; remove it to have new tokens made") from None
+        raise ConfigError(f"{path}: {error}; remove the file to have new tokens made") from None
 
 
 class Access:
@@ -89,7 +89,7 @@ class Access:
         """Return the tokens in words if they were made now, else an empty text."""
         if self._tokens is None or not self.made:
             return ""
-        return f"to drive: {self._tokens.operator}\nto look:  {self._tokens.viewer}"
+        return f"to drive:     {self._tokens.operator}\nto view only: {self._tokens.viewer}"
 
     def role(self, token: str) -> Role | None:
         """Return the role of a token; None if it is unknown."""

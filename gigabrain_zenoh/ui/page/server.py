@@ -82,7 +82,7 @@ class GuardedApp:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
         if scope["type"] == "http" and not self._access.named(Headers(scope=scope)):
-            response = PlainTextResponse("this page has another name\n", 421)
+            response = PlainTextResponse("unknown name of this page; add it with --name\n", 421)
             await response(scope, receive, send)
             return
 

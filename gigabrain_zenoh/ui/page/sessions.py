@@ -33,7 +33,7 @@ MAX_REPLY_CHARS = 500
 MAX_REASON_BYTES = 120  # of a reason for closing
 MAX_WAITING_FRAMES = 64  # for a slow browser
 BAD_FRAME, WRONG_TOKEN, FULL = 1008, 4401, 4429  # codes for closing a WebSocket (RFC 6455 7.4)
-OTHER_STEERS = "another page steers the robot"
+OTHER_STEERS = "another page steers the robot; wait until it stops"
 
 
 class Viewer:
@@ -157,7 +157,7 @@ class Sessions:
         """Serve one browser from its login to its end."""
         if not self._access.own_page(socket.headers):
             log.warning("refused a page of another origin")
-            await socket.close(BAD_FRAME, "this page is not of this server")
+            await socket.close(BAD_FRAME, "the page is of another origin")
             return
         await socket.accept()
         with contextlib.suppress(WebSocketDisconnect):
@@ -168,7 +168,7 @@ class Sessions:
             viewer = Viewer(next(self._numbers), role)
             await self._serve_viewer(socket, viewer)
             if viewer.gives_way.is_set():
-                await socket.close(FULL, "an operator has taken this place")
+                await socket.close(FULL, "replaced by an operator")
 
     def _has_place(self, role: Role) -> bool:
         """Return whether one more is admitted; for an operator a viewer gives way."""
@@ -263,14 +263,14 @@ class Sessions:
             raise ValueError("too many frames")
         kind, content = frame[:1], frame[1:]
         if viewer.role != "operator":
-            raise ValueError("a viewer may look and not drive")
+            raise ValueError("viewers may not drive")
         if kind == bytes((frames.DRIVE,)):
             if not self._arbiter.drive(viewer.number, frames.drive_of(content), now_s):
                 self._reply(viewer, PageReply(id=0, what="drive", ok=False, text=OTHER_STEERS))
         elif kind == bytes((frames.ASK,)):
             self._start_request(viewer, frames.decoded(content, PageRequest))
         else:
-            raise ValueError("an unknown frame")
+            raise ValueError("unknown frame")
 
     def _start_request(self, viewer: Viewer, request: PageRequest) -> None:
         if request.what == "estop":

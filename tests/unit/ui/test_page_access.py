@@ -101,7 +101,7 @@ def test_tokens_are_told_to_whoever_had_them_made(tmp_path: Path) -> None:
     config = PageConfig(login=True, tokens=str(tmp_path / "tokens.json"))
     first, second = Access(config, 8080), Access(config, 8080)
     made, _ = tokens(tmp_path / "tokens.json")
-    assert first.new_tokens_text() == f"to drive: {made.operator}\nto look:  {made.viewer}"
+    assert first.new_tokens_text() == f"to drive:     {made.operator}\nto view only: {made.viewer}"
     assert second.new_tokens_text() == ""
     assert Access(PageConfig(), 8080).new_tokens_text() == ""
 
