@@ -137,13 +137,17 @@ class PageView(ViewerScene):
 
     max_cameras = 4
 
-    def __init__(self, bus: Bus, send: Callable[[str, bytes], None]) -> None:
-        self._send = send
+    def __init__(
+        self,
+        bus: Bus,
+        send: Callable[[str, bytes], None],
+        on_body: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._send, self._on_body = send, on_body
         self._kept: dict[str, bytes] = {}  # map and task, by slot
         self._lines: list[bytes] = []
         self._described: BodyDescription | None = None
         self._numbers = itertools.count()
-        self.on_body: Callable[[], None] = lambda: None
         super().__init__(bus)
 
     def state_frame(self, driving: int, viewers: int) -> bytes:
@@ -184,7 +188,7 @@ class PageView(ViewerScene):
         if isinstance(message, Body):
             before, self._described = self._described, message.description
             if before != message.description:
-                self.on_body()
+                self._on_body()
         elif isinstance(message, Health):
             self._send(f"health/{message.process}", as_json(HEALTH, message))
         elif isinstance(message, LogRecord):

@@ -21,9 +21,7 @@ from gigabrain_zenoh.bus.bus import Bus
 from gigabrain_zenoh.config.settings import PageConfig
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.ui.page.access import Access, check, token_file, wants_login
-from gigabrain_zenoh.ui.page.frames import PageView
-from gigabrain_zenoh.ui.page.sessions import RequestHandler, Sessions
-from gigabrain_zenoh.ui.steering import TeleopArbiter
+from gigabrain_zenoh.ui.page.sessions import Sessions
 
 log = logging.getLogger(__name__)
 
@@ -119,9 +117,7 @@ async def run(config: PageConfig, bus: Bus, ready: Callable[[], None]) -> None:
     check(config)
     with listen(config) as listener:
         access = Access(config, listener.getsockname()[1])
-        sessions = Sessions(access)
-        view = PageView(bus, sessions.send)
-        sessions.serve(view, TeleopArbiter(view), RequestHandler(bus))
+        sessions = Sessions(bus, access)
         server = _server(config, access, sessions)
         serving = asyncio.ensure_future(server.serve(sockets=[listener]))
         sending = asyncio.ensure_future(_send_frames(bus, sessions))

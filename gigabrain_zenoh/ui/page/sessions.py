@@ -119,9 +119,9 @@ def _text_of(replies: Sequence[GoalReply | TaskReply]) -> str:
 
 
 class Sessions:
-    """All viewers."""
+    """All viewers, and what serves them: the view of the robot, steering and requests."""
 
-    def __init__(self, access: Access) -> None:
+    def __init__(self, bus: Bus, access: Access) -> None:
         self._access = access
         self._numbers = itertools.count(1)
         self._pending: dict[asyncio.Task[None], Viewer] = {}
@@ -129,11 +129,9 @@ class Sessions:
         self._loop = asyncio.get_running_loop()
         self._rates = RateLimiter()
         self.viewers: list[Viewer] = []
-
-    def serve(self, view: PageView, arbiter: TeleopArbiter, handler: RequestHandler) -> None:
-        """Set the sources of frames, and the recipients of commands and requests."""
-        self._view, self._arbiter, self._handler = view, arbiter, handler
-        view.on_body = self._introduce_all
+        self._handler = RequestHandler(bus)
+        self._view = PageView(bus, self.send, self._introduce_all)
+        self._arbiter = TeleopArbiter(self._view)
 
     def send(self, slot: str, frame: bytes) -> None:
         """Send a frame to all viewers without waiting."""

@@ -13,9 +13,7 @@ from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.waiting import settle
 from gigabrain_zenoh.ui.page import frames
 from gigabrain_zenoh.ui.page.access import Access, tokens
-from gigabrain_zenoh.ui.page.frames import PageView
-from gigabrain_zenoh.ui.page.sessions import RequestHandler, Sessions
-from gigabrain_zenoh.ui.steering import TeleopArbiter
+from gigabrain_zenoh.ui.page.sessions import Sessions
 
 HOST = "127.0.0.1:8080"
 
@@ -53,10 +51,8 @@ class Page:
     def __init__(self, folder: Path) -> None:
         config = PageConfig(login=True, tokens=str(folder / "tokens.json"))
         self.tokens, _ = tokens(folder / "tokens.json")
-        self.sessions = Sessions(Access(config, 8080))
         self.net = Net()
-        scene = PageView(self.net.one, self.sessions.send)
-        self.sessions.serve(scene, TeleopArbiter(scene), RequestHandler(self.net.one))
+        self.sessions = Sessions(self.net.one, Access(config, 8080))
         self._talks: list[asyncio.Task[None]] = []
 
     async def comes(self, token: str = "") -> Socket:
