@@ -1,4 +1,4 @@
-"""Takes the docs' pictures of the operator page: python -m tests.qa.pictures FOLDER."""
+"""Takes the screenshots of the operator page for the docs: python -m tests.qa.pictures FOLDER."""
 
 import asyncio
 import sys
@@ -14,17 +14,17 @@ from gigabrain_zenoh.ui.run_report import RunMonitor
 from tests.system.page import CHROMIUM, FLAGS, OPERATOR, Robot
 
 READY_S = 600.0  # a machine without compiled kernels compiles them first
-MAPPED_M2, MAP_S = 45.0, 300.0  # so much of the house is to be seen, and how long that may take
+MAPPED_M2, MAP_S = 45.0, 300.0  # mapped area that a screenshot shows, and time until then
 NAVIGATES = {
     "perception": {"mapping": "slam"},
-    "decision": {"behaviour": "navigate", "begin": "roam"},
+    "decision": {"behaviour": "navigate", "settings": {"start": "explore"}},
     "speed": 2.0,  # in lock-step, so that a busy machine does not make it stop
 }
 SIZES = {"light": (1280, 800), "phone": (390, 844), "dark": (1280, 800)}
 
 
-async def take(folder: Path) -> None:
-    """A house, explored until there is something to see; the topics as well in the dark one."""
+async def take_screenshots(folder: Path) -> None:
+    """Explore the house and take all screenshots; the dark one shows the topics."""
     with tempfile.TemporaryDirectory() as place:
         home = Home(Path(place) / "home")
         try:
@@ -41,24 +41,24 @@ async def take(folder: Path) -> None:
                     page = await chromium.new_page()
                     await page.goto(f"{robot.origin}/#{OPERATOR}")
                     for name in SIZES:
-                        await dress(page, name)
-                        await until(lambda: worth_a_picture(watch), "a way in a map", MAP_S)
+                        await prepare(page, name)
+                        await until(lambda: is_worth_a_screenshot(watch), "a way in a map", MAP_S)
                         await page.screenshot(path=folder / f"page_{name}.png")
                     await chromium.close()
         finally:
             home.close()
 
 
-def worth_a_picture(watch: RunMonitor) -> bool:
-    """Whether the map has grown, and the robot drives to somewhere not too near."""
+def is_worth_a_screenshot(watch: RunMonitor) -> bool:
+    """Return whether enough is mapped, and the robot drives to a goal more than 2 m away."""
     task, state = watch.task.current, watch.state.fresh()
     far = task is not None and (task.distance_remaining or 0.0) > 2.0
     drives = state is not None and state.gate.mode == "enabled" and state.velocity.linear_x > 0.1
     return far and drives and (watch.mapped_m2 or 0.0) > MAPPED_M2
 
 
-async def dress(page: Page, name: str) -> None:
-    """One page is dressed anew for each picture: several at a time would slow the robot."""
+async def prepare(page: Page, name: str) -> None:
+    """Set size and colours of the page; one page serves all, as several would slow the robot."""
     width, height = SIZES[name]
     await page.set_viewport_size({"width": width, "height": height})
     await page.emulate_media(color_scheme="dark" if name == "dark" else "light")
@@ -69,4 +69,4 @@ async def dress(page: Page, name: str) -> None:
 
 
 if __name__ == "__main__":
-    asyncio.run(take(Path(sys.argv[1])))
+    asyncio.run(take_screenshots(Path(sys.argv[1])))
