@@ -27,9 +27,11 @@ from tests.unit.recording import bags
 
 
 def call(*arguments: str) -> object:
-    return make_app(arguments)(
+    """Run a command; return its exit code."""
+    code = make_app(arguments)(
         arguments, exit_on_error=False, print_error=False, result_action="return_value"
     )
+    return code or 0
 
 
 @pytest.fixture(scope="module")
