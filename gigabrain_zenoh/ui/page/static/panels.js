@@ -63,7 +63,7 @@ export function showFigures(state, robot) {
 function activity(state, robot) {
   if (!state) return 'no messages from the robot'
   const { mode, commander } = state.gate
-  if (mode !== 'enabled' && compiling.size) return `starting up: ${[...compiling].join(' and ')} compiling, once per installation`
+  if (mode !== 'enabled' && compiling.size) return `compiling, once per installation: ${[...compiling].join(', ')}`
   if (mode !== 'enabled') return mode === 'idle' ? 'idle: waiting to be enabled' : MODES[mode]
   if (commander !== 'control') return `${commander} drives`
   if (robot.driving) return `steered by viewer ${robot.driving}`
@@ -74,10 +74,10 @@ export function showSafety(safety, body) {
   setText($('verdict'), safety?.verdict ?? 'silent')
   listCauses($('warnings'), [...(safety?.causes ?? []), ...(safety?.warnings ?? []), ...problemsOfProcesses()])
   if (!body) return
-  const caps = safety?.caps ?? {}
+  const caps = safety?.caps ?? {}, stopped = !safety || safety.verdict === 'stop'
   const rows = AXES.filter(([, limit]) => body[limit] > 0).map(([name, limit, unit]) => {
     const lower = [caps[name], name.startsWith('turn') ? caps.rotation : null].filter((cap) => cap != null)
-    return [name.replace('_', ' '), body[limit], safety ? Math.min(body[limit], ...lower) : 0, unit]
+    return [name.replace('_', ' '), body[limit], stopped ? 0 : Math.min(body[limit], ...lower), unit]
   })
   replaceChildren($('caps'), JSON.stringify(rows), () => rows.flatMap(([name, limit, allowed, unit]) => {
     const bar = makeElement('i'), fill = makeElement('b', '', allowed < limit ? 'capped' : '')
