@@ -130,8 +130,7 @@ def receivers(key: str, processes: Iterable[Description]) -> list[str]:
 def flows(processes: Iterable[Description], health: Mapping[str, Health]) -> list[Flow]:
     """Return every flow of messages, from senders to receivers.
 
-    A key that its sender reports at 0 Hz is no flow, unless its last value is kept for late
-    subscribers.
+    A key that its sender reports at 0 Hz is no flow. Keys whose last value is kept are flows.
     """
     processes, found = tuple(processes), set()
     for sender in processes:

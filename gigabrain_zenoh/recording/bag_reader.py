@@ -1,7 +1,7 @@
 """Reads a bag from its first byte to its last, however it ended, and reports what is damaged.
 
-The library parses single records. Its readers end at the first damaged byte, return a message
-that was cut off as if it were whole, and allocate whatever size a chunk claims (400 MB for one of
+The library parses single records. Its readers end at the first damaged byte, and return a message
+that was cut off as if it were whole. They allocate the size that a chunk claims (400 MB for one of
 13 kB).
 The walk from record to record, and the limits, are therefore ours.
 """

@@ -71,7 +71,7 @@ async def test_every_kind_of_message_has_a_channel_to_be_drawn_from(bridge: Brid
     assert viewer.server["capabilities"] == ["clientPublish", "connectionGraph"]
 
 
-async def test_who_comes_late_is_given_the_map(bridge: Bridge) -> None:
+async def test_a_late_subscriber_gets_the_map(bridge: Bridge) -> None:
     cells = bytes((0, 100, 255, 50))
     grid = OccupancyGrid(
         resolution=0.05, width=2, height=2, origin_x=-1.0, origin_y=0.5, cells=cells
@@ -135,7 +135,7 @@ async def test_the_frames_join_map_and_robot(bridge: Bridge) -> None:
     assert Pose(x=1.0, y=0.0, yaw=0.0) != state.pose
 
 
-async def test_a_viewer_sees_who_talks_to_whom(bridge: Bridge) -> None:
+async def test_a_viewer_sees_the_connection_graph(bridge: Bridge) -> None:
     bridge.robot.publish(SCAN, EXAMPLES["LaserScan"])  # type: ignore[type-var]
     await NameClaim(bridge.robot).take()
     await NameClaim(bridge.bus).take()
@@ -181,7 +181,7 @@ def _panels(place: object) -> list[str]:
     return [*_panels(place["first"]), *_panels(place["second"])]
 
 
-async def test_a_robot_turns_as_a_viewer_tells_it_and_a_second_bridge_says_what_to_do(
+async def test_a_robot_turns_as_a_viewer_steers_and_a_second_bridge_is_refused(
     home: Home,
 ) -> None:
     from gigabrain_zenoh.qa.probe import probing

@@ -103,7 +103,7 @@ async def first(port: int) -> tuple[bytes, asyncio.StreamWriter]:
 
 
 @pytest.mark.usefixtures("impatient")
-async def test_of_200_who_do_not_read_16_get_in_and_are_cut_off(
+async def test_of_200_viewers_that_do_not_read_16_are_admitted_and_cut_off(
     talker: tuple[Talker, int, Front],
 ) -> None:
     made, port, stands = talker
@@ -137,7 +137,7 @@ async def test_another_site_cannot_look_on_through_a_browser(bridge: Bridge) -> 
         pass
 
 
-async def test_100_who_connect_and_are_silent_keep_nobody_out(
+async def test_100_silent_connections_keep_no_viewer_out(
     talker: tuple[Talker, int, Front],
 ) -> None:
     _, port, stands = talker

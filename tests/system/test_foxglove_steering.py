@@ -58,7 +58,7 @@ async def test_of_two_viewers_one_steers(bridge: Bridge) -> None:
      {"linear": {"z": 1}, "angular": {}}, b'{"linear_x": 0.1' + b" " * 2000 + b"}"],
     ids=str,
 )  # fmt: skip
-async def test_what_is_no_velocity_steers_nobody(bridge: Bridge, content: object) -> None:
+async def test_an_invalid_velocity_does_not_steer(bridge: Bridge, content: object) -> None:
     async with bridge.viewer() as viewer:
         await viewer.publish_on(topic_to_steer(bridge.config))
         await viewer.publish(content)
@@ -67,9 +67,7 @@ async def test_what_is_no_velocity_steers_nobody(bridge: Bridge, content: object
 
 
 @pytest.mark.parametrize("topic", ["/teleop", "/teleop/", "/cmd_vel", "robot/cmd_vel", ""])
-async def test_who_does_not_know_the_topic_may_look_and_not_drive(
-    bridge: Bridge, topic: str
-) -> None:
+async def test_a_viewer_without_the_secret_topic_cannot_steer(bridge: Bridge, topic: str) -> None:
     async with bridge.viewer() as stranger, bridge.viewer() as owner:
         await stranger.publish_on(topic)
         await owner.publish_on(topic_to_steer(bridge.config))

@@ -104,7 +104,7 @@ async def test_a_window_that_loses_the_focus_lets_all_keys_go(
     await page.keyboard.up("a")
 
 
-async def test_the_e_stop_stops_a_driving_robot_and_names_who_confirmed_it(
+async def test_the_e_stop_stops_a_driving_robot_and_names_the_confirming_body(
     chromium: Browser, seen: Probe
 ) -> None:
     page = await chromium.open()
@@ -131,7 +131,7 @@ async def test_the_e_stop_stops_a_driving_robot_and_names_who_confirmed_it(
     assert await text(page, "confirmed") == ""
 
 
-async def test_a_goal_that_nobody_serves_is_refused_in_words(chromium: Browser) -> None:
+async def test_a_goal_without_a_server_is_refused_on_the_page(chromium: Browser) -> None:
     page = await chromium.open()
     await page.click("#map", position={"x": 300, "y": 200})
     await told(page, "goal", "no process serves goals")
@@ -212,7 +212,7 @@ async def test_a_joystick_pressed_while_the_robot_stops_for_a_moment_steers_when
     await seen.at_rest()
 
 
-async def test_what_was_held_when_the_robot_was_latched_has_to_be_pressed_anew(
+async def test_a_key_held_while_the_robot_was_latched_must_be_pressed_again(
     chromium: Browser, seen: Probe
 ) -> None:
     page, other = await chromium.open(), await chromium.open()

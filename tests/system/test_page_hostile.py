@@ -100,9 +100,7 @@ async def test_a_flood_is_cut_off_and_others_go_on(robot: Robot) -> None:
 
 @pytest.mark.usefixtures("served")
 @pytest.mark.parametrize("begun", [b"", b"GET / HTTP/1.1\r\nHost: "], ids=["silent", "half"])
-async def test_those_who_connect_and_ask_for_nothing_keep_nobody_out(
-    robot: Robot, begun: bytes
-) -> None:
+async def test_silent_connections_keep_no_browser_out(robot: Robot, begun: bytes) -> None:
     with contextlib.ExitStack() as stack:
         for _ in range(100):
             silent = socket.create_connection(("127.0.0.1", robot.port), timeout=20)
@@ -136,7 +134,7 @@ async def test_a_page_asked_for_by_another_name_is_not_given(robot: Robot) -> No
 
 
 @pytest.mark.usefixtures("served")
-async def test_a_viewer_who_never_reads_slows_neither_robot_nor_others(robot: Robot) -> None:
+async def test_a_viewer_that_never_reads_slows_neither_robot_nor_others(robot: Robot) -> None:
     reader, writer = await asyncio.open_connection("127.0.0.1", robot.port, limit=1024)
     head = (
         f"GET /ws HTTP/1.1\r\nHost: 127.0.0.1:{robot.port}\r\nOrigin: {robot.origin}\r\n"
@@ -158,7 +156,7 @@ async def test_a_viewer_who_never_reads_slows_neither_robot_nor_others(robot: Ro
     writer.close()
 
 
-async def test_a_demo_says_where_its_page_is_and_steps_aside_from_a_taken_port(
+async def test_a_demo_prints_the_address_of_its_page_and_avoids_a_taken_port(
     home: Home,
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:

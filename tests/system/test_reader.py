@@ -19,7 +19,7 @@ asyncio.run(quiet())
 """
 
 
-def test_who_prints_into_a_pipe_learns_at_once_that_nobody_reads_on() -> None:
+def test_a_closed_pipe_on_stdout_is_noticed_at_once() -> None:
     read, write = os.pipe()
     with subprocess.Popen(
         [sys.executable, "-c", QUIET.format(patience_s=60)], stdout=write
@@ -31,7 +31,7 @@ def test_who_prints_into_a_pipe_learns_at_once_that_nobody_reads_on() -> None:
 
 
 @pytest.mark.parametrize("kind", ["pipe", "file"])
-def test_who_is_read_is_left_alone(kind: str, tmp_path: Path) -> None:
+def test_an_open_stdout_is_left_alone(kind: str, tmp_path: Path) -> None:
     with (tmp_path / "out").open("wb") as file:
         command = subprocess.run(
             [sys.executable, "-c", QUIET.format(patience_s=0.3)],

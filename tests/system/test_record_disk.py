@@ -67,9 +67,7 @@ def test_on_a_slow_disk_what_is_written_and_what_was_dropped_is_what_came(
     assert found.notes["gigabrain.recorded"]["dropped"] == str(status.dropped)
 
 
-def test_whoever_hands_messages_over_never_waits_for_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_bus_never_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stood, gate = threading.Event(), threading.Event()
 
     class StuckTape(AppendOnlyFile):

@@ -56,7 +56,7 @@ async def test_a_recorder_that_is_killed_costs_the_robot_nothing_and_its_file_is
     assert read_info(folder / first).notes["gigabrain"]["world"] == "arena"
 
 
-async def test_what_cannot_be_recorded_is_said_in_one_line(home: Home) -> None:
+async def test_a_recording_that_cannot_start_is_refused_in_one_line(home: Home) -> None:
     there = home.folder / "there.mcap"
     there.write_text("mine")
     lost = await home.run("record", "--connect", "tcp/127.0.0.1:9")

@@ -121,7 +121,7 @@ async def test_a_velocity_asks_for_the_body_and_gives_it_back(demo: Home) -> Non
     assert re.search(r"; (control drives|the brain has not got it back: .*)\n$", driving.out)
 
 
-async def test_processes_and_who_talks_to_whom_are_shown(demo: Home) -> None:
+async def test_processes_and_their_graph_are_shown(demo: Home) -> None:
     told = ("node list", "node info driver", "graph", "top --once")
     table, driver, graph, once = await asyncio.gather(
         *(printed(demo, *command.split()) for command in told)
@@ -133,7 +133,7 @@ async def test_processes_and_who_talks_to_whom_are_shown(demo: Home) -> None:
     assert re.search(r"^cmd_vel +\d", once, re.M)
 
 
-async def test_the_log_tells_who_changed_a_parameter(demo: Home) -> None:
+async def test_the_log_names_the_user_who_changed_a_parameter(demo: Home) -> None:
     follow = demo.start("log", "--follow", "--process", "decision", "--json", "-n", "1")
     await until(lambda: follow.out, "the log's past")
     told = await printed(demo, "param", "set", "decision", "max_linear_speed", "0.15")
@@ -226,7 +226,7 @@ async def test_pipes_end_without_a_complaint(demo: Home) -> None:
     assert await asyncio.gather(*(broken_off(*one.split()) for one in commands)) == ["", "", ""]
 
 
-async def test_without_a_robot_one_line_says_what_to_do(home: Home) -> None:
+async def test_without_a_robot_one_line_gives_the_remedy(home: Home) -> None:
     commands = (
         "topic list", "topic echo scan", "node list", "graph", "top --once", "param list",
         "foxglove", "log --follow --connect tcp/127.0.0.1:1",

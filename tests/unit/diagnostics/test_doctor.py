@@ -57,7 +57,7 @@ def found(machine: MachineFacts = MACHINE, robot: RobotFacts = ROBOT) -> list[Di
     return [one for one in examine(machine, robot) if one.grade != "ok"]
 
 
-def test_a_machine_and_a_robot_that_are_well_are_said_to_be() -> None:
+def test_a_healthy_machine_and_robot_have_only_good_results() -> None:
     assert found() == []
     assert exit_code(examine(MACHINE, ROBOT)) == 0
 

@@ -1,4 +1,4 @@
-"""What tools say of topics and messages: names, rates, arrays in words, and what people type."""
+"""Topics and messages in the tools: names, rates, summaries of arrays, and typed messages."""
 
 import asyncio
 import json
@@ -119,7 +119,7 @@ def test_an_old_name_of_a_topic_still_finds_it() -> None:
 def monitor_of(
     times_ms: list[float], size: int = 4, delay_ms: float = 3.0
 ) -> tuple[TopicMonitor, int]:
-    """A monitor that has heard messages at these times, and the time of the last."""
+    """Return a monitor that received messages at these times, and the time of the last."""
     now = [0]
     monitor = TopicMonitor(lambda: now[0], lambda: now[0])
     for i, at in enumerate(times_ms, 1):
@@ -131,7 +131,7 @@ def monitor_of(
     return monitor, now[0]
 
 
-def test_who_makes_up_keys_costs_a_bounded_number_of_them() -> None:
+def test_the_number_of_counted_keys_is_bounded() -> None:
     monitor = TopicMonitor()
     monitor.add("robot/scan", "", b"")
     for n in range(10_000):
@@ -291,7 +291,7 @@ async def test_echo_shows_what_comes_and_ends_after_so_many(net: Net) -> None:
     assert out == ["linear_x=0.1", "linear_x=0.2"]
 
 
-async def test_echo_of_what_nobody_sends_says_so_when_its_time_is_over(net: Net) -> None:
+async def test_echo_reports_a_silent_topic_after_its_time_limit(net: Net) -> None:
     await NameClaim(net.two).take()
     how = EchoOptions(within_s=0.01)
     with pytest.raises(BodyLost) as told:

@@ -145,7 +145,7 @@ def line(t: int, process: str = "driver", level: str = "info", **more: object) -
 
 @pytest.fixture
 def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A state folder with an old run and a new one."""
+    """Make a state folder with an old run and a new one."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
     base = tmp_path / "gigabrain" / "runs"
     for name in ("20260101T000000Z-demo-1", "20260102T000000Z-red-2"):
@@ -181,7 +181,7 @@ def test_what_is_not_there_to_be_read_is_answered_with_what_is(runs: Path) -> No
     assert ago_ns("10m", 10**12) == 400 * 10**9
 
 
-def test_without_any_run_one_line_says_how_to_get_one(
+def test_without_a_run_the_error_names_the_command_to_start_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
@@ -215,7 +215,7 @@ async def told(net: Net, name: str = "", value: str = "") -> ParamReply:
 
 
 async def thinking(net: Net) -> "asyncio.Task[None]":
-    """A decision process in memory."""
+    """Run a decision process in memory."""
     serve_params(net.one)
     running = asyncio.create_task(decision.run(DecisionConfig(), net.one, lambda: None))
     await asyncio.sleep(0)

@@ -26,7 +26,7 @@ Break = Callable[[RobotInMemory], Awaitable[None]]
 
 
 async def asked(robot: RobotInMemory, command: CmdVel | None = None) -> Verdict:
-    """What `why` says of the next second and a half, in which somebody may send a command."""
+    """Return the verdict on the next 1.5 s, in which an operator may send `command`."""
     bus = Bus(robot.network.transport(), robot.clock, "why")
     look = asyncio.ensure_future(ChainWatcher(bus).collect())
     if command:
@@ -38,7 +38,7 @@ async def asked(robot: RobotInMemory, command: CmdVel | None = None) -> Verdict:
 
 
 async def broken(folder: Path, do: Break, *, wait: int = 60) -> tuple[str, int, str, str]:
-    """The broken link once `do` has been done: its exit code, what is said, what to do."""
+    """Return the link that is broken after `do`: name, exit code, text and remedy."""
     async with RobotInMemory(folder) as robot:
         await robot.go(100)
         await do(robot)
@@ -49,7 +49,7 @@ async def broken(folder: Path, do: Break, *, wait: int = 60) -> tuple[str, int, 
     return found.link, verdict.exit_code, found.text, found.remedy
 
 
-async def test_a_robot_that_moves_is_said_to_move_with_figures_for_each_link(
+async def test_of_a_moving_robot_each_link_is_ok_with_its_figures(
     tmp_path: Path,
 ) -> None:
     async with RobotInMemory(tmp_path) as robot:
@@ -98,7 +98,7 @@ async def test_a_process_that_is_dead_or_hangs_is_named(
     assert f"gigabrain log --process {process}" in found[3]
 
 
-async def test_a_process_that_answers_and_says_nothing_is_told_from_one_that_is_gone(
+async def test_a_silent_process_differs_from_one_that_is_gone(
     tmp_path: Path,
 ) -> None:
     async def do(robot: RobotInMemory) -> None:
@@ -222,7 +222,7 @@ async def test_a_latched_gate_is_named_with_the_way_out(tmp_path: Path) -> None:
     assert found[3] == "find out why it was pressed: `gigabrain release`, then `gigabrain enable`"
 
 
-async def test_a_gate_that_nobody_enables_is_named(tmp_path: Path) -> None:
+async def test_a_gate_that_is_not_enabled_is_named(tmp_path: Path) -> None:
     async def do(robot: RobotInMemory) -> None:
         await robot.operator.ask(ESTOP, EstopRequest(source="ann"))
         await robot.go(40)
@@ -305,7 +305,7 @@ def standing(
     wants: Velocity = STANDS,
     operator: bool = False,
 ) -> ChainFacts:
-    """The robot that drove, now that it stands."""
+    """Return the facts of a robot that drove and stands now."""
     assert moving.state
     assert moving.intent
     assert moving.command
@@ -368,7 +368,7 @@ def test_a_gate_that_is_shut_comes_before_a_brain_that_waits(
     assert "by itself" not in verdict.broken.remedy
 
 
-def test_a_brain_that_stands_although_it_has_a_goal_says_why(moving: ChainFacts) -> None:
+def test_a_brain_that_stands_with_a_goal_gives_its_reason(moving: ChainFacts) -> None:
     reason = "waiting: it is not sure where in the map it is"
     verdict = judge(standing(moving, DRIVES, reason=reason))
     assert verdict.broken
@@ -376,7 +376,7 @@ def test_a_brain_that_stands_although_it_has_a_goal_says_why(moving: ChainFacts)
     assert verdict.broken.text == f"decision wants to stand: {reason}"
 
 
-def test_an_operator_who_keeps_the_body_from_a_goal_is_named(moving: ChainFacts) -> None:
+def test_an_operator_that_keeps_the_body_from_a_goal_is_named(moving: ChainFacts) -> None:
     wants = Velocity(linear_x=0.2)
     verdict = judge(standing(moving, DRIVES, wants=wants, operator=True))
     assert verdict.broken
@@ -387,14 +387,14 @@ def test_an_operator_who_keeps_the_body_from_a_goal_is_named(moving: ChainFacts)
     assert "control sends zero" in silent.broken.text
 
 
-def test_a_decision_that_is_starting_up_is_told_from_one_that_is_mute(moving: ChainFacts) -> None:
+def test_a_starting_decision_differs_from_a_silent_one(moving: ChainFacts) -> None:
     starting = replace(standing(moving, TaskStatus()), intent=None)
     assert judge(starting).waits
     assert judge(replace(starting, tasks=None)).exit_code == 15
 
 
 async def facts_of(folder: Path) -> ChainFacts:
-    """One look at a robot that drives."""
+    """Return the facts of a robot that drives."""
     async with RobotInMemory(folder) as robot:
         await robot.go(100)
         bus = Bus(robot.network.transport(), robot.clock, "why")
@@ -405,7 +405,7 @@ async def facts_of(folder: Path) -> ChainFacts:
     return facts
 
 
-async def test_what_a_process_cannot_do_is_told_beside_the_links(tmp_path: Path) -> None:
+async def test_problems_of_processes_are_notes_beside_the_links(tmp_path: Path) -> None:
     full = Cause(code="map_full", text="the map is full", remedy="map in parts")
     async with RobotInMemory(tmp_path) as robot:
         robot.operator.problems = (full,)

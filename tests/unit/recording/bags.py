@@ -25,7 +25,7 @@ BEGIN_NS = 1_767_225_600_000_000_000
 
 
 def state(seq: int, boot: int = 7) -> bytes:
-    """A RobotState as it goes over the bus; its speed is a hundredth of its number."""
+    """Return an encoded RobotState; its speed is a hundredth of its number."""
     message = RobotState(
         stamp_ns=BEGIN_NS + seq * 20_000_000,
         seq=seq,
@@ -40,7 +40,7 @@ def state(seq: int, boot: int = 7) -> bytes:
 
 
 def scan(seq: int) -> bytes:
-    """A LaserScan of 360 beams that does not compress; the same for the same number."""
+    """Return an encoded LaserScan of 360 random beams; the number is the seed."""
     ranges = ranges_bytes(np.random.default_rng(seq).uniform(0.2, 3.4, 360))
     message = LaserScan(
         seq=seq, boot=7, tick=seq, basis=seq,
@@ -50,7 +50,7 @@ def scan(seq: int) -> bytes:
 
 
 def arrival(at_ns: int, key: str, payload: bytes) -> ReceivedMessage:
-    """What the recorder makes of a message."""
+    """Return a message as the recorder receives it."""
     topic = topic_of(key)
     kind = topic.type.__name__ if topic else ""
     encoding = f"application/msgpack;gigabrain.{kind}"
@@ -58,7 +58,7 @@ def arrival(at_ns: int, key: str, payload: bytes) -> ReceivedMessage:
 
 
 def drive(states: int) -> Iterator[ReceivedMessage]:
-    """States at 50 Hz, with a scan after every fifth."""
+    """Yield states at 50 Hz, with a scan after every fifth."""
     scans = itertools.count(1)
     for seq in range(1, states + 1):
         yield arrival(seq * 20_000_000, "robot/state", state(seq))
@@ -69,7 +69,7 @@ def drive(states: int) -> Iterator[ReceivedMessage]:
 def write(
     path: Path, arrivals: Iterator[ReceivedMessage], *, flush_every: int = 12, end: bool = True
 ) -> int:
-    """A recording of `arrivals`, flushed after so many, finished or not; how many are in it."""
+    """Write a recording of `arrivals`; return their number."""
     file, count = BagWriter(path, viewers=False, notes={}), 0
     for count, each in enumerate(arrivals, 1):
         file.add(each)
@@ -84,17 +84,17 @@ def write(
 
 
 def seqs(path: Path, key: str = "robot/state") -> list[int]:
-    """The numbers of the messages on `key` that can be read."""
+    """Return the numbers of the readable messages on `key`."""
     return [sample.header.seq for sample in Bag(path) if sample.key == key]
 
 
 def kept(*paths: Path) -> Counter[str]:
-    """How many messages can be read from some files."""
+    """Count the readable messages of some files, by key."""
     return Counter(sample.key for path in paths for sample in Bag(path))
 
 
 def wait(recorder: Recorder, condition: Callable[[Status], bool]) -> None:
-    """Until its thread has come so far."""
+    """Wait until the status of the recorder fulfils a condition."""
     for _ in range(6000):
         if condition(recorder.status()):
             return

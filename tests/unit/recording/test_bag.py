@@ -41,7 +41,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_what_was_recorded_comes_out_byte_for_byte_with_its_key_encoding_and_schema(
+def test_messages_are_read_byte_for_byte_with_key_encoding_and_schema(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "a.mcap"
@@ -71,7 +71,9 @@ def test_other_programs_read_it_by_its_index(whole: Path) -> None:
     assert (channel.message_encoding, message.sequence) == ("msgpack", 1)
 
 
-def test_it_says_what_is_in_it(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_lists_the_keys_with_their_figures(
+    whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     found = read_info(whole)
     assert (found.messages, found.seconds, found.finished) == (600, 9.981, True)
     scan, state = found.keys
@@ -99,7 +101,7 @@ def test_missing_messages_are_counted_and_make_the_check_fail(
     assert "robot/state: 10 messages are missing" in capsys.readouterr().out
 
 
-def test_a_sender_that_starts_anew_is_told_from_a_gap() -> None:
+def test_a_restarted_sender_is_not_a_gap() -> None:
     gaps = SequenceGaps()
     for seq, boot in ((5, 1), (6, 1), (9, 1), (2, 2), (3, 2), (9, 3)):
         gaps.count("robot/state", Header(seq=seq, boot=boot))
@@ -119,7 +121,7 @@ def test_two_senders_on_one_key_have_a_count_each() -> None:
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"{", b"\x81\xa3seq\xa1x", b"[]", b"{}" * 9])
-def test_what_is_no_message_has_an_empty_header(payload: bytes) -> None:
+def test_an_invalid_message_has_an_empty_header(payload: bytes) -> None:
     assert header_of(payload) == Header()
 
 
@@ -131,7 +133,7 @@ def test_what_is_no_message_has_an_empty_header(payload: bytes) -> None:
         (b"\x89MCAP1\r\n" + bytes(40), "is MCAP of version 1; version 0 can be read"),
     ],
 )
-def test_a_file_that_is_no_bag_is_refused_in_one_line(
+def test_a_file_that_is_not_a_bag_is_refused_in_one_line(
     tmp_path: Path, content: bytes, complaint: str
 ) -> None:
     path = tmp_path / "x.mcap"
@@ -211,7 +213,7 @@ def test_a_malformed_record_costs_no_other_of_its_chunk(
     assert recover(path, tmp_path / "repaired.mcap").messages == 4
 
 
-def test_where_nothing_can_be_saved_that_is_said(
+def test_a_file_without_messages_is_reported_by_recover(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "stub.mcap"
@@ -234,7 +236,7 @@ def test_flipped_bytes_anywhere_never_break_the_reader(whole: Path, tmp_path: Pa
         assert len(list(Bag(path))) >= 588 - 12, at
 
 
-def test_cut_anywhere_all_that_is_earlier_can_be_read(tmp_path: Path) -> None:
+def test_a_file_cut_anywhere_can_be_read_up_to_the_cut(tmp_path: Path) -> None:
     path, cut = tmp_path / "open.mcap", tmp_path / "cut.mcap"
     bags.write(path, bags.drive(200), end=False)
     content = path.read_bytes()
@@ -267,9 +269,7 @@ def test_a_cut_recording_is_recovered_into_one_with_an_index(tmp_path: Path) -> 
         call("bag", "recover", str(path))
 
 
-def test_the_next_start_mends_what_was_cut_off_and_leaves_the_rest_alone(
-    whole: Path, tmp_path: Path
-) -> None:
+def test_the_next_start_recovers_only_files_that_were_cut_off(whole: Path, tmp_path: Path) -> None:
     cut, good, other = (tmp_path / name for name in ("cut.mcap", "good.mcap", "text.mcap"))
     bags.write(cut, bags.drive(100), end=False)
     shutil.copy(whole, good)

@@ -1,4 +1,4 @@
-"""A recording as a LeRobot dataset. That lerobot itself loads it was tried by hand: it is heavy."""
+"""A recording as a LeRobot dataset. Loading it with lerobot, a heavy package, was tried by hand."""
 
 import importlib.util
 import json
@@ -76,7 +76,7 @@ def test_the_dataset_has_the_folders_of_the_format(tmp_path: Path) -> None:
     assert (episode["dataset_to_index"], episode["tasks"]) == (info["total_frames"], ["drive"])
 
 
-def test_a_recording_in_which_nobody_drives_is_refused(tmp_path: Path) -> None:
+def test_a_recording_without_a_drive_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     bags.write(path, bags.drive(20))
     with pytest.raises(ConfigError, match="the gate was never enabled"):

@@ -1,4 +1,4 @@
-"""The recorder: what comes is in the file as it came, and is counted."""
+"""The recorder writes messages as they arrive, and counts them."""
 
 import asyncio
 import os
@@ -24,7 +24,7 @@ from tests.unit.recording import bags
 from tests.unit.recording.bags import QUICK, kept
 
 
-async def test_what_comes_over_the_bus_is_in_the_file_as_it_came(tmp_path: Path) -> None:
+async def test_messages_are_recorded_byte_for_byte(tmp_path: Path) -> None:
     net, path = Net(), tmp_path / "a.mcap"
     with Recorder(path, QUICK) as recorder, listening(net.one, recorder, ()):
         for _ in range(3):
@@ -61,7 +61,7 @@ async def test_a_map_from_before_the_recording_is_in_it(tmp_path: Path) -> None:
     await net.two.close()
 
 
-async def test_the_process_records_and_tells_how_it_is_doing(tmp_path: Path) -> None:
+async def test_the_process_records_and_reports_its_counts(tmp_path: Path) -> None:
     net = Net()
     config = RecorderConfig(folder=str(tmp_path), keep_free_mb=0, flush_s=0.05)
     process = asyncio.ensure_future(run(config, net.one, lambda: None))
@@ -84,7 +84,7 @@ async def test_the_process_records_and_tells_how_it_is_doing(tmp_path: Path) -> 
     await net.two.close()
 
 
-def test_viewers_find_something_to_draw_of_every_kind(tmp_path: Path) -> None:
+def test_every_kind_of_message_is_drawn_for_viewers(tmp_path: Path) -> None:
     file = BagWriter(tmp_path / "v.mcap", viewers=True, notes={})
     for n, topic in enumerate(TOPICS):
         payload = codec.encode(EXAMPLES[topic.type.__name__])
@@ -130,7 +130,7 @@ def test_a_file_that_exists_or_cannot_be_made_is_refused_before_anything_is_reco
         Recorder(there / "x.mcap", QUICK).begin()
 
 
-def test_messages_that_gathered_bear_the_times_of_their_own_stamps() -> None:
+def test_messages_received_in_a_batch_have_the_times_of_their_stamps() -> None:
     intake = Intake(1 << 20, lambda: 1_000_000_000)
     for ago_ms in (50, 30, 10, 70, -5):
         state = replace(example(STATE.type), stamp_ns=(1_000 - ago_ms) * 1_000_000)
@@ -139,7 +139,7 @@ def test_messages_that_gathered_bear_the_times_of_their_own_stamps() -> None:
     assert times == [950_000_000, 970_000_000, 990_000_000, 1_000_000_000, 1_000_000_001]
 
 
-def test_what_is_dropped_is_not_missing_nor_a_new_sender() -> None:
+def test_a_dropped_message_is_neither_missing_nor_a_restart() -> None:
     intake = Intake(5000, lambda: 1)
     for seq in range(1, 6):  # of 1.5 kB each: three fit
         intake.receive("robot/scan", "", bags.scan(seq))
@@ -147,7 +147,7 @@ def test_what_is_dropped_is_not_missing_nor_a_new_sender() -> None:
     assert not intake.gaps.restarts
 
 
-def test_who_makes_up_keys_and_encodings_costs_a_bounded_number_of_them() -> None:
+def test_the_number_of_recorded_channels_is_bounded() -> None:
     intake = Intake(1 << 30, lambda: 1)
     intake.receive("robot/scan", "", bags.scan(1))
     for n in range(10_000):
@@ -161,7 +161,7 @@ def test_who_makes_up_keys_and_encodings_costs_a_bounded_number_of_them() -> Non
     assert intake.dropped == {OTHER_KEYS: 20_002 - len(arrivals)}
 
 
-def test_viewers_get_every_second_state_and_each_thought_once(tmp_path: Path) -> None:
+def test_viewers_get_every_second_state_and_each_intent_once(tmp_path: Path) -> None:
     file = BagWriter(tmp_path / "a.mcap", viewers=True, notes={})
     for tick in range(50):  # one second
         for topic in (STATE, INTENT):
@@ -176,7 +176,7 @@ def test_viewers_get_every_second_state_and_each_thought_once(tmp_path: Path) ->
     assert (drawn["robot/intent"], drawn["/viz/path"]) == (50, 10)
 
 
-def test_the_writer_is_told_to_hurry_once_a_quarter_of_the_room_is_full() -> None:
+def test_the_writer_is_woken_when_a_quarter_of_the_queue_is_full() -> None:
     told: list[int] = []
     intake = Intake(4000, lambda: 1, lambda: told.append(1))
     for expected in (0, 0, 1, 1):

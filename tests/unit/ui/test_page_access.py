@@ -1,4 +1,4 @@
-"""Who may open the operator page, who steers, and what a slow browser gets."""
+"""Access to the operator page, steering by one viewer, and the queue of a slow browser."""
 
 import socket
 import stat
@@ -42,7 +42,7 @@ def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
         tokens(path)
 
 
-def test_of_many_who_make_the_tokens_at_once_all_have_the_same(tmp_path: Path) -> None:
+def test_processes_that_make_tokens_at_once_get_the_same(tmp_path: Path) -> None:
     for number, start in enumerate(("none", "none", "empty", "empty")):
         path = tmp_path / f"tokens-{number}.json"
         if start == "empty":
@@ -77,7 +77,7 @@ def test_tokens_are_read_from_a_folder_that_cannot_be_written(
         tokens(tmp_path / "other.json")
 
 
-def test_an_empty_file_of_tokens_is_made_anew_and_said_so(
+def test_an_empty_file_of_tokens_is_replaced_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "tokens.json"
@@ -97,7 +97,7 @@ async def test_a_page_that_cannot_be_served_makes_no_tokens(tmp_path: Path) -> N
     assert not path.exists()
 
 
-def test_tokens_are_told_to_whoever_had_them_made(tmp_path: Path) -> None:
+def test_new_tokens_are_printed_once(tmp_path: Path) -> None:
     config = PageConfig(login=True, tokens=str(tmp_path / "tokens.json"))
     first, second = Access(config, 8080), Access(config, 8080)
     made, _ = tokens(tmp_path / "tokens.json")
@@ -187,7 +187,7 @@ def test_of_each_viewer_120_messages_a_second_are_processed() -> None:
 
 
 class Seated:
-    """A page of two viewers beside a Waffle, on a clock that the test moves."""
+    """A page with two viewers and a Waffle; the test gives the time."""
 
     def __init__(self, tell: Callable[[str, bytes], None] = lambda _slot, _frame: None) -> None:
         self.net, self.steered = Net(), list[Twist]()
@@ -223,7 +223,7 @@ async def test_one_viewer_steers_until_it_lets_go_or_falls_silent() -> None:
     assert page.speeds == [0.26, 0.1, 0.0]
 
 
-async def test_what_a_network_had_stored_and_hands_over_at_once_steers_nobody() -> None:
+async def test_commands_buffered_by_a_network_do_not_steer() -> None:
     page = Seated()
     await settle()
     for at_s in (1.0, 1.04, 1.08):
@@ -238,7 +238,7 @@ async def test_what_a_network_had_stored_and_hands_over_at_once_steers_nobody() 
     assert page.speeds == [0.1, 0.0]
 
 
-async def test_a_goal_that_nobody_serves_is_said_to_be_so() -> None:
+async def test_a_goal_without_a_server_is_refused_with_the_reason() -> None:
     page = Seated()
     goal = PageRequest(id=7, what="goal", goal=GoalRequest(x=1.0, y=2.0))
     reply = await RequestHandler(page.net.one).handle(goal)

@@ -1,4 +1,4 @@
-"""Who gets a place at the operator page, and who gives one up."""
+"""Places at the operator page: a viewer gives way to an operator."""
 
 import asyncio
 import contextlib
@@ -19,7 +19,7 @@ HOST = "127.0.0.1:8080"
 
 
 class Socket(WebSocket):
-    """A browser's end, in memory."""
+    """A browser's end of a WebSocket, in memory."""
 
     def __init__(self) -> None:
         scope = {"type": "websocket", "path": "/ws", "query_string": b""}
@@ -46,7 +46,7 @@ class Socket(WebSocket):
 
 
 class Page:
-    """The sessions of a page that wants a token."""
+    """The sessions of a page that requires a token."""
 
     def __init__(self, folder: Path) -> None:
         config = PageConfig(login=True, tokens=str(folder / "tokens.json"))
@@ -56,7 +56,7 @@ class Page:
         self._talks: list[asyncio.Task[None]] = []
 
     async def comes(self, token: str = "") -> Socket:
-        """A browser that says who it is, or nothing."""
+        """Connect a browser, with a token or silent."""
         socket = Socket()
         if token:
             socket.said.put_nowait(frames.as_json(frames.LOGIN, frames.Login(token=token)))
@@ -96,7 +96,7 @@ async def test_operators_get_in_though_all_places_are_taken_by_operators(page: P
     assert [operator.code for operator in operators] == [0] * 64 + [4429]
 
 
-async def test_200_browsers_that_do_not_say_who_they_are_keep_no_operator_out(page: Page) -> None:
+async def test_200_browsers_without_a_login_keep_no_operator_out(page: Page) -> None:
     silent = [await page.comes() for _ in range(200)]
     assert [each.code for each in silent] == [4401] * 136 + [0] * 64
     operator = await page.comes(page.tokens.operator)

@@ -1,4 +1,4 @@
-"""What keys and a gamepad mean, and that letting go of either stops the robot."""
+"""Keys and gamepad of teleoperation; releasing either stops the robot."""
 
 import asyncio
 import os
@@ -34,7 +34,7 @@ WAFFLE = load_robot("turtlebot3_waffle")  # 0.26 m/s, 1.82 rad/s
 ALPHA = load_robot("alpha")  # goes sideways as well, 0.2 m/s
 
 
-def test_keys_are_told_from_arrows_and_from_what_else_a_terminal_sends() -> None:
+def test_keys_and_arrows_are_found_among_other_escape_sequences() -> None:
     assert keys_of("wW\x1b[A\x1bOD +\x1b[1;5C\x1b[15~\x03") == [
         "w", "w", "up", "left", " ", "+", "right", "\x03",
     ]  # fmt: skip
@@ -118,7 +118,7 @@ async def test_a_gamepad_that_is_unplugged_holds_no_button(tmp_path: Path) -> No
     assert Gamepad(tmp_path / "nowhere").pad is None
 
 
-def test_the_display_says_who_drives_and_what_to_do_about_what_holds_it_back() -> None:
+def test_the_display_names_commander_causes_and_remedies() -> None:
     gate = GateStatus(mode="latched", causes=(estop("ann"),), commander="")
     state = example(RobotState)
     state = type(state)(robot_type="mock", pose=state.pose, velocity=state.velocity, gate=gate)
@@ -130,7 +130,7 @@ def test_the_display_says_who_drives_and_what_to_do_about_what_holds_it_back() -
 
 
 class Held:
-    """The robot as a station sees it: the gate is open for the brain, whose place it takes."""
+    """A robot whose gate is enabled for the brain, from which the station takes over."""
 
     def __init__(self, asked: Callable[[], None] = lambda: None) -> None:
         self.state: RobotState | None = None
@@ -172,7 +172,7 @@ async def test_a_station_that_a_signal_ends_stops_the_body_and_hands_it_back(
     assert robot.enabled == 2  # for the station, and for the brain again
 
 
-async def test_a_station_that_cannot_hand_back_says_so_and_ends(
+async def test_a_station_that_cannot_return_the_body_reports_it_and_ends(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def lost() -> None:

@@ -1,4 +1,4 @@
-"""Who watches a robot asks again when a question was lost, and sees when it lacks processors."""
+"""RunMonitor repeats lost queries, and notices a brain that is late on a busy machine."""
 
 import asyncio
 
@@ -17,7 +17,7 @@ async def answer(_: DescribeRequest) -> Description:
     return Description(process="driver", pid=7, host="robot", version="1")
 
 
-async def test_a_process_that_comes_back_in_time_is_heard() -> None:
+async def test_a_process_that_returns_in_time_is_described() -> None:
     net = Net()
     asking = asyncio.ensure_future(RunMonitor(net.one).describe("driver", 20.0))
     await asyncio.sleep(0.15)
@@ -27,7 +27,7 @@ async def test_a_process_that_comes_back_in_time_is_heard() -> None:
     assert told.pid == 7
 
 
-async def test_who_never_answers_is_none() -> None:
+async def test_a_process_that_never_answers_has_no_description() -> None:
     assert await RunMonitor(Net().one).describe("driver", 0.15) is None
 
 
