@@ -20,6 +20,13 @@ from gigabrain_zenoh.ui.run_report import RunMonitor
 FRAMES_HZ = 4
 FAULT_SHOWN_S = 30.0
 LINE_INTERVAL_S = 10.0  # of the robot's time, without a terminal
+ACTIVITIES = {  # of processes that send nothing about the robot
+    "router": "connects the processes",
+    "relay": "connects the processes",
+    "page": "shows the robot in a browser",
+    "foxglove": "shows the robot in Foxglove",
+    "emulator": "emulates the body's line",
+}
 GATE_COLOURS = {"enabled": "green", "idle": "yellow", "stopping": "yellow", "latched": "red"}
 
 
@@ -221,10 +228,6 @@ def _activity(name: str, watch: RunMonitor) -> str:
     """Describe the work of a process by its messages."""
     health = watch.health.get(name)
     sent = health.sent_hz if health else {}
-    if name in ("router", "relay"):
-        return "connects the processes"
-    if name == "page":
-        return "shows the robot in a browser"
     if name == "recorder":
         return f"recorded {health.counters.get('recorded', 0) if health else 0} messages"
     if name == "driver":
@@ -243,6 +246,12 @@ def _activity(name: str, watch: RunMonitor) -> str:
         if command is None:
             return "silent"
         return f"{command.linear_x:+.2f} m/s  {command.angular_z:+.2f} rad/s"
+    if name == "safety":
+        return _verdict_summary(watch)
+    return ACTIVITIES.get(name, "")
+
+
+def _verdict_summary(watch: RunMonitor) -> str:
     verdict = watch.safety.fresh()
     if verdict is None:
         return "silent"

@@ -6,10 +6,12 @@ import pytest
 
 from gigabrain_schemas.base import Cause, Pose, Velocity
 from gigabrain_schemas.body import GateMode, GateStatus, RobotState
+from gigabrain_schemas.examples import example
 from gigabrain_schemas.requests import DescribeRequest, Description
 from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.topics import DESCRIBE, SAFETY, STATE
 from gigabrain_zenoh.testing.in_memory import Net
+from gigabrain_zenoh.ui.live_view import _activity
 from gigabrain_zenoh.ui.run_report import RunMonitor
 
 
@@ -53,3 +55,15 @@ async def test_a_brain_that_is_late_on_a_busy_machine_is_held_by_its_load(
     busy = Cause(code=warning, text="why")
     net.two.publish(SAFETY, SafetyState(verdict="stop", warnings=(busy,)))
     assert watch.held_by_load is held
+
+
+@pytest.mark.parametrize(
+    ("process", "activity"),
+    [("safety", "ok"), ("emulator", "emulates the body's line"), ("other", "")],
+)
+async def test_only_the_row_of_safety_shows_its_verdict(process: str, activity: str) -> None:
+    net = Net()
+    watch = RunMonitor(net.one)
+    net.two.publish(STATE, example(RobotState))
+    net.two.publish(SAFETY, SafetyState(verdict="ok"))
+    assert _activity(process, watch) == activity
