@@ -170,7 +170,7 @@ def test_the_secret_to_steer_opens_no_page(tmp_path: Path, monkeypatch: pytest.M
     path = tmp_path / "gigabrain" / "foxglove" / "secret"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     path.write_text("a b")
-    with pytest.raises(ConfigError, match="remove it, and a new one is made"):
+    with pytest.raises(ConfigError, match="remove the file for a new one"):
         topic_to_steer(FoxgloveConfig())
 
 

@@ -27,11 +27,9 @@ from tests.unit.recording import bags
 
 
 def call(*arguments: str) -> object:
-    """Run a command; return its exit code."""
-    code = make_app(arguments)(
+    return make_app(arguments)(
         arguments, exit_on_error=False, print_error=False, result_action="return_value"
     )
-    return code or 0
 
 
 @pytest.fixture(scope="module")
