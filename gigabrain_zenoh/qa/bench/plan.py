@@ -146,7 +146,7 @@ def _measure(
         anew.timing("costs of the whole map"),
         changed.timing("costs after a change"),
         first.timing("costs after a change, and a plan"),
-        searching.timing("optimal way, office"),
+        searching.timing("optimal path, office"),
         planning.timing("the same, pulled tight"),
         *_corner_to_corner(size, rng, ratios),
     )
@@ -190,7 +190,7 @@ def _corner_to_corner(
         with all_:
             field = search.field(cost, (0, 0), "from")
     ratios.append(_paid(cost, cells) / float(field[goal]))
-    return one.timing("optimal way, random map, corner to corner"), all_.timing(
+    return one.timing("optimal path, random map, corner to corner"), all_.timing(
         "Dijkstra of it all"
     )
 

@@ -26,8 +26,6 @@ from gigabrain_zenoh.qa.judging import Failed, Finding, Skipped
 
 POLL_S = 0.004
 PATIENCE_S = 10.0  # of wall time without a single tick
-
-
 REST_SPEED = 0.02  # [m/s], of the true body, below which it stands
 WORLD = "arena"
 OPEN_TICKS = 250  # 5 s

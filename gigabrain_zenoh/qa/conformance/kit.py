@@ -35,73 +35,40 @@ CUT = "motors at zero {promise}; both + 100; at rest 15 ticks (legs: 30) later"
 ALONE = (
     DriverCheck("opens", "received within 5 s", driver_checks.opens),
     DriverCheck("obeys", "measured speed within 10 % + 0.02", driver_checks.obeys),
-    DriverCheck(
-        "obeys within limits",
-        "asked for 10 times its speed: at most its max speeds",
-        driver_checks.limits,
-    ),
-    DriverCheck(
-        "returns what it sent",
-        "the body's commands, to 0.02; without a peer, its motion",
-        driver_checks.returns,
-    ),
+    DriverCheck("obeys within limits", "asked for 10 times its speed: at most its max speeds",
+                driver_checks.limits),
+    DriverCheck("returns what it sent", "the body's commands, to 0.02; without a peer, its motion",
+                driver_checks.returns),
     DriverCheck("refuses NaN itself", "all zero, nothing raised", driver_checks.refuses_nan),
-    DriverCheck(
-        "never raises", "stop and close, in any state, within 2 s", driver_checks.never_raises
-    ),
-    DriverCheck(
-        "stops when it is killed",
-        "motors at zero {promise} + 100",
-        gate_checks.driver_killed,
-        with_peer=True,
-        repeated=True,
-    ),
-)
+    DriverCheck("never raises", "stop and close, in any state, within 2 s",
+                driver_checks.never_raises),
+    DriverCheck("stops when it is killed", "motors at zero {promise} + 100",
+                gate_checks.driver_killed, with_peer=True, repeated=True),
+)  # fmt: skip
 GATED = (
-    DriverCheck(
-        "reports at its rate", "9 of 10 ticks, 100 ms old; scans to 25 %", gate_checks.reports
-    ),
-    DriverCheck(
-        "stops on silence",
-        "7 ticks, its ramp, 15 of the body (legs: 30)",
-        gate_checks.silence,
-        repeated=True,
-    ),
-    DriverCheck(
-        "stops on NaN", "zero in 2 ticks, 15 of the body (legs: 30)", gate_checks.not_a_number
-    ),
+    DriverCheck("reports at its rate", "9 of 10 ticks, 100 ms old; scans to 25 %",
+                gate_checks.reports),
+    DriverCheck("stops on silence", "7 ticks, its ramp, 15 of the body (legs: 30)",
+                gate_checks.silence, repeated=True),
+    DriverCheck("stops on NaN", "zero in 2 ticks, 15 of the body (legs: 30)",
+                gate_checks.not_a_number),
     DriverCheck("stops on disorder", "nothing obeyed; as on silence", gate_checks.disorder),
-    DriverCheck(
-        "stops on SIGKILL", "of the commander; as on silence", gate_checks.killed, repeated=True
-    ),
-    DriverCheck(
-        "stops unplugged",
-        f"reported in 100 ms, {CUT}",
-        gate_checks.unplugged,
-        with_peer=True,
-        repeated=True,
-    ),
-    DriverCheck(
-        "stops on a frozen peer",
-        f"reported in 250 ms, {CUT}",
-        gate_checks.frozen,
-        with_peer=True,
-        repeated=True,
-    ),
-    DriverCheck(
-        "reconnects",
-        "by itself in 5 s; still until enabled, then drives",
-        gate_checks.reconnects,
-        with_peer=True,
-    ),
+    DriverCheck("stops on SIGKILL", "of the commander; as on silence",
+                gate_checks.killed, repeated=True),
+    DriverCheck("stops unplugged", f"reported in 100 ms, {CUT}",
+                gate_checks.unplugged, with_peer=True, repeated=True),
+    DriverCheck("stops on a frozen peer", f"reported in 250 ms, {CUT}",
+                gate_checks.frozen, with_peer=True, repeated=True),
+    DriverCheck("reconnects", "by itself in 5 s; still until enabled, then drives",
+                gate_checks.reconnects, with_peer=True),
     DriverCheck("command to byte", "p50 at most 1 ms", gate_checks.latency),
-)
+)  # fmt: skip
 
 
 async def check(
     name: str, link: LinkName, folder: Path, progress: Callable[[str], None], repeat: int = 1
 ) -> list[DriverCheckResult]:
-    """Run all checks on the robot called `name`. Raises ConfigError when it cannot be had."""
+    """Run all checks on the robot called `name`. Raises ConfigError."""
     async with CheckedRobot(name, link, folder) as robot:
         return await run(robot, progress, repeat)
 
@@ -126,7 +93,7 @@ async def run(
 
 
 class SharedGate:
-    """One gated driver for all checks, and a new one after each that failed."""
+    """One gated driver for all checks; a failed check gets a new one for the next."""
 
     def __init__(self, robot: CheckedRobot) -> None:
         self._robot, self._stack = robot, contextlib.AsyncExitStack()
@@ -204,5 +171,5 @@ async def _tried(call: Callable[[], Awaitable[Finding]]) -> Finding:
         return Finding(False, str(error), late_ms=late_ms)
     except GigabrainError as error:
         return Finding(False, str(error))
-    except Exception as error:  # noqa: BLE001 - a stranger's driver; its error is the finding
+    except Exception as error:  # noqa: BLE001 - any error of an unknown driver is a finding
         return Finding(False, repr(error))
