@@ -1,6 +1,6 @@
 """Old words of YAML files and of the command line that still work, each with a one-line notice.
 
-A row goes in the release that `REMOVED_IN` names. Until then the old word means the new one.
+A row is removed in the release that `REMOVED_IN` names. Until then the old word means the new one.
 """
 
 import sys
@@ -243,5 +243,6 @@ def _notice(where: str, old: str, new: str) -> None:
 
 
 def _notice_text(old: str, new: str) -> str:
-    now = f"is now '{new}'" if new else "has no effect here"
-    return f"'{old}' {now}; the old word goes in {REMOVED_IN}"
+    if not new:
+        return f"'{old}' has no effect here; remove it before {REMOVED_IN}"
+    return f"'{old}' is now '{new}'; the old word works until {REMOVED_IN}"
