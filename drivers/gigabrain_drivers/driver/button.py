@@ -16,10 +16,11 @@ from gigabrain_zenoh.config.settings import ButtonConfig
 from gigabrain_zenoh.errors import NotConfirmed
 from gigabrain_zenoh.gate import causes as why
 
+log = logging.getLogger(__name__)
+
 ECHO_TIMEOUT_NS = 200_000_000  # what has not come back by then counts as never coming
 QUESTION_BYTES = 2  # of each question: none of them can be guessed, nor held over from before
 
-log = logging.getLogger(__name__)
 BAUD = 115_200
 PERIOD_NS = 20_000_000  # between two questions
 PUBLISH_EVERY = 2  # of them: 25 times a second

@@ -25,6 +25,8 @@ from gigabrain_zenoh.host.threads import BackgroundWriter
 from gigabrain_zenoh.logs import Fault
 from gigabrain_zenoh.runtime.audit import AuditTrail
 
+log = logging.getLogger(__name__)
+
 MAX_LATCH_BYTES = 65_536
 UNREADABLE = Cause(
     code="latch_unreadable",
@@ -34,7 +36,6 @@ UNREADABLE = Cause(
 )
 
 Raised = dict[str, tuple[str, Cause]]  # by its code: who raised it, and the cause
-log = logging.getLogger(__name__)
 ON_TIME_NS = TICK_NS // 2  # a tick at least this long after the last is not late
 DISK_RETRY_TICKS = 50  # once a second: what the disk did not take is tried again
 Stop = Callable[[], Awaitable[None]]

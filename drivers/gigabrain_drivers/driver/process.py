@@ -34,9 +34,10 @@ from gigabrain_zenoh.geometry.limits import ZERO, limits_of
 from gigabrain_zenoh.geometry.stopping import scan_limit_ns
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
+log = logging.getLogger(__name__)
+
 R = TypeVar("R", bound=Struct)
 Bounds = tuple[float, float]
-log = logging.getLogger(__name__)
 BODY_EVERY_TICKS = 50  # once a second
 STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
 

@@ -31,10 +31,8 @@ MAX_FOOT_OFFSET = (0.15, 0.10)  # [m], of a foot from its home, ahead and sidewa
 LEVEL_GAIN, DAMP_S = 0.45, 0.02  # how firmly the standing feet hold the body level
 FOOT_SPEED = 2.0  # [m/s], up or down, of a standing foot
 HEIGHT_SPEED = 0.1  # [m/s], of the whole body
-AT_REST_COMMAND, AT_REST_SPEED = (
-    1e-3,
-    0.15,
-)  # [m/s], commanded and measured, below which stepping ends
+AT_REST_COMMAND = 1e-3  # [m/s] and [rad/s], below which stepping ends,
+AT_REST_SPEED = 0.15  # [m/s], when the measured speed is below this too
 FALLEN = 0.8  # [rad] of roll or pitch
 
 

@@ -24,10 +24,8 @@ Samples = NDArray[np.float64]
 Piece = TypeVar("Piece")
 MAX_SAMPLES = 20_000  # per turn; the fastest lidar here measures 3200
 CLOCKWISE = -math.pi / 180  # from degrees clockwise to radians counter-clockwise
-MIN_PERIODS, MAX_PERIODS = (
-    0.25,
-    3.0,
-)  # of the nominal period; less is a backlog, more is two turns mixed
+MIN_PERIODS = 0.25  # of the nominal period, for one turn; less is a backlog,
+MAX_PERIODS = 3.0  # and more is two turns mixed
 
 
 class ScanSource(abc.ABC):

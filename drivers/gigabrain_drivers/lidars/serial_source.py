@@ -16,10 +16,11 @@ from gigabrain_schemas.body import Lidar, LinkHealth
 from gigabrain_schemas.sensors import LaserScan
 from gigabrain_zenoh.clock import Clock
 
+log = logging.getLogger(__name__)
+
 _LDS01 = re.compile(rb"\xfa[\xa0-\xdb].{40}\xfa[\xa0-\xdb]", re.DOTALL)
 _COIN_D4 = re.compile(rb"\xaa\x55.{8}", re.DOTALL)
 
-log = logging.getLogger(__name__)
 CHECK_PERIOD_NS = 100_000_000  # between two checks for scans
 LOG_AFTER_NS = 2_000_000_000  # without a scan, until it is logged
 REOPEN_NS = 5_000_000_000  # without a scan, until the port is reopened

@@ -17,10 +17,7 @@ from gigabrain_zenoh.host.files import read_bounded
 CONNECT_TIMEOUT_S = 1.0
 HAPPY_EYEBALLS_S = 0.1  # after which the next address of a name is tried beside the one before
 QUIET_NS = 200_000_000  # a frozen peer goes on acknowledging; only its own bytes show it alive
-LINGER_DISCARD = struct.pack(
-    "ii", 1, 0
-)  # linger on, for 0 s: what is still to be sent is thrown away
-
+LINGER_DISCARD = struct.pack("ii", 1, 0)  # linger on, for 0 s: unsent bytes are dropped
 MAX_ADDRESS_BYTES = 256  # of a file with an address
 
 

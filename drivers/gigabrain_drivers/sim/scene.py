@@ -11,6 +11,8 @@ from gigabrain_drivers.sim.body import SimBody, SimModel
 from gigabrain_drivers.sim.world import Box, ClosedPath, Pose, Shape, World
 from gigabrain_zenoh.errors import ConfigError
 
+log = logging.getLogger(__name__)
+
 FLOOR = "floor"  # name of the floor's geom, material and texture
 
 MATERIALS = {
@@ -35,7 +37,6 @@ PERSON_RADIUS_M = 0.25
 PERSON_SPEED = 0.8  # [m/s]
 PERSON_GAP_M = 0.5  # from the person's side to the robot's outer edge
 NEW_MEETING_M = 1.0  # walked since it last stood: standing again is another meeting
-log = logging.getLogger(__name__)
 ROBOT = "robot/"  # prefix of all names of the robot's model
 PERSON = "person"
 MAX_MISMATCH = 0.05  # share by which two measures differ that should be the same

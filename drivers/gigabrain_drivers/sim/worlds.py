@@ -1,7 +1,7 @@
 """Worlds by name: an arena, a house and a warehouse drawn by hand, and random layouts.
 
 Free passages are at least 1.1 m wide (doors 1.0 m) and everything else is flush, so a robot that
-only looks a metre ahead and turns right can roam for ever.
+only looks a metre ahead and turns right can roam without end.
 """
 
 import math
@@ -28,11 +28,10 @@ from gigabrain_zenoh.errors import UnknownName, unknown
 RANDOM_HALF_M = 3.5
 PASSAGE_M = 1.15  # the least gap that a robot may find; narrower ones are closed
 MAX_FREE, MAX_BY_WALL = 8, 5  # obstacles, at most
-MIN_OBSTACLES = 10  # obstacles
+MIN_OBSTACLES = 10
 LAYOUT_ATTEMPTS = 400  # for one layout
 OBSTACLE_MATERIALS = ("orange", "teal", "yellow", "blue", "green", "clay")
 Placed = tuple[Shape, float]  # a shape and the radius of the circle round it
-__all__ = ["World", "load_world", "world_names"]
 START_CLEARANCE_M = 0.6  # from the robot's origin to anything that stands
 PERSON_CLEARANCE_M = 1.5  # from the robot's origin to the person's middle
 RANDOM = "random:"

@@ -69,10 +69,8 @@ _UNIT = re.compile(r"\s*([-+]?[0-9]*\.?[0-9]*)\s*([A-Za-z%].*?)?\s*")
 ROUNDING = 1e-6  # of a digit: what binary fractions miss
 _FORMAT = re.compile(r"\+?0?[0-9]{0,2}(?:(?:\.[0-9])?f|d|[xX])")
 _ANY_NUMBER = r" *[-+]?[0-9]{1,12}(?:\.[0-9]{0,9})?"
-MAX_LINE_BYTES = 256  # bytes of a line
-MAX_VALUE = (
-    1e8  # in SI units; beyond, either way, no number is a measurement. Counters may count on.
-)
+MAX_LINE_BYTES = 256
+MAX_VALUE = 1e8  # in SI units; beyond, no number is a measurement. Counters may count on.
 DIGITS = "0123456789."  # what is no end of a number
 _FIELD = re.compile(r"\{([^{}|:]*)(?:\|([^{}|:]*))?(?::([^{}]*))?\}")
 

@@ -24,10 +24,8 @@ PROBE_BYTES = 600
 DTR_NS = 100_000_000  # after opening, until the terminal-ready line is cleared
 START_NS = 1_000_000_000  # after opening, until it listens
 RESTART_NS = 3_000_000_000  # without a packet, until it is stopped and started
-REFLECTION_MM, REFLECTION_QUALITY = (
-    150,
-    65,
-)  # up to here, a sample this weak is a reflection of the housing
+REFLECTION_MM = 150  # up to here, a sample of at most this
+REFLECTION_QUALITY = 65  # is a reflection of the housing
 MIRROR_QUALITY = 255
 
 
