@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple
 
 import serial
 
@@ -75,41 +75,25 @@ MODELS = {
 }
 
 
-class Line(Protocol):
-    """The operations of a port that the start-up needs."""
-
-    def send(self, data: bytes) -> None:
-        """Send bytes to the lidar."""
-
-    async def ask(self, request: bytes, kind: int) -> bytes:
-        """Return the single answer to a request. Raises StartupError."""
-
-    def motor(self, *, on: bool) -> None:
-        """Start or stop the motor."""
-
-    def identified(self, info: Info, *, pwm: bool) -> None:
-        """Note the lidar's identity, and whether a board powers its motor."""
-
-
-async def start(line: Line, scan_mode: str) -> None:
+async def start(lidar: "Rplidar", scan_mode: str) -> None:
     """Bring the lidar from any state to a stream of samples. Raises StartupError.
 
     The order is that of the vendor's SDK.
     """
-    await _stop(line)
-    info = Info.read(await line.ask(rplidar.request(rplidar.GET_INFO), rplidar.INFO))
-    line.identified(info, pwm=await _on_board(line, info))
-    await _check_health(line)
-    line.motor(on=True)
-    await _stop(line)
-    kind, mode = await choose_mode(line, info, scan_mode)
+    await _stop(lidar)
+    info = Info.read(await lidar.ask(rplidar.request(rplidar.GET_INFO), rplidar.INFO))
+    lidar.identified(info, pwm=await _on_board(lidar, info))
+    await _check_health(lidar)
+    lidar.motor(on=True)
+    await _stop(lidar)
+    kind, mode = await choose_mode(lidar, info, scan_mode)
     if kind == rplidar.STANDARD:
-        line.send(rplidar.request(rplidar.SCAN))
+        lidar.send(rplidar.request(rplidar.SCAN))
     else:
-        line.send(rplidar.express_request(mode))
+        lidar.send(rplidar.express_request(mode))
 
 
-async def choose_mode(line: Line, info: Info, scan_mode: str) -> tuple[int, int]:
+async def choose_mode(lidar: "Rplidar", info: Info, scan_mode: str) -> tuple[int, int]:
     """Return the answer type and number of the scan mode to use. Raises StartupError.
 
     `auto` is the lidar's typical mode, or the fastest of those that are understood here.
@@ -117,14 +101,14 @@ async def choose_mode(line: Line, info: Info, scan_mode: str) -> tuple[int, int]
     if info.firmware < CONF_FIRMWARE and info.model >> 4 < CONF_FAMILY:
         return _old_mode(info, scan_mode), 0
     wanted = set(FORMATS) if scan_mode == "auto" else {KINDS[scan_mode]}
-    typical = _number(await _conf(line, rplidar.MODE_TYPICAL))
-    kind = await _kind(line, typical)
+    typical = _number(await _conf(lidar, rplidar.MODE_TYPICAL))
+    kind = await _kind(lidar, typical)
     if kind in wanted:
         return kind, typical
     fitting = []
-    for mode in range(_number(await _conf(line, rplidar.MODE_COUNT))):
-        if (kind := await _kind(line, mode)) in wanted:
-            period = _number(await _conf(line, rplidar.MODE_MICROSECONDS, mode))
+    for mode in range(_number(await _conf(lidar, rplidar.MODE_COUNT))):
+        if (kind := await _kind(lidar, mode)) in wanted:
+            period = _number(await _conf(lidar, rplidar.MODE_MICROSECONDS, mode))
             fitting.append((period, kind, mode))
     if not fitting:
         raise StartupError(f"this RPLIDAR has no scan_mode {scan_mode!r} that is understood here")
@@ -142,38 +126,38 @@ def _old_mode(info: Info, scan_mode: str) -> int:
     return has.get(scan_mode, rplidar.STANDARD)
 
 
-async def _stop(line: Line) -> None:
-    line.send(rplidar.request(rplidar.STOP))
+async def _stop(lidar: "Rplidar") -> None:
+    lidar.send(rplidar.request(rplidar.STOP))
     await asyncio.sleep(STOP_S)
 
 
-async def _on_board(line: Line, info: Info) -> bool:
+async def _on_board(lidar: "Rplidar", info: Info) -> bool:
     if info.model >> 4 not in PWM_FAMILIES:
         return False
     try:
-        flags = await line.ask(rplidar.request(rplidar.GET_BOARD, bytes(4)), rplidar.BOARD)
+        flags = await lidar.ask(rplidar.request(rplidar.GET_BOARD, bytes(4)), rplidar.BOARD)
     except StartupError:  # without a board there is no answer
         return False
     return bool(flags[0] & 1)
 
 
-async def _check_health(line: Line) -> None:
-    health = Health.read(await line.ask(rplidar.request(rplidar.GET_HEALTH), rplidar.HEALTH))
+async def _check_health(lidar: "Rplidar") -> None:
+    health = Health.read(await lidar.ask(rplidar.request(rplidar.GET_HEALTH), rplidar.HEALTH))
     if health.status == 2:
-        line.send(rplidar.request(rplidar.RESET))
+        lidar.send(rplidar.request(rplidar.RESET))
         await asyncio.sleep(RESET_S)
         raise StartupError(
             f"the RPLIDAR has stopped to protect itself, code {health.code}; was reset"
         )
 
 
-async def _kind(line: Line, mode: int) -> int:
-    return (await _conf(line, rplidar.MODE_ANSWER, mode))[0]
+async def _kind(lidar: "Rplidar", mode: int) -> int:
+    return (await _conf(lidar, rplidar.MODE_ANSWER, mode))[0]
 
 
-async def _conf(line: Line, key: int, mode: int | None = None) -> bytes:
+async def _conf(lidar: "Rplidar", key: int, mode: int | None = None) -> bytes:
     """Return the value of a setting, at least one byte. Raises StartupError."""
-    data = await line.ask(rplidar.conf_request(key, mode), rplidar.CONF)
+    data = await lidar.ask(rplidar.conf_request(key, mode), rplidar.CONF)
     if int.from_bytes(data[:4], "little") != key or len(data) < 5:
         raise StartupError(f"the RPLIDAR does not report setting 0x{key:02x}")
     return data[4:]
