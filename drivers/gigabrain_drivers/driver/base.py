@@ -88,7 +88,7 @@ class Driver(abc.ABC):
         await self.stop()
 
     async def park(self) -> None:
-        """Take up a posture in which the body may be left alone. Raises BodyLost."""
+        """Take a posture in which the body may be left alone. Raises BodyLost."""
         raise Unsupported(f"{type(self).__name__} cannot park its body")
 
     async def limp(self) -> None:
@@ -137,7 +137,7 @@ class Driver(abc.ABC):
         raise Unsupported(f"{type(self).__name__} has no joints to position")
 
     async def get_joint_states(self) -> tuple[Joint, ...]:
-        """All joints as measured. Raises BodyLost."""
+        """Return all joints as measured. Raises BodyLost."""
         return (await self.read_state()).joints
 
     async def get_sensor_data(self, sensor_name: str) -> Message | None:

@@ -91,7 +91,7 @@ class Button:
         self._pressed = asyncio.Event()
 
     async def run(self, ready: Callable[[], None]) -> None:
-        """Until cancelled."""
+        """Watch the contact until cancelled."""
         self._link.open()
         ready()
         try:
@@ -132,7 +132,7 @@ class Button:
         return self._loop.problem(now_ns)
 
     async def _keep_latched(self) -> None:
-        """For as long as the contact is open the robot has to be latched."""
+        """Latch the robot for as long as the contact is open."""
         while True:
             await self._pressed.wait()
             state = self._states.fresh()

@@ -28,7 +28,7 @@ Options = TypeVar("Options", bound=Struct)
 
 
 def robot_files() -> dict[str, Path]:
-    """Every known robot and its file, by name."""
+    """Return the file of every known robot, by name."""
     bodies = Path(str(resources.files("gigabrain_drivers") / "bodies"))
     ours = {path.parent.name: path for path in sorted(bodies.glob("*/robot.yaml"))}
     return {**_robots_of_packages(), **ours}

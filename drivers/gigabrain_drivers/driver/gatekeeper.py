@@ -119,7 +119,7 @@ class CauseWatch:
 
 
 def raised(state: GateState) -> Raised:
-    """Every cause of this moment. What safety or the driver has found is not the gate's own."""
+    """Return every present cause by its code, with its origin: gate, driver or safety."""
     safety = state.safety
     found: Raised = {cause.code: ("gate", cause) for cause in state.causes}
     found |= {cause.code: ("driver", cause) for cause in state.faults}
@@ -173,7 +173,7 @@ class Gatekeeper:
         self._bus.serve(ENABLE, self._on_enable)
 
     def step(self, event: gate.Event) -> gate.Outcome:
-        """One event through the gate."""
+        """Step the gate by one event."""
         before = self.state
         self.state, outcome = gate.step(self._config, before, event)
         if self.state.output != before.output:

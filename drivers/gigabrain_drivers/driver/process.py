@@ -286,7 +286,7 @@ class DriverProcess:
                 self._lockstep.command(command)
 
     def _on_joint_command(self, _key: str, _command: JointCommand) -> None:
-        """No body of this package has joints to command; a refusal that can be seen."""
+        """Count a refusal: no body of this package has joints to command."""
         self._bus.counters["refused_no_joints"] += 1
 
     def _on_bad_command(self, payload: bytes) -> None:

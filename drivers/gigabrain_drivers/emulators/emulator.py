@@ -227,7 +227,7 @@ def wire_kind(name: str) -> Literal["serial", "tcp", ""]:
 
 
 def _parts(options: LinkOptions) -> dict[str, Any]:
-    """Each station's options."""
+    """Return each station's options."""
     return {BASE: options, **({SCAN: options.scan} if options.scan else {})}
 
 

@@ -82,7 +82,7 @@ class FaultyWire:
         self._waiting = bytearray()  # what came while the device stood still
 
     def write(self, data: bytes) -> bool:
-        """From the device to the host."""
+        """Send from the device to the host."""
         faults = self.faults
         if faults.silence or faults.frozen or faults.reboot:
             return True

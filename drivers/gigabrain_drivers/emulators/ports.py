@@ -68,7 +68,7 @@ class Pty:
         self._out_free = self._in_free = 0.0
 
     def write(self, data: bytes) -> bool:
-        """To the host; False when the port is unplugged."""
+        """Send to the host. Return False when the port is unplugged."""
         if self._master is None:
             return False
         self._out_free = self._after(self._out_free, self._send, data)

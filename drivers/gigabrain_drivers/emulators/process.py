@@ -43,7 +43,7 @@ async def emulate(config: EmulatorConfig, say: Callable[[str], None]) -> None:
 async def _serve_terminal(
     emulator: Emulator, config: EmulatorConfig, say: Callable[[str], None]
 ) -> None:
-    """For ever. Raises BodyLost with the physics."""
+    """Apply faults that are typed, until cancelled. Raises BodyLost with the physics."""
     for name, port in emulator.ports.items():
         say(f"{config.body} in {config.world}: {name} at {where(port)}")
     say(f"faults, one line each: [{'|'.join(emulator.stations)}] "

@@ -102,7 +102,7 @@ class LegGeometry:
 
     @cached_property
     def legs(self) -> tuple[Leg, ...]:
-        """In the order of LEGS."""
+        """The legs in the order of LEGS."""
         return tuple(
             Leg(
                 hip_x=ahead * self.hip_x,
@@ -220,7 +220,7 @@ class LegOdometry:
         self.velocity = Twist(0.0, 0.0, 0.0)  # along the floor
 
     def update(self, senses: Senses, passed_s: float) -> None:
-        """Take in a sample, `passed_s` after the one before."""
+        """Integrate a sample, `passed_s` after the one before."""
         passed_s = min(passed_s, MAX_SAMPLE_GAP_S)
         tilt = senses.tilt()
         velocity = self._by_accelerometer(senses, tilt, passed_s)

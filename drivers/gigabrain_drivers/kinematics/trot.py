@@ -51,7 +51,7 @@ class Trot:
         self.stepping = False  # whether feet are lifted at all
 
     def sense(self, senses: Senses, passed_s: float) -> None:
-        """Take in a sample, `passed_s` after the one before."""
+        """Integrate a sample, `passed_s` after the one before."""
         self.odometry.update(senses, passed_s)
         self.fallen = self.fallen or max(map(abs, senses.tilt())) > FALLEN
 

@@ -172,7 +172,7 @@ class SampleBuffer(TurnBuffer[tuple[Sequence[float], Sequence[float]]]):
     def unpack(
         self, pieces: list[tuple[Sequence[float], Sequence[float]]]
     ) -> tuple[Samples, Samples]:
-        """One after the other."""
+        """Join the pieces one after the other."""
         angles, distances = map(itertools.chain.from_iterable, zip(*pieces, strict=True))
         return np.fromiter(angles, np.float64), np.fromiter(distances, np.float64)
 

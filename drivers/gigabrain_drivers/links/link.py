@@ -281,7 +281,7 @@ class Liveness:
             self._heard_ns, self._hoping_ns = None, self._clock.now_ns()
 
     def alive(self) -> bool:
-        """Whether the newest message is recent enough."""
+        """Return whether the newest message is recent enough."""
         silent_ns = self._clock.now_ns() - (self._heard_ns or self._hoping_ns)
         alive = self._heard_ns is not None and silent_ns <= self._silent_ns
         if alive:

@@ -47,7 +47,7 @@ def state_message(simulation: Simulation, robot_type: str) -> RobotState:
 
 
 def scan_message(lidar: Lidar, ranges: NDArray[np.float32]) -> LaserScan:
-    """One turn of `lidar` with these `ranges` (beams,) [m]."""
+    """Return one turn of `lidar` with these `ranges` (beams,) [m]."""
     return LaserScan(
         angle_min=0.0,
         angle_increment=math.tau / lidar.beams,
@@ -125,7 +125,7 @@ class MujocoDriver(Driver):
         await self.stop()
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
-        """One tick per 20 ms of simulated time; ends when the run's seconds are over."""
+        """Yield one tick per 20 ms of simulated time, until the run's seconds are over."""
         self._bridge = Bridge()
         self._thread = threading.Thread(target=self._run_physics, name="physics", daemon=True)
         self._thread.start()

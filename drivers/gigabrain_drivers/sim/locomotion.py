@@ -40,7 +40,7 @@ class Battery:
         self._current = config.idle_current_a
 
     def drain(self, drive_current: float) -> None:
-        """Take one tick of `drive_current` [A] and the idle current out of it."""
+        """Drain one step of `drive_current` [A] and the idle current."""
         self._current = self._config.idle_current_a + drive_current
         self._left_ah = max(self._left_ah - self._current * STEP_S / HOUR_S, 0.0)
 
@@ -66,7 +66,7 @@ class MotorHeat:
         self.celsius = config.ambient_celsius
 
     def warm(self, free_current: float, torque: float) -> float:
-        """One tick at a no-load current [A] and a torque [N m]; returns the whole current [A]."""
+        """Heat for one step of no-load current [A] and torque [N m]; return the current [A]."""
         config = self._config
         current = free_current + abs(torque) / config.torque_per_ampere
         cooling = (self.celsius - config.ambient_celsius) / config.thermal_resistance
@@ -117,7 +117,7 @@ class Locomotion(abc.ABC):
 
     @abc.abstractmethod
     def sense(self, imu: ImuSample) -> None:
-        """Take in what encoders and inertial unit measured in the tick."""
+        """Read what encoders and inertial unit measured in the step."""
 
     @abc.abstractmethod
     def wear(self) -> float:
@@ -133,7 +133,7 @@ class Locomotion(abc.ABC):
 
     @abc.abstractmethod
     def motors(self) -> tuple[Motor, ...]:
-        """All driven joints."""
+        """Return all driven joints."""
 
     def contacts(self) -> tuple[bool, ...]:
         """Return which feet bear weight; none for a body without feet."""
@@ -161,7 +161,7 @@ class Rolling(Locomotion):
         self._x = self._y = self._yaw = 0.0
 
     def command(self, twist: Twist) -> Twist:
-        """Both wheels slow down alike if one would be too fast."""
+        """Aim for a velocity; both wheels slow down alike if one would be too fast."""
         left, right = self._kinematics.to_wheels(twist)
         scale = max(abs(left), abs(right)) / self._body.max_wheel_speed
         if scale > 1:
@@ -199,7 +199,7 @@ class Rolling(Locomotion):
         return count + math.trunc(angle / self._angle_per_tick - count)
 
     def wear(self) -> float:
-        """The motors draw by their speed and by their torque."""
+        """Return the current that the motors draw by their speed and by their torque."""
         config, effort, current = self._body, self._data.actuator_force.tolist(), 0.0
         share = config.battery.drive_current_a / len(self._heat) / config.max_wheel_speed
         wheels = zip(self._heat, self._motors, self._speeds(self._angle_per_tick), strict=True)
@@ -219,7 +219,7 @@ class Rolling(Locomotion):
         return Twist(odometry.linear_x, 0.0, odometry.angular_z)
 
     def motors(self) -> tuple[Motor, ...]:
-        """Left and right wheel."""
+        """Return left and right wheel."""
         effort = self._data.actuator_force
         speeds = self._speeds(self._angle_per_tick)
         parts = zip(self._body.wheels, self._counts, speeds, self._motors, self._heat, strict=True)
@@ -275,7 +275,7 @@ class Walking(Locomotion):
         return self._body.walker.to_body(self._gait)
 
     def walk(self, gait: Gait) -> None:
-        """From the next tick on."""
+        """Aim for a gait from the next step on."""
         self._gait = gait
 
     def act(self) -> None:
@@ -304,7 +304,7 @@ class Walking(Locomotion):
         self._turned += self._trot.odometry.velocity.angular_z * STEP_S
 
     def wear(self) -> float:
-        """Torque heats the windings; what the joints do to the world comes on top."""
+        """Heat the windings by torque; add the joints' mechanical power to the current."""
         power, resistance = 0.0, self._body.motor.resistance_ohm
         rates = by_joint(self._senses.rates) if self._senses else [0.0] * len(self._heat)
         for heat, effort, rate in zip(self._heat, self._efforts(), rates, strict=True):
@@ -331,9 +331,9 @@ class Walking(Locomotion):
         )
 
     def contacts(self) -> tuple[bool, ...]:
-        """In the order of LEGS."""
+        """Return the contacts in the order of LEGS."""
         return self._senses.contacts if self._senses else (False,) * len(LEGS)
 
     def _efforts(self) -> list[float]:
-        """Each joint's torque [N m]."""
+        """Return each joint's torque [N m]."""
         return self._data.actuator_force[self._motors].tolist()  # type: ignore[no-any-return]

@@ -117,7 +117,7 @@ class Simulation:
         return self._sample
 
     def motors(self) -> tuple[Motor, ...]:
-        """All driven joints."""
+        """Return all driven joints."""
         return self._locomotion.motors()
 
     def contacts(self) -> tuple[bool, ...]:

@@ -63,7 +63,7 @@ class Truth:
         return math.cos(yaw) * x + math.sin(yaw) * y, turning
 
     def update(self) -> None:
-        """Take in the tick that was just simulated."""
+        """Account for the step that was just simulated."""
         self._ticks += 1
         pose = self.pose()
         self.distance_m += math.hypot(pose.x - self._position.x, pose.y - self._position.y)
@@ -95,7 +95,7 @@ class Truth:
                 self.min_clearance_m = max(min(gap, limit), 0.0)
 
     def _lower_bounds(self) -> NDArray[np.float64]:
-        """At least this far is each obstacle from the robot [m], by boxes and a circle round it."""
+        """Return a lower bound of each obstacle's distance [m], by boxes and a circle."""
         things = self._obstacles
         offset = self._data.xpos[self._base, :2] - self._data.geom_xpos[things, :2]
         axes = self._data.geom_xmat[things].reshape(-1, 3, 3)[:, :2, :2]

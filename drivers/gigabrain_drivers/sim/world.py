@@ -152,5 +152,5 @@ class World:
         )
 
     def everything(self) -> tuple[Shape, ...]:
-        """All shapes, the outer walls included."""
+        """Return all shapes, the outer walls included."""
         return (*self.walls(), *self.shapes)

@@ -224,7 +224,7 @@ def _layout(random: np.random.Generator) -> list[Placed]:
 
 
 def _gap(shape: Shape, radius: float, other: Shape, other_radius: float) -> float:
-    """At least this much room is between two shapes [m], by the circles round them."""
+    """Return a lower bound of the gap between two shapes [m], by the circles round them."""
     return math.hypot(shape.x - other.x, shape.y - other.y) - radius - other_radius
 
 
@@ -262,7 +262,7 @@ NAMED_WORLDS: dict[str, Callable[[], World]] = {
 
 
 def world_names() -> dict[str, str]:
-    """One line about each world, by name."""
+    """Return one line about each world, by name."""
     names = {name: build().description for name, build in NAMED_WORLDS.items()}
     return {**names, f"{RANDOM}SEED": random_world(0).description}
 

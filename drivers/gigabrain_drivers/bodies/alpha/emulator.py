@@ -73,7 +73,7 @@ class Alpha(Device):
         self._refused += self._decoder.errors - errors
 
     def step(self, now_ns: int) -> None:
-        """Watchdog and report."""
+        """Watch the time since the last command, and report."""
         supply = self.body.snapshot.battery.voltage
         on = supply - self.sag_volts >= BROWN_OUT_SHARE * supply
         if on != self._on:

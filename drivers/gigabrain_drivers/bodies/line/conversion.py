@@ -29,7 +29,7 @@ class LineCommand:
         self._by_wheels = any(name.startswith(WHEEL) for name in template.names)
 
     def line(self, wanted: Velocity, seq: int) -> bytes:
-        """The line that asks for a velocity, rounded so that no limit is exceeded."""
+        """Return the line that asks for a velocity, rounded so that no limit is exceeded."""
         values = {**self._values(wanted), "seq": float(seq)}
         return self.template.encode(values, toward_zero=True)
 
@@ -49,7 +49,7 @@ class LineCommand:
         return Velocity(**{name: value + 0.0 for name, value in twist._asdict().items()})  # no -0
 
     def _values(self, velocity: Velocity) -> dict[str, float]:
-        """All that a command line may say of a velocity."""
+        """Return all that a command line may contain of a velocity."""
         twist = Twist(velocity.linear_x, velocity.linear_y, velocity.angular_z)
         values = twist._asdict()
         if self._base:
@@ -67,7 +67,7 @@ class SentWording:
         self._held = b""
 
     def feed(self, data: bytes) -> list[str]:
-        """In words, what `data` completes."""
+        """Describe what `data` completes."""
         self._held = (self._held + data)[-self._longest - 1 :]
         if name := self._named.get(self._held):
             self._held = b""
@@ -126,13 +126,13 @@ class LineReport:
         return True
 
     def restart(self) -> None:
-        """The line was cut: what comes next continues from here."""
+        """Count from the next line on: the connection was cut."""
         self._angles = self._pose = None
         self._now_ns = 0
         self._steps.clear()
 
     def velocity(self) -> Velocity:
-        """Each part as reported, or by the wheels' speeds, or by how the position has changed."""
+        """Return each part as reported, by the wheels' speeds, or by the position's change."""
         own, (linear_x, linear_y, angular_z) = self._values, self._measured()
         return Velocity(
             linear_x=own.get("linear_x", linear_x),
@@ -153,7 +153,7 @@ class LineReport:
         return tuple(found)
 
     def battery(self) -> Battery | None:
-        """Its percentage as reported, or by its voltage."""
+        """Return the battery; its percentage as reported, or by its voltage."""
         values, options = self._values, self._options
         voltage, percentage = values.get("battery_voltage"), values.get("battery_percentage")
         if voltage is not None and percentage is None:

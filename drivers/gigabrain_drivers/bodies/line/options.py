@@ -225,7 +225,7 @@ def _check_odometry(state: tuple[Template, ...], base: Base | None) -> None:
 
 
 def _check_motion(state: tuple[Template, ...], robot: RobotFile, base: Base | None) -> None:
-    """Every way in which the body can move is measured."""
+    """Check that every motion of the body is measured."""
     seen = frozenset[str]().union(*(template.names for template in state))
     wholes = [POSE, *((position_fields(base), speed_fields(base)) if base else ())]
     if any(seen.issuperset(whole) for whole in wholes):

@@ -44,7 +44,7 @@ class MockBody(Driver):
         self._lidar: ScanSource | None = None  # a real one, where its link has one
 
     async def open(self) -> None:
-        """Nothing to connect to but a lidar that it may carry; else a scan is there at once."""
+        """Connect to the lidar that it may carry; without one a scan is there at once."""
         self._open = True
         self._lidar = open_lidar(self, Clock())
         if self._lidar is None:
@@ -58,7 +58,7 @@ class MockBody(Driver):
             await lidar.close()
 
     async def stop(self) -> None:
-        """At rest at once."""
+        """Come to rest at once."""
         self._velocity = ZERO
 
     async def ticks(self, clock: Clock) -> AsyncIterator[int]:
@@ -78,7 +78,7 @@ class MockBody(Driver):
     async def set_base_velocity(
         self, linear_x: float, linear_y: float, angular_z: float
     ) -> Velocity:
-        """Take on the velocity at once."""
+        """Take the velocity at once."""
         if not self._open:
             raise BodyLost("the mock is not open")
         to = self.bounded(linear_x, 0.0, angular_z)

@@ -100,7 +100,7 @@ class Board:
 
     @property
     def problem(self) -> str:
-        """In one line why the body cannot be driven, or an empty text."""
+        """The reason in one line why the body cannot be driven, or an empty text."""
         if self.link.problem:
             return self.link.problem
         if not self.ready:
@@ -273,7 +273,7 @@ class OpenCrDriver(Driver):
 
     @property
     def problem(self) -> str:
-        """In one line why the body cannot be driven, or an empty text."""
+        """The reason in one line why the body cannot be driven, or an empty text."""
         return self._board.problem
 
     async def open(self) -> None:
@@ -296,12 +296,12 @@ class OpenCrDriver(Driver):
             await self._lidar.close()
 
     async def stop(self) -> None:
-        """Zero velocity, at once."""
+        """Send zero velocity, at once."""
         self._commanded_ns = self._clock.now_ns()
         self._board.halt()
 
     async def limp(self) -> None:
-        """Wheels that turn freely; the next start of a driver holds them again."""
+        """Let the wheels turn freely; the next start of a driver holds them again."""
         if not self._board.release_motors():
             raise BodyLost(self.problem or f"{self.link} takes no commands")
 

@@ -116,7 +116,7 @@ class OpenCr(Device):
         self.body.command(0.0, 0.0, 0.0)
 
     def feed(self, data: bytes) -> None:
-        """Take instructions; while it calibrates they wait."""
+        """Execute instructions; while it calibrates they wait."""
         if not self._on:
             return
         if self._calibrating_ns:
@@ -127,7 +127,7 @@ class OpenCr(Device):
                 self._execute(packet)
 
     def step(self, now_ns: int) -> None:
-        """One pass of the firmware's main loop."""
+        """Do one pass of the firmware's main loop."""
         on = self.body.snapshot.battery.voltage - self.sag_volts >= BROWN_OUT_V
         if on != self._on:
             self.reset()

@@ -1,4 +1,4 @@
-"""Slamtec's RPLIDARs: identified, spun up and told to scan; started again whenever silent."""
+"""Slamtec's RPLIDARs: identified, spun up and set to scan; started again whenever silent."""
 
 import asyncio
 import logging
