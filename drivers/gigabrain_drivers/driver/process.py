@@ -42,77 +42,6 @@ BODY_EVERY_TICKS = 50  # once a second
 STALE_NS = 250_000_000  # the echo's 150 ms and the watchdog's 100: older must never move the body
 
 
-class RawSpeeds(msgspec.Struct):
-    """A command before its numbers are looked at."""
-
-    linear_x: float = 0.0
-    linear_y: float = 0.0
-    angular_z: float = 0.0
-    source: str = ""
-    boot: int = 0
-
-
-def not_finite(payload: bytes) -> tuple[str, int] | None:
-    """Source and boot of a command with NaN or infinity in it; None for anything else."""
-    try:
-        raw = msgspec.msgpack.decode(payload, type=RawSpeeds)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-        return None
-    speeds = (raw.linear_x, raw.linear_y, raw.angular_z)
-    if all(abs(speed) < float("inf") for speed in speeds):
-        return None
-    return raw.source, raw.boot
-
-
-def clipped(record: R) -> R:
-    """Return `record` with each bounded float within its bounds, in nested records as well."""
-    changes: dict[str, Any] = {}
-    for name, bounds in _fields(type(record)).items():
-        value = getattr(record, name)
-        within = _within(value, bounds)
-        if within is not value:
-            changes[name] = within
-    return msgspec.structs.replace(record, **changes) if changes else record
-
-
-def _within(value: Any, bounds: Bounds | None) -> Any:
-    """Return what is to stand in place of `value`: itself, unless it is out of bounds."""
-    if isinstance(value, Struct):
-        return clipped(value)
-    if isinstance(value, tuple):
-        parts = tuple(_within(part, bounds) for part in value)
-        return value if all(a is b for a, b in zip(value, parts, strict=True)) else parts
-    if bounds is None or not isinstance(value, float) or bounds[0] <= value <= bounds[1]:
-        return value
-    return value if math.isnan(value) else min(max(value, bounds[0]), bounds[1])
-
-
-@functools.cache
-def _fields(of: type[Struct]) -> dict[str, Bounds | None]:
-    """Return the fields that may have to be clipped, with the bounds of their floats."""
-    told = inspect.type_info(of)
-    assert isinstance(told, inspect.StructType)
-    fields = {field.name: _bounds(field.type) for field in told.fields}
-    return {name: bounds for name, bounds in fields.items() if bounds != ()}  # type: ignore[misc]
-
-
-def _bounds(told: inspect.Type) -> Bounds | tuple[()] | None:
-    """Return the bounds of a float or of a tuple's floats; None for records, () for all else."""
-    if isinstance(told, inspect.FloatType):
-        low, high = told.ge, told.le
-        return (-math.inf if low is None else low, math.inf if high is None else high)
-    if isinstance(told, inspect.StructType):
-        return None
-    if isinstance(told, inspect.VarTupleType):
-        return _bounds(told.item_type)
-    if isinstance(told, inspect.TupleType):
-        return _bounds(told.item_types[0])
-    if isinstance(told, inspect.UnionType):
-        found = [one for one in map(_bounds, told.types) if one != ()]
-        return found[0] if found else ()
-    return ()
-
-
 class DriverProcess:
     """One body on the bus."""
 
@@ -338,3 +267,74 @@ async def run(config: DriverConfig, bus: Bus, ready: Callable[[], None]) -> None
             f"expected one of: {known}"
         )
     await DriverProcess(config, robot, driver, bus).run(ready)
+
+
+class RawSpeeds(msgspec.Struct):
+    """A command before its numbers are checked."""
+
+    linear_x: float = 0.0
+    linear_y: float = 0.0
+    angular_z: float = 0.0
+    source: str = ""
+    boot: int = 0
+
+
+def not_finite(payload: bytes) -> tuple[str, int] | None:
+    """Return source and boot of a command with NaN or infinity; None for anything else."""
+    try:
+        raw = msgspec.msgpack.decode(payload, type=RawSpeeds)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return None
+    speeds = (raw.linear_x, raw.linear_y, raw.angular_z)
+    if all(abs(speed) < float("inf") for speed in speeds):
+        return None
+    return raw.source, raw.boot
+
+
+def clipped(record: R) -> R:
+    """Return `record` with each bounded float within its bounds, in nested records as well."""
+    changes: dict[str, Any] = {}
+    for name, bounds in _fields(type(record)).items():
+        value = getattr(record, name)
+        within = _within(value, bounds)
+        if within is not value:
+            changes[name] = within
+    return msgspec.structs.replace(record, **changes) if changes else record
+
+
+def _within(value: Any, bounds: Bounds | None) -> Any:
+    """Return `value` within its bounds; the same object where nothing changes."""
+    if isinstance(value, Struct):
+        return clipped(value)
+    if isinstance(value, tuple):
+        parts = tuple(_within(part, bounds) for part in value)
+        return value if all(a is b for a, b in zip(value, parts, strict=True)) else parts
+    if bounds is None or not isinstance(value, float) or bounds[0] <= value <= bounds[1]:
+        return value
+    return value if math.isnan(value) else min(max(value, bounds[0]), bounds[1])
+
+
+@functools.cache
+def _fields(record: type[Struct]) -> dict[str, Bounds | None]:
+    """Return the fields that may have to be clipped, with the bounds of their floats."""
+    info = inspect.type_info(record)
+    assert isinstance(info, inspect.StructType)
+    fields = {field.name: _bounds(field.type) for field in info.fields}
+    return {name: bounds for name, bounds in fields.items() if bounds != ()}  # type: ignore[misc]
+
+
+def _bounds(info: inspect.Type) -> Bounds | tuple[()] | None:
+    """Return the bounds of a float or of a tuple's floats; None for records, () for all else."""
+    if isinstance(info, inspect.FloatType):
+        low, high = info.ge, info.le
+        return (-math.inf if low is None else low, math.inf if high is None else high)
+    if isinstance(info, inspect.StructType):
+        return None
+    if isinstance(info, inspect.VarTupleType):
+        return _bounds(info.item_type)
+    if isinstance(info, inspect.TupleType):
+        return _bounds(info.item_types[0])
+    if isinstance(info, inspect.UnionType):
+        found = [one for one in map(_bounds, info.types) if one != ()]
+        return found[0] if found else ()
+    return ()
