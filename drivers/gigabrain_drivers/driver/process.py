@@ -292,7 +292,11 @@ def not_finite(payload: bytes) -> tuple[str, int] | None:
 
 
 def clipped(record: R) -> R:
-    """Return `record` with each bounded float within its bounds, in nested records as well."""
+    """Return `record` with each bounded float within its bounds, in nested records as well.
+
+    A faulty body may report 1e6 m/s. Clipped, that is 100 m/s, which safety stops; refused by the
+    message, the whole state would be missing.
+    """
     changes: dict[str, Any] = {}
     for name, bounds in _fields(type(record)).items():
         value = getattr(record, name)
