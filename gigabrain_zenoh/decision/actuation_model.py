@@ -28,7 +28,7 @@ LEAST_CHANGE = (0.04, 0.15)  # [m/s], [rad/s], within EXCITED_TICKS; smaller cha
 NOISE = (0.004, 0.01)  # [m/s], [rad/s], minimum; prevents overconfidence in an exact model
 MEMORY_TICKS = 1000  # excited ticks; time constant with which squared errors are forgotten
 ENOUGH_TICKS = 40  # excited ticks before the estimate is used
-LOOK_TICKS = 5  # between evaluations of all candidates
+EVALUATION_TICKS = 5  # between evaluations of all candidates
 SPREAD_S = 0.1  # standard deviation of the prior
 ALIKE = 4.0  # errors of neighbouring ticks correlate: this many ticks count as one sample
 GAINS = (0.5, 1.5)  # range of plausible gains; outside it the body is not driving freely
@@ -42,19 +42,19 @@ class Axis:
         # a candidate with zero lag reaches the commanded speed by the next tick
         self._follows = 1.0 - np.exp(-TICK_S / np.maximum(LAGS_S, 1e-9))
         self._outputs = np.zeros((DELAYS, len(LAGS_S)))  # row 0: no delay, row 1: one tick, …
-        self._told = [0.0] * EXCITED_TICKS
+        self._commanded = [0.0] * EXCITED_TICKS
         self._model_model, self._model_measured = np.zeros((2, DELAYS, len(LAGS_S)))
         self._measured_measured = 0.0
         self.weight = 0.0  # discounted number of excited ticks
 
-    def rest(self, measured: float) -> None:
+    def reset(self, measured: float) -> None:
         """Reset the predictions to the measured speed, while the body follows no command."""
         self._outputs[:] = measured
-        self._told = [measured] * EXCITED_TICKS
+        self._commanded = [measured] * EXCITED_TICKS
 
-    def tick(self, told: float, measured: float) -> bool:
+    def update(self, commanded: float, measured: float) -> bool:
         """Process one tick's commanded and measured speed; return whether it was informative."""
-        excited = max(self._told) - min(self._told) > self._least_change
+        excited = max(self._commanded) - min(self._commanded) > self._least_change
         if excited:
             keep = 1.0 - 1.0 / MEMORY_TICKS
             self._model_model = keep * self._model_model + self._outputs * self._outputs
@@ -62,8 +62,8 @@ class Axis:
             self._measured_measured = keep * self._measured_measured + measured * measured
             self.weight = keep * self.weight + 1.0
         self._outputs[1:] = self._outputs[:-1]
-        self._outputs[0] += self._follows * (told - self._outputs[0])
-        self._told = [*self._told[1:], told]
+        self._outputs[0] += self._follows * (commanded - self._outputs[0])
+        self._commanded = [*self._commanded[1:], commanded]
         return excited
 
     def gains(self) -> Floats:
@@ -94,7 +94,7 @@ class ActuationEstimator:
         """Return the current estimate; the prior until enough has been learnt."""
         return self._response
 
-    def command(self, command: CmdVel) -> None:
+    def add_command(self, command: CmdVel) -> None:
         """Add a command of the commander or the brain; for each tick, keep the highest `seq`.
 
         The gate uses `seq` as well, because other clients may publish under the commander's name.
@@ -107,7 +107,7 @@ class ActuationEstimator:
         if key not in self._commands or command.seq >= self._commands[key].seq:
             self._commands[key] = command
 
-    def state(self, state: RobotState) -> None:
+    def add_state(self, state: RobotState) -> None:
         """Add a robot state, to be evaluated LATE_TICKS later, when its commands have arrived."""
         if state.boot != self._boot:
             self._begin(state.boot)
@@ -118,7 +118,7 @@ class ActuationEstimator:
         self._states[state.tick] = state
         for tick in sorted(self._states):
             if tick <= state.tick - LATE_TICKS:
-                self._look(self._states.pop(tick))
+                self._process(self._states.pop(tick))
 
     def sent(self, after: int, until: int) -> tuple[tuple[int, Velocity], ...]:
         """Return the commander's commands with their ticks, for `after` < tick <= `until`.
@@ -126,7 +126,9 @@ class ActuationEstimator:
         The command of a tick may still be in transit when the state of the next tick arrives.
         """
         mine = self._commander
-        coming = {tick: told for (tick, source), told in self._commands.items() if source == mine}
+        coming = {
+            tick: command for (tick, source), command in self._commands.items() if source == mine
+        }
         recent = {**self._past, **coming}
         return tuple(
             (tick, velocity_of(recent[tick])) for tick in sorted(recent) if after < tick <= until
@@ -139,39 +141,39 @@ class ActuationEstimator:
         self._commands: dict[tuple[int, str], CmdVel] = {}  # by tick and source
         self._past: dict[int, CmdVel] = {}  # the commander's, already evaluated
         self._states: dict[int, RobotState] = {}
-        self._told: CmdVel | None = None
+        self._command: CmdVel | None = None
         self._axes = tuple(Axis(*each) for each in zip(LEAST_CHANGE, NOISE, strict=True))
         self._response = self._prior
 
-    def _look(self, state: RobotState) -> None:
+    def _process(self, state: RobotState) -> None:
         learnt = False
         for tick in range(max(self._done + 1, state.tick - SILENT_TICKS), state.tick + 1):
             # a missed state is assumed to equal the next one
             learnt |= self._one_tick(tick, state)
         self._done = state.tick
         for tick, source in [key for key in self._commands if key[0] <= self._done]:
-            told = self._commands.pop((tick, source))
+            command = self._commands.pop((tick, source))
             if source == (state.gate.commander or BRAIN):
-                self._past[tick] = told
+                self._past[tick] = command
         for tick in [tick for tick in self._past if tick <= self._done - DELAYS]:
             del self._past[tick]
-        if learnt and self._done % LOOK_TICKS == 0:
-            self._weigh()
+        if learnt and self._done % EVALUATION_TICKS == 0:
+            self._evaluate()
 
     def _one_tick(self, tick: int, state: RobotState) -> bool:
         gate, measured = state.gate, state.velocity
-        self._told = told = self._commands.get((tick, gate.commander), self._told)
+        self._command = command = self._commands.get((tick, gate.commander), self._command)
         x, z = self._axes
-        obeyed = told and gate.mode == "enabled" and told.source == gate.commander
-        if not told or not obeyed or told.tick < tick - SILENT_TICKS:
-            x.rest(measured.linear_x)
-            z.rest(measured.angular_z)
+        obeyed = command and gate.mode == "enabled" and command.source == gate.commander
+        if not command or not obeyed or command.tick < tick - SILENT_TICKS:
+            x.reset(measured.linear_x)
+            z.reset(measured.angular_z)
             return False
-        forward = x.tick(told.linear_x, measured.linear_x)
-        turn = z.tick(told.angular_z, measured.angular_z)
+        forward = x.update(command.linear_x, measured.linear_x)
+        turn = z.update(command.angular_z, measured.angular_z)
         return forward or turn
 
-    def _weigh(self) -> None:
+    def _evaluate(self) -> None:
         """Set the response to the mean of all candidates, weighted by their likelihood."""
         x, z = self._axes
         if x.weight + z.weight < ENOUGH_TICKS:

@@ -109,7 +109,7 @@ class ContextSource:
         self._history = self._history.then(state)
         self._states.append(state)
         self._latency.observe_state(state.boot, state.tick)
-        self._estimator.state(state)
+        self._estimator.add_state(state)
         body = self._bodies.current
         if body and not self._subscribed_commands:
             self._subscribed_commands = True
@@ -168,7 +168,7 @@ class ContextSource:
         """Record a command, clamped as by the gate: the body follows the clamped one."""
         if body := self.body:
             obeyed = clamp(velocity_of(command), limits_of(body))
-            self._estimator.command(replace(command, **asdict(obeyed)))
+            self._estimator.add_command(replace(command, **asdict(obeyed)))
         if command.source == BRAIN:
             self._commands.receive(command)
 

@@ -311,7 +311,7 @@ class Navigator:
             )
         )
         outcome = self._outcome(context, command, route, plan)
-        headline = f"{route.activity}: {route.reason}" if route.temporary else outcome.activity
+        headline = f"{route.activity}: {route.reason}" if route.activity else outcome.activity
         late = context.delayed_s
         slow = f"; slower: this host is late by {late:.2f} s" if late else ""
         intent = self._intent(
@@ -340,7 +340,7 @@ class Navigator:
         left = _rest_of(route.points, here)
         distance_m = float(np.hypot(*np.diff(left, axis=0).T).sum())
         self._longest_m = max(self._longest_m, distance_m, 1e-6)
-        arrived = plan.arrived and command.kind != "explore" and not route.temporary
+        arrived = plan.arrived and command.kind != "explore" and not route.activity
         speed = min(self._config.max_linear_speed or math.inf, context.body.max_linear_speed)
         place = describe_goal(route.goal)
         driving = "exploring" if command.kind == "explore" else f"going to {place}"

@@ -144,12 +144,7 @@ class Route:
     points: Floats | None = None  # (n, 2) [m] in the map
     state: Literal["running", "done", "failed"] = "running"
     reason: str = ""  # for people
-    activity: str = ""  # of a temporary destination; arriving there is not arriving at the goal
-
-    @property
-    def temporary(self) -> bool:
-        """Whether the route leads to another place than the requested one for a while."""
-        return bool(self.activity)
+    activity: str = ""  # of a temporary destination, at which the command is not done
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -345,7 +340,10 @@ class RoutePlanner:
             if goal is None:
                 return self._explored(request, costs)
             self._last_frontier_tick = request.tick
-            if self._goal and _apart(goal, self._goal) > SAME_FRONTIER_M:
+            if (
+                self._goal
+                and math.hypot(goal.x - self._goal.x, goal.y - self._goal.y) > SAME_FRONTIER_M
+            ):
                 self._drop_frontier(request.tick)
             found = self._find(goal, request.here, costs)
             if isinstance(found, Path):
@@ -443,10 +441,6 @@ def _cells_to_add(value: float, origin: float, count: int, resolution: float) ->
     before = math.ceil((origin - value + GOAL_MARGIN_M) / resolution)
     after = math.ceil((value - end + GOAL_MARGIN_M) / resolution)
     return max(0, before), max(0, after)
-
-
-def _apart(a: Goal, b: Goal) -> float:
-    return math.hypot(a.x - b.x, a.y - b.y)
 
 
 def _offset(found: Unreachable) -> str:

@@ -84,35 +84,35 @@ class Mapper:
         self._last: Moment | None = None  # at the last scan that was processed
         self._blank = not config.map  # the map is still empty
         self._mapped = False  # this process has processed a scan, or restored a map
-        self._shown: OccupancyGrid | None = None
-        self._shown_tick = self._said_tick = 0
+        self._published: OccupancyGrid | None = None
+        self._checked_tick = self._sent_tick = 0
         saves = config.mapping == "slam" and config.state_dir and bus.input_log.live
         self._autosave = Autosave(Path(config.state_dir)) if saves else None
         self._before: Moment | None = None  # at the last scan in a restored map
-        self._said, self._left_out = "", ""
+        self._logged, self._left_out = "", ""
         self._early = False  # the first scan arrived without its odometry
         self._took_ms = NewestValues(TIMED)
         self._saving = asyncio.Lock()  # concurrent saves would write to the same files
         bus.serve(MAP_SAVE, self._save)
         bus.report = self._report
 
-    def see(self, scan: LaserScan, problem: str) -> None:
+    def process_scan(self, scan: LaserScan, problem: str) -> None:
         """Process a scan, or skip it if `problem` is not empty or its odometry is missing."""
         if problem:
-            self._leave_out(problem)
+            self._skip(problem)
             return
         moment = self._fusion.at(scan.basis) if scan.boot == self._boot else None
         if moment is None and self._last is None and not self._early:
             self._early = True  # its odometry was published before this process subscribed
             self._bus.counters["scans_left_out"] += 1
         elif moment is None or (self._last and moment.tick <= self._last.tick):
-            self._leave_out("there is no odometry for its tick")
+            self._skip("no odometry for its tick")
         else:
-            self._take(scan, moment)
+            self._process(scan, moment)
 
-    def miss(self, scan: LaserScan, tick: int) -> None:
+    def skip_future_scan(self, scan: LaserScan, tick: int) -> None:
         """Skip a scan whose state had not arrived by `tick`, when the next scan came."""
-        self._leave_out(f"it claims to be of tick {scan.basis}, which had not come by tick {tick}")
+        self._skip(f"its tick {scan.basis} is in the future at tick {tick}")
 
     def close(self) -> None:
         """Stop the worker threads."""
@@ -120,14 +120,14 @@ class Mapper:
         if self._autosave:
             self._autosave.close()
 
-    def hear(self, state: RobotState) -> None:
-        """Add a robot state; must be called before `see` for scans of the same tick."""
+    def add_state(self, state: RobotState) -> None:
+        """Add a robot state; must be called before `process_scan` for scans of the same tick."""
         body = self._bodies.current
         if body:
-            self._begin_anew(state.boot)
+            self._reset_odometry(state.boot)
             self._fusion.add(state, body.description)
 
-    def _begin_anew(self, boot: int) -> None:
+    def _reset_odometry(self, boot: int) -> None:
         """Reset the odometry when the driver has restarted; the map is kept.
 
         If this process has restarted and the driver has not, resume the last autosaved map.
@@ -135,13 +135,13 @@ class Mapper:
         if boot == self._boot:
             return
         if self._boot:
-            self._chart.lose("the driver has started anew")
-        self._boot, self._fusion, self._last, self._shown = boot, Fusion(), None, None
+            self._chart.lose("the driver has restarted")
+        self._boot, self._fusion, self._last, self._published = boot, Fusion(), None, None
         self._before, self._early = None, False
         if self._autosave and not self._mapped:
-            self._go_on(self._autosave, boot)
+            self._resume_map(self._autosave, boot)
 
-    def _go_on(self, autosave: Autosave, boot: int) -> None:
+    def _resume_map(self, autosave: Autosave, boot: int) -> None:
         """Resume the newest intact map that was saved during this run of the driver, if any."""
         from gigabrain_zenoh.mapping.slam_map import GrowingMap  # imports gtsam, as above
 
@@ -160,24 +160,24 @@ class Mapper:
             log.info("resumed the map of tick %d", head.tick, extra={"data": data})
             return
 
-    def _take(self, scan: LaserScan, moment: Moment) -> None:
+    def _process(self, scan: LaserScan, moment: Moment) -> None:
         body = self._bodies.current
         if body is None or body.description.lidar is None:
             return
         began = time.perf_counter()
         view = view_of(body.description.lidar, scan, self._config.ignore_below)
         before = self._last
-        place = self._chart.step(view, *self._way(moment))
+        place = self._chart.step(view, *self._motion(moment))
         self._mapped = True
         if self._autosave and before:
-            self._keep(self._autosave, before)
+            self._autosave_map(self._autosave, before)
         self._bus.publish(POSE, message_of(place), basis=scan.basis)
-        self._tell(place)
-        self._show(scan.basis)
+        self._log_pose(place)
+        self._publish_map(scan.basis)
         self._left_out = ""
         self._took_ms.add((time.perf_counter() - began) * 1e3)
 
-    def _way(self, moment: Moment) -> tuple[Floats, Floats]:
+    def _motion(self, moment: Moment) -> tuple[Floats, Floats]:
         """Return the motion from the last scan to this one (3,), and its covariance (3, 3).
 
         The first scan of a new map is placed at its odometry pose. After a crash of this process,
@@ -191,7 +191,7 @@ class Mapper:
             self._chart.lose("the odometry has jumped")
         return moment.fused if blank else step, noise
 
-    def _keep(self, autosave: Autosave, before: Moment) -> None:
+    def _autosave_map(self, autosave: Autosave, before: Moment) -> None:
         """Save the map as it was at the scan `before`, when a save is due.
 
         The copy is cheap and does not alter the map. A run with saves and a run without behave the
@@ -203,23 +203,23 @@ class Mapper:
         elif autosave.due(self._boot, before.tick):
             self._chart.keep()
 
-    def _show(self, tick: int) -> None:
+    def _publish_map(self, tick: int) -> None:
         """Publish the map when it has changed, at most every MAP_TICKS.
 
         An unchanged map is published again after MAP_AGAIN_TICKS, in case another publisher has
         replaced it.
         """
-        if self._shown and tick < self._shown_tick + MAP_TICKS:
+        if self._published and tick < self._checked_tick + MAP_TICKS:
             return
-        self._shown_tick = tick
-        self._tell_problems()
+        self._checked_tick = tick
+        self._log_problems()
         grid = self._chart.grid()
-        due = grid != self._shown or tick >= self._said_tick + MAP_AGAIN_TICKS
+        due = grid != self._published or tick >= self._sent_tick + MAP_AGAIN_TICKS
         if due and grid.cells:
             self._bus.publish(MAP, grid, basis=tick)
-            self._shown, self._said_tick = grid, tick
+            self._published, self._sent_tick = grid, tick
 
-    def _tell_problems(self) -> None:
+    def _log_problems(self) -> None:
         """Log each new problem once, and list all current problems in the health messages."""
         problems, known = self._chart.problems(), self._bus.problems
         if self._autosave and self._autosave.problem:
@@ -230,22 +230,23 @@ class Mapper:
         self._bus.problems = problems
         self._bus.counters["optimiser_rebuilt"] = self._chart.report().get("optimiser_rebuilt", 0)
 
-    def _tell(self, place: Place) -> None:
+    def _log_pose(self, place: Place) -> None:
         """Log changes of the localization, with the reason when the robot is not localized."""
-        said = "localized" if place.localized else f"not localized: {place.why}"
-        if said == self._said:
+        text = "localized" if place.localized else f"not localized: {place.why}"
+        if text == self._logged:
             return
-        self._said = said
+        self._logged = text
+        if place.localized:
+            x, y, yaw = place.pose.tolist()
+            text = f"{text} at ({x:.2f}, {y:.2f}), {np.degrees(yaw):.0f} degrees"
         level = logging.INFO if place.localized else logging.WARNING
-        x, y, yaw = place.pose.tolist()
-        text = f"{said} at ({x:.2f}, {y:.2f}), {np.degrees(yaw):.0f} degrees"
-        log.log(level, text if place.localized else said, extra={"data": {"event": "localized"}})
+        log.log(level, text, extra={"data": {"event": "localized"}})
 
-    def _leave_out(self, why: str) -> None:
+    def _skip(self, why: str) -> None:
         self._bus.counters["scans_left_out"] += 1
         if why != self._left_out:
             self._left_out = why
-            log.warning("a scan is left out of the map: %s", why, extra={"data": {"event": "scan"}})
+            log.warning("scan not mapped: %s", why, extra={"data": {"event": "scan"}})
 
     async def _save(self, request: MapRequest) -> MapReply:
         log_accepted(self._bus, MAP_SAVE.key, request, self._last.tick if self._last else 0)

@@ -94,17 +94,17 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
     body = bus.latest(BODY)
     needs = (SCAN.key,) if config.mapping == "off" else (SCAN.key, STATE.key)
 
-    def came() -> tuple[object, ...]:
+    def received() -> tuple[object, ...]:
         return tuple(map(bus.arrived.get, needs)) if body.current else ()
 
-    bus.progress = Progress(came, lambda: bus.sent[WORLD.key])
+    bus.progress = Progress(received, lambda: bus.sent[WORLD.key])
 
-    def see(scan: LaserScan) -> None:
+    def on_scan(scan: LaserScan) -> None:
         if body.current:
             bus.publish(WORLD, step(config, body.current.description, scan), basis=scan.basis)
 
     if config.mapping == "off":
-        bus.latest(SCAN, see)
+        bus.latest(SCAN, on_scan)
         ready()
         await bus.failed
         return
@@ -121,18 +121,18 @@ def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body], mapper: "Map
     """Publish world models with obstacles placed by odometry; then pass each scan to the mapper."""
     surroundings = Surroundings()
 
-    def see(scan: LaserScan, pose: Pose | None) -> None:
+    def on_scan(scan: LaserScan, pose: Pose | None) -> None:
         if body.current:
             description = body.current.description
             world = step(config, description, scan)
             world = surroundings.add(world, description.lidar, scan, pose)
             bus.publish(WORLD, world, basis=scan.basis)
-            mapper.see(scan, world.scan_problem)
+            mapper.process_scan(scan, world.scan_problem)
 
-    def hear(state: RobotState) -> None:
-        mapper.hear(state)
+    def on_state(state: RobotState) -> None:
+        mapper.add_state(state)
         placed.state(state)
 
-    placed = PlacedScans(see, lambda scan: mapper.miss(scan, bus.time.tick))
-    bus.latest(STATE, hear)
+    placed = PlacedScans(on_scan, lambda scan: mapper.skip_future_scan(scan, bus.time.tick))
+    bus.latest(STATE, on_state)
     bus.latest(SCAN, placed.scan)

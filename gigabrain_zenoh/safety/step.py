@@ -148,4 +148,4 @@ def _future_scan(inputs: SafetyInputs) -> str:
     scan, tick = inputs.scan, inputs.state.tick
     if scan is None or scan.basis <= tick:
         return ""
-    return f"; the newest claims to be of tick {scan.basis}, and it is tick {tick}"
+    return f"; the newest has the future tick {scan.basis} at tick {tick}"

@@ -97,11 +97,10 @@ async def test_bad_scans_are_left_out_and_told_once(caplog: pytest.LogCaptureFix
         assert robot.bus.counters["scans_left_out"] == 4
         poses: list[PoseInMap] = robot.sent(POSE)
     assert [pose.basis for pose in poses] == [5, 10, 15, 20]
-    told = [record.message for record in caplog.records if "left out" in record.message]
+    told = [record.message for record in caplog.records if "not mapped" in record.message]
     assert told == [
-        "a scan is left out of the map: the scan has 200 beams, the body's lidar 360",
-        "a scan is left out of the map: "
-        "it claims to be of tick 1010, which had not come by tick 15",
+        "scan not mapped: the scan has 200 beams, the body's lidar 360",
+        "scan not mapped: its tick 1010 is in the future at tick 15",
     ]
 
 

@@ -209,7 +209,7 @@ class BarnBrain:
 
     def tick(self, state: RobotState, scan: LaserScan | None) -> CmdVel:
         """Return the command of one tick."""
-        self._response.state(state)
+        self._response.add_state(state)
         if scan is not None:
             world = perception.step(self._perception, JACKAL, scan)
             world = self._surroundings.add(world, LIDAR, scan, state.pose)
@@ -217,7 +217,7 @@ class BarnBrain:
         inputs = control.ControlInputs(state=state, intent=self._intent)
         self._memory, command = control.step(JACKAL, self._memory, inputs)
         command = replace(command, boot=BOOT, tick=state.tick)
-        self._response.command(command)
+        self._response.add_command(command)
         return command
 
     def _decide(self, state: RobotState, world: WorldModel) -> Intent:

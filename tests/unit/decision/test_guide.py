@@ -116,7 +116,7 @@ def test_who_comes_no_nearer_than_a_hand_settles_there_and_says_so() -> None:
     settled = ask(tick=1502, x=4.85)
     assert settled.goal == Goal(x=4.85, y=1.0, yaw=1.5)
     assert settled.reason == "0.15 m from the requested goal: no progress for 30 s"
-    assert not settled.temporary
+    assert not settled.activity
     again = ask(tick=3002, x=4.86)  # while it turns
     assert (again.goal, again.reason) == (settled.goal, settled.reason)
     assert again.version == settled.version
@@ -193,10 +193,10 @@ def test_it_makes_room_when_somebody_stays_where_it_is_to_go() -> None:
     ask = functools.partial(think, guide, goal=goal, x=4.0, y=3.0)
     ask(ROOM, tick=1)
     waits = ask(TAKEN, tick=50)
-    assert (waits.goal, waits.temporary) == (goal, False)
-    assert not ask(TAKEN, tick=501).temporary
+    assert (waits.goal, waits.activity) == (goal, "")
+    assert not ask(TAKEN, tick=501).activity
     leaves = ask(TAKEN, tick=502)
-    assert leaves.temporary
+    assert leaves.activity
     assert (leaves.activity, leaves.reason) == ("giving way", "the goal is occupied")
     assert leaves.version != waits.version
     assert leaves.goal
@@ -264,6 +264,6 @@ def test_a_robot_between_walls_goes_far_from_who_stands_at_its_goal() -> None:
     ask(aisle, tick=1)
     ask(taken, tick=50)
     leaves = ask(taken, tick=502)
-    assert leaves.temporary
+    assert leaves.activity
     assert leaves.goal
     assert leaves.goal.x < 1.0

@@ -42,11 +42,11 @@ class Plant:
             self.tick += 1
             measured_v = self.v + self._noise[0] * self._random.standard_normal()
             measured_w = self.w + self._noise[1] * self._random.standard_normal()
-            self.estimator.state(state(self.tick, v=measured_v, w=measured_w, gate=gate))
+            self.estimator.add_state(state(self.tick, v=measured_v, w=measured_w, gate=gate))
             self.told_v += min(0.02, max(-0.02, v - self.told_v))
             self.told_w += min(0.06, max(-0.06, w - self.told_w))
             told = CmdVel(linear_x=self.told_v, angular_z=self.told_w, source=source)
-            self.estimator.command(replace(told, boot=BOOT, tick=self.tick))
+            self.estimator.add_command(replace(told, boot=BOOT, tick=self.tick))
             for _ in range(PARTS):
                 self._late.append((self.told_v, self.told_w))
                 now_v, now_w = self._late.popleft()
@@ -125,7 +125,7 @@ def test_it_notices_when_the_body_becomes_slower() -> None:
 def test_a_new_start_of_the_driver_begins_anew() -> None:
     plant = Plant(0.1, 0.15)
     assert plant.wander(20) != PRIOR
-    plant.estimator.state(state(1, boot=8))
+    plant.estimator.add_state(state(1, boot=8))
     assert plant.estimator.response == PRIOR
 
 
@@ -170,43 +170,43 @@ def told(tick: int, v: float = 0.0, source: str = "control", seq: int = 0) -> Cm
 
 def test_what_others_than_the_commander_say_was_not_told_to_the_body() -> None:
     estimator = ActuationEstimator()
-    estimator.state(state(10))
-    estimator.command(told(10, 0.2))
-    estimator.command(told(10, -2.0, source="stranger"))
+    estimator.add_state(state(10))
+    estimator.add_command(told(10, 0.2))
+    estimator.add_command(told(10, -2.0, source="stranger"))
     assert [speed.linear_x for _, speed in estimator.sent(0, 10)] == [0.2]
 
 
 def test_who_uses_the_commanders_name_is_believed_no_more_than_by_the_gate() -> None:
     estimator = ActuationEstimator()
-    estimator.state(state(11))
+    estimator.add_state(state(11))
     for command in (told(10, -2.0), told(10, 0.2, seq=7), told(11, 0.3, seq=8), told(11, -2.0)):
-        estimator.command(command)
+        estimator.add_command(command)
     assert [speed.linear_x for _, speed in estimator.sent(0, 11)] == [0.2, 0.3]
 
 
 def test_after_a_change_of_commander_the_new_ones_commands_count() -> None:
     estimator = ActuationEstimator()
-    estimator.state(state(10))
-    estimator.command(told(10, 0.2))
-    estimator.state(state(11, gate=GateStatus(mode="enabled", commander="script")))
-    estimator.command(told(11, 0.1, source="script"))
-    estimator.command(told(11, 0.2))
+    estimator.add_state(state(10))
+    estimator.add_command(told(10, 0.2))
+    estimator.add_state(state(11, gate=GateStatus(mode="enabled", commander="script")))
+    estimator.add_command(told(11, 0.1, source="script"))
+    estimator.add_command(told(11, 0.2))
     assert [speed.linear_x for tick, speed in estimator.sent(10, 11)] == [0.1]
 
 
 def test_commands_of_ticks_that_are_far_off_are_not_kept() -> None:
     estimator = ActuationEstimator()
-    estimator.state(state(10))
+    estimator.add_state(state(10))
     for tick in range(10, 20_000):
-        estimator.command(told(tick))
+        estimator.add_command(told(tick))
     assert [tick for tick, _ in estimator.sent(0, 2**40)] == [10, 11, 12, 13, 14, 15]
 
 
 def test_however_many_sources_and_ticks_are_named_little_is_kept() -> None:
     estimator = ActuationEstimator()
     for tick in range(1, 200):
-        estimator.state(state(tick))
+        estimator.add_state(state(tick))
         for n in range(50):
-            estimator.command(told(tick + n, source=f"stranger {n}"))
-            estimator.command(told(tick + n))
+            estimator.add_command(told(tick + n, source=f"stranger {n}"))
+            estimator.add_command(told(tick + n))
     assert len(estimator._commands) + len(estimator._past) < 40

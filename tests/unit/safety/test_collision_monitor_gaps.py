@@ -85,7 +85,7 @@ def test_c_scans_of_ticks_to_come_do_not_hide_that_none_is_true() -> None:
         found.append((tick, [cause.code for cause in verdict.causes]))
     assert [tick for tick, causes in found if "scan_lost" in causes] == list(range(23, 41))
     assert verdict.causes[0].text == (
-        "no scan for more than 250 ms; the newest claims to be of tick 1040, and it is tick 40"
+        "no scan for more than 250 ms; the newest has the future tick 1040 at tick 40"
     )
 
 
