@@ -132,14 +132,14 @@ def test_a_new_start_of_the_driver_begins_anew() -> None:
 def test_the_order_of_messages_within_a_few_ticks_does_not_matter() -> None:
     early, late = Plant(), Plant()
     held: list[CmdVel] = []
-    take = late.estimator.command
+    take = late.estimator.add_command
 
     def hold_back(command: CmdVel) -> None:
         held.append(command)
         if len(held) > 3:
             take(held.pop(0))
 
-    late.estimator.command = hold_back  # type: ignore[method-assign]
+    late.estimator.add_command = hold_back  # type: ignore[method-assign]
     assert early.wander(13) == late.wander(13)
     assert early.estimator.response.turn_gain == late.estimator.response.turn_gain
 
@@ -153,13 +153,13 @@ def test_it_remembers_what_the_body_was_told_of_late() -> None:
 
 def test_states_and_commands_that_are_missing_now_and_then_do_no_harm() -> None:
     plant = Plant(0.1, 0.15)
-    state_of, count = plant.estimator.state, itertools.count()
+    state_of, count = plant.estimator.add_state, itertools.count()
 
     def lossy(measured: object) -> None:
         if next(count) % 7:
             state_of(measured)  # type: ignore[arg-type]
 
-    plant.estimator.state = lossy  # type: ignore[method-assign]
+    plant.estimator.add_state = lossy  # type: ignore[method-assign]
     found = plant.wander(30)
     assert found.delay + found.lag == pytest.approx(0.25, abs=0.041)
 
