@@ -78,8 +78,8 @@ class ControlLease:
     """Tracks whether one commander has the body, from the gate's states.
 
     A passing stop, as for an obstacle, does not end the lease. It is lost when another commander
-    takes over or the gate latches. Then the script must ask again, so that it does not take the
-    body back from the person who has just stopped it.
+    takes over or the gate latches. Then the script must ask again: it must not take the body
+    back from the person who has just stopped it.
     """
 
     def __init__(self, source: str) -> None:

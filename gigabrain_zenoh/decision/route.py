@@ -37,7 +37,7 @@ DETOUR_M = 1.0  # a path that is longer than the last plan by this is another wa
 AT_GOAL_M = 0.05  # of path left where the robot only has to turn and stop
 MAX_TIMER_RESTARTS = 3  # for detours and arrivals, until the robot is nearer than ever
 
-OCCUPIED_NEAR_M = 2.0  # from the goal; farther away the robot is in nobody's way
+OCCUPIED_NEAR_M = 2.0  # from the goal; a robot farther away blocks no one
 GIVE_WAY_TICKS = 750  # 15 s; an obstacle that is still there does not wait for the robot
 MAX_GIVE_WAYS = 2  # per goal
 MAX_WAITING_COST = 2.0  # of a place to wait at

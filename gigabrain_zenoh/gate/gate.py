@@ -2,9 +2,9 @@
 
     latched ──release──► idle ──enable──► enabled ──any cause──► stopping ──► idle or latched
 
-`step(config, state, event) -> (state, outcome)`. Its time is the robot's tick (20 ms). Where there
-is a wall clock worth trusting (not when time is lock-stepped), events carry it as well, and the age
-of an echoed tick is bounded by both.
+`step(config, state, event) -> (state, outcome)`. Its time is the robot's tick (20 ms). With a
+wall clock (not when time is lock-stepped), events carry its time too. Both then bound the age of an
+echoed tick.
 """
 
 from msgspec.structs import replace
@@ -253,7 +253,7 @@ def _safety(state: GateState, said: SafetyState) -> GateState:
 
 def _enable(config: GateConfig, state: GateState, event: Enable) -> tuple[GateState, Outcome]:
     if not event.source:
-        return rejected(state, "say who asks: the source must not be empty")
+        return rejected(state, "the source is empty; name the commander")
     if state.mode == "latched":
         return rejected(state, f"latched: {why.in_words(state.causes)}; release it first")
     if state.mode == "stopping":

@@ -1,10 +1,10 @@
 """Obstacles assumed where the lidar sees nothing now, and what is known to be free there.
 
 The surroundings are divided into sectors that keep their direction while the body turns. A sector
-without a valid beam stands for an obstacle at its last range, less the distance that the body may
-have moved since. A lidar that covers 270 degrees has seen what is behind the body on the way there:
-for half a minute the newest scan of a place tells whether it is free, and so does having stood
-there. Nothing else is assumed to be free.
+without a valid beam stands for an obstacle. Its range is the last one, less the distance that the
+body may have moved since. A lidar that covers 270 degrees has seen what is behind the body on the
+way there: for half a minute the newest scan of a place tells whether it is free, and so does having
+stood there. Nothing else is assumed to be free.
 """
 
 import math
@@ -51,8 +51,8 @@ def update(
 ) -> tuple[Ranges, tuple[int, ...]]:
     """Return the nearest range of each sector [m], and the unknown sectors.
 
-    `yaw` is the body's, `last` the ranges of the scan before (empty at the start), and `moved_m`
-    [m] the distance that the body may have moved since. Ranges below `housing_m` are invalid.
+    `yaw` is the body's; `last` has the ranges of the scan before, or is empty at the start. Since
+    then the body may have moved by `moved_m` [m]. Ranges below `housing_m` are invalid.
     """
     values = ranges(scan).astype(np.float64)
     sector = _sectors(lidar, scan, yaw)

@@ -93,7 +93,7 @@ class Power(Struct, frozen=True, kw_only=True):
         return tuple(found)
 
     def warnings(self, limits: Thresholds, state: RobotState) -> tuple[Cause, ...]:
-        """Return what will become a cause if nobody acts."""
+        """Return warnings of what will stop the body next."""
         found = []
         low = [ticks >= ticks_of(limits.battery_sustain) for ticks in self.low_ticks]
         if low[1]:
@@ -202,7 +202,7 @@ class Host(Struct, frozen=True, kw_only=True):
     memory: float | None = None  # [%] used
 
     def warnings(self, limits: Thresholds) -> tuple[Cause, ...]:
-        """Return what will hurt if nobody acts; none of it stops the body."""
+        """Return warnings of scarce resources; none of them stops the body."""
         found = []
         if self.disk_mb is not None and self.disk_mb < limits.disk_warn:
             found.append(cause("disk_low", f"{self.disk_mb:.0f} MB left on the disk"))
@@ -242,7 +242,7 @@ class PipelineProgress(Struct, frozen=True, kw_only=True):
     ) -> tuple[Cause, ...]:
         """Return why the body must stop; `silent` names the systems without fresh messages.
 
-        The brain matters only while it drives, or may drive next. If nobody drives and all three
+        The brain matters only while it drives, or may drive next. If no commander drives and all
         systems are silent, there is no brain, and a script need not wait for one. With the `first`
         scan that cannot be known yet.
         """

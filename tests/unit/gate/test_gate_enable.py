@@ -26,7 +26,7 @@ def test_nobody_enables_namelessly() -> None:
     rig = idle()
     before = rig.state
     assert rig.feed(gate.Enable("")) == gate.Outcome(
-        ok=False, text="say who asks: the source must not be empty"
+        ok=False, text="the source is empty; name the commander"
     )
     assert rig.state == before
 
