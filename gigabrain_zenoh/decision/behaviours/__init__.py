@@ -26,7 +26,7 @@ from gigabrain_zenoh.plugins import load_plugin, plugin_names
 GROUP = "gigabrain.behaviours"
 SHIPPED = {  # name in a deployment file -> "module:class"
     "avoid": "gigabrain_zenoh.decision.behaviours.avoid:Avoid",
-    "navigate": "gigabrain_zenoh.decision.behaviours.navigate:Navigate",
+    "navigate": "gigabrain_zenoh.decision.behaviours:Navigate",
 }
 
 NAVIGATION_PACKAGES = ("numba", "cv2", "py_trees")
@@ -122,6 +122,27 @@ class NavigationConfig(Struct, frozen=True, kw_only=True, forbid_unknown_fields=
     samples: Annotated[int, Meta(ge=64, le=20_000)] = 1000  # candidate plans per scan
     start: Literal["wait", "explore"] = "wait"  # explore, then visit places, until a task comes
     scripts: str = ""  # folder of the programs that missions may run; empty: none
+
+
+class Navigate:
+    """Drives to goals by the map: passes each command of the task queue to the navigator."""
+
+    Config = NavigationConfig
+    PARAMS: ClassVar[Mapping[str, str]] = {
+        "max_linear_speed": "a number above 0, up to 10 [m/s], or null for the body's limit alone",
+    }
+    DEMO: ClassVar[Mapping[str, Any]] = {"start": "explore"}
+
+    def __init__(self, config: NavigationConfig) -> None:
+        pass
+
+    def configure(self, config: NavigationConfig) -> None:
+        """Keep nothing: the navigator has the settings."""
+
+    def step(self, inputs: Inputs) -> StepResult:
+        """Carry out the present command."""
+        assert inputs.drive
+        return inputs.drive(inputs.command)
 
 
 def names() -> list[str]:
