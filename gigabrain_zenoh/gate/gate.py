@@ -15,7 +15,6 @@ from gigabrain_zenoh.gate import causes as why
 from gigabrain_zenoh.gate.state import (
     BRAIN,
     ISSUED_TICKS,
-    Command,
     Enable,
     Estop,
     Event,
@@ -26,6 +25,7 @@ from gigabrain_zenoh.gate.state import (
     Release,
     Safety,
     Tick,
+    VelocityCommand,
     age_ns,
     is_finite,
     refusal,
@@ -79,7 +79,6 @@ def rejected(state: GateState, text: str) -> tuple[GateState, Outcome]:
 
 __all__ = [
     "BRAIN",
-    "Command",
     "Enable",
     "Estop",
     "Event",
@@ -90,6 +89,7 @@ __all__ = [
     "Release",
     "Safety",
     "Tick",
+    "VelocityCommand",
     "age_ns",
     "status",
     "step",
@@ -116,7 +116,7 @@ def _take(config: GateConfig, state: GateState, event: Event) -> tuple[GateState
     match event:
         case Tick():
             return _tick(config, state, event), Outcome()
-        case Command():
+        case VelocityCommand():
             return _command(state, event)
         case NotFinite():
             return _not_finite(state, event)
@@ -212,7 +212,7 @@ def _output(config: GateConfig, state: GateState) -> Velocity:
     return change(state.before, target, config.limits, TICK_S)
 
 
-def _command(state: GateState, event: Command) -> tuple[GateState, Outcome]:
+def _command(state: GateState, event: VelocityCommand) -> tuple[GateState, Outcome]:
     command = event.command
     if not is_finite(command):
         return _not_finite(state, NotFinite(command.source, command.boot))

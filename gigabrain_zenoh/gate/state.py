@@ -60,7 +60,7 @@ class Tick(msgspec.Struct, frozen=True):
     late: bool = False  # it was missed and is made up for, right behind another one
 
 
-class Command(msgspec.Struct, frozen=True):
+class VelocityCommand(msgspec.Struct, frozen=True):
     """A velocity command has arrived."""
 
     command: CmdVel
@@ -100,7 +100,7 @@ class Enable(msgspec.Struct, frozen=True):
     by: str = ""  # sender of the request, if another than `source`
 
 
-Event = Tick | Command | NotFinite | Safety | Estop | Release | Enable
+Event = Tick | VelocityCommand | NotFinite | Safety | Estop | Release | Enable
 
 
 class Outcome(msgspec.Struct, frozen=True):

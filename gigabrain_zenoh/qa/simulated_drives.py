@@ -106,7 +106,7 @@ class SafetyTrack(_SimulatedBody):
         self._judge()
         header = {"boot": BOOT, "tick": self.gate.tick, "seq": self.gate.tick}
         self._asked = replace(wish, **header)
-        self._feed(gate.Command(self._asked))
+        self._feed(gate.VelocityCommand(self._asked))
         output = self.gate.output
         simulation.drive(output.linear_x, output.linear_y, output.angular_z)
 

@@ -182,7 +182,7 @@ class Gatekeeper:
             self._note_change(before)
         return outcome
 
-    def command(self, event: gate.Command) -> gate.Outcome:
+    def command(self, event: gate.VelocityCommand) -> gate.Outcome:
         """A command through the gate; one that is refused is counted, and its sender named."""
         outcome = self.step(event)
         reason, source = outcome.refused, event.command.source

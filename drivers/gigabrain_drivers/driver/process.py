@@ -207,7 +207,7 @@ class DriverProcess:
 
     def _on_command(self, _key: str, command: CmdVel) -> None:
         arrived_ns = self._bus.clock.now_ns()
-        self._gatekeeper.command(gate.Command(command, self._wall_ns()))
+        self._gatekeeper.command(gate.VelocityCommand(command, self._wall_ns()))
         if command.boot == self._gate.boot:
             counts = self._gate.mode == "enabled"
             self._round_trip.answered(command.basis, arrived_ns, counts=counts)

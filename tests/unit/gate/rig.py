@@ -78,7 +78,7 @@ class Rig:
             tick=self.state.tick - echo,
             basis=0 if basis is None else self.state.tick - basis,
         )
-        return self.feed(gate.Command(command, wall_ns))
+        return self.feed(gate.VelocityCommand(command, wall_ns))
 
     def safety(
         self,

@@ -197,7 +197,7 @@ class GateMachine(RuleBasedStateMachine):
 
     def send(self, command: CmdVel, wall_ns: int) -> None:
         before, good = self.state, self.good
-        outcome = self.feed(gate.Command(command, wall_ns))
+        outcome = self.feed(gate.VelocityCommand(command, wall_ns))
         assert outcome.ok == (outcome.refused == "")
         if outcome.refused:
             assert self.state.command == before.command
@@ -228,7 +228,7 @@ class GateMachine(RuleBasedStateMachine):
     def keep_books(self, before: gate.GateState, event: gate.Event, outcome: gate.Outcome) -> None:
         if self.state.commander != before.commander:
             self.opened, self.good = self.state.tick, None
-        if isinstance(event, gate.Command) and not outcome.refused:
+        if isinstance(event, gate.VelocityCommand) and not outcome.refused:
             self.good, self.good_tick = event.command, self.state.tick
         theirs = before.commander != "" and outcome.refused == "not_finite"
         if isinstance(event, gate.Estop) or (theirs and self.state != before):

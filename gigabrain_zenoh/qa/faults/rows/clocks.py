@@ -193,7 +193,7 @@ def _falsely_accepted(rig: Rig, count: int) -> int:
         if opened.state.enables != enables:
             highest, enables = -1, opened.state.enables
         command = _near_an_edge(opened, chance, highest)
-        accepted = opened.feed(gate.Command(command)).ok
+        accepted = opened.feed(gate.VelocityCommand(command)).ok
         echo = opened.state.tick - command.tick
         mine = command.boot == opened.state.boot and 0 <= echo <= 7
         wrong += accepted and not (mine and command.seq > highest)

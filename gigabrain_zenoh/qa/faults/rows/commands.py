@@ -106,7 +106,7 @@ def _event(opened: OpenGate, value: dict[str, Any], seq: int) -> gate.Event:
     header = {"source": COMMANDER, "boot": opened.state.boot, "tick": opened.state.tick, "seq": seq}
     payload = msgspec.msgpack.encode({"linear_x": 0.0, **speeds, **header})
     try:
-        return gate.Command(COMMAND.decode(payload))
+        return gate.VelocityCommand(COMMAND.decode(payload))
     except ValueError:
         bad = any(isinstance(v, float) and not math.isfinite(v) for v in speeds.values())
         # what is neither a command nor a non-finite number is dropped without a source
@@ -234,7 +234,7 @@ def let_through(body: BodyDescription, count: int) -> Iterator[tuple[Velocity, V
             if wild:
                 linear, angular = _any_direction(body, chance)
             seq += 1
-            opened.feed(gate.Command(opened.command(linear, seq, angular)))
+            opened.feed(gate.VelocityCommand(opened.command(linear, seq, angular)))
         left -= 1
         yield opened.state.before, opened.state.output
 
