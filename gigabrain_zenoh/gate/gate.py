@@ -220,7 +220,7 @@ def _command(state: GateState, event: VelocityCommand) -> tuple[GateState, Outco
     if refused:
         return state, Outcome(refused=refused, ok=False)
     if command.source == BRAIN:
-        state = replace(state, heard=command, heard_tick=state.tick)
+        state = replace(state, brain_command=command, brain_tick=state.tick)
     if state.mode != "enabled":
         return state, Outcome(refused="not_enabled", ok=False)
     if command.source != state.commander:
@@ -243,12 +243,12 @@ def _not_finite(state: GateState, event: NotFinite) -> tuple[GateState, Outcome]
     return replace(state, nan_ticks=recent, healthy_ticks=0, before=ZERO), refused
 
 
-def _safety(state: GateState, said: SafetyState) -> GateState:
-    if said.boot != state.boot or said.tick > state.tick:
+def _safety(state: GateState, verdict: SafetyState) -> GateState:
+    if verdict.boot != state.boot or verdict.tick > state.tick:
         return state
-    if state.safety and said.tick < state.safety.tick:
+    if state.safety and verdict.tick < state.safety.tick:
         return state
-    return replace(state, safety=said)
+    return replace(state, safety=verdict)
 
 
 def _enable(config: GateConfig, state: GateState, event: Enable) -> tuple[GateState, Outcome]:
@@ -267,6 +267,6 @@ def _enable(config: GateConfig, state: GateState, event: Enable) -> tuple[GateSt
     if found:
         return rejected(state, f"not now: {why.in_words(found)}")
     granted = Outcome(text=f"{event.source} drives")
-    if state.commander == event.source:  # it goes on: a second enable is no command
+    if state.commander == event.source:  # it continues: an enable is no command
         return replace(state, enables=state.enables + 1), granted
     return _enabled(state, event.source), granted

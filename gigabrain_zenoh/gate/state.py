@@ -37,10 +37,10 @@ class GateState(msgspec.Struct, frozen=True, kw_only=True):
     enables: int = 0
     enabled_tick: int = -1000  # when the present commander was enabled
     command: CmdVel | None = None  # last valid one of the commander
-    command_tick: int = 0  # when it came
+    command_tick: int = 0  # of its arrival
     next_seq: int = 0  # the lowest that the commander may use
-    heard: CmdVel | None = None  # last valid one of the brain, also while another commands
-    heard_tick: int = -1000
+    brain_command: CmdVel | None = None  # last valid one of the brain, also while another commands
+    brain_tick: int = -1000
     safety: SafetyState | None = None
     stopped_tick: int = 0  # when stopping began
     still_ticks: int = 0
@@ -146,12 +146,12 @@ def stop_reasons(config: GateConfig, state: GateState, source: str) -> tuple[Cau
     """Return the causes for which `source` must not move the body now."""
     found = [*state.faults, *_verdict(state)]
     if state.mode == "enabled" and source == state.commander:
-        command, came = state.command, state.command_tick
+        command, arrived = state.command, state.command_tick
     elif source == BRAIN:
-        command, came = state.heard, state.heard_tick
+        command, arrived = state.brain_command, state.brain_tick
     else:
         return tuple(found)  # a new commander need not have sent a command yet
-    if state.tick - came > SILENCE_TICKS:
+    if state.tick - arrived > SILENCE_TICKS:
         found.append(why.SILENCE)
     if command and command.basis and age_ns(state, command.basis, None) > config.basis_ns:
         found.append(why.STALE)

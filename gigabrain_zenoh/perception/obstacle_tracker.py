@@ -69,7 +69,7 @@ class ObstacleTrack:
     moving: bool = False
     partly: bool = False  # when it was first seen, only a part of it was
     standing_s: float = 0.0
-    anchor_x: float = 0.0  # [m], where it last stood
+    anchor_x: float = 0.0  # [m], last place where it stood
     anchor_y: float = 0.0
 
     def predict(self, dt: float) -> None:
@@ -258,7 +258,7 @@ class ObstacleTracker:
         x, y = _place(cluster, lidar, pose, track.radius)
         if cluster.whole:
             track.correct(x, y, cluster.radius, cluster.noise, most_off=TURNED)
-        else:  # what is hidden of it is not missing from its size
+        else:  # a hidden part does not make it smaller
             track.correct(x, y, track.radius, PARTIAL_NOISE_FACTOR * cluster.noise)
 
     def _judge(self) -> None:

@@ -24,7 +24,7 @@ from gigabrain_zenoh.geometry.sweep import depth, edges, radius
 SECTORS = 36
 SECTOR_RAD = math.tau / SECTORS
 CONTACT_M = 0.001  # outside the footprint
-PROBE_STEP_M, PROBE_MAX_M = 0.05, 0.35  # distances from the body at which past views are asked
+PROBE_STEP_M, PROBE_MAX_M = 0.05, 0.35  # distances from the body that are looked up in past views
 MAX_AGE_TICKS = 30_000_000_000 // TICK_NS  # of a past view
 VIEW_SPACING_M = 0.05  # turns count by how far they move a corner
 MAX_VIEWS = 48

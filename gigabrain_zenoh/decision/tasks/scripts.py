@@ -126,6 +126,6 @@ async def _outcome(
     return code == 0, _in_words(code, str(output))
 
 
-def _in_words(code: int | None, said: str) -> str:
+def _in_words(code: int | None, output: str) -> str:
     ended = "ended well" if code == 0 else f"ended with exit code {code}"
-    return f"{ended}: {said}" if said else ended
+    return f"{ended}: {output}" if output else ended
