@@ -4,6 +4,7 @@ import logging
 from collections.abc import Callable
 
 import msgspec
+from msgspec import structs
 from msgspec.structs import replace
 
 from gigabrain_schemas.base import TICK_NS, TICK_S, Message, Velocity
@@ -176,13 +177,7 @@ def _wish(
 
 
 def _command(velocity: Velocity, *, operator: bool = False) -> CmdVel:
-    return CmdVel(
-        linear_x=velocity.linear_x,
-        linear_y=velocity.linear_y,
-        angular_z=velocity.angular_z,
-        source=BRAIN,
-        operator=operator,
-    )
+    return CmdVel(**structs.asdict(velocity), source=BRAIN, operator=operator)
 
 
 def _log_tracking(tick: int, *, lost: bool) -> None:

@@ -20,7 +20,7 @@ from gigabrain_zenoh.config.settings import PerceptionConfig
 from gigabrain_zenoh.geometry.pose import PlacedScans
 from gigabrain_zenoh.geometry.scan import EDGE, blind_ahead, hits, scan_problem
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
-from gigabrain_zenoh.perception.obstacle_tracker import Surroundings
+from gigabrain_zenoh.perception.obstacle_tracker import ObstacleTracker
 from gigabrain_zenoh.runtime.heartbeat import Progress
 
 if TYPE_CHECKING:
@@ -119,13 +119,13 @@ async def run(config: PerceptionConfig, bus: Bus, ready: Callable[[], None]) -> 
 
 def _follow(config: PerceptionConfig, bus: Bus, body: Latest[Body], mapper: "Mapper") -> None:
     """Publish world models with obstacles placed by odometry; then pass each scan to the mapper."""
-    surroundings = Surroundings()
+    tracker = ObstacleTracker()
 
     def on_scan(scan: LaserScan, pose: Pose | None) -> None:
         if body.current:
             description = body.current.description
             world = step(config, description, scan)
-            world = surroundings.add(world, description.lidar, scan, pose)
+            world = tracker.add_obstacles(world, description.lidar, scan, pose)
             bus.publish(WORLD, world, basis=scan.basis)
             mapper.process_scan(scan, world.scan_problem)
 

@@ -174,6 +174,16 @@ class ObstacleTracker:
         self._space = FreeSpace()
         self._boot = self._tick = self._ids = 0
 
+    def add_obstacles(
+        self, world: WorldModel, lidar: Lidar | None, scan: LaserScan, pose: Pose | None
+    ) -> WorldModel:
+        """Return `world` with its obstacles in the parent frame of `pose`, if that is known."""
+        if lidar is None or pose is None or not world.scan_ok:
+            return world
+        hits = arrays.hits(world).astype(np.float64)
+        found = self.update(hits, lidar, scan.angle_increment, pose, scan.boot, scan.basis)
+        return replace(world, obstacles=found)
+
     def update(
         self, hits: Floats, lidar: Lidar, spacing: float, pose: Pose, boot: int, tick: int
     ) -> tuple[Obstacle, ...]:
@@ -320,20 +330,3 @@ def _place(cluster: Cluster, lidar: Lidar, pose: Pose, radius: float) -> tuple[f
     ahead = lidar.x + distance * math.cos(cluster.bearing)
     left = lidar.y + distance * math.sin(cluster.bearing)
     return to_parent(pose, ahead, left)
-
-
-class Surroundings:
-    """Adds tracked obstacles to world models."""
-
-    def __init__(self) -> None:
-        self._tracker = ObstacleTracker()
-
-    def add(
-        self, world: WorldModel, lidar: Lidar | None, scan: LaserScan, pose: Pose | None
-    ) -> WorldModel:
-        """Return `world` with its obstacles in the parent frame of `pose`, if that is known."""
-        if lidar is None or pose is None or not world.scan_ok:
-            return world
-        hits = arrays.hits(world).astype(np.float64)
-        found = self._tracker.update(hits, lidar, scan.angle_increment, pose, scan.boot, scan.basis)
-        return replace(world, obstacles=found)

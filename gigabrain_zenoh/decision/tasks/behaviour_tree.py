@@ -5,7 +5,7 @@ All nodes use the robot's time.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Protocol
+from typing import Annotated
 
 from msgspec import Meta
 from py_trees.behaviour import Behaviour
@@ -29,26 +29,14 @@ from gigabrain_zenoh.decision.tasks.mission import (
     Script,
     Step,
 )
+from gigabrain_zenoh.decision.tasks.scripts import Run
 
 FOREVER = -1  # for py-trees
 Index = Annotated[float, Meta(ge=0, le=1e9)]
 Progress = dict[str, Index]  # of each running node, by its number in depth-first order
 
 
-class RunningScript(Protocol):
-    """A program of the host that was started."""
-
-    @property
-    def result(self) -> tuple[bool, str] | None:
-        """Success and a text for people; None while it runs."""
-        ...
-
-    def stop(self) -> None:
-        """End it, if it still runs."""
-        ...
-
-
-StartScript = Callable[[Script], RunningScript]
+StartScript = Callable[[Script], Run]
 
 
 @dataclass
@@ -165,7 +153,7 @@ class ScriptNode(Leaf):
     def __init__(self, script: Script, context: MissionContext) -> None:
         super().__init__(f"running {script.run}", context)
         self._script = script
-        self._running: RunningScript | None = None
+        self._running: Run | None = None
 
     def initialise(self) -> None:
         """Start the program."""

@@ -48,7 +48,7 @@ class Run:
     """One program while it runs, in a process group of its own."""
 
     def __init__(self, scripts: Scripts, script: Script) -> None:
-        self.result: tuple[bool, str] | None = None
+        self.result: tuple[bool, str] | None = None  # success, and a text for people
         self._task = asyncio.ensure_future(self._run(scripts, script))
 
     def stop(self) -> None:

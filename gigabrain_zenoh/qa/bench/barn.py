@@ -38,7 +38,7 @@ from gigabrain_zenoh.navigation.local_planner import (
     SentCommand,
 )
 from gigabrain_zenoh.perception import node as perception
-from gigabrain_zenoh.perception.obstacle_tracker import Surroundings
+from gigabrain_zenoh.perception.obstacle_tracker import ObstacleTracker
 from gigabrain_zenoh.qa.bench.barn_course import (
     HARD,
     IDEAL,
@@ -200,7 +200,7 @@ class BarnBrain:
     def __init__(self, goal: Goal, settings: LocalSettings) -> None:
         self._goal = goal
         self._planner = LocalPlanner(JACKAL, settings)
-        self._surroundings = Surroundings()
+        self._tracker = ObstacleTracker()
         self._response = ActuationEstimator()
         self._memory = control.ControlMemory()
         self._intent: Intent | None = None
@@ -212,7 +212,7 @@ class BarnBrain:
         self._response.add_state(state)
         if scan is not None:
             world = perception.step(self._perception, JACKAL, scan)
-            world = self._surroundings.add(world, LIDAR, scan, state.pose)
+            world = self._tracker.add_obstacles(world, LIDAR, scan, state.pose)
             self._intent = self._decide(state, world)
         inputs = control.ControlInputs(state=state, intent=self._intent)
         self._memory, command = control.step(JACKAL, self._memory, inputs)
