@@ -196,16 +196,19 @@ def test_it_makes_room_when_somebody_stays_where_it_is_to_go() -> None:
     assert (waits.goal, waits.activity) == (goal, "")
     assert not ask(TAKEN, tick=501).activity
     leaves = ask(TAKEN, tick=502)
-    assert leaves.activity
     assert (leaves.activity, leaves.reason) == ("giving way", "the goal is occupied")
     assert leaves.version != waits.version
     assert leaves.goal
     assert abs(leaves.goal.y - 3.0) >= 1.0  # beside the line on which the other is likely to go on
     assert math.hypot(leaves.goal.x - 4.0, leaves.goal.y - 3.0) < 1.5
     stays = ask(TAKEN, tick=1251, x=leaves.goal.x, y=leaves.goal.y)
-    assert (stays.temporary, stays.goal, stays.version) == (True, leaves.goal, leaves.version)
+    assert (stays.activity, stays.goal, stays.version) == (
+        leaves.activity,
+        leaves.goal,
+        leaves.version,
+    )
     goes = ask(ROOM, tick=1252, x=leaves.goal.x, y=leaves.goal.y)
-    assert (goes.goal, goes.temporary, goes.state) == (goal, False, "running")
+    assert (goes.goal, goes.activity, goes.state) == (goal, "", "running")
     assert goes.version != leaves.version
 
 
@@ -237,10 +240,10 @@ def test_who_stood_aside_comes_back_to_look_whether_there_is_room_again() -> Non
     assert looks.reason == "the goal is inside something"
     assert looks.goal
     assert looks.points is not None
-    assert looks.temporary  # to be there is not to have arrived
+    assert looks.activity  # to be there is not to have arrived
     assert 0.2 < math.hypot(looks.goal.x - 5.0, looks.goal.y - 3.0) < 0.8
     back = ask(ROOM, tick=1400, x=looks.goal.x, y=looks.goal.y)
-    assert (back.goal, back.temporary, back.reason) == (goal, False, "")
+    assert (back.goal, back.activity, back.reason) == (goal, "", "")
 
 
 def test_it_makes_room_for_who_keeps_it_from_the_place_beside_its_goal() -> None:
@@ -251,8 +254,8 @@ def test_it_makes_room_for_who_keeps_it_from_the_place_beside_its_goal() -> None
     ask(ROOM, tick=1)
     beside = ask(taken, tick=50)
     assert beside.reason.startswith("0.11 m from the requested goal: the goal is too close to ")
-    assert not beside.temporary
-    assert ask(taken, tick=502).temporary
+    assert not beside.activity
+    assert ask(taken, tick=502).activity
 
 
 def test_a_robot_between_walls_goes_far_from_who_stands_at_its_goal() -> None:
