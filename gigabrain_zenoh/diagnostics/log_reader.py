@@ -26,7 +26,7 @@ Line = Mapping[str, Any]
 
 
 class LogFilter(msgspec.Struct, frozen=True, kw_only=True):
-    """Which lines to show."""
+    """Selects the log lines to show."""
 
     process: str = ""  # empty for all
     level: str = "debug"  # lowest

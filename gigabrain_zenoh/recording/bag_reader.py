@@ -161,7 +161,7 @@ def read_records(path: Path) -> Iterator[McapRecord | BagDamage | BagEnd]:
 def _walk(data: mmap.mmap) -> Iterator[McapRecord | BagDamage | BagEnd]:
     at, end = len(MAGIC), len(data)
     summary = _summary(data)
-    if summary:  # declares again what a damaged chunk may have declared
+    if summary:  # repeats the declarations of damaged chunks
         yield from (item for item in _parse(summary, at) if isinstance(item, Schema | Channel))
     while at < end:
         opcode, after = _head(data, at)

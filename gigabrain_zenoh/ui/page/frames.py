@@ -73,7 +73,7 @@ class PageReply(Struct, frozen=True, kw_only=True):
     ok: bool
     text: Text
     robot: str = ""  # type of the robot that confirmed it
-    not_confirmed: bool = False  # of an e-stop; the text then says what to do
+    not_confirmed: bool = False  # an e-stop without confirmation; the text gives the remedy
 
 
 def as_json(kind: int, content: Any) -> bytes:
