@@ -219,9 +219,8 @@ def usage_error(error: CycloptsError) -> str:
             return f"unexpected argument {name!r}{see}"
         case MissingArgumentError(argument=Argument() as argument):
             given = error.keyword or next((token.keyword for token in argument.tokens), None)
-            return (
-                f"{given}: a value is missing" if given else f"missing {_shown(argument)}"
-            ) + see
+            missing = f"{given}: a value is missing" if given else f"missing {_shown(argument)}"
+            return missing + see
         case RepeatArgumentError(token=token):
             return f"{token.keyword}: given twice"
         case CoercionError(argument=Argument() as argument, token=token) if token:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 from cyclopts import Parameter
@@ -31,15 +31,13 @@ ROUTER = "tcp/127.0.0.1:7447"
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
-class ProcessOptions:
-    """Connection and logging of a process."""
+class HostOptions:
+    """Identity and logging of a process."""
 
-    connect: str = ROUTER
-    "Zenoh endpoint of the router."
     namespace: str = ""
     "Namespace of the robot, where one router serves several robots."
     keys: Path | None = None
-    "Folder of this host's identity, for a router that requires keys."
+    "Folder of this host's identity, if the robot has keys."
     run_dir: Path | None = None
     "Write a log file to this folder."
     level: Level = "info"
@@ -50,13 +48,12 @@ class ProcessOptions:
         """Return the folder of the identity; empty for none."""
         return str(self.keys.expanduser().absolute()) if self.keys else ""
 
-    def run(self, name: str, settings: dict[str, Any], endpoint: Endpoint | None = None) -> int:
+    def run_at(self, endpoint: Endpoint, name: str, settings: dict[str, Any]) -> int:
         """Run the process `name` until a signal; return its exit code."""
-        found = endpoint or find_endpoint(self.connect, self.namespace, self.folder)
         return run_process(
             ProcessConfig(
                 name=name,
-                endpoint=found,
+                endpoint=endpoint,
                 settings=settings,
                 run_dir=str(self.run_dir) if self.run_dir else None,
                 level=self.level,
@@ -64,7 +61,21 @@ class ProcessOptions:
         )
 
 
-LOCAL = ProcessOptions()
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class ProcessOptions(HostOptions):
+    """Connection and logging of a process."""
+
+    connect: str = ROUTER
+    "Zenoh endpoint of the router."
+
+    def run(self, name: str, settings: dict[str, Any]) -> int:
+        """Connect, and run the process `name` until a signal; return its exit code."""
+        endpoint = find_endpoint(self.connect, self.namespace, self.folder)
+        return self.run_at(endpoint, name, settings)
+
+
+ALONE, LOCAL = HostOptions(), ProcessOptions()
 
 
 def router(
@@ -72,7 +83,7 @@ def router(
     listen: tuple[str, ...] = (ROUTER,),
     fleet: tuple[str, ...] = (),
     insecure: bool = False,
-    process: Annotated[ProcessOptions, Parameter(show=False)] = LOCAL,
+    process: HostOptions = ALONE,
 ) -> int:
     """Run the router that connects the other processes. Tools on this machine find it.
 
@@ -93,7 +104,7 @@ def router(
     settings = router_config(endpoint, run_folders.state_dir() / "robots" / (namespace or "router"))
     here = Endpoint(connect=(reached_at(listen[0]),), namespace=namespace, keys=keys)
     with announced(namespace or "router", secured(here)):
-        return process.run("router", msgspec.to_builtins(settings), endpoint)
+        return process.run_at(endpoint, "router", msgspec.to_builtins(settings))
 
 
 def perception(*, process: ProcessOptions = LOCAL) -> int:
