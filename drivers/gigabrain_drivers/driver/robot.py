@@ -56,6 +56,10 @@ class LinkOptions(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     scan: ScanOptions | None = None  # a lidar that the driver carries, see lidars.base.open_lidar
     lidar: Lidar | None = None  # overrides the lidar of the body's file
 
+    def battery_volts(self) -> tuple[float, float] | None:
+        """Return the voltages that the driver takes for empty and full, where it has any."""
+        return None
+
 
 class Run(Struct, frozen=True, kw_only=True):
     """Settings of one run of a driver."""

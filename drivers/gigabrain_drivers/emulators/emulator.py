@@ -13,7 +13,6 @@ import msgspec
 from msgspec.structs import replace
 
 from gigabrain_drivers import shipped_emulators
-from gigabrain_drivers.bodies.line.options import LineOptions
 from gigabrain_drivers.driver import catalog
 from gigabrain_drivers.driver.robot import LinkOptions, Run
 from gigabrain_drivers.emulators.base import Broken, Device, EmulatedBody, Port, Wire
@@ -44,16 +43,13 @@ def emulated_body(name: str, run: Run) -> EmulatedBody:
     run = replace(run, folder=folder)
     body, world = sim_body(robot, options, run), load_world(run.world, run.seed)
     _, _, real, _ = catalog.load_link(name, replace(run, link="emulated"))
-    if isinstance(real, LineOptions):
-        body = dataclasses.replace(body, battery=_charged(body.battery, real))
+    if volts := real.battery_volts():
+        body = dataclasses.replace(body, battery=_charged(body.battery, *volts))
     return EmulatedBody(robot, Simulation(body, world, run.seed), run)
 
 
-def _charged(battery: SimBattery, line: LineOptions) -> SimBattery:
-    """Return the battery between the voltages that the line's driver takes for empty and full."""
-    empty, full = line.battery_empty, line.battery_full
-    if empty is None or full is None:
-        return battery
+def _charged(battery: SimBattery, empty: float, full: float) -> SimBattery:
+    """Return the battery between the voltages that the real link's driver expects."""
     nominal = (empty + full) / 2
     return dataclasses.replace(
         battery, empty_voltage=empty, nominal_voltage=nominal, full_voltage=full
@@ -62,7 +58,7 @@ def _charged(battery: SimBattery, line: LineOptions) -> SimBattery:
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Have the folder for this process alone, until it ends or dies. Raises ConfigError."""
+    """Lock the folder for this process, until it ends or dies. Raises ConfigError."""
     with contextlib.ExitStack() as stack:
         try:
             folder.mkdir(parents=True, exist_ok=True)

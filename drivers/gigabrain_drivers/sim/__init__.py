@@ -1,6 +1,7 @@
-"""Simulated bodies: MuJoCo physics, worlds, sensors and the truth about them. No bus in here.
+"""Simulated bodies: MuJoCo physics, worlds, sensors and the truth about them.
 
-Time goes on in whole steps, so that it never drifts; two of them are a tick of the robot's clock.
+Imports `driver` and `kinematics`; `emulators` and pictures use it. Time goes on in whole steps, so
+that it never drifts; two of them are a tick of the robot's clock.
 """
 
 import time

@@ -60,6 +60,12 @@ class LineOptions(LinkOptions, frozen=True, kw_only=True, forbid_unknown_fields=
         self._check_flags(seen)
         self._check_baud(command, state)
 
+    def battery_volts(self) -> tuple[float, float] | None:
+        """Return the voltages for 0 % and 100 %, where both are given."""
+        if self.battery_empty is None or self.battery_full is None:
+            return None
+        return self.battery_empty, self.battery_full
+
     def command_template(self) -> Template:
         """Return the template of the command line."""
         return _template("command", self.command, COMMAND, self.ticks_per_turn)
