@@ -69,7 +69,7 @@ class MissionContext:
         self.progress = self.left_s = None
 
 
-class Leaf(Behaviour):
+class _Leaf(Behaviour):
     """A node without children."""
 
     def __init__(self, name: str, context: MissionContext) -> None:
@@ -82,7 +82,7 @@ class Leaf(Behaviour):
         return Status.FAILURE
 
 
-class DriveNode(Leaf):
+class _DriveNode(_Leaf):
     """Issues a drive command, and ends with its outcome."""
 
     def __init__(
@@ -94,13 +94,11 @@ class DriveNode(Leaf):
         self._prefix = f"{place}: " if place else ""
 
     def initialise(self) -> None:
-        """Take a new number, so that it is a new command."""
         self._command = DriveCommand(
             next(self.context.numbers), self._command.kind, self._command.goal
         )
 
     def update(self) -> Status:
-        """Return the state of the command."""
         outcome, self.context.doing = self.context.outcome, self.name
         if outcome and outcome.number == self._command.number and outcome.state != "running":
             done = outcome.state == "done"
@@ -109,7 +107,7 @@ class DriveNode(Leaf):
         return Status.RUNNING
 
 
-class WaitNode(Leaf):
+class _WaitNode(_Leaf):
     """Succeeds after some seconds of the robot's time."""
 
     def __init__(self, seconds: float, context: MissionContext) -> None:
@@ -117,11 +115,9 @@ class WaitNode(Leaf):
         self._seconds, self._until_s = seconds, 0.0
 
     def initialise(self) -> None:
-        """Start the timer."""
         self._until_s = self.context.now_s + self._seconds
 
     def update(self) -> Status:
-        """Succeed once the time has passed."""
         left_s = self._until_s - self.context.now_s
         if left_s <= 1e-9:
             return Status.SUCCESS
@@ -130,7 +126,7 @@ class WaitNode(Leaf):
         return Status.RUNNING
 
 
-class ConditionNode(Leaf):
+class _ConditionNode(_Leaf):
     """Succeeds if a condition holds; otherwise waits or fails. An unknown value does not hold."""
 
     def __init__(self, condition: Condition, context: MissionContext, *, waits: bool) -> None:
@@ -138,7 +134,6 @@ class ConditionNode(Leaf):
         self._condition, self._waits = condition, waits
 
     def update(self) -> Status:
-        """Evaluate the condition."""
         self.context.doing = self.name
         holds = self._condition.holds(self.context.read)
         if holds or self._waits:
@@ -147,7 +142,7 @@ class ConditionNode(Leaf):
         return self.failed(f"{self._condition.text} {why}")
 
 
-class ScriptNode(Leaf):
+class _ScriptNode(_Leaf):
     """Runs a program of the host, which ends with the node."""
 
     def __init__(self, script: Script, context: MissionContext) -> None:
@@ -156,11 +151,9 @@ class ScriptNode(Leaf):
         self._running: Run | None = None
 
     def initialise(self) -> None:
-        """Start the program."""
         self._running = self.context.start(self._script)
 
     def update(self) -> Status:
-        """Return the program's result."""
         self.context.doing = self.name
         result = self._running.result if self._running else None
         if result is None:
@@ -168,13 +161,12 @@ class ScriptNode(Leaf):
         return Status.SUCCESS if result[0] else self.failed(f"{self._script.run} {result[1]}")
 
     def terminate(self, new_status: Status) -> None:
-        """Stop the program."""
         if self._running:
             self._running.stop()
             self._running = None
 
 
-class TimeoutNode(Decorator):
+class _TimeoutNode(Decorator):
     """Fails if its child takes longer than some seconds of the robot's time.
 
     The clock stops while the gate or an operator holds the body.
@@ -185,11 +177,9 @@ class TimeoutNode(Decorator):
         self._seconds, self._context, self.began_s = seconds, context, 0.0
 
     def initialise(self) -> None:
-        """Start the timer."""
         self.began_s = self._context.free_s
 
     def update(self) -> Status:
-        """Return the child's status, or FAILURE once the time has passed."""
         too_long = self._context.free_s - self.began_s > self._seconds
         if self.decorated.status is Status.RUNNING and too_long:
             outcome = self._context.outcome
@@ -201,7 +191,7 @@ class TimeoutNode(Decorator):
         return self.decorated.status
 
 
-class GuardNode(Behaviour):
+class _GuardNode(Behaviour):
     """Ticks `then` to its end whenever a condition holds, otherwise `do`, which then continues."""
 
     def __init__(
@@ -215,7 +205,6 @@ class GuardNode(Behaviour):
             self.children.append(child)
 
     def tick(self) -> Iterator[Behaviour]:
-        """Tick one of the two children."""
         if self.status is not Status.RUNNING:
             self.interrupted = False
         if not self.interrupted and self._condition.holds(self._context.read):
@@ -231,8 +220,7 @@ class GuardNode(Behaviour):
         yield self
 
     def update(self) -> Status:
-        """Return the status of the last tick: `tick` does the work."""
-        return self.status
+        return self.status  # of the last `tick`
 
     def _resume(self) -> Status:
         """Continue with `do` after `then`; fail if the condition still holds."""
@@ -243,7 +231,6 @@ class GuardNode(Behaviour):
         return Status.RUNNING
 
     def stop(self, new_status: Status) -> None:
-        """Stop both children."""
         for child in self.children:
             if child.status is Status.RUNNING or new_status is Status.INVALID:
                 child.stop(Status.INVALID)
@@ -285,14 +272,14 @@ class TreeBuilder:
         if step.goto is not None:
             return self._go_to(step.goto)
         if step.explore or step.visit:
-            return DriveNode("explore" if step.explore else "visit", context)
+            return _DriveNode("explore" if step.explore else "visit", context)
         if step.wait is not None:
-            return WaitNode(step.wait, context)
+            return _WaitNode(step.wait, context)
         if step.wait_until is not None:
-            return ConditionNode(parse(step.wait_until), context, waits=True)
+            return _ConditionNode(parse(step.wait_until), context, waits=True)
         if step.check is not None:
-            return ConditionNode(parse(step.check), context, waits=False)
-        return ScriptNode(step.script, context) if step.script else None
+            return _ConditionNode(parse(step.check), context, waits=False)
+        return _ScriptNode(step.script, context) if step.script else None
 
     def _decorated(self, step: Step) -> Behaviour:
         if step.retry:
@@ -302,10 +289,10 @@ class TreeBuilder:
             return _repeated(self._sequence(step.repeat.do), step.repeat.times)
         if step.timeout:
             child = self._sequence(step.timeout.do)
-            return TimeoutNode(child, step.timeout.seconds, self._context)
+            return _TimeoutNode(child, step.timeout.seconds, self._context)
         if step.guard:
             then, do = self._sequence(step.guard.then), self._sequence(step.guard.do)
-            return GuardNode(parse(step.guard.when), then, do, self._context)
+            return _GuardNode(parse(step.guard.when), then, do, self._context)
         assert step.battery_below
         return self._battery(step.battery_below)
 
@@ -313,22 +300,22 @@ class TreeBuilder:
         then = self._go_to(low.goto)
         if low.until is not None:
             charged = parse(f"battery.percentage >= {low.until:g}")
-            wait = ConditionNode(charged, self._context, waits=True)
+            wait = _ConditionNode(charged, self._context, waits=True)
             then = Sequence("charge", memory=True, children=[then, wait])
         when = parse(f"battery.percentage < {low.percentage:g}")
-        return GuardNode(when, then, self._sequence(low.do), self._context)
+        return _GuardNode(when, then, self._sequence(low.do), self._context)
 
     def _patrol(self, patrol: Patrol) -> Behaviour:
         children: list[Behaviour] = []
         for place in patrol.points:
             children.append(self._go_to(place))
             if patrol.wait:
-                children.append(WaitNode(patrol.wait, self._context))
+                children.append(_WaitNode(patrol.wait, self._context))
         return _repeated(Sequence("round", memory=True, children=children), patrol.loops)
 
     def _go_to(self, place: Place) -> Behaviour:
         name = place if isinstance(place, str) else ""
-        return DriveNode("goto", self._context, self._mission.goal(place), name)
+        return _DriveNode("goto", self._context, self._mission.goal(place), name)
 
 
 def _repeated(child: Behaviour, times: int | None) -> Behaviour:
@@ -347,9 +334,9 @@ def progress_of(root: Behaviour, free_s: float) -> Progress:
             progress[str(number)] = node.failures
         elif isinstance(node, Repeat):
             progress[str(number)] = node.success
-        elif isinstance(node, TimeoutNode):
+        elif isinstance(node, _TimeoutNode):
             progress[str(number)] = round(free_s - node.began_s, -1)  # coarse: each change is saved
-        elif isinstance(node, GuardNode):
+        elif isinstance(node, _GuardNode):
             progress[str(number)] = node.interrupted
     return progress
 
@@ -366,9 +353,9 @@ def restore(root: Behaviour, progress: Progress) -> None:
             node.failures = int(value)
         elif isinstance(node, Repeat):
             node.success = int(value)
-        elif isinstance(node, TimeoutNode):
+        elif isinstance(node, _TimeoutNode):
             node.began_s = -value
-        elif isinstance(node, GuardNode):
+        elif isinstance(node, _GuardNode):
             node.interrupted = bool(value)
         else:
             continue

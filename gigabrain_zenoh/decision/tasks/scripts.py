@@ -92,16 +92,13 @@ class _Output(asyncio.SubprocessProtocol):
         return " ".join(self._text.decode(errors="replace").split())
 
     def pipe_data_received(self, fd: int, data: bytes) -> None:
-        """Keep the last bytes."""
         self._text += data
         del self._text[:-MAX_OUTPUT]
 
     def pipe_connection_lost(self, fd: int, exc: Exception | None) -> None:
-        """Record that all writers have closed the output."""
         self.silent.set()
 
     def process_exited(self) -> None:
-        """Record that it has ended; its children may still write."""
         self.ended.set()
 
 
