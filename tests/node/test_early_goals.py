@@ -14,6 +14,7 @@ from gigabrain_zenoh.cli.task import progress
 from gigabrain_zenoh.config.settings import DecisionConfig
 from gigabrain_zenoh.decision import goal_server
 from gigabrain_zenoh.decision import node as decision
+from gigabrain_zenoh.decision.behaviours import WaitReason
 from gigabrain_zenoh.errors import ConfigError
 from gigabrain_zenoh.kernels.precompile import ensure_compiled
 from gigabrain_zenoh.testing.in_memory import NodeBench
@@ -38,12 +39,12 @@ async def test_a_goal_is_taken_while_decision_still_gets_ready(
         operator = Bus(bench.network.transport(), bench.clock, "operator")
         operator.subscribe(TASK, lambda _key, status: told.append(status))
         replies = await operator.ask(GOAL, GoalRequest(x=4.0, y=0.8, source="ann"))
-        assert replies == [GoalReply(ok=True, text="goal-1: accepted; starting up",
+        assert replies == [GoalReply(ok=True, text=f"goal-1: accepted; {WaitReason.STARTING}",
                                      goal="goal-1")]  # fmt: skip
         for _ in range(3):
             await bench.clock.advance(200_000_000)
         assert len(told) >= 3
-        assert progress("goal-1", told[-1]) == "goal-1: accepted, waiting: starting up"
+        assert progress("goal-1", told[-1]) == f"goal-1: accepted, waiting: {WaitReason.STARTING}"
         assert not bench.sent(INTENT)
         warm.set()
         await bench.ready()
@@ -53,7 +54,7 @@ async def test_a_goal_is_taken_while_decision_still_gets_ready(
 async def test_a_goal_that_was_given_before_there_was_a_map_is_driven_to() -> None:
     async with Plane(CELLS) as plane:
         reply = await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
-        assert reply.text == "goal-1: accepted; perception is starting up"
+        assert reply.text == f"goal-1: accepted; {WaitReason.PERCEPTION_STARTING}"
         assert (await plane.ask_at_once(MISSION, MissionRequest(mission="do: [{goto: [1, 2]}]"))).ok
         await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
         await plane.until("succeeded", seconds=60)
@@ -75,11 +76,11 @@ async def test_a_goal_waits_until_it_is_sure_for_the_first_time_where_it_is() ->
         plane.localized = False
         await plane.go(0.3)
         reply = await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8))
-        assert reply.text == "goal-1: accepted; the pose in the map is uncertain"
+        assert reply.text == f"goal-1: accepted; {WaitReason.NOT_LOCALIZED}"
         await plane.go(1.0)
         assert plane.travelled == 0.0
         assert progress("goal-1", plane.status) == (
-            "goal-1: going to (4.00, 0.80), 0 %, waiting: the pose in the map is uncertain"
+            f"goal-1: going to (4.00, 0.80), 0 %, waiting: {WaitReason.NOT_LOCALIZED}"
         )
         plane.localized = True
         await plane.until("succeeded", seconds=60)

@@ -11,6 +11,8 @@ from gigabrain_schemas.safety import SafetyState
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest
 from gigabrain_schemas.topics import GOAL, MISSION, SAFETY
 from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision.behaviours import WaitReason
+from gigabrain_zenoh.decision.tasks.task_queue import NO_GOAL
 from gigabrain_zenoh.testing.samples import BOOT
 from tests.node.plane import ROOM, Plane, drawn
 
@@ -21,7 +23,7 @@ STANDS = Velocity()
 async def test_it_drives_round_a_wall_to_its_goal_and_says_how_far_it_is() -> None:
     async with Plane(CELLS) as plane:
         await plane.go(0.2)
-        assert plane.intent.reason == "waiting: for a goal"
+        assert plane.intent.reason == NO_GOAL.reason
         reply = await plane.ask(GOAL, GoalRequest(x=4.0, y=0.8, source="ann"))
         assert (reply.ok, reply.goal) == (True, "goal-1")
         assert reply.text.startswith("goal-1: on the way, 3.")
@@ -37,7 +39,7 @@ async def test_it_drives_round_a_wall_to_its_goal_and_says_how_far_it_is() -> No
         assert math.hypot(plane.x - 4.0, plane.y - 0.8) < 0.15
         assert plane.status.done[0].reason == "at (4.00, 0.80)"
         await plane.go(0.5)
-        assert (plane.intent.twist, plane.intent.reason) == (STANDS, "waiting: for a goal")
+        assert (plane.intent.twist, plane.intent.reason) == (STANDS, NO_GOAL.reason)
 
 
 @pytest.mark.parametrize(
@@ -99,9 +101,7 @@ async def test_without_a_map_it_says_what_to_change() -> None:
         ):
             reply = await plane.ask(service, request)  # type: ignore[arg-type]
             assert not reply.ok
-            assert reply.text == (
-                "no localization; set perception: {mapping: slam} or {mapping: localize}"
-            )
+            assert reply.text == WaitReason.NO_LOCALIZATION
         assert (await plane.ask(MISSION, MissionRequest(mission="do: [{wait: 1}]"))).ok
 
 
@@ -113,7 +113,7 @@ async def test_it_stands_while_it_is_not_sure_where_it_is_and_goes_on_afterwards
         plane.localized = False
         await plane.go(1.5)
         assert plane.intent.twist == STANDS
-        assert plane.intent.reason == "waiting: the pose in the map is uncertain"
+        assert plane.intent.reason == f"waiting: {WaitReason.NOT_LOCALIZED}"
         travelled = plane.travelled
         await plane.go(2.0)
         assert plane.travelled == travelled

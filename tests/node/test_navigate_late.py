@@ -12,7 +12,7 @@ from gigabrain_schemas.tasks import GoalRequest
 from gigabrain_schemas.topics import GOAL, MAP
 from gigabrain_zenoh.decision import navigator as navigating
 from gigabrain_zenoh.decision.behaviours import NavigationConfig
-from gigabrain_zenoh.decision.navigator import Navigator
+from gigabrain_zenoh.decision.navigator import NO_ROUTE, Navigator
 from gigabrain_zenoh.decision.route import Route, RoutePlanner, RouteRequest
 from gigabrain_zenoh.testing.in_memory import Net
 from gigabrain_zenoh.testing.samples import BOOT, state
@@ -113,10 +113,10 @@ async def test_a_plan_for_a_huge_map_does_not_delay_the_first_one_for_the_real_m
         await plane.go(0.1)
         await plane.ask_at_once(GOAL, GoalRequest(x=4.0, y=0.8))
         await plane.go(0.2)
-        assert plane.intent.reason == "waiting: for a path through the map"
+        assert plane.intent.reason == NO_ROUTE.reason
         began = plane.tick
         plane.bench.send(MAP, as_map(CELLS, plane.tick, plane.boot))
-        while plane.intent.reason == "waiting: for a path through the map":
+        while plane.intent.reason == NO_ROUTE.reason:
             await plane.go(0.02)
         assert plane.tick - began <= 25
 

@@ -8,6 +8,7 @@ from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest, TaskRequest
 from gigabrain_schemas.topics import GOAL, MISSION, TASK_CHANGE
 from gigabrain_zenoh.config.settings import DecisionConfig
+from gigabrain_zenoh.decision.tasks.task_queue import NO_GOAL
 from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
@@ -100,13 +101,13 @@ async def test_who_was_told_to_do_nothing_does_not_roam_after_a_restart_of_decis
         await plane.go(0.5)
         await plane.ask(TASK_CHANGE, TaskRequest(do="cancel", task="all", source="ann"))
         await plane.go(0.5)
-        assert plane.intent.reason == "waiting: for a goal"
+        assert plane.intent.reason == NO_GOAL.reason
         saved = tmp_path / "tasks.json"
         while not saved.exists() or b'"jobs":[]' not in saved.read_bytes():  # noqa: ASYNC110
             await asyncio.sleep(0.01)
         await plane.restart()
         await plane.go(1.0)
-        assert plane.intent.reason == "waiting: for a goal"
+        assert plane.intent.reason == NO_GOAL.reason
         plane.driver_starts_anew()
         await plane.restart()
         await plane.go(1.0)

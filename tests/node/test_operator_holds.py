@@ -11,12 +11,12 @@ from gigabrain_schemas.body import GateStatus
 from gigabrain_schemas.brain import CmdVel
 from gigabrain_schemas.tasks import GoalRequest, MissionRequest
 from gigabrain_schemas.topics import CMD_VEL, GOAL, MISSION
+from gigabrain_zenoh.decision.context import OPERATOR_HOLDS
 from gigabrain_zenoh.gate.causes import estop
 from gigabrain_zenoh.testing.samples import DRIVING
 from tests.node.plane import ROOM, Plane, drawn
 
 CELLS = drawn(ROOM)
-HOLDS = "an operator holds the body; `gigabrain enable` hands it back"
 
 
 class Held(Plane):
@@ -51,7 +51,7 @@ def script(plane: Held) -> None:
 @pytest.mark.parametrize(
     ("hold", "why"),
     [
-        (operator, HOLDS),
+        (operator, OPERATOR_HOLDS),
         (pressed, "the gate is latched: e-stop pressed by ann"),
         (script, "script-7 has the body"),
     ],

@@ -6,7 +6,7 @@ import pytest
 
 from gigabrain_schemas.base import Velocity
 from gigabrain_schemas.safety import SpeedCaps
-from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.gate import causes, gate
 from gigabrain_zenoh.geometry.limits import ZERO
 from tests.unit.gate.rig import BOOT, ZONE, Rig, calm, driving, enabled, idle
 
@@ -256,7 +256,6 @@ def test_the_brain_takes_over_by_what_it_says_not_by_what_the_other_said() -> No
         rig.send(source="alice")
     assert rig.feed(gate.Enable("control", take=True, by="alice")) == gate.Outcome(
         ok=False,
-        text="not now: no valid command for 100 ms (check that the commander runs and reaches the "
-        "robot, then enable it again)",
+        text=f"not now: {causes.in_words((causes.SILENCE,))}",
     )
     assert (rig.mode, rig.state.commander) == ("enabled", "alice")

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 
 from gigabrain_schemas.base import Velocity
-from gigabrain_zenoh.gate import gate
+from gigabrain_zenoh.gate import causes, gate
 from gigabrain_zenoh.geometry.limits import ZERO
 from tests.unit.gate.rig import BLIND, LOST, ZONE, Rig, enabled, idle
 
@@ -72,9 +72,7 @@ def test_all_that_speaks_against_it_is_said() -> None:
     rig.tick(8, faults=(LOST,))
     assert rig.feed(gate.Enable("control")) == gate.Outcome(
         ok=False,
-        text="not now: the body does not answer; the safety process is silent (start the safety "
-        "process, or read its log); no valid command for 100 ms (check that the commander runs "
-        "and reaches the robot, then enable it again)",
+        text=f"not now: {causes.in_words((LOST, causes.SAFETY_SILENT, causes.SILENCE))}",
     )
 
 
